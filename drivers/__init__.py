@@ -1,0 +1,1 @@
+"""Real devices and buses, one file each, found by name through entry points."""

@@ -1,0 +1,64 @@
+"""Every error that samii-rig raises on purpose, as one tree.
+
+Each carries one line for the person at the bench: what, where, the value that was
+wrong, and what would be right. The command line prints that line and exits with the
+class's `exit_code`; anything else that escapes is a defect of ours.
+"""
+
+
+class SamiiRigError(Exception):
+    """Root of the tree; `str(error)` is the line for the person."""
+
+    exit_code = 1
+
+
+class InputError(SamiiRigError):
+    """Something that a person gave is wrong.
+
+    Parameters
+    ----------
+    where : the file (or command line option) that holds it.
+    field : the field in it, dotted, `""` when the whole is meant.
+    value : what stands there.
+    expected : what would be right, as a phrase that follows "expected".
+    """
+
+    exit_code = 2
+
+    def __init__(self, where: str, field: str, value: object, expected: str) -> None:
+        self.where, self.field, self.value, self.expected = where, field, value, expected
+        place = f"{where}: {field}" if field else where
+        shown = repr(value)
+        if len(shown) > 80:
+            shown = shown[:77] + "..."
+        super().__init__(f"{place} is {shown}; expected {expected}")
+
+
+class RecordingError(SamiiRigError):
+    """A recording is damaged, incomplete or not one of ours."""
+
+    exit_code = 2
+
+
+class EstimateError(SamiiRigError):
+    """The data do not allow the estimate that was asked for; the line says what is missing."""
+
+    exit_code = 2
+
+
+class LimitError(SamiiRigError):
+    """A plan would break a limit; the line names the number and the amplitude that would not."""
+
+    exit_code = 4
+
+
+class GateError(SamiiRigError):
+    """The safety gate refused: wrong state, no deadman, or a command outside its limits."""
+
+    exit_code = 5
+
+
+class DeviceError(SamiiRigError):
+    """A device did not do what its Protocol promises."""
+
+    exit_code = 6

@@ -1,0 +1,1 @@
+"""The transfer matrix model of a rig."""

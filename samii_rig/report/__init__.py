@@ -1,0 +1,1 @@
+"""What a person sees: plots, one HTML page, terminal summaries."""

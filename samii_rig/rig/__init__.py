@@ -1,0 +1,1 @@
+"""The rig file: chain, channels, limits, tolerances, units."""

@@ -1,0 +1,90 @@
+"""Read TOML files into checked models; what is wrong is said in one line."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from samii_rig.errors import InputError
+from samii_rig.rig.schema import Rig
+
+Model = TypeVar("Model", bound=BaseModel)
+MAX_BYTES = 4_000_000  # a rig file is a few kB; more is not one
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of the rigs that come with the package."""
+    folder = resources.files("samii_rig.rig") / "data"
+    return tuple(sorted(p.name.removesuffix(".toml") for p in folder.iterdir()))
+
+
+def read_text(path: Path, what: str) -> str:
+    """The text of a file, or an InputError that says why it cannot be read."""
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(str(path), "", path.stat().st_size, f"a {what} under 4 MB")
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(str(path), "", error.strerror, f"a readable {what}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(str(path), "", error.reason, f"a {what} in UTF-8") from error
+
+
+def parse(model: type[Model], text: str, where: str) -> Model:
+    """`text` (TOML) as `model`; InputError names `where`, the field and what would be right."""
+    try:
+        data = tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise InputError(where, "", str(error) or "nested too deep", "valid TOML") from error
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise _one_line(error, data, where) from error
+
+
+def load_rig(name: str) -> tuple[Rig, str]:
+    """The rig called `name` (shipped, or the path of a file) and the text of its file."""
+    if name in shipped():
+        text = (resources.files("samii_rig.rig") / "data" / f"{name}.toml").read_text("utf-8")
+        return parse(Rig, text, f"{name}.toml"), text
+    path = Path(name)
+    if not path.exists():
+        expected = f"the path of a rig file or one of {', '.join(shipped())}"
+        raise InputError("--rig", "", name, expected)
+    text = read_text(path, "rig file")
+    return parse(Rig, text, str(path)), text
+
+
+def _one_line(error: ValidationError, data: dict[str, object], where: str) -> InputError:
+    first = error.errors(include_url=False)[0]
+    field = ""
+    node: object = data
+    for key in first["loc"]:
+        if isinstance(key, int) and isinstance(node, list) and key < len(node):
+            node = node[key]
+            named = node.get("name") if isinstance(node, dict) else None
+            field += f"[{named or key}]"
+        elif isinstance(node, dict) and key in node:
+            node = node[key]
+            field += f".{key}"
+        elif first["type"] == "missing":
+            field += f".{key}"
+        # Otherwise the key is the tag of a union, which the file does not show.
+    message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "missing":
+        value: object = None
+        message = "this field (it is missing)"
+    elif first["type"] == "extra_forbidden":
+        value = first["loc"][-1]
+        message = "a known field name"
+    elif first["type"] == "value_error":
+        value = node.get("value", "inconsistent") if isinstance(node, dict) else node
+        if not isinstance(node, str | int | float):
+            return InputError(where, field.lstrip("."), "inconsistent", f"consistency: {message}")
+    else:
+        value = first.get("input")
+    return InputError(where, field.lstrip("."), value, message)

@@ -1,0 +1,1 @@
+"""Driving a rig: devices' Protocols, clocks, the safety gate, the loop, plans and dry runs."""

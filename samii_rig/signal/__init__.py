@@ -1,0 +1,1 @@
+"""Excitations, and frequency responses with what is known of their error."""

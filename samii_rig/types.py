@@ -1,0 +1,211 @@
+"""The data that flows through the system, and nothing else.
+
+Axes are named here once and never change order. Values are in SI units unless the
+channel's `unit` says otherwise (an actuator's input may be counts).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from enum import IntFlag
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Int = NDArray[np.int64]
+Flags = NDArray[np.uint8]
+
+Role = Literal["reference", "command", "sensor"]
+
+
+class Quality(IntFlag):
+    """What is known to be wrong with one value of one channel."""
+
+    GOOD = 0
+    MISSING = 1  # never arrived; the value is NaN
+    CLIPPED = 2  # at the end of the converter's range
+    STALE = 4  # repeated by the device because nothing newer was there
+    LIMITED = 8  # the device's own limit or deadman changed the output
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One column of a recording.
+
+    role: `reference` was chosen by us and is known exactly (the excitation u),
+    `command` went out to the actuator (v), `sensor` was measured.
+    low, high: ends of the converter's range in `unit`.
+    resolution: one step of the converter in `unit`; 0 when unknown.
+    """
+
+    name: str
+    unit: str
+    role: Role = "sensor"
+    low: float = -np.inf
+    high: float = np.inf
+    resolution: float = 0.0
+    description: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleBlock:
+    """Consecutive samples as they came from a device.
+
+    time : (n,) int64, ns on the device's clock, the instant of sampling.
+    sequence : (n,) int64, counts every sample the device took; a jump is a loss.
+    values : (n, n_channels) float64 in each channel's unit; NaN where missing.
+    quality : (n, n_channels) uint8 of `Quality`.
+    """
+
+    channels: tuple[Channel, ...]
+    time: Int
+    sequence: Int
+    values: Float
+    quality: Flags
+
+    def __len__(self) -> int:
+        return int(self.time.shape[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A part of a recording in which one thing was done: one sweep at one amplitude.
+
+    start, stop : sequence numbers, half open; lead-in and ring-down are inside.
+    level : peak amplitude of the reference in `unit`; levels are never pooled silently.
+    repeat : 0, 1, ...; segments of equal `kind` and `level` with the same reference.
+    kind : `burst` starts and ends at rest; `periodic` is a whole number of periods
+        of a periodic reference; `single` promises neither.
+    """
+
+    name: str
+    kind: Literal["burst", "periodic", "single"]
+    start: int
+    stop: int
+    level: float
+    unit: str
+    repeat: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class StopRecord:
+    """How a run ended. `reason` is one line for the person."""
+
+    status: Literal["completed", "stopped", "tripped", "failed", "unknown"]
+    reason: str
+    late_ticks: int = 0
+    missing_samples: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something noticed in the data that is not physics, in plain words.
+
+    kind : one of gap, clipping, stuck, repeat, leakage, timing, offset, saturation,
+        closed_loop, distortion, dof.
+    severity : `note` tells, `warning` weakens the result, `error` made us exclude or refuse.
+    """
+
+    kind: str
+    severity: Literal["note", "warning", "error"]
+    message: str
+    channel: str = ""
+    segment: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A run, whole: every sample and all that is needed to repeat it.
+
+    time, sequence : (n,) int64; values : (n, n_channels); quality : (n, n_channels).
+    rig_toml, experiment_toml : the files as they were, "" when there was none.
+    metadata : seed, versions, operator, start time, device, import map, source hashes...
+    source : where it was read from, for messages.
+    """
+
+    channels: tuple[Channel, ...]
+    rate_hz: float
+    time: Int
+    sequence: Int
+    values: Float
+    quality: Flags
+    segments: tuple[Segment, ...] = ()
+    rig_toml: str = ""
+    experiment_toml: str = ""
+    metadata: dict[str, str] = field(default_factory=dict)
+    stop: StopRecord = StopRecord("unknown", "the recording holds no stop record")
+    source: str = ""
+
+    def __len__(self) -> int:
+        return int(self.time.shape[0])
+
+    def column(self, name: str) -> int:
+        """Index of the channel called `name`; KeyError if there is none."""
+        for i, channel in enumerate(self.channels):
+            if channel.name == name:
+                return i
+        raise KeyError(name)
+
+    def names(self, role: Role) -> tuple[str, ...]:
+        """Names of all channels with this role, in column order."""
+        return tuple(c.name for c in self.channels if c.role == role)
+
+    def cut(self, segment: Segment) -> Recording:
+        """The samples of one segment as a recording of its own."""
+        a, b = np.searchsorted(self.sequence, [segment.start, segment.stop])
+        return replace(
+            self,
+            time=self.time[a:b],
+            sequence=self.sequence[a:b],
+            values=self.values[a:b],
+            quality=self.quality[a:b],
+            segments=(segment,),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FrequencyResponse:
+    """A frequency response with what is known of its error.
+
+    frequency : (n_freq,) Hz, increasing.
+    H : (n_freq, n_out, n_in) complex, output unit per input unit.
+    covariance : (n_freq, p, p) complex, p = n_out * n_in: E[dH dH^H] of the circular
+        complex error dH = H.reshape(n_freq, p) - truth; the real and the imaginary part
+        of one entry have variance C/2 each.
+    dof : (n_freq,) complex degrees of freedom nu of `covariance` (complex Wishart): with
+        p entries, dH^H C^-1 dH is distributed as nu p/(nu-p+1) F(2p, 2(nu-p+1)).
+    coherence : (n_freq, n_out).
+    level : amplitude of the reference in `level_unit`; NaN when mixed.
+    input_rms : (n_freq, n_in) amplitude of the input at each line, in the input's unit,
+        NaN when unknown: what a describing function is read against.
+    even, odd : (n_freq, n_out) relative distortion levels, or None where the excitation
+        does not show them.
+    method, why : which estimator, and why it was chosen, in plain words.
+    sources : names or hashes of the recordings it came from.
+    """
+
+    frequency: Float
+    H: Complex
+    covariance: Complex
+    dof: Float
+    coherence: Float
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    level: float
+    level_unit: str
+    input_rms: Float
+    rate_hz: float
+    n_averages: int
+    method: str
+    why: str
+    even: Float | None = None
+    odd: Float | None = None
+    findings: tuple[Finding, ...] = ()
+    sources: tuple[str, ...] = ()
+
+    def variance(self) -> Float:
+        """(n_freq, n_out, n_in) E|dH|^2, the diagonal of `covariance`."""
+        return np.diagonal(self.covariance, axis1=1, axis2=2).real.reshape(self.H.shape)

@@ -1,0 +1,1 @@
+"""The simulated rig, which stands in for the hardware behind the same Protocols."""
