@@ -5,6 +5,8 @@ wrong, and what would be right. The command line prints that line and exits with
 class's `exit_code`; anything else that escapes is a defect of ours.
 """
 
+MAX_SHOWN = 80  # characters of a wrong value that fit on the line beside the rest
+
 
 class SamiiRigError(Exception):
     """Root of the tree; `str(error)` is the line for the person."""
@@ -26,12 +28,18 @@ class InputError(SamiiRigError):
     exit_code = 2
 
     def __init__(self, where: str, field: str, value: object, expected: str) -> None:
-        self.where, self.field, self.value, self.expected = where, field, value, expected
-        place = f"{where}: {field}" if field else where
         shown = repr(value)
-        if len(shown) > 80:
-            shown = shown[:77] + "..."
+        if len(shown) > MAX_SHOWN:
+            shown = shown[: MAX_SHOWN - 3] + "..."
+        place = f"{where}: {field}" if field else where
         super().__init__(f"{place} is {shown}; expected {expected}")
+
+    @classmethod
+    def saying(cls, where: str, field: str, statement: str) -> "InputError":
+        """An error whose statement already holds the value and what would be right."""
+        error = cls.__new__(cls)
+        Exception.__init__(error, ": ".join(part for part in (where, field, statement) if part))
+        return error
 
 
 class RecordingError(SamiiRigError):

@@ -74,17 +74,18 @@ def _one_line(error: ValidationError, data: dict[str, object], where: str) -> In
         elif first["type"] == "missing":
             field += f".{key}"
         # Otherwise the key is the tag of a union, which the file does not show.
-    message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "missing":
-        value: object = None
-        message = "this field (it is missing)"
-    elif first["type"] == "extra_forbidden":
-        value = first["loc"][-1]
-        message = "a known field name"
-    elif first["type"] == "value_error":
-        value = node.get("value", "inconsistent") if isinstance(node, dict) else node
-        if not isinstance(node, str | int | float):
-            return InputError(where, field.lstrip("."), "inconsistent", f"consistency: {message}")
-    else:
-        value = first.get("input")
-    return InputError(where, field.lstrip("."), value, message)
+    field = field.lstrip(".")
+    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    match first["type"]:
+        case "value_error":
+            return InputError.saying(where, field, message)
+        case "missing":
+            return InputError.saying(where, field, "missing; expected a value")
+        case "extra_forbidden":
+            return InputError.saying(where, field, "no such field; expected a known name")
+        case "union_tag_not_found":
+            return InputError.saying(where, field, "has no kind; expected one, as in the docs")
+        case "union_tag_invalid":
+            kinds = first["ctx"]["expected_tags"]
+            return InputError(where, f"{field}.kind", first["ctx"]["tag"], f"one of {kinds}")
+    return InputError(where, field, first.get("input"), message)

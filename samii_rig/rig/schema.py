@@ -2,7 +2,7 @@
 
 Every physical parameter carries its unit, its tolerance and where the number came from.
 The state vector along the chain is z = [w, theta, M, V, 1] (paper 2, eq. 8), its sign
-convention w' = theta, theta' = M/EI, M' = V, V' = mu s^2 w (paper 1, eq. 1-5, where the
+convention w' = theta, theta' = M/EI, M' = V, V' = -mu s^2 w (paper 1, eq. 1-5, where the
 first state is written -w).
 """
 
@@ -160,14 +160,14 @@ class SensorBase(Strict):
     @model_validator(mode="after")
     def _range(self) -> Self:
         if not self.low < self.high:
-            raise ValueError(f"low {self.low:g} is not below high {self.high:g}")
+            raise ValueError(f"low {self.low:g}, high {self.high:g}; expected low below high")
         return self
 
 
 def _unit(expected: str) -> AfterValidator:
     def check(unit: str) -> str:
         if unit != expected:
-            raise ValueError(f"{unit!r}; expected {expected!r}")
+            raise ValueError(f"is {unit!r}; expected {expected!r}")
         return unit
 
     return AfterValidator(check)
@@ -235,7 +235,7 @@ class ActuatorSpec(Strict):
     @model_validator(mode="after")
     def _range(self) -> Self:
         if not self.low < 0 < self.high:
-            raise ValueError(f"low {self.low:g} and high {self.high:g} must lie around 0")
+            raise ValueError(f"low {self.low:g}, high {self.high:g}; expected 0 between them")
         return self
 
 
@@ -358,7 +358,10 @@ class Rig(Strict):
                     f"expected {units[limit.channel]!r}"
                 )
         if self.centring and self.centring.sensor not in {s.name for s in self.sensor}:
-            raise ValueError(f"centring: sensor {self.centring.sensor!r} does not exist")
+            raise ValueError(
+                f"centring: sensor {self.centring.sensor!r} does not exist; "
+                f"expected one of {[s.name for s in self.sensor]}"
+            )
         return self
 
     def units(self) -> dict[str, str]:

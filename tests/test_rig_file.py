@@ -1,0 +1,112 @@
+"""A rig file says what it means, and what is wrong with it is said in one line.
+
+Plan: the shipped rigs load and carry the papers' numbers; every kind of mistake names
+file, field, value and what would be right; nothing but InputError ever leaves the loader.
+"""
+
+import contextlib
+import re
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from samii_rig.errors import InputError
+from samii_rig.rig.load import load_rig, parse, shipped
+from samii_rig.rig.schema import Rig, TorsionalSpring, parameters
+
+SAMII = load_rig("samii")[1]
+
+
+def rejected(text: str, where: str = "my.toml") -> str:
+    with pytest.raises(InputError) as caught:
+        parse(Rig, text, where)
+    line = str(caught.value)
+    assert "\n" not in line
+    assert line.startswith(where)
+    return line
+
+
+def test_shipped_rigs_load_and_say_where_every_number_comes_from() -> None:
+    assert shipped() == ("samii", "sflr")
+    for name in shipped():
+        rig, _ = load_rig(name)
+        for element in rig.element:
+            for symbol, parameter in parameters(element).items():
+                assert parameter.source.startswith(("[", "absent")), (element.name, symbol)
+
+
+def test_samii_carries_table_ii_of_paper_1() -> None:
+    rig, _ = load_rig("samii")
+    stiffness = {e.name: e.k.value for e in rig.element if isinstance(e, TorsionalSpring)}
+    assert stiffness == {
+        "clamp": 2.674e5,
+        "joint_1": 0.136e5,
+        "joint_2": 0.108e5,
+        "joint_3": 0.252e5,
+    }
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('unit = "N m^2"', 'unit = "N/m"', r"element\[beam\].EI.*'N/m'; expected 'N m\^2'"),
+        ("value = 2.674e5", "value = -2.674e5", r"clamp.*-267400.*more than 0"),
+        ("value = 2.674e5", "value = nan", r"clamp.*k\.value.*finite"),
+        ("value = 2.674e5", 'value = "stiff"', r"clamp.*k\.value is 'stiff'"),
+        ('base = "clamped"', 'base = "glued"', r"base is 'glued'.*'clamped'"),
+        ('base = "clamped"\n', "", r"base: missing; expected a value"),
+        ("rate_hz = 500.0", "rate_hz = 0.0", r"rate_hz is 0.0.*greater than 0"),
+        ('name = "a_1"', 'name = "a_0"', r"'a_0' occurs twice"),
+        ('on = "link_1"', 'on = "link_9"', r"a_1.*'link_9' does not exist.*'link_1'"),
+        ('on = "link_1"', 'on = "joint_1"', r"a_1: joint_1 has no extent"),
+        ("position = 0.1969", "position = 0.2", r"a_1.*0.2 m lies beyond link_1.*0.1969"),
+        ('"joint_2_source", "joint_2"]', '"joint_2", "joint_2_source"]', r"not neighbours"),
+        ('input = "v_2"', 'input = "v_3"', r"input 'v_3' is no actuator.*v_2"),
+        ('unit = "rad/(s V)"', 'unit = "rad/s"', r"K has unit 'rad/s'; expected 'rad/\(s V\)'"),
+        (
+            'kind = "relative_angle"',
+            'kind = "gyroscope"',
+            r"sensor\[theta_2\].kind is 'gyroscope'.*one of.*'relative_angle'",
+        ),
+        ('unit = "m/s^2"\nnoise', 'unit = "g"\nnoise', r"a_0.*unit: is 'g'.*'m/s\^2'"),
+        ('channel = "theta_2"', 'channel = "theta_9"', r"limit on 'theta_9'.*no such channel"),
+        ("max = 0.35", "max = 0.0", r"limit.*max is 0.0.*greater than 0"),
+        ("low = -1.5", "low = 2.0", r"theta_2.*low 2, high 1.5; expected low below high"),
+        ('sensor = "theta_2"', 'sensor = "theta_7"', r"centring.*'theta_7' does not exist"),
+        ("rate_hz", "rate", r"rate_hz: missing"),
+        ('tip = "free"', 'tip = "free"\ntop = 1', r"top: no such field"),
+    ],
+)
+def test_a_mistake_is_named_with_field_value_and_remedy(old: str, new: str, says: str) -> None:
+    assert old in SAMII
+    line = rejected(SAMII.replace(old, new, 1))
+    assert re.search(says, line), line
+
+
+def test_a_rig_without_elements_or_a_missing_file_is_refused(tmp_path: Path) -> None:
+    assert "element" in rejected(re.sub(r"(?ms)^\[\[element\]\].*?(?=^#|^\[\[sensor)", "", SAMII))
+    with pytest.raises(InputError, match=r"--rig is 'nowhere'.*samii, sflr"):
+        load_rig("nowhere")
+    with pytest.raises(InputError, match="readable rig file"):
+        load_rig(str(tmp_path))
+    (tmp_path / "latin.toml").write_bytes(b'name = "\xff"')
+    with pytest.raises(InputError, match="UTF-8"):
+        load_rig(str(tmp_path / "latin.toml"))
+
+
+@given(st.text(max_size=200))
+def test_no_text_gets_anything_but_an_input_error_out_of_the_loader(text: str) -> None:
+    with pytest.raises(InputError):
+        parse(Rig, text, "fuzz.toml")
+
+
+LINES = SAMII.splitlines()
+
+
+@given(st.integers(0, len(LINES) - 1), st.sampled_from(["", "x = 1", "[[", "value = {}", "k = 3"]))
+def test_a_damaged_line_loads_or_is_an_input_error(at: int, instead: str) -> None:
+    text = "\n".join([*LINES[:at], instead, *LINES[at + 1 :]])
+    with contextlib.suppress(InputError):
+        parse(Rig, text, "fuzz.toml")
