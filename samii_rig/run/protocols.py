@@ -12,7 +12,7 @@ output to zero when nothing came for `deadman` seconds. Samples stream back in b
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Float, SampleBlock
@@ -119,7 +119,7 @@ class PlannedSegment:
     """
 
     name: str
-    kind: str
+    kind: Literal["burst", "periodic", "single"]
     level: float
     unit: str
     repeat: int
