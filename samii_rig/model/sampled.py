@@ -1,0 +1,157 @@
+"""The rig as the converters see it: hold, sensor filters, delays and aliases.
+
+A digital controller does not see the chain's continuous response G(f) but that of the
+sequence it reads to the sequence it writes,
+
+    H(f) = sum over k of  hold(f_k) G(f_k) F(f_k),      f_k = f + k rate,
+
+with the zero-order hold of the output and the filter F of each sensor. A lag is a negative
+phase: the hold alone is -18 degrees at 50 Hz and 500 samples/s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from samii_rig.errors import InputError
+from samii_rig.model.tmm import Chain
+from samii_rig.rig.schema import Rig, SensorBase
+from samii_rig.types import Complex, Float
+
+ALIAS_TOLERANCE = 1e-5  # of each response, change by the last doubling of the aliases
+FIRST_ALIASES = 16  # aliases on each side to begin with
+BLOCK = 128  # frequencies at once, so that memory stays bounded
+MAX_ALIASES = 4096  # on each side; the terms fall at least as 1/f^2 from there
+
+
+def hold_response(frequency_hz: Float, rate_hz: float, delay: float = 0.0) -> Complex:
+    """Zero-order hold, (n,) complex: exp(-j w T/2) sinc(f T) exp(-j w delay)."""
+    f = np.asarray(frequency_hz, dtype=np.float64)
+    lag = np.exp(-2j * np.pi * f * (0.5 / rate_hz + delay))
+    return np.asarray(lag * np.sinc(f / rate_hz))
+
+
+def lowpass_poles(sensor: SensorBase) -> Complex:
+    """Poles of the sensor's anti-alias Butterworth filter, rad/s, (order,)."""
+    if sensor.antialias is None:
+        return np.zeros(0, dtype=np.complex128)
+    n = sensor.antialias.order
+    angle = np.pi * (2 * np.arange(n) + n + 1) / (2 * n)
+    unit = np.exp(1j * angle)
+    if n % 2:
+        unit[n // 2] = -1.0  # the odd one is real; rounding would leave it beside the axis
+    return np.asarray(2 * np.pi * sensor.antialias.corner_hz * unit)
+
+
+def filter_poles(sensor: SensorBase) -> Complex:
+    """All poles of `filter_response`, the high-pass's last, rad/s."""
+    low = lowpass_poles(sensor)
+    if sensor.highpass_hz > 0:
+        return np.append(low, -2 * np.pi * sensor.highpass_hz)
+    return low
+
+
+def filter_response(sensor: SensorBase, s: Complex) -> Complex:
+    """Anti-alias filter times high-pass s/(s + w_hp) at complex s, without the delay."""
+    s = np.asarray(s, dtype=np.complex128)
+    value = np.ones_like(s)
+    for q in lowpass_poles(sensor):
+        value = value * (-q / (s - q))
+    if sensor.highpass_hz > 0:
+        value = value * (s / (s + 2 * np.pi * sensor.highpass_hz))
+    return value
+
+
+def filter_residues(sensor: SensorBase) -> Complex:
+    """Residues of `filter_response` at `filter_poles`, all of which are simple."""
+    low = lowpass_poles(sensor)
+    corner = 2 * np.pi * sensor.highpass_hz
+    out = [
+        -q * np.prod([-other / (q - other) for k, other in enumerate(low) if k != j])
+        for j, q in enumerate(low)
+    ]
+    if corner > 0:
+        out = [r * q / (q + corner) for r, q in zip(out, low, strict=True)]
+        out.append(-corner * np.prod(-low / (-corner - low)))
+    return np.array(out, dtype=np.complex128)
+
+
+def sensor_response(sensors: Sequence[SensorBase], frequency_hz: Float) -> Complex:
+    """Filters and delays of the sensors, (n_freq, n_sensor); a delay is a negative phase."""
+    f = np.asarray(frequency_hz, dtype=np.float64)
+    s = np.asarray(2j * np.pi * f, dtype=np.complex128)
+    columns = [filter_response(x, s) * np.exp(-s * x.delay) for x in sensors]
+    return np.stack(columns, axis=1)
+
+
+def feedthrough(chain: Chain) -> Float:
+    """Instantaneous response of the continuous chain, (n_sensor, n_input): G(s) as s grows
+    along the positive real axis, where no wave comes back.
+
+    Only an accelerometer rigidly on the driven side of a source has any. Found from two
+    points, G(s) = D + c/s, and zero where G still falls from the one to the other.
+    """
+    far = np.array([1e7, 2e7], dtype=np.complex128)  # 1/s, far above every corner of a rig
+    G = chain.evaluate(far).real
+    D = 2 * G[1] - G[0]
+    return np.asarray(np.where(np.abs(G[1]) > 0.9 * np.abs(G[0]), D, 0.0))
+
+
+def sampled_response(rig: Rig, frequency_hz: Float, chain: Chain | None = None) -> Complex:
+    """Response of the sampled sensors to the sampled commands, by summation over aliases.
+
+    frequency_hz : (n_freq,), above 0 and at most half the rate.
+    Returns (n_freq, n_sensor, n_input) complex, rig-file order. The sensors are read just
+    before the output changes, so that a jump of the output is not in the sample taken with it.
+    Uses the transfer matrices alone, not the state space of `samii_rig.model.realise`.
+    """
+    f = np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64))
+    if not np.all((f > 0) & (f <= rig.rate_hz / 2)):
+        wrong = f[~((f > 0) & (f <= rig.rate_hz / 2))][0]
+        raise InputError(rig.name, "frequency_hz", float(wrong), f"0 to {rig.rate_hz / 2:g} Hz")
+    chain = Chain(rig) if chain is None else chain
+    blocks = [_aliased(rig, chain, f[i : i + BLOCK]) for i in range(0, f.size, BLOCK)]
+    return np.concatenate(blocks) - _half_jumps(rig, chain, f)
+
+
+def _aliased(rig: Rig, chain: Chain, f: Float) -> Complex:
+    """Sum over as many aliases as the slowest of these frequencies needs."""
+    total = _terms(rig, chain, f, np.zeros(1, dtype=np.int64))
+    reached, upto = 0, FIRST_ALIASES
+    while True:
+        k = np.arange(reached + 1, upto + 1)
+        part = _terms(rig, chain, f, k) + _terms(rig, chain, f, -k)
+        total += part
+        if upto >= MAX_ALIASES or np.all(np.abs(part) <= ALIAS_TOLERANCE * np.abs(total)):
+            return total
+        reached, upto = upto, 2 * upto
+
+
+def _terms(rig: Rig, chain: Chain, f: Float, k: np.ndarray) -> Complex:
+    """Sum over the aliases k of hold G F, (n_freq, n_sensor, n_input)."""
+    at = (f[:, None] + k * rig.rate_hz).ravel()
+    # The response to a real input at -f is the conjugate of that at f.
+    G = chain.response(np.abs(at))
+    G = np.where((at < 0)[:, None, None], G.conj(), G)
+    F = sensor_response(rig.sensor, at)
+    hold = np.stack([hold_response(at, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
+    terms = G * F[:, :, None] * hold[:, None, :]
+    return np.asarray(terms.reshape(f.size, k.size, *terms.shape[1:]).sum(axis=1))
+
+
+def _half_jumps(rig: Rig, chain: Chain, f: Float) -> Complex:
+    """What the symmetric sum has too much where a jump falls on a sampling instant.
+
+    A Fourier sum gives the mean of both sides of a jump; the sample is the side before it.
+    """
+    D = feedthrough(chain)
+    out = np.zeros((f.size, len(rig.sensor), len(rig.actuator)), dtype=np.complex128)
+    for i, sensor in enumerate(rig.sensor):
+        for j, actuator in enumerate(rig.actuator):
+            periods = (actuator.delay + sensor.delay) * rig.rate_hz
+            if sensor.antialias is None and abs(periods - round(periods)) < 1e-9:
+                lag = np.exp(-2j * np.pi * f * round(periods) / rig.rate_hz)
+                out[:, i, j] = D[i, j] / 2 * lag * (1 - np.exp(-2j * np.pi * f / rig.rate_hz))
+    return out

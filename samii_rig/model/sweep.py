@@ -1,0 +1,337 @@
+"""The stable sweep: which states are possible at a port, seen from one end of the chain.
+
+The states that one end's boundary condition allows form a plane; two columns span it.
+A sweep carries both through the elements and changes their basis on the way so that they
+never become parallel. Between elements they have the form
+
+    column 1 = (w1, theta1, M1, V1),    column 2 = (w2, 0, M2, V2),
+
+which every rigid link keeps. A spring turns much moment into rotation; restoring
+theta2 = 0 behind it is done by formulas in which nothing cancels. In a beam the columns
+are written as the four waves exp(+-beta x/L), exp(+-j beta x/L) and combined so that only
+column 1 holds the fastest growing one; both are then scaled by it, so exponentials only
+decay.
+
+A change of basis is X_after = U X_before B; the 2x2 matrix B of each element is kept, so
+a solution a (coefficients in the last basis) is carried back by a_before = B a_after,
+which again holds decaying factors only.
+
+The sweep from the tip is the same one on the mirrored chain: with theta and V reversed,
+U^-1 is the U of the mirrored element.
+"""
+
+from __future__ import annotations
+
+from samii_rig.model.lanes import (
+    LANES,
+    TINY,
+    conj,
+    get,
+    inverse,
+    norm2,
+    part,
+    pick,
+    put,
+    scaled,
+)
+from samii_rig.model.registers import (
+    BEAM,
+    BEAM_KIND,
+    CLAMPED,
+    EXCHANGE,
+    FLAG,
+    FREE_END,
+    HUGE,
+    IS_LONG,
+    LINK,
+    LONG,
+    MIXED,
+    NUMERATOR,
+    RHO,
+    SCALE,
+    SHORT,
+    SPRING,
+    THETA2,
+    X_ROWS,
+    B,
+    S,
+    X,
+    Y,
+)
+from samii_rig.types import Float
+
+# Rows of columns 1 and 2, of X and of B.
+_PAIRS = ((X, X + 8), (X + 2, THETA2), (X + 4, X + 10), (X + 6, X + 12), (B, B + 2), (B + 4, B + 6))
+
+
+@part
+def boundary(W: Float, kind: int) -> None:
+    """The two columns of an end: w = theta = 0 clamped, w = M = 0 pinned, M = V = 0 free."""
+    # The sign makes det[column 1, column 2] that of (w, theta) in this order.
+    one = X + 4 if kind == CLAMPED else X + 2
+    two, value = (X + 8, -1.0) if kind == FREE_END else (X + 12, 1.0)
+    for i in range(X_ROWS * LANES):
+        W[X * LANES + i] = 0.0
+    for i in range(LANES):
+        W[one * LANES + i] = 1.0
+    for i in range(LANES):
+        W[two * LANES + i] = value
+
+
+@part
+def link(W: Float, L: float, r: float, m: float, inertia: float) -> None:
+    """Carry X over a rigid link; see `elements.rigid_link_matrix`."""
+    for i in range(LANES):
+        s2 = get(W, S + 2, i)
+        theta1 = get(W, X + 2, i)
+        w1, V1 = get(W, X, i), get(W, X + 6, i)
+        w2, V2 = get(W, X + 8, i), get(W, X + 12, i)
+        ms2 = scaled(s2, m)
+        A1 = ms2 * (w1 + scaled(theta1, r))
+        A2 = ms2 * w2
+        put(W, X, i, w1 + scaled(theta1, L))
+        M1 = get(W, X + 4, i) + scaled(V1, L) - scaled(A1, L - r)
+        put(W, X + 4, i, M1 + scaled(s2, inertia) * theta1)
+        put(W, X + 6, i, V1 - A1)
+        put(W, X + 10, i, get(W, X + 10, i) + scaled(V2, L) - scaled(A2, L - r))
+        put(W, X + 12, i, V2 - A2)
+
+
+@part
+def _awkward(a: complex, b: complex) -> bool:
+    """Should the columns be exchanged or scaled, for pivots a and b of columns 1 and 2?"""
+    size = norm2(a)
+    return (norm2(b) > EXCHANGE * size) | (size > HUGE) | (size < 1.0 / HUGE)
+
+
+@part
+def _exchange(W: Float, a: int, b: int, scaling: bool) -> None:
+    """Make the column with the larger of the pivots in rows a and b column 1, of size 1.
+
+    Columns (1, 2) become (2, -1), which keeps the determinant. Sets FLAG and SCALE.
+    Lane by lane and with branches, as few need it.
+    """
+    for i in range(LANES):
+        x, y = get(W, a, i), get(W, b, i)
+        flag = norm2(y) > EXCHANGE * norm2(x)
+        pivot = y if flag else x
+        size = abs(pivot.real) + abs(pivot.imag)
+        scale = 1.0 / size if scaling and size > 0 else 1.0
+        W[FLAG * LANES + i] = 1.0 if flag else 0.0
+        W[SCALE * LANES + i] = scale
+        for one, other in _PAIRS:
+            x, y = get(W, one, i), get(W, other, i)
+            if flag:
+                x, y = y, -x
+            put(W, one, i, scaled(x, scale))
+            put(W, other, i, y)
+
+
+@part
+def spring(W: Float, k: float, c: float) -> None:
+    """Carry X over theta+ = theta- + C M, C = 1/(c s + k), and restore theta2 = 0.
+
+    Behind the spring the columns' rotations are theta1 + C M1 and C M2; column 2 less
+    rho times column 1 has none. Its moment, a difference of large numbers if computed so,
+    is M2 theta1 over the pivot's rotation.
+    """
+    awkward = 0
+    for i in range(LANES):
+        s = get(W, S, i)
+        C = inverse(complex(k + c * s.real, c * s.imag))
+        theta1, M1, M2 = get(W, X + 2, i), get(W, X + 4, i), get(W, X + 10, i)
+        t1 = theta1 + C * M1
+        t2 = C * M2
+        put(W, NUMERATOR, i, M2 * theta1)
+        put(W, X + 2, i, t1)
+        put(W, THETA2, i, t2)
+        awkward += _awkward(t1, t2)
+    if awkward > 0:
+        _exchange(W, X + 2, THETA2, True)
+    else:
+        for i in range(LANES):
+            W[FLAG * LANES + i] = 0.0
+            W[SCALE * LANES + i] = 1.0
+    for i in range(LANES):
+        t = get(W, X + 2, i)
+        scale = W[SCALE * LANES + i]
+        divide = scaled(conj(t), 1.0 / (norm2(t) + TINY))
+        rho = get(W, THETA2, i) * divide
+        put(W, X + 8, i, get(W, X + 8, i) - rho * get(W, X, i))
+        # The pivot has been scaled, the numerator not.
+        put(W, X + 10, i, scaled(get(W, NUMERATOR, i) * divide, scale))
+        put(W, X + 12, i, get(W, X + 12, i) - rho * get(W, X + 6, i))
+        put(W, RHO, i, rho)
+
+
+@part
+def restore(W: Float) -> None:
+    """Restore theta2 = 0 behind a beam and complete its B."""
+    awkward = 0
+    for i in range(LANES):
+        awkward += _awkward(get(W, X + 2, i), get(W, THETA2, i))
+    if awkward > 0:
+        _exchange(W, X + 2, THETA2, True)
+    else:
+        for i in range(LANES):
+            W[SCALE * LANES + i] = 1.0
+    for i in range(LANES):
+        t = get(W, X + 2, i)
+        rho = get(W, THETA2, i) * scaled(conj(t), 1.0 / (norm2(t) + TINY))
+        put(W, X + 8, i, get(W, X + 8, i) - rho * get(W, X, i))
+        put(W, X + 10, i, get(W, X + 10, i) - rho * get(W, X + 4, i))
+        put(W, X + 12, i, get(W, X + 12, i) - rho * get(W, X + 6, i))
+        put(W, B + 2, i, get(W, B + 2, i) - rho * get(W, B, i))
+        put(W, B + 6, i, get(W, B + 6, i) - rho * get(W, B + 4, i))
+
+
+@part
+def short_beam(W: Float, L: float) -> None:
+    """Carry X over a beam of small beta by the plain matrix (paper 1, eq. 9)."""
+    for i in range(LANES):
+        c0, c1 = get(W, BEAM + 29, i), get(W, BEAM + 31, i)
+        c2, c3 = get(W, BEAM + 33, i), get(W, BEAM + 35, i)
+        q1, q2, q3 = get(W, BEAM + 37, i), get(W, BEAM + 39, i), get(W, BEAM + 41, i)
+        a, stiff = get(W, BEAM + 25, i), get(W, BEAM + 27, i)
+        w, t = get(W, X, i), scaled(get(W, X + 2, i), L)
+        M, V = a * get(W, X + 4, i), scaled(a * get(W, X + 6, i), L)
+        put(W, X, i, c0 * w + c1 * t + c2 * M + c3 * V)
+        put(W, X + 2, i, scaled(q3 * w + c0 * t + c1 * M + c2 * V, 1.0 / L))
+        put(W, X + 4, i, stiff * (q2 * w + q3 * t + c0 * M + c1 * V))
+        put(W, X + 6, i, scaled(stiff * (q1 * w + q2 * t + q3 * M + c0 * V), 1.0 / L))
+        w = get(W, X + 8, i)
+        M, V = a * get(W, X + 10, i), scaled(a * get(W, X + 12, i), L)
+        put(W, X + 8, i, c0 * w + c2 * M + c3 * V)
+        put(W, THETA2, i, scaled(q3 * w + c1 * M + c2 * V, 1.0 / L))
+        put(W, X + 10, i, stiff * (q2 * w + c0 * M + c1 * V))
+        put(W, X + 12, i, scaled(stiff * (q1 * w + q3 * M + c0 * V), 1.0 / L))
+        put(W, B, i, complex(1.0, 0.0))
+        put(W, B + 2, i, complex(0.0, 0.0))
+        put(W, B + 4, i, complex(0.0, 0.0))
+        put(W, B + 6, i, complex(1.0, 0.0))
+
+
+@part
+def _to_waves(
+    w: complex, t: complex, M: complex, V: complex
+) -> tuple[complex, complex, complex, complex]:
+    e, f, g, h = w + M, t + V, w - M, t - V
+    h = complex(-h.imag, h.real)
+    return e + f, e - f, g - h, g + h
+
+
+@part
+def _from_waves(
+    a: complex, b: complex, c: complex, d: complex
+) -> tuple[complex, complex, complex, complex]:
+    e, f, g, h = a + b, a - b, c + d, c - d
+    h = complex(-h.imag, h.real)
+    return e + g, f + h, e - g, f - h
+
+
+@part
+def long_beam(W: Float) -> None:
+    """Carry X over a beam by its four waves.
+
+    With lengths in L/beta the state of a wave exp(lambda beta x/L) is
+    (1, lambda, lambda^2, lambda^3), lambda = 1, -1, j, -j: to and from the waves is a
+    discrete Fourier transform of four points.
+    """
+    swaps = 0
+    for i in range(LANES):
+        g1, g2, g3 = get(W, BEAM + 13, i), get(W, BEAM + 15, i), get(W, BEAM + 17, i)
+        w, t = get(W, X, i), g1 * get(W, X + 2, i)
+        M, V = g2 * get(W, X + 4, i), g3 * get(W, X + 6, i)
+        a1, b1, c, d = _to_waves(w, t, M, V)
+        # Growing (m) and decaying (n) of the waves exp(+-j beta): which is which
+        # depends on the sign of Im beta.
+        upper = W[(BEAM + 12) * LANES + i] > 0
+        put(W, X, i, a1)
+        put(W, X + 2, i, b1)
+        put(W, X + 4, i, pick(upper, d, c))
+        put(W, X + 6, i, pick(upper, c, d))
+        w, M, V = get(W, X + 8, i), g2 * get(W, X + 10, i), g3 * get(W, X + 12, i)
+        a2, b2, c, d = _to_waves(w, complex(0.0, 0.0), M, V)
+        put(W, X + 8, i, a2)
+        put(W, THETA2, i, b2)
+        put(W, X + 10, i, pick(upper, d, c))
+        put(W, X + 12, i, pick(upper, c, d))
+        swaps += norm2(a2) > EXCHANGE * norm2(a1)
+    if swaps > 0:
+        _exchange(W, X, X + 8, False)
+    else:
+        for i in range(LANES):
+            W[FLAG * LANES + i] = 0.0
+    for i in range(LANES):
+        a, b, m, n = get(W, X, i), get(W, X + 2, i), get(W, X + 4, i), get(W, X + 6, i)
+        rho = get(W, X + 8, i) * scaled(conj(a), 1.0 / (norm2(a) + TINY))
+        bo = get(W, THETA2, i) - rho * b
+        mo = get(W, X + 10, i) - rho * m
+        no = get(W, X + 12, i) - rho * n
+        # exp(-beta), decaying exp(+-j beta), and their products and ratio.
+        E1, E2, R = get(W, BEAM, i), get(W, BEAM + 2, i), get(W, BEAM + 4, i)
+        E12, E11, E22 = get(W, BEAM + 6, i), get(W, BEAM + 8, i), get(W, BEAM + 10, i)
+        b, m, n = b * E11, m * R, n * E12
+        bo, no = bo * E12, no * E22
+        upper = W[(BEAM + 12) * LANES + i] > 0
+        h1, h2, h3 = get(W, BEAM + 19, i), get(W, BEAM + 21, i), get(W, BEAM + 23, i)
+        w, t, M, V = _from_waves(a, b, pick(upper, n, m), pick(upper, m, n))
+        put(W, X, i, scaled(w, 0.25))
+        put(W, X + 2, i, h1 * t)
+        put(W, X + 4, i, h2 * M)
+        put(W, X + 6, i, h3 * V)
+        w, t, M, V = _from_waves(complex(0.0, 0.0), bo, pick(upper, no, mo), pick(upper, mo, no))
+        put(W, X + 8, i, scaled(w, 0.25))
+        put(W, THETA2, i, h1 * t)
+        put(W, X + 10, i, h2 * M)
+        put(W, X + 12, i, h3 * V)
+        flag = W[FLAG * LANES + i]
+        keep = 1.0 - flag
+        put(W, B, i, scaled(E1, keep))
+        put(W, B + 2, i, complex(-flag - keep * rho.real, -keep * rho.imag) * E2)
+        put(W, B + 4, i, scaled(E1, flag))
+        put(W, B + 6, i, complex(keep - flag * rho.real, -flag * rho.imag) * E2)
+
+
+@part
+def _swap_store(W: Float) -> None:
+    for i in range((S - X) * LANES):
+        x = W[X * LANES + i]
+        W[X * LANES + i] = W[Y * LANES + i]
+        W[Y * LANES + i] = x
+
+
+@part
+def _keep_short(W: Float) -> None:
+    for row in range(S - X):
+        for i in range(LANES):
+            if W[IS_LONG * LANES + i] == 0.0:
+                W[(X + row) * LANES + i] = W[(Y + row) * LANES + i]
+
+
+@part
+def step(W: Float, kind: int, par: Float, mirrored: bool, regime: int) -> bool:
+    """Carry X over one element; True if that changed the basis."""
+    if kind == LINK:
+        r = par[0] - par[1] if mirrored else par[1]
+        link(W, par[0], r, par[2], par[3])
+        return False
+    if kind == SPRING:
+        spring(W, par[0], par[1])
+        return True
+    if kind == BEAM_KIND:
+        # If lanes lie on both sides of the threshold, both forms; each lane keeps its own.
+        if regime == MIXED:
+            for i in range((S - X) * LANES):
+                W[Y * LANES + i] = W[X * LANES + i]
+        if regime != LONG:
+            short_beam(W, par[2])
+        if regime == MIXED:
+            _swap_store(W)
+        if regime != SHORT:
+            long_beam(W)
+        if regime == MIXED:
+            _keep_short(W)
+        restore(W)
+        return True
+    return False
