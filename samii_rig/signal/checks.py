@@ -1,0 +1,321 @@
+"""What can be wrong with data before physics is asked: gaps, clocks, clipping, stuck
+sensors, repeats that do not repeat, bursts that do not end at rest.
+
+Each check names the channel, the place and the count in plain words and decides nothing;
+`samii_rig.signal.estimate` excludes or refuses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samii_rig.signal.groups import Piece, Selection
+from samii_rig.signal.noise import pooled
+from samii_rig.signal.spectra import rests
+from samii_rig.signal.statistics import hotelling, hotelling_p
+from samii_rig.types import Channel, Finding, Float, Quality, Recording, Segment
+
+# Root mean square of the time stamps about a uniform clock, in samples, that is worth a
+# word: 5 % of a sample is 1 degree of phase at 1/18 of the sample rate.
+JITTER = 0.05
+RATE_ERROR = 1e-3  # relative; the frequency axis is off by as much
+# A repeat is foreign when its distance to its nearest fellow is this many times (in power)
+# the distance of the two that agree best: three times in amplitude.
+FOREIGN = 10.0
+# Two repeats cannot be told apart; they are refused when the difference is this part of the
+# signal (power: 10 % in amplitude) and has structure along frequency.
+TWO_DIFFER = 0.01
+STRUCTURE = 0.7  # lag-one coherence; noise alone has about 1/sqrt(lines)
+# A burst still rings when its tail, common to the repeats, is this improbable as noise; over
+# all lines of the tail together.
+RINGING = 1e-8
+TAIL_PART = 0.1  # of the burst, looked at
+TAIL_LEAST = 16  # samples
+# With one burst there is no scatter: 5 times the tail's own noise, and 2e-3 of the peak.
+TAIL_NOISE, TAIL_PEAK = 5.0, 2e-3
+STUCK_PART = 0.2  # of the samples in which the input moves
+STUCK_SAMPLES = 20
+FLAT_RUN, FLAT_RUNS = 3, 3  # as many equal samples at the extreme, as many times
+COARSE = 1000  # distinct values below which equal neighbours mean nothing
+
+
+def breaks(cut: Recording, segment: Segment, names: Sequence[str]) -> list[tuple[int, int, str]]:
+    """Where samples are missing: (index of the first sample after, samples lost, channel).
+
+    A jump in the sequence has channel ""; a NaN names its channel and counts from its own
+    first sample. Sorted by place.
+    """
+    found: list[tuple[int, int, str]] = []
+    jump = np.diff(cut.sequence)
+    found += [(int(i) + 1, int(jump[i]) - 1, "") for i in np.flatnonzero(jump > 1)]
+    if len(cut):
+        if lost := int(cut.sequence[0]) - segment.start:
+            found.append((0, lost, ""))
+        if lost := segment.stop - int(cut.sequence[-1]) - 1:
+            found.append((len(cut), lost, ""))
+    else:
+        found.append((0, segment.stop - segment.start, ""))
+    for name in names:
+        i = cut.column(name)
+        missing = (cut.quality[:, i] & Quality.MISSING).astype(bool)
+        for start, stop in runs(missing | ~np.isfinite(cut.values[:, i])):
+            found.append((start, stop - start, name))
+    return sorted(found)
+
+
+def gap_finding(
+    cut: Recording, segment: Segment, found: Sequence[tuple[int, int, str]]
+) -> Finding | None:
+    """One finding for all breaks of a segment, None without any."""
+    if not found:
+        return None
+    first, lost, channel = found[0]
+    what = f" of {channel}" if channel else ""
+    total = sum(n for _, n, _ in found)
+    where = f"at sample {segment.start + first}"
+    more = f"; {total} in {len(found)} places in all" if len(found) > 1 else ""
+    message = f"{_place(cut, segment)}: {lost} samples{what} missing {where}{more}"
+    return Finding("gap", "error", message, channel=channel, segment=segment.name)
+
+
+def timing(cut: Recording, segment: Segment) -> list[Finding]:
+    """Time that stands still or runs backwards (error), jitter or a wrong rate (warning)."""
+    if len(cut) < 3:
+        return []
+    place = _place(cut, segment)
+    step = np.diff(cut.time)
+    if np.any(bad := (step <= 0) | (np.diff(cut.sequence) <= 0)):
+        i = int(np.flatnonzero(bad)[0])
+        message = f"{place}: time or count does not advance after sample {int(cut.sequence[i])}"
+        return [Finding("timing", "error", message, segment=segment.name)]
+    count = (cut.sequence - cut.sequence[0]).astype(float)
+    seconds = (cut.time - cut.time[0]) * 1e-9
+    slope = float(seconds @ count / (count @ count))
+    out = []
+    if abs(slope * cut.rate_hz - 1) > RATE_ERROR:
+        message = f"{place}: the clock says {1 / slope:.6g} Hz, the recording {cut.rate_hz:g} Hz"
+        out.append(Finding("timing", "warning", message, segment=segment.name))
+    jitter = float(np.std(seconds - slope * count)) / slope
+    if jitter > JITTER:
+        message = f"{place}: samples lie {jitter:.2g} of a sample (rms) off a uniform clock"
+        out.append(Finding("timing", "warning", message, segment=segment.name))
+    return out
+
+
+def clipping(cut: Recording, segment: Segment, selection: Selection) -> list[Finding]:
+    """Samples at the end of a converter's range: flagged, at low or high, or flat tops.
+
+    A clipped sensor is an error, a saturated command a warning: what went out is known.
+    """
+    out = []
+    for channel in (selection.input, *selection.outputs):
+        i = cut.column(channel.name)
+        x, flags = cut.values[:, i], cut.quality[:, i]
+        flagged = (flags & (Quality.CLIPPED | Quality.LIMITED)).astype(bool)
+        at_end = flagged | (x <= channel.low) | (x >= channel.high)
+        how = "at the end of its range"
+        if not at_end.any() and channel.role == "sensor":
+            at_end, how = _flat_tops(x), "flat at its extreme"
+        if n := int(np.count_nonzero(at_end)):
+            first = int(cut.sequence[int(np.flatnonzero(at_end)[0])])
+            sensor = channel.role == "sensor"
+            message = (
+                f"{_place(cut, segment)}: {channel.name} is {how} in {n} samples, first at {first}"
+            )
+            out.append(
+                Finding(
+                    "clipping" if sensor else "saturation",
+                    "error" if sensor else "warning",
+                    message,
+                    channel=channel.name,
+                    segment=segment.name,
+                )
+            )
+    return out
+
+
+def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Finding]:
+    """Outputs that stand still while the input moves.
+
+    One that never changes is an error, and so is one that freezes although its noise moves
+    it at nearly every other sample. A coarse sensor that rests for long is a warning: dry
+    friction looks the same.
+    """
+    out = []
+    v = cut.values[:, cut.column(selection.input.name)]
+    moving = np.diff(v) != 0
+    if np.count_nonzero(moving) < STUCK_SAMPLES:
+        return []
+    for channel in selection.outputs:
+        x = cut.values[:, cut.column(channel.name)]
+        still = np.diff(x) == 0
+        place = f"{_place(cut, segment)}: {channel.name}"
+        if still.all():
+            message = f"{place} never changes while {selection.input.name} moves"
+            out.append(Finding("stuck", "error", message, channel.name, segment.name))
+            continue
+        longest = max(runs(still), key=lambda run: run[1] - run[0], default=(0, 0))
+        length = longest[1] - longest[0]
+        inside = int(np.count_nonzero(moving[longest[0] : longest[1]]))
+        if inside < STUCK_SAMPLES:
+            continue
+        lively = np.count_nonzero(still) - length < 0.1 * (still.size - length)
+        if lively or inside > STUCK_PART * np.count_nonzero(moving):
+            message = (
+                f"{place} stands still for {length + 1} samples from "
+                f"{int(cut.sequence[longest[0]])} while {selection.input.name} moves"
+            )
+            severity: Literal["error", "warning"] = "error" if lively else "warning"
+            out.append(Finding("stuck", severity, message, channel.name, segment.name))
+    return out
+
+
+def not_at_rest(
+    pieces: Sequence[Piece], channels: Sequence[Channel], highest: float
+) -> list[Finding]:
+    """Motion that has not died out at the end of the bursts, at most one finding: leakage.
+
+    What is common to the tails of all repeats is held against their scatter, line by line up
+    to `highest` (cycles per sample) and for all outputs together: the joint covariance would
+    see it too. The first of `channels` is the input, which follows from the outputs.
+    """
+    n = min(len(p) for p in pieces)
+    _, rest = rests(pieces[0].r)
+    tail = min(rest, int(TAIL_PART * n))
+    if tail < TAIL_LEAST:
+        message = f"{pieces[0].name}: the reference acts until the end; no ring-down was recorded"
+        return [Finding("leakage", "warning", message)]
+    ends = np.stack([p.z[-tail:, 1:] for p in pieces])
+    ends = ends - ends.mean(axis=1, keepdims=True)
+    i, significant = _ringing(ends, highest) if len(pieces) > 1 else _moving(ends[0], pieces[0])
+    if not significant:
+        return []
+    channel = channels[i + 1]
+    size = float(np.sqrt(np.mean(ends[:, :, i].mean(axis=0) ** 2)))
+    peak = max(float(np.ptp(p.z[:, i + 1])) for p in pieces) / 2
+    message = (
+        f"{channel.name} still moves by {size:.3g} {channel.unit} (rms, {size / peak:.2%} of its "
+        f"peak) in the last {tail} samples of {pieces[0].name}"
+    )
+    return [Finding("leakage", "warning", message, channel=channel.name)]
+
+
+def foreign_repeats(
+    spectra: NDArray[np.complex128], names: Sequence[str], channels: Sequence[str]
+) -> dict[int, Finding]:
+    """Repeats that do not repeat, by index: spectra (n, n_freq, n_channels) of one reference.
+
+    Three or more: the one that is far from all while others agree; the rest are looked at
+    again without it. Two: no one can say which is wrong, so both are named when their
+    difference is large and has structure along frequency (a changed gain, a knock).
+    """
+    out: dict[int, Finding] = {}
+    kept = list(range(len(spectra)))
+    while len(kept) >= 3:
+        worst = _most_foreign(spectra[kept])
+        if worst is None:
+            break
+        index, channel, ratio = kept[worst[0]], worst[1], worst[2]
+        message = (
+            f"{names[index]} does not repeat the others: {channels[channel]} is "
+            f"{np.sqrt(ratio):.1f} times as far from them as they are from each other"
+        )
+        out[index] = Finding("repeat", "error", message, channels[channel], names[index])
+        kept.remove(index)
+    if len(spectra) == 2:
+        signal = np.mean(np.abs(spectra) ** 2, axis=(0, 1))
+        for i, name in enumerate(channels):
+            change = spectra[0, :, i] - spectra[1, :, i]
+            power = float(np.mean(np.abs(change) ** 2)) / 2
+            relative = change / np.where(spectra[0, :, 0] == 0, 1, spectra[0, :, 0])
+            structured = max(_lag_one(change), _lag_one(relative)) > STRUCTURE
+            if signal[i] > 0 and power > TWO_DIFFER * signal[i] and structured:
+                message = (
+                    f"{names[0]} and {names[1]} differ in {name} by "
+                    f"{np.sqrt(power / signal[i]):.0%}, and not by noise"
+                )
+                out[0] = Finding("repeat", "error", message, name, names[0])
+                break
+    return out
+
+
+def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Half-open ranges in which `flags` is true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _place(cut: Recording, segment: Segment) -> str:
+    return f"{cut.source}, {segment.name}" if cut.source else segment.name
+
+
+def _flat_tops(x: Float) -> NDArray[np.bool_]:
+    flat = np.zeros(x.shape, bool)
+    finite = x[np.isfinite(x)]
+    if finite.size == 0 or np.unique(finite).size < COARSE:
+        return flat
+    for extreme in (finite.min(), finite.max()):
+        tops = [run for run in runs(x == extreme) if run[1] - run[0] >= FLAT_RUN]
+        if len(tops) >= FLAT_RUNS:
+            for start, stop in tops:
+                flat[start:stop] = True
+    return flat
+
+
+def _most_foreign(spectra: NDArray[np.complex128]) -> tuple[int, int, float] | None:
+    n, _, n_channels = spectra.shape
+    worst: tuple[int, int, float] | None = None
+    for c in range(n_channels):
+        x = spectra[:, :, c]
+        distance = np.full((n, n), np.inf)
+        for a in range(n):
+            for b in range(a):
+                distance[a, b] = distance[b, a] = float(np.mean(np.abs(x[a] - x[b]) ** 2))
+        # Rounding alone is no distance.
+        best = max(float(distance.min()), 1e-20 * float(np.mean(np.abs(x) ** 2)))
+        if best == 0:
+            continue
+        nearest = distance.min(axis=1)
+        index = int(np.argmax(nearest))
+        ratio = float(nearest[index]) / best
+        if ratio > FOREIGN and (worst is None or ratio > worst[2]):
+            worst = (index, c, ratio)
+    return worst
+
+
+def _ringing(ends: Float, highest: float) -> tuple[int, bool]:
+    """The loudest output of the mean tail in its noise, and whether the tail is no noise."""
+    n, tail, p = ends.shape
+    spectra = np.fft.rfft(ends * np.hanning(tail)[:, None], axis=1)
+    # A line of the windowed tail is 2 lines wide: every second one is nearly independent.
+    spectra = spectra[:, 2 : max(4, int(highest * tail) + 1) : 2]
+    bins = spectra.shape[1]
+    lively = np.mean(np.abs(spectra) ** 2, axis=(0, 1)) > 0
+    mean = spectra.mean(axis=0)
+    scatter = (spectra - mean)[:, :, lively]
+    p = int(np.count_nonzero(lively))
+    lines = min(bins, -(-4 * p // (n - 1)))
+    if p == 0 or (n - 1) * lines <= p or not np.any(scatter):
+        return int(np.argmax(np.abs(mean).max(axis=0))), bool(np.any(mean)) and p > 0
+    covariance, nu, _ = pooled(scatter, n - 1, lines)
+    t2 = hotelling(mean[:, lively], covariance / n)
+    probability = hotelling_p(t2, p, np.maximum(nu, p))
+    unit = np.abs(mean) / np.sqrt(np.mean(np.abs(spectra - mean) ** 2, axis=(0, 1)) + 1e-300)
+    return int(np.argmax(unit.max(axis=0) * lively)), bool(probability.min() < RINGING / bins)
+
+
+def _moving(end: Float, piece: Piece) -> tuple[int, bool]:
+    """As `_ringing`, for one burst: against the differences of neighbouring samples."""
+    noise = np.std(np.diff(end, axis=0), axis=0) / np.sqrt(2)
+    peak = np.ptp(piece.z[:, 1:], axis=0) / 2
+    ratio = np.std(end, axis=0) / np.maximum(TAIL_NOISE * noise, TAIL_PEAK * peak + 1e-300)
+    return int(np.argmax(ratio)), bool(ratio.max() > 1)
+
+
+def _lag_one(x: NDArray[np.complex128]) -> float:
+    power = float(np.vdot(x, x).real)
+    return abs(complex(np.vdot(x[:-1], x[1:]))) / power if power > 0 else 0.0

@@ -1,0 +1,123 @@
+"""Which pieces are trusted, and which method the data call for."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from samii_rig.errors import EstimateError
+from samii_rig.signal import checks
+from samii_rig.signal.groups import Group, Selection
+from samii_rig.signal.spectra import burst_spectra, excited, period, spectrum
+from samii_rig.types import Finding
+
+Method = Literal["auto", "burst", "periodic", "local", "h1", "h2", "hv"]
+
+
+def drop_stuck(group: Group, *, chosen: bool) -> None:
+    """Leave out outputs that never changed in any piece; refuse when they were asked for."""
+    still = [
+        i
+        for i in range(len(group.selection.outputs))
+        if all(np.ptp(p.z[:, i + 1]) == 0 for p in group.pieces)
+    ]
+    if np.all([np.ptp(p.z[:, 0]) == 0 for p in group.pieces]):
+        raise EstimateError(
+            f"{group.pieces[0].name}: the input {group.selection.input.name} never moves"
+        )
+    if not still:
+        return
+    names = [group.selection.outputs[i].name for i in still]
+    if chosen or len(still) == len(group.selection.outputs):
+        raise EstimateError(
+            f"{group.pieces[0].name}: {', '.join(names)} never changed while the input moved"
+        )
+    keep = [i for i in range(len(group.selection.outputs)) if i not in still]
+    outputs = tuple(group.selection.outputs[i] for i in keep)
+    group.selection = Selection(group.selection.input, outputs)
+    columns = [0, *(i + 1 for i in keep)]
+    group.pieces = [replace(p, z=p.z[:, columns]) for p in group.pieces]
+
+
+def drop_foreign(group: Group) -> None:
+    """Exclude repeats that do not repeat; of only two, neither can be trusted."""
+    if len(group.pieces) < 2 or not group.equal_length:
+        return
+    # A first burst from rest differs from those that start in a tail, and is left out anyhow.
+    skip = 1 if runs_on(group) else 0
+    pieces = group.pieces[skip:]
+    names = [p.name for p in pieces]
+    spectra, _ = burst_spectra(pieces, group.rate_hz)
+    lines = excited(spectra, None)
+    Z = np.stack([s.Z[lines] for s in spectra])
+    foreign = checks.foreign_repeats(Z, names, group.selection.names)
+    if foreign and len(pieces) == 2:
+        raise EstimateError(
+            f"{foreign[min(foreign)].message}; a third repeat would tell which is wrong, or "
+            "estimate each by itself"
+        )
+    group.findings += foreign.values()
+    group.pieces = [
+        replace(p, follows=p.follows and i - 1 not in foreign)
+        for i, p in enumerate(group.pieces, start=-skip)
+        if i not in foreign
+    ]
+
+
+def choose(
+    group: Group, method: Method
+) -> tuple[Literal["burst", "settled", "periodic", "local"], str]:
+    """The method for a group, and why; EstimateError when the one asked for cannot be."""
+    n = len(group.pieces)
+    if method == "local":
+        return "local", "asked for"
+    if method in ("burst", "periodic"):
+        whole = method == "burst" and n < 2
+        if whole or not group.equal_length:
+            raise EstimateError(
+                f"{group.pieces[0].name}: method {method!r} needs two or more repeats of equal "
+                f"length, there are {n} pieces; method 'local' needs only one"
+            )
+        return method, "asked for"
+    if group.kind == "periodic" and group.equal_length:
+        p = period(group.pieces[0].r)
+        if sum(len(x) // p for x in group.pieces) >= 2:
+            return "periodic", f"whole periods of {p / group.rate_hz:g} s: no leakage"
+    if n == 1:
+        return "local", "there is one sweep: leakage and noise are told apart by local models"
+    if not group.equal_length:
+        return "local", "the repeats differ in length or miss samples: local models join them"
+    if moving := _moving(group):
+        if runs_on(group):
+            return "settled", (
+                f"the bursts do not end at rest, but each runs into the next: all but the first "
+                f"of {n} are whole periods of one motion, without leakage"
+            )
+        group.findings += moving
+        return "local", "the bursts do not end at rest: transients are removed by local models"
+    return "burst", f"{n} bursts from rest to rest with one reference: no leakage"
+
+
+def runs_on(group: Group) -> bool:
+    """Whether three bursts or more ran into each other while they still rang."""
+    consecutive = all(p.follows for p in group.pieces[1:])
+    whole = group.kind == "burst" and group.equal_length
+    return len(group.pieces) > 2 and whole and consecutive and bool(_moving(group))
+
+
+def at_rest(group: Group) -> bool:
+    """Whether all pieces are whole bursts that start and end at rest."""
+    if group.kind != "burst":
+        return False
+    known = {f.kind for f in group.findings}
+    return "leakage" not in known and not _moving(group)
+
+
+def _moving(group: Group) -> list[Finding]:
+    spectra = [spectrum(p, group.rate_hz) for p in group.pieces]
+    longest = max(spectra, key=lambda s: s.n)
+    highest = longest.frequency[excited(spectra, None)[-1]] / group.rate_hz
+    channels = (group.selection.input, *group.selection.outputs)
+    return checks.not_at_rest(group.pieces, channels, float(highest))

@@ -1,0 +1,344 @@
+"""Frequency responses from recordings: choose the method, estimate, say why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samii_rig.errors import EstimateError, InputError
+from samii_rig.signal import local, repeats, welch
+from samii_rig.signal.choose import Method, at_rest, choose, drop_foreign, drop_stuck
+from samii_rig.signal.gather import Gaps, gather
+from samii_rig.signal.groups import Group, Piece
+from samii_rig.signal.quantisation import floor_of
+from samii_rig.signal.spectra import (
+    burst_spectra,
+    comb,
+    excited,
+    period,
+    rests,
+    settled_spectra,
+    spectrum,
+)
+from samii_rig.types import Complex, Finding, Float, FrequencyResponse, Int, Recording
+
+LEAD_IN = 0.01  # of a burst; less rest before it cannot be tapered
+# Frequencies of a local estimate at most; neighbours share their data anyhow.
+LOCAL_LINES = 2000
+# A local rational model is taken where it lowers the logarithm of the leave-one-out error
+# by this much: 10 % in power, more than two models of noise alone differ by.
+RATIONAL_GAIN = 0.1
+# Least 1 - rho^2 between reference and transient (see `local.Windows.distinct`); in simulation
+# the error is as stated above it, and up to 8 sigma off below.
+DISTINCT = 0.5
+
+
+def estimate(
+    recordings: Sequence[Recording],
+    *,
+    input: str | None = None,
+    outputs: Sequence[str] | None = None,
+    reference: str | None = None,
+    method: Method = "auto",
+    gaps: Gaps = "refuse",
+    band: tuple[float, float] | None = None,
+    pooling: int | None = None,
+    nperseg: int = 2048,
+) -> tuple[FrequencyResponse, ...]:
+    """Frequency responses from one input to all outputs, one for each level and experiment.
+
+    Parameters
+    ----------
+    recordings : segments of equal kind, level and reference are repeats of each other; a
+        recording without segments is one segment.
+    input, outputs : channel names; without them the command that moves, and all sensors.
+    reference : column that carries the excitation; without it the reference column in use
+        (u + kp theta_ref when both are), and the input itself when none is.
+    method : `auto`; `burst` and `periodic` line by line over repeats; `local` local
+        polynomial or rational models; `h1`, `h2`, `hv` Welch, for comparison.
+    gaps : what to do with a segment that misses samples: `refuse`, `exclude` it, or `model`
+        what follows a gap as a new transient (local models). Nothing is made up.
+    band : Hz; without it, where the reference has energy.
+    pooling : neighbouring lines that share one noise covariance (burst, periodic).
+    nperseg : samples per window (Welch).
+
+    Returns
+    -------
+    One `FrequencyResponse` per group, in order of appearance. `method` and `why` say what
+    was done; `findings` what was noticed, excluded or weakened. `input_rms` is the rms of
+    the sine at the time the sweep passes a frequency (periodic: of the line).
+
+    Raises
+    ------
+    InputError : a channel, method or band that does not exist.
+    EstimateError : the data do not allow it; the message says what would. Where other
+        groups can be estimated, a group that cannot be becomes a finding of the first.
+    """
+    if method not in get_args(Method):
+        raise InputError("estimate", "method", method, f"one of {', '.join(get_args(Method))}")
+    if gaps not in get_args(Gaps):
+        raise InputError("estimate", "gaps", gaps, f"one of {', '.join(get_args(Gaps))}")
+    if band is not None and not 0 <= band[0] < band[1]:
+        raise InputError("estimate", "band", band, "(low, high) in Hz, low below high")
+    groups = gather(recordings, input=input, outputs=outputs, reference=reference, gaps=gaps)
+    out: list[FrequencyResponse] = []
+    failed: list[EstimateError] = []
+    for group in groups:
+        try:
+            drop_stuck(group, chosen=outputs is not None)
+            if method in ("h1", "h2", "hv"):
+                out.append(_welch(group, method, nperseg, band))
+                continue
+            drop_foreign(group)
+            choice, why = choose(group, method)
+            if choice == "local":
+                out.append(_local(group, why, band))
+            else:
+                out.append(_repeats(group, choice, why, band, pooling))
+        except EstimateError as error:
+            failed.append(error)
+    if not out:
+        raise failed[0]
+    lost = tuple(Finding("repeat", "error", f"not estimated: {error}") for error in failed)
+    return (replace(out[0], findings=(*out[0].findings, *lost)), *out[1:])
+
+
+def _repeats(
+    group: Group,
+    method: Literal["burst", "settled", "periodic"],
+    why: str,
+    band: tuple[float, float] | None,
+    pooling: int | None,
+) -> FrequencyResponse:
+    pieces = group.pieces
+    if method == "periodic":
+        pieces = _periods(group)
+    if method == "burst":
+        spectra, shared = burst_spectra(pieces, group.rate_hz)
+        if rests(pieces[0].r)[0] < LEAD_IN * len(pieces[0]):
+            group.findings.append(_no_lead_in(pieces[0].name))
+    elif method == "settled":
+        spectra, shared = settled_spectra(pieces, group.rate_hz), 1.0
+        text = f"{pieces[0].name} left out: it started from rest, the others from its tail"
+        group.findings.append(Finding("leakage", "note", text, segment=pieces[0].name))
+        pieces = pieces[1:]
+    else:
+        spectra, shared = [spectrum(p, group.rate_hz) for p in pieces], 1.0
+    lines = comb(spectra, band) if method == "periodic" else excited(spectra, band)
+    n, p = len(pieces), len(group.selection.outputs)
+    wanted = pooling or repeats.pooling_lines(n, p)
+    if min(wanted, lines.size) * (n - 1) <= p:
+        raise EstimateError(
+            f"{n} repeats of {lines.size} lines do not give a covariance of {p} outputs; "
+            "more repeats, a wider band or fewer outputs would"
+        )
+    R = np.stack([s.R[lines] for s in spectra])
+    Z = np.stack([s.Z[lines] for s in spectra])
+    floor, findings = floor_of(group, pieces)
+    result = repeats.over_repeats(R, Z, wanted, floor, shared)
+    scatter = np.diagonal(result.noise, axis1=1, axis2=2).real
+    for i, message in findings.items():
+        part = float(np.mean(scatter[:, i] < floor[i]))
+        if part > 0:
+            text = f"{message} in {part:.0%} of the lines; what is missing was added"
+            name = group.selection.outputs[i].name
+            group.findings.append(Finding("dof", "note", text, channel=name))
+    amplitude = (
+        np.sqrt(2 * result.input_power / len(pieces[0]))
+        if method == "periodic"
+        else np.abs(result.gain) * _peak(pieces) / np.sqrt(2)
+    )
+    return _response(
+        group,
+        frequency=spectra[0].frequency[lines],
+        H=result.H,
+        covariance=result.covariance,
+        dof=result.dof,
+        coherence=_coherence(result.H, result.gain, np.mean(np.abs(R) ** 2, axis=0), result.noise),
+        input_rms=amplitude,
+        n=n,
+        method=f"{method} (over repeats, through {group.through})",
+        why=f"{why}; {result.remark}",
+    )
+
+
+def _no_lead_in(name: str) -> Finding:
+    message = (
+        f"{name} starts without rest before it: noise that resonates is cut off sharply, "
+        "neighbouring lines share it, and the degrees of freedom may be fewer than stated"
+    )
+    return Finding("dof", "note", message)
+
+
+def _periods(group: Group) -> list[Piece]:
+    """Every period as a piece; the first of three or more carries the transient and goes."""
+    p = period(group.pieces[0].r)
+    out = []
+    for piece in group.pieces:
+        count = len(piece) // p
+        skip = 1 if count > 2 else 0
+        for k in range(skip, count):
+            rows = slice(k * p, (k + 1) * p)
+            out.append(Piece(f"{piece.name}, period {k + 1}", piece.r[rows], piece.z[rows]))
+    if len(out) < 2:
+        raise EstimateError(f"{group.pieces[0].name}: one period; method 'local' needs only one")
+    return out
+
+
+def _local(group: Group, why: str, band: tuple[float, float] | None) -> FrequencyResponse:
+    spectra = [spectrum(p, group.rate_hz) for p in group.pieces]
+    longest = max(spectra, key=lambda s: s.n)
+    lines = excited(spectra, band)
+    lines = lines[:: max(1, -(-lines.size // LOCAL_LINES))]
+    f0 = longest.frequency[lines]
+    p = len(group.selection.outputs)
+    still = at_rest(group)
+    rate = group.rate_hz
+    # A piece much shorter than the longest has too few lines in a window to help.
+    used = [i for i, s in enumerate(spectra) if s.n > longest.n // 2]
+    spectra = [spectra[i] for i in used]
+    breaks = [[k / rate for k in group.pieces[i].breaks] for i in used]
+    width, transients = local.plan(breaks, p, longest.n / rate, at_rest=still)
+    data = local.windows(spectra, f0, width, transients)
+    clear = data.distinct() > DISTINCT
+    if not clear.all():
+        group.findings.append(_unclear(f0, clear))
+        lines, f0 = lines[clear], f0[clear]
+        data = local.windows(spectra, f0, width, transients)
+    fits = [local.fit(data, degree) for degree in (0, 1, 2)]
+    # Neighbours within a window share their data, so they decide together.
+    width_lines = round(width / (f0[1] - f0[0])) if f0.size > 1 else 1
+    best = _best_degree([_smooth(f.press, width_lines) for f in fits])
+    rational = float(np.mean(best > 0))
+
+    def pick(name: str) -> Complex:
+        stack = np.stack([getattr(f, name) for f in fits])
+        return np.asarray(stack[best, np.arange(best.size)])
+
+    dof = np.array([f.dof for f in fits])[best]
+    if fits[0].dof <= p:
+        raise EstimateError(f"{dof.min():.2g} degrees of freedom for {p} outputs; more data would")
+    # Of the piece in which the sweep passes the frequency.
+    power = np.max([np.interp(f0, s.frequency, np.abs(s.R) ** 2) for s in spectra], axis=0)
+    return _response(
+        group,
+        frequency=f0,
+        H=pick("H"),
+        covariance=pick("covariance"),
+        dof=dof,
+        coherence=_coherence(pick("H"), pick("gain"), power, pick("noise")),
+        input_rms=np.abs(pick("gain")) * _peak(group.pieces) / np.sqrt(2),
+        n=len(group.pieces),
+        method=f"local (LPM, LRM at {rational:.0%} of the lines, through {group.through})",
+        why=f"{why}; windows of {width:.3g} Hz, "
+        + (f"{len(transients)} transients" if transients else "at rest at both ends: no transient"),
+    )
+
+
+def _unclear(f0: Float, clear: NDArray[np.bool_]) -> Finding:
+    if not clear.any():
+        raise EstimateError(
+            "the sweep cannot be told from a transient anywhere; a lead-in at rest would help"
+        )
+    left = f0[~clear]
+    message = (
+        f"{left.size} lines between {left[0]:.3g} and {left[-1]:.3g} Hz left out: the sweep "
+        "passes them so near the start or the end of the record that a transient looks the same"
+    )
+    return Finding("leakage", "warning", message)
+
+
+def _smooth(x: Float, lines: int) -> Float:
+    half = min(lines // 2, x.size - 1)
+    padded = np.pad(x, half, mode="edge")
+    return np.convolve(padded, np.ones(2 * half + 1) / (2 * half + 1), mode="valid")
+
+
+def _best_degree(press: Sequence[Float]) -> Int:
+    """Degree of D per line: the smallest that no larger one beats by `RATIONAL_GAIN`."""
+    best = np.zeros(press[0].size, np.int64)
+    score = press[0]
+    for degree in range(1, len(press)):
+        better = press[degree] < score - RATIONAL_GAIN
+        best = np.where(better, degree, best)
+        score = np.where(better, press[degree], score)
+    return best
+
+
+def _welch(
+    group: Group, method: str, nperseg: int, band: tuple[float, float] | None
+) -> FrequencyResponse:
+    result = welch.frequency_response(
+        [p.z for p in group.pieces], group.rate_hz, nperseg=nperseg, method=method
+    )
+    inside = slice(1, None)
+    f = result.frequency[inside]
+    keep = np.ones(f.size, bool) if band is None else (f >= band[0]) & (f <= band[1])
+    warning = Finding(
+        "leakage",
+        "warning",
+        f"{method.upper()} by Welch windows of {nperseg / group.rate_hz:g} s: for comparison; "
+        "leakage and what a loop feeds back bias it, and its covariance does not know",
+    )
+    group.findings.append(warning)
+    return _response(
+        group,
+        frequency=f[keep],
+        H=result.H[inside][keep],
+        covariance=result.covariance[inside][keep],
+        dof=np.full(int(keep.sum()), result.dof),
+        coherence=result.coherence[inside][keep],
+        input_rms=np.full(int(keep.sum()), np.nan),
+        n=result.n_frames,
+        method=f"{method} (Welch, {nperseg} samples, Hann)",
+        why="asked for",
+    )
+
+
+def _coherence(H: Complex, gain: Complex, power: Float, noise: Complex) -> Float:
+    """Part of each output's power in one repeat that the reference explains."""
+    signal = np.abs(H) ** 2 * (np.abs(gain) ** 2 * power)[:, None]
+    rest = np.diagonal(noise, axis1=1, axis2=2).real
+    total = signal + rest
+    return np.divide(signal, total, out=np.zeros_like(signal), where=total > 0)
+
+
+def _peak(pieces: Sequence[Piece]) -> float:
+    return max(float(np.abs(p.r).max(initial=0.0)) for p in pieces)
+
+
+def _response(
+    group: Group,
+    *,
+    frequency: Float,
+    H: Complex,
+    covariance: Complex,
+    dof: Float,
+    coherence: Float,
+    input_rms: Float,
+    n: int,
+    method: str,
+    why: str,
+) -> FrequencyResponse:
+    return FrequencyResponse(
+        frequency=frequency,
+        H=H[:, :, None],
+        covariance=covariance,
+        dof=dof,
+        coherence=coherence,
+        inputs=(group.selection.input,),
+        outputs=group.selection.outputs,
+        level=group.level,
+        level_unit=group.unit,
+        input_rms=input_rms[:, None],
+        rate_hz=group.rate_hz,
+        n_averages=n,
+        method=method,
+        why=why,
+        findings=tuple(group.findings),
+        sources=tuple(group.sources),
+    )

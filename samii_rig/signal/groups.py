@@ -1,0 +1,197 @@
+"""From recordings to groups of repeats: what one estimate is made of."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from samii_rig.errors import EstimateError, InputError
+from samii_rig.types import Channel, Finding, Float, Recording, Segment
+
+# Correlation of two references above which they are the same experiment repeated; a lost
+# sample costs about its share of the length.
+SAME_REFERENCE = 0.98
+LENGTH_DIFFERS = 0.05  # relative difference in length that lost samples can explain
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """The samples that are there: r (n,) reference, z (n, 1 + p) input and outputs.
+
+    breaks : indices before which samples are missing; what came before them does not
+        explain what follows.
+    follows : whether the piece before it in the group ended where this one starts.
+    """
+
+    name: str
+    r: Float
+    z: Float
+    breaks: tuple[int, ...] = ()
+    follows: bool = False
+
+    def __len__(self) -> int:
+        return int(self.r.shape[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Which columns of a recording an estimate reads, by name."""
+
+    input: Channel
+    outputs: tuple[Channel, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Input first, then the outputs: the columns of `Piece.z`."""
+        return (self.input.name, *(c.name for c in self.outputs))
+
+
+@dataclass(slots=True)
+class Group:
+    """Repeats of one experiment at one level."""
+
+    selection: Selection
+    kind: str
+    level: float
+    unit: str
+    rate_hz: float
+    pieces: list[Piece] = field(default_factory=list)
+    sources: list[str] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    through: str = ""
+
+    @property
+    def equal_length(self) -> bool:
+        """Whether all pieces have the same number of samples and none is missing."""
+        return len({len(p) for p in self.pieces}) == 1 and not any(p.breaks for p in self.pieces)
+
+
+def select(recording: Recording, input: str | None, outputs: Sequence[str] | None) -> Selection:
+    """The input channel and the outputs; InputError when they are not there or not clear."""
+    where = recording.source or "recording"
+    by_name = {c.name: c for c in recording.channels}
+    if input is None:
+        commands = recording.names("command")
+        moving = [
+            n for n in commands if np.nanmax(np.abs(_column(recording, n)), initial=0.0) > 0.0
+        ]
+        if len(moving) != 1:
+            found = list(moving or commands)
+            raise InputError(where, "input", found, "the name of the one input to estimate from")
+        input = moving[0]
+    if outputs is None:
+        outputs = [n for n in recording.names("sensor") if n != input]
+    for name, option in [(input, "input"), *((n, "outputs") for n in outputs)]:
+        if name not in by_name:
+            raise InputError(where, option, name, f"one of {', '.join(by_name)}")
+    if not outputs:
+        raise InputError(where, "outputs", [], "at least one sensor")
+    return Selection(by_name[input], tuple(by_name[n] for n in outputs))
+
+
+def segments_of(recording: Recording) -> tuple[Segment, ...]:
+    """The recording's segments, or the whole of it as one `single` segment."""
+    if recording.segments:
+        return recording.segments
+    if len(recording) == 0:
+        raise EstimateError(f"{recording.source or 'recording'}: it holds no sample")
+    references = [c for c in recording.channels if c.role == "reference"]
+    driven = references or [c for c in recording.channels if c.role == "command"]
+    peaks = {c: float(np.nanmax(np.abs(_column(recording, c.name)), initial=0.0)) for c in driven}
+    loudest = max(peaks, key=lambda c: peaks[c]) if peaks else None
+    return (
+        Segment(
+            name="whole",
+            kind="single",
+            start=int(recording.sequence[0]),
+            stop=int(recording.sequence[-1]) + 1,
+            level=peaks[loudest] if loudest else float("nan"),
+            unit=loudest.unit if loudest else "",
+        ),
+    )
+
+
+def reference_of(
+    cut: Recording, selection: Selection, reference: str | None
+) -> tuple[Float, str, Finding | None]:
+    """The reference of a cut, what it is in words, and a finding when it is the input itself.
+
+    With both u and theta_ref in use the loop v = u + kp (theta_ref - theta) has the
+    exogenous input r = u + kp theta_ref; kp comes from the rig file in the recording.
+    """
+    where = cut.source or "recording"
+    if reference is not None:
+        if reference not in {c.name for c in cut.channels}:
+            names = ", ".join(c.name for c in cut.channels)
+            raise InputError(where, "reference", reference, f"one of {names}")
+        return _column(cut, reference), reference, None
+    used = [n for n in cut.names("reference") if np.nanmax(np.abs(_column(cut, n)), initial=0) > 0]
+    if not used:
+        finding = Finding(
+            "closed_loop",
+            "warning",
+            f"no reference was recorded, {selection.input.name} takes its place: if a loop acts "
+            "on it, noise that came through the loop biases the estimate",
+            channel=selection.input.name,
+        )
+        return _column(cut, selection.input.name), selection.input.name, finding
+    if len(used) == 1:
+        return _column(cut, used[0]), used[0], None
+    units = {n: cut.channels[cut.column(n)].unit for n in used}
+    direct = [n for n in used if units[n] == selection.input.unit]
+    angle = [n for n in used if units[n] != selection.input.unit]
+    kp = _centring_gain(cut)
+    if len(direct) == 1 and len(angle) == 1 and kp is not None:
+        r = _column(cut, direct[0]) + kp * _column(cut, angle[0])
+        return r, f"{direct[0]} + {kp:g} {angle[0]}", None
+    raise InputError(where, "reference", used, "one reference column that is in use, by name")
+
+
+@dataclass(frozen=True, slots=True)
+class Waveform:
+    """A reference for comparing: in the order recorded, and on the segment's own count
+    (0 where a sample is missing).
+
+    Where a loop lost ticks, some devices go on with the next sample of the reference, others
+    skip it; both are the same experiment.
+    """
+
+    recorded: Float
+    counted: Float
+
+    @classmethod
+    def of(cls, cut: Recording, segment: Segment, r: Float) -> Waveform:
+        """The reference `r` of a cut."""
+        counted = np.zeros(max(segment.stop - segment.start, 1))
+        place = cut.sequence - segment.start
+        inside = (place >= 0) & (place < counted.size)
+        counted[place[inside]] = np.nan_to_num(r[inside])
+        return cls(np.nan_to_num(r), counted)
+
+    def same(self, other: Waveform) -> bool:
+        """Whether both are one waveform, but for some lost samples."""
+        return _alike(self.recorded, other.recorded) or _alike(self.counted, other.counted)
+
+
+def _alike(a: Float, b: Float) -> bool:
+    n = min(a.size, b.size)
+    if abs(a.size - b.size) > LENGTH_DIFFERS * n:
+        return False
+    size = float(np.linalg.norm(a[:n]) * np.linalg.norm(b[:n]))
+    return size > 0 and float(a[:n] @ b[:n]) / size > SAME_REFERENCE
+
+
+def _column(recording: Recording, name: str) -> Float:
+    return recording.values[:, recording.column(name)]
+
+
+def _centring_gain(recording: Recording) -> float | None:
+    """kp of the rig file that the recording carries, None if it carries none."""
+    try:
+        gain = tomllib.loads(recording.rig_toml)["centring"]["kp"]
+    except (tomllib.TOMLDecodeError, KeyError, TypeError):
+        return None
+    return float(gain) if isinstance(gain, int | float) else None
