@@ -1,0 +1,259 @@
+"""What an MCAP file contains, found in one pass over its record heads."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from isal.isal_zlib import crc32
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, DataEnd, Footer, Header, McapRecord, Metadata, Schema
+
+from samii_rig.errors import RecordingError
+from samii_rig.record import layout, scan
+from samii_rig.record.scan import ChunkHead, DamagedError, Span
+
+_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
+_INDEX_HEAD = struct.Struct("<HI")  # channel id, bytes of entries
+_INDEX_ENTRY = 16  # log time and offset, u64 each
+
+Item = TypeVar("Item")
+Record = TypeVar("Record", bound=McapRecord)
+
+
+@dataclass(slots=True)
+class Chunk:
+    """A chunk and, by channel id, how many messages its index says it has.
+
+    `counts` is empty where the file ends before the index.
+    """
+
+    head: ChunkHead
+    counts: dict[int, int] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Contents:
+    """The data section of a file.
+
+    end : where it ends: after the DataEnd record, or where the file is damaged.
+    data_crc : what DataEnd says, None without one. data_end : offset of DataEnd.
+    damage : what could not be read; empty in strict mode, which raises it instead.
+    """
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
+    attachments: list[Span] = field(default_factory=list)
+    chunks: list[Chunk] = field(default_factory=list)
+    damage: list[DamagedError] = field(default_factory=list)
+    end: int = 0
+    data_end: int = 0
+    data_crc: int | None = None
+
+    def channel_id(self, topic: str) -> int | None:
+        """Id of the one channel with this topic, None if there is none."""
+        found = [c.id for c in self.channels.values() if c.topic == topic]
+        if len(found) > 1:
+            raise RecordingError(f"{topic} is registered {len(found)} times; expected once")
+        return found[0] if found else None
+
+    def maps(self, name: str) -> list[dict[str, str]]:
+        """All metadata records of this name that are ours, checked."""
+        return [layout.unsealed(m, f"metadata {n}") for n, m in self.metadata if n == name]
+
+    def one_map(self, name: str) -> dict[str, str] | None:
+        """The one metadata record of this name, None if there is none."""
+        found = self.maps(name)
+        if len(found) > 1:
+            raise RecordingError(f"metadata {name} occurs {len(found)} times; expected once")
+        return found[0] if found else None
+
+
+def read_contents(data: memoryview, stop: int, *, strict: bool) -> Contents:
+    """Walk the data section, which ends before `stop`.
+
+    strict : raise the first DamagedError; otherwise note it, look for the next whole chunk behind
+        it and go on.
+    """
+    if not scan.has_magic(data, 0):
+        raise RecordingError("it does not begin as an MCAP file")
+    contents = Contents()
+    search = _ChunkSearch(data, stop)
+    at = scan.MAGIC_SIZE
+    while at < stop and contents.data_crc is None:
+        span = None
+        try:
+            span = next(scan.spans(data, at, stop))
+            _take(contents, data, span)
+            at = contents.end = span.end
+        except DamagedError as damaged:
+            if strict:
+                raise
+            contents.damage.append(damaged)
+            # If its length is right the record ends where it says; if a whole chunk begins
+            # before that, the length is what was damaged.
+            chunk = search.first(at + 1)
+            ends = [x for x in (chunk, span.end if span else None) if x is not None]
+            if not ends:
+                break
+            at = min(ends)
+    return contents
+
+
+def _take(contents: Contents, data: memoryview, span: Span) -> None:
+    match span.opcode:
+        case Opcode.HEADER:
+            scan.parse(Header, data, span)
+        case Opcode.SCHEMA:
+            schema = scan.parse(Schema, data, span)
+            contents.schemas[schema.id] = schema
+        case Opcode.CHANNEL:
+            channel = scan.parse(Channel, data, span)
+            contents.channels[channel.id] = channel
+        case Opcode.METADATA:
+            record = scan.parse(Metadata, data, span)
+            contents.metadata.append((record.name, record.metadata))
+        case Opcode.ATTACHMENT:
+            if not scan.attachment_whole(data, span):
+                raise DamagedError(span.start, "an attachment's CRC does not fit")
+            contents.attachments.append(span)
+        case Opcode.CHUNK:
+            contents.chunks.append(Chunk(scan.chunk_head(data, span)))
+        case Opcode.MESSAGE_INDEX:
+            _take_index(contents, data, span)
+        case Opcode.DATA_END:
+            contents.data_crc = scan.parse(DataEnd, data, span).data_section_crc
+            contents.data_end = span.start
+        case Opcode.MESSAGE:
+            raise DamagedError(span.start, "a message outside of a chunk; expected all in chunks")
+        case _:
+            raise DamagedError(span.start, f"a record of kind {span.opcode} among the data")
+
+
+def _take_index(contents: Contents, data: memoryview, span: Span) -> None:
+    if span.end - span.content < _INDEX_HEAD.size:
+        raise DamagedError(span.start, "a message index is shorter than its head")
+    channel_id, length = _INDEX_HEAD.unpack_from(data, span.content)
+    if span.content + _INDEX_HEAD.size + length != span.end or length % _INDEX_ENTRY:
+        raise DamagedError(span.start, "a message index does not fit its record")
+    if not contents.chunks:
+        raise DamagedError(span.start, "a message index before any chunk")
+    counts = contents.chunks[-1].counts
+    counts[channel_id] = counts.get(channel_id, 0) + length // _INDEX_ENTRY
+
+
+class _ChunkSearch:
+    """Finds chunks that are whole down to their CRC among bytes that have lost their order."""
+
+    # Before the compression's name: opcode and length, two times, size and CRC.
+    _BEFORE = scan.HEAD + 8 + 8 + 8 + 4
+    _MARKS = tuple(struct.pack("<I", len(name)) + name for name in (b"lz4", b"zstd"))
+
+    def __init__(self, data: memoryview, stop: int) -> None:
+        self._data = data
+        self._stop = stop
+        self._known: tuple[int, int | None] | None = None  # searched from, found at
+
+    def first(self, start: int) -> int | None:
+        """Offset of the first whole chunk at or after `start`, None if there is none."""
+        if self._known is not None:
+            searched, found = self._known
+            if searched <= start and (found is None or start <= found):
+                return found
+        at = self._candidate(start)
+        while at is not None and not self._whole(at):
+            at = self._candidate(at + 1)
+        self._known = (start, at)
+        return at
+
+    def _candidate(self, start: int) -> int | None:
+        hits = (scan.find(self._data, m, start + self._BEFORE, self._stop) for m in self._MARKS)
+        return min((hit - self._BEFORE for hit in hits if hit >= 0), default=None)
+
+    def _whole(self, at: int) -> bool:
+        try:
+            span = next(scan.spans(self._data, at, self._stop))
+            if span.opcode != Opcode.CHUNK:
+                return False
+            scan.unpack(self._data, scan.chunk_head(self._data, span))
+        except DamagedError:
+            return False
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class Tail:
+    """The end of a finished file, its CRC checked. summary_start : where the summary begins."""
+
+    summary_start: int
+    footer: Span
+
+
+def read_tail(data: memoryview) -> Tail:
+    """Footer and summary; DamagedError unless every byte of them is as it was written."""
+    size = len(data)
+    at = size - scan.MAGIC_SIZE - scan.FOOTER_SIZE
+    if at < scan.MAGIC_SIZE or not scan.has_magic(data, size - scan.MAGIC_SIZE):
+        raise DamagedError(size, "the file ends before it is finished")
+    span = next(scan.spans(data, at, size - scan.MAGIC_SIZE))
+    if span.opcode != Opcode.FOOTER or span.end != size - scan.MAGIC_SIZE:
+        raise DamagedError(at, "the footer is damaged")
+    footer = scan.parse(Footer, data, span)
+    if not scan.MAGIC_SIZE < footer.summary_start <= at:
+        raise DamagedError(at, "the footer does not say where the summary begins")
+    if crc32(data[footer.summary_start : span.end - 4]) != footer.summary_crc:
+        raise DamagedError(footer.summary_start, "the summary's CRC does not fit")
+    return Tail(footer.summary_start, span)
+
+
+def summary_channels(data: memoryview, tail: Tail) -> tuple[dict[int, Schema], dict[int, Channel]]:
+    """Schemas and channels as the summary repeats them."""
+    schemas, channels = {}, {}
+    for span in scan.spans(data, tail.summary_start, tail.footer.start):
+        if span.opcode == Opcode.SCHEMA:
+            schema = scan.parse(Schema, data, span)
+            schemas[schema.id] = schema
+        elif span.opcode == Opcode.CHANNEL:
+            channel = scan.parse(Channel, data, span)
+            channels[channel.id] = channel
+    return schemas, channels
+
+
+def messages(raw: bytes | memoryview, channel_id: int) -> Iterator[tuple[int, bytes]]:
+    """(log time in ns, payload) of one channel's messages in an unpacked chunk."""
+    view = memoryview(raw)
+    for span in scan.spans(view, 0, len(view)):
+        if span.opcode != Opcode.MESSAGE:
+            continue
+        if span.end - span.content < _MESSAGE_HEAD.size:
+            raise DamagedError(span.start, "a message is shorter than its head")
+        number, _, log_time, _ = _MESSAGE_HEAD.unpack_from(view, span.content)
+        if number == channel_id:
+            yield log_time, bytes(view[span.content + _MESSAGE_HEAD.size : span.end])
+
+
+def decoded(
+    data: memoryview, contents: Contents, topic: str, decode: Callable[[bytes], Item]
+) -> list[Item]:
+    """All messages of a topic of ours, decoded, in the order of the file."""
+    channel_id = contents.channel_id(topic)
+    if channel_id is None:
+        return []
+    found: list[Item] = []
+    for chunk in contents.chunks:
+        if not chunk.counts or channel_id in chunk.counts:
+            raw = scan.unpack(data, chunk.head)
+            found.extend(decode(payload) for _, payload in messages(raw, channel_id))
+    return found
+
+
+def attachment(data: memoryview, contents: Contents, name: str) -> bytes | None:
+    """The attachment of this name, None if there is none."""
+    for span in contents.attachments:
+        record = scan.parse(Attachment, data, span)
+        if record.name == name:
+            return record.data
+    return None

@@ -1,0 +1,214 @@
+"""Read a recording into numpy, and the results and events that were logged with it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.opcode import Opcode
+
+from samii_rig.errors import RecordingError
+from samii_rig.record import events, layout, response, scan
+from samii_rig.record.contents import (
+    Chunk,
+    Contents,
+    attachment,
+    decoded,
+    read_contents,
+    read_tail,
+)
+from samii_rig.record.events import Event
+from samii_rig.record.layout import SampleLayout
+from samii_rig.record.scan import DamagedError
+from samii_rig.types import FrequencyResponse, Recording, StopRecord
+
+THREADS = min(4, os.cpu_count() or 1)
+# Samples in memory against bytes in the file: about 6 in a recording that compresses well.
+# A file beyond this is made to fill the memory.
+MAX_EXPANSION = 100
+SMALL = 64 << 20  # bytes of samples that are never too many
+
+_Records = np.ndarray[Any, np.dtype[np.void]]
+
+
+def read_recording(path: Path, *, partial: bool = False) -> Recording:
+    """The samples of a run and all that was recorded beside them.
+
+    Every chunk's CRC is checked, and that as many samples are there as the stop record says;
+    `verify` checks the file down to its last byte.
+
+    partial : take a file that is still being written, or was cut off, up to its last whole
+        chunk; otherwise such a file is refused.
+
+    RecordingError if the file is damaged, unfinished, or not laid out as `RunWriter` does it.
+    """
+    with _contents(path, partial=partial) as (data, contents):
+        sample_id, sample_layout = sample_channel(contents)
+        arrays = _read_samples(data, contents, sample_id, sample_layout)
+        time, sequence, values, quality = arrays
+        stop = contents.one_map(layout.STOP)
+        if stop is None:
+            stop_record = StopRecord("unknown", "the recording holds no stop record")
+        else:
+            stop_record, samples = layout.stop_from_map(stop)
+            if samples != len(time):
+                raise RecordingError(f"it holds {len(time)} of the {samples} samples of the run")
+        return Recording(
+            channels=sample_layout.channels,
+            rate_hz=sample_layout.rate_hz,
+            time=time,
+            sequence=sequence,
+            values=values,
+            quality=quality,
+            segments=tuple(layout.segment_from_map(m) for m in contents.maps(layout.SEGMENT)),
+            rig_toml=_text(data, contents, layout.RIG_FILE),
+            experiment_toml=_text(data, contents, layout.EXPERIMENT_FILE),
+            metadata=contents.one_map(layout.NOTES) or {},
+            stop=stop_record,
+            source=str(path),
+        )
+
+
+def read_frequency_responses(path: Path, *, partial: bool = False) -> list[FrequencyResponse]:
+    """The frequency responses logged in a recording, or in a file derived from some."""
+    with _contents(path, partial=partial) as (data, contents):
+        return decoded(data, contents, layout.RESPONSES, response.decode)
+
+
+def read_events(path: Path, *, partial: bool = False) -> list[Event]:
+    """The events logged in a recording, in the order in which they were logged."""
+    with _contents(path, partial=partial) as (data, contents):
+        return decoded(data, contents, layout.EVENTS, events.decode)
+
+
+def read_notes(path: Path, *, partial: bool = False) -> dict[str, str]:
+    """The metadata of a recording (seed, versions, operator, hashes of sources, ...)."""
+    with _contents(path, partial=partial) as (_, contents):
+        return contents.one_map(layout.NOTES) or {}
+
+
+@contextmanager
+def _contents(path: Path, *, partial: bool) -> Iterator[tuple[memoryview, Contents]]:
+    """The file's bytes and contents; errors inside name the file."""
+    data = scan.mapped(path)
+    try:
+        if partial:
+            contents = read_contents(data, len(data), strict=False)
+        else:
+            tail = read_tail(data)
+            contents = read_contents(data, tail.summary_start, strict=True)
+            if contents.data_crc is None or contents.end != tail.summary_start:
+                raise DamagedError(contents.end, "the summary does not follow the data")
+        run = contents.one_map(layout.RUN)
+        if run is None or run.get("format") != layout.FORMAT:
+            raise RecordingError("it is an MCAP file, but not a recording of samii-rig")
+        yield data, contents
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def sample_channel(contents: Contents) -> tuple[int, SampleLayout]:
+    """Id and layout of `/samples`; RecordingError if it is missing or not ours."""
+    channel_id = contents.channel_id(layout.SAMPLES)
+    if channel_id is None:
+        raise RecordingError(f"there is no {layout.SAMPLES} in it")
+    channel = contents.channels[channel_id]
+    sample_layout = SampleLayout.from_metadata(channel.metadata)
+    schema = contents.schemas.get(channel.schema_id)
+    if (
+        schema is None
+        or schema.data != sample_layout.schema_text().encode()
+        or schema.encoding != layout.SCHEMA_ENCODING
+        or channel.message_encoding != layout.MESSAGE_ENCODING
+    ):
+        raise RecordingError(f"the schema of {layout.SAMPLES} is not the one that we write")
+    return channel_id, sample_layout
+
+
+def sample_records(
+    raw: bytes | memoryview, channel_id: int, dtype: np.dtype[np.void]
+) -> _Records | None:
+    """An unpacked chunk as an array of sample messages; None if it holds none.
+
+    RecordingError if it holds samples and something else.
+    """
+    if len(raw) >= dtype.itemsize and len(raw) % dtype.itemsize == 0:
+        records = np.frombuffer(raw, dtype)
+        ours = (
+            (records["opcode"] == Opcode.MESSAGE)
+            & (records["length"] == dtype.itemsize - scan.HEAD)
+            & (records["channel"] == channel_id)
+        )
+        if ours.all():
+            return records
+    view = memoryview(raw)
+    for span in scan.spans(view, 0, len(view)):
+        number = int.from_bytes(view[span.content : span.content + 2], "little")
+        if span.opcode == Opcode.MESSAGE and number == channel_id:
+            raise DamagedError(span.start, "a chunk mixes samples with others, not as we write it")
+    return None
+
+
+def _read_samples(
+    data: memoryview, contents: Contents, channel_id: int, sample_layout: SampleLayout
+) -> tuple[np.ndarray[Any, Any], ...]:
+    """time, sequence, values, quality of all samples, each chunk unpacked to its place."""
+    dtype = sample_layout.record
+    columns = len(sample_layout.channels)
+    places: list[tuple[Chunk, int, int]] = []
+    rows = 0
+    for chunk in contents.chunks:
+        count = chunk.counts.get(channel_id, 0)
+        if not chunk.counts:  # cut off before its index: only its bytes tell
+            found = sample_records(scan.unpack(data, chunk.head), channel_id, dtype)
+            count = 0 if found is None else len(found)
+        if count:
+            if chunk.head.size != count * dtype.itemsize:
+                raise DamagedError(chunk.head.span.start, "a chunk's index does not fit its size")
+            places.append((chunk, rows, count))
+            rows += count
+    size = rows * (16 + 9 * columns)
+    if size > max(SMALL, MAX_EXPANSION * len(data)):
+        raise RecordingError(f"{len(data)} bytes claim {size} bytes of samples")
+    time, sequence = np.empty(rows, np.int64), np.empty(rows, np.int64)
+    values, quality = np.empty((rows, columns)), np.empty((rows, columns), np.uint8)
+    value_rows, quality_rows = values.view(f"V{8 * columns}"), quality.view(f"V{columns}")
+
+    def place(item: tuple[Chunk, int, int]) -> None:
+        chunk, first, count = item
+        records = sample_records(scan.unpack(data, chunk.head), channel_id, dtype)
+        if records is None or len(records) != count:
+            raise DamagedError(chunk.head.span.start, "a chunk's index does not fit its samples")
+        to = slice(first, first + count)
+        time[to] = records["log_time"].view(np.int64)
+        sequence[to] = records["sequence"]
+        value_rows[to, 0] = records["values"]
+        quality_rows[to, 0] = records["quality"]
+
+    if len(places) > 1:
+        with ThreadPoolExecutor(THREADS) as pool:
+            for _ in pool.map(place, places):
+                pass
+    else:
+        for item in places:
+            place(item)
+    if not np.all(sequence[1:] > sequence[:-1]):
+        raise RecordingError("its samples are not in the order of their sequence")
+    if rows and time.min() < 0:
+        raise RecordingError("a sample's time stamp is beyond 2^63 ns")
+    return time, sequence, values, quality
+
+
+def _text(data: memoryview, contents: Contents, name: str) -> str:
+    content = attachment(data, contents, name)
+    if content is None:
+        return ""
+    try:
+        return content.decode()
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"attachment {name} is not UTF-8") from error

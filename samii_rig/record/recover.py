@@ -1,0 +1,211 @@
+"""Give back what is left of a run that was cut off, or of a file that was damaged."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from samii_rig.errors import RecordingError
+from samii_rig.record import events, layout, response, scan
+from samii_rig.record.contents import (
+    Chunk,
+    Contents,
+    attachment,
+    messages,
+    read_contents,
+    read_tail,
+    summary_channels,
+)
+from samii_rig.record.layout import SampleLayout
+from samii_rig.record.reader import sample_channel, sample_records
+from samii_rig.record.writer import PARTIAL, RunWriter
+from samii_rig.types import Channel, SampleBlock, StopRecord
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """What was given back. `problems` : what was found damaged, one line each."""
+
+    path: Path
+    samples: int
+    events: int
+    responses: int
+    segments: int
+    problems: tuple[str, ...]
+
+
+def default_output(path: Path) -> Path:
+    """NAME.mcap.partial and NAME.mcap both become NAME.recovered.mcap."""
+    name = path.name.removesuffix(PARTIAL).removesuffix(".mcap")
+    return path.with_name(f"{name}.recovered.mcap")
+
+
+def recover(path: Path, output: Path | None = None) -> Recovered:
+    """Write every sample, event and result of `path` that is whole into a new file.
+
+    What counts as whole is a chunk whose CRC fits: nothing is guessed. The new file names its
+    source and the source's SHA-256 in its metadata; the source is left alone.
+
+    RecordingError if nothing can be had, or the new file cannot be written.
+    """
+    data = scan.mapped(path)
+    try:
+        contents = _contents(data)
+        problems = [str(damage) for damage in contents.damage]
+        channels, rate_hz, sample_id = _samples_of(contents)
+    except RecordingError as error:
+        raise RecordingError(f"{path}: nothing can be recovered: {error}") from error
+    good: list[Chunk] = []
+    for chunk in contents.chunks:
+        try:
+            scan.unpack(data, chunk.head)
+            good.append(chunk)
+        except RecordingError as error:
+            problems.append(str(error))
+    notes = next(iter(_maps(contents, layout.NOTES)), {})
+    notes["recovered_from"] = path.name
+    notes["recovered_from_sha256"] = hashlib.sha256(data).hexdigest()
+    if problems:
+        notes["recovered_problems"] = "; ".join(problems[:20])
+    if not good:
+        raise RecordingError(f"{path}: nothing can be recovered: no whole chunk is in it")
+    target = output or default_output(path)
+    with RunWriter(
+        target,
+        channels,
+        rate_hz,
+        rig_toml=_text(data, contents, layout.RIG_FILE),
+        experiment_toml=_text(data, contents, layout.EXPERIMENT_FILE),
+        metadata=notes,
+    ) as writer:
+        samples = 0
+        if sample_id is not None:
+            for chunk in good:
+                samples += _copy(data, chunk, sample_id, channels, rate_hz, writer, problems)
+        happened = _decoded(data, contents, good, layout.EVENTS, events.decode)
+        for event in happened:
+            writer.event(event.time, event.name, event.payload)
+        segments = []
+        for item in _maps(contents, layout.SEGMENT):
+            segments.append(layout.segment_from_map(item))
+            writer.segment(segments[-1])
+        results = _decoded(data, contents, good, layout.RESPONSES, response.decode)
+        for result in results:
+            writer.frequency_response(result)
+        writer.close(_stop(contents, samples))
+    return Recovered(
+        path=target,
+        samples=samples,
+        events=len(happened),
+        responses=len(results),
+        segments=len(segments),
+        problems=tuple(problems),
+    )
+
+
+def _contents(data: memoryview) -> Contents:
+    """The contents, with the summary's copies of schemas and channels where it is whole."""
+    try:
+        tail = read_tail(data)
+    except RecordingError:
+        return read_contents(data, len(data), strict=False)
+    contents = read_contents(data, tail.summary_start, strict=False)
+    schemas, channels = summary_channels(data, tail)
+    contents.schemas.update(schemas)
+    contents.channels.update(channels)
+    return contents
+
+
+def _samples_of(contents: Contents) -> tuple[tuple[Channel, ...], float, int | None]:
+    """Channels, rate and id of `/samples`; of a file of results only, none of them."""
+    if contents.channel_id(layout.SAMPLES) is None:
+        if contents.channel_id(layout.RESPONSES) is None:
+            raise RecordingError(f"neither {layout.SAMPLES} nor {layout.RESPONSES} is in it")
+        return (), 1.0, None
+    sample_id, sample_layout = sample_channel(contents)
+    return sample_layout.channels, sample_layout.rate_hz, sample_id
+
+
+def _copy(
+    data: memoryview,
+    chunk: Chunk,
+    sample_id: int,
+    channels: tuple[Channel, ...],
+    rate_hz: float,
+    writer: RunWriter,
+    problems: list[str],
+) -> int:
+    """Copy one chunk's samples; returns how many."""
+    columns = len(channels)
+    dtype = SampleLayout(channels, rate_hz).record
+    try:
+        records = sample_records(scan.unpack(data, chunk.head), sample_id, dtype)
+        if records is None:
+            return 0
+        writer.write(
+            SampleBlock(
+                channels=channels,
+                time=records["log_time"].astype(np.int64),
+                sequence=records["sequence"].astype(np.int64),
+                values=np.ascontiguousarray(records["values"]).view("<f8").reshape(-1, columns),
+                quality=np.ascontiguousarray(records["quality"]).view("u1").reshape(-1, columns),
+            )
+        )
+    except RecordingError as error:
+        problems.append(f"byte {chunk.head.span.start}: {error}")
+        return 0
+    return len(records)
+
+
+def _decoded(
+    data: memoryview,
+    contents: Contents,
+    chunks: list[Chunk],
+    topic: str,
+    decode: Callable[[bytes], Item],
+) -> list[Item]:
+    """The messages of a topic in the whole chunks."""
+    channel_id = contents.channel_id(topic)
+    found: list[Item] = []
+    for chunk in chunks:
+        if channel_id is None or (chunk.counts and channel_id not in chunk.counts):
+            continue
+        raw = scan.unpack(data, chunk.head)
+        found.extend(decode(payload) for _, payload in messages(raw, channel_id))
+    return found
+
+
+def _maps(contents: Contents, name: str) -> list[dict[str, str]]:
+    """The metadata records of this name whose checksum fits."""
+    found = []
+    for key, item in contents.metadata:
+        if key == name:
+            with contextlib.suppress(RecordingError):
+                found.append(layout.unsealed(item, name))
+    return found
+
+
+def _stop(contents: Contents, samples: int) -> StopRecord:
+    """The run's own stop record if it has one, with what is lost since in the reason."""
+    for item in _maps(contents, layout.STOP):
+        stop, written = layout.stop_from_map(item)
+        lost = written - samples
+        if lost:
+            return replace(stop, reason=f"{stop.reason} (recovered: {lost} samples lost)")
+        return stop
+    return StopRecord("unknown", "recovered: the recording was cut off before the run's end")
+
+
+def _text(data: memoryview, contents: Contents, name: str) -> str:
+    try:
+        return (attachment(data, contents, name) or b"").decode()
+    except (RecordingError, UnicodeDecodeError):
+        return ""

@@ -1,0 +1,184 @@
+"""A frequency response as one MCAP message: what it holds, and back.
+
+The arrays are float64[] fields under their own names, so that any reader of ROS 2 messages
+gets them; the words and the channels are strings (JSON where they have structure).
+"""
+
+from __future__ import annotations
+
+import json
+from typing import Any, cast
+
+import numpy as np
+
+from samii_rig.errors import RecordingError
+from samii_rig.record import cdr
+from samii_rig.record.layout import MAX_CHANNELS, channel_from_json, channel_to_json
+from samii_rig.types import Finding, Float, FrequencyResponse
+
+SCHEMA = "samii_rig/msg/FrequencyResponse"
+
+# ROS 2 wants lower case; arrays are flattened in the order of the axes in types.py.
+_FIELDS: tuple[tuple[cdr.Kind, str, str], ...] = (
+    ("string", "method", "which estimator"),
+    ("string", "why", "why it was chosen"),
+    ("string", "sources", "JSON: recordings it came from"),
+    ("string", "inputs", "JSON: channels"),
+    ("string", "outputs", "JSON: channels"),
+    ("string", "findings", "JSON: what was noticed"),
+    ("string", "level_unit", ""),
+    ("float64", "level", "amplitude of the reference"),
+    ("float64", "rate_hz", "samples/s"),
+    ("int64", "n_averages", ""),
+    ("float64[]", "frequency", "Hz, n_freq"),
+    ("float64[]", "h_real", "n_freq * n_out * n_in"),
+    ("float64[]", "h_imag", ""),
+    ("float64[]", "covariance_real", "n_freq * p * p, p = n_out * n_in"),
+    ("float64[]", "covariance_imag", ""),
+    ("float64[]", "dof", "n_freq"),
+    ("float64[]", "coherence", "n_freq * n_out"),
+    ("float64[]", "input_rms", "n_freq * n_in"),
+    ("float64[]", "even", "n_freq * n_out, NaN where unknown"),
+    ("float64[]", "odd", ""),
+)
+_KINDS = tuple(kind for kind, _, _ in _FIELDS)
+SCHEMA_TEXT = "".join(
+    f"{kind} {name}" + (f"  # {comment}\n" if comment else "\n") for kind, name, comment in _FIELDS
+)
+
+
+def encode(response: FrequencyResponse) -> bytes:
+    """The message; RecordingError if the arrays do not have the shapes that types.py says."""
+    n, n_out, n_in = response.H.shape
+    p = n_out * n_in
+    unknown = np.full((n, n_out), np.nan)
+    shapes: dict[str, tuple[Any, tuple[int, ...]]] = {
+        "frequency": (response.frequency, (n,)),
+        "H": (response.H, (n, n_out, n_in)),
+        "covariance": (response.covariance, (n, p, p)),
+        "dof": (response.dof, (n,)),
+        "coherence": (response.coherence, (n, n_out)),
+        "input_rms": (response.input_rms, (n, n_in)),
+        "even": (unknown if response.even is None else response.even, (n, n_out)),
+        "odd": (unknown if response.odd is None else response.odd, (n, n_out)),
+    }
+    for name, (array, shape) in shapes.items():
+        if np.shape(array) != shape:
+            raise RecordingError(f"{name} of a response is {np.shape(array)}; expected {shape}")
+    if (n_out, n_in) != (len(response.outputs), len(response.inputs)):
+        raise RecordingError(
+            f"a response of {n_out} x {n_in} names {len(response.outputs)} outputs and "
+            f"{len(response.inputs)} inputs"
+        )
+    values: list[cdr.Value] = [
+        response.method,
+        response.why,
+        json.dumps(response.sources),
+        json.dumps([channel_to_json(c) for c in response.inputs]),
+        json.dumps([channel_to_json(c) for c in response.outputs]),
+        json.dumps([_finding_to_json(f) for f in response.findings]),
+        response.level_unit,
+        float(response.level),
+        float(response.rate_hz),
+        int(response.n_averages),
+        response.frequency,
+        response.H.real,
+        response.H.imag,
+        response.covariance.real,
+        response.covariance.imag,
+        response.dof,
+        response.coherence,
+        response.input_rms,
+        shapes["even"][0],
+        shapes["odd"][0],
+    ]
+    return cdr.encode(_KINDS, values)
+
+
+def decode(data: bytes) -> FrequencyResponse:
+    """The response in a message; RecordingError if it is not one."""
+    values = dict(zip((name for _, name, _ in _FIELDS), cdr.decode(_KINDS, data), strict=True))
+    try:
+        inputs, outputs, findings, sources = (
+            json.loads(cast(str, values[key]))
+            for key in ("inputs", "outputs", "findings", "sources")
+        )
+        channels_in = tuple(channel_from_json(item) for item in inputs)
+        channels_out = tuple(channel_from_json(item) for item in outputs)
+        noticed = tuple(_finding_from_json(item) for item in findings)
+        named = tuple(str(item) for item in sources)
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise RecordingError("a frequency response's description cannot be read") from error
+    n, n_in, n_out = np.size(values["frequency"]), len(channels_in), len(channels_out)
+    if not (0 < n_in <= MAX_CHANNELS and 0 < n_out <= MAX_CHANNELS):
+        raise RecordingError("a frequency response names no inputs or no outputs")
+    p = n_in * n_out
+
+    def array(name: str, *shape: int) -> Float:
+        value = cast(Float, values[name])
+        if value.size != int(np.prod(shape, dtype=object)):
+            raise RecordingError(
+                f"{name} of a frequency response has {value.size} values; expected {shape}"
+            )
+        return value.reshape(shape)
+
+    even, odd = array("even", n, n_out), array("odd", n, n_out)
+    return FrequencyResponse(
+        frequency=array("frequency", n),
+        H=array("h_real", n, n_out, n_in) + 1j * array("h_imag", n, n_out, n_in),
+        covariance=array("covariance_real", n, p, p) + 1j * array("covariance_imag", n, p, p),
+        dof=array("dof", n),
+        coherence=array("coherence", n, n_out),
+        inputs=channels_in,
+        outputs=channels_out,
+        level=cast(float, values["level"]),
+        level_unit=cast(str, values["level_unit"]),
+        input_rms=array("input_rms", n, n_in),
+        rate_hz=cast(float, values["rate_hz"]),
+        n_averages=cast(int, values["n_averages"]),
+        method=cast(str, values["method"]),
+        why=cast(str, values["why"]),
+        even=None if np.isnan(even).all() else even,
+        odd=None if np.isnan(odd).all() else odd,
+        findings=noticed,
+        sources=named,
+    )
+
+
+def summary(response: FrequencyResponse) -> dict[str, str]:
+    """What a person wants to know of it, for the metadata record beside the message."""
+    return {
+        "method": response.method,
+        "why": response.why,
+        "inputs": ", ".join(c.name for c in response.inputs),
+        "outputs": ", ".join(c.name for c in response.outputs),
+        "level": f"{response.level:g} {response.level_unit}",
+        "lines": str(len(response.frequency)),
+        "low_hz": f"{response.frequency.min():g}",
+        "high_hz": f"{response.frequency.max():g}",
+        "averages": str(response.n_averages),
+        "sources": ", ".join(response.sources),
+    }
+
+
+def _finding_to_json(finding: Finding) -> dict[str, str]:
+    return {
+        "kind": finding.kind,
+        "severity": finding.severity,
+        "message": finding.message,
+        "channel": finding.channel,
+        "segment": finding.segment,
+    }
+
+
+def _finding_from_json(item: dict[str, Any]) -> Finding:
+    severity = item["severity"]
+    if severity not in ("note", "warning", "error"):
+        raise ValueError(severity)
+    return Finding(
+        kind=str(item["kind"]),
+        severity=cast(Any, severity),
+        message=str(item["message"]),
+        channel=str(item["channel"]),
+        segment=str(item["segment"]),
+    )

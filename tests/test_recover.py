@@ -1,0 +1,213 @@
+"""What was on the disk is given back: after a kill, a cut at any byte, or damage."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from record_kit import (
+    CHANNELS,
+    EXPERIMENT,
+    NOTES,
+    RATE,
+    RIG,
+    SEGMENT,
+    block,
+    blocks,
+    joined,
+    write_run,
+)
+
+from samii_rig.errors import RecordingError
+from samii_rig.record import scan
+from samii_rig.record.contents import read_contents
+from samii_rig.record.reader import read_events, read_frequency_responses, read_recording
+from samii_rig.record.recover import default_output, recover
+from samii_rig.record.verify import verify
+from samii_rig.record.writer import RunWriter
+from samii_rig.types import SampleBlock
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    path = tmp_path_factory.mktemp("whole") / "run.mcap"
+    write_run(path, blocks())
+    return path.read_bytes()
+
+
+def chunk_ends(path: Path) -> list[tuple[int, int]]:
+    """(offset of its end, samples) of every chunk of samples."""
+    data = scan.mapped(path)
+    found = read_contents(data, len(data), strict=False).chunks
+    return [(c.head.span.end, c.counts[1]) for c in found if 1 in c.counts]
+
+
+def assert_prefix(path: Path, rows: int) -> None:
+    """The recording holds exactly the first `rows` samples of `blocks()`."""
+    recording = read_recording(path)
+    found = (recording.time, recording.sequence, recording.values, recording.quality)
+    for got, want in zip(found, joined(blocks()), strict=True):
+        np.testing.assert_array_equal(got, want[:rows])
+
+
+def test_a_file_cut_at_any_byte_gives_back_what_is_there(tmp_path: Path, whole: bytes) -> None:
+    path, output = tmp_path / "run.mcap", tmp_path / "again.mcap"
+    path.write_bytes(whole)
+    ends = chunk_ends(path)
+    steps = set(range(0, len(whole), 211))
+    for end, _ in ends:
+        steps |= set(range(end - 2, end + 3))
+    for length in sorted(steps):
+        path.write_bytes(whole[:length])
+        rows = sum(n for end, n in ends if end <= length)
+        verdict = verify(path)
+        assert verdict.status == ("lossy" if rows else "nothing"), length
+        assert verdict.samples == rows
+        if rows:
+            recovered = recover(path, output)
+            assert recovered.samples == rows
+            assert_prefix(output, rows)
+            assert verify(output).status == "whole"
+            output.unlink()
+        elif length < ends[0][0] // 2:  # before the first event
+            with pytest.raises(RecordingError):
+                recover(path, output)
+            assert not list(tmp_path.glob("again*"))
+
+
+def test_all_but_the_samples_comes_back_too(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "run.mcap.partial"
+    path.write_bytes(whole[: len(whole) - 20])  # all but the end of the footer
+    recovered = recover(path)
+    assert recovered.path == tmp_path / "run.recovered.mcap"
+    assert (recovered.events, recovered.responses, recovered.segments) == (1, 2, 1)
+    recording = read_recording(recovered.path)
+    assert recording.channels == CHANNELS
+    assert recording.segments == (SEGMENT,)
+    assert (recording.rig_toml, recording.experiment_toml) == (RIG, EXPERIMENT)
+    assert recording.metadata.items() >= NOTES.items()
+    assert recording.metadata["recovered_from"] == "run.mcap.partial"
+    assert recording.stop.status == "completed"
+    assert [e.name for e in read_events(recovered.path)] == ["armed"]
+    assert len(read_frequency_responses(recovered.path)) == 2
+
+
+def test_a_run_cut_off_says_so_in_its_stop_record(tmp_path: Path) -> None:
+    writer = RunWriter(tmp_path / "run.mcap", CHANNELS, RATE)
+    writer.write(block(0, 9))
+    writer.abort()
+    recording = read_recording(recover(writer.partial_path).path)
+    assert recording.stop.status == "unknown"
+    assert "cut off" in recording.stop.reason
+
+
+def test_damage_in_the_middle_costs_no_more_than_its_chunk(tmp_path: Path, whole: bytes) -> None:
+    path, output = tmp_path / "run.mcap", tmp_path / "again.mcap"
+    path.write_bytes(whole)
+    ends = chunk_ends(path)
+    sequences = [set(part.sequence.tolist()) for part in blocks()]
+    truth = {s: v for part in blocks() for s, v in zip(part.sequence, part.values, strict=True)}
+    rng = np.random.default_rng(2)
+    for at in rng.integers(8, ends[-1][0], 60):
+        damaged = bytearray(whole)
+        damaged[at] ^= 1 << int(rng.integers(8))
+        path.write_bytes(damaged)
+        recovered = recover(path, output)
+        recording = read_recording(output)
+        got = set(recording.sequence.tolist())
+        assert sum(not chunk <= got for chunk in sequences) <= 1, at
+        for sequence, row in zip(recording.sequence, recording.values, strict=True):
+            np.testing.assert_array_equal(row, truth[sequence])
+        assert recovered.samples == len(recording)
+        output.unlink()
+
+
+def test_recover_overwrites_nothing(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(whole)
+    recover(path)
+    with pytest.raises(RecordingError, match="exists already"):
+        recover(path)
+    assert path.read_bytes() == whole
+    assert default_output(tmp_path / "a.mcap.partial") == tmp_path / "a.recovered.mcap"
+
+
+CHILD = """
+import sys, time
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from record_kit import CHANNELS, RATE, block
+from samii_rig.record.writer import RunWriter
+writer = RunWriter(Path({path!r}), CHANNELS, RATE)
+start = 0
+while True:
+    for rows in (1, 700, 13, 20_000, 250):
+        writer.write(block(start, rows))
+        start += rows
+        time.sleep({pause})
+        report = writer.flush() if {flush} else start
+        print(report, time.monotonic(), flush=True)
+"""
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.003, 0.02, 0.05, 0.13, 0.31])
+def test_a_killed_run_gives_back_all_that_was_flushed(tmp_path: Path, delay: float) -> None:
+    samples, _ = _killed(tmp_path, flush=True, pause=0.0, delay=delay)
+    partial = tmp_path / "run.mcap.partial"
+    assert verify(partial).exit_code == 3
+    recovered = recover(partial)
+    assert recovered.samples >= samples
+    assert_continuous(recovered.path)
+    assert verify(recovered.path).status == "whole"
+
+
+def test_a_killed_run_loses_no_more_than_a_second(tmp_path: Path) -> None:
+    """Nobody flushed: what was written more than a second before the kill is there."""
+    samples, _ = _killed(tmp_path, flush=False, pause=0.01, delay=1.6)
+    recovered = recover(tmp_path / "run.mcap.partial")
+    assert 0 < samples <= recovered.samples
+    assert_continuous(recovered.path)
+
+
+def _killed(folder: Path, *, flush: bool, pause: float, delay: float) -> tuple[int, float]:
+    """Run the child, kill it `delay` s after its first report.
+
+    Returns what it had reported: at all if it flushes, else a second before the kill.
+    """
+    tests = str(Path(__file__).parent)
+    code = CHILD.format(tests=tests, path=str(folder / "run.mcap"), flush=flush, pause=pause)
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
+        assert child.stdout is not None
+        reports = [child.stdout.readline()]
+        time.sleep(delay)
+        killed = time.monotonic()
+        child.send_signal(signal.SIGKILL)
+        reports += child.stdout.readlines()
+    before = killed if flush else killed - 1.0
+    counted = [0]
+    for line in reports:
+        count, _, moment = line.strip().partition(" ")
+        if line.endswith("\n") and float(moment) <= before:
+            counted.append(int(count))
+    return counted[-1], killed
+
+
+def assert_continuous(path: Path) -> None:
+    """Every sample from the first on, with the value that it was given."""
+    recording = read_recording(path)
+    np.testing.assert_array_equal(recording.sequence, np.arange(len(recording)))
+    start = 0
+    sizes = (1, 700, 13, 20_000, 250)
+    for i in range(len(recording)):
+        rows = sizes[i % len(sizes)]
+        part: SampleBlock = block(start, rows)
+        rest = recording.values[start : start + rows]
+        np.testing.assert_array_equal(rest, part.values[: len(rest)])
+        start += rows
+        if start >= len(recording):
+            break
