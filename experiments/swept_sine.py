@@ -1,0 +1,188 @@
+"""Swept sine: bursts at several levels, repeated, each starting and ending at rest."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from samii_rig.errors import InputError
+from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Rig, Strict
+from samii_rig.run.limits import find_actuator
+from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.signal.excitation import Interpolation, Sweep, swept_sine
+
+# Above this part of the rate a sampled sine looks like another one for the hold and the
+# sensors' filters, and the anti-alias filters cut.
+HIGHEST = 0.45
+# Longer plans are better run one after another: the prediction holds the spectrum of the
+# whole plan in memory. 2.8 hours at 500 samples/s.
+MOST_SAMPLES = 5_000_000
+
+
+class SweptSine(Strict):
+    """A swept sine experiment file.
+
+    drive : `output` adds the sweep to the output, u in v = u + kp (theta_ref - theta), with
+        theta_ref = 0; `reference` sweeps theta_ref with u = 0, as the recordings of the SFLR
+        robot were made.
+    unit : of the levels; the actuator's for `output`, the centring sensor's for `reference`.
+    start_hz, stop_hz, duration : of the sweep, s; `ramp` at both of its ends is inside.
+    amplitudes : peak of the reference at each level, in `unit`.
+    schedule : points [Hz, factor], factor at most 1, by which the level is lowered over
+        frequency; in between as `interpolation` says.
+    kp : of the centring loop; absent for the rig's own.
+    order : `by_level` repeats a level before the next, `by_repeat` runs through all levels
+        in each repeat, `random` shuffles all with `seed`.
+    lead_in, ring_down : s of silence before and after each sweep.
+    """
+
+    experiment: Literal["swept_sine"]
+    name: Name
+    description: str = ""
+    actuator: Name
+    unit: str
+    drive: Literal["output", "reference"] = "output"
+    sweep: Sweep
+    start_hz: Positive
+    stop_hz: Positive
+    duration: Positive
+    amplitudes: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
+    repeats: Annotated[int, Field(ge=1, le=1000)] = 1
+    ramp: NonNegative = 0.0
+    lead_in: NonNegative = 0.0
+    ring_down: NonNegative = 0.0
+    schedule: tuple[tuple[Positive, Annotated[float, Field(ge=0, le=1)]], ...] = ()
+    interpolation: Interpolation = "logarithmic"
+    kp: Finite | None = None
+    order: Literal["by_level", "by_repeat", "random"] = "by_level"
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @field_validator("amplitudes")
+    @classmethod
+    def _distinct(cls, amplitudes: tuple[float, ...]) -> tuple[float, ...]:
+        if len(set(amplitudes)) != len(amplitudes):
+            raise ValueError("each level once (repeat it with `repeats`)")
+        return amplitudes
+
+    @field_validator("kp")
+    @classmethod
+    def _kp(cls, kp: float | None) -> float | None:
+        if kp is not None and kp < 0:
+            raise ValueError("0 or more; a negative kp drives the joint off centre")
+        return kp
+
+    @model_validator(mode="after")
+    def _shape(self) -> Self:
+        if 2.0 * self.ramp > self.duration:
+            raise ValueError(
+                f"two ramps of {self.ramp:g} s do not fit into a sweep of {self.duration:g} s"
+            )
+        hz = [point[0] for point in self.schedule]
+        if sorted(set(hz)) != hz:
+            raise ValueError("schedule: frequencies must increase")
+        if self.interpolation == "logarithmic" and any(f == 0 for _, f in self.schedule):
+            raise ValueError('schedule: a factor of 0 needs interpolation = "linear"')
+        return self
+
+    def plan(self, rig: Rig) -> Plan:
+        """Every segment's reference at the rig's rate.
+
+        InputError if the rig has no such actuator, another unit or no centring sensor, if
+        the sweep is shorter than two samples or reaches above 0.45 of the rate.
+        """
+        where = f"experiment {self.name}"
+        actuator = find_actuator(rig, self.actuator, where)
+        centring = rig.centring
+        unit, what = actuator.unit, f"actuator {actuator.name}"
+        if self.drive == "reference":
+            if centring is None:
+                raise InputError(
+                    where, "drive", "reference", f"a rig that centres; {rig.name} has no [centring]"
+                )
+            unit, what = rig.units()[centring.sensor], f"sensor {centring.sensor}"
+        if self.unit != unit:
+            raise InputError(where, "unit", self.unit, f"{unit!r}, the unit of {what}")
+        kp = self.kp if self.kp is not None else (centring.kp if centring else 0.0)
+        if kp > 0 and centring is None:
+            raise InputError(where, "kp", kp, f"0; {rig.name} has no [centring]")
+        if kp == 0 and self.drive == "reference":
+            raise InputError(where, "kp", kp, "above 0: the reference acts through kp alone")
+        if self.duration * rig.rate_hz < 2:
+            raise InputError(
+                where, "duration", self.duration, f"at least two samples, {2 / rig.rate_hz:g} s"
+            )
+        for field in ("start_hz", "stop_hz"):
+            if getattr(self, field) > HIGHEST * rig.rate_hz:
+                raise InputError(
+                    where,
+                    field,
+                    getattr(self, field),
+                    f"at most {HIGHEST * rig.rate_hz:g} Hz, {HIGHEST:g} of the rate",
+                )
+        samples = (self.lead_in + self.duration + self.ring_down) * rig.rate_hz
+        if samples * len(self.amplitudes) * self.repeats > MOST_SAMPLES:
+            raise InputError(
+                where,
+                "duration",
+                self.duration,
+                f"a plan of at most {MOST_SAMPLES / rig.rate_hz / 3600:.0f} hours",
+            )
+        # Without centring kp is 0 and the device reads this sensor to no effect.
+        return self._plan(rig, kp, centring.sensor if centring else rig.sensor[0].name)
+
+    def _plan(self, rig: Rig, kp: float, sensor: str) -> Plan:
+        shape, frequency = swept_sine(
+            rig.rate_hz,
+            self.start_hz,
+            self.stop_hz,
+            self.duration,
+            sweep=self.sweep,
+            ramp=self.ramp,
+            lead_in=self.lead_in,
+            ring_down=self.ring_down,
+            schedule=self.schedule,
+            interpolation=self.interpolation,
+        )
+        band = (min(self.start_hz, self.stop_hz), max(self.start_hz, self.stop_hz))
+        rest = np.zeros_like(shape)
+        levels = {level: level * shape for level in self.amplitudes}
+        segments = []
+        for level, repeat in self._order():
+            wave = levels[level]
+            u, theta_ref = (wave, rest) if self.drive == "output" else (rest, wave)
+            segments.append(
+                PlannedSegment(
+                    name=f"{self.name}_{level:g}_{repeat + 1}",
+                    kind="burst",
+                    level=level,
+                    unit=self.unit,
+                    repeat=repeat,
+                    u=u,
+                    theta_ref=theta_ref,
+                    band_hz=band,
+                    frequency=frequency,
+                )
+            )
+        return Plan(
+            experiment=self.name,
+            rate_hz=rig.rate_hz,
+            actuator=self.actuator,
+            kp=kp,
+            centring_sensor=sensor,
+            segments=tuple(segments),
+            seed=self.seed,
+        )
+
+    def _order(self) -> list[tuple[float, int]]:
+        """(level, repeat) of each segment. Repeats of a level stay in order, so that a
+        repeat's number says when it was done."""
+        by_level = [(a, r) for a in self.amplitudes for r in range(self.repeats)]
+        if self.order == "by_level":
+            return by_level
+        if self.order == "by_repeat":
+            return [(a, r) for r in range(self.repeats) for a in self.amplitudes]
+        levels = [a for a, _ in by_level]
+        shuffled = np.random.default_rng(self.seed).permutation(levels).tolist()
+        return [(a, shuffled[:i].count(a)) for i, a in enumerate(shuffled)]

@@ -1,0 +1,74 @@
+"""How well a plan will measure: the expected error of its frequency responses, by band."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from samii_rig.rig.schema import Rig
+from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.types import Float
+
+
+@dataclass(frozen=True, slots=True)
+class BandError:
+    """Predicted standard deviation of sensor/command in one band at one level.
+
+    std : sqrt(E|dH|^2) in sensor unit per actuator unit, median over the lines of the band,
+        each 1/duration of a segment wide, all repeats averaged. Averaging n neighbouring
+        lines divides it by sqrt(n). relative : std/|H|, median.
+    """
+
+    channel: str
+    level: float
+    level_unit: str
+    low_hz: float
+    high_hz: float
+    std: float
+    relative: float
+
+
+def expected_errors(
+    plan: Plan, rig: Rig, v: Float, parts: list[slice], hz: Float, size: Float
+) -> list[BandError]:
+    """Noise over command: dY = N - H dV vanishes but for the sensor's own noise, because the
+    command is read back; a sensor's noise is spread evenly over the n lines of a segment."""
+    out: list[BandError] = []
+    levels: dict[tuple[float, str], list[tuple[PlannedSegment, slice]]] = {}
+    for s, part in zip(plan.segments, parts, strict=True):
+        levels.setdefault((s.level, s.unit), []).append((s, part))
+    for (level, unit), members in levels.items():
+        s, part = members[0]
+        n = part.stop - part.start
+        V = np.abs(np.fft.rfft(v[part]))
+        f = np.fft.rfftfreq(n, 1 / plan.rate_hz)
+        for low, high in _octaves(*s.band_hz):
+            inside = (f >= low) & (f < high)
+            if not inside.any():
+                continue
+            for i, sensor in enumerate(rig.sensor):
+                sigma = math.hypot(sensor.noise_rms, sensor.resolution / math.sqrt(12))
+                std = sigma * math.sqrt(n / len(members)) / V[inside]
+                H = np.interp(f[inside], hz, size[:, i])
+                out.append(
+                    BandError(
+                        sensor.name,
+                        level,
+                        unit,
+                        low,
+                        high,
+                        float(np.median(std)),
+                        float(np.median(std / H)),
+                    )
+                )
+    return out
+
+
+def _octaves(low: float, high: float) -> list[tuple[float, float]]:
+    """The band in equal parts on a logarithmic axis, each as near to an octave as fits."""
+    n = max(1, round(math.log2(high / low))) if high > low else 1
+    edges = low * (high / low) ** (np.arange(n + 1) / n)
+    return [(float(a), float(b)) for a, b in pairwise(edges)]

@@ -1,0 +1,270 @@
+"""The judgement of the safety gate: a pure function of everything that the gate knows.
+
+`latest.observe` keeps what the samples say, `decide` says what may happen. Neither holds a
+device, so the whole input space can be tested, and mutants of them killed.
+
+    SAFE --arm--> ARMED --start--> RUNNING --stop--> SAFE
+    ARMED or RUNNING --anything wrong--> FAULT --clear(person, reason)--> SAFE
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from samii_rig.run.latest import Latest
+from samii_rig.run.limits import ChannelLimit, GateLimits
+from samii_rig.run.protocols import CommandBlock
+
+
+class State(Enum):
+    """Where the gate stands. Only RUNNING lets a command through."""
+
+    SAFE = "safe"
+    ARMED = "armed"
+    RUNNING = "running"
+    FAULT = "fault"
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """Ask for ARMED. deadman : as the actuator declares it, s, or None."""
+
+    deadman: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Ask for RUNNING."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """Ask whether all is well."""
+
+
+@dataclass(frozen=True, slots=True)
+class Write:
+    """Ask to send a reference."""
+
+    block: CommandBlock
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """End at zero. Always granted; a FAULT stays one."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Fail:
+    """Something broke: end at zero and in FAULT. Always granted."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Clear:
+    """A person takes a FAULT back and says why that is safe."""
+
+    person: str
+    reason: str
+
+
+Request = Arm | Start | Check | Write | Stop | Fail | Clear
+
+
+class Act(Enum):
+    """What the holder does with the actuator."""
+
+    NOTHING = "nothing"
+    CONFIGURE = "configure"
+    WRITE = "write"
+    ZERO = "zero"
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """What was decided: the state that follows and what to do with the actuator.
+
+    what : a word for it. number, limit : what was compared, in `unit`; NaN where nothing was.
+    """
+
+    state: State
+    act: Act
+    accepted: bool
+    what: str
+    reason: str = ""
+    number: float = math.nan
+    limit: float = math.nan
+    unit: str = ""
+
+
+def decide(
+    state: State, request: Request, latest: Latest, limits: GateLimits, now: int
+) -> Decision:
+    """What may happen. A pure function of everything that the gate knows.
+
+    A request that comes in the wrong state is a defect of whoever sent it and ends in
+    FAULT; arming that is refused for a cause that can be mended stays SAFE.
+    """
+    match request:
+        case Stop(reason):
+            after = State.FAULT if state is State.FAULT else State.SAFE
+            return Decision(after, Act.ZERO, True, "stop", reason)
+        case Fail(reason):
+            return Decision(State.FAULT, Act.ZERO, True, "failure", reason)
+        case Clear(person, reason):
+            if state is not State.FAULT:
+                return _wrong_state(state, "clear", State.FAULT)
+            if not (person.strip() and reason.strip()):
+                return Decision(
+                    state, Act.ZERO, False, "clear", "a fault is cleared by a name and a reason"
+                )
+            return Decision(State.SAFE, Act.ZERO, True, "clear", f"{person}: {reason}")
+        case Arm(deadman):
+            if state is not State.SAFE:
+                return _wrong_state(state, "arm", State.SAFE)
+            if deadman is None:
+                return Decision(
+                    state,
+                    Act.ZERO,
+                    False,
+                    "deadman",
+                    f"{limits.output.channel} declares no deadman, so nothing would end its "
+                    "output if this program died",
+                )
+            wrong = violation(latest, limits, now)
+            if wrong is not None:
+                return replace(wrong, state=state)
+            return Decision(State.ARMED, Act.CONFIGURE, True, "arm")
+        case Start():
+            if state is not State.ARMED:
+                return _wrong_state(state, "start", State.ARMED)
+            return violation(latest, limits, now) or Decision(
+                State.RUNNING, Act.NOTHING, True, "start"
+            )
+        case Check():
+            if state in (State.SAFE, State.FAULT):
+                return Decision(state, Act.NOTHING, True, "check")
+            return violation(latest, limits, now) or Decision(state, Act.NOTHING, True, "check")
+    # What is left is a Write.
+    if state is not State.RUNNING:
+        return _wrong_state(state, "write", State.RUNNING)
+    return (
+        violation(latest, limits, now)
+        or command_violation(request.block, latest, limits)
+        or Decision(state, Act.WRITE, True, "write")
+    )
+
+
+def violation(latest: Latest, limits: GateLimits, now: int) -> Decision | None:
+    """The first thing that the samples or the client's silence say is wrong, as a FAULT."""
+    if latest.disorder:
+        return _fault("order", "samples came out of order; the device's clock or count jumped back")
+    for i, c in enumerate(limits.channels):
+        peak, rate = latest.peak[i], latest.rate[i]
+        if math.isnan(peak):
+            return _fault("not a number", f"{c.channel} gave a value that is not a number")
+        if peak > c.max + c.slack:
+            return _over(c, peak, c.max, "limit", c.unit)
+        if rate > c.max_rate + c.slack * limits.rate_hz:
+            return _over(c, rate, c.max_rate, "rate", f"{c.unit}/s")
+        if latest.clipped[i]:
+            return _fault("clipped", f"{c.channel} is at the end of its range and sees no further")
+        age = latest.age(i, now)
+        if age > c.stale_after:
+            return _fault(
+                "stale",
+                f"{c.channel} said nothing new for {age:.3g} s; allowed {c.stale_after:g} s",
+                age,
+                c.stale_after,
+                "s",
+            )
+    if latest.limited:
+        return _fault("device", f"the device itself changed {limits.output.channel}")
+    silence = (now - latest.heartbeat) * 1e-9
+    if silence > limits.heartbeat_age:
+        return _fault(
+            "heartbeat",
+            f"no sign of the operator's client; allowed {limits.heartbeat_age:g} s",
+            silence,
+            limits.heartbeat_age,
+            "s",
+        )
+    return None
+
+
+def command_violation(block: CommandBlock, latest: Latest, limits: GateLimits) -> Decision | None:
+    """What is wrong with a reference before it reaches the wire, as a FAULT.
+
+    The device adds kp (theta_ref - theta), so the output is bounded by
+    |u| + kp (|theta_ref| + |theta|) with the largest |theta| of the newest block, and its
+    slew likewise, over the border to the last block too.
+    """
+    n = len(block)
+    if n == 0 or block.u.shape != (n,) or block.theta_ref.shape != (n,):
+        return _fault("shape", "u and theta_ref must be one value a sample, at least one")
+    if not (np.isfinite(block.u).all() and np.isfinite(block.theta_ref).all()):
+        return _fault("not a number", "the reference holds a value that is not a number")
+    if latest.next >= 0 and block.first != latest.next:
+        return _fault(
+            "order",
+            f"the reference continues at sample {block.first}; expected {latest.next}",
+            block.first,
+            latest.next,
+        )
+    if block.first <= latest.sequence:
+        return _fault(
+            "late",
+            f"the reference for sample {block.first} came after sample {latest.sequence}",
+            block.first,
+            latest.sequence,
+        )
+    ahead = (block.first + n - 1 - latest.sequence) / limits.rate_hz
+    if ahead > limits.max_ahead:
+        return _fault(
+            "ahead",
+            f"the reference reaches {ahead:.3g} s ahead; allowed {limits.max_ahead:g} s",
+            ahead,
+            limits.max_ahead,
+            "s",
+        )
+    kp, output = abs(limits.kp), limits.output
+    angle = angle_rate = 0.0
+    for i, c in enumerate(limits.channels):
+        if c.channel == limits.centring_sensor:
+            angle, angle_rate = latest.peak[i], latest.rate[i]
+    bound = float((np.abs(block.u) + kp * np.abs(block.theta_ref)).max()) + kp * angle
+    if bound > output.max:
+        return _over(output, bound, output.max, "limit", output.unit)
+    step = abs(float(block.u[0]) - latest.u) + kp * abs(
+        float(block.theta_ref[0]) - latest.theta_ref
+    )
+    if n > 1:
+        u, theta_ref = block.u, block.theta_ref
+        steps = np.abs(u[1:] - u[:-1]) + kp * np.abs(theta_ref[1:] - theta_ref[:-1])
+        step = max(step, float(steps.max()))
+    slew = step * limits.rate_hz + kp * angle_rate
+    if slew > output.max_rate:
+        return _over(output, slew, output.max_rate, "rate", f"{output.unit}/s")
+    return None
+
+
+def _fault(
+    what: str, reason: str, number: float = math.nan, limit: float = math.nan, unit: str = ""
+) -> Decision:
+    return Decision(State.FAULT, Act.ZERO, False, what, reason, number, limit, unit)
+
+
+def _over(c: ChannelLimit, number: float, limit: float, what: str, unit: str) -> Decision:
+    text = f"{c.channel} at {number:.4g} {unit} is over its {what} of {limit:g} {unit} ({c.reason})"
+    return _fault(what, text, number, limit, unit)
+
+
+def _wrong_state(state: State, what: str, needed: State) -> Decision:
+    return _fault("state", f"{what} in state {state.value}; possible only in {needed.value}")

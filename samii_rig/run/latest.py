@@ -1,0 +1,140 @@
+"""What the gate knows of the samples: a small summary, carried on block by block."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from samii_rig.types import Float, Int, Quality, SampleBlock
+
+# How much faster than the host's a device's clock may seem to fall behind before its
+# samples count as old, s/s: ten times the 100 ppm of a poor crystal.
+CLOCK_DRIFT = 1e-3
+# Flags as plain numbers: an enum in an array operation costs more than the operation.
+BLIND = np.uint8(Quality.MISSING | Quality.STALE)  # a value that says nothing new
+CLIPPED, LIMITED = np.uint8(Quality.CLIPPED), np.uint8(Quality.LIMITED)
+NEVER = -(2**62)  # a time before all others, ns
+
+
+@dataclass(frozen=True, slots=True)
+class Latest:
+    """What the samples and the client said last; times in ns. n: channels the gate needs.
+
+    good : (n,) device time of the newest value of each channel that was not blind.
+    peak, rate : (n,) largest |value| and |change|/s in the newest block; NaN for a value
+        that is not a number and not marked missing; the rate reaches back over the border.
+    last : (n,) newest good value.
+    clipped : (n,) a converter at its end. limited : the device itself changed the output.
+    disorder : samples came out of order, now or before.
+    sequence, time : of the newest sample. offset : smallest host minus device time, as of
+        `offset_at`, host time.
+    first, next : first sample that was commanded, the one that comes next; -1 for none.
+    u, theta_ref : reference at the last sample commanded.
+    """
+
+    good: tuple[int, ...]
+    peak: tuple[float, ...]
+    rate: tuple[float, ...]
+    last: tuple[float, ...]
+    clipped: tuple[bool, ...]
+    limited: bool = False
+    disorder: bool = False
+    sequence: int = -1
+    time: int = NEVER
+    offset: int = -NEVER
+    offset_at: int = 0
+    heartbeat: int = NEVER
+    first: int = -1
+    next: int = -1
+    u: float = 0.0
+    theta_ref: float = 0.0
+
+    @classmethod
+    def nothing(cls, n: int) -> Latest:
+        """Before the first sample."""
+        zero = (0.0,) * n
+        return cls((NEVER,) * n, zero, zero, (math.nan,) * n, (False,) * n)
+
+    def age(self, i: int, now: int) -> float:
+        """Seconds since channel i said something new; inf before it said anything.
+
+        The two clocks have different zeros, so what is measured is how much later than the
+        promptest sample so far: silence shows, and so does a queue that grows.
+        """
+        if self.good[i] == NEVER:
+            return math.inf
+        drift = CLOCK_DRIFT * (now - self.offset_at)
+        return max(0.0, (now - self.good[i] - self.offset - drift) * 1e-9)
+
+
+def observe(
+    latest: Latest, block: SampleBlock, columns: Int, rates: tuple[int, ...], now: int
+) -> Latest:
+    """What is known after a block of samples.
+
+    columns : (n,) column of each channel that the gate needs, the actuator's first.
+    rates : which of those n have a limit on their rate.
+    """
+    n = len(block)
+    if n == 0:
+        return latest
+    time, sequence = block.time, block.sequence
+    values = block.values[:, columns]
+    quality = block.quality[:, columns]
+    size = np.abs(values)
+    good, last = (int(time[-1]),) * len(columns), tuple(values[-1].tolist())
+    clipped, limited = (False,) * len(columns), False
+    seen: list[slice | Int] = [slice(None)] * len(columns)
+    if quality.any():
+        blind = (quality & BLIND) != 0
+        clipped = tuple(((quality & CLIPPED) != 0).any(axis=0).tolist())
+        commanded = sequence >= latest.first if latest.first >= 0 else np.zeros(n, dtype=bool)
+        limited = bool(((quality[:, 0] & LIMITED) != 0)[commanded].any())
+        # A blind value says nothing: the one before the block stands in its place.
+        size = np.where(blind, np.abs(np.nan_to_num(latest.last)), size)
+        seen = [np.flatnonzero(~b) for b in blind.T]
+        ends = [int(rows[-1]) if len(rows) else -1 for rows in seen if not isinstance(rows, slice)]
+        good = tuple(int(time[e]) if e >= 0 else g for e, g in zip(ends, latest.good, strict=True))
+        last = tuple(
+            float(values[e, i]) if e >= 0 else x
+            for i, (e, x) in enumerate(zip(ends, latest.last, strict=True))
+        )
+    # Not a number, or infinite, without being marked missing: NaN, which trips.
+    peak = tuple(x if x < math.inf else math.nan for x in size.max(axis=0).tolist())
+    rate = [0.0] * len(columns)
+    for i in rates:
+        rate[i] = _steepest(latest.last[i], latest.good[i], values[seen[i], i], time[seen[i]])
+    order = time[0] > latest.time and sequence[0] > latest.sequence
+    if n > 1:
+        order = order and (time[1:] > time[:-1]).all() and (sequence[1:] > sequence[:-1]).all()
+    drifted = latest.offset + round(CLOCK_DRIFT * (now - latest.offset_at))
+    return replace(
+        latest,
+        good=good,
+        peak=peak,
+        rate=tuple(rate),
+        last=last,
+        clipped=clipped,
+        limited=limited,
+        disorder=latest.disorder or not order,
+        sequence=int(sequence[-1]),
+        time=int(time[-1]),
+        offset=min(drifted, now - int(time[-1])),
+        offset_at=now,
+    )
+
+
+def _steepest(last: float, since: int, x: Float, t: Int) -> float:
+    """Largest |dx/dt| in 1/s over the values x at t (ns), from the one before them on."""
+    if len(x) == 0:
+        return 0.0
+    steepest = 0.0
+    if not math.isnan(last):
+        # max(1, ...): time that stands still is found by the check of the order.
+        steepest = abs(float(x[0]) - last) / (max(1, int(t[0]) - since) * 1e-9)
+    if len(x) > 1:
+        inside = np.abs(x[1:] - x[:-1]) / (np.maximum(t[1:] - t[:-1], 1) * 1e-9)
+        steepest = max(steepest, float(inside.max()))
+    return steepest

@@ -1,0 +1,347 @@
+"""The loop that carries out a plan: reference out ahead of time, samples in, zero at the end.
+
+The device's clock paces. Each tick reads what arrived, lets the gate judge it, sends the
+reference on so that it stays ahead, and hands the samples to the recorder. Whatever ends
+the run, the first thing done is the output at zero; the recording is closed after that.
+"""
+
+from __future__ import annotations
+
+import math
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Event
+from typing import Literal
+
+import numpy as np
+
+from samii_rig.errors import DeviceError, GateError, SamiiRigError
+from samii_rig.rig.schema import Rig
+from samii_rig.run.gate import Gate, GateEvent
+from samii_rig.run.interrupts import Interrupts
+from samii_rig.run.judgement import State
+from samii_rig.run.limits import gate_limits
+from samii_rig.run.pace import LoopSettings, choose_tick
+from samii_rig.run.protocols import CommandBlock, OpenRig, Plan
+from samii_rig.run.sink import Collector, QueuedSink, Sink
+from samii_rig.types import Quality, SampleBlock, Segment, StopRecord
+
+FIRST_SAMPLE = 1.0  # s to wait for the device's first sample
+GATHER = 0.25  # s of samples in one message to the recorder
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a run is, for a display.
+
+    segment : 1-based, of n_segments; name, level, unit, repeat are the segment's.
+    time_left : s on the device's clock. frequency : Hz now, NaN at rest.
+    channel, margin : the channel nearest to its limit since the last report, 1 - |value|/limit.
+    worst_channel, worst_margin : the same over the whole run.
+    """
+
+    segment: int
+    n_segments: int
+    name: str
+    level: float
+    unit: str
+    repeat: int
+    time_left: float
+    frequency: float
+    channel: str
+    margin: float
+    worst_channel: str
+    worst_margin: float
+    late_ticks: int
+    missing_samples: int
+
+
+def run(
+    plan: Plan,
+    rig: Rig,
+    device: OpenRig,
+    sink: Sink,
+    progress: Callable[[Progress], None] | None = None,
+    stop: Event | None = None,
+    *,
+    alive: Callable[[], bool] | None = None,
+    settings: LoopSettings | None = None,
+) -> StopRecord:
+    """Carry out `plan`; always returns, and always with the output at zero.
+
+    Parameters
+    ----------
+    sink : the recorder. On real time it works in a thread of its own; on simulated time
+        (`device.metadata["clock"] == "simulated"`) it is called directly.
+    stop : when set, the run ends in good order (status `stopped`), as it does on Ctrl-C.
+    alive : asked each tick whether the operator's client gave a sign of life since.
+
+    Returns
+    -------
+    StopRecord with status completed, stopped, tripped (by the gate) or failed (by anything
+    else; the traceback of a defect goes to the sink as an event).
+
+    Raises
+    ------
+    InputError if the settings do not fit the device, GateError if the device lacks a channel
+    that the limits need: both before anything moves.
+    """
+    job = _Run(plan, rig, device, sink, progress, alive, settings or LoopSettings())
+    with Interrupts() as interrupts:
+        status, reason = job.until_the_end(stop or Event(), interrupts)
+        interrupts.ending = True
+        return job.close(status, reason)
+
+
+Status = Literal["completed", "stopped", "tripped", "failed"]
+
+
+class _Run:
+    """One run; each method is one phase of it."""
+
+    def __init__(
+        self,
+        plan: Plan,
+        rig: Rig,
+        device: OpenRig,
+        sink: Sink,
+        progress: Callable[[Progress], None] | None,
+        alive: Callable[[], bool] | None,
+        settings: LoopSettings,
+    ) -> None:
+        self.plan, self.rig, self.device, self.settings = plan, rig, device, settings
+        self.progress, self.alive = progress, alive
+        self.clock, self.sensor = device.clock, device.sensor
+        simulated = device.metadata.get("clock") == "simulated"
+        self.tick = choose_tick(settings, device, plan.rate_hz, simulated)
+        self.ahead = math.ceil((settings.ahead + self.tick) * plan.rate_hz)
+        self.u = np.concatenate([s.u for s in plan.segments])
+        self.theta_ref = np.concatenate([s.theta_ref for s in plan.segments])
+        self.ends = np.cumsum([len(s.u) for s in plan.segments])
+        self.collector = Collector(
+            rig, plan, self.sensor.channels, max(1, round(GATHER * plan.rate_hz))
+        )
+        limits = gate_limits(
+            rig, plan.actuator, plan.kp, plan.centring_sensor, settings.heartbeat_age
+        )
+        self.gate = Gate(device.actuator, limits, self.sensor.channels, self._log)
+        # Last: it starts a thread.
+        self.queued = None if simulated else QueuedSink(sink)
+        self.sink: Sink = self.queued or sink
+        self.newest = -1  # newest sample that arrived
+        self.apart = 0  # ns, host's clock minus the device's
+        self.start = -1  # sample at which the plan begins
+        self.sent = 0  # samples of the plan that were sent, and of the rest after it
+        self.done = 0  # segments that are whole and reported
+        self.late = self.missing = 0
+        self.margin = self.worst = ("", math.inf)
+
+    def until_the_end(self, stop: Event, interrupts: Interrupts) -> tuple[Status, str]:
+        """Run; when this returns the output is at zero, whatever happened."""
+        status: Status = "failed"
+        reason = ""
+        try:
+            self._begin()
+            status, reason = self._stream(stop, interrupts)
+        except GateError as error:
+            # Refused before it was armed: nothing tripped, nothing moved.
+            status = "tripped" if self.gate.state is State.FAULT else "failed"
+            reason = str(error)
+            self._zero(reason)
+        except KeyboardInterrupt:
+            status, reason = "stopped", "KeyboardInterrupt (Ctrl-C)"
+            self._zero(reason)
+        except SamiiRigError as error:
+            reason = str(error)
+            self._zero(reason, failed=True)
+        except BaseException as error:
+            reason = f"{type(error).__name__}: {error}"
+            self._zero(reason, failed=True)
+            self._try(lambda: self._event("error", traceback=traceback.format_exc()))
+        else:
+            self._zero(reason)
+        return status, reason
+
+    def close(self, status: Status, reason: str) -> StopRecord:
+        """The output is at zero: take what still arrives, and finish the recording."""
+        late, missing = self.late, self.missing
+        troubles = [self._try(self._tail), self._try(self._flush)]
+        self._try(
+            lambda: self._event(
+                "stop", status=status, reason=reason, late_ticks=late, missing_samples=missing
+            )
+        )
+        if self.queued is not None:
+            troubles.append(self._try(self.queued.close))
+        for trouble in dict.fromkeys(t for t in troubles if t and t not in reason):
+            if status == "completed":
+                status = "failed"
+            reason = f"{reason}; then {trouble}"
+        return StopRecord(status, reason, late, missing)
+
+    def _begin(self) -> None:
+        """Wait for the first sample, arm, start."""
+        give_up = self.clock.now() + round(FIRST_SAMPLE * 1e9)
+        while self.newest < 0:
+            if self.clock.now() > give_up:
+                raise DeviceError(f"the device gave no sample in {FIRST_SAMPLE:g} s")
+            self.clock.sleep(self.tick)
+            self._read()
+        self.gate.arm(self.clock.now())
+        self._read()
+        self.gate.start(self.clock.now())
+        self.start = self.newest + 1 + self.ahead
+        self.collector.start_at(self.start)
+        self._event("plan", start=self.start, samples=len(self.u))
+
+    def _stream(self, stop: Event, interrupts: Interrupts) -> tuple[Status, str]:
+        total = len(self.u)
+        due = self.clock.now()
+        report = due
+        while self.newest < self.start + total - 1:
+            if interrupts.reason:
+                return "stopped", f"stopped by {interrupts.reason}"
+            if stop.is_set():
+                return "stopped", "stopped on request"
+            self._send()
+            self._report_segments()
+            due += round(self.tick * 1e9)
+            self.clock.sleep((due - self.clock.now()) * 1e-9)
+            if self.clock.now() - due > 0.5e9 * self.tick:
+                self.late += 1
+                due = self.clock.now()
+            self._read()
+            if self.collector.full:
+                self._flush()
+            if self.progress is not None and self.clock.now() >= report:
+                report = self.clock.now() + round(self.settings.report * 1e9)
+                self.progress(self._progress())
+                self.margin = ("", math.inf)
+        self.gate.stop("the plan is done", self.clock.now())
+        self._report_segments()
+        n = len(self.plan.segments)
+        return "completed", f"all {n} segments done"
+
+    def _read(self) -> None:
+        """Take what arrived; the gate sees it first."""
+        if self.alive is not None and self.alive():
+            self.gate.beat(self.clock.now())
+        block = self.sensor.read()
+        self.collector.add(block)
+        self.gate.observe(block, self.clock.now())
+        if len(block):
+            self.apart = self.clock.now() - int(block.time[-1])
+            self._count(block)
+            self.margin = _nearer(self.margin, self.gate.margin())
+            self.worst = _nearer(self.worst, self.margin)
+
+    def _count(self, block: SampleBlock) -> None:
+        """Notice samples that were lost or came without values."""
+        first, last = int(block.sequence[0]), int(block.sequence[-1])
+        before = first - 1 if self.newest < 0 else self.newest
+        lost = last - before - len(block)
+        self.newest = last
+        if lost > 0:
+            self._event("gap", after=before, lost=lost)
+        self.missing += lost
+        if block.quality.any():
+            self.missing += int(((block.quality & Quality.MISSING) != 0).any(axis=1).sum())
+
+    def _send(self) -> None:
+        """Send the reference up to `ahead` past the newest sample. After the plan's end go on
+        with rest, so that the deadman stays fed until the last sample has arrived."""
+        upto = self.newest + 1 - self.start + self.ahead
+        n = upto - self.sent
+        if n <= 0:
+            return
+        u, theta_ref = np.zeros(n), np.zeros(n)
+        part = slice(self.sent, min(upto, len(self.u)))
+        if part.start < part.stop:
+            u[: part.stop - part.start] = self.u[part]
+            theta_ref[: part.stop - part.start] = self.theta_ref[part]
+        self.gate.write(CommandBlock(self.start + self.sent, u, theta_ref), self.clock.now())
+        self.sent = upto
+
+    def _report_segments(self) -> None:
+        """Tell the sink of segments whose last sample has arrived, after their samples."""
+        while self.done < len(self.ends) and self.newest + 1 >= self.start + self.ends[self.done]:
+            self._flush()
+            s = self.plan.segments[self.done]
+            end = self.start + int(self.ends[self.done])
+            self.sink.segment(
+                Segment(s.name, s.kind, end - len(s.u), end, s.level, s.unit, s.repeat)
+            )
+            self.done += 1
+
+    def _progress(self) -> Progress:
+        at = min(max(self.newest - self.start, 0), len(self.u) - 1)
+        i = int(np.searchsorted(self.ends, at, side="right"))
+        s = self.plan.segments[i]
+        inside = at - (int(self.ends[i]) - len(s.u))
+        return Progress(
+            segment=i + 1,
+            n_segments=len(self.ends),
+            name=s.name,
+            level=s.level,
+            unit=s.unit,
+            repeat=s.repeat,
+            time_left=(self.start + len(self.u) - 1 - self.newest) / self.plan.rate_hz,
+            frequency=float(s.frequency[inside]),
+            channel=self.margin[0],
+            margin=self.margin[1],
+            worst_channel=self.worst[0],
+            worst_margin=self.worst[1],
+            late_ticks=self.late,
+            missing_samples=self.missing,
+        )
+
+    def _zero(self, reason: str, *, failed: bool = False) -> None:
+        """Output at zero. What goes wrong after that (its log) must not hide the cause."""
+        try:
+            (self.gate.fail if failed else self.gate.stop)(reason, self.clock.now())
+        except BaseException:
+            self.device.actuator.zero()
+
+    def _tail(self) -> None:
+        """The samples after the end, which show the output at zero."""
+        self.clock.sleep(self.tick)
+        self.collector.add(self.sensor.read())
+
+    def _flush(self) -> None:
+        block = self.collector.take()
+        if block is not None:
+            self.sink.write(block)
+
+    def _log(self, event: GateEvent) -> None:
+        d = event.decision
+        numbers = {"number": d.number, "limit": d.limit}
+        self.sink.event(
+            event.time - self.apart,
+            "gate",
+            {
+                "request": event.request,
+                "state": d.state.value,
+                "accepted": int(d.accepted),
+                "what": d.what,
+                "reason": d.reason,
+                **{k: v for k, v in numbers.items() if math.isfinite(v)},
+                **({"unit": d.unit} if d.unit else {}),
+            },
+        )
+
+    def _event(self, kind: str, **fields: str | int | float) -> None:
+        self.sink.event(self.clock.now() - self.apart, kind, fields)
+
+    def _try(self, step: Callable[[], None]) -> str:
+        """Do a step of the ending; what goes wrong as a line, "" if nothing."""
+        try:
+            step()
+        except Exception as error:
+            known = isinstance(error, SamiiRigError)
+            return str(error) if known else f"{type(error).__name__}: {error}"
+        return ""
+
+
+def _nearer(a: tuple[str, float], b: tuple[str, float]) -> tuple[str, float]:
+    return a if a[1] <= b[1] else b

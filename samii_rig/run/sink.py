@@ -1,0 +1,151 @@
+"""From the loop to the recorder: blocks are gathered, completed with the reference, and
+handed over without ever making the loop wait."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from samii_rig.errors import DeviceError
+from samii_rig.rig.schema import Rig
+from samii_rig.run.protocols import Plan
+from samii_rig.types import Channel, Quality, SampleBlock, Segment
+
+
+class Sink(Protocol):
+    """Where a run's samples and events go: a recorder."""
+
+    def write(self, block: SampleBlock, /) -> None:
+        """Keep these samples."""
+
+    def event(self, time: int, name: str, payload: dict[str, Any], /) -> None:
+        """Keep what happened at `time` (ns, device's clock): a gate decision, a gap, an error."""
+
+    def segment(self, segment: Segment, /) -> None:
+        """A part of the plan was done, whole; its samples were written before."""
+
+
+class QueuedSink:
+    """Lets a slow sink work in a thread of its own, so that a slow disk never moves the output.
+
+    What the thread raises comes out of the next call here. A queue that is full raises
+    DeviceError: a run that cannot be recorded ends.
+    """
+
+    def __init__(self, sink: Sink, depth: int = 256) -> None:
+        self._sink = sink
+        self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(depth)
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
+        self._thread.start()
+
+    def write(self, block: SampleBlock) -> None:
+        """Queue samples."""
+        self._put(lambda: self._sink.write(block))
+
+    def event(self, time: int, name: str, payload: dict[str, Any]) -> None:
+        """Queue an event."""
+        self._put(lambda: self._sink.event(time, name, payload))
+
+    def segment(self, segment: Segment) -> None:
+        """Queue a finished segment."""
+        self._put(lambda: self._sink.segment(segment))
+
+    def close(self) -> None:
+        """Return when all is written; raises what went wrong."""
+        self._queue.put(None)
+        self._thread.join()
+        self._raise()
+
+    def _put(self, job: Callable[[], None]) -> None:
+        self._raise()
+        try:
+            self._queue.put_nowait(job)
+        except queue.Full:
+            raise DeviceError(
+                f"the recorder fell {self._queue.maxsize} blocks behind; expected a faster disk"
+            ) from None
+
+    def _raise(self) -> None:
+        if self._error is not None:
+            error, self._error = self._error, None
+            raise error
+
+    def _work(self) -> None:
+        failed = False
+        while (job := self._queue.get()) is not None:
+            if failed:
+                continue  # keeps emptying the queue so that close() returns
+            try:
+                job()
+            except BaseException as error:
+                self._error, failed = error, True
+
+
+def recorded_channels(rig: Rig, plan: Plan, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
+    """The columns of a run's recording: the device's own `channels`, and the reference.
+
+    A device that reports channels of role `reference` itself is believed; to another's
+    `u` and `theta_ref` are added, filled in from the plan by sample number.
+    """
+    if any(c.role == "reference" for c in channels):
+        return channels
+    units = rig.units()
+    angle = units.get(plan.centring_sensor, "1")
+    u = Channel("u", units[plan.actuator], "reference", description="excitation")
+    theta_ref = Channel("theta_ref", angle, "reference", description="centring set point")
+    return (*channels, u, theta_ref)
+
+
+class Collector:
+    """Gathers a device's blocks into larger ones with the columns of `recorded_channels`.
+
+    rows : samples after which `full` is true.
+    """
+
+    def __init__(self, rig: Rig, plan: Plan, channels: tuple[Channel, ...], rows: int) -> None:
+        self._rows, self._held, self._blocks = rows, 0, list[SampleBlock]()
+        self._u = np.concatenate([s.u for s in plan.segments])
+        self._theta_ref = np.concatenate([s.theta_ref for s in plan.segments])
+        self._start = -1
+        self.channels = recorded_channels(rig, plan, channels)
+        self._added = len(self.channels) > len(channels)
+
+    def start_at(self, sequence: int) -> None:
+        """The plan's first sample has this number."""
+        self._start = sequence
+
+    def add(self, block: SampleBlock) -> None:
+        """Hold a block."""
+        if len(block):
+            self._blocks.append(block)
+            self._held += len(block)
+
+    @property
+    def full(self) -> bool:
+        """Whether enough is held to be worth a message."""
+        return self._held >= self._rows
+
+    def take(self) -> SampleBlock | None:
+        """All that is held as one block, None if nothing is."""
+        if not self._blocks:
+            return None
+        blocks, self._blocks, self._held = self._blocks, [], 0
+        sequence = np.concatenate([b.sequence for b in blocks])
+        values = np.concatenate([b.values for b in blocks])
+        quality = np.concatenate([b.quality for b in blocks])
+        if self._added:
+            n = len(self._u)
+            at = sequence - self._start
+            inside = (at >= 0) & (at < n) & (self._start >= 0)
+            at = np.where(inside, at, 0)
+            columns = [np.where(inside, x[at], 0.0) for x in (self._u, self._theta_ref)]
+            values = np.column_stack([values, *columns])
+            known = np.full((len(sequence), 2), Quality.GOOD, dtype=np.uint8)
+            quality = np.concatenate([quality, known], axis=1)
+        time = np.concatenate([b.time for b in blocks])
+        return SampleBlock(self.channels, time, sequence, values, quality)

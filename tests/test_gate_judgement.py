@@ -1,0 +1,413 @@
+"""The gate's judgement as a pure function: which number trips it, and that nothing else does."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from fake_device import FakeDevice, fake_rig
+from hypothesis import given
+from hypothesis import strategies as st
+
+from samii_rig.run.judgement import (
+    Act,
+    Arm,
+    Check,
+    Clear,
+    Fail,
+    Start,
+    State,
+    Stop,
+    Write,
+    command_violation,
+    decide,
+    violation,
+)
+from samii_rig.run.latest import NEVER, Latest, observe
+from samii_rig.run.limits import gate_limits
+from samii_rig.run.protocols import CommandBlock
+from samii_rig.types import Quality, SampleBlock
+
+LIMITS = gate_limits(fake_rig(), "v", 4.0, "theta")
+COLUMNS, RATES = np.array([0, 1]), (0, 1)
+NOW = 10**9
+STATES = list(State)
+
+
+def block(values, *, first=0, quality=None, late=0):
+    values = np.atleast_2d(np.array(values, dtype=float))
+    n = len(values)
+    sequence = np.arange(first, first + n)
+    time = sequence * 2_000_000
+    flags = np.zeros((n, 2), dtype=np.uint8) if quality is None else np.array(quality, np.uint8)
+    return SampleBlock(FakeDevice.channels, time, sequence, values, flags)
+
+
+def seen(values, now=None, latest=None, **how):
+    b = block(values, **how)
+    now = int(b.time[-1]) if now is None else now
+    return observe(latest or Latest.nothing(2), b, COLUMNS, RATES, now)
+
+
+def command(u, theta_ref=None, first=100):
+    u = np.atleast_1d(np.array(u, dtype=float))
+    ref = np.zeros_like(u) if theta_ref is None else np.atleast_1d(np.array(theta_ref, dtype=float))
+    return CommandBlock(first, u, ref)
+
+
+FINE = seen([[0.0, 0.0], [0.0, 0.0]])
+
+
+def verdict(latest, now=None):
+    return violation(latest, LIMITS, latest.time if now is None else now)
+
+
+# What samples say
+
+
+def test_samples_at_rest_are_fine():
+    assert verdict(FINE) is None
+
+
+@pytest.mark.parametrize(
+    ("values", "what", "number"),
+    [
+        ([[0, 0], [0, 0.3501]], "limit", 0.3501),
+        ([[0, 0], [0, -0.3501]], "limit", 0.3501),
+        ([[5.01, 0], [5.01, 0]], "limit", 5.01),
+        ([[0, 0], [4.1, 0]], "rate", 2050.0),
+        ([[4.1, 0], [0, 0]], "rate", 2050.0),
+    ],
+)
+def test_a_number_over_its_limit_trips_and_is_named(values, what, number):
+    d = verdict(seen(values))
+    assert (d.state, d.act, d.accepted, d.what) == (State.FAULT, Act.ZERO, False, what)
+    assert d.number == pytest.approx(number)
+    assert f"{d.limit:g}" in d.reason
+
+
+@pytest.mark.parametrize("values", [[[0, 0.35]], [[5.0, 0]], [[1.0, 0], [5.0, 0]]])
+def test_a_number_at_its_limit_does_not_trip(values):
+    assert verdict(seen(values)) is None
+
+
+def test_a_converters_rounding_over_the_output_limit_is_forgiven_but_not_more():
+    limits = replace(LIMITS, output=replace(LIMITS.output, slack=0.01))
+    assert violation(seen([[5.009, 0]]), limits, 0) is None
+    assert violation(seen([[5.011, 0]]), limits, 0).what == "limit"
+    assert violation(seen([[1.0, 0], [5.009, 0]]), limits, 2_000_000) is None
+    assert violation(seen([[0.9, 0], [4.911, 0]]), limits, 2_000_000).what == "rate"
+
+
+def test_the_rate_is_taken_over_the_border_of_two_blocks():
+    before = seen([[0, 0]])
+    assert verdict(seen([[4.1, 0]], latest=before, first=1)).what == "rate"
+    assert verdict(seen([[3.9, 0]], latest=before, first=1)) is None
+
+
+def test_the_rate_over_a_gap_uses_the_time_that_passed():
+    assert verdict(seen([[4.1, 0]], latest=seen([[0, 0]]), first=2)) is None
+    lost = [[0, 0], [Quality.MISSING, 0], [0, 0]]
+    assert verdict(seen([[0, 0], [math.nan, 0], [4.1, 0]], quality=lost)) is None
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("column", [0, 1])
+def test_what_is_not_a_number_trips(value, column):
+    row = [0.0, 0.0]
+    row[column] = value
+    assert verdict(seen([row, [0, 0]])).what == "not a number"
+
+
+def test_a_missing_value_is_waited_for_but_not_for_ever():
+    lost = [[0, Quality.MISSING]]
+    latest = seen([[0.0, math.nan]], latest=seen([[0, 0.2]]), first=1, quality=lost)
+    assert verdict(latest) is None
+    assert latest.peak[1] == 0.2  # the value before it stands
+    assert verdict(seen([[0.0, math.nan]], latest=latest, first=40, quality=lost)).what == "stale"
+
+
+def test_a_channel_that_the_device_repeats_grows_old():
+    latest = seen([[0, 0.1]])
+    for n in range(1, 30):
+        latest = seen([[0, 0.1]], latest=latest, first=n, quality=[[0, Quality.STALE]])
+    assert verdict(latest).what == "stale"
+
+
+def test_a_channel_that_never_spoke_is_stale():
+    latest = seen([[0.0, math.nan]], quality=[[0, Quality.MISSING]])
+    assert verdict(latest).number == math.inf
+    assert verdict(Latest.nothing(2)).what == "stale"
+
+
+def test_silence_trips_after_stale_after_and_not_before():
+    assert verdict(FINE, FINE.time + 50_000_000) is None
+    assert verdict(FINE, FINE.time + 51_000_000).what == "stale"
+
+
+def test_an_empty_block_changes_nothing():
+    empty = block([[0, 0]])
+    empty = SampleBlock(
+        empty.channels,
+        *(x[:0] for x in (empty.time, empty.sequence)),
+        empty.values[:0],
+        empty.quality[:0],
+    )
+    assert observe(FINE, empty, COLUMNS, RATES, NOW) is FINE
+
+
+def test_a_queue_that_grows_shows_as_age():
+    """The device's clock has another zero, so only growth can be seen."""
+    latest = seen([[0, 0]], now=7 * NOW)
+    for n in range(1, 200):
+        latest = seen([[0, 0]], latest=latest, first=n, now=7 * NOW + n * 2_400_000)
+    assert verdict(latest, latest.offset_at).what == "stale"
+
+
+@given(ppm=st.floats(-200, 200), zero=st.integers(-(10**15), 10**15))
+def test_clocks_that_drift_apart_are_not_staleness(ppm, zero):
+    latest = Latest.nothing(2)
+    for n in range(0, 300_000, 10_000):  # ten minutes
+        host = zero + round(n * 2_000_000 * (1 + ppm * 1e-6))
+        latest = seen([[0, 0]], latest=latest, first=n, now=host)
+        assert latest.age(1, host) < 0.002
+
+
+@pytest.mark.parametrize("first", [0, -3])
+def test_samples_that_go_back_trip_for_good(first):
+    latest = seen([[0, 0]], latest=seen([[0, 0]]), first=first)
+    assert verdict(latest).what == "order"
+    assert verdict(seen([[0, 0]], latest=latest, first=5)).what == "order"
+
+
+@pytest.mark.parametrize("what", ["time", "sequence"])
+def test_order_inside_a_block_is_checked(what):
+    b = block([[0, 0]] * 3)
+    wrong = getattr(b, what).copy()
+    wrong[1] = wrong[2]
+    latest = observe(Latest.nothing(2), replace(b, **{what: wrong}), COLUMNS, RATES, NOW)
+    assert verdict(latest, NOW).what == "order"
+
+
+def test_a_converter_at_its_end_is_blind_and_trips():
+    assert verdict(seen([[0, 0.1]], quality=[[0, Quality.CLIPPED]])).what == "clipped"
+
+
+def test_an_output_that_the_device_changed_trips_once_commands_are_under_way():
+    limited = [[Quality.LIMITED, 0]]
+    assert verdict(seen([[0, 0]], quality=limited)) is None
+    running = replace(FINE, first=10)
+    assert verdict(seen([[0, 0]], latest=running, first=9, quality=limited)) is None
+    assert verdict(seen([[0, 0]], latest=running, first=10, quality=limited)).what == "device"
+
+
+def test_a_flag_on_one_sample_does_not_hide_the_next_value():
+    latest = seen([[0, 0], [0, 0.4]], quality=[[0, Quality.MISSING], [0, 0]])
+    assert verdict(latest).what == "limit"
+
+
+def test_the_heartbeat_counts_only_where_a_client_is_needed():
+    needed = replace(LIMITS, heartbeat_age=0.5)
+    beat = replace(FINE, heartbeat=0)
+    assert violation(replace(FINE, heartbeat=NEVER), LIMITS, FINE.time) is None
+    assert violation(FINE, needed, FINE.time).what == "heartbeat"
+    late = seen([[0, 0]], latest=beat, first=251)
+    assert violation(beat, needed, FINE.time) is None
+    assert violation(late, needed, late.time).what == "heartbeat"
+
+
+# What a reference says
+
+
+def wrong(block, latest=FINE, limits=LIMITS):
+    return command_violation(block, latest, limits)
+
+
+def test_a_small_reference_passes():
+    assert wrong(command([0.0, 1.0, 2.0])) is None
+    assert wrong(command([0.0, 0.0], [0.1, 0.2])) is None
+
+
+def test_the_bound_adds_the_loops_own_share():
+    moved = seen([[0, -0.3], [0, -0.3]])
+    assert wrong(command([2.0, 3.7]), moved) is None
+    d = wrong(command([2.0, 3.9]), moved)
+    assert (d.what, d.number) == ("limit", pytest.approx(3.9 + 4 * 0.3))
+    d = wrong(command([0.0, 0.0, 0.0], [0.5, 1.0, 1.3]))
+    assert (d.what, d.number) == ("limit", pytest.approx(5.2))
+
+
+def test_a_reference_at_its_limits_passes():
+    assert wrong(command([2.0, 4.0, 5.0])) is None
+    assert wrong(command([4.0])) is None
+
+
+@pytest.mark.parametrize("u", [[4.1], [0.0, 4.1], [0.0, 2.0, -2.1]])
+def test_a_step_is_refused_over_the_border_and_inside(u):
+    assert wrong(command(u)).what == "rate"
+
+
+def test_the_slew_counts_from_the_last_sample_sent():
+    sent = replace(FINE, u=3.0, theta_ref=0.2)
+    assert wrong(command([4.0], [0.2]), sent) is None
+    assert wrong(command([-1.1], [0.2]), sent).what == "rate"
+    assert wrong(command([1.0], [-0.4]), sent).what == "rate"
+
+
+def test_a_turning_joint_uses_up_slew():
+    turning = seen([[0, 0], [0, 0.3]])  # 150 rad/s, 600 V/s through kp
+    assert wrong(command([2.9]), FINE) is None
+    assert wrong(command([2.9]), turning).what == "rate"
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_reference_that_is_not_a_number_is_refused(value):
+    assert wrong(command([value])).what == "not a number"
+    assert wrong(command([0.0], [value])).what == "not a number"
+
+
+def test_a_reference_of_wrong_shape_is_refused():
+    assert wrong(CommandBlock(100, np.zeros(0), np.zeros(0))).what == "shape"
+    assert wrong(CommandBlock(100, np.zeros(2), np.zeros(3))).what == "shape"
+    assert wrong(CommandBlock(100, np.zeros((2, 2)), np.zeros(2))).what == "shape"
+
+
+def test_a_reference_must_continue_and_must_not_be_late():
+    sent = replace(FINE, next=100)
+    assert wrong(command([0.0], first=100), sent) is None
+    assert wrong(command([0.0], first=101), sent).what == "order"
+    assert wrong(command([0.0], first=99), sent).what == "order"
+    assert wrong(command([0.0], first=1)).what == "late"
+    assert wrong(command([0.0], first=2)) is None
+
+
+def test_a_reference_must_not_reach_far_ahead_of_the_samples():
+    # The newest sample is number 1; a quarter of a second is 125 samples.
+    assert wrong(command([0.0] * 25, first=102)) is None
+    assert wrong(command([0.0] * 26, first=102)).what == "ahead"
+
+
+# States
+
+
+WRITE = Write(command([0.1]))
+BAD = seen([[0, 9.0]])
+
+
+def decided(state, request, latest=FINE):
+    return decide(state, request, latest, LIMITS, latest.time)
+
+
+def test_the_way_through_a_run():
+    armed = decided(State.SAFE, Arm(0.05))
+    assert (armed.state, armed.act) == (State.ARMED, Act.CONFIGURE)
+    assert decided(State.ARMED, Start()).state is State.RUNNING
+    assert decided(State.RUNNING, WRITE).act is Act.WRITE
+    assert decided(State.RUNNING, Stop("done")).state is State.SAFE
+
+
+@pytest.mark.parametrize("state", STATES)
+@pytest.mark.parametrize(
+    "request_",
+    [
+        Arm(0.05),
+        Arm(None),
+        Start(),
+        Check(),
+        WRITE,
+        Stop("x"),
+        Fail("x"),
+        Clear("Ada", "looked"),
+        Clear(" ", "looked"),
+        Clear("Ada", ""),
+    ],
+    ids=lambda r: type(r).__name__,
+)
+@pytest.mark.parametrize("latest", [FINE, BAD, Latest.nothing(2)], ids=["fine", "bad", "nothing"])
+def test_only_running_on_good_samples_lets_a_command_through(state, request_, latest):
+    d = decided(state, request_, latest)
+    if d.act is Act.WRITE:
+        assert state is State.RUNNING
+        assert latest is FINE
+        assert request_ is WRITE
+    if d.state is State.RUNNING:
+        assert d.act in (Act.WRITE, Act.NOTHING)
+        assert latest is FINE
+    if not d.accepted:
+        assert d.act is Act.ZERO
+        assert d.reason
+    if state is State.FAULT and d.state is not State.FAULT:
+        assert request_ == Clear("Ada", "looked")
+    if d.state in (State.SAFE, State.FAULT) and state in (State.ARMED, State.RUNNING):
+        assert d.act is Act.ZERO
+
+
+@pytest.mark.parametrize("request_", [Start(), WRITE, Clear("Ada", "looked")])
+def test_a_request_in_the_wrong_state_is_a_fault(request_):
+    assert decided(State.SAFE, request_).state is State.FAULT
+
+
+def test_a_refusal_says_the_state_and_the_one_that_is_needed():
+    for request_, needed in [(Start(), "armed"), (WRITE, "running"), (Clear("A", "b"), "fault")]:
+        reason = decided(State.SAFE, request_).reason
+        assert reason.endswith(f"in state safe; possible only in {needed}")
+    assert decided(State.FAULT, Arm(0.05)).reason.endswith("possible only in safe")
+
+
+@pytest.mark.parametrize("state", [State.ARMED, State.RUNNING, State.FAULT])
+def test_arming_twice_is_a_fault(state):
+    assert decided(state, Arm(0.05)).state is State.FAULT
+
+
+def test_arming_refused_for_a_cause_that_can_be_mended_stays_safe():
+    assert decided(State.SAFE, Arm(None)).what == "deadman"
+    for d in (decided(State.SAFE, Arm(None)), decided(State.SAFE, Arm(0.05), BAD)):
+        assert (d.state, d.accepted) == (State.SAFE, False)
+
+
+@pytest.mark.parametrize("state", [State.ARMED, State.RUNNING])
+def test_a_check_on_bad_samples_ends_in_fault(state):
+    assert decided(state, Check(), BAD).state is State.FAULT
+    assert decided(state, Check()).state is state
+
+
+@pytest.mark.parametrize("state", [State.SAFE, State.FAULT])
+def test_a_check_at_rest_judges_nothing(state):
+    d = decided(state, Check(), BAD)
+    assert (d.state, d.act, d.accepted) == (state, Act.NOTHING, True)
+
+
+@pytest.mark.parametrize("state", STATES)
+def test_stop_and_fail_are_always_granted(state):
+    assert decided(state, Stop("x")).act is Act.ZERO
+    stopped = State.FAULT if state is State.FAULT else State.SAFE
+    assert decided(state, Stop("x")).state is stopped
+    assert decided(state, Fail("x")).state is State.FAULT
+
+
+# The limits themselves
+
+
+def test_the_tightest_of_several_limits_holds():
+    rig = fake_rig()
+    second = rig.limit[1].model_copy(update={"max": 0.2, "reason": "softer", "max_rate": 3.0})
+    tight = gate_limits(rig.model_copy(update={"limit": (*rig.limit, second)}), "v", 4.0, "theta")
+    assert (tight.sensors[0].max, tight.sensors[0].max_rate) == (0.2, 3.0)
+    assert tight.sensors[0].reason == "softer"
+
+
+def test_without_a_limit_the_converters_range_is_one():
+    rig = fake_rig().model_copy(update={"limit": ()})
+    limits = gate_limits(rig, "v", 4.0, "theta")
+    assert (limits.output.max, limits.output.max_rate) == (10.0, math.inf)
+    assert [c.channel for c in limits.channels] == ["v", "theta"]
+    assert limits.device_loop().max_angle == math.inf
+    assert [c.channel for c in gate_limits(rig, "v", 0.0, "theta").channels] == ["v"]
+
+
+def test_the_device_gets_the_same_limits():
+    loop = LIMITS.device_loop()
+    assert (loop.sensor, loop.kp) == ("theta", 4.0)
+    assert (loop.max_output, loop.max_rate, loop.max_angle) == (5.0, 2000.0, 0.35)
