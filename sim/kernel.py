@@ -1,0 +1,259 @@
+"""The inner loop: plant, converters and the device's own control, sample by sample.
+
+What an embedded controller does at sample n: read the sensors, form
+v[n] = u[n] + kp (theta_ref[n] - theta[n]), keep its limits and its deadman, put v[n] out. The
+plant then moves on by one sample in `inner` exact steps.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from samii_rig.types import Flags, Float, Int, Quality
+from sim.plant import Tables
+
+CLIPPED, LIMITED, MISSING = int(Quality.CLIPPED), int(Quality.LIMITED), int(Quality.MISSING)
+# Columns of a block: the two references, the command, then the sensors.
+U, THETA_REF, V, SENSORS = 0, 1, 2, 3
+
+
+class Converters(NamedTuple):
+    """What stands between the analogue values and the numbers; (m,) each, one a sensor.
+
+    step, low, high : resolution (0 for none) and ends of the range. noise, offset : in the
+    sensor's unit. hum, hum_rate : amplitude after the sensor's filters and rad a sample.
+    stuck, lost : sample from which the value stands still, or is NaN.
+    v_step, v_low, v_high : the same of the output.
+    """
+
+    step: Float
+    low: Float
+    high: Float
+    noise: Float
+    offset: Float
+    hum: Float
+    hum_rate: Float
+    stuck: Int
+    lost: Int
+    v_step: float
+    v_low: float
+    v_high: float
+
+
+class Control(NamedTuple):
+    """The device's loop and limits, in actuator units and samples.
+
+    theta : index of the centring sensor. slew : largest change a sample. deadman : samples
+    without reference after which the output drops to zero.
+    """
+
+    theta: int
+    kp: float
+    max_output: float
+    slew: float
+    max_angle: float
+    deadman: int
+
+
+class Drive(NamedTuple):
+    """What acts on the drive beside the command.
+
+    disturbance : rms of the equivalent input in one inner step. friction : dry friction as an
+    equivalent input. memory : what is left of the drive's speed after one inner step.
+    """
+
+    disturbance: float
+    friction: float
+    memory: float
+
+
+class State(NamedTuple):
+    """All that the loop carries from one call to the next; arrays, changed in place.
+
+    x : (2, n) modal states. held : the last sensor values. waiting : (pipeline + 1,) outputs
+    on their way. early : (slots, m) sensor values read ahead of their sample. number :
+    [v, applied input, extra input, drive speed, last theta_ref]. flag : [sample, live, dry
+    samples, tripped, dead]
+    """
+
+    x: Float
+    held: Float
+    waiting: Float
+    early: Float
+    number: Float
+    flag: Int
+
+
+# Places in State.number and State.flag.
+LAST_V, APPLIED, EXTRA, SPEED, LAST_REF = range(5)
+SAMPLE, LIVE, DRY, TRIPPED, DEAD = range(5)
+
+
+def rest(tables: Tables) -> State:
+    """Everything still."""
+    m, _, n = tables.row.shape
+    slots = int(tables.ahead.max(initial=0)) // tables.inner + 2
+    return State(
+        np.zeros((2, n)),
+        np.zeros(m),
+        np.zeros(tables.pipeline + 1),
+        np.zeros((slots, m)),
+        np.zeros(5),
+        np.zeros(5, dtype=np.int64),
+    )
+
+
+@njit(cache=True)
+def _read(t: Tables, s: State, i: int, old: float, new: float, extra: float) -> float:
+    y = t.row_old[i] * old + t.row_new[i] * new + t.row_extra[i] * extra
+    x = s.x
+    for k in range(x.shape[1]):
+        y += t.row[i, 0, k] * x[0, k] + t.row[i, 1, k] * x[1, k]
+    return float(y)
+
+
+@njit(cache=True)
+def _convert(c: Converters, i: int, n: int, y: float, noise: float) -> tuple[float, int]:
+    """One sample of sensor i: its value and its flags."""
+    if n >= c.lost[i]:
+        return np.nan, MISSING
+    y += c.offset[i] + c.noise[i] * noise
+    if c.hum[i] > 0.0:
+        y += c.hum[i] * np.sin(c.hum_rate[i] * n)
+    if c.step[i] > 0.0:
+        y = np.rint(y / c.step[i]) * c.step[i]
+    if y >= c.high[i]:
+        return c.high[i], CLIPPED
+    if y <= c.low[i]:
+        return c.low[i], CLIPPED
+    return y, 0
+
+
+@njit(cache=True)
+def _command(
+    c: Converters, k: Control, s: State, u: float, ref: float, given: bool, theta: float
+) -> tuple[float, int]:
+    """v of this sample, and whether a limit or the deadman changed it."""
+    flag = s.flag
+    if given:
+        flag[LIVE], flag[DRY], flag[DEAD] = 1, 0, 0
+    elif flag[LIVE]:
+        flag[DRY] += 1
+        if k.deadman >= 0 and flag[DRY] > k.deadman:
+            flag[LIVE], flag[DEAD] = 0, 1
+    if flag[LIVE] and not flag[TRIPPED] and not abs(theta) <= k.max_angle:
+        flag[TRIPPED] = 1
+    if flag[TRIPPED] or flag[DEAD]:
+        return 0.0, LIMITED
+    if not flag[LIVE]:
+        return 0.0, 0
+    wanted = u + k.kp * (ref - theta)
+    low = max(-k.max_output, c.v_low, s.number[LAST_V] - k.slew)
+    high = min(k.max_output, c.v_high, s.number[LAST_V] + k.slew)
+    v = min(max(wanted, low), high)
+    limited = LIMITED if v != wanted else 0
+    if c.v_step > 0.0:
+        v = np.rint(v / c.v_step) * c.v_step
+        if v > high:
+            v -= c.v_step
+        elif v < low:
+            v += c.v_step
+    return v, limited
+
+
+@njit(cache=True)
+def _friction(d: Drive, speed: float, u: float) -> tuple[float, float]:
+    """Dry friction of the drive over one step, as an input, and the speed after the step.
+
+    The drive's speed in units of its input obeys speed' = p (u - friction sign(speed) -
+    speed); it sticks where it passes zero while |u| <= friction.
+    """
+    gain = 1.0 - d.memory
+    side = speed if speed != 0.0 else u
+    if speed == 0.0 and abs(u) <= d.friction:
+        return -u, 0.0
+    pull = -d.friction if side > 0.0 else d.friction
+    after = d.memory * speed + gain * (u + pull)
+    if after * side <= 0.0 and abs(u) <= d.friction:
+        return -d.memory * speed / gain - u, 0.0
+    return pull, after
+
+
+@njit(cache=True)
+def advance(
+    t: Tables,
+    c: Converters,
+    k: Control,
+    d: Drive,
+    s: State,
+    u: Float,
+    theta_ref: Float,
+    given: Flags,
+    noise: Float,
+    disturbance: Float,
+    values: Float,
+    quality: Flags,
+) -> None:
+    """Take len(u) samples: fills values and quality, (n, 3 + m), and moves the state on.
+
+    given : (n,) 1 where the queue held a reference. noise : (n, m), disturbance : (n, inner),
+    standard normal; empty if there is none.
+    """
+    m = t.ahead.shape[0]
+    n_pole = s.x.shape[1]
+    slots = s.early.shape[0]
+    number, flag = s.number, s.flag
+    noisy = noise.shape[0] > 0
+    for n in range(u.shape[0]):
+        sample = flag[SAMPLE]
+        slot = sample % slots
+        for i in range(m):
+            if t.ahead[i] == 0:
+                y = _read(t, s, i, number[APPLIED], 0.0, number[EXTRA])
+            else:
+                y = s.early[slot, i]
+            y, q = _convert(c, i, sample, y, noise[n, i] if noisy else 0.0)
+            if sample >= c.stuck[i]:
+                y = s.held[i]
+            s.held[i] = y
+            values[n, SENSORS + i], quality[n, SENSORS + i] = y, q
+
+        if given[n]:
+            number[LAST_REF] = theta_ref[n]
+        reference = u[n] if given[n] else 0.0
+        v, limited = _command(
+            c, k, s, reference, number[LAST_REF], given[n] != 0, values[n, SENSORS + k.theta]
+        )
+        values[n, U], values[n, THETA_REF], values[n, V] = reference, number[LAST_REF], v
+        quality[n, U], quality[n, THETA_REF], quality[n, V] = 0, 0, limited
+        number[LAST_V] = v
+        s.waiting[sample % s.waiting.shape[0]] = v
+
+        for j in range(t.inner):
+            old = number[APPLIED]
+            new = old
+            share = 0.0
+            if j == t.change:
+                new = s.waiting[(sample - t.pipeline) % s.waiting.shape[0]]
+                share = t.mean
+            extra = d.disturbance * disturbance[n, j] if d.disturbance > 0.0 else 0.0
+            if d.friction > 0.0:
+                push = share * old + (1.0 - share) * new + extra
+                pull, number[SPEED] = _friction(d, number[SPEED], push)
+                extra += pull
+            for i in range(m):
+                if t.ahead[i] > 0 and (j + t.ahead[i]) % t.inner == 0:
+                    at = (sample + (j + t.ahead[i]) // t.inner) % slots
+                    s.early[at, i] = _read(t, s, i, old, new, extra)
+            both = new + extra
+            before = old + extra
+            for q in range(n_pole):
+                re = t.decay[0, q] * s.x[0, q] - t.decay[1, q] * s.x[1, q]
+                im = t.decay[1, q] * s.x[0, q] + t.decay[0, q] * s.x[1, q]
+                s.x[0, q] = re + t.old[0, q] * before + t.new[0, q] * both
+                s.x[1, q] = im + t.old[1, q] * before + t.new[1, q] * both
+            number[APPLIED], number[EXTRA] = new, extra
+        flag[SAMPLE] = sample + 1

@@ -1,0 +1,73 @@
+"""What can be set of the simulated rig: the table [device.settings] of a rig file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+from pydantic import Field, ValidationError
+
+from samii_rig.errors import InputError
+from samii_rig.rig.schema import Name, NonNegative, Positive, Rig, Strict
+
+
+class Hum(Strict):
+    """A tone that a sensor's cable picks up, before its filters: `amplitude` in its unit."""
+
+    amplitude: NonNegative
+    frequency_hz: Positive
+
+
+class SimSettings(Strict):
+    """Settings of the simulated rig; an unknown one is an error.
+
+    seed : of all noise; the same seed gives the same samples.
+    noise : false makes the sensors ideal: no noise, no steps of the converter, no offset.
+        Their filters, delays and ranges stay, and so do the steps of the output.
+    inner : inner steps a sample. Without disturbance and friction it changes nothing,
+        because every step is exact.
+    band_hz : edge of the search for poles; default 4 times the sample rate.
+    disturbance_rms : a disturbance of the drive that does not depend on the reference, in the
+        actuator's unit: white noise that adds to v behind the point where v is recorded. Its mean
+        over one sample has this rms. It enters where v enters, so the true response from v to
+        every sensor stays the one without disturbance.
+    coulomb_friction : dry friction of the drive, as the input that just overcomes it, in the
+        actuator's unit. An ideal velocity source does not feel a torque beside it, so the
+        friction acts inside the drive: speed' = p (v - friction sign(speed) - speed), stuck
+        at zero speed while |v| is smaller. The best linear response then depends on the level.
+    hum : by sensor name.
+    stuck, nan : by sensor name, s from which the sensor repeats its last value, or gives NaN.
+    drop : numbers of samples that the device takes but that never arrive.
+    """
+
+    seed: Annotated[int, Field(ge=0)] = 0
+    noise: bool = True
+    inner: Annotated[int, Field(ge=1, le=64)] = 8
+    band_hz: Positive | None = None
+    disturbance_rms: NonNegative = 0.0
+    coulomb_friction: NonNegative = 0.0
+    hum: dict[Name, Hum] = Field(default_factory=dict)
+    stuck: dict[Name, NonNegative] = Field(default_factory=dict)
+    nan: dict[Name, NonNegative] = Field(default_factory=dict)
+    drop: tuple[Annotated[int, Field(ge=0)], ...] = ()
+
+
+def read_settings(rig: Rig, overrides: Mapping[str, object]) -> SimSettings:
+    """The rig file's [device.settings] with `overrides` on top; InputError names a wrong one."""
+    try:
+        settings = SimSettings.model_validate({**rig.device.settings, **overrides})
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = ".".join(["device", "settings", *map(str, first["loc"])])
+        if first["type"] == "extra_forbidden":
+            known = ", ".join(SimSettings.model_fields)
+            raise InputError(rig.name, field, first["input"], f"one of {known}") from error
+        expected = first["msg"].removeprefix("Input should be ")
+        raise InputError(rig.name, field, first["input"], expected) from error
+    names = {s.name for s in rig.sensor}
+    for setting in ("hum", "stuck", "nan"):
+        for name in getattr(settings, setting):
+            if name not in names:
+                where = f"device.settings.{setting}"
+                raise InputError(rig.name, where, name, f"one of {', '.join(sorted(names))}")
+    return settings

@@ -1,0 +1,22 @@
+"""The simulated rig does all that a device must."""
+
+from contract import DeviceContract
+
+from samii_rig.rig.load import load_rig
+from samii_rig.run.devices import open_device
+from samii_rig.run.protocols import OpenRig
+
+
+class TestSimulatedSamii(DeviceContract):
+    rig = load_rig("samii")[0]
+
+    def open(self) -> OpenRig:
+        return open_device(self.rig, {})
+
+
+class TestSimulatedSflr(DeviceContract):
+    rig = load_rig("sflr")[0]
+    level = 0.2
+
+    def open(self) -> OpenRig:
+        return open_device(self.rig, {})
