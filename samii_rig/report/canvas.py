@@ -1,0 +1,194 @@
+"""The parts that the page's figures are made of, as plain plotly descriptions.
+
+Colours are names that start with "@" (`@ink`, `@level0`); the page's script puts in those
+of the reader's light or dark scheme. Arrays go as base64 of float32.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from samii_rig.types import Float
+
+Figure = dict[str, Any]
+N_COLOURS = 6
+
+
+def packed(values: Float) -> dict[str, str]:
+    """An array as plotly reads it fast: little-endian float32 in base64."""
+    array = np.ascontiguousarray(values, dtype="<f4")
+    out = {"dtype": "f4", "bdata": base64.b64encode(array.tobytes()).decode("ascii")}
+    if array.ndim == 2:
+        out["shape"] = f"{array.shape[0]}, {array.shape[1]}"
+    return out
+
+
+def axis(title: str) -> dict[str, Any]:
+    """What every axis has in common."""
+    return {
+        "title": {"text": title, "standoff": 8},
+        "gridcolor": "@grid",
+        "linecolor": "@muted",
+        "zeroline": False,
+        "ticks": "outside",
+        "tickcolor": "@muted",
+        "automargin": True,
+    }
+
+
+def base_layout(height: int) -> dict[str, Any]:
+    """What every figure has in common."""
+    return {
+        "height": height,
+        "margin": {"l": 64, "r": 16, "t": 62, "b": 44},
+        "modebar": {"bgcolor": "rgba(0,0,0,0)", "color": "@muted", "activecolor": "@ink"},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "rgba(0,0,0,0)",
+        "font": {"family": "system-ui, sans-serif", "size": 13, "color": "@ink"},
+        "hovermode": "x unified",
+        "hoverlabel": {"bgcolor": "@panel", "bordercolor": "@grid", "font": {"color": "@ink"}},
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom", "xanchor": "left"},
+    }
+
+
+def stacked(
+    rows: int, titles: Sequence[str], height: int, weights: Sequence[float] | None = None
+) -> Figure:
+    """An empty figure of `rows` panels over one logarithmic frequency axis."""
+    layout = base_layout(height)
+    share = np.array(weights or [1.0] * rows)
+    share = share / share.sum()
+    gap = 0.035
+    top = 1.0
+    for row, title in enumerate(titles, 1):
+        bottom = top - share[row - 1] * (1 - gap * (rows - 1))
+        number = "" if row == 1 else str(row)
+        layout[f"yaxis{number}"] = axis(title) | {
+            "domain": [max(float(bottom), 0.0), float(top)],
+            "anchor": "x",
+        }
+        top = bottom - gap
+    last = "y" if rows == 1 else f"y{rows}"
+    layout["xaxis"] = axis("frequency [Hz]") | {"anchor": last, "hoverformat": ".4g"}
+    log_scale(layout["xaxis"])
+    return {"data": [], "layout": layout}
+
+
+def log_scale(axis: dict[str, Any]) -> None:
+    """Make an axis logarithmic."""
+    axis |= {
+        "type": "log",
+        "exponentformat": "power",
+        "minor": {"dtick": "D1", "ticks": "outside", "ticklen": 3, "tickcolor": "@muted"},
+    }
+
+
+def ticked(low: float, high: float) -> dict[str, Any]:
+    """A logarithmic axis from 10^`low` to 10^`high` with round numbers written out in full."""
+    if high - low < 0.02:  # a single line
+        low, high = low - 0.1, high + 0.1
+    span = high - low
+    steps = (1,) if span > 3 else (1, 2, 5) if span > 0.6 else (1, 1.5, 2, 3, 4, 5, 6, 7, 8, 9)
+    decades = range(int(np.floor(low)), int(np.ceil(high)) + 1)
+    ticks = [s * 10.0**d for d in decades for s in steps if low <= np.log10(s * 10.0**d) <= high]
+    return {
+        "range": [float(low), float(high)],
+        "tickmode": "array",
+        "tickvals": ticks,
+        "ticktext": [f"{tick:g}" for tick in ticks],
+    }
+
+
+def band(figure: Figure, f: Float, low: Float, high: Float, axis: str, level: int) -> None:
+    """Add the area between two curves; nothing where either is NaN."""
+    # One closed outline for each stretch without NaN: `tonexty` would fill across holes.
+    good = np.isfinite(low) & np.isfinite(high)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(int)))
+    xs: list[Float] = []
+    ys: list[Float] = []
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        xs += [f[a:b], f[a:b][::-1], f[a : a + 1], np.array([np.nan])]
+        ys += [high[a:b], low[a:b][::-1], high[a : a + 1], np.array([np.nan])]
+    if not xs:
+        return
+    colour = level % N_COLOURS
+    figure["data"].append(
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "x": packed(np.concatenate(xs)),
+            "y": packed(np.concatenate(ys)),
+            "yaxis": axis,
+            "line": {"width": 0},
+            "fill": "toself",
+            "fillcolor": f"@level{colour}soft",
+            "legendgroup": f"level{level}",
+            "showlegend": False,
+            "hoverinfo": "skip",
+        }
+    )
+
+
+def line(
+    figure: Figure,
+    f: Float,
+    values: Float,
+    name: str,
+    axis: str,
+    level: int | None,
+    *,
+    hover: str,
+    legend: bool = True,
+) -> None:
+    """Add a curve: of the measurement at the `level`-th amplitude, dashed of the model (None)."""
+    style = {"width": 2.2, "color": "@ink", "dash": "dash"}
+    if level is not None:
+        style = {"width": 1.4, "color": f"@level{level % N_COLOURS}"}
+    figure["data"].append(
+        {
+            "type": "scatter",
+            "mode": "lines",
+            "name": name,
+            "x": packed(f),
+            "y": packed(values),
+            "yaxis": axis,
+            "line": style,
+            "legendgroup": "model" if level is None else f"level{level}",
+            "showlegend": legend,
+            "hovertemplate": hover,
+        }
+    )
+
+
+def shade(span: tuple[float, float]) -> dict[str, Any]:
+    """A frequency band in which the curves differ."""
+    return {
+        "type": "rect",
+        "xref": "x",
+        "yref": "paper",
+        "x0": span[0],
+        "x1": span[1],
+        "y0": 0,
+        "y1": 1,
+        "fillcolor": "@differs",
+        "line": {"width": 0},
+        "layer": "below",
+    }
+
+
+def level_line(axis: str, at: float) -> dict[str, Any]:
+    """A dashed line across the panel of `axis` at one value."""
+    return {
+        "type": "line",
+        "xref": "paper",
+        "x0": 0,
+        "x1": 1,
+        "yref": axis,
+        "y0": at,
+        "y1": at,
+        "line": {"color": "@ink", "width": 1.5, "dash": "dash"},
+    }

@@ -1,0 +1,128 @@
+"""Bode figures for a paper: PNG, SVG or PDF by matplotlib, without its global state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MultipleLocator, NullFormatter
+
+from samii_rig.errors import InputError
+from samii_rig.record.export import replacing
+from samii_rig.report.compare import ModelCurve
+from samii_rig.report.plots import Curves, unit
+from samii_rig.types import FrequencyResponse
+
+SUFFIXES = (".png", ".svg", ".pdf")
+# Okabe and Ito's colours, which people of any colour vision tell apart.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#8C6D00", "#56B4E9")
+_COLUMN_INCH = 3.5  # one column of a two-column page
+_ROW_INCH = 3.6
+_LEFT_INCH, _BOTTOM_INCH, _TOP_INCH = 0.7, 0.48, 0.28
+_DPI = 300
+_NOISE_PART = 0.004  # of the lines may lie below the gain axis
+
+
+def bode_figure(responses: Sequence[FrequencyResponse], model: ModelCurve | None = None) -> Figure:
+    """Gain and phase of every output (one column each, first input), bands of 90 %.
+
+    Levels are told apart by colour, the model is dashed black.
+    """
+    responses = sorted(responses, key=lambda r: (not np.isfinite(r.level), r.level))
+    outputs, u = responses[0].outputs, responses[0].inputs[0]
+    figure = Figure(figsize=(_COLUMN_INCH * len(outputs), _ROW_INCH))
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2, len(outputs), sharex=True, squeeze=False, height_ratios=(1.5, 1.0))
+    width, height = figure.get_size_inches()
+    # Fixed margins: matplotlib's layout engine draws everything three times to find them.
+    figure.subplots_adjust(
+        left=_LEFT_INCH / width,
+        right=1 - 0.1 / width,
+        bottom=_BOTTOM_INCH / height,
+        top=1 - _TOP_INCH / height,
+        wspace=_LEFT_INCH / (_COLUMN_INCH - _LEFT_INCH),
+        hspace=0.1,
+    )
+    curves = [Curves.of(r) for r in responses]
+    for i, y in enumerate(outputs):
+        gain, angle = axes[0, i], axes[1, i]
+        for k, c in enumerate(curves):
+            _draw(gain, angle, c, i, _COLOURS[k % len(_COLOURS)])
+        if model is not None:
+            f = responses[0].frequency
+            f = np.union1d(f, model.frequency[(model.frequency > f[0]) & (model.frequency < f[-1])])
+            H = model.at(f, y.name, u.name)
+            nearest = np.interp(f, responses[-1].frequency, curves[-1].angle[:, i, 0])
+            turn = np.rad2deg(np.unwrap(np.angle(np.where(np.isfinite(H), H, 1.0))))
+            turn += 360.0 * np.round(np.median(nearest - turn) / 360.0)
+            gain.plot(f, np.abs(H), "k--", lw=1.1, label=f"model {model.name}")
+            angle.plot(f, np.where(np.isfinite(H), turn, np.nan), "k--", lw=1.1)
+        size = np.abs(np.concatenate([r.H[:, i, 0] for r in responses]))
+        size = size[np.isfinite(size) & (size > 0)]
+        if size.size:
+            low, high = np.quantile(np.log10(size), [_NOISE_PART, 1.0])
+            if model is not None and np.isfinite(H).any():
+                low = min(low, float(np.log10(np.nanmin(np.abs(H)))))
+                high = max(high, float(np.log10(np.nanmax(np.abs(H)))))
+            room = 0.05 * (high - low) + 0.05
+            gain.set_ylim(10 ** (low - room), 10 ** (high + room))
+        _dress(gain, angle, f"{y.name}/{u.name} [{unit(y, u)}]")
+        positive = responses[0].frequency[responses[0].frequency > 0]
+        angle.set_xlim(positive[0], positive[-1])
+    axes[0, 0].legend(fontsize=7, frameon=False)
+    return figure
+
+
+def save_figure(path: Path | str, figure: Figure) -> Path:
+    """Write `figure` in the format of the suffix; whole or not at all.
+
+    Raises
+    ------
+    InputError : another suffix, or a place that cannot be written to.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError("figure", "suffix", path.suffix, f"one of {', '.join(SUFFIXES)}")
+    # Text stays text in an SVG, and a figure of the same data is the same file.
+    with (
+        replacing(path) as part,
+        matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "samii-rig"}),
+    ):
+        dated = {"Date": None} if path.suffix.lower() == ".svg" else None
+        figure.savefig(part, format=path.suffix[1:].lower(), dpi=_DPI, metadata=dated)
+    return path
+
+
+def _draw(gain: Axes, angle: Axes, c: Curves, i: int, colour: str) -> None:
+    r = c.response
+    f, size = r.frequency, np.abs(r.H[:, i, 0])
+    name = f"{r.level:g} {r.level_unit}" if np.isfinite(r.level) else "measured"
+    low = np.maximum(c.low[:, i, 0], 0.1 * size)  # zero is nowhere on a logarithmic axis
+    gain.fill_between(f, low, c.high[:, i, 0], color=colour, alpha=0.25, lw=0)
+    gain.plot(f, size, color=colour, lw=0.9, label=name)
+    half = np.where(c.half[:, i, 0] < 180.0, c.half[:, i, 0], np.nan)
+    turn = c.angle[:, i, 0]
+    angle.fill_between(f, turn - half, turn + half, color=colour, alpha=0.25, lw=0)
+    angle.plot(f, turn, color=colour, lw=0.9)
+
+
+def _dress(gain: Axes, angle: Axes, title: str) -> None:
+    gain.set_title(title, fontsize=9)
+    gain.set_xscale("log")
+    gain.set_yscale("log")
+    gain.set_ylabel("gain", fontsize=9)
+    angle.set_ylabel("phase [\u00b0]", fontsize=9)
+    angle.set_xlabel("frequency [Hz]", fontsize=9)
+    angle.yaxis.set_major_locator(MultipleLocator(90))
+    angle.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    angle.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    angle.xaxis.set_minor_formatter(NullFormatter())
+    for axes in (gain, angle):
+        axes.grid(visible=True, color="0.88", lw=0.5)
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)

@@ -1,0 +1,213 @@
+"""The report: one HTML file that holds all it shows and asks no one for anything.
+
+The page may load nothing: its own policy (Content-Security-Policy) forbids every address
+and every script but the two inside, which it knows by their hashes.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from pathlib import Path
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from samii_rig.errors import InputError
+from samii_rig.record.events import Event
+from samii_rig.record.export import replacing
+from samii_rig.report import facts, plots, series
+from samii_rig.report.canvas import Figure
+from samii_rig.report.compare import ModelCurve, compare, pretty
+from samii_rig.report.drawing import draw
+from samii_rig.report.verdicts import verdicts
+from samii_rig.rig.schema import Rig
+from samii_rig.types import FrequencyResponse, Recording
+
+_WORDS = {"good": "good", "note": "note", "warning": "look", "bad": "attention"}
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """One figure of the page and what is said above it."""
+
+    id: str
+    title: str
+    caption: str
+    figure: Figure
+    options: tuple[str, ...] = ()
+
+    @property
+    def json(self) -> Markup:
+        """The figure as JSON that cannot end its script element."""
+        text = json.dumps(self.figure, separators=(",", ":"), allow_nan=False)
+        return Markup(text.replace("<", "\\u003c"))
+
+
+def write_report(
+    path: Path | str,
+    recordings: Recording | Sequence[Recording],
+    responses: Sequence[FrequencyResponse],
+    *,
+    rig: Rig | None = None,
+    model: ModelCurve | None = None,
+    title: str = "",
+    spectrogram_channel: str = "",
+    band_hz: tuple[float, float] = (0.0, np.inf),
+    events: Sequence[Event] = (),
+) -> Path:
+    """Write the page about `recordings` and what was estimated from them to `path`.
+
+    responses : one for each amplitude level, all with the same inputs and outputs.
+    model : laid over every response. band_hz : where it is compared in numbers.
+    spectrogram_channel : "" takes the last sensor. events : of the gate and the loop.
+
+    Raises
+    ------
+    InputError : responses of different channels, an unknown channel, a place that cannot be
+        written to; nothing half-written is left.
+    """
+    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    responses = sorted(responses, key=lambda r: (not np.isfinite(r.level), r.level))
+    _check(recordings, responses, spectrogram_channel)
+    page = render(recordings, responses, rig, model, title, spectrogram_channel, band_hz, events)
+    path = Path(path)
+    with replacing(path) as part:
+        part.write_text(page, encoding="utf-8")
+    return path
+
+
+def render(
+    recordings: Sequence[Recording],
+    responses: Sequence[FrequencyResponse],
+    rig: Rig | None,
+    model: ModelCurve | None,
+    title: str,
+    spectrogram_channel: str,
+    band_hz: tuple[float, float],
+    events: Sequence[Event],
+) -> str:
+    """The page as text; `responses` in the order in which they are drawn."""
+    comparisons = (
+        [] if model is None else [c for r in responses for c in compare(r, model, band_hz)]
+    )
+    headlines, bodes, ratios = [], [], []
+    if responses:
+        first = responses[0]
+        curves = [plots.Curves.of(r) for r in responses]
+        for i, y in enumerate(first.outputs):
+            for j, u in enumerate(first.inputs):
+                name, id_ = f"{y.name}/{u.name}", f"{i}-{j}"
+                figure = plots.headline(curves, i, j, model, comparisons)
+                said = facts.headline(y.name, u.name, comparisons)
+                headlines.append(Plot(f"head-{id_}", name, said, figure))
+                bodes.append(Plot(f"bode-{id_}", name, "", plots.bode(curves, i, j, model)))
+                if any((c.output, c.input) == (y.name, u.name) for c in comparisons) and model:
+                    figure = plots.ratio(curves, i, j, model)
+                    ratios.append(Plot(f"ratio-{id_}", name, "dashed: agreement", figure))
+    time, spectrum = _recorded(recordings, spectrogram_channel)
+    style, script, plotly = _asset("page.css"), _asset("page.js"), _plotly()
+    return _template().render(
+        title=title or facts.title(recordings, rig),
+        subtitle=facts.subtitle(recordings, rig),
+        policy=_policy(plotly, script),
+        style=Markup(style),
+        script=Markup(script),
+        plotly=Markup(plotly),
+        words=_WORDS,
+        verdicts=verdicts(recordings, responses, comparisons),
+        headlines=headlines,
+        bode=bodes,
+        ratios=ratios,
+        comparisons=comparisons,
+        peaks=facts.peak_rows(responses, model),
+        series=time,
+        spectrogram=spectrum,
+        done=facts.done(recordings, rig),
+        events=facts.event_rows(events, recordings),
+        chain=Markup(draw(rig)) if rig else "",
+        chain_caption=rig.description if rig else "",
+        limits=facts.limit_rows(recordings, rig) if rig else [],
+        predicted=facts.has_prediction(recordings),
+        responses=[facts.method_row(r) for r in responses],
+        findings=facts.finding_rows(responses),
+        files=facts.files(recordings),
+        metadata=facts.metadata(recordings),
+        all_plots=[p for p in (*headlines, *bodes, *ratios, time, spectrum) if p],
+    )
+
+
+def _recorded(recordings: Sequence[Recording], channel: str) -> tuple[Plot | None, Plot | None]:
+    parts = series.pieces(recordings)
+    if not parts:
+        return None, None
+    names = tuple(p.name for p in parts)
+    lost = any(np.any(np.diff(p.recording.sequence) > 1) for p in parts)
+    said = "All channels, largest and smallest value of each pixel."
+    said += " Crosses: samples are missing after these." if lost else ""
+    time = Plot("time", "Recorded samples.", said, series.time_series(parts), names)
+    loudest = max(parts, key=lambda p: p.recording.segments[0].level if p.recording.segments else 0)
+    sensors = loudest.recording.names("sensor") or (loudest.recording.channels[-1].name,)
+    shown = channel or sensors[-1]
+    unit = loudest.recording.channels[loudest.recording.column(shown)].unit
+    figure = series.spectrogram(loudest, shown)
+    caption = f"{loudest.name}; dB below the loudest spot"
+    return time, Plot("spectrum", f"{shown} [{pretty(unit)}].", caption, figure)
+
+
+def _check(
+    recordings: Sequence[Recording], responses: Sequence[FrequencyResponse], channel: str
+) -> None:
+    if not recordings and not responses:
+        raise InputError("report", "", "nothing", "a recording or a response")
+    for r in responses:
+        for role in ("inputs", "outputs"):
+            names = [[c.name for c in getattr(x, role)] for x in (r, responses[0])]
+            if names[0] != names[1]:
+                expected = f"{names[1]}, the same in all responses"
+                raise InputError("report", role, names[0], expected)
+    for recording in recordings if channel else ():
+        names_ = [c.name for c in recording.channels]
+        if channel not in names_:
+            raise InputError("report", "spectrogram channel", channel, f"one of {names_}")
+
+
+def _policy(*scripts: str) -> str:
+    """Content-Security-Policy: nothing from anywhere, and of scripts these alone.
+
+    plotly sets styles on elements, so inline styles are allowed; blob and data images are its
+    "save as PNG".
+    """
+    hashes = " ".join(
+        f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'"
+        for s in scripts
+    )
+    return (
+        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; "
+        "img-src data: blob:; form-action 'none'; base-uri 'none'"
+    )
+
+
+def _template() -> jinja2.Template:
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    return environment.from_string(_asset("page.html.j2"))
+
+
+def _asset(name: str) -> str:
+    return (resources.files("samii_rig.report") / "assets" / name).read_text("utf-8")
+
+
+@cache
+def _plotly() -> str:
+    """plotly.js, once. Its line ends are made the ones that a browser hashes."""
+    from plotly.offline import get_plotlyjs
+
+    return str(get_plotlyjs()).replace("\r\n", "\n").replace("\r", "\n")

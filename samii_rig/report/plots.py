@@ -1,0 +1,271 @@
+"""The figures of frequency responses on the page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from samii_rig.report.canvas import (
+    Figure,
+    band,
+    level_line,
+    line,
+    log_scale,
+    shade,
+    stacked,
+    ticked,
+)
+from samii_rig.report.compare import BAND, Comparison, ModelCurve, pretty, telling
+from samii_rig.report.peaks import peaks
+from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_width
+from samii_rig.types import Channel, Float, FrequencyResponse, Int
+
+_BINS = 1200  # of log-frequency; more than the pixels of a wide screen
+_NOISE_PART = 0.004  # of the lines may lie outside a gain axis
+_PEAK_LABELS = 4  # more would stand on each other
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """A response with the bands that are drawn around it, (n_freq, n_out, n_in) each."""
+
+    response: FrequencyResponse
+    low: Float
+    high: Float
+    angle: Float
+    half: Float
+
+    @classmethod
+    def of(cls, response: FrequencyResponse) -> Curves:
+        """Bands of 90 % of gain and phase (degrees)."""
+        gain = magnitude_interval(response, BAND)
+        half = phase_half_width(response, BAND)
+        return cls(response, gain.low, gain.high, phase(response), half)
+
+
+def headline(
+    curves: Sequence[Curves],
+    output: int,
+    input: int,
+    model: ModelCurve | None,
+    comparisons: Sequence[Comparison],
+) -> Figure:
+    """Gain of one output, its bands and the model's curve, differences shaded: one look."""
+    responses = [c.response for c in curves]
+    y, u = responses[0].outputs[output], responses[0].inputs[input]
+    figure = stacked(1, [f"{y.name}/{u.name} [{unit(y, u)}]"], 330)
+    log_scale(figure["layout"]["yaxis"])
+    for k, c in enumerate(curves):
+        _gain(figure, c, k, output, input)
+    curve = np.empty(0)
+    if model is not None:
+        curve = _model_gain(figure, responses, model, y.name, u.name)
+    _frame(figure, responses)
+    _fit_gain(figure, responses, output, input, curve)
+    worst = telling(comparisons).get((y.name, u.name))
+    if worst is not None:
+        figure["layout"]["shapes"] = [shade(span) for span in worst.spans_hz]
+    found = peaks(responses[-1], output, input)
+    found = tuple(sorted(found, key=lambda p: -p.prominence_db)[:_PEAK_LABELS])
+    figure["layout"]["annotations"] = [
+        {
+            "x": float(np.log10(p.frequency_hz)),
+            "y": float(np.log10(p.gain)),
+            "text": f"{p.frequency_hz:.3g} Hz",
+            "ax": 0,
+            "ay": -26,
+            "arrowcolor": "@muted",
+            "arrowwidth": 1,
+            "arrowhead": 0,
+            "font": {"size": 12, "color": "@ink"},
+        }
+        for p in found
+    ]
+    return figure
+
+
+def bode(
+    curves: Sequence[Curves],
+    output: int,
+    input: int,
+    model: ModelCurve | None,
+) -> Figure:
+    """Gain, phase and coherence of one entry of H, every level with its 90 % band."""
+    responses = [c.response for c in curves]
+    y, u = responses[0].outputs[output], responses[0].inputs[input]
+    titles = [f"gain [{unit(y, u)}]", "phase [\u00b0]", "coherence"]
+    figure = stacked(3, titles, 720, weights=(0.46, 0.32, 0.22))
+    log_scale(figure["layout"]["yaxis"])
+    figure["layout"]["yaxis2"] |= {"dtick": 90}
+    figure["layout"]["yaxis3"] |= {"range": [0, 1.04], "dtick": 0.5}
+    anchor: Float | None = None
+    for k, c in enumerate(curves):
+        r = c.response
+        at = _lines(r, output, input)
+        f = r.frequency[at]
+        _gain(figure, c, k, output, input)
+        angle = c.angle[at, output, input]
+        if anchor is None:
+            anchor = np.stack([f, angle])
+        angle = _same_turn(f, angle, anchor)
+        half = c.half[at, output, input]
+        known = half < 180.0
+        width = np.where(known, half, np.nan)
+        band(figure, f, angle - width, angle + width, "y2", k)
+        line(figure, f, angle, _label(r), "y2", k, legend=False, hover="%{y:.1f}\u00b0")
+        coherence = r.coherence[at, output]
+        line(figure, f, coherence, _label(r), "y3", k, legend=False, hover="%{y:.3f}")
+    curve = np.empty(0)
+    if model is not None and anchor is not None:
+        curve = _model_gain(figure, responses, model, y.name, u.name)
+        f = _common(responses, model)
+        H = model.at(f, y.name, u.name)
+        angle = _same_turn(f, np.rad2deg(_unwrapped(H)), anchor)
+        line(
+            figure,
+            f,
+            angle,
+            f"model {model.name}",
+            "y2",
+            None,
+            legend=False,
+            hover="%{y:.1f}\u00b0",
+        )
+    _frame(figure, responses)
+    _fit_gain(figure, responses, output, input, curve)
+    return figure
+
+
+def ratio(
+    curves: Sequence[Curves],
+    output: int,
+    input: int,
+    model: ModelCurve,
+) -> Figure:
+    """Model over measurement: gain and phase, with the measurement's 90 % band around it."""
+    responses = [c.response for c in curves]
+    y, u = responses[0].outputs[output], responses[0].inputs[input]
+    figure = stacked(2, ["model/measured", "phase [\u00b0]"], 520)
+    log_scale(figure["layout"]["yaxis"])
+    figure["layout"]["yaxis2"] |= {"dtick": 45}
+    quotients: list[Float] = []
+    for k, c in enumerate(curves):
+        r = c.response
+        at = _lines(r, output, input)
+        f = r.frequency[at]
+        H = model.at(f, y.name, u.name)
+        size = np.abs(H)
+        low, high = c.low[at, output, input], c.high[at, output, input]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            quotient = H / r.H[at, output, input]
+            upper = np.where(low > 0, size / low, np.nan)
+            band(figure, f, size / high, upper, "y", k)
+        quotients.append(np.abs(quotient))
+        line(figure, f, np.abs(quotient), _label(r), "y", k, hover="\u00d7 %{y:.3f}")
+        angle = np.rad2deg(np.angle(quotient))
+        half = c.half[at, output, input]
+        band_half = np.where(half < 180.0, half, np.nan)
+        band(figure, f, angle - band_half, angle + band_half, "y2", k)
+        line(figure, f, angle, _label(r), "y2", k, legend=False, hover="%{y:.1f}\u00b0")
+    _frame(figure, responses)
+    shown = np.concatenate(quotients)
+    shown = np.log10(shown[np.isfinite(shown) & (shown > 0)])
+    if shown.size:
+        low, high = np.quantile(shown, [_NOISE_PART, 1 - _NOISE_PART])
+        figure["layout"]["yaxis"] |= ticked(min(low, 0.0) - 0.06, max(high, 0.0) + 0.06)
+    figure["layout"]["shapes"] = [level_line(axis, at) for axis, at in (("y", 1.0), ("y2", 0.0))]
+    return figure
+
+
+def unit(output: Channel, input: Channel) -> str:
+    """Unit of a response for a person: `(m/s\u00b2)/V`."""
+    over, under = pretty(output.unit), pretty(input.unit)
+    return f"({over})/{under}" if "/" in over else f"{over}/{under}"
+
+
+def _frame(figure: Figure, responses: Sequence[FrequencyResponse]) -> None:
+    """Frequency axis over the measured band, ticks at 1, 2, 5 until the reader zooms."""
+    low = min(float(r.frequency[r.frequency > 0][0]) for r in responses)
+    high = max(float(r.frequency[-1]) for r in responses)
+    figure["layout"]["xaxis"] |= ticked(np.log10(low), np.log10(high))
+
+
+def _fit_gain(
+    figure: Figure, responses: Sequence[FrequencyResponse], i: int, j: int, model: Float
+) -> None:
+    """Gain axis over the curves; a few lines that are all noise do not stretch it."""
+    parts = [np.abs(r.H[:, i, j]) for r in responses] + [model]
+    logs = [np.log10(p[np.isfinite(p) & (p > 0)]) for p in parts]
+    logs = [p for p in logs if p.size]
+    if not logs:
+        return
+    low = min(float(np.quantile(p, _NOISE_PART)) for p in logs)
+    high = max(float(p.max()) for p in logs)
+    room = 0.06 * (high - low) + 0.05
+    # The names of the peaks need room above them.
+    figure["layout"]["yaxis"] |= ticked(low - room, high + 4 * room)
+
+
+def _gain(figure: Figure, c: Curves, k: int, i: int, j: int) -> None:
+    r = c.response
+    at = _lines(r, i, j)
+    f = r.frequency[at]
+    low, high = c.low[at, i, j], c.high[at, i, j]
+    gain = np.abs(r.H[at, i, j])
+    # On a logarithmic axis zero is nowhere; a tenth of the estimate is "may be nothing".
+    band(figure, f, np.maximum(low, 0.1 * gain), high, "y", k)
+    line(figure, f, gain, _label(r), "y", k, hover="%{y:.4g}")
+
+
+def _model_gain(
+    figure: Figure,
+    responses: Sequence[FrequencyResponse],
+    model: ModelCurve,
+    y: str,
+    u: str,
+) -> Float:
+    f = _common(responses, model)
+    gain = np.abs(model.at(f, y, u))
+    line(figure, f, gain, f"model {model.name}", "y", None, hover="%{y:.4g}")
+    return gain
+
+
+def _label(r: FrequencyResponse) -> str:
+    return f"{r.level:g} {r.level_unit}" if np.isfinite(r.level) else "measured"
+
+
+def _lines(r: FrequencyResponse, i: int, j: int) -> Int:
+    """Indices of the lines to draw: all, or the extremes in each bin of log-frequency."""
+    f, gain = r.frequency, np.abs(r.H[:, i, j])
+    usable = np.flatnonzero((f > 0) & np.isfinite(gain))
+    if len(usable) <= 2 * _BINS:
+        return usable
+    x = np.log(f[usable])
+    bins = np.minimum(((x - x[0]) / (x[-1] - x[0]) * _BINS).astype(np.int64), _BINS - 1)
+    order = np.lexsort((gain[usable], bins))
+    ends = np.flatnonzero(np.diff(bins[order], prepend=-1, append=_BINS))
+    chosen = np.concatenate([order[ends[:-1]], order[ends[1:] - 1]])
+    return np.unique(usable[chosen])
+
+
+def _common(responses: Sequence[FrequencyResponse], model: ModelCurve) -> Float:
+    """The model's own lines within the band that was measured."""
+    low = min(r.frequency[r.frequency > 0][0] for r in responses)
+    high = max(r.frequency[-1] for r in responses)
+    f = model.frequency
+    return np.asarray(f[(f >= low) & (f <= high)])
+
+
+def _unwrapped(H: Any) -> Float:
+    return np.unwrap(np.angle(np.where(np.isfinite(H), H, 1.0)))
+
+
+def _same_turn(f: Float, angle: Float, anchor: Float) -> Float:
+    """`angle` moved by whole turns to lie next to the first curve."""
+    if not len(f):
+        return angle
+    difference = np.interp(f, anchor[0], anchor[1]) - angle
+    return np.asarray(angle + 360.0 * np.round(np.nanmedian(difference) / 360.0))

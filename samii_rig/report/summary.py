@@ -1,0 +1,211 @@
+"""What the terminal shows: live progress of the whole plan, then a summary in few lines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol, Self
+
+from rich.console import Console, Group, RenderableType
+from rich.live import Live
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from samii_rig.report.compare import ModelCurve, compare, percent, pretty
+from samii_rig.report.facts import level
+from samii_rig.report.peaks import peaks
+from samii_rig.report.plots import unit
+from samii_rig.report.verdicts import Verdict, duration, verdicts
+from samii_rig.types import FrequencyResponse, Recording
+
+if TYPE_CHECKING:  # it compiles the model, which showing needs not
+    from samii_rig.run.dryrun import DryRun
+
+_STYLES = {"good": "green", "note": "blue", "warning": "yellow", "bad": "bold red"}
+_WORDS = {"good": "good", "note": "note", "warning": "look", "bad": "ATTENTION"}
+_SHOWN = 4  # peaks in one cell of the table
+_MARGIN_CLOSE = 0.2  # of a limit left: shown as close
+_BAR = 30  # characters
+
+
+class ProgressLike(Protocol):
+    """How far a run is: the fields of `samii_rig.run.loop.Progress` that are shown."""
+
+    @property
+    def segment(self) -> int:
+        """1-based, of `n_segments`."""
+
+    @property
+    def n_segments(self) -> int:
+        """Of the whole plan."""
+
+    @property
+    def name(self) -> str:
+        """Name of the segment."""
+
+    @property
+    def level(self) -> float:
+        """Amplitude of the segment in `unit`."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of `level`."""
+
+    @property
+    def time_left(self) -> float:
+        """s."""
+
+    @property
+    def frequency(self) -> float:
+        """Hz now, NaN at rest."""
+
+    @property
+    def worst_channel(self) -> str:
+        """The channel that came nearest to its limit, "" for none."""
+
+    @property
+    def worst_margin(self) -> float:
+        """1 - |value|/limit of that channel."""
+
+
+def progress_line(progress: ProgressLike, total_s: float) -> RenderableType:
+    """One line of bar and one of words: `sweep 3/9 ... 41 s left, 12.3 Hz at 2 V, ...`."""
+    p = progress
+    done = max(0.0, min(1.0, 1 - p.time_left / total_s)) if total_s > 0 else 1.0
+    head = Table.grid(padding=(0, 1))
+    head.add_row(
+        f"{p.name} {p.segment}/{p.n_segments}",
+        ProgressBar(total=1.0, completed=done, width=_BAR),
+        f"{percent(done)}",
+        f"{duration(max(p.time_left, 0.0))} left",
+    )
+    now = "at rest" if math.isnan(p.frequency) else f"{p.frequency:.2f} Hz"
+    words = Text(f"{now} at {p.level:g} {p.unit}")
+    if p.worst_channel:
+        style = "green" if p.worst_margin > _MARGIN_CLOSE else "yellow"
+        style = "bold red" if p.worst_margin <= 0 else style
+        words.append("; nearest to a limit so far: ")
+        words.append(f"{p.worst_channel}, {percent(p.worst_margin)} left", style=style)
+    return Group(head, words)
+
+
+class LiveProgress:
+    """Shows a run while it goes; call it with each progress report.
+
+    >>> with LiveProgress(console, total_s=180.0) as show:   # doctest: +SKIP
+    ...     run(plan, rig, device, sink, progress=show)
+
+    Without a terminal (a pipe, a log file) it prints one plain line a segment instead.
+    """
+
+    def __init__(self, console: Console, total_s: float) -> None:
+        self._console, self._total = console, total_s
+        self._live = Live(console=console, refresh_per_second=4, transient=True)
+        self._segment = 0
+
+    def __enter__(self) -> Self:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._console.is_terminal:
+            self._live.stop()
+
+    def __call__(self, progress: ProgressLike) -> None:
+        """Show `progress`."""
+        if self._console.is_terminal:
+            self._live.update(progress_line(progress, self._total))
+        elif progress.segment != self._segment:
+            self._segment = progress.segment
+            self._console.print(
+                f"{progress.segment}/{progress.n_segments} {progress.name}, "
+                f"{progress.level:g} {progress.unit}, {duration(progress.time_left)} left",
+                highlight=False,
+            )
+
+
+def summary(
+    recordings: Sequence[Recording],
+    responses: Sequence[FrequencyResponse],
+    model: ModelCurve | None = None,
+    band_hz: tuple[float, float] = (0.0, math.inf),
+) -> RenderableType:
+    """The verdicts and one table: peaks and model over measurement, per level and output."""
+    responses = sorted(responses, key=lambda r: (not math.isfinite(r.level), r.level))
+    found = [] if model is None else [c for r in responses for c in compare(r, model, band_hz)]
+    said = [verdict_line(v) for v in verdicts(recordings, responses, found)]
+    if not responses:
+        return Group(*said)
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for name in ("response", "level", "peaks: Hz, gain, standard deviation"):
+        table.add_column(name, overflow="fold")
+    if found:
+        table.add_column("model/measured")
+    by_key = {(c.output, c.input, c.level): c for c in found}
+    for i, y in enumerate(responses[0].outputs):
+        for j, u in enumerate(responses[0].inputs):
+            for r in responses:
+                tall = sorted(peaks(r, i, j), key=lambda p: -p.prominence_db)[:_SHOWN]
+                cells = [
+                    f"{p.frequency_hz:.2f} Hz {p.gain:.3g} \u00b1{100 * p.sigma / p.gain:.1f} %"
+                    for p in sorted(tall, key=lambda p: p.frequency_hz)
+                ]
+                row = [f"{y.name}/{u.name} [{unit(y, u)}]", level(r), "\n".join(cells) or "none"]
+                c = by_key.get((y.name, u.name, r.level))
+                if c is not None:
+                    phase = round(c.phase_deg, 1) + 0.0
+                    row.append(
+                        f"\u00d7 {c.gain:.3f}, {phase:+.1f}\u00b0, {percent(c.outside)} outside"
+                    )
+                table.add_row(*(Text(cell) for cell in row))
+    return Group(*said, Text(""), table)
+
+
+def dry_run_summary(predicted: DryRun) -> RenderableType:
+    """What a plan will come to: duration, margins (worst first), expected error per band."""
+    margins = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for name in ("channel", "held to its", "predicted", "limit", "margin", "where"):
+        margins.add_column(name)
+    for m in predicted.margins:
+        style = "green" if m.margin > _MARGIN_CLOSE else "yellow" if m.margin >= 0 else "bold red"
+        margins.add_row(
+            m.channel,
+            m.what,
+            f"{m.predicted:.3g} {pretty(m.unit)}",
+            f"{m.limit:g} {pretty(m.unit)}",
+            Text(percent(m.margin), style=style),
+            m.segment,
+        )
+    channels = list(dict.fromkeys(b.channel for b in predicted.bands))
+    errors = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for name in ("expected error at", *channels):
+        errors.add_column(name)
+    rows: dict[str, dict[str, str]] = {}
+    for b in predicted.bands:
+        key = f"{b.level:g} {b.level_unit}, {b.low_hz:.3g}\u2013{b.high_hz:.3g} Hz"
+        rows.setdefault(key, {})[b.channel] = f"{100 * b.relative:.2g} %"
+    for key, cells in rows.items():
+        errors.add_row(key, *(cells.get(c, "") for c in channels))
+    head = Text(f"The plan takes {duration(predicted.duration)}. Predicted by the model:")
+    return Group(head, margins, Text(""), errors) if rows else Group(head, margins)
+
+
+def show_dry_run(predicted: DryRun, console: Console | None = None) -> None:
+    """Print `dry_run_summary`."""
+    (console or Console(highlight=False)).print(dry_run_summary(predicted))
+
+
+def verdict_line(verdict: Verdict) -> Text:
+    """`good  The response is measured. Standard deviation ...`, the mark in colour."""
+    line = Text(f"{_WORDS[verdict.mark]:<9} ", style=_STYLES[verdict.mark])
+    line.append(f"{verdict.title}. ", style="bold default")
+    line.append(verdict.text, style="not bold default")
+    return line

@@ -1,0 +1,305 @@
+"""The report says what the data say, in words first, and needs nothing from elsewhere."""
+
+import base64
+import hashlib
+import io
+import json
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from types import SimpleNamespace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from report_kit import MODES, measured, model, recorded
+from rich.console import Console
+
+from samii_rig.errors import InputError
+from samii_rig.report.compare import ModelCurve, compare
+from samii_rig.report.decimate import thin
+from samii_rig.report.drawing import draw
+from samii_rig.report.figures import bode_figure, save_figure
+from samii_rig.report.page import write_report
+from samii_rig.report.peaks import peaks
+from samii_rig.report.summary import LiveProgress, dry_run_summary, progress_line, summary
+from samii_rig.report.verdicts import verdicts
+from samii_rig.rig.load import load_rig
+from samii_rig.run.dryrun import DryRun, Margin
+from samii_rig.run.expected import BandError
+from samii_rig.types import Finding, StopRecord
+
+
+class Page(HTMLParser):
+    """What a browser would find in a page: addresses, texts, scripts, ids."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.addresses, self.ids, self.scripts = [], [], {}
+        self.text, self.policy = "", ""
+        self._script = None
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "action", "data", "srcset")]
+        self.ids += [found["id"]] if "id" in found else []
+        if found.get("http-equiv") == "Content-Security-Policy":
+            self.policy = found["content"]
+        self._script = tag in ("script", "style") and (found.get("id") or f"{tag}{len(self.ids)}")
+
+    def handle_data(self, data):
+        if self._script:
+            self.scripts[self._script] = self.scripts.get(self._script, "") + data
+        else:
+            self.text += data
+
+    def handle_endtag(self, tag):
+        if tag in ("script", "style"):
+            self._script = None
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    rig, _ = load_rig("samii")
+    path = write_report(
+        folder / "r.html",
+        recorded(lost=3),
+        [measured(2.0, seed=1), measured(1.0)],
+        rig=rig,
+        model=model(0.6),
+    )
+    assert list(folder.iterdir()) == [path]
+    text = path.read_text(encoding="utf-8")
+    assert len(text.encode()) < 8_000_000
+    return text, Page(text)
+
+
+def test_nothing_is_asked_of_anyone(page):
+    _, parsed = page
+    assert parsed.addresses
+    assert all(address.startswith("#") for address in parsed.addresses)
+    assert {address[1:] for address in parsed.addresses} <= set(parsed.ids)
+    assert len(parsed.ids) == len(set(parsed.ids))
+    assert "default-src 'none'" in parsed.policy
+    assert "http" not in parsed.policy
+
+
+def test_the_policy_lets_exactly_the_pages_own_scripts_run(page):
+    text, parsed = page
+    scripts = re.findall(r"<script>(.*?)</script>", text, flags=re.DOTALL)
+    hashes = {base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts}
+    assert hashes == set(re.findall(r"'sha256-([^']+)'", parsed.policy))
+    assert not re.search(r"<[^>]+ on(load|click|error)=", text)
+
+
+def test_the_verdicts_stand_first(page):
+    _, parsed = page
+    said = parsed.text
+    assert "The model differs from the measurement" in said
+    assert "gain 0.600" in said
+    assert "3 of 6,003 samples missing" in said
+    assert said.index("The model differs") < said.index("Bode\n")
+
+
+def test_every_figure_has_data(page):
+    _, parsed = page
+    figures = {k: json.loads(v) for k, v in parsed.scripts.items() if k.startswith("data-")}
+    assert {k.split("-")[1] for k in figures} == {"head", "bode", "ratio", "time", "spectrum"}
+    for name, figure in figures.items():
+        for traces in [s["data"] for s in figure["sets"]] if "sets" in figure else [figure["data"]]:
+            assert traces, name
+            for trace in traces:
+                x = np.frombuffer(base64.b64decode(trace["x"]["bdata"]), "<f4")
+                assert np.isfinite(x).sum() > 2 or trace["name"] == "samples missing", name
+
+
+def test_text_from_files_cannot_become_markup(tmp_path):
+    evil = "</script><script>alert(1)</script><img src=http://x/y>"
+    recording = replace(recorded(600), metadata={"operator": evil}, source=evil)
+    response = measured(n=60, findings=(Finding("gap", "warning", evil, evil, evil),))
+    rig, _ = load_rig("sflr")
+    rig = rig.model_copy(update={"name": evil, "description": evil})
+    path = write_report(tmp_path / "r.html", recording, [response], rig=rig, model=model())
+    parsed = Page(path.read_text(encoding="utf-8"))
+    assert all(address.startswith("#") for address in parsed.addresses)
+    assert "alert(1)" in parsed.text
+
+
+def test_a_report_of_a_recording_alone_and_of_a_response_alone(tmp_path):
+    alone = write_report(tmp_path / "a.html", recorded(), []).read_text(encoding="utf-8")
+    assert "No response was estimated" in alone
+    response = write_report(tmp_path / "b.html", [], [measured()]).read_text(encoding="utf-8")
+    assert "The response is measured" in response
+
+
+ODD = {
+    "noise known for certain": {"dof": np.full(50, np.inf)},
+    "no noise at all": {"covariance": np.zeros((50, 2, 2), complex)},
+    "a line at 0 Hz": {"frequency": np.linspace(0.0, 10.0, 50)},
+    "levels mixed": {"level": math.nan},
+    "an output that is dead": {"H": np.zeros((50, 2, 1), complex)},
+    "a single degree of freedom": {"dof": np.ones(50)},
+}
+
+
+@pytest.mark.parametrize("case", ODD)
+def test_odd_responses_are_shown_all_the_same(tmp_path, case):
+    response = replace(measured(n=50), **ODD[case])
+    write_report(tmp_path / "r.html", [], [response], model=model())
+    assert case
+    printed(summary([], [response], model()))
+    bode_figure([response], model())
+
+
+def test_what_cannot_be_reported(tmp_path):
+    path = tmp_path / "r.html"
+    with pytest.raises(InputError, match="expected a recording or a response"):
+        write_report(path, [], [])
+    with pytest.raises(InputError, match="spectrogram channel is 'x'"):
+        write_report(path, recorded(), [], spectrogram_channel="x")
+    other = replace(measured(), outputs=measured().outputs[::-1])
+    with pytest.raises(InputError, match="the same in all responses"):
+        write_report(path, [], [measured(), other])
+    with pytest.raises(InputError, match="expected the shape"):
+        ModelCurve("m", np.arange(3.0), np.ones((3, 2), complex), ("a", "b"), ("u",))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_truth_agrees_and_a_wrong_gain_does_not():
+    right = compare(measured(n=2000), model())
+    # 10 % of the lines lie outside a 90 % region of the truth.
+    assert all(c.outside == pytest.approx(0.10, abs=0.03) for c in right)
+    assert all(c.gain == pytest.approx(1.0, abs=0.005) for c in right)
+    (wrong, _) = compare(measured(n=2000), model(0.5), (1.0, 24.0))
+    assert wrong.gain == pytest.approx(0.5, abs=0.005)
+    assert not wrong.agrees
+    assert wrong.first_hz == pytest.approx(1.0, rel=0.01)
+    assert "gain 0.5" in wrong.sentence()
+    assert "1\u201324 Hz" in wrong.sentence()
+
+
+def test_a_run_that_was_tripped_is_said_first():
+    tripped = replace(recorded(), stop=StopRecord("tripped", "theta_2 over 0.35 rad"))
+    first = verdicts([tripped], [measured()], [])[0]
+    assert first.mark == "bad"
+    assert "theta_2 over 0.35 rad" in first.text
+
+
+def test_findings_are_gathered_by_kind_and_name_files_without_folders():
+    gaps = [Finding("gap", "error", f"/some/lab/run_{k}.mcap, sweep: 1 missing") for k in (1, 2)]
+    worn = Finding("clipping", "warning", "a_0 clips.")
+    (said,) = verdicts([], [measured(findings=(*gaps, worn))], [])[-1:]
+    assert said.mark == "bad"
+    assert said.text == "run_1.mcap, sweep: 1 missing (and 1 more of this kind). a_0 clips."
+
+
+def test_a_gain_that_changes_with_level_is_called_so():
+    same = verdicts([], [measured(1.0), measured(2.0, seed=1)], [])
+    assert "does not depend" in " ".join(v.title for v in same)
+    changed = verdicts([], [measured(1.0), measured(2.0, seed=1, gain=1.2)], [])
+    (said,) = [v for v in changed if "changes with the amplitude" in v.title]
+    assert "not linear" in said.text
+
+
+def test_peaks_are_the_modes_and_noise_has_none():
+    found = [p.frequency_hz for p in peaks(measured(relative=0.01), 1)]
+    for hz in MODES[:1] + MODES[2:]:
+        assert min(abs(f / hz - 1) for f in found) < 0.03
+    f = np.linspace(1, 40, 2000)
+    rng = np.random.default_rng(3)
+    noise = 1 + 0.3 * (rng.standard_normal((2000, 2, 1)) + 1j * rng.standard_normal((2000, 2, 1)))
+    flat = replace(measured(n=2000), frequency=f, H=noise)
+    assert peaks(flat, 0) == ()
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(1, 60))
+def test_thinning_keeps_every_extreme(values, pixels):
+    y = np.array(values)
+    t, thinned = thin(np.arange(len(y), dtype=float), y, pixels)
+    assert thinned.max() == y.max()
+    assert thinned.min() == y.min()
+    assert (np.diff(t) >= 0).all()
+    assert len(t) <= max(len(y), 2 * pixels)
+
+
+@pytest.mark.parametrize("name", ["samii", "sflr"])
+def test_the_drawing_names_every_part(name):
+    rig, _ = load_rig(name)
+    texts = [e.text for e in ElementTree.fromstring(draw(rig)).iter("text")]
+    assert {e.name for e in rig.element} <= set(texts)
+    assert all(any(t.startswith(s.name) for t in texts) for s in rig.sensor)
+    assert rig.base in texts
+
+
+def test_figures_for_a_paper(tmp_path):
+    figure = bode_figure([measured(1.0, n=100), measured(2.0, n=100)], model())
+    assert save_figure(tmp_path / "bode.png", figure).stat().st_size > 20_000
+    text = save_figure(tmp_path / "bode.svg", figure).read_text(encoding="utf-8")
+    assert "theta_2/v_2 [rad/V]" in text
+    assert "transfer matrices" in text
+    with pytest.raises(InputError, match="suffix"):
+        save_figure(tmp_path / "bode.bmp", figure)
+
+
+def printed(thing, **options):
+    console = Console(file=io.StringIO(), width=110, **options)
+    console.print(thing)
+    return console.file.getvalue()
+
+
+def test_the_terminal_says_the_same():
+    said = printed(summary([recorded()], [measured(1.0)], model(0.6)))
+    assert "The model differs from the measurement" in said
+    assert "\u00d7 0.600" in said
+    assert "2.3" in said
+
+
+def test_a_dry_run_says_its_margins_and_errors():
+    margin = Margin("theta_2", "limit", "rad", 0.28, 0.35, "frame", "sweep_4", 4.0, "V", 5.0)
+    over = replace(margin, channel="a_0", unit="m/s^2", predicted=33.0, limit=30.0)
+    band = BandError("theta_2", 4.0, "V", 1.0, 2.0, 1e-5, 0.013)
+    peaks_ = np.zeros((1, 1))
+    said = printed(
+        dry_run_summary(DryRun(95.0, ("v_2",), ("V",), peaks_, 0.0, (over, margin), (band,)))
+    )
+    for part in ("95 s", "33 m/s\u00b2", "-10 %", "20 %", "1\u20132 Hz", "1.3 %"):
+        assert part in said
+
+
+def report(segment, frequency=3.2):
+    return SimpleNamespace(
+        segment=segment,
+        n_segments=9,
+        name="sweep",
+        level=2.0,
+        unit="V",
+        time_left=41.0,
+        frequency=frequency,
+        worst_channel="theta_2",
+        worst_margin=0.31,
+    )
+
+
+def test_progress_lives_on_a_terminal_and_is_one_line_a_segment_elsewhere():
+    assert "at rest at 2 V" in printed(progress_line(report(3, math.nan), 90.0))
+    terminal = Console(file=io.StringIO(), width=100, force_terminal=True)
+    with LiveProgress(terminal, 90.0) as show:
+        show(report(3))
+    said = re.sub(r"\x1b\[[0-9;]*m", "", terminal.file.getvalue())
+    for part in ("3/9", "54 %", "41 s left", "3.20 Hz at 2 V", "theta_2, 31 % left"):
+        assert part in said
+    plain = Console(file=io.StringIO(), width=100)
+    with LiveProgress(plain, 90.0) as show:
+        for segment in (1, 1, 1, 2):
+            show(report(segment))
+    assert plain.file.getvalue().splitlines() == [
+        "1/9 sweep, 2 V, 41 s left",
+        "2/9 sweep, 2 V, 41 s left",
+    ]
