@@ -1,0 +1,42 @@
+"""All commands, by name. Heavy imports wait until a command needs them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+import samii_rig
+from samii_rig.cli import estimate, files, record
+
+app = typer.Typer(
+    name="samii-rig",
+    help="Drive a flexible robot, record it, estimate its frequency responses, "
+    "hold the model against them.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _version(value: bool) -> None:
+    if value:
+        typer.echo(f"samii-rig {samii_rig.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+app.command("run")(record.run)
+app.command("import")(files.import_)
+app.command("frf")(estimate.frf)
+app.command("report")(estimate.report)
+app.command("verify")(files.verify)
+app.command("recover")(files.recover)

@@ -1,0 +1,105 @@
+"""What several commands share: output, options, the model over a measurement."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from samii_rig.report.compare import ModelCurve
+    from samii_rig.rig.schema import Rig
+    from samii_rig.types import FrequencyResponse, Recording
+
+RigOption = Annotated[
+    str, typer.Option("--rig", help="Name of a shipped rig, or the path of a rig file.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, for machines.")]
+Logs = Annotated[list[Path], typer.Argument(help="Recordings (.mcap).", show_default=False)]
+
+
+def say_json(data: dict[str, Any]) -> None:
+    """One JSON object on standard output; numbers that JSON has not become null."""
+    json.dump(_plain(data), sys.stdout, indent=2, allow_nan=False)
+    sys.stdout.write("\n")
+
+
+def _plain(value: Any) -> Any:
+    match value:
+        case dict():
+            return {str(k): _plain(v) for k, v in value.items()}
+        case list() | tuple():
+            return [_plain(v) for v in value]
+        case float():
+            return value if abs(value) < float("inf") else None
+        case str() | int() | None:
+            return value
+        case _:
+            return str(value)
+
+
+def rig_of(recordings: Sequence[Recording], option: str | None) -> tuple[Rig, str] | None:
+    """The rig to hold against recordings: the one asked for, else the one they carry."""
+    from samii_rig.rig.load import load_rig, parse
+    from samii_rig.rig.schema import Rig
+
+    if option:
+        return load_rig(option)
+    text = next((r.rig_toml for r in recordings if r.rig_toml), "")
+    return (parse(Rig, text, "the recording's rig file"), text) if text else None
+
+
+def model_curve(rig: Rig, responses: Sequence[FrequencyResponse]) -> ModelCurve | None:
+    """The rig's model, seen through its hold, filters and sampling, at the lines measured.
+
+    None when nothing was measured.
+    """
+    import numpy as np
+
+    from samii_rig.model.sampled import sampled_response
+    from samii_rig.report.compare import ModelCurve
+
+    if not responses:
+        return None
+    f = np.unique(np.concatenate([r.frequency for r in responses]))
+    f = f[(f > 0) & (f < rig.rate_hz / 2)]
+    return ModelCurve(
+        rig.name,
+        f,
+        sampled_response(rig, f),
+        tuple(s.name for s in rig.sensor),
+        tuple(a.name for a in rig.actuator),
+    )
+
+
+def comparisons(
+    responses: Sequence[FrequencyResponse], curve: ModelCurve | None
+) -> list[dict[str, Any]]:
+    """Model over measurement for every output and level, as plain data."""
+    from dataclasses import asdict
+
+    from samii_rig.report.compare import compare
+
+    return [asdict(c) for r in responses if curve for c in compare(r, curve)]
+
+
+def response_json(r: FrequencyResponse) -> dict[str, Any]:
+    """What one frequency response is, without its lines: those are for `frf --export`."""
+    return {
+        "inputs": [c.name for c in r.inputs],
+        "outputs": [c.name for c in r.outputs],
+        "level": r.level,
+        "level_unit": r.level_unit,
+        "lines": len(r.frequency),
+        "low_hz": r.frequency[0],
+        "high_hz": r.frequency[-1],
+        "method": r.method,
+        "why": r.why,
+        "n_averages": r.n_averages,
+        "findings": [f.message for f in r.findings],
+    }

@@ -1,0 +1,196 @@
+"""`samii-rig frf` and `samii-rig report`: results from recordings that exist."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from samii_rig.cli.common import (
+    JsonOption,
+    Logs,
+    comparisons,
+    model_curve,
+    response_json,
+    rig_of,
+    say_json,
+)
+from samii_rig.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from samii_rig.signal.choose import Method
+    from samii_rig.signal.gather import Gaps
+    from samii_rig.types import FrequencyResponse, Recording
+
+ALL = (0.0, float("inf"))  # Hz: every line that was estimated
+
+RigOverride = Annotated[
+    str | None,
+    typer.Option("--rig", help="Rig to lay over the data [default: the one they carry]"),
+]
+InputOption = Annotated[str | None, typer.Option("--input", help="Input channel.")]
+OutputOption = Annotated[
+    list[str] | None, typer.Option("--output", help="Output channel; may be repeated.")
+]
+MethodOption = Annotated[
+    str, typer.Option(help="auto, burst, periodic, local, h1, h2 or hv (Welch).")
+]
+GapsOption = Annotated[
+    str, typer.Option(help="A segment that misses samples: refuse, exclude or model it.")
+]
+BandOption = Annotated[
+    tuple[float, float] | None, typer.Option(help="Lowest and highest frequency, Hz.")
+]
+
+
+def frf(
+    logs: Logs,
+    rig: RigOverride = None,
+    input_: InputOption = None,
+    output: OutputOption = None,
+    method: MethodOption = "auto",
+    gaps: GapsOption = "refuse",
+    band: BandOption = None,
+    export: Annotated[
+        list[Path] | None,
+        typer.Option(help="Write a .csv, .npz or .uff file; one a level. May be repeated."),
+    ] = None,
+    save: Annotated[
+        Path | None, typer.Option(help="Write a .mcap of the results that names its sources.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Estimate frequency responses with their uncertainty; recordings of one level are pooled.
+
+    The method is chosen from what the recordings hold, and said.
+
+    Example: samii-rig frf runs/*.mcap --export frf.csv --save frf.mcap
+    """
+    from rich.console import Console
+
+    from samii_rig.record.derived import save_frequency_responses
+    from samii_rig.record.export import export_response
+    from samii_rig.report.summary import summary
+
+    for path in export or ():
+        if path.suffix.lower() not in (".csv", ".npz", ".uff"):
+            raise InputError("--export", "", str(path), "a name that ends in .csv, .npz or .uff")
+    console = Console(highlight=False)
+    recordings = _read(logs)
+    responses = _estimated(recordings, input_, output, method, gaps, band)
+    held = rig_of(recordings, rig)
+    curve = model_curve(held[0], responses) if held else None
+    written = []
+    for path in export or ():
+        names = _one_a_level(path, responses)
+        written += [export_response(n, r) for n, r in zip(names, responses, strict=True)]
+    if save:
+        save_frequency_responses(save, responses, logs)
+        written.append(save)
+    if json:
+        say_json(
+            {
+                "responses": [response_json(r) for r in responses],
+                "model_over_measurement": comparisons(responses, curve),
+                "written": written,
+            }
+        )
+        return
+    console.print(summary(recordings, responses, curve, band or ALL))
+    for r in responses:
+        console.print(f"\n{r.level:g} {r.level_unit}: {r.method}. {r.why}")
+    for path in written:
+        console.print(f"written  {path}", soft_wrap=True)
+
+
+def report(
+    logs: Logs,
+    rig: RigOverride = None,
+    out: Annotated[
+        Path | None, typer.Option(help="The page [default: beside the first recording]")
+    ] = None,
+    figure: Annotated[
+        list[Path] | None,
+        typer.Option(help="Also the Bode diagram as .png, .svg or .pdf, for a paper."),
+    ] = None,
+    input_: InputOption = None,
+    output: OutputOption = None,
+    method: MethodOption = "auto",
+    gaps: GapsOption = "refuse",
+    band: BandOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Write one self-contained HTML page about recordings: works offline, interactive.
+
+    Example: samii-rig report runs/*.mcap --out report.html --figure bode.svg
+    """
+    from rich.console import Console
+
+    from samii_rig.record.reader import read_events
+    from samii_rig.report.figures import bode_figure, save_figure
+    from samii_rig.report.page import write_report
+    from samii_rig.report.summary import summary
+
+    recordings = _read(logs)
+    responses = _estimated(recordings, input_, output, method, gaps, band)
+    held = rig_of(recordings, rig)
+    curve = model_curve(held[0], responses) if held else None
+    page = write_report(
+        out or logs[0].with_suffix(".html"),
+        recordings,
+        responses,
+        rig=held[0] if held else None,
+        model=curve,
+        band_hz=band or ALL,
+        events=[event for path in logs for event in read_events(path)],
+    )
+    written = [page]
+    for path in figure or ():
+        written.append(save_figure(path, bode_figure(responses, curve)))
+    if json:
+        say_json({"written": written, "model_over_measurement": comparisons(responses, curve)})
+        return
+    console = Console(highlight=False)
+    console.print(summary(recordings, responses, curve, band or ALL))
+    for path in written:
+        console.print(f"written  {path}", soft_wrap=True)
+
+
+def _read(logs: list[Path]) -> list[Recording]:
+    from samii_rig.record.reader import read_recording
+
+    return [read_recording(path) for path in logs]
+
+
+def _estimated(
+    recordings: list[Recording],
+    input_: str | None,
+    output: list[str] | None,
+    method: str,
+    gaps: str,
+    band: tuple[float, float] | None,
+) -> tuple[FrequencyResponse, ...]:
+    from samii_rig.signal.estimate import estimate
+
+    # `estimate` itself refuses names that it does not know.
+    return estimate(
+        recordings,
+        input=input_,
+        outputs=output,
+        method=cast("Method", method),
+        gaps=cast("Gaps", gaps),
+        band=band,
+    )
+
+
+def _one_a_level(path: Path, responses: Sequence[FrequencyResponse]) -> list[Path]:
+    """The path itself for one response, else one name each that tells the level."""
+    if len(responses) == 1:
+        return [path]
+    names = [f"{path.stem}_{r.level:g}" for r in responses]
+    if len(set(names)) < len(names):
+        names = [f"{name}_{i + 1}" for i, name in enumerate(names)]
+    return [path.with_name(name + path.suffix) for name in names]
