@@ -1,0 +1,197 @@
+"""Component-mode reduction of the whole mechanism (paper 1, eq. 13 and 14).
+
+    q = [phi_r  phi_f] [theta; eta_f]
+
+A rigid mode phi_r is the motion when one actuator coordinate turns by 1 rad and nothing else is
+loaded; a flexible mode phi_f is an undamped mode with all actuator coordinates held. Held, the
+reduced model has the natural frequencies of the full one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse.linalg import splu
+
+from samii_rig.errors import InputError
+from samii_rig.fem.assemble import Source
+from samii_rig.fem.model import Fem, multiplier_unit, positive_hz, saddle
+from samii_rig.types import Complex, Float
+
+if TYPE_CHECKING:
+    from control import StateSpace
+
+ROUNDING = 1e-10  # of the terms it is summed from, below which a reduced stiffness is zero
+# Least inertia of a coordinate beside the others, relative: below it the coordinate has next to no
+# mass, its states are too fast, and rounding spoils the response.
+INERTIA = 1e-9
+FLOATS = 1e-12  # a squared natural frequency below this, over the model's scale, is zero
+
+
+@dataclass(frozen=True, slots=True)
+class Reduced:
+    """M eta'' + C eta' + K eta = force u, the first `n_rigid` of eta being joint angles (rad).
+
+    M, C, K : (n, n); for a chain that the joints leave free, only flexible modes have stiffness
+    (eq. 14). shapes : (n_q, n) [phi_r phi_f] in the coordinates of the full model.
+    coordinates : names of the n_rigid joints. inputs, outputs : names; inputs are the rig's
+    actuators, then "T_<joint>" in N m for each joint driven by a torque.
+    force : (n, n_in) generalised forces; sources : joints whose rotation is prescribed.
+    position, velocity, acceleration : (n_out, n) rows, sensors = sum of row times derivative.
+    """
+
+    M: Float
+    C: Float
+    K: Float
+    shapes: Float
+    coordinates: tuple[str, ...]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    force: Float
+    sources: tuple[Source, ...]
+    position: Float
+    velocity: Float
+    acceleration: Float
+
+    @property
+    def n_rigid(self) -> int:
+        """Number of actuator coordinates."""
+        return len(self.coordinates)
+
+    def state_space(self) -> tuple[Float, Float, Float, Float]:
+        """(A, B, C, D) with states [theta_s, theta_s', eta_x, eta_x'] (SI units).
+
+        theta_s are the rotations that velocity sources prescribe, with the lag
+        theta_s'' = K p v - p theta_s' (paper 2, eq. 1); eta_x all other coordinates.
+        """
+        n, n_in = self.force.shape
+        s = [self.coordinates.index(d.element) for d in self.sources]
+        x = [i for i in range(n) if i not in s]
+        n_s, n_x = len(s), len(x)
+        size = 2 * (n_s + n_x)
+        # eta = E0 state, eta' = E1 state, eta'' = E2 state + F u.
+        E0, E1, E2, F = *(np.zeros((n, size)) for _ in range(3)), np.zeros((n, n_in))
+        E0[s, :n_s] = np.eye(n_s)
+        E1[s, n_s : 2 * n_s] = np.eye(n_s)
+        E0[x, 2 * n_s : 2 * n_s + n_x] = np.eye(n_x)
+        E1[x, 2 * n_s + n_x :] = np.eye(n_x)
+        for at, source in zip(s, self.sources, strict=True):
+            E2[at] = -source.p * E1[at]
+            F[at, source.column] = source.gain
+        inner, across = self.M[np.ix_(x, x)], self.M[np.ix_(x, s)]
+        E2[x] = np.linalg.solve(inner, -self.K[x] @ E0 - self.C[x] @ E1 - across @ E2[s])
+        F[x] = np.linalg.solve(inner, self.force[x] - across @ F[s])
+        A = np.vstack([E1[s], E2[s], E1[x], E2[x]])
+        B = np.vstack([np.zeros((n_s, n_in)), F[s], np.zeros((n_x, n_in)), F[x]])
+        C = self.position @ E0 + self.velocity @ E1 + self.acceleration @ E2
+        return A, B, C, self.acceleration @ F
+
+    def response(self, frequency_hz: ArrayLike) -> Complex:
+        """(n_freq, n_out, n_in) as `Fem.response`, of the reduced model."""
+        A, B, C, D = self.state_space()
+        s = 2j * np.pi * positive_hz(frequency_hz)
+        return np.asarray(C @ np.linalg.solve(s[:, None, None] * np.eye(len(A)) - A, B) + D)
+
+    def to_statespace(self) -> StateSpace:
+        """The model as `control.StateSpace`, inputs and outputs named."""
+        import control  # takes a second, and most uses of a model need it not
+
+        return control.ss(*self.state_space(), inputs=self.inputs, outputs=self.outputs)
+
+
+def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced:
+    """The component-mode reduction of a finite element model.
+
+    flexible : flexible modes kept. torque : joints that get an actuator coordinate driven by a
+    torque, besides the rig's sources, which all have one; a locked joint is then free.
+
+    Raises InputError for an unknown joint, more flexible modes than there are or than leave a
+    joint driven by a torque any inertia, a beam with `eta` (no equation in time), a chain that
+    floats when its actuators are held.
+    """
+    fem.refuse_loss()
+    m, rig = fem.mechanism, fem.rig
+    driven = [*(a.element for a in m.sources), *(a.element for a in m.feedback)]
+    passive = [name for name in m.joints if name not in driven]
+    for name in torque:
+        if name not in passive or [*torque].count(name) > 1:
+            expected = f"joints without a source, each once, of {passive}"
+            raise InputError(rig.name, "torque", name, expected)
+    names = (*driven, *torque)
+    joints = [m.joints[name] for name in names]
+    basis = fem.basis(joints)
+    omega = basis.modes.omega
+    if not 0 <= flexible <= omega.size:
+        raise InputError(rig.name, "flexible", flexible, f"0 to {omega.size} modes")
+    if omega.size and omega[0] ** 2 < FLOATS * basis.scale:
+        raise InputError.saying(rig.name, "base", "the chain floats; expected an end that holds it")
+
+    static = _Static(fem, joints)
+    turned = np.array([static.unit(static.lock(j))[0] for j in joints]).T
+    phi = np.hstack([turned.reshape(-1, len(joints)), basis.modes.shapes[:, :flexible]])
+    M, K = phi.T @ m.M @ phi, phi.T @ m.K @ phi
+    K[abs(K) < ROUNDING * (abs(phi).T @ abs(m.K) @ abs(phi))] = 0.0
+
+    free = M[len(m.sources) :, len(m.sources) :]
+    size = np.sqrt(np.maximum(free.diagonal(), np.finfo(float).tiny))
+    if np.min(np.linalg.eigvalsh(free / np.outer(size, size)), initial=1.0) < INERTIA:
+        raise InputError(
+            rig.name, "flexible", flexible, "fewer modes: these leave a joint without inertia"
+        )
+
+    position, acceleration = m.angle @ phi, m.acceleration @ phi
+    velocity = np.zeros_like(position)
+    for sensor, row in m.moment:
+        # By reciprocity the multiplier that holds the load r is v^T r, v the static shape of a
+        # unit gap at that constraint; r are the forces of inertia and damping, so that the
+        # moment has the static part of all modes left out.
+        v, reaction = static.unit(row)
+        position[sensor, : len(joints)] = [reaction[static.lock(j)] for j in joints]
+        velocity[sensor] = -v @ (fem.C @ phi)
+        acceleration[sensor] = -v @ (m.M @ phi)
+    inputs = (*(a.name for a in rig.actuator), *(f"T_{name}" for name in torque))
+    force = np.zeros((len(K), len(inputs)))
+    for i, joint in enumerate(m.feedback, len(m.sources)):
+        force[i, joint.column] = joint.gain
+    for i in range(len(torque)):
+        force[len(driven) + i, len(rig.actuator) + i] = 1.0
+    return Reduced(
+        M,
+        phi.T @ fem.C @ phi,
+        K,
+        phi,
+        names,
+        inputs,
+        tuple(s.name for s in rig.sensor),
+        force,
+        m.sources,
+        position,
+        velocity,
+        acceleration,
+    )
+
+
+class _Static:
+    """The mechanism at rest with its actuator coordinates held."""
+
+    def __init__(self, fem: Fem, joints: Collection[int]) -> None:
+        m, Phi = fem.mechanism, fem.constraints(joints)
+        self._n, self._n_c = m.M.shape[0], Phi.shape[0]
+        self._first, self._held = m.Phi.shape[0], fem.held(joints)
+        self._unit = multiplier_unit(m.K)
+        self._lu = splu(saddle(m.K, self._unit * Phi))
+
+    def lock(self, joint: int) -> int:
+        """The constraint that holds this coordinate."""
+        return self._first + self._held.index(joint)
+
+    def unit(self, constraint: int) -> tuple[Float, Float]:
+        """(n_q,) shape and (n_c,) multipliers when Phi q is 1 at this constraint."""
+        rhs = np.zeros(self._n + self._n_c)
+        rhs[self._n + constraint] = self._unit
+        x = self._lu.solve(rhs)
+        return x[: self._n], self._unit * x[self._n :]
