@@ -24,7 +24,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 # numba recompiles a cached function when its own file has changed; these also when another
 # kernel's file has, as they call each other.
 _FILES = (
-    "lanes", "registers", "waves", "beam", "sweep", "block", "solve", "gradient", "respond",
+    "lanes", "registers", "waves", "beam", "sweep", "block",
+    "solve", "gradient", "adjoint", "respond",
 )  # fmt: skip
 _STAMP = tuple(
     (file.stat().st_mtime, file.stat().st_size)

@@ -66,7 +66,7 @@ def set_term_factor(x: System, W: Float, t: int) -> None:
 
 
 @part
-def solve(W: Float, p: Float, q: Float, c: Float) -> None:
+def _coefficients(W: Float, p: Float, q: Float, c: Float) -> None:
     """ALPHA and GAMMA for the jump dual to FACTOR c, from a port's columns p and q."""
     cw, ct, cM, cV = c[0], c[1], c[2], c[3]
     for i in range(LANES):
@@ -109,9 +109,13 @@ def _carry(c: Float, kind: int, change: Float) -> None:
 
 
 @part
-def walk(x: System, k: Work, port: int, low: int, high: int, wanted: Flag) -> None:
-    """Carry ALPHA from `port` down to `low`, GAMMA up to `high`; store the wanted ports'."""
+def solve(x: System, k: Work, port: int, c: Float, low: int, high: int, wanted: Flag) -> None:
+    """The coefficients at the wanted ports for the jump at `port` dual to FACTOR c^T z.
+
+    alphas from the port down to `low`, gammas from it up to `high`.
+    """
     W = k.W
+    _coefficients(W, k.columns_p[port], k.columns_q[port], c)
     alpha = W[ALPHA * LANES : (ALPHA + 4) * LANES]
     gamma = W[GAMMA * LANES : (GAMMA + 4) * LANES]
     if wanted[port]:
