@@ -58,11 +58,11 @@ def headline(output: str, input: str, comparisons: Sequence[Comparison]) -> str:
     if top is None:
         return "measured gain with its 90 % band"
     if top.agrees:
-        return "the model lies within the 90 % band of the measurement"
+        return "model and measurement differ by no more than the noise"
     phase = round(top.phase_deg)
     return (
         f"model {top.gain:.3g} \u00d7 the measured gain, phase {phase:+d}\u00b0 in the "
-        f"median at {top.level:g} {top.level_unit}; shaded where it leaves the 90 % band "
+        f"median at {top.level:g} {top.level_unit}; shaded where the difference is more than noise "
         f"({top.low_hz:.3g}\u2013{top.high_hz:.3g} Hz compared)"
     )
 
