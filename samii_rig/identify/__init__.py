@@ -1,0 +1,1 @@
+"""From measured frequency responses to modes and to the parameters of a rig."""

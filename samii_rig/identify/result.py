@@ -1,0 +1,209 @@
+"""What an identification found, with intervals, and how well it fits."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from scipy import stats
+
+from samii_rig.identify.data import Data
+from samii_rig.identify.identifiability import Identifiability
+from samii_rig.identify.parameters import Space
+from samii_rig.rig.schema import Rig
+from samii_rig.signal.statistics import octaves
+from samii_rig.types import Complex, Float
+
+REFUSED = 0.01  # p-value below which the model is said not to fit
+AT_BOUND = 1e-3  # distance of log(value) from its bound that counts as on it
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How well a model fits in noise units.
+
+    ratio : mean of T^2 over its mean if the model holds (Hotelling), corrected for the number
+        of parameters: chi-square per degree of freedom; 1 when the model holds.
+    p_value : probability of such a ratio when the model holds.
+    n_real : real numbers fitted.
+    """
+
+    ratio: float
+    p_value: float
+    n_real: int
+
+    @property
+    def holds(self) -> bool:
+        """Whether the noise alone can explain what is left."""
+        return self.p_value >= REFUSED
+
+
+@dataclass(frozen=True, slots=True)
+class Residual:
+    """What is left of one channel in one band at one level.
+
+    ratio : mean of |e|^2/C over its mean if the model holds.
+    error : |e| over |H|, both summed in squares over the band.
+    """
+
+    output: str
+    input: str
+    level: float
+    level_unit: str
+    low_hz: float
+    high_hz: float
+    ratio: float
+    error: float
+
+
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """Free parameters of a rig from measured responses.
+
+    rig : with the values found. names, units, start, values : (n,) SI.
+    log_covariance : (n, n) of log(value) if the model holds.
+    prior_sd : (n,) relative, inf for none.
+    at_bound : names of parameters that ended on a bound.
+    starts, reached : how many starts were tried, how many ended at this optimum.
+    prediction : (n_freq, p) at the lines used, for each response.
+    """
+
+    rig: Rig
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    start: Float
+    values: Float
+    log_covariance: Float
+    prior_sd: Float
+    fit: Fit
+    start_fit: Fit
+    residuals: tuple[Residual, ...]
+    identifiability: Identifiability
+    at_bound: tuple[str, ...]
+    starts: int
+    reached: int
+    prediction: tuple[Complex, ...]
+
+    def value(self, name: str) -> float:
+        """SI value of the parameter called `element.symbol`."""
+        return float(self.values[self.names.index(name)])
+
+    def inflation(self) -> float:
+        """Factor on standard deviations where the model is refused: the root of `fit.ratio`."""
+        return 1.0 if self.fit.holds else math.sqrt(max(self.fit.ratio, 1.0))
+
+    def interval(self, level: float = 0.9) -> tuple[Float, Float]:
+        """Lower and upper ends (n,) of the intervals of the values.
+
+        Where the model is refused they are wider by `inflation`: the misfit, taken for noise.
+        """
+        sd = np.sqrt(np.diag(self.log_covariance)) * self.inflation()
+        factor = np.exp(float(stats.norm.ppf((1 + level) / 2)) * sd)
+        ends = np.stack([self.values / factor, self.values * factor])
+        return np.min(ends, axis=0), np.max(ends, axis=0)
+
+    def correlation(self) -> Float:
+        """(n, n) correlation of the estimates of log(value)."""
+        sd = np.sqrt(np.diag(self.log_covariance))
+        return np.asarray(self.log_covariance / np.outer(sd, sd))
+
+    def plain(self) -> dict[str, object]:
+        """Numbers and words as plain data, for machines."""
+        low, high = self.interval()
+        return {
+            "rig": self.rig.name,
+            "parameters": {
+                name: {
+                    "start": float(self.start[i]),
+                    "value": float(self.values[i]),
+                    "low_90": float(low[i]),
+                    "high_90": float(high[i]),
+                    "unit": self.units[i],
+                }
+                for i, name in enumerate(self.names)
+            },
+            "chi_square_per_dof": self.fit.ratio,
+            "p_value": self.fit.p_value,
+            "residuals": [asdict(r) for r in self.residuals],
+            "verdict": list(self.sentences()),
+        }
+
+    def sentences(self) -> tuple[str, ...]:
+        """The verdict in words: fit, identifiability, bounds, starts."""
+        f = self.fit
+        if f.holds:
+            first = (
+                f"The model fits: chi-square per degree of freedom {f.ratio:.3f}, "
+                f"p = {f.p_value:.2g}."
+            )
+        else:
+            first = (
+                f"The model does not fit: what is left is {math.sqrt(f.ratio):.3g} times the "
+                f"noise (chi-square per degree of freedom {f.ratio:.4g}, p = {f.p_value:.1g}). "
+                f"Intervals are widened by {self.inflation():.3g} and hold only if what is "
+                "missing acts like noise."
+            )
+        out = [first, *self.identifiability.sentences]
+        out += [f"{name} ended on its bound." for name in self.at_bound]
+        if self.reached < self.starts:
+            out.append(
+                f"{self.reached} of {self.starts} starts ended here, the others at a worse fit."
+            )
+        return tuple(out)
+
+
+def fit_of(data: Data, t2: Sequence[Float], n_free: int) -> Fit:
+    """The test of a model from T^2 of every line, see `chi_square`.
+
+    T^2 of lines that share a covariance vary together, so the mean of n lines of p entries
+    in n_w groups has the relative variance 1/(p n) + 1/(p nu n_w); its distribution is taken
+    for a gamma of that variance.
+    """
+    size = np.array([d.p * len(d.frequency) for d in data.lines], dtype=np.float64)
+    total = sum(d.p * float(np.sum(q / d.mean())) for d, q in zip(data.lines, t2, strict=True))
+    sharing = np.array([d.shared[1] for d in data.lines])
+    taken = 0.5 * n_free * float(np.sum(size * sharing) / np.sum(size))
+    ratio = total / max(float(np.sum(size)) - taken, 1.0)
+    spread = 0.0
+    for d, n in zip(data.lines, size, strict=True):
+        groups = max(1.0, len(d.frequency) / d.shared[0])
+        alone = 1 / max(1.0, len(d.frequency) / d.shared[1])
+        spread += n**2 * (alone + 1 / (float(np.mean(d.dof)) * groups)) / d.p
+    spread /= float(np.sum(size)) ** 2
+    p_value = float(stats.gamma.sf(ratio, 1 / spread, scale=spread))
+    return Fit(ratio, p_value, data.n_real)
+
+
+def residuals_of(data: Data, prediction: Sequence[Complex]) -> tuple[Residual, ...]:
+    """Per response, channel and octave, what the prediction leaves."""
+    out = []
+    for d, H in zip(data.lines, prediction, strict=True):
+        error = np.abs(H - d.H)
+        expected = d.dof / np.maximum(d.dof - 1, 1e-9)
+        for low, high in octaves(d.frequency):
+            inside = (d.frequency >= low) & (d.frequency < high)
+            if not inside.any():
+                continue
+            for k in range(d.p):
+                noise = (error[inside, k] / d.sd[inside, k]) ** 2 / expected[inside]
+                out.append(
+                    Residual(
+                        d.outputs[k],
+                        d.inputs[k],
+                        d.response.level,
+                        d.response.level_unit,
+                        float(d.frequency[inside][0]),
+                        float(d.frequency[inside][-1]),
+                        float(np.mean(noise)),
+                        float(np.linalg.norm(error[inside, k]) / np.linalg.norm(d.H[inside, k])),
+                    )
+                )
+    return tuple(out)
+
+
+def bounds_met(space: Space, x: Float) -> tuple[str, ...]:
+    """Names of the parameters that lie on a bound at x."""
+    near = np.minimum(x - space.lower, space.upper - x) < AT_BOUND
+    return tuple(name for name, on in zip(space.names, near, strict=True) if on)

@@ -1,0 +1,77 @@
+"""What an identification found, as a table for the terminal."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from samii_rig.identify.modal import Modes, Value
+from samii_rig.identify.result import Identification, Residual
+
+
+def summary_table(found: Identification) -> RenderableType:
+    """The verdict in words, parameters with 90 % intervals, what is left per channel."""
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    table.add_column("parameter", no_wrap=True)
+    for column in ("identified", "90 % interval", "change"):
+        table.add_column(column, justify="right", no_wrap=True)
+    table.add_column("unit")
+    low, high = found.interval()
+    for i, name in enumerate(found.names):
+        half = (high[i] - low[i]) / 2 / found.values[i]
+        table.add_row(
+            name,
+            f"{found.values[i]:.5g}",
+            f"\u00b1 {100 * half:.2g} %",
+            f"{100 * (found.values[i] / found.start[i] - 1):+.1f} %",
+            found.units[i],
+        )
+    said = (Text(line) for line in found.sentences())
+    return Group(*said, Text(""), table, Text(""), _channels(found))
+
+
+def _channels(found: Identification) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for column in ("what is left of", "level", "in units of the noise (1: noise alone)"):
+        table.add_column(column)
+    rows: dict[tuple[str, str], list[Residual]] = {}
+    for r in found.residuals:
+        key = f"{r.output}/{r.input}", f"{r.level:g} {r.level_unit}"
+        rows.setdefault(key, []).append(r)
+    for (channel, level), parts in rows.items():
+        worst = max(parts, key=lambda r: r.ratio)
+        table.add_row(
+            channel,
+            level,
+            f"{np.mean([r.ratio for r in parts]) ** 0.5:.2f}, at most {worst.ratio**0.5:.2f} "
+            f"at {worst.low_hz:.2g} to {worst.high_hz:.2g} Hz",
+        )
+    return table
+
+
+def modes_table(modes: Modes) -> RenderableType:
+    """Frequencies, damping and shapes of modes, and zeros, with 90 % intervals."""
+    table = Table(title="Modes, with half the width of the 90 % interval")
+    for column in ("mode", "frequency, Hz", "damping, %"):
+        table.add_column(column, justify="right")
+    for name in modes.outputs:
+        table.add_column(f"shape at {name}", justify="right")
+    for i, mode in enumerate(modes.modes, 1):
+        shape = [
+            f"{z.real:.4g} {z.imag:+.2g}j" if k != mode.reference else "1"
+            for k, z in enumerate(mode.shape)
+        ]
+        table.add_row(str(i), _value(mode.frequency_hz), _value(mode.damping, 100), *shape)
+    zeros = Table(title="Zeros")
+    for column in ("output", "frequency, Hz", "damping, %"):
+        zeros.add_column(column, justify="right")
+    for zero in modes.zeros:
+        zeros.add_row(zero.output, _value(zero.frequency_hz), _value(zero.damping, 100))
+    return Group(table, zeros)
+
+
+def _value(x: Value, scale: float = 1.0) -> str:
+    half = scale * (x.interval()[1] - x.value)
+    return f"{scale * x.value:.5g} \u00b1 {half:.2g}"
