@@ -73,14 +73,15 @@ class Drive(NamedTuple):
 class State(NamedTuple):
     """All that the loop carries from one call to the next; arrays, changed in place.
 
-    x : (2, n) modal states. held : the last sensor values. waiting : (pipeline + 1,) outputs
-    on their way. early : (slots, m) sensor values read ahead of their sample. number :
-    [v, applied input, extra input, drive speed, last theta_ref]. flag : [sample, live, dry
-    samples, tripped, dead]
+    x : (2, n) modal states. held, held_flag : the last sensor values and their flags. waiting :
+    (pipeline + 1,) outputs on their way. early : (slots, m) sensor values read ahead of their
+    sample. number : [v, applied input, extra input, drive speed, last theta_ref].
+    flag : [sample, live, dry samples, tripped, dead]
     """
 
     x: Float
     held: Float
+    held_flag: Flags
     waiting: Float
     early: Float
     number: Float
@@ -99,6 +100,7 @@ def rest(tables: Tables) -> State:
     return State(
         np.zeros((2, n)),
         np.zeros(m),
+        np.zeros(m, dtype=np.uint8),
         np.zeros(tables.pipeline + 1),
         np.zeros((slots, m)),
         np.zeros(5),
@@ -217,8 +219,8 @@ def advance(
                 y = s.early[slot, i]
             y, q = _convert(c, i, sample, y, noise[n, i] if noisy else 0.0)
             if sample >= c.stuck[i]:
-                y = s.held[i]
-            s.held[i] = y
+                y, q = s.held[i], s.held_flag[i]
+            s.held[i], s.held_flag[i] = y, q
             values[n, SENSORS + i], quality[n, SENSORS + i] = y, q
 
         if given[n]:

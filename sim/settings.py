@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -21,7 +22,8 @@ class Hum(Strict):
 class SimSettings(Strict):
     """Settings of the simulated rig; an unknown one is an error.
 
-    seed : of all noise; the same seed gives the same samples.
+    seed : of all noise; the same seed gives the same samples. Without one it is drawn anew
+        for each run, which the recording then names.
     noise : false makes the sensors ideal: no noise, no steps of the converter, no offset.
         Their filters, delays and ranges stay, and so do the steps of the output.
     inner : inner steps a sample. Without disturbance and friction it changes nothing,
@@ -40,7 +42,7 @@ class SimSettings(Strict):
     drop : numbers of samples that the device takes but that never arrive.
     """
 
-    seed: Annotated[int, Field(ge=0)] = 0
+    seed: Annotated[int, Field(ge=0, default_factory=lambda: secrets.randbits(32))]
     noise: bool = True
     inner: Annotated[int, Field(ge=1, le=64)] = 8
     band_hz: Positive | None = None

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from fake_device import RATE, K, fake_rig
+from fake_device import RATE, FakeDevice, K, fake_rig
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from samii_rig.errors import LimitError
+from samii_rig.errors import InputError, LimitError
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Limit, Rig
 from samii_rig.run.dryrun import predict
@@ -243,3 +243,44 @@ def test_more_repeats_and_larger_levels_lower_the_predicted_error():
     one = std([0.05])
     np.testing.assert_allclose(std([0.1]), one / 2, rtol=1e-6)
     np.testing.assert_allclose(std([0.05] * 4), one / 2, rtol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("levels", "passes"), [((3.9,), True), ((4.2,), False), ((2.1, -2.1), False)]
+)
+def test_the_step_between_segments_and_back_to_rest_counts(levels, passes):
+    """Segments are sent without a border: at 500 Hz a step of 4 V is the 2000 V/s allowed."""
+    parts = []
+    for i, level in enumerate(levels):
+        u = np.linspace(0.0, level, 50)  # ends at its level: no ramp down, no ring-down
+        u = u if i == 0 else u[::-1]
+        f = np.full(50, np.nan)
+        parts.append(PlannedSegment(f"s{i}", "burst", 1.0, "V", i, u, 0 * u, (0.5, 40.0), f))
+    plan = Plan("test", RATE, "v", 0.0, "theta", tuple(parts), 0)
+    predicted = predict(plan, FAKE)
+    slew = next(m for m in predicted.margins if (m.channel, m.what) == ("v", "rate"))
+    step = abs(levels[0]) if len(levels) == 1 else abs(levels[1] - levels[0])
+    assert slew.predicted == pytest.approx(step * RATE)
+    stop = run(plan, FAKE, FakeDevice().open(), Memory())
+    if passes:
+        predicted.refuse()
+        assert stop.status == "completed"
+    else:
+        with pytest.raises(LimitError, match="rate"):
+            predicted.refuse()
+        assert stop.status == "tripped"
+
+
+def test_a_rig_that_could_never_be_armed_is_refused_before_it_is_tried():
+    rig, _ = load_rig("samii")
+    bare = rig.actuator[0].model_copy(update={"deadman": None})
+    changed = rig.model_copy(update={"actuator": (bare,)})
+    with pytest.raises(InputError, match=r"actuator\[v_2\].deadman"):
+        predict(load_experiment("swept_sine", rig)[0].plan(rig), changed)
+
+
+def test_a_motor_with_nothing_to_push_against_is_refused():
+    rig, _ = load_rig("sflr")
+    floating = rig.model_copy(update={"base": "pinned"})
+    with pytest.raises(InputError, match="moves nothing"):
+        predict(load_experiment("swept_sine", rig)[0].plan(rig), floating)

@@ -422,6 +422,86 @@ def test_a_pace_that_would_starve_the_device_is_refused(settings):
         run(plan(), RIG, FakeDevice().open(), Memory(), settings=settings)
 
 
+# Zero, and that it happened
+
+
+def test_an_output_that_reads_back_other_than_zero_at_the_end_is_a_failure():
+    device = FakeDevice()
+
+    def still_on(block):
+        values = block.values.copy()
+        values[:, 0] = 3.0 if device.zeros else values[:, 0]
+        return replace(block, values=values)
+
+    device.spoil = still_on
+    stop, _, sink = go(device)
+    assert stop.status == "failed"
+    assert stop.reason.startswith("THE OUTPUT IS NOT AT ZERO: v read 3 V")
+    assert sink.events[-1][1]["status"] == "failed"
+
+
+def test_a_zero_that_is_late_by_a_block_is_no_failure():
+    device, held = FakeDevice(), []
+
+    def one_late(block):
+        held.append(block)
+        return held[-2] if len(held) > 1 else replace_rows(block)
+
+    device.spoil = one_late
+    stop, _, _ = go(device)
+    assert stop.status == "completed"
+
+
+def replace_rows(block):
+    return replace(
+        block,
+        time=block.time[:0],
+        sequence=block.sequence[:0],
+        values=block.values[:0],
+        quality=block.quality[:0],
+    )
+
+
+def test_a_device_that_falls_silent_after_zero_is_a_failure():
+    device = FakeDevice()
+    device.spoil = lambda block: replace_rows(block) if device.zeros else block
+    stop, _, _ = go(device)
+    assert stop.status == "failed"
+    assert "no sample shows v at zero" in stop.reason
+
+
+@pytest.mark.parametrize("error", [OSError("bus off"), KeyboardInterrupt()])
+def test_an_output_that_cannot_be_zeroed_is_told_first(error, monkeypatch):
+    device = FakeDevice()
+    monkeypatch.setattr(device, "zero", raising_always(error))
+    stop = run(plan(), RIG, device.open(), Memory())
+    assert stop.status == "failed"
+    assert stop.reason.startswith("the output could not be zeroed: ")
+
+
+def test_a_zero_that_fails_at_first_is_tried_again(monkeypatch):
+    device = FakeDevice()
+    works, calls = device.zero, []
+
+    def breaks():
+        calls.append(1)
+        if len(calls) <= 5:
+            raise OSError("bus off")
+        works()
+
+    monkeypatch.setattr(device, "zero", breaks)
+    stop, _, _ = go(device)
+    assert stop.status in ("failed", "tripped")
+    assert "bus off" in stop.reason
+
+
+def raising_always(error):
+    def breaks():
+        raise error
+
+    return breaks
+
+
 # Real time
 
 
@@ -462,6 +542,51 @@ def test_a_queue_hands_on_what_its_thread_raised():
         queued.close()
 
 
+def test_what_the_recorders_thread_raised_comes_out_of_every_later_call():
+    queued = QueuedSink(Broken("gate", OSError("disk full")))
+    queued.event(0, "gate", {})
+    with contextlib.suppress(OSError):
+        for _ in range(100):
+            time.sleep(0.01)
+            queued.event(0, "x", {})
+    for _ in range(2):
+        with pytest.raises(OSError, match="disk full"):
+            queued.event(0, "x", {})
+    with pytest.raises(OSError, match="disk full"):
+        queued.close()
+
+
+def test_a_recorder_that_lost_samples_makes_a_stopped_run_a_failed_one():
+    stop = run(
+        plan(duration=0.4),
+        RIG,
+        RealTime().open(),
+        Broken("stop", OSError("disk full")),
+        stop=after(0.3),
+    )
+    assert stop.status == "failed"
+    assert stop.reason == "stopped on request; then OSError: disk full"
+
+
+@pytest.mark.parametrize("depth", [1, 8])
+def test_a_disk_that_hangs_is_reported_and_not_waited_for(depth):
+    hang = threading.Event()
+
+    class Hangs(Memory):
+        def event(self, time, name, payload):
+            hang.wait(20.0)
+
+    queued = QueuedSink(Hangs(), depth, close_within=0.2)
+    with contextlib.suppress(DeviceError):
+        for _ in range(2):
+            queued.event(0, "x", {})
+    started = time.monotonic()
+    with pytest.raises(DeviceError, match=r"did not finish in 0\.2 s"):
+        queued.close()
+    assert time.monotonic() - started < 2.0
+    hang.set()
+
+
 def test_a_queue_that_is_full_ends_the_run_instead_of_waiting():
     gate = threading.Event()
 
@@ -489,6 +614,15 @@ def test_a_second_signal_breaks_a_hang_and_none_disturbs_the_ending():
             signal.raise_signal(signal.SIGTERM)
         interrupts.ending = True
         signal.raise_signal(signal.SIGINT)
+
+
+def test_what_can_be_left_out_is_given_up_on_the_first_signal_only():
+    with Interrupts() as interrupts:
+        interrupts.ending = True
+        with pytest.raises(KeyboardInterrupt), interrupts.give_up():
+            signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        assert interrupts.ending
 
 
 def test_outside_the_main_thread_signals_are_left_alone():

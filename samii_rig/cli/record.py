@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
@@ -38,7 +39,10 @@ def run(
         bool, typer.Option("--dry-run", help="Predict, say the margins, move nothing.")
     ] = False,
     seed: Annotated[
-        int | None, typer.Option(help="Seed of the simulated rig's noise.", min=0)
+        int | None,
+        typer.Option(
+            help="Seed of the simulated rig's noise [default: drawn, and recorded]", min=0
+        ),
     ] = None,
     operator: Annotated[str, typer.Option(help="Who stands at the rig; recorded.")] = "",
     no_report: Annotated[bool, typer.Option("--no-report", help="Write no HTML page.")] = False,
@@ -53,6 +57,7 @@ def run(
     """
     from rich.console import Console
 
+    from samii_rig.errors import InputError
     from samii_rig.report.summary import LiveProgress, show_dry_run, summary
     from samii_rig.rig.load import load_rig
     from samii_rig.run.campaign import carry_out
@@ -60,6 +65,8 @@ def run(
     from samii_rig.run.experiments import load_experiment
 
     console = Console(highlight=False)
+    if out is not None and out.suffix != ".mcap":
+        raise InputError("samii-rig run", "--out", str(out), "a name that ends in .mcap")
     the_rig, rig_text = load_rig(rig)
     plan_file, experiment_text = load_experiment(experiment, the_rig)
     plan = plan_file.plan(the_rig)
@@ -72,9 +79,13 @@ def run(
     predicted.refuse()
     if dry_run:
         return
-    slug = the_rig.name.lower().replace(" ", "_")
+    slug = re.sub(r"[^a-z0-9]+", "_", the_rig.name.lower()).strip("_")
     path = out or Path("runs") / f"{datetime.now():%Y-%m-%dT%H-%M-%S}_{slug}_{plan.experiment}.mcap"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        expected = f"a folder that can be made ({error.strerror})"
+        raise InputError("samii-rig run", "--out", str(path.parent), expected) from error
     live = LiveProgress(console, plan.duration)
     with nullcontext() if json else live:
         outcome = carry_out(

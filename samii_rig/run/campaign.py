@@ -12,14 +12,15 @@ from importlib import metadata
 from pathlib import Path
 from threading import Event
 
-from samii_rig.errors import EstimateError
-from samii_rig.record.reader import read_recording
+from samii_rig.errors import DeviceError, SamiiRigError
+from samii_rig.record.reader import read_frequency_responses, read_recording
 from samii_rig.record.writer import RunWriter
 from samii_rig.rig.schema import Rig
 from samii_rig.run.devices import open_device
 from samii_rig.run.dryrun import DryRun
+from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import Progress, run
-from samii_rig.run.protocols import Plan
+from samii_rig.run.protocols import OpenRig, Plan
 from samii_rig.run.sink import recorded_channels
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import FrequencyResponse, Recording, StopRecord
@@ -72,24 +73,37 @@ def carry_out(
             **{f"device_{key}": value for key, value in device.metadata.items()},
             **versions(),
         }
-        with RunWriter(
-            path,
-            recorded_channels(rig, plan, device.sensor.channels),
-            plan.rate_hz,
-            rig_toml=rig_toml,
-            experiment_toml=experiment_toml,
-            metadata=notes,
-        ) as writer:
-            ended = run(plan, rig, device, writer, progress, stop)
-            writer.flush()
-            recording = read_recording(writer.partial_path, partial=True)
-            responses, trouble = _estimated(replace(recording, source=str(path)))
-            for response in responses:
-                writer.frequency_response(response)
+        with (
+            Interrupts() as interrupts,
+            RunWriter(
+                path,
+                recorded_channels(rig, plan, device.sensor.channels),
+                plan.rate_hz,
+                rig_toml=rig_toml,
+                experiment_toml=experiment_toml,
+                metadata=notes,
+            ) as writer,
+        ):
+            try:
+                ended = run(plan, rig, device, writer, progress, stop, interrupts=interrupts)
+            except BaseException as error:
+                # Refused before anything moved; the recording says so and is whole.
+                interrupts.ending = True
+                writer.close(StopRecord("failed", _line(error)))
+                raise
+            trouble = _estimate_into(writer, interrupts)
             writer.close(ended)
     finally:
-        device.close()
+        _close(device)
+    responses = tuple(read_frequency_responses(path))
     return Outcome(path, read_recording(path), responses, ended, trouble)
+
+
+def _close(device: OpenRig) -> None:
+    try:
+        device.close()
+    except Exception as error:
+        raise DeviceError(f"the device did not close: {_line(error)}") from error
 
 
 def versions() -> dict[str, str]:
@@ -106,11 +120,28 @@ def _peaks(predicted: DryRun) -> dict[str, float]:
     }
 
 
-def _estimated(recording: Recording) -> tuple[tuple[FrequencyResponse, ...], str]:
-    if not recording.segments:
-        return (), "no segment was completed"
+def _estimate_into(writer: RunWriter, interrupts: Interrupts) -> str:
+    """Estimate what was recorded so far into the same file; why not, "" if it went well.
+
+    Nothing that goes wrong here may keep the recording from its end: the samples are kept,
+    and `samii-rig frf` can be asked again, with other options.
+    """
     try:
-        return estimate([recording]), ""
-    except EstimateError as error:
-        # The samples are kept; `samii-rig frf` can be asked again, with other options.
-        return (), str(error)
+        with interrupts.give_up():
+            writer.flush()
+            recording = read_recording(writer.partial_path, partial=True)
+            if not recording.segments:
+                return "no segment was completed"
+            responses = estimate([replace(recording, source=str(writer.path))])
+        for response in responses:
+            writer.frequency_response(response)
+    except KeyboardInterrupt as error:
+        return f"the estimate was given up on {error}; samii-rig frf makes it from the recording"
+    except Exception as error:
+        return _line(error)
+    return ""
+
+
+def _line(error: BaseException) -> str:
+    text = " ".join(str(error).split())
+    return text if isinstance(error, SamiiRigError) else f"{type(error).__name__}: {text}"

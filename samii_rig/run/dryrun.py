@@ -18,12 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from samii_rig.errors import LimitError
+from samii_rig.errors import InputError, LimitError
 from samii_rig.model.sampled import filter_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import AngularVelocitySource, Moment, Rig, Sensor
 from samii_rig.run.expected import BandError, expected_errors
-from samii_rig.run.limits import GateLimits, gate_limits
+from samii_rig.run.limits import GateLimits, find_actuator, gate_limits
 from samii_rig.run.protocols import Plan
 from samii_rig.types import Complex, Float
 
@@ -106,8 +106,12 @@ class DryRun:
 def predict(plan: Plan, rig: Rig) -> DryRun:
     """Peaks, margins and the FRF's expected error of a plan, from the model alone.
 
-    Raises LimitError if the centring loop itself would be unstable.
+    Raises LimitError if the centring loop itself would be unstable, InputError if the rig
+    could never be armed, or its source moves nothing.
     """
+    if find_actuator(rig, plan.actuator, rig.name).deadman is None:
+        expected = "the device's own, in s; without one it is never armed"
+        raise InputError(rig.name, f"actuator[{plan.actuator}].deadman", None, expected)
     moments = _joint_moments(rig, plan.actuator)
     seen = rig.model_copy(update={"sensor": (*rig.sensor, *moments)})
     limits = gate_limits(rig, plan.actuator, plan.kp, plan.centring_sensor)
@@ -118,6 +122,9 @@ def predict(plan: Plan, rig: Rig) -> DryRun:
     omega = 2 * np.pi * plan.rate_hz * np.arange(n // 2 + 1) / n
     H = _sampled(seen, plan.actuator, np.asarray(sigma + 1j * omega, dtype=np.complex128))
     names = [s.name for s in seen.sensor]
+    if not np.any(np.abs(H) > 0.0):
+        expected = f"an end that {plan.actuator} can push against; it moves nothing"
+        raise InputError(rig.name, "base", rig.base, expected)
     if plan.kp != 0.0:
         sensitivity = 1.0 + plan.kp * H[:, names.index(plan.centring_sensor)]
         _refuse_unstable(sensitivity, plan)
@@ -208,12 +215,22 @@ def _margins(
     theta = series[centring.name] if centring else np.zeros(1)
     theta_noise = _noise(centring) if centring else 0.0
     bound, slew = [], []
+    # The whole plan's steps, from rest and back to rest: segments are sent without a border.
+    u, theta_ref = (
+        np.concatenate([[0.0], *(getattr(s, name) for s in plan.segments), [0.0]])
+        for name in ("u", "theta_ref")
+    )
+    steps = np.abs(np.diff(u)) + kp * np.abs(np.diff(theta_ref))
+    turning = np.abs(np.diff(theta, prepend=0.0)) if centring else np.zeros(len(u) - 2)
+    reach = math.ceil(limits.max_ahead * rate)
     for s, part in zip(plan.segments, parts, strict=True):
-        angle = np.abs(theta[part]) if centring else np.zeros(1)
-        turning = np.abs(np.diff(theta[part])) if centring else np.zeros(1)
+        # The gate judges a reference by the angle of up to `reach` samples before.
+        seen = slice(max(0, part.start - reach), part.stop)
+        angle = np.abs(theta[seen]) if centring else np.zeros(1)
         bound.append(float((np.abs(s.u) + kp * np.abs(s.theta_ref)).max() + kp * angle.max()))
-        step = np.abs(np.diff(s.u, prepend=0.0)) + kp * np.abs(np.diff(s.theta_ref, prepend=0.0))
-        slew.append(float(step.max() + kp * turning.max()) * rate)
+        # The step out of a segment counts for it too: it leads back to rest after the last.
+        step = steps[part.start : part.stop + 1].max()
+        slew.append(float(step + kp * turning[seen].max()) * rate)
     add(output.channel, "limit", output.unit, bound, kp * theta_noise, output.max, output.reason)
     add(
         output.channel,
@@ -228,7 +245,8 @@ def _margins(
         x, fixed = series[c.channel], _noise(sensors[c.channel])
         size = [float(np.abs(x[part]).max()) for part in parts]
         add(c.channel, "limit", c.unit, size, fixed, c.max, c.reason)
-        turn = [float(np.abs(np.diff(x[part])).max()) * rate for part in parts]
+        turns = np.abs(np.diff(x, prepend=0.0))
+        turn = [float(turns[part].max()) * rate for part in parts]
         add(c.channel, "rate", f"{c.unit}/s", turn, 2 * fixed * rate, c.max_rate, c.reason)
     for sensor in rig.sensor:
         reason = "end of the converter's range"

@@ -10,7 +10,10 @@ import numpy as np
 
 from samii_rig.rig.schema import Rig
 from samii_rig.run.protocols import Plan, PlannedSegment
-from samii_rig.types import Float
+from samii_rig.signal.groups import Piece
+from samii_rig.signal.periodic import first_used
+from samii_rig.signal.spectra import comb, spectrum
+from samii_rig.types import Float, Int
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,8 +21,9 @@ class BandError:
     """Predicted standard deviation of sensor/command in one band at one level.
 
     std : sqrt(E|dH|^2) in sensor unit per actuator unit, median over the lines of the band,
-        each 1/duration of a segment wide, all repeats averaged. Averaging n neighbouring
-        lines divides it by sqrt(n). relative : std/|H|, median.
+        each 1/duration of a segment wide (of a periodic reference, the lines that it drives),
+        all repeats averaged. Averaging n neighbouring lines divides it by sqrt(n).
+    relative : std/|H|, median.
     """
 
     channel: str
@@ -42,9 +46,10 @@ def expected_errors(
         levels.setdefault((s.level, s.unit), []).append((s, part))
     for (level, unit), members in levels.items():
         s, part = members[0]
+        part, driven = _used(s, part, plan)
         n = part.stop - part.start
-        V = np.abs(np.fft.rfft(v[part]))
-        f = np.fft.rfftfreq(n, 1 / plan.rate_hz)
+        V = np.abs(np.fft.rfft(v[part]))[driven]
+        f = np.fft.rfftfreq(n, 1 / plan.rate_hz)[driven]
         for low, high in _octaves(*s.band_hz):
             inside = (f >= low) & (f < high)
             if not inside.any():
@@ -65,6 +70,21 @@ def expected_errors(
                     )
                 )
     return out
+
+
+def _used(s: PlannedSegment, part: slice, plan: Plan) -> tuple[slice, Int]:
+    """The samples of a segment that an estimate uses, and the lines that it has: of a periodic
+    reference all but the first period, and the lines that the reference drives."""
+    n = part.stop - part.start
+    if s.kind != "periodic":
+        return part, np.arange(n // 2 + 1)
+    first, last = s.recorded or (0, n)
+    r = (s.u + plan.kp * s.theta_ref)[first:last]
+    first += first_used(r)
+    r = r[first_used(r) :]
+    # A spectrum leaves line 0 out.
+    lines = 1 + comb([spectrum(Piece(s.name, r, r[:, None]), plan.rate_hz)], None)
+    return slice(part.start + first, part.start + last), lines
 
 
 def _octaves(low: float, high: float) -> list[tuple[float, float]]:

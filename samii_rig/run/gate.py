@@ -56,6 +56,9 @@ class Gate:
 
     Every method takes `now`, ns on the host's clock. Those that ask raise GateError when
     refused, with the output already at zero.
+
+    FAULT is latched as long as this object lives, which is one run: a new run is a new arming
+    by a person, who has read how the last one ended.
     """
 
     def __init__(

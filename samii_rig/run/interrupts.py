@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 
 SIGNALS = tuple(
@@ -16,13 +18,15 @@ class Interrupts:
 
     A second signal, for a program that hangs in a device and never looks at the flag,
     raises KeyboardInterrupt; once `ending` is set (the output is at zero and only the
-    recording is being closed) further signals are ignored. Only Python's main thread may
-    handle signals; in any other this does nothing.
+    recording is being closed) further signals are ignored. `give_up` is for work in between
+    that can be left out: the next signal raises KeyboardInterrupt, the rest are ignored. Only
+    Python's main thread may handle signals; in any other this does nothing.
     """
 
     def __init__(self) -> None:
         self.reason = ""
         self.ending = False
+        self._optional = False
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> Interrupts:
@@ -42,10 +46,22 @@ class Interrupts:
             if callable(handler) or isinstance(handler, int):
                 signal.signal(number, handler)
 
+    @contextmanager
+    def give_up(self) -> Iterator[None]:
+        """While this is open one signal raises KeyboardInterrupt; `ending` afterwards."""
+        self._optional, self.ending = True, False
+        try:
+            yield
+        finally:
+            self._optional, self.ending = False, True
+
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.ending:
             return
         name = signal.Signals(number).name
+        if self._optional:
+            self.ending = True
+            raise KeyboardInterrupt(name)
         if self.reason:
             raise KeyboardInterrupt(name)
         self.reason = f"{name} (Ctrl-C)" if number == signal.SIGINT else name

@@ -185,6 +185,9 @@ def violation(latest: Latest, limits: GateLimits, now: int) -> Decision | None:
                 c.stale_after,
                 "s",
             )
+        stuck = _standstill(c, latest, i)
+        if stuck is not None:
+            return stuck
     if latest.limited:
         return _fault("device", f"the device itself changed {limits.output.channel}")
     silence = (now - latest.heartbeat) * 1e-9
@@ -196,6 +199,26 @@ def violation(latest: Latest, limits: GateLimits, now: int) -> Decision | None:
             limits.heartbeat_age,
             "s",
         )
+    return None
+
+
+def _standstill(c: ChannelLimit, latest: Latest, i: int) -> Decision | None:
+    """A value that repeats bit by bit although the output must have moved it, as a FAULT."""
+    rule, held = c.stuck, (latest.time - latest.since[i]) * 1e-9
+    travel = rule.gain * abs(latest.travel[i])
+    if travel > rule.at_once or (held >= rule.after and travel > rule.travel):
+        limit = rule.travel if held >= rule.after else rule.at_once
+        reason = (
+            f"{c.channel} is stuck: the same value for {held:.3g} s while the output must have "
+            f"moved it by {travel:.3g} {c.unit}; allowed {limit:.3g} {c.unit}"
+        )
+        return _fault("stuck", reason, travel, limit, c.unit)
+    if held >= rule.noise_after and latest.effort[i] > rule.effort * held:
+        reason = (
+            f"{c.channel} is stuck: the very same value, without its noise, for {held:.3g} s "
+            f"while the output moved; allowed {rule.noise_after:g} s"
+        )
+        return _fault("stuck", reason, held, rule.noise_after, "s")
     return None
 
 

@@ -26,6 +26,8 @@ class Latest:
     peak, rate : (n,) largest |value| and |change|/s in the newest block; NaN for a value
         that is not a number and not marked missing; the rate reaches back over the border.
     last : (n,) newest good value.
+    since : (n,) time of the newest good value that differed from the one before it.
+    travel, effort : (n,) integral of v and of |v| since then, in actuator unit times s.
     clipped : (n,) a converter at its end. limited : the device itself changed the output.
     disorder : samples came out of order, now or before.
     sequence, time : of the newest sample. offset : smallest host minus device time, as of
@@ -38,6 +40,9 @@ class Latest:
     peak: tuple[float, ...]
     rate: tuple[float, ...]
     last: tuple[float, ...]
+    since: tuple[int, ...]
+    travel: tuple[float, ...]
+    effort: tuple[float, ...]
     clipped: tuple[bool, ...]
     limited: bool = False
     disorder: bool = False
@@ -55,7 +60,8 @@ class Latest:
     def nothing(cls, n: int) -> Latest:
         """Before the first sample."""
         zero = (0.0,) * n
-        return cls((NEVER,) * n, zero, zero, (math.nan,) * n, (False,) * n)
+        never, unknown = (NEVER,) * n, (math.nan,) * n
+        return cls(never, zero, zero, unknown, never, zero, zero, (False,) * n)
 
     def age(self, i: int, now: int) -> float:
         """Seconds since channel i said something new; inf before it said anything.
@@ -106,6 +112,7 @@ def observe(
     rate = [0.0] * len(columns)
     for i in rates:
         rate[i] = _steepest(latest.last[i], latest.good[i], values[seen[i], i], time[seen[i]])
+    since, travel, effort = _standstill(latest, values, time, seen)
     order = time[0] > latest.time and sequence[0] > latest.sequence
     if n > 1:
         order = order and (time[1:] > time[:-1]).all() and (sequence[1:] > sequence[:-1]).all()
@@ -116,6 +123,9 @@ def observe(
         peak=peak,
         rate=tuple(rate),
         last=last,
+        since=since,
+        travel=travel,
+        effort=effort,
         clipped=clipped,
         limited=limited,
         disorder=latest.disorder or not order,
@@ -124,6 +134,33 @@ def observe(
         offset=min(drifted, now - int(time[-1])),
         offset_at=now,
     )
+
+
+def _standstill(
+    latest: Latest, values: Float, time: Int, seen: list[slice | Int]
+) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
+    """For each channel the time of its last change, and the integrals of v and |v| since."""
+    # v acts from its sample to the next. One that is lost or no number moves nothing here:
+    # the limits judge it.
+    v = np.concatenate([[latest.last[0]], values[:-1, 0]])
+    v[~np.isfinite(v)] = 0.0
+    elapsed = np.diff(time, prepend=time[0] if latest.time == NEVER else latest.time) * 1e-9
+    with np.errstate(over="ignore", invalid="ignore"):
+        pushed, worked = np.cumsum(v * elapsed), np.cumsum(np.abs(v) * elapsed)
+        rows = np.arange(len(time))
+        since, travel, effort = list(latest.since), list(latest.travel), list(latest.effort)
+        for i, good in enumerate(seen):
+            x, at = values[good, i], rows[good]
+            changed = at[x != np.concatenate([[latest.last[i]], x[:-1]])] if len(x) else at
+            if len(changed):
+                j = int(changed[-1])
+                since[i] = int(time[j])
+                travel[i] = float(pushed[-1] - pushed[j])
+                effort[i] = float(worked[-1] - worked[j])
+            else:
+                travel[i] += float(pushed[-1])
+                effort[i] += float(worked[-1])
+    return tuple(since), tuple(travel), tuple(effort)
 
 
 def _steepest(last: float, since: int, x: Float, t: Int) -> float:

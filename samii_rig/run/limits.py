@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from samii_rig.errors import InputError
-from samii_rig.rig.schema import ActuatorSpec, Rig
+from samii_rig.rig.schema import (
+    AbsoluteAngle,
+    ActuatorSpec,
+    AngularVelocitySource,
+    RelativeAngle,
+    Rig,
+    Sensor,
+)
 from samii_rig.run.protocols import DeviceLoop
 
 # How long the read-back of an actuator without a deadman may be missing, s. Such an
@@ -17,6 +24,38 @@ READBACK_STALE = 0.05
 # carries out even if this program dies, and only then does its deadman count.
 MAX_AHEAD = 0.25
 
+# When a value that repeats bit by bit is a dead sensor, and not a joint at rest or a coarse
+# encoder. Where theta dips (an antiresonance) an angle may stand still for some time while
+# the command moves the source to and fro; for longer than STUCK_AFTER the shipped campaigns
+# leave at most 4.2 steps of such travel unseen, and 17 % of the limit for a shorter time.
+STUCK_AFTER = 0.25  # s
+STUCK_STEPS = 16.0  # of the sensor's resolution
+STUCK_PART = 0.01  # of its limit, where its steps are finer than that
+AT_ONCE_PART = 0.5  # of its limit, however short the time
+# Any other sensor is judged by its own noise: with this rms, in steps of its converter, a
+# value repeats for a second once in 1e11 seconds.
+NOISY = 0.25
+NOISE_AFTER = 1.0  # s
+NOISE_STEPS = 4.0  # of the actuator's converter: smallest mean |v| that counts as moving
+
+
+@dataclass(frozen=True, slots=True)
+class Stuck:
+    """When a value that repeats bit by bit is a fault, while the output v is not zero.
+
+    gain : sensor unit per s and actuator unit: what the command must cause, gain * integral
+        of v, counted from the value's last change.
+    after, travel : s and sensor unit, both passed: stuck. at_once : the same in any time.
+    noise_after, effort : s and mean |v|, both passed: stuck. inf for what is not judged.
+    """
+
+    gain: float = 0.0
+    after: float = math.inf
+    travel: float = math.inf
+    at_once: float = math.inf
+    noise_after: float = math.inf
+    effort: float = math.inf
+
 
 @dataclass(frozen=True, slots=True)
 class ChannelLimit:
@@ -26,7 +65,7 @@ class ChannelLimit:
     slack : added to `max` (and one step a sample to the rate) before a trip: one step of
         the converter, so that a device that holds its output at the limit is not blamed
         for its rounding.
-    stale_after : s.
+    stale_after : s. stuck : when the channel must not stand still.
     """
 
     channel: str
@@ -36,6 +75,7 @@ class ChannelLimit:
     stale_after: float
     reason: str
     slack: float = 0.0
+    stuck: Stuck = Stuck()
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +147,40 @@ def gate_limits(
         limited = any(True for _ in rig.limits_on(s.name))
         if limited or (kp != 0.0 and s.name == sensor):
             reason = "the loop that centres the joint reads it"
-            sensors.append(_channel(rig, s.name, s.unit, math.inf, reason, s.stale_after, 0.0))
+            c = _channel(rig, s.name, s.unit, math.inf, reason, s.stale_after, 0.0)
+            sensors.append(replace(c, stuck=_stuck(rig, spec, s, c.max)))
     return GateLimits(rig.rate_hz, output, tuple(sensors), kp, sensor, heartbeat_age)
+
+
+def _stuck(rig: Rig, actuator: ActuatorSpec, sensor: Sensor, most: float) -> Stuck:
+    """What the sensor must show of a command, from the chain's statics and its own noise."""
+    noisy = sensor.noise_rms > NOISY * sensor.resolution
+    noise_after = NOISE_AFTER if noisy else math.inf
+    effort = NOISE_STEPS * actuator.resolution
+    gain = _angle_gain(rig, actuator.name, sensor)
+    floor = STUCK_PART * most if math.isfinite(most) else 0.0
+    travel = max(STUCK_STEPS * sensor.resolution, floor)
+    if gain == 0.0 or travel == 0.0:
+        return Stuck(noise_after=noise_after, effort=effort)
+    at_once = max(AT_ONCE_PART * most, travel)
+    return Stuck(abs(gain), STUCK_AFTER, travel, at_once, noise_after, effort)
+
+
+def _angle_gain(rig: Rig, actuator: str, sensor: Sensor) -> float:
+    """Low-frequency rad/s of the sensor per unit of the actuator; 0 if the angle does not
+    follow it: slowly turned, springs and beams of a clamped chain turn along."""
+    order = [e.name for e in rig.element]
+    if isinstance(sensor, RelativeAngle):
+        seen = set(sensor.across)
+    elif isinstance(sensor, AbsoluteAngle) and rig.base == "clamped":
+        seen = set(order[: order.index(sensor.after) + 1])
+    else:
+        return 0.0
+    return sum(
+        e.K.value
+        for e in rig.element
+        if isinstance(e, AngularVelocitySource) and e.input == actuator and e.name in seen
+    )
 
 
 def _channel(

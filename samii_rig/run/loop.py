@@ -10,14 +10,15 @@ from __future__ import annotations
 import math
 import traceback
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from threading import Event
-from typing import Literal
 
 import numpy as np
 
 from samii_rig.errors import DeviceError, GateError, SamiiRigError
 from samii_rig.rig.schema import Rig
+from samii_rig.run.ending import Status, Zero, attempt, with_troubles
 from samii_rig.run.gate import Gate, GateEvent
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.judgement import State
@@ -36,7 +37,8 @@ class Progress:
     """How far a run is, for a display.
 
     segment : 1-based, of n_segments; name, level, unit, repeat are the segment's.
-    time_left : s on the device's clock. frequency : Hz now, NaN at rest.
+    time_left : s on the device's clock. frequency : Hz now, NaN at rest, inf where the
+        whole band is driven at once.
     channel, margin : the channel nearest to its limit since the last report, 1 - |value|/limit.
     worst_channel, worst_margin : the same over the whole run.
     """
@@ -67,14 +69,20 @@ def run(
     *,
     alive: Callable[[], bool] | None = None,
     settings: LoopSettings | None = None,
+    interrupts: Interrupts | None = None,
 ) -> StopRecord:
-    """Carry out `plan`; always returns, and always with the output at zero.
+    """Carry out `plan`; always returns, with the output at zero.
+
+    A device whose output cannot be zeroed, or does not show zero, makes the status `failed`
+    and the reason begin with that.
 
     Parameters
     ----------
     sink : the recorder. On real time it works in a thread of its own; on simulated time
         (`device.metadata["clock"] == "simulated"`) it is called directly.
     stop : when set, the run ends in good order (status `stopped`), as it does on Ctrl-C.
+    interrupts : signals that end the run, if the caller handles them already; they are left
+        with `ending` set.
     alive : asked each tick whether the operator's client gave a sign of life since.
 
     Returns
@@ -88,13 +96,10 @@ def run(
     that the limits need: both before anything moves.
     """
     job = _Run(plan, rig, device, sink, progress, alive, settings or LoopSettings())
-    with Interrupts() as interrupts:
-        status, reason = job.until_the_end(stop or Event(), interrupts)
-        interrupts.ending = True
+    with nullcontext(interrupts) if interrupts else Interrupts() as signals:
+        status, reason = job.until_the_end(stop or Event(), signals)
+        signals.ending = True
         return job.close(status, reason)
-
-
-Status = Literal["completed", "stopped", "tripped", "failed"]
 
 
 class _Run:
@@ -126,6 +131,7 @@ class _Run:
             rig, plan.actuator, plan.kp, plan.centring_sensor, settings.heartbeat_age
         )
         self.gate = Gate(device.actuator, limits, self.sensor.channels, self._log)
+        self.zero = Zero(device, limits.output)
         # Last: it starts a thread.
         self.queued = None if simulated else QueuedSink(sink)
         self.sink: Sink = self.queued or sink
@@ -158,7 +164,7 @@ class _Run:
         except BaseException as error:
             reason = f"{type(error).__name__}: {error}"
             self._zero(reason, failed=True)
-            self._try(lambda: self._event("error", traceback=traceback.format_exc()))
+            attempt(lambda: self._event("error", traceback=traceback.format_exc()))
         else:
             self._zero(reason)
         return status, reason
@@ -166,18 +172,17 @@ class _Run:
     def close(self, status: Status, reason: str) -> StopRecord:
         """The output is at zero: take what still arrives, and finish the recording."""
         late, missing = self.late, self.missing
-        troubles = [self._try(self._tail), self._try(self._flush)]
-        self._try(
+        troubles = [attempt(self._tail), attempt(self._flush)]
+        if self.zero.trouble:
+            status, reason = "failed", f"{self.zero.trouble}; the run had ended: {reason}"
+        status, reason = with_troubles(status, reason, troubles)
+        attempt(
             lambda: self._event(
                 "stop", status=status, reason=reason, late_ticks=late, missing_samples=missing
             )
         )
         if self.queued is not None:
-            troubles.append(self._try(self.queued.close))
-        for trouble in dict.fromkeys(t for t in troubles if t and t not in reason):
-            if status == "completed":
-                status = "failed"
-            reason = f"{reason}; then {trouble}"
+            status, reason = with_troubles(status, reason, [attempt(self.queued.close)])
         return StopRecord(status, reason, late, missing)
 
     def _begin(self) -> None:
@@ -268,9 +273,10 @@ class _Run:
         while self.done < len(self.ends) and self.newest + 1 >= self.start + self.ends[self.done]:
             self._flush()
             s = self.plan.segments[self.done]
-            end = self.start + int(self.ends[self.done])
+            begin = self.start + int(self.ends[self.done]) - len(s.u)
+            first, last = s.recorded or (0, len(s.u))
             self.sink.segment(
-                Segment(s.name, s.kind, end - len(s.u), end, s.level, s.unit, s.repeat)
+                Segment(s.name, s.kind, begin + first, begin + last, s.level, s.unit, s.repeat)
             )
             self.done += 1
 
@@ -301,12 +307,11 @@ class _Run:
         try:
             (self.gate.fail if failed else self.gate.stop)(reason, self.clock.now())
         except BaseException:
-            self.device.actuator.zero()
+            self.zero.force()
 
     def _tail(self) -> None:
-        """The samples after the end, which show the output at zero."""
-        self.clock.sleep(self.tick)
-        self.collector.add(self.sensor.read())
+        """The samples after the end, which must show the output at zero."""
+        self.zero.check(self.tick, self.collector.add, spoke=self.newest >= 0)
 
     def _flush(self) -> None:
         block = self.collector.take()
@@ -332,15 +337,6 @@ class _Run:
 
     def _event(self, kind: str, **fields: str | int | float) -> None:
         self.sink.event(self.clock.now() - self.apart, kind, fields)
-
-    def _try(self, step: Callable[[], None]) -> str:
-        """Do a step of the ending; what goes wrong as a line, "" if nothing."""
-        try:
-            step()
-        except Exception as error:
-            known = isinstance(error, SamiiRigError)
-            return str(error) if known else f"{type(error).__name__}: {error}"
-        return ""
 
 
 def _nearer(a: tuple[str, float], b: tuple[str, float]) -> tuple[str, float]:

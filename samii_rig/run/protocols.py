@@ -105,7 +105,7 @@ class OpenRig:
     metadata: dict[str, str]
 
     def close(self) -> None:
-        """Output zero, then let go of the devices."""
+        """Output zero. A driver that holds a port extends this to release it after that."""
         self.actuator.zero()
 
 
@@ -115,7 +115,10 @@ class PlannedSegment:
 
     u, theta_ref : (n,) at the rig's rate, lead-in and ring-down included.
     band_hz : where the excitation has its energy.
-    frequency : (n,) Hz at each sample, NaN at rest; for the progress display.
+    frequency : (n,) Hz at each sample, NaN at rest, inf where the whole band is driven at
+        once; for the progress display.
+    recorded : the samples [start, stop) of u that the recording's segment holds, None for
+        all; what is outside (ramps, settling) is recorded too, but belongs to no segment.
     """
 
     name: str
@@ -127,6 +130,7 @@ class PlannedSegment:
     theta_ref: Float
     band_hz: tuple[float, float]
     frequency: Float
+    recorded: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True, slots=True)

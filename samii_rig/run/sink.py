@@ -3,8 +3,10 @@ handed over without ever making the loop wait."""
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -14,6 +16,10 @@ from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.protocols import Plan
 from samii_rig.types import Channel, Quality, SampleBlock, Segment
+
+# s that the recorder may still write after the run: a queue that is full on a disk of a few
+# megabytes a second. A disk that hangs for longer is reported, not waited for.
+CLOSE_WITHIN = 30.0
 
 
 class Sink(Protocol):
@@ -32,12 +38,15 @@ class Sink(Protocol):
 class QueuedSink:
     """Lets a slow sink work in a thread of its own, so that a slow disk never moves the output.
 
-    What the thread raises comes out of the next call here. A queue that is full raises
-    DeviceError: a run that cannot be recorded ends.
+    What the thread raises comes out of every later call here: samples are lost from then on,
+    and a caller that swallows it once must not end as if they were not. A queue that is full
+    raises DeviceError: a run that cannot be recorded ends.
+
+    close_within : s that `close` waits for what is still queued.
     """
 
-    def __init__(self, sink: Sink, depth: int = 256) -> None:
-        self._sink = sink
+    def __init__(self, sink: Sink, depth: int = 256, close_within: float = CLOSE_WITHIN) -> None:
+        self._sink, self._close_within = sink, close_within
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(depth)
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
@@ -56,10 +65,17 @@ class QueuedSink:
         self._put(lambda: self._sink.segment(segment))
 
     def close(self) -> None:
-        """Return when all is written; raises what went wrong."""
-        self._queue.put(None)
-        self._thread.join()
+        """Return when all is written; raises what went wrong, DeviceError if it takes too long."""
+        give_up = time.monotonic() + self._close_within
+        with contextlib.suppress(queue.Full):
+            self._queue.put(None, timeout=self._close_within)
+        self._thread.join(max(0.0, give_up - time.monotonic()))
         self._raise()
+        if self._thread.is_alive():
+            raise DeviceError(
+                f"the recorder did not finish in {self._close_within:g} s; the last samples are "
+                "lost; expected a disk that answers"
+            )
 
     def _put(self, job: Callable[[], None]) -> None:
         self._raise()
@@ -72,8 +88,7 @@ class QueuedSink:
 
     def _raise(self) -> None:
         if self._error is not None:
-            error, self._error = self._error, None
-            raise error
+            raise self._error
 
     def _work(self) -> None:
         failed = False
