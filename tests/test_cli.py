@@ -9,14 +9,19 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
 from samii_rig.errors import SamiiRigError
+from samii_rig.record import scan
+from samii_rig.record.contents import read_contents
 from samii_rig.record.reader import read_frequency_responses, read_recording
+from samii_rig.record.store import write_recording
 from samii_rig.rig.load import load_rig
 
 SWEEP = """
@@ -114,6 +119,97 @@ def test_a_cut_recording_is_recovered(log: Path, tmp_path: Path) -> None:
     assert call("verify", tmp_path / "empty.mcap")[0] == 1
 
 
+def test_recover_ends_with_3_only_if_something_inside_was_damaged(
+    log: Path, tmp_path: Path
+) -> None:
+    damaged = bytearray(log.read_bytes())
+    chunks = read_contents(scan.mapped(log), len(damaged), strict=False).chunks
+    # Of its CRC: a bit of packed zeros may unpack to the same zeros.
+    damaged[chunks[len(chunks) // 2].head.span.start + scan.HEAD + 3 * 8] ^= 1
+    paths = [tmp_path / name for name in ("whole.mcap", "damaged.mcap")]
+    paths[0].write_bytes(log.read_bytes())
+    paths[1].write_bytes(damaged)
+    assert call("recover", paths[0])[0] == 0
+    code, said = call("recover", paths[1], "--json")
+    assert code == 3
+    assert json.loads(said)["files"][0]["problems"]
+    paths[1].write_bytes(b"")
+    assert call("recover", paths[1], "--out", tmp_path / "none.mcap")[0] == 1
+
+
+def test_a_folder_is_called_one(tmp_path: Path) -> None:
+    for command in ("verify", "recover"):
+        code, said = call(command, tmp_path)
+        assert code == 2
+        assert said == f"{tmp_path} is a folder; expected a recording"
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "name"),
+    [
+        ("report", "--out", "short.mcap"),
+        ("report", "--out", "page.htm"),
+        ("report", "--figure", "short.mcap"),
+        ("report", "--figure", "bode.jpg"),
+        ("frf", "--export", "short.mcap"),
+        ("frf", "--save", "short.mcap"),
+        ("frf", "--save", "frf.csv"),
+    ],
+)
+def test_no_result_takes_the_place_of_a_recording(
+    log: Path, tmp_path: Path, command: str, option: str, name: str
+) -> None:
+    copy = tmp_path / "short.mcap"
+    copy.write_bytes(log.read_bytes())
+    code, said = call(command, copy, option, tmp_path / name)
+    assert code == 2
+    assert said.startswith(option)
+    assert "\n" not in said
+    assert copy.read_bytes() == log.read_bytes()
+    assert [p.name for p in tmp_path.iterdir()] == ["short.mcap"]
+
+
+def test_not_even_a_recording_with_the_ending_of_a_page_is_replaced(
+    log: Path, tmp_path: Path
+) -> None:
+    odd = tmp_path / "odd.html"
+    odd.write_bytes(log.read_bytes())
+    for arguments in ([odd], [odd, "--out", tmp_path / "." / "odd.html"]):
+        code, said = call("report", *arguments)
+        assert code == 2
+        assert "another file than the recordings" in said
+    assert odd.read_bytes() == log.read_bytes()
+
+
+def test_saved_results_are_not_replaced_and_nothing_else_is_written(
+    log: Path, tmp_path: Path
+) -> None:
+    saved = tmp_path / "frf.mcap"
+    saved.write_bytes(b"earlier")
+    code, said = call("frf", log, "--save", saved, "--export", tmp_path / "frf.csv")
+    assert code == 2
+    assert "no recording of that name yet" in said
+    assert [p.name for p in tmp_path.iterdir()] == ["frf.mcap"]
+
+
+def test_the_advice_about_gaps_is_an_option(log: Path, tmp_path: Path) -> None:
+    recording = read_recording(log)
+    there = np.ones(len(recording), bool)
+    there[1000:1003] = False
+    gappy = replace(
+        recording,
+        time=recording.time[there],
+        sequence=recording.sequence[there],
+        values=recording.values[there],
+        quality=recording.quality[there],
+    )
+    write_recording(tmp_path / "gappy.mcap", gappy)
+    code, said = call("frf", tmp_path / "gappy.mcap")
+    assert code == 2
+    assert "--gaps exclude" in said
+    assert "gaps=" not in said
+
+
 def test_a_dry_run_moves_nothing_and_writes_nothing(sweep: Path, tmp_path: Path) -> None:
     code, said = call("run", sweep, "--dry-run", "--out", tmp_path / "x.mcap")
     assert code == 0
@@ -142,7 +238,7 @@ def test_a_run_that_would_break_a_limit_is_refused_with_the_amplitude_that_would
         ("stop_hz = 30.0", "stop_hz = 400.0", "400"),
         ("[0.5]", "[nan]", "nan"),
         ("[0.5]", "[-1.0]", "-1.0"),
-        ('experiment = "swept_sine"', 'experiment = "dance"', "expected one of swept_sine"),
+        ('experiment = "swept_sine"', 'experiment = "dance"', "expected one of "),
     ],
 )
 def test_a_wrong_experiment_is_one_line_and_exit_code_2(

@@ -10,6 +10,7 @@ from report_kit import measured
 
 from samii_rig.errors import InputError
 from samii_rig.record.export import export_response, replacing, to_frd
+from samii_rig.report.page import write_report
 
 
 def test_npz_holds_everything_without_pickle(tmp_path):
@@ -100,3 +101,9 @@ def test_a_folder_is_not_replaced(tmp_path):
     (tmp_path / "r.csv").mkdir()
     with pytest.raises(InputError, match="expected the path of a file"):
         export_response(tmp_path / "r.csv", measured(n=5))
+
+
+def test_a_page_is_written_to_no_name_but_a_pages(tmp_path):
+    with pytest.raises(InputError, match=r"suffix is '\.mcap'; expected \.html"):
+        write_report(tmp_path / "run.mcap", [], [measured()])
+    assert list(tmp_path.iterdir()) == []

@@ -27,7 +27,7 @@ from samii_rig.errors import RecordingError
 from samii_rig.record import scan
 from samii_rig.record.contents import read_contents
 from samii_rig.record.reader import read_events, read_frequency_responses, read_recording
-from samii_rig.record.recover import default_output, recover
+from samii_rig.record.recover import NothingError, default_output, recover
 from samii_rig.record.verify import verify
 from samii_rig.record.writer import RunWriter
 from samii_rig.types import SampleBlock
@@ -71,6 +71,7 @@ def test_a_file_cut_at_any_byte_gives_back_what_is_there(tmp_path: Path, whole: 
         if rows:
             recovered = recover(path, output)
             assert recovered.samples == rows
+            assert recovered.exit_code == 0, recovered.problems
             assert_prefix(output, rows)
             assert verify(output).status == "whole"
             output.unlink()
@@ -124,7 +125,39 @@ def test_damage_in_the_middle_costs_no_more_than_its_chunk(tmp_path: Path, whole
         for sequence, row in zip(recording.sequence, recording.values, strict=True):
             np.testing.assert_array_equal(row, truth[sequence])
         assert recovered.samples == len(recording)
+        assert recovered.exit_code == 3 or len(recording) == len(truth), at
         output.unlink()
+
+
+def test_the_exit_code_tells_a_loss_from_a_missing_end(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(whole)
+    chunks = [
+        c.head.span for c in read_contents(scan.mapped(path), len(whole), strict=False).chunks
+    ]
+    first = chunks[1]
+    segment = whole.index(SEGMENT.name.encode())
+    cases = {
+        "whole": (whole, 0),
+        "cut": (whole[: chunks[3].end - 5], 0),
+        "cut and damaged": (
+            whole[: first.end - 1] + bytes([whole[first.end - 1] ^ 1]) + whole[first.end : -40],
+            3,
+        ),
+        "a chunk taken out": (whole[: first.start] + whole[chunks[2].start :], 3),
+        "a segment's checksum": (whole[:segment] + b"S" + whole[segment + 1 :], 3),
+        "the end of zeros": (whole[: chunks[3].end] + bytes(100), 3),
+        "an event alone": (whole[: first.start], 1),
+    }
+    for name, (content, code) in cases.items():
+        path.write_bytes(content)
+        recovered = recover(path, tmp_path / f"{name}.mcap")
+        assert recovered.exit_code == code, (name, recovered.problems)
+    for content in (b"", whole[:300]):
+        path.write_bytes(content)
+        with pytest.raises(NothingError) as refused:
+            recover(path, tmp_path / "nothing.mcap")
+        assert refused.value.exit_code == 1
 
 
 def test_recover_overwrites_nothing(tmp_path: Path, whole: bytes) -> None:

@@ -21,6 +21,7 @@ from record_kit import CHANNELS, RATE, block, blocks, write_run
 from samii_rig.errors import RecordingError
 from samii_rig.record import cdr, events, layout, response, scan
 from samii_rig.record.appender import Appender, build_chunk, message_chunk
+from samii_rig.record.contents import read_contents
 from samii_rig.record.reader import read_events, read_frequency_responses, read_recording
 from samii_rig.record.recover import recover
 from samii_rig.record.verify import verify
@@ -90,6 +91,8 @@ def test_what_holds_no_sample_is_nothing(tmp_path: Path, whole: bytes) -> None:
         assert (verdict.status, verdict.exit_code) == ("nothing", 1)
     with pytest.raises(RecordingError, match="not there"):
         verify(tmp_path / "missing.mcap")
+    with pytest.raises(RecordingError, match="is a folder; expected a recording"):
+        verify(tmp_path)
 
 
 def test_two_runs_in_one_file_are_not_one_recording(tmp_path: Path) -> None:
@@ -263,3 +266,79 @@ def test_lengths_beyond_the_file_are_refused(
     with pytest.raises(RecordingError, match="byte"):
         read_recording(path)
     read_all(path)
+
+
+def _chunk_head(claimed: int, packed: int) -> bytes:
+    """A chunk up to its packed bytes, `packed` in number."""
+    body = struct.pack("<QQQII", 0, 0, claimed, 0, 3) + b"lz4" + struct.pack("<Q", packed)
+    return struct.pack("<BQ", Opcode.CHUNK, len(body) + packed) + body
+
+
+def _false_chunks(count: int) -> bytes:
+    """Chunks inside each other, all of which reach to the end and unpack to its 60 MB of zeros.
+
+    Each is a plain LZ4 block around the head of the next.
+    """
+    claimed = 60 << 20
+    packed = lz4.frame.compress(bytes(claimed), store_size=False)
+    begin = packed[:7]
+    found = _chunk_head(claimed, len(packed)) + packed
+    around = struct.pack("<I", 1 << 31 | len(found) - len(packed) + len(begin))
+    for _ in range(count):
+        packed = begin + around + found
+        found = _chunk_head(claimed, len(packed)) + packed
+    return found
+
+
+def _false_attachments(count: int) -> bytes:
+    """Attachments that reach to the end, each with an empty whole chunk behind its head."""
+    packed = lz4.frame.compress(b"")
+    chunk = _chunk_head(0, len(packed)) + packed
+    found = bytes(1_000_000)
+    for _ in range(count):
+        found = struct.pack("<BQ", Opcode.ATTACHMENT, len(chunk) + len(found)) + chunk + found
+    return found
+
+
+@pytest.mark.parametrize("make", [lambda: _false_chunks(40), lambda: _false_attachments(1000)])
+def test_the_work_grows_no_faster_than_the_file(
+    tmp_path: Path, whole: bytes, make: Callable[[], bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What lies inside each other could make the same bytes be unpacked or read again and again."""
+    path = tmp_path / "run.mcap"
+    at = whole.index(struct.pack("<BQ", Opcode.DATA_END, 4))
+    path.write_bytes(whole[:at] + bytes(1) + make())
+    work = [0]
+    unpack, attachment_whole = scan.unpack, scan.attachment_whole
+
+    def unpack_counted(data: memoryview, head: scan.ChunkHead) -> bytes | memoryview:
+        work[0] += head.size
+        return unpack(data, head)
+
+    def attachment_counted(data: memoryview, span: scan.Span) -> bool:
+        work[0] += span.end - span.start
+        return attachment_whole(data, span)
+
+    monkeypatch.setattr(scan, "unpack", unpack_counted)
+    monkeypatch.setattr(scan, "attachment_whole", attachment_counted)
+    verdict = verify(path)
+    assert work[0] < 70 * path.stat().st_size + 2 * scan.MAX_CHUNK
+    assert verdict.status == "lossy"
+    assert verdict.samples == 120
+    assert any("given up" in problem for problem in verdict.problems)
+    assert recover(path).samples == 120
+
+
+def test_a_damaged_length_is_no_reason_to_give_up(tmp_path: Path) -> None:
+    """Every chunk but the last claims to reach far into those behind it."""
+    path = tmp_path / "run.mcap"
+    write_run(path, blocks(40))
+    content = bytearray(path.read_bytes())
+    data = scan.mapped(path)
+    chunks = read_contents(data, len(data), strict=False).chunks
+    for chunk in chunks[1:-1:2]:
+        content[chunk.head.span.start + 2] ^= 0x10
+    path.write_bytes(content)
+    verdict = verify(path)
+    assert verdict.chunks >= len(chunks) // 2
+    assert not any("given up" in problem for problem in verdict.problems)

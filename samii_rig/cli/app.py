@@ -7,13 +7,16 @@ from typing import Annotated
 import typer
 
 import samii_rig
-from samii_rig.cli import estimate, files, record
+from samii_rig.cli import estimate, files, identify, record
 
 app = typer.Typer(
     name="samii-rig",
     help="Drive a flexible robot, record it, estimate its frequency responses, "
     "hold the model against them.",
     no_args_is_help=True,
+    rich_markup_mode=None,
+    epilog="Exit codes: 0 done, 2 bad input, 3 a recording is damaged, 4 the plan would break a "
+    "limit, 5 the safety gate tripped, 6 the device failed, 130 stopped.",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -38,5 +41,6 @@ app.command("run")(record.run)
 app.command("import")(files.import_)
 app.command("frf")(estimate.frf)
 app.command("report")(estimate.report)
+app.command("identify")(identify.identify)
 app.command("verify")(files.verify)
 app.command("recover")(files.recover)

@@ -23,6 +23,20 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object,
 Logs = Annotated[list[Path], typer.Argument(help="Recordings (.mcap).", show_default=False)]
 
 
+def check_target(
+    option: str, path: Path, suffixes: Sequence[str], inputs: Sequence[Path] = ()
+) -> None:
+    """InputError unless `path` ends in one of `suffixes` and is none of the `inputs`."""
+    from samii_rig.errors import InputError
+
+    if path.suffix.lower() not in suffixes:
+        *most, last = suffixes
+        named = f"{', '.join(most)} or {last}" if most else last
+        raise InputError(option, "", str(path), f"a name that ends in {named}")
+    if any(path.exists() and i.exists() and path.samefile(i) for i in inputs):
+        raise InputError(option, "", str(path), "another file than the recordings that are read")
+
+
 def say_json(data: dict[str, Any]) -> None:
     """One JSON object on standard output; numbers that JSON has not become null."""
     json.dump(_plain(data), sys.stdout, indent=2, allow_nan=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -10,13 +11,14 @@ import typer
 from samii_rig.cli.common import (
     JsonOption,
     Logs,
+    check_target,
     comparisons,
     model_curve,
     response_json,
     rig_of,
     say_json,
 )
-from samii_rig.errors import InputError
+from samii_rig.errors import EstimateError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -56,10 +58,14 @@ def frf(
     band: BandOption = None,
     export: Annotated[
         list[Path] | None,
-        typer.Option(help="Write a .csv, .npz or .uff file; one a level. May be repeated."),
+        typer.Option(
+            help="Write a .csv, .npz or .uff file, one a level, replaced if it exists. "
+            "May be repeated."
+        ),
     ] = None,
     save: Annotated[
-        Path | None, typer.Option(help="Write a .mcap of the results that names its sources.")
+        Path | None,
+        typer.Option(help="Write a new .mcap of the results that names its sources."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -76,11 +82,14 @@ def frf(
     from samii_rig.report.summary import summary
 
     for path in export or ():
-        if path.suffix.lower() not in (".csv", ".npz", ".uff"):
-            raise InputError("--export", "", str(path), "a name that ends in .csv, .npz or .uff")
+        check_target("--export", path, (".csv", ".npz", ".uff"), logs)
+    if save:
+        check_target("--save", save, (".mcap",), logs)
+        if save.exists():
+            raise InputError("--save", "", str(save), "no recording of that name yet")
     console = Console(highlight=False)
-    recordings = _read(logs)
-    responses = _estimated(recordings, input_, output, method, gaps, band)
+    recordings = read_all(logs)
+    responses = estimated(recordings, input_, output, method, gaps, band)
     held = rig_of(recordings, rig)
     curve = model_curve(held[0], responses) if held else None
     written = []
@@ -110,11 +119,16 @@ def report(
     logs: Logs,
     rig: RigOverride = None,
     out: Annotated[
-        Path | None, typer.Option(help="The page [default: beside the first recording]")
+        Path | None,
+        typer.Option(
+            help="The page (.html), replaced if it exists [default: beside the first recording]"
+        ),
     ] = None,
     figure: Annotated[
         list[Path] | None,
-        typer.Option(help="Also the Bode diagram as .png, .svg or .pdf, for a paper."),
+        typer.Option(
+            help="Also the Bode diagram as .png, .svg or .pdf, for a paper; replaced if it exists."
+        ),
     ] = None,
     input_: InputOption = None,
     output: OutputOption = None,
@@ -134,12 +148,16 @@ def report(
     from samii_rig.report.page import write_report
     from samii_rig.report.summary import summary
 
-    recordings = _read(logs)
-    responses = _estimated(recordings, input_, output, method, gaps, band)
+    page = out or logs[0].with_suffix(".html")
+    check_target("--out", page, (".html",), logs)
+    for path in figure or ():
+        check_target("--figure", path, (".png", ".svg", ".pdf"), logs)
+    recordings = read_all(logs)
+    responses = estimated(recordings, input_, output, method, gaps, band)
     held = rig_of(recordings, rig)
     curve = model_curve(held[0], responses) if held else None
-    page = write_report(
-        out or logs[0].with_suffix(".html"),
+    write_report(
+        page,
         recordings,
         responses,
         rig=held[0] if held else None,
@@ -159,13 +177,14 @@ def report(
         console.print(f"written  {path}", soft_wrap=True)
 
 
-def _read(logs: list[Path]) -> list[Recording]:
+def read_all(logs: list[Path]) -> list[Recording]:
+    """All recordings; RecordingError names the first that cannot be read."""
     from samii_rig.record.reader import read_recording
 
     return [read_recording(path) for path in logs]
 
 
-def _estimated(
+def estimated(
     recordings: list[Recording],
     input_: str | None,
     output: list[str] | None,
@@ -173,17 +192,21 @@ def _estimated(
     gaps: str,
     band: tuple[float, float] | None,
 ) -> tuple[FrequencyResponse, ...]:
+    """Frequency responses by the options of the command line."""
     from samii_rig.signal.estimate import estimate
 
     # `estimate` itself refuses names that it does not know.
-    return estimate(
-        recordings,
-        input=input_,
-        outputs=output,
-        method=cast("Method", method),
-        gaps=cast("Gaps", gaps),
-        band=band,
-    )
+    try:
+        return estimate(
+            recordings,
+            input=input_,
+            outputs=output,
+            method=cast("Method", method),
+            gaps=cast("Gaps", gaps),
+            band=band,
+        )
+    except EstimateError as error:  # its advice in the words of the command line
+        raise EstimateError(re.sub(r"gaps='(\w+)'", r"--gaps \1", str(error))) from error
 
 
 def _one_a_level(path: Path, responses: Sequence[FrequencyResponse]) -> list[Path]:

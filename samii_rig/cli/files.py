@@ -90,6 +90,9 @@ def recover(
 
     The damaged file is left as it is.
 
+    Exit code 0: all that it held, though its end may be missing, as after a power cut;
+    3: something in it was damaged or lost; 1: no sample and no result.
+
     Example: samii-rig recover runs/broken.mcap.partial
     """
     from dataclasses import asdict
@@ -102,11 +105,12 @@ def recover(
     found = [give_back(path, out) for path in logs]
     if json:
         say_json({"files": [asdict(r) for r in found]})
-        return
-    for r in found:
+    for r in () if json else found:
         typer.echo(
             f"{r.path}: {r.samples:,} samples, {r.segments} segments, {r.events} events, "
             f"{r.responses} frequency responses"
         )
         for problem in r.problems:
             typer.echo(f"  {problem}")
+    codes = {r.exit_code for r in found}
+    raise typer.Exit(1 if 1 in codes else max(codes))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from heapq import merge
 from typing import TypeVar
 
 from isal.isal_zlib import crc32
@@ -18,6 +20,11 @@ from samii_rig.record.scan import ChunkHead, DamagedError, Span
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
 _INDEX_HEAD = struct.Struct("<HI")  # channel id, bytes of entries
 _INDEX_ENTRY = 16  # log time and offset, u64 each
+# Bytes that looking for whole chunks may read or unpack in vain, as a multiple of the file.
+# Damage by chance costs each chunk's unpacked size at most once; samples pack to more than
+# 1/64 unless next to all of them are constant.
+_VAIN = 64
+_GIVEN_UP = "false chunks overlap; the search for whole ones behind is given up"
 
 Item = TypeVar("Item")
 Record = TypeVar("Record", bound=McapRecord)
@@ -97,9 +104,13 @@ def read_contents(data: memoryview, stop: int, *, strict: bool) -> Contents:
             # before that, the length is what was damaged.
             chunk = search.first(at + 1)
             ends = [x for x in (chunk, span.end if span else None) if x is not None]
-            if not ends:
+            if search.given_up:
+                contents.damage.append(DamagedError(at, _GIVEN_UP))
+            if not ends or search.given_up:
                 break
             at = min(ends)
+            if span:
+                search.charge(span.end - at)  # read once in vain, and soon again
     return contents
 
 
@@ -146,7 +157,12 @@ def _take_index(contents: Contents, data: memoryview, span: Span) -> None:
 
 
 class _ChunkSearch:
-    """Finds chunks that are whole down to their CRC among bytes that have lost their order."""
+    """Finds chunks that are whole down to their CRC among bytes that have lost their order.
+
+    False chunks may lie inside each other and share the bytes that they make one unpack, so
+    that the work could grow with the square of the file. What is read or unpacked in vain is
+    therefore charged, and beyond `_VAIN` times the file and one chunk the search gives up.
+    """
 
     # Before the compression's name: opcode and length, two times, size and CRC.
     _BEFORE = scan.HEAD + 8 + 8 + 8 + 4
@@ -156,6 +172,19 @@ class _ChunkSearch:
         self._data = data
         self._stop = stop
         self._known: tuple[int, int | None] | None = None  # searched from, found at
+        # Each mark is passed once, as nobody searches backwards.
+        hits = (re.finditer(re.escape(mark), data[:stop]) for mark in self._MARKS)
+        self._hits = (hit.start() - self._BEFORE for hit in merge(*hits, key=re.Match.start))
+        self._budget = _VAIN * stop + scan.MAX_CHUNK
+
+    @property
+    def given_up(self) -> bool:
+        """So much was unpacked in vain that the file is made to cost time."""
+        return self._budget < 0
+
+    def charge(self, size: int) -> None:
+        """Count bytes that were read or unpacked in vain."""
+        self._budget -= size
 
     def first(self, start: int) -> int | None:
         """Offset of the first whole chunk at or after `start`, None if there is none."""
@@ -163,23 +192,28 @@ class _ChunkSearch:
             searched, found = self._known
             if searched <= start and (found is None or start <= found):
                 return found
-        at = self._candidate(start)
-        while at is not None and not self._whole(at):
-            at = self._candidate(at + 1)
-        self._known = (start, at)
-        return at
-
-    def _candidate(self, start: int) -> int | None:
-        hits = (scan.find(self._data, m, start + self._BEFORE, self._stop) for m in self._MARKS)
-        return min((hit - self._BEFORE for hit in hits if hit >= 0), default=None)
+        found = None
+        for at in self._hits:
+            if self.given_up:
+                break
+            if at >= start and self._whole(at):
+                found = at
+                break
+        self._known = (start, found)
+        return found
 
     def _whole(self, at: int) -> bool:
         try:
             span = next(scan.spans(self._data, at, self._stop))
             if span.opcode != Opcode.CHUNK:
                 return False
-            scan.unpack(self._data, scan.chunk_head(self._data, span))
+            head = scan.chunk_head(self._data, span)
         except DamagedError:
+            return False
+        try:
+            scan.unpack(self._data, head)
+        except DamagedError:
+            self.charge(head.size + span.end - span.start)
             return False
         return True
 

@@ -13,15 +13,15 @@ from __future__ import annotations
 
 import re
 from importlib import resources
-from pathlib import Path
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from samii_rig.errors import InputError
-from samii_rig.rig.load import parse, read_text
+from samii_rig.rig.load import load_named, names_in
 from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Strict
 from samii_rig.types import Role
+
+_FOLDER = resources.files("samii_rig.record") / "data"
 
 
 def _pattern(text: str) -> str:
@@ -214,18 +214,9 @@ class ImportMap(Strict):
 
 def shipped_maps() -> tuple[str, ...]:
     """Names of the maps that come with the package."""
-    folder = resources.files("samii_rig.record") / "data"
-    return tuple(sorted(p.name.removesuffix(".toml") for p in folder.iterdir()))
+    return names_in(_FOLDER)
 
 
 def load_map(name: str) -> tuple[ImportMap, str]:
     """The map called `name` (shipped, or the path of a file) and the text of its file."""
-    if name in shipped_maps():
-        text = (resources.files("samii_rig.record") / "data" / f"{name}.toml").read_text("utf-8")
-        return parse(ImportMap, text, f"{name}.toml"), text
-    path = Path(name)
-    if not path.is_file():
-        expected = f"the path of a map file or one of {', '.join(shipped_maps())}"
-        raise InputError("--map", "", name, expected)
-    text = read_text(path, "map file")
-    return parse(ImportMap, text, str(path)), text
+    return load_named(ImportMap, name, _FOLDER, "--map", "map file")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -32,7 +31,11 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """What was given back. `problems` : what was found damaged, one line each."""
+    """What was given back.
+
+    problems : what was found damaged or lost, one line each; `cut` : they are no more than a
+        missing end, as a killed process or a full disk leaves it, behind records all whole.
+    """
 
     path: Path
     samples: int
@@ -40,6 +43,20 @@ class Recovered:
     responses: int
     segments: int
     problems: tuple[str, ...]
+    cut: bool
+
+    @property
+    def exit_code(self) -> int:
+        """0 all that the file held, 3 something was damaged or lost, 1 no sample and no result."""
+        if not (self.samples or self.responses):
+            return 1
+        return 3 if self.problems and not self.cut else 0
+
+
+class NothingError(RecordingError):
+    """There is a file, but nothing can be had from it."""
+
+    exit_code = 1
 
 
 def default_output(path: Path) -> Path:
@@ -54,15 +71,17 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
     What counts as whole is a chunk whose CRC fits: nothing is guessed. The new file names its
     source and the source's SHA-256 in its metadata; the source is left alone.
 
-    RecordingError if nothing can be had, or the new file cannot be written.
+    NothingError if nothing can be had; RecordingError if there is no file or the new one cannot
+    be written.
     """
-    data = scan.mapped(path)
+    scan.require_file(path)
     try:
+        data = scan.mapped(path)
         contents = _contents(data)
         problems = [str(damage) for damage in contents.damage]
         channels, rate_hz, sample_id = _samples_of(contents)
     except RecordingError as error:
-        raise RecordingError(f"{path}: nothing can be recovered: {error}") from error
+        raise NothingError(f"{path}: nothing can be recovered: {error}") from error
     good: list[Chunk] = []
     for chunk in contents.chunks:
         try:
@@ -70,13 +89,15 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
             good.append(chunk)
         except RecordingError as error:
             problems.append(str(error))
-    notes = next(iter(_maps(contents, layout.NOTES)), {})
+    notes = next(iter(_maps(contents, layout.NOTES, problems)), {})
+    segments = [layout.segment_from_map(item) for item in _maps(contents, layout.SEGMENT, problems)]
+    stops = [layout.stop_from_map(item) for item in _maps(contents, layout.STOP, problems)]
     notes["recovered_from"] = path.name
     notes["recovered_from_sha256"] = hashlib.sha256(data).hexdigest()
     if problems:
         notes["recovered_problems"] = "; ".join(problems[:20])
     if not good:
-        raise RecordingError(f"{path}: nothing can be recovered: no whole chunk is in it")
+        raise NothingError(f"{path}: nothing can be recovered: no whole chunk is in it")
     target = output or default_output(path)
     with RunWriter(
         target,
@@ -93,14 +114,15 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
         happened = _decoded(data, contents, good, layout.EVENTS, events.decode)
         for event in happened:
             writer.event(event.time, event.name, event.payload)
-        segments = []
-        for item in _maps(contents, layout.SEGMENT):
-            segments.append(layout.segment_from_map(item))
-            writer.segment(segments[-1])
+        for segment in segments:
+            writer.segment(segment)
         results = _decoded(data, contents, good, layout.RESPONSES, response.decode)
         for result in results:
             writer.frequency_response(result)
-        writer.close(_stop(contents, samples))
+        lost = stops[0][1] - samples if stops else 0
+        if lost:
+            problems.append(f"{lost} samples of the run are lost")
+        writer.close(_stop(stops, lost))
     return Recovered(
         path=target,
         samples=samples,
@@ -108,6 +130,17 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
         responses=len(results),
         segments=len(segments),
         problems=tuple(problems),
+        cut=len(problems) == 1 and _cut(data, contents),
+    )
+
+
+def _cut(data: memoryview, contents: Contents) -> bool:
+    """The file ends in the middle of a record, and all records before it are whole."""
+    end = contents.damage[-1] if contents.damage else None
+    return (
+        isinstance(end, scan.CutError)
+        and end.offset == contents.end
+        and not scan.has_magic(data, len(data) - scan.MAGIC_SIZE)
     )
 
 
@@ -183,21 +216,21 @@ def _decoded(
     return found
 
 
-def _maps(contents: Contents, name: str) -> list[dict[str, str]]:
-    """The metadata records of this name whose checksum fits."""
+def _maps(contents: Contents, name: str, problems: list[str]) -> list[dict[str, str]]:
+    """The metadata records of this name whose checksum fits; the others go to `problems`."""
     found = []
     for key, item in contents.metadata:
         if key == name:
-            with contextlib.suppress(RecordingError):
+            try:
                 found.append(layout.unsealed(item, name))
+            except RecordingError as error:
+                problems.append(str(error))
     return found
 
 
-def _stop(contents: Contents, samples: int) -> StopRecord:
+def _stop(stops: list[tuple[StopRecord, int]], lost: int) -> StopRecord:
     """The run's own stop record if it has one, with what is lost since in the reason."""
-    for item in _maps(contents, layout.STOP):
-        stop, written = layout.stop_from_map(item)
-        lost = written - samples
+    for stop, _ in stops:
         if lost:
             return replace(stop, reason=f"{stop.reason} (recovered: {lost} samples lost)")
         return stop

@@ -66,6 +66,18 @@ class Span:
         return self.start + HEAD
 
 
+class CutError(DamagedError):
+    """The bytes end before the record at `offset` does."""
+
+
+def require_file(path: Path) -> None:
+    """RecordingError unless there is a file at `path`."""
+    if path.is_dir():
+        raise RecordingError(f"{path} is a folder; expected a recording")
+    if not path.is_file():
+        raise RecordingError(f"{path} is not there; expected a recording")
+
+
 def mapped(path: Path) -> memoryview:
     """The bytes of a file, mapped, not read; the mapping ends with the last view of it.
 
@@ -86,13 +98,13 @@ def spans(data: memoryview, start: int, stop: int) -> Iterator[Span]:
     at = start
     while at < stop:
         if at + HEAD > stop:
-            raise DamagedError(at, "the file ends in the head of a record")
+            raise CutError(at, "the file ends in the head of a record")
         opcode, length = struct.unpack_from("<BQ", data, at)
         end = at + HEAD + length
         if opcode == 0:
             raise DamagedError(at, "opcode 0 is not a record")
         if end > stop:
-            raise DamagedError(at, f"a record of {length} bytes does not fit into the file")
+            raise CutError(at, f"a record of {length} bytes does not fit into the file")
         yield Span(opcode, at, end)
         at = end
 
@@ -203,14 +215,3 @@ def attachment_whole(data: memoryview, span: Span) -> bool:
 def has_magic(data: memoryview, at: int) -> bool:
     """MCAP's magic stands at this offset."""
     return at >= 0 and bytes(data[at : at + MAGIC_SIZE]) == MCAP0_MAGIC
-
-
-def find(data: memoryview, mark: bytes, start: int, stop: int) -> int:
-    """Offset of `mark` between `start` and `stop`, -1 if it is not there."""
-    step = 1 << 20
-    while start < stop:
-        piece = bytes(data[start : min(start + step + len(mark) - 1, stop)])
-        if (hit := piece.find(mark)) >= 0:
-            return start + hit
-        start += step
-    return -1

@@ -55,8 +55,7 @@ class Verdict:
 
 def verify(path: Path) -> Verdict:
     """Check every byte of a file; never raises for what is in it, only if there is no file."""
-    if not path.is_file():
-        raise RecordingError(f"{path} is not there; expected a recording")
+    scan.require_file(path)
     size = path.stat().st_size
     try:
         return _verify(path, scan.mapped(path))

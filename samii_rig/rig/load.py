@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from importlib import resources
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,12 +14,17 @@ from samii_rig.errors import InputError
 from samii_rig.rig.schema import Rig
 
 Model = TypeVar("Model", bound=BaseModel)
+_FOLDER = resources.files("samii_rig.rig") / "data"
 MAX_BYTES = 4_000_000  # a rig file is a few kB; more is not one
 
 
 def shipped() -> tuple[str, ...]:
     """Names of the rigs that come with the package."""
-    folder = resources.files("samii_rig.rig") / "data"
+    return names_in(_FOLDER)
+
+
+def names_in(folder: Traversable) -> tuple[str, ...]:
+    """Names of the TOML files that come with the package in `folder`."""
     return tuple(sorted(p.name.removesuffix(".toml") for p in folder.iterdir()))
 
 
@@ -48,15 +54,26 @@ def parse(model: type[Model], text: str, where: str) -> Model:
 
 def load_rig(name: str) -> tuple[Rig, str]:
     """The rig called `name` (shipped, or the path of a file) and the text of its file."""
-    if name in shipped():
-        text = (resources.files("samii_rig.rig") / "data" / f"{name}.toml").read_text("utf-8")
-        return parse(Rig, text, f"{name}.toml"), text
+    return load_named(Rig, name, _FOLDER, "--rig", "rig file")
+
+
+def load_named(
+    model: type[Model], name: str, folder: Traversable, option: str, what: str
+) -> tuple[Model, str]:
+    """The `model` called `name` (of `folder`, or the path of a file) and the text of its file.
+
+    option, what : the command line's option and the kind of file, for the error's line.
+    """
+    names = names_in(folder)
+    if name in names:
+        text = (folder / f"{name}.toml").read_text("utf-8")
+        return parse(model, text, f"{name}.toml"), text
     path = Path(name)
     if not path.exists():
-        expected = f"the path of a rig file or one of {', '.join(shipped())}"
-        raise InputError("--rig", "", name, expected)
-    text = read_text(path, "rig file")
-    return parse(Rig, text, str(path)), text
+        expected = f"the path of a {what} or one of {', '.join(names)}"
+        raise InputError(option, "", name, expected)
+    text = read_text(path, what)
+    return parse(model, text, str(path)), text
 
 
 def _one_line(error: ValidationError, data: dict[str, object], where: str) -> InputError:
