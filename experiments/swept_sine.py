@@ -75,6 +75,10 @@ class SweptSine(Strict):
 
     @model_validator(mode="after")
     def _shape(self) -> Self:
+        if self.start_hz == self.stop_hz:
+            raise ValueError(
+                f"start_hz and stop_hz are both {self.start_hz:g} Hz; expected a sweep between two"
+            )
         if 2.0 * self.ramp > self.duration:
             raise ValueError(
                 f"two ramps of {self.ramp:g} s do not fit into a sweep of {self.duration:g} s"

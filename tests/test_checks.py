@@ -213,12 +213,14 @@ def test_motion_at_the_end_of_the_bursts_is_leakage():
     assert any(f.kind == "leakage" and f.channel == "theta" for f in r.findings)
 
 
-def ringing_sweeps(repeats: int, seed: int, noise: float) -> tuple[Recording, np.ndarray]:
+def ringing_sweeps(
+    repeats: int, seed: int, noise: float, radius: float = 0.995
+) -> tuple[Recording, np.ndarray]:
     """Bursts of a mode so lightly damped that each runs into the next, and its response."""
     rng = np.random.default_rng(seed)
     t = (np.arange(N) - 100) / RATE
     u = np.where((t > 0) & (t < 12), np.sin(2 * np.pi * (0.3 + 0.3 * t) * t), 0.0)
-    b, a = [0.0, 0.02], [1.0, -2 * 0.995 * np.cos(0.15), 0.995**2]
+    b, a = [0.0, 0.02], [1.0, -2 * radius * np.cos(0.15), radius**2]
     x = signal.lfilter(b, a, np.tile(u, repeats))
     values = np.stack([np.tile(u, repeats)] * 2 + [x, np.gradient(x)], axis=1)
     values[:, 2:] += rng.normal(size=(x.size, 2)) * noise
@@ -246,6 +248,35 @@ def test_intervals_of_bursts_that_run_into_each_other_hold():
         i = magnitude_interval(r)
         inside.append(np.mean((i.low[:, 0, 0] < abs(expected)) & (abs(expected) < i.high[:, 0, 0])))
     assert 0.87 < np.mean(inside) < 0.93
+
+
+@pytest.mark.parametrize("periods", [0.4, 0.7, 1.0, 2.0])
+@pytest.mark.parametrize("repeats", [3, 4])
+def test_the_louder_it_rings_the_less_it_is_taken_for_rest(periods, repeats):
+    """A ring that takes `periods` bursts to fall to 1/e differs from tail to tail."""
+    radius = np.exp(-1 / (periods * N))
+    recording, truth = ringing_sweeps(repeats, 2, 1e-3, radius)
+    (r,) = estimate([recording], band=(0.5, 6.0), outputs=["theta"])
+    assert not r.method.startswith("burst")
+    if r.method.startswith("local"):
+        assert any(f.kind == "leakage" for f in r.findings)
+    else:
+        expected = truth[np.searchsorted(np.arange(1, N // 2) * RATE / N, r.frequency - 1e-9)]
+        sigma = np.sqrt(r.variance()[:, 0, 0])
+        assert np.quantile(abs(r.H[:, 0, 0] - expected) / sigma, 0.99) < 4
+
+
+def test_the_same_samples_twice_are_no_repeat():
+    recording = sweeps(3)
+    with pytest.raises(EstimateError, match="the very samples of another repeat"):
+        estimate([recording, recording])
+
+
+def test_another_amplitude_is_another_experiment_whatever_its_level_says():
+    recording = sweeps(4)
+    values = recording.values.copy()
+    values[2 * N :] *= 3
+    assert [r.n_averages for r in estimate([replace(recording, values=values)])] == [2, 2]
 
 
 def test_a_burst_after_a_foreign_one_is_not_taken_for_a_period():

@@ -230,8 +230,8 @@ def test_a_file_is_loaded_by_its_path(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "experiment is None; expected one of swept_sine"),
-        ('experiment = "braced"', "experiment is 'braced'; expected one of swept_sine"),
+        ("", "experiment is None; expected one of multisine"),
+        ('experiment = "braced"', "experiment is 'braced'; expected one of multisine"),
         ("experiment = 3", "experiment is 3"),
         ("experiment = ", "valid TOML"),
     ],

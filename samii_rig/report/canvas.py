@@ -164,6 +164,31 @@ def line(
     )
 
 
+def points(
+    figure: Figure, f: Float, values: Float, name: str, axis: str, level: int, *, full: bool
+) -> None:
+    """Add points at the `level`-th amplitude, full or hollow; none where a value is not above 0."""
+    seen = values > 0
+    figure["data"].append(
+        {
+            "type": "scatter",
+            "mode": "markers",
+            "name": name,
+            "x": packed(f[seen]),
+            "y": packed(values[seen]),
+            "yaxis": axis,
+            "marker": {
+                "size": 5,
+                "symbol": "circle" if full else "circle-open",
+                "color": f"@level{level % N_COLOURS}",
+            },
+            "legendgroup": f"level{level}",
+            "showlegend": False,
+            "hovertemplate": "%{y:.2g} %",
+        }
+    )
+
+
 def shade(span: tuple[float, float]) -> dict[str, Any]:
     """A frequency band in which the curves differ."""
     return {

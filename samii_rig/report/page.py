@@ -70,14 +70,16 @@ def write_report(
 
     Raises
     ------
-    InputError : responses of different channels, an unknown channel, a place that cannot be
-        written to; nothing half-written is left.
+    InputError : a name that does not end in .html, responses of different channels, an unknown
+        channel, a place that cannot be written to; nothing half-written is left.
     """
+    path = Path(path)
+    if path.suffix.lower() != ".html":
+        raise InputError("report", "suffix", path.suffix, ".html")
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     responses = sorted(responses, key=lambda r: (not np.isfinite(r.level), r.level))
     _check(recordings, responses, spectrogram_channel)
     page = render(recordings, responses, rig, model, title, spectrogram_channel, band_hz, events)
-    path = Path(path)
     with replacing(path) as part:
         part.write_text(page, encoding="utf-8")
     return path
@@ -107,7 +109,8 @@ def render(
                 figure = plots.headline(curves, i, j, model, comparisons)
                 said = facts.headline(y.name, u.name, comparisons)
                 headlines.append(Plot(f"head-{id_}", name, said, figure))
-                bodes.append(Plot(f"bode-{id_}", name, "", plots.bode(curves, i, j, model)))
+                said = plots.distortion_caption(responses)
+                bodes.append(Plot(f"bode-{id_}", name, said, plots.bode(curves, i, j, model)))
                 if any((c.output, c.input) == (y.name, u.name) for c in comparisons) and model:
                     figure = plots.ratio(curves, i, j, model)
                     ratios.append(Plot(f"ratio-{id_}", name, "dashed: agreement", figure))

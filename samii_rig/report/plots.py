@@ -14,6 +14,7 @@ from samii_rig.report.canvas import (
     level_line,
     line,
     log_scale,
+    points,
     shade,
     stacked,
     ticked,
@@ -93,11 +94,17 @@ def bode(
     input: int,
     model: ModelCurve | None,
 ) -> Figure:
-    """Gain, phase and coherence of one entry of H, every level with its 90 % band."""
+    """Gain, phase and coherence of one entry of H, every level with its 90 % band; below them
+    even and odd distortion where the excitation shows them."""
     responses = [c.response for c in curves]
     y, u = responses[0].outputs[output], responses[0].inputs[input]
     titles = [f"gain [{unit(y, u)}]", "phase [\u00b0]", "coherence"]
-    figure = stacked(3, titles, 720, weights=(0.46, 0.32, 0.22))
+    if _shows_distortion(responses):
+        titles.append("distortion [%]")
+        figure = stacked(4, titles, 920, weights=(0.36, 0.25, 0.14, 0.25))
+        _distortion(figure, responses, output, input)
+    else:
+        figure = stacked(3, titles, 720, weights=(0.46, 0.32, 0.22))
     log_scale(figure["layout"]["yaxis"])
     figure["layout"]["yaxis2"] |= {"dtick": 90}
     figure["layout"]["yaxis3"] |= {"range": [0, 1.04], "dtick": 0.5}
@@ -112,10 +119,11 @@ def bode(
             anchor = np.stack([f, angle])
         angle = _same_turn(f, angle, anchor)
         half = c.half[at, output, input]
-        known = half < 180.0
+        known = half < 90.0  # beyond, the curve would be noise over whole turns
         width = np.where(known, half, np.nan)
         band(figure, f, angle - width, angle + width, "y2", k)
-        line(figure, f, angle, _label(r), "y2", k, legend=False, hover="%{y:.1f}\u00b0")
+        shown = np.where(known, angle, np.nan)
+        line(figure, f, shown, _label(r), "y2", k, legend=False, hover="%{y:.1f}\u00b0")
         coherence = r.coherence[at, output]
         line(figure, f, coherence, _label(r), "y3", k, legend=False, hover="%{y:.3f}")
     curve = np.empty(0)
@@ -137,6 +145,42 @@ def bode(
     _frame(figure, responses)
     _fit_gain(figure, responses, output, input, curve)
     return figure
+
+
+def distortion_caption(responses: Sequence[FrequencyResponse]) -> str:
+    """What the points of the lowest panel are, "" where there is none."""
+    if not _shows_distortion(responses):
+        return ""
+    return (
+        "distortion: full points odd, hollow points even, as part of the output; line: "
+        "standard deviation of the gain"
+    )
+
+
+def _shows_distortion(responses: Sequence[FrequencyResponse]) -> bool:
+    return any(r.even is not None or r.odd is not None for r in responses)
+
+
+def _distortion(figure: Figure, responses: Sequence[FrequencyResponse], i: int, j: int) -> None:
+    """Even and odd distortion as parts of the output, and the response's own relative
+    standard deviation, below which they say nothing."""
+    log_scale(figure["layout"]["yaxis4"])
+    shown: list[Float] = []
+    for k, r in enumerate(responses):
+        f, label = r.frequency, _label(r)
+        sigma = 100 * np.sqrt(r.variance()[:, i, j]) / np.abs(r.H[:, i, j])
+        name = f"standard deviation, {label}"
+        line(figure, f, sigma, name, "y4", k, legend=False, hover="%{y:.2g} %")
+        shown.append(sigma)
+        for name, level, full in (("even", r.even, False), ("odd", r.odd, True)):
+            if level is not None:
+                values = 100 * level[:, i]
+                points(figure, f, values, f"{name}, {label}", "y4", k, full=full)
+                shown.append(values)
+    logs = np.concatenate([np.log10(x[np.isfinite(x) & (x > 0)]) for x in shown])
+    if logs.size:
+        low, high = np.quantile(logs, [_NOISE_PART, 1.0])
+        figure["layout"]["yaxis4"] |= ticked(low - 0.1, high + 0.1)
 
 
 def ratio(

@@ -59,7 +59,7 @@ class ProgressLike(Protocol):
 
     @property
     def frequency(self) -> float:
-        """Hz now, NaN at rest."""
+        """Hz now, NaN at rest, inf where the whole band is driven at once."""
 
     @property
     def worst_channel(self) -> str:
@@ -82,6 +82,7 @@ def progress_line(progress: ProgressLike, total_s: float) -> RenderableType:
         f"{duration(max(p.time_left, 0.0))} left",
     )
     now = "at rest" if math.isnan(p.frequency) else f"{p.frequency:.2f} Hz"
+    now = "the whole band" if math.isinf(p.frequency) else now
     words = Text(f"{now} at {p.level:g} {p.unit}")
     if p.worst_channel:
         style = "green" if p.worst_margin > _MARGIN_CLOSE else "yellow"

@@ -136,7 +136,9 @@ def _levels(responses: Sequence[FrequencyResponse]) -> list[Verdict]:
     if not shared.size or names[0] != names[1]:
         return []
     found = difference(low, high, octaves(shared))
-    unequal = [d for d in found if d.p_value < _P_DIFFERENT and d.change > _SMALL_CHANGE]
+    unequal = [
+        d for d in found if d.p_value * len(found) < _P_DIFFERENT and d.change > _SMALL_CHANGE
+    ]
     between = f"{low.level:g} and {high.level:g} {high.level_unit}"
     if not unequal:
         text = f"Between {between} no octave changes by more than its noise and 2 %."

@@ -1,5 +1,5 @@
 """What can be wrong with data before physics is asked: gaps, clocks, clipping, stuck
-sensors, repeats that do not repeat, bursts that do not end at rest.
+sensors, repeats that do not repeat. (`rest` looks at how bursts end.)
 
 Each check names the channel, the place and the count in plain words and decides nothing;
 `samii_rig.signal.estimate` excludes or refuses.
@@ -13,11 +13,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from samii_rig.signal.groups import Piece, Selection
-from samii_rig.signal.noise import pooled
-from samii_rig.signal.spectra import rests
-from samii_rig.signal.statistics import hotelling, hotelling_p
-from samii_rig.types import Channel, Finding, Float, Quality, Recording, Segment
+from samii_rig.signal.groups import Selection
+from samii_rig.types import Finding, Float, Quality, Recording, Segment
 
 # Root mean square of the time stamps about a uniform clock, in samples, that is worth a
 # word: 5 % of a sample is 1 degree of phase at 1/18 of the sample rate.
@@ -30,13 +27,6 @@ FOREIGN = 10.0
 # signal (power: 10 % in amplitude) and has structure along frequency.
 TWO_DIFFER = 0.01
 STRUCTURE = 0.7  # lag-one coherence; noise alone has about 1/sqrt(lines)
-# A burst still rings when its tail, common to the repeats, is this improbable as noise; over
-# all lines of the tail together.
-RINGING = 1e-8
-TAIL_PART = 0.1  # of the burst, looked at
-TAIL_LEAST = 16  # samples
-# With one burst there is no scatter: 5 times the tail's own noise, and 2e-3 of the peak.
-TAIL_NOISE, TAIL_PEAK = 5.0, 2e-3
 STUCK_PART = 0.2  # of the samples in which the input moves
 STUCK_SAMPLES = 20
 FLAT_RUN, FLAT_RUNS = 3, 3  # as many equal samples at the extreme, as many times
@@ -174,36 +164,6 @@ def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Findin
     return out
 
 
-def not_at_rest(
-    pieces: Sequence[Piece], channels: Sequence[Channel], highest: float
-) -> list[Finding]:
-    """Motion that has not died out at the end of the bursts, at most one finding: leakage.
-
-    What is common to the tails of all repeats is held against their scatter, line by line up
-    to `highest` (cycles per sample) and for all outputs together: the joint covariance would
-    see it too. The first of `channels` is the input, which follows from the outputs.
-    """
-    n = min(len(p) for p in pieces)
-    _, rest = rests(pieces[0].r)
-    tail = min(rest, int(TAIL_PART * n))
-    if tail < TAIL_LEAST:
-        message = f"{pieces[0].name}: the reference acts until the end; no ring-down was recorded"
-        return [Finding("leakage", "warning", message)]
-    ends = np.stack([p.z[-tail:, 1:] for p in pieces])
-    ends = ends - ends.mean(axis=1, keepdims=True)
-    i, significant = _ringing(ends, highest) if len(pieces) > 1 else _moving(ends[0], pieces[0])
-    if not significant:
-        return []
-    channel = channels[i + 1]
-    size = float(np.sqrt(np.mean(ends[:, :, i].mean(axis=0) ** 2)))
-    peak = max(float(np.ptp(p.z[:, i + 1])) for p in pieces) / 2
-    message = (
-        f"{channel.name} still moves by {size:.3g} {channel.unit} (rms, {size / peak:.2%} of its "
-        f"peak) in the last {tail} samples of {pieces[0].name}"
-    )
-    return [Finding("leakage", "warning", message, channel=channel.name)]
-
-
 def foreign_repeats(
     spectra: NDArray[np.complex128], names: Sequence[str], channels: Sequence[str]
 ) -> dict[int, Finding]:
@@ -285,35 +245,6 @@ def _most_foreign(spectra: NDArray[np.complex128]) -> tuple[int, int, float] | N
         if ratio > FOREIGN and (worst is None or ratio > worst[2]):
             worst = (index, c, ratio)
     return worst
-
-
-def _ringing(ends: Float, highest: float) -> tuple[int, bool]:
-    """The loudest output of the mean tail in its noise, and whether the tail is no noise."""
-    n, tail, p = ends.shape
-    spectra = np.fft.rfft(ends * np.hanning(tail)[:, None], axis=1)
-    # A line of the windowed tail is 2 lines wide: every second one is nearly independent.
-    spectra = spectra[:, 2 : max(4, int(highest * tail) + 1) : 2]
-    bins = spectra.shape[1]
-    lively = np.mean(np.abs(spectra) ** 2, axis=(0, 1)) > 0
-    mean = spectra.mean(axis=0)
-    scatter = (spectra - mean)[:, :, lively]
-    p = int(np.count_nonzero(lively))
-    lines = min(bins, -(-4 * p // (n - 1)))
-    if p == 0 or (n - 1) * lines <= p or not np.any(scatter):
-        return int(np.argmax(np.abs(mean).max(axis=0))), bool(np.any(mean)) and p > 0
-    covariance, nu, _ = pooled(scatter, n - 1, lines)
-    t2 = hotelling(mean[:, lively], covariance / n)
-    probability = hotelling_p(t2, p, np.maximum(nu, p))
-    unit = np.abs(mean) / np.sqrt(np.mean(np.abs(spectra - mean) ** 2, axis=(0, 1)) + 1e-300)
-    return int(np.argmax(unit.max(axis=0) * lively)), bool(probability.min() < RINGING / bins)
-
-
-def _moving(end: Float, piece: Piece) -> tuple[int, bool]:
-    """As `_ringing`, for one burst: against the differences of neighbouring samples."""
-    noise = np.std(np.diff(end, axis=0), axis=0) / np.sqrt(2)
-    peak = np.ptp(piece.z[:, 1:], axis=0) / 2
-    ratio = np.std(end, axis=0) / np.maximum(TAIL_NOISE * noise, TAIL_PEAK * peak + 1e-300)
-    return int(np.argmax(ratio)), bool(ratio.max() > 1)
 
 
 def _lag_one(x: NDArray[np.complex128]) -> float:

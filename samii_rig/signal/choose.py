@@ -10,8 +10,8 @@ import numpy as np
 from samii_rig.errors import EstimateError
 from samii_rig.signal import checks
 from samii_rig.signal.groups import Group, Selection
+from samii_rig.signal.rest import Ringing, ringing
 from samii_rig.signal.spectra import burst_spectra, excited, period, spectrum
-from samii_rig.types import Finding
 
 Method = Literal["auto", "burst", "periodic", "local", "h1", "h2", "hv"]
 
@@ -45,8 +45,8 @@ def drop_foreign(group: Group) -> None:
     """Exclude repeats that do not repeat; of only two, neither can be trusted."""
     if len(group.pieces) < 2 or not group.equal_length:
         return
-    # A first burst from rest differs from those that start in a tail, and is left out anyhow.
-    skip = 1 if runs_on(group) else 0
+    # Bursts on the way from rest differ from those that start in a tail, for no fault of theirs.
+    skip = settling(group) or int(_in_a_row(group) and _ringing(group) is not None)
     pieces = group.pieces[skip:]
     names = [p.name for p in pieces]
     spectra, _ = burst_spectra(pieces, group.rate_hz)
@@ -89,22 +89,33 @@ def choose(
         return "local", "there is one sweep: leakage and noise are told apart by local models"
     if not group.equal_length:
         return "local", "the repeats differ in length or miss samples: local models join them"
-    if moving := _moving(group):
-        if runs_on(group):
+    if ring := _ringing(group):
+        if skip := settling(group):
             return "settled", (
                 f"the bursts do not end at rest, but each runs into the next: all but the first "
-                f"of {n} are whole periods of one motion, without leakage"
+                f"{skip} of {n} are whole periods of one motion, without leakage"
             )
-        group.findings += moving
+        group.findings.append(ring.finding)
         return "local", "the bursts do not end at rest: transients are removed by local models"
     return "burst", f"{n} bursts from rest to rest with one reference: no leakage"
 
 
-def runs_on(group: Group) -> bool:
-    """Whether three bursts or more ran into each other while they still rang."""
-    consecutive = all(p.follows for p in group.pieces[1:])
-    whole = group.kind == "burst" and group.equal_length
-    return len(group.pieces) > 2 and whole and consecutive and bool(_moving(group))
+def settling(group: Group) -> int:
+    """How many of bursts that run into each other to leave out, until the motion is settled.
+
+    0 where that is not what they are: at rest at their ends, not in a row, or too few to leave
+    two after the motion has settled.
+    """
+    if not _in_a_row(group):
+        return 0
+    ring = _ringing(group)
+    return ring.settled_after if ring and len(group.pieces) - ring.settled_after >= 2 else 0
+
+
+def _in_a_row(group: Group) -> bool:
+    """Whether these are three bursts or more, each of which started where one ended."""
+    row = group.kind == "burst" and group.equal_length and len(group.pieces) > 2
+    return row and all(p.follows for p in group.pieces[1:])
 
 
 def at_rest(group: Group) -> bool:
@@ -112,12 +123,12 @@ def at_rest(group: Group) -> bool:
     if group.kind != "burst":
         return False
     known = {f.kind for f in group.findings}
-    return "leakage" not in known and not _moving(group)
+    return "leakage" not in known and _ringing(group) is None
 
 
-def _moving(group: Group) -> list[Finding]:
+def _ringing(group: Group) -> Ringing | None:
     spectra = [spectrum(p, group.rate_hz) for p in group.pieces]
     longest = max(spectra, key=lambda s: s.n)
     highest = longest.frequency[excited(spectra, None)[-1]] / group.rate_hz
     channels = (group.selection.input, *group.selection.outputs)
-    return checks.not_at_rest(group.pieces, channels, float(highest))
+    return ringing(group.pieces, channels, float(highest))

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samii_rig.errors import EstimateError, InputError
-from samii_rig.signal import local, repeats, welch
-from samii_rig.signal.choose import Method, at_rest, choose, drop_foreign, drop_stuck
+from samii_rig.signal import local, periodic, repeats, welch
+from samii_rig.signal.choose import Method, at_rest, choose, drop_foreign, drop_stuck, settling
+from samii_rig.signal.distortion import Distortion, distortion
 from samii_rig.signal.gather import Gaps, gather
 from samii_rig.signal.groups import Group, Piece
 from samii_rig.signal.quantisation import floor_of
@@ -19,7 +20,6 @@ from samii_rig.signal.spectra import (
     burst_spectra,
     comb,
     excited,
-    period,
     rests,
     settled_spectra,
     spectrum,
@@ -87,13 +87,20 @@ def estimate(
     groups = gather(recordings, input=input, outputs=outputs, reference=reference, gaps=gaps)
     out: list[FrequencyResponse] = []
     failed: list[EstimateError] = []
+    usable: list[Group] = []
     for group in groups:
         try:
             drop_stuck(group, chosen=outputs is not None)
+            if method not in ("h1", "h2", "hv"):
+                drop_foreign(group)
+            usable.append(group)
+        except EstimateError as error:
+            failed.append(error)
+    for group in periodic.joined(usable) if method in ("auto", "periodic") else usable:
+        try:
             if method in ("h1", "h2", "hv"):
                 out.append(_welch(group, method, nperseg, band))
                 continue
-            drop_foreign(group)
             choice, why = choose(group, method)
             if choice == "local":
                 out.append(_local(group, why, band))
@@ -115,21 +122,24 @@ def _repeats(
     pooling: int | None,
 ) -> FrequencyResponse:
     pieces = group.pieces
-    if method == "periodic":
-        pieces = _periods(group)
+    periods: periodic.Periods | None = None
     if method == "burst":
         spectra, shared = burst_spectra(pieces, group.rate_hz)
         if rests(pieces[0].r)[0] < LEAD_IN * len(pieces[0]):
             group.findings.append(_no_lead_in(pieces[0].name))
     elif method == "settled":
-        spectra, shared = settled_spectra(pieces, group.rate_hz), 1.0
-        text = f"{pieces[0].name} left out: it started from rest, the others from its tail"
-        group.findings.append(Finding("leakage", "note", text, segment=pieces[0].name))
-        pieces = pieces[1:]
+        skip = settling(group)
+        spectra, shared = settled_spectra(pieces[skip - 1 :], group.rate_hz), 1.0
+        for piece in pieces[:skip]:
+            text = f"{piece.name} left out: the motion had not settled since it started from rest"
+            group.findings.append(Finding("leakage", "note", text, segment=piece.name))
+        pieces = pieces[skip:]
     else:
-        spectra, shared = [spectrum(p, group.rate_hz) for p in pieces], 1.0
+        periods = periodic.periods(group)
+        pieces, spectra, shared = periods.pieces, periods.independent, 1.0
+        why = f"{why}; {periods.why}" if periods.why else why
     lines = comb(spectra, band) if method == "periodic" else excited(spectra, band)
-    n, p = len(pieces), len(group.selection.outputs)
+    n, p = len(spectra), len(group.selection.outputs)
     wanted = pooling or repeats.pooling_lines(n, p)
     if min(wanted, lines.size) * (n - 1) <= p:
         raise EstimateError(
@@ -139,6 +149,13 @@ def _repeats(
     R = np.stack([s.R[lines] for s in spectra])
     Z = np.stack([s.Z[lines] for s in spectra])
     floor, findings = floor_of(group, pieces)
+    over, seen, averages = "repeats", Distortion(None, None), n
+    rounding = floor
+    if periods is not None:
+        over, averages = periods.over, len(pieces)
+        if len(periods.spectra) > 1:
+            # Each realisation is rounded in its own way, so that the scatter shows it.
+            floor, findings = np.zeros_like(floor), {}
     result = repeats.over_repeats(R, Z, wanted, floor, shared)
     scatter = np.diagonal(result.noise, axis1=1, axis2=2).real
     for i, message in findings.items():
@@ -147,12 +164,16 @@ def _repeats(
             text = f"{message} in {part:.0%} of the lines; what is missing was added"
             name = group.selection.outputs[i].name
             group.findings.append(Finding("dof", "note", text, channel=name))
+    if periods is not None:
+        names = [c.name for c in group.selection.outputs]
+        seen = distortion(periods.spectra, lines, result.H, rounding, names)
+        group.findings += seen.findings
     amplitude = (
         np.sqrt(2 * result.input_power / len(pieces[0]))
         if method == "periodic"
         else np.abs(result.gain) * _peak(pieces) / np.sqrt(2)
     )
-    return _response(
+    response = _response(
         group,
         frequency=spectra[0].frequency[lines],
         H=result.H,
@@ -160,10 +181,11 @@ def _repeats(
         dof=result.dof,
         coherence=_coherence(result.H, result.gain, np.mean(np.abs(R) ** 2, axis=0), result.noise),
         input_rms=amplitude,
-        n=n,
-        method=f"{method} (over repeats, through {group.through})",
+        n=averages,
+        method=f"{method} (over {over}, through {group.through})",
         why=f"{why}; {result.remark}",
     )
+    return replace(response, even=seen.even, odd=seen.odd)
 
 
 def _no_lead_in(name: str) -> Finding:
@@ -172,21 +194,6 @@ def _no_lead_in(name: str) -> Finding:
         "neighbouring lines share it, and the degrees of freedom may be fewer than stated"
     )
     return Finding("dof", "note", message)
-
-
-def _periods(group: Group) -> list[Piece]:
-    """Every period as a piece; the first of three or more carries the transient and goes."""
-    p = period(group.pieces[0].r)
-    out = []
-    for piece in group.pieces:
-        count = len(piece) // p
-        skip = 1 if count > 2 else 0
-        for k in range(skip, count):
-            rows = slice(k * p, (k + 1) * p)
-            out.append(Piece(f"{piece.name}, period {k + 1}", piece.r[rows], piece.z[rows]))
-    if len(out) < 2:
-        raise EstimateError(f"{group.pieces[0].name}: one period; method 'local' needs only one")
-    return out
 
 
 def _local(group: Group, why: str, band: tuple[float, float] | None) -> FrequencyResponse:

@@ -67,6 +67,12 @@ def gather(
             name = f"{recording.source}, {segment.name}" if recording.source else segment.name
             z = cut.values[:, [cut.column(n) for n in own.names]]
             kept, breaks = _whole_rows(cut, names)
+            measured = np.ptp(z[kept][:, 1:]) > 0
+            if measured and any(np.array_equal(p.z, z[kept]) for p in group.pieces):
+                raise EstimateError(
+                    f"{name} holds the very samples of another repeat: the same file twice, or a "
+                    "simulation with the same seed; leave one out"
+                )
             follows = ends.get(id(group)) == segment.start and not breaks
             ends[id(group)] = segment.stop
             group.pieces.append(Piece(name, r[kept], z[kept], breaks, follows))

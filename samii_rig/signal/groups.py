@@ -24,6 +24,7 @@ class Piece:
     breaks : indices before which samples are missing; what came before them does not
         explain what follows.
     follows : whether the piece before it in the group ended where this one starts.
+    realisation : of a multisine; pieces of another one have other phases.
     """
 
     name: str
@@ -31,6 +32,7 @@ class Piece:
     z: Float
     breaks: tuple[int, ...] = ()
     follows: bool = False
+    realisation: int = 0
 
     def __len__(self) -> int:
         return int(self.r.shape[0])
@@ -98,6 +100,11 @@ def segments_of(recording: Recording) -> tuple[Segment, ...]:
         return recording.segments
     if len(recording) == 0:
         raise EstimateError(f"{recording.source or 'recording'}: it holds no sample")
+    if recording.experiment_toml:
+        raise EstimateError(
+            f"{recording.source or 'recording'}: the run ended before its first segment did; "
+            "nothing to estimate"
+        )
     references = [c for c in recording.channels if c.role == "reference"]
     driven = references or [c for c in recording.channels if c.role == "command"]
     peaks = {c: float(np.nanmax(np.abs(_column(recording, c.name)), initial=0.0)) for c in driven}
@@ -180,7 +187,10 @@ def _alike(a: Float, b: Float) -> bool:
     n = min(a.size, b.size)
     if abs(a.size - b.size) > LENGTH_DIFFERS * n:
         return False
-    size = float(np.linalg.norm(a[:n]) * np.linalg.norm(b[:n]))
+    norms = float(np.linalg.norm(a[:n])), float(np.linalg.norm(b[:n]))
+    if min(norms) < SAME_REFERENCE * max(norms):
+        return False  # another amplitude, whatever the level is said to be
+    size = norms[0] * norms[1]
     return size > 0 and float(a[:n] @ b[:n]) / size > SAME_REFERENCE
 
 

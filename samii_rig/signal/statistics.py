@@ -80,7 +80,7 @@ def decibel_interval(response: FrequencyResponse, level: float = 0.9) -> Interva
 def phase(response: FrequencyResponse) -> Float:
     """Phase of H in degrees, (n_freq, n_out, n_in), unwrapped along frequency.
 
-    Only lines that are known to better than 90 degrees take part in the unwrapping; the
+    Only lines that are known to better than 45 degrees take part in the unwrapping; the
     others are put next to their neighbours, so that noise cannot add whole turns.
     """
     angle: Float = np.angle(response.H)
@@ -88,7 +88,7 @@ def phase(response: FrequencyResponse) -> Float:
     out = np.empty_like(angle)
     grid = response.frequency
     for i in np.ndindex(angle.shape[1:]):
-        known = half[(slice(None), *i)] < 90.0
+        known = half[(slice(None), *i)] < 45.0
         column = angle[(slice(None), *i)]
         if np.count_nonzero(known) < 2:
             out[(slice(None), *i)] = column

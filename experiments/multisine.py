@@ -1,0 +1,180 @@
+"""Random-phase odd multisine: periods of noise-like drive that show what is not linear."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from samii_rig.errors import InputError
+from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Rig, Strict
+from samii_rig.run.limits import find_actuator
+from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.signal.excitation import Interpolation, cosine_ramp, schedule_factor
+from samii_rig.signal.multisine import odd_lines, realisations
+from samii_rig.types import Float
+
+# Above this part of the rate a sampled sine looks like another one for the hold and the
+# sensors' filters, and the anti-alias filters cut.
+HIGHEST = 0.45
+# Longer plans are better run one after another: the prediction holds the spectrum of the
+# whole plan in memory. 2.8 hours at 500 samples/s.
+MOST_SAMPLES = 5_000_000
+# A weaker line than this part of the strongest measures little, and a detection line beside
+# it could not be told from it.
+LEAST_FACTOR = 0.01
+
+
+class Multisine(Strict):
+    """A multisine experiment file.
+
+    Each segment is one realisation: a cosine ramp, whole periods of settling, whole measured
+    periods, a ramp down. The recorded segment (kind `periodic`) holds the last settling
+    period and the measured ones; the estimate leaves out its first period.
+
+    drive, unit, kp, schedule, interpolation : as for the swept sine.
+    period : T in s, a whole number of samples; lines are multiples of 1/T.
+    low_hz, high_hz : the odd lines between them are driven,
+    group : but one of each so many consecutive ones, left out at random as a detection line.
+    amplitudes : peak of the drive at each level, in `unit`.
+    realisations : how many, each with phases of its own; periods : measured in each.
+    settle : periods before the measured ones, one at least.
+    ramp : s of the cosine ramp up before them and down after them.
+    crest : wanted peak/rms, see `samii_rig.signal.multisine`.
+    order : `by_level` runs all realisations of a level before the next, `by_realisation`
+        all levels of a realisation.
+    """
+
+    experiment: Literal["multisine"]
+    name: Name
+    description: str = ""
+    actuator: Name
+    unit: str
+    drive: Literal["output", "reference"] = "output"
+    period: Positive
+    low_hz: Positive
+    high_hz: Positive
+    group: Annotated[int, Field(ge=2, le=100)] = 4
+    amplitudes: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
+    realisations: Annotated[int, Field(ge=1, le=1000)] = 3
+    periods: Annotated[int, Field(ge=2, le=1000)] = 3
+    settle: Annotated[int, Field(ge=1, le=100)] = 1
+    ramp: NonNegative = 0.0
+    crest: Annotated[float, Field(gt=1, le=10)] = 2.5
+    schedule: tuple[tuple[Positive, Annotated[float, Field(ge=LEAST_FACTOR, le=1)]], ...] = ()
+    interpolation: Interpolation = "logarithmic"
+    kp: Finite | None = None
+    order: Literal["by_level", "by_realisation"] = "by_level"
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @field_validator("amplitudes")
+    @classmethod
+    def _distinct(cls, amplitudes: tuple[float, ...]) -> tuple[float, ...]:
+        if len(set(amplitudes)) != len(amplitudes):
+            raise ValueError("each level once (measure it longer with `realisations`)")
+        return amplitudes
+
+    @field_validator("kp")
+    @classmethod
+    def _kp(cls, kp: float | None) -> float | None:
+        if kp is not None and kp < 0:
+            raise ValueError("0 or more; a negative kp drives the joint off centre")
+        return kp
+
+    @model_validator(mode="after")
+    def _shape(self) -> Self:
+        if self.high_hz <= self.low_hz:
+            raise ValueError(f"high_hz: {self.high_hz:g} Hz; expected more than low_hz")
+        hz = [point[0] for point in self.schedule]
+        if sorted(set(hz)) != hz:
+            raise ValueError("schedule: frequencies must increase")
+        return self
+
+    def plan(self, rig: Rig) -> Plan:
+        """Every segment's reference at the rig's rate.
+
+        InputError if the rig has no such actuator, another unit or no centring sensor, if
+        the period is no whole number of samples, or if the band is too narrow or too high.
+        """
+        where = f"experiment {self.name}"
+        kp, sensor = self._loop(rig, where)
+        n = round(self.period * rig.rate_hz)
+        if abs(n / rig.rate_hz - self.period) > 1e-9 * self.period or n < 1:
+            near = max(n, 1) / rig.rate_hz
+            raise InputError(
+                where, "period", self.period, f"a whole number of samples, such as {near:g} s"
+            )
+        if self.high_hz > HIGHEST * rig.rate_hz:
+            most = f"at most {HIGHEST * rig.rate_hz:g} Hz, {HIGHEST:g} of the rate"
+            raise InputError(where, "high_hz", self.high_hz, most)
+        length = n * (self.settle + self.periods) + 2 * self.ramp * rig.rate_hz
+        if length * len(self.amplitudes) * self.realisations > MOST_SAMPLES:
+            longest = f"a plan of at most {MOST_SAMPLES / rig.rate_hz / 3600:.0f} hours"
+            raise InputError(where, "period", self.period, longest)
+        grid, phases = np.random.SeedSequence(self.seed).spawn(2)
+        lines = odd_lines(
+            self.low_hz, self.high_hz, self.period, self.group, np.random.default_rng(grid)
+        )
+        if lines.odd.size == 0:
+            least = f"a longer one: {self.group} odd lines between low_hz and high_hz at least"
+            raise InputError(where, "period", self.period, least)
+        shape = schedule_factor(lines.excited / self.period, self.schedule, self.interpolation)
+        waves = realisations(n, lines.excited, shape, self.crest, self.realisations, phases)
+        return Plan(
+            experiment=self.name,
+            rate_hz=rig.rate_hz,
+            actuator=self.actuator,
+            kp=kp,
+            centring_sensor=sensor,
+            segments=tuple(
+                self._segment(rig.rate_hz, level, i, waves[i]) for level, i in self._order()
+            ),
+            seed=self.seed,
+        )
+
+    def _loop(self, rig: Rig, where: str) -> tuple[float, str]:
+        """kp and the sensor that centres, checked against the rig."""
+        actuator = find_actuator(rig, self.actuator, where)
+        centring = rig.centring
+        unit, what = actuator.unit, f"actuator {actuator.name}"
+        if self.drive == "reference":
+            if centring is None:
+                raise InputError(
+                    where, "drive", "reference", f"a rig that centres; {rig.name} has no [centring]"
+                )
+            unit, what = rig.units()[centring.sensor], f"sensor {centring.sensor}"
+        if self.unit != unit:
+            raise InputError(where, "unit", self.unit, f"{unit!r}, the unit of {what}")
+        kp = self.kp if self.kp is not None else (centring.kp if centring else 0.0)
+        if kp > 0 and centring is None:
+            raise InputError(where, "kp", kp, f"0; {rig.name} has no [centring]")
+        if kp == 0 and self.drive == "reference":
+            raise InputError(where, "kp", kp, "above 0: the reference acts through kp alone")
+        return kp, centring.sensor if centring else rig.sensor[0].name
+
+    def _segment(self, rate_hz: float, level: float, i: int, wave: Float) -> PlannedSegment:
+        n, ramp = wave.size, round(self.ramp * rate_hz)
+        before = ramp + (self.settle - 1) * n
+        stop = before + (1 + self.periods) * n
+        turn = np.arange(-before, stop - before + ramp) % n
+        u = level * wave[turn] * cosine_ramp(turn.size, rate_hz, ramp / rate_hz)
+        rest = np.zeros_like(u)
+        return PlannedSegment(
+            name=f"{self.name}_{level:g}_{i + 1}",
+            kind="periodic",
+            level=level,
+            unit=self.unit,
+            repeat=i,
+            u=u if self.drive == "output" else rest,
+            theta_ref=rest if self.drive == "output" else u,
+            band_hz=(self.low_hz, self.high_hz),
+            frequency=np.full(u.shape, np.inf),
+            recorded=(before, stop),
+        )
+
+    def _order(self) -> list[tuple[float, int]]:
+        """(level, realisation) of each segment."""
+        if self.order == "by_level":
+            return [(a, i) for a in self.amplitudes for i in range(self.realisations)]
+        return [(a, i) for i in range(self.realisations) for a in self.amplitudes]
