@@ -5,39 +5,32 @@ from __future__ import annotations
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
+from experiments.driven import HIGHEST, MOST_SAMPLES, Driven
 from samii_rig.errors import InputError
-from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Rig, Strict
-from samii_rig.run.limits import find_actuator
+from samii_rig.rig.schema import NonNegative, Positive, Rig
 from samii_rig.run.protocols import Plan, PlannedSegment
-from samii_rig.signal.excitation import Interpolation, cosine_ramp, schedule_factor
+from samii_rig.signal.excitation import cosine_ramp, schedule_factor
 from samii_rig.signal.multisine import odd_lines, realisations
 from samii_rig.types import Float
 
-# Above this part of the rate a sampled sine looks like another one for the hold and the
-# sensors' filters, and the anti-alias filters cut.
-HIGHEST = 0.45
-# Longer plans are better run one after another: the prediction holds the spectrum of the
-# whole plan in memory. 2.8 hours at 500 samples/s.
-MOST_SAMPLES = 5_000_000
 # A weaker line than this part of the strongest measures little, and a detection line beside
 # it could not be told from it.
 LEAST_FACTOR = 0.01
 
 
-class Multisine(Strict):
+class Multisine(Driven):
     """A multisine experiment file.
 
     Each segment is one realisation: a cosine ramp, whole periods of settling, whole measured
     periods, a ramp down. The recorded segment (kind `periodic`) holds the last settling
     period and the measured ones; the estimate leaves out its first period.
 
-    drive, unit, kp, schedule, interpolation : as for the swept sine.
+    schedule : as for the swept sine.
     period : T in s, a whole number of samples; lines are multiples of 1/T.
     low_hz, high_hz : the odd lines between them are driven,
     group : but one of each so many consecutive ones, left out at random as a detection line.
-    amplitudes : peak of the drive at each level, in `unit`.
     realisations : how many, each with phases of its own; periods : measured in each.
     settle : periods before the measured ones, one at least.
     ramp : s of the cosine ramp up before them and down after them.
@@ -47,40 +40,17 @@ class Multisine(Strict):
     """
 
     experiment: Literal["multisine"]
-    name: Name
-    description: str = ""
-    actuator: Name
-    unit: str
-    drive: Literal["output", "reference"] = "output"
     period: Positive
     low_hz: Positive
     high_hz: Positive
     group: Annotated[int, Field(ge=2, le=100)] = 4
-    amplitudes: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
     realisations: Annotated[int, Field(ge=1, le=1000)] = 3
     periods: Annotated[int, Field(ge=2, le=1000)] = 3
     settle: Annotated[int, Field(ge=1, le=100)] = 1
     ramp: NonNegative = 0.0
     crest: Annotated[float, Field(gt=1, le=10)] = 2.5
     schedule: tuple[tuple[Positive, Annotated[float, Field(ge=LEAST_FACTOR, le=1)]], ...] = ()
-    interpolation: Interpolation = "logarithmic"
-    kp: Finite | None = None
     order: Literal["by_level", "by_realisation"] = "by_level"
-    seed: Annotated[int, Field(ge=0)] = 0
-
-    @field_validator("amplitudes")
-    @classmethod
-    def _distinct(cls, amplitudes: tuple[float, ...]) -> tuple[float, ...]:
-        if len(set(amplitudes)) != len(amplitudes):
-            raise ValueError("each level once (measure it longer with `realisations`)")
-        return amplitudes
-
-    @field_validator("kp")
-    @classmethod
-    def _kp(cls, kp: float | None) -> float | None:
-        if kp is not None and kp < 0:
-            raise ValueError("0 or more; a negative kp drives the joint off centre")
-        return kp
 
     @model_validator(mode="after")
     def _shape(self) -> Self:
@@ -98,7 +68,7 @@ class Multisine(Strict):
         the period is no whole number of samples, or if the band is too narrow or too high.
         """
         where = f"experiment {self.name}"
-        kp, sensor = self._loop(rig, where)
+        kp, sensor = self.loop(rig, where)
         n = round(self.period * rig.rate_hz)
         if abs(n / rig.rate_hz - self.period) > 1e-9 * self.period or n < 1:
             near = max(n, 1) / rig.rate_hz
@@ -132,26 +102,6 @@ class Multisine(Strict):
             ),
             seed=self.seed,
         )
-
-    def _loop(self, rig: Rig, where: str) -> tuple[float, str]:
-        """kp and the sensor that centres, checked against the rig."""
-        actuator = find_actuator(rig, self.actuator, where)
-        centring = rig.centring
-        unit, what = actuator.unit, f"actuator {actuator.name}"
-        if self.drive == "reference":
-            if centring is None:
-                raise InputError(
-                    where, "drive", "reference", f"a rig that centres; {rig.name} has no [centring]"
-                )
-            unit, what = rig.units()[centring.sensor], f"sensor {centring.sensor}"
-        if self.unit != unit:
-            raise InputError(where, "unit", self.unit, f"{unit!r}, the unit of {what}")
-        kp = self.kp if self.kp is not None else (centring.kp if centring else 0.0)
-        if kp > 0 and centring is None:
-            raise InputError(where, "kp", kp, f"0; {rig.name} has no [centring]")
-        if kp == 0 and self.drive == "reference":
-            raise InputError(where, "kp", kp, "above 0: the reference acts through kp alone")
-        return kp, centring.sensor if centring else rig.sensor[0].name
 
     def _segment(self, rate_hz: float, level: float, i: int, wave: Float) -> PlannedSegment:
         n, ramp = wave.size, round(self.ramp * rate_hz)

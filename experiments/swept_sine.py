@@ -5,73 +5,37 @@ from __future__ import annotations
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
+from experiments.driven import HIGHEST, MOST_SAMPLES, Driven
 from samii_rig.errors import InputError
-from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Rig, Strict
-from samii_rig.run.limits import find_actuator
+from samii_rig.rig.schema import NonNegative, Positive, Rig
 from samii_rig.run.protocols import Plan, PlannedSegment
-from samii_rig.signal.excitation import Interpolation, Sweep, swept_sine
-
-# Above this part of the rate a sampled sine looks like another one for the hold and the
-# sensors' filters, and the anti-alias filters cut.
-HIGHEST = 0.45
-# Longer plans are better run one after another: the prediction holds the spectrum of the
-# whole plan in memory. 2.8 hours at 500 samples/s.
-MOST_SAMPLES = 5_000_000
+from samii_rig.signal.excitation import Sweep, swept_sine
 
 
-class SweptSine(Strict):
+class SweptSine(Driven):
     """A swept sine experiment file.
 
-    drive : `output` adds the sweep to the output, u in v = u + kp (theta_ref - theta), with
-        theta_ref = 0; `reference` sweeps theta_ref with u = 0, as the recordings of the SFLR
-        robot were made.
-    unit : of the levels; the actuator's for `output`, the centring sensor's for `reference`.
     start_hz, stop_hz, duration : of the sweep, s; `ramp` at both of its ends is inside.
-    amplitudes : peak of the reference at each level, in `unit`.
     schedule : points [Hz, factor], factor at most 1, by which the level is lowered over
         frequency; in between as `interpolation` says.
-    kp : of the centring loop; absent for the rig's own.
     order : `by_level` repeats a level before the next, `by_repeat` runs through all levels
         in each repeat, `random` shuffles all with `seed`.
     lead_in, ring_down : s of silence before and after each sweep.
     """
 
     experiment: Literal["swept_sine"]
-    name: Name
-    description: str = ""
-    actuator: Name
-    unit: str
-    drive: Literal["output", "reference"] = "output"
     sweep: Sweep
     start_hz: Positive
     stop_hz: Positive
     duration: Positive
-    amplitudes: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
     repeats: Annotated[int, Field(ge=1, le=1000)] = 1
     ramp: NonNegative = 0.0
     lead_in: NonNegative = 0.0
     ring_down: NonNegative = 0.0
     schedule: tuple[tuple[Positive, Annotated[float, Field(ge=0, le=1)]], ...] = ()
-    interpolation: Interpolation = "logarithmic"
-    kp: Finite | None = None
     order: Literal["by_level", "by_repeat", "random"] = "by_level"
-    seed: Annotated[int, Field(ge=0)] = 0
-
-    @field_validator("amplitudes")
-    @classmethod
-    def _distinct(cls, amplitudes: tuple[float, ...]) -> tuple[float, ...]:
-        if len(set(amplitudes)) != len(amplitudes):
-            raise ValueError("each level once (repeat it with `repeats`)")
-        return amplitudes
-
-    @field_validator("kp")
-    @classmethod
-    def _kp(cls, kp: float | None) -> float | None:
-        if kp is not None and kp < 0:
-            raise ValueError("0 or more; a negative kp drives the joint off centre")
-        return kp
 
     @model_validator(mode="after")
     def _shape(self) -> Self:
@@ -97,22 +61,7 @@ class SweptSine(Strict):
         the sweep is shorter than two samples or reaches above 0.45 of the rate.
         """
         where = f"experiment {self.name}"
-        actuator = find_actuator(rig, self.actuator, where)
-        centring = rig.centring
-        unit, what = actuator.unit, f"actuator {actuator.name}"
-        if self.drive == "reference":
-            if centring is None:
-                raise InputError(
-                    where, "drive", "reference", f"a rig that centres; {rig.name} has no [centring]"
-                )
-            unit, what = rig.units()[centring.sensor], f"sensor {centring.sensor}"
-        if self.unit != unit:
-            raise InputError(where, "unit", self.unit, f"{unit!r}, the unit of {what}")
-        kp = self.kp if self.kp is not None else (centring.kp if centring else 0.0)
-        if kp > 0 and centring is None:
-            raise InputError(where, "kp", kp, f"0; {rig.name} has no [centring]")
-        if kp == 0 and self.drive == "reference":
-            raise InputError(where, "kp", kp, "above 0: the reference acts through kp alone")
+        kp, sensor = self.loop(rig, where)
         if self.duration * rig.rate_hz < 2:
             raise InputError(
                 where, "duration", self.duration, f"at least two samples, {2 / rig.rate_hz:g} s"
@@ -133,8 +82,7 @@ class SweptSine(Strict):
                 self.duration,
                 f"a plan of at most {MOST_SAMPLES / rig.rate_hz / 3600:.0f} hours",
             )
-        # Without centring kp is 0 and the device reads this sensor to no effect.
-        return self._plan(rig, kp, centring.sensor if centring else rig.sensor[0].name)
+        return self._plan(rig, kp, sensor)
 
     def _plan(self, rig: Rig, kp: float, sensor: str) -> Plan:
         shape, frequency = swept_sine(

@@ -1,0 +1,80 @@
+"""What all experiments share that drive one actuator: levels, and how they act on the loop."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator
+
+from samii_rig.errors import InputError
+from samii_rig.rig.schema import Finite, Name, Positive, Rig, Strict
+from samii_rig.run.limits import find_actuator
+from samii_rig.signal.excitation import Interpolation
+
+# Above this part of the rate a sampled sine looks like another one for the hold and the
+# sensors' filters, and the anti-alias filters cut.
+HIGHEST = 0.45
+# Longer plans are better run one after another: the prediction holds the spectrum of the
+# whole plan in memory. 2.8 hours at 500 samples/s.
+MOST_SAMPLES = 5_000_000
+
+
+class Driven(Strict):
+    """An experiment file that drives one actuator at several levels.
+
+    drive : `output` adds the excitation to the output, u in v = u + kp (theta_ref - theta),
+        with theta_ref = 0; `reference` gives it to theta_ref with u = 0, as the recordings of
+        the SFLR robot were made.
+    unit : of the levels; the actuator's for `output`, the centring sensor's for `reference`.
+    amplitudes : peak of the excitation at each level, in `unit`.
+    interpolation : of the schedule's factor between its points.
+    kp : of the centring loop; absent for the rig's own.
+    """
+
+    name: Name
+    description: str = ""
+    actuator: Name
+    unit: str
+    drive: Literal["output", "reference"] = "output"
+    amplitudes: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
+    interpolation: Interpolation = "logarithmic"
+    kp: Finite | None = None
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @field_validator("amplitudes")
+    @classmethod
+    def _distinct(cls, amplitudes: tuple[float, ...]) -> tuple[float, ...]:
+        if len(set(amplitudes)) != len(amplitudes):
+            raise ValueError("each level once; it is measured longer by repeating it")
+        return amplitudes
+
+    @field_validator("kp")
+    @classmethod
+    def _kp(cls, kp: float | None) -> float | None:
+        if kp is not None and kp < 0:
+            raise ValueError("0 or more; a negative kp drives the joint off centre")
+        return kp
+
+    def loop(self, rig: Rig, where: str) -> tuple[float, str]:
+        """kp and the sensor that centres, checked against the rig.
+
+        Without centring kp is 0, and the device reads the sensor to no effect. InputError if
+        the rig has no such actuator, another unit, or no centring where it is needed.
+        """
+        actuator = find_actuator(rig, self.actuator, where)
+        centring = rig.centring
+        unit, what = actuator.unit, f"actuator {actuator.name}"
+        if self.drive == "reference":
+            if centring is None:
+                raise InputError(
+                    where, "drive", "reference", f"a rig that centres; {rig.name} has no [centring]"
+                )
+            unit, what = rig.units()[centring.sensor], f"sensor {centring.sensor}"
+        if self.unit != unit:
+            raise InputError(where, "unit", self.unit, f"{unit!r}, the unit of {what}")
+        kp = self.kp if self.kp is not None else (centring.kp if centring else 0.0)
+        if kp > 0 and centring is None:
+            raise InputError(where, "kp", kp, f"0; {rig.name} has no [centring]")
+        if kp == 0 and self.drive == "reference":
+            raise InputError(where, "kp", kp, "above 0: the reference acts through kp alone")
+        return kp, centring.sensor if centring else rig.sensor[0].name
