@@ -310,6 +310,16 @@ def test_real_recordings_are_imported_and_estimated(recordings: Path, tmp_path: 
     assert a["phase_deg"] - hold == pytest.approx(3.0, abs=1.0)
 
 
+def test_parameters_are_identified_from_a_log(log: Path) -> None:
+    code, said = call("identify", log, "--free", "joint_2.k", "--free", "joint_1.k")
+    assert code == 0
+    assert "The model fits" in said
+    assert "joint_2.k" in said
+    code, said = call("identify", log, "--free", "joint_9.k")
+    assert code == 2
+    assert "joint_9" in said
+
+
 def test_help_and_errors_import_nothing_heavy() -> None:
     code = (
         "import sys\nsys.argv = ['samii-rig', '--help']\nfrom samii_rig.cli import main\n"
