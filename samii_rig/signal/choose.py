@@ -46,7 +46,8 @@ def drop_foreign(group: Group) -> None:
     if len(group.pieces) < 2 or not group.equal_length:
         return
     # Bursts on the way from rest differ from those that start in a tail, for no fault of theirs.
-    skip = settling(group) or int(_in_a_row(group) and _ringing(group) is not None)
+    ring = _ringing(group) if _in_a_row(group) else None
+    skip = (_settling(group, ring) or 1) if ring else 0
     pieces = group.pieces[skip:]
     names = [p.name for p in pieces]
     spectra, _ = burst_spectra(pieces, group.rate_hz)
@@ -90,26 +91,25 @@ def choose(
     if not group.equal_length:
         return "local", "the repeats differ in length or miss samples: local models join them"
     if ring := _ringing(group):
-        if skip := settling(group):
+        group.unsettled = _settling(group, ring)
+        if group.unsettled:
             return "settled", (
                 f"the bursts do not end at rest, but each runs into the next: all but the first "
-                f"{skip} of {n} are whole periods of one motion, without leakage"
+                f"{group.unsettled} of {n} are whole periods of one motion, without leakage"
             )
         group.findings.append(ring.finding)
         return "local", "the bursts do not end at rest: transients are removed by local models"
     return "burst", f"{n} bursts from rest to rest with one reference: no leakage"
 
 
-def settling(group: Group) -> int:
+def _settling(group: Group, ring: Ringing) -> int:
     """How many of bursts that run into each other to leave out, until the motion is settled.
 
-    0 where that is not what they are: at rest at their ends, not in a row, or too few to leave
-    two after the motion has settled.
+    0 where that is not what they are: not in a row, or too few to leave two after the motion
+    has settled.
     """
-    if not _in_a_row(group):
-        return 0
-    ring = _ringing(group)
-    return ring.settled_after if ring and len(group.pieces) - ring.settled_after >= 2 else 0
+    left = len(group.pieces) - ring.settled_after
+    return ring.settled_after if _in_a_row(group) and left >= 2 else 0
 
 
 def _in_a_row(group: Group) -> bool:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.signal import local, periodic, repeats, welch
-from samii_rig.signal.choose import Method, at_rest, choose, drop_foreign, drop_stuck, settling
+from samii_rig.signal.choose import Method, at_rest, choose, drop_foreign, drop_stuck
 from samii_rig.signal.distortion import Distortion, distortion
 from samii_rig.signal.gather import Gaps, gather
 from samii_rig.signal.groups import Group, Piece
@@ -128,7 +128,7 @@ def _repeats(
         if rests(pieces[0].r)[0] < LEAD_IN * len(pieces[0]):
             group.findings.append(_no_lead_in(pieces[0].name))
     elif method == "settled":
-        skip = settling(group)
+        skip = group.unsettled
         spectra, shared = settled_spectra(pieces[skip - 1 :], group.rate_hz), 1.0
         for piece in pieces[:skip]:
             text = f"{piece.name} left out: the motion had not settled since it started from rest"

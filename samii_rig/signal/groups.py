@@ -53,7 +53,10 @@ class Selection:
 
 @dataclass(slots=True)
 class Group:
-    """Repeats of one experiment at one level."""
+    """Repeats of one experiment at one level.
+
+    unsettled : of bursts that run into each other, how many come before the motion has settled.
+    """
 
     selection: Selection
     kind: str
@@ -64,6 +67,7 @@ class Group:
     sources: list[str] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     through: str = ""
+    unsettled: int = 0
 
     @property
     def equal_length(self) -> bool:
