@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from samii_rig.cli import main
 from samii_rig.cli.app import app
 from samii_rig.errors import SamiiRigError
 from samii_rig.record import scan
@@ -336,3 +337,28 @@ def test_help_and_errors_import_nothing_heavy() -> None:
     )
     assert "heavy: []" in done.stdout
     assert "recover" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run", "--foo"], "samii-rig run: No such option: --foo"),
+        (["frf"], "samii-rig frf: Missing argument 'logs'"),
+        (["bogus"], "samii-rig: No such command 'bogus'"),
+        (["run", "swept_sine", "--seed", "x"], "samii-rig run: Invalid value for '--seed'"),
+    ],
+)
+def test_a_wrong_option_costs_one_line(
+    arguments: list[str],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["samii-rig", *arguments])
+    with pytest.raises(SystemExit) as end:
+        main()
+    error = capsys.readouterr().err
+    assert end.value.code == 2
+    assert error.startswith(said)
+    assert error.count("\n") == 1
+    assert "--help" in error
