@@ -1,0 +1,1 @@
+"""From an identified model to a controller that damps vibration."""

@@ -1,0 +1,1 @@
+"""When model and measurement differ: where, what physics, and what it improves."""

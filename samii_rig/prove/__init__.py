@@ -1,0 +1,1 @@
+"""The proof: concealed trials, diagnosed without the truth, then scored against it."""

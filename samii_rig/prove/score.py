@@ -1,0 +1,278 @@
+"""Scores of many trials, each a frequency or a quantile with its 90 % interval.
+
+Goals are those of the proof (docs/proof.md). A frequency's interval is Wilson's, a
+median's is that of order statistics, others are from a bootstrap over trials.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from scipy import stats
+
+from samii_rig.prove.trial import Trial
+
+T = TypeVar("T")
+Stated = tuple[float, bool]
+"""Probability stated of a cause, and whether it was right."""
+
+LEVEL = 0.9
+SURE = 0.8  # a wrong answer stated with more than this is confidently wrong
+BINS = ((0.0, 3.0), (3.0, 10.0), (10.0, 30.0), (30.0, 100.0), (100.0, math.inf))
+"""Effect sizes, sigma."""
+CALIBRATION_BINS = 10
+RESAMPLES = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """One figure of merit.
+
+    value, low, high : NaN where no trial tells. n : trials that tell.
+    goal : the bound; met when value is at least it (`at_least`) or at most it.
+    """
+
+    what: str
+    value: float
+    low: float
+    high: float
+    n: int
+    goal: float | None = None
+    at_least: bool = True
+
+    @property
+    def met(self) -> bool | None:
+        """None where there is no goal or nothing to judge it by."""
+        if self.goal is None or math.isnan(self.value):
+            return None
+        return self.value >= self.goal if self.at_least else self.value <= self.goal
+
+
+def frequency(
+    what: str, hits: Sequence[bool], goal: float | None = None, at_least: bool = True
+) -> Score:
+    """How often, with Wilson's interval."""
+    n = len(hits)
+    if n == 0:
+        return Score(what, math.nan, math.nan, math.nan, 0, goal, at_least)
+    p, z = sum(hits) / n, float(stats.norm.ppf((1 + LEVEL) / 2))
+    middle = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return Score(what, p, max(0.0, middle - half), min(1.0, middle + half), n, goal, at_least)
+
+
+def median(
+    what: str, values: Sequence[float], goal: float | None = None, at_least: bool = True
+) -> Score:
+    """Median with the interval between order statistics (at least 90 %)."""
+    x, n = np.sort(np.asarray(values, float)), len(values)
+    if n == 0:
+        return Score(what, math.nan, math.nan, math.nan, 0, goal, at_least)
+    k = int(stats.binom.ppf((1 - LEVEL) / 2, n, 0.5))
+    low, high = x[max(k - 1, 0)], x[min(n - k, n - 1)]
+    return Score(what, float(np.median(x)), float(low), float(high), n, goal, at_least)
+
+
+def bootstrap(
+    what: str,
+    trials: Sequence[T],
+    statistic: Callable[[Sequence[T]], float],
+    goal: float | None = None,
+    at_least: bool = True,
+) -> Score:
+    """Any statistic of what each trial yields, with a percentile interval over resampled trials."""
+    value = statistic(trials)
+    if math.isnan(value):
+        return Score(what, math.nan, math.nan, math.nan, len(trials), goal, at_least)
+    rng = np.random.default_rng(len(trials))
+    drawn = [
+        statistic([trials[i] for i in rng.integers(len(trials), size=len(trials))])
+        for _ in range(RESAMPLES)
+    ]
+    low, high = np.nanquantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    return Score(what, value, float(low), float(high), len(trials), goal, at_least)
+
+
+def auroc(positive: Sequence[float], negative: Sequence[float]) -> float:
+    """Chance that a positive scores above a negative, ties half; NaN without both."""
+    if not len(positive) or not len(negative):
+        return math.nan
+    a, b = np.asarray(positive, float)[:, None], np.asarray(negative, float)[None]
+    return float(np.mean((a > b) + 0.5 * (a == b)))
+
+
+def stated(trial: Trial) -> list[Stated]:
+    """Every cause named; one is right when it is one of the effects, up to its class."""
+    if not trial.answer.speaks:
+        return []
+    good = {id(cause) for _, cause in trial.matches()}
+    return [(cause.probability, id(cause) in good) for cause in trial.answer.causes]
+
+
+def reliability(rows: Sequence[Sequence[Stated]]) -> list[tuple[float, float, int]]:
+    """(mean stated probability, frequency of being right, n) by tenths of the probability.
+
+    rows : of each trial, what `stated` gives.
+    """
+    pairs = np.array([pair for row in rows for pair in row], float).reshape(-1, 2)
+    place = np.minimum((pairs[:, 0] * CALIBRATION_BINS).astype(int), CALIBRATION_BINS - 1)
+    inside = [pairs[place == b] for b in range(CALIBRATION_BINS)]
+    return [(float(x[:, 0].mean()), float(x[:, 1].mean()), len(x)) for x in inside if len(x)]
+
+
+def calibration_error(rows: Sequence[Sequence[Stated]]) -> float:
+    """Expected calibration error: mean |stated - frequency| over the bins, by their counts."""
+    bins = reliability(rows)
+    total = sum(n for _, _, n in bins)
+    return sum(abs(p - f) * n for p, f, n in bins) / total if total else math.nan
+
+
+def parameter_errors(trials: Sequence[Trial]) -> tuple[list[float], list[bool]]:
+    """Relative error and coverage by the interval, of every parameter named as it is hidden.
+
+    A parameter of a cause that is right only up to its class has no truth to hold against it.
+    """
+    errors, covered = [], []
+    for trial in trials:
+        for effect, cause in trial.matches():
+            if effect.name != cause.name:
+                continue
+            for symbol, (value, low, high) in cause.parameters.items():
+                true = effect.parameters.get(symbol)
+                if true:
+                    errors.append(abs(value - true) / abs(true))
+                    covered.append(low <= true <= high)
+    return errors, covered
+
+
+def scores(trials: Sequence[Trial]) -> list[Score]:
+    """Every figure of the proof over all trials, in the order of its table."""
+    nothing = [t for t in trials if t.truth.kind == "nothing"]
+    one = [t for t in trials if t.truth.kind == "one"]
+    two = [t for t in trials if t.truth.kind == "two"]
+    outside = [t for t in trials if t.truth.kind == "outside"]
+
+    def above(some: Sequence[Trial], sigma: float) -> list[Trial]:
+        return [t for t in some if t.truth.size >= sigma]
+
+    out = [
+        frequency(
+            "false alarms where nothing is missing",
+            [t.answer.verdict != "no_mismatch" for t in nothing],
+            0.01,
+            at_least=False,
+        )
+    ]
+    for sigma, place, name in ((10.0, 0.90, 0.90), (30.0, 0.98, 0.97)):
+        big = above(one, sigma)
+        text = f"from {sigma:g} sigma"
+        out.append(frequency(f"place right, {text}", [t.place_right for t in big], place))
+        out.append(frequency(f"place in the 90 % set, {text}", [t.place_in_set for t in big], 0.98))
+        out.append(frequency(f"name right up to its class, {text}", [t.right for t in big], name))
+    out.append(
+        frequency(
+            "confidently wrong",
+            [t.confidence > SURE and not t.right for t in trials],
+            0.02,
+            at_least=False,
+        )
+    )
+    strange = above(outside, 30.0)
+    out.append(
+        frequency(
+            "outside the vocabulary, from 30 sigma: unknown or ambiguous",
+            [t.answer.verdict in ("unknown", "ambiguous") for t in strange],
+            0.90,
+        )
+    )
+    familiar = above(one, 30.0)
+    out.append(
+        bootstrap(
+            "AUROC of 1 - best probability, from 30 sigma",
+            [*strange, *familiar],
+            lambda some: auroc(
+                [1 - t.confidence for t in some if t.truth.kind == "outside"],
+                [1 - t.confidence for t in some if t.truth.kind == "one"],
+            ),
+            0.95,
+        )
+    )
+    out.append(frequency("two effects: both found", [t.right for t in above(two, 10.0)], 0.80))
+    out.append(
+        bootstrap(
+            "expected calibration error",
+            [stated(t) for t in trials],
+            calibration_error,
+            0.05,
+            at_least=False,
+        )
+    )
+    errors, covered = parameter_errors(above(one, 30.0))
+    out.append(median("parameter error, from 30 sigma", errors, 0.05, at_least=False))
+    out.append(frequency("90 % intervals of parameters cover", covered))
+    gaps = [
+        t.answer.gap_closed for t in familiar if t.answer.speaks and t.answer.gap_closed is not None
+    ]
+    out.append(median("gap closed on data not used, from 30 sigma", gaps, 0.9))
+    every = [
+        t.answer.gap_closed for t in trials if t.answer.speaks and t.answer.gap_closed is not None
+    ]
+    out.append(frequency("named though the gap did not close", [g < 0 for g in every], 0.0, False))
+    return out
+
+
+def by_size(trials: Sequence[Trial]) -> list[tuple[str, list[Score]]]:
+    """Place, name and confident errors of single effects by their size in sigma."""
+    out = []
+    for low, high in BINS:
+        inside = [t for t in trials if t.truth.kind == "one" and low <= t.truth.size < high]
+        label = f"{low:g}-{high:g}" if math.isfinite(high) else f"over {low:g}"
+        out.append((label, _short(inside)))
+    return out
+
+
+def by_physics(trials: Sequence[Trial], sigma: float = 10.0) -> list[tuple[str, list[Score]]]:
+    """The same by row of the vocabulary, single effects from `sigma`."""
+    big = [t for t in trials if t.truth.kind == "one" and t.truth.size >= sigma]
+    names = sorted({t.truth.effects[0].physics for t in big})
+    return [
+        (name, _short([t for t in big if t.truth.effects[0].physics == name])) for name in names
+    ]
+
+
+def _short(trials: Sequence[Trial]) -> list[Score]:
+    return [
+        frequency("detected", [t.answer.verdict != "no_mismatch" for t in trials]),
+        frequency("place right", [t.place_right for t in trials]),
+        frequency("name right", [t.right for t in trials]),
+        frequency("confidently wrong", [t.confidence > SURE and not t.right for t in trials]),
+    ]
+
+
+def confusion(trials: Sequence[Trial], sigma: float = 10.0) -> dict[tuple[str, str], int]:
+    """(hidden physics, said) -> trials; single and no effects; one from `sigma` on.
+
+    An answer that holds the truth in its class counts as the truth's own name.
+    """
+    out: dict[tuple[str, str], int] = {}
+    for t in trials:
+        if t.truth.kind == "one" and t.truth.size >= sigma:
+            hidden = t.truth.effects[0].physics
+        elif t.truth.kind == "nothing":
+            hidden = "nothing"
+        else:
+            continue
+        if t.right:
+            said = hidden
+        elif t.answer.speaks:
+            said = " + ".join(sorted({c.name[0] for c in t.answer.causes}))
+            # Right physics at a wrong place is no right answer.
+            said = f"{said}, elsewhere" if said == hidden else said
+        else:
+            said = "nothing" if t.answer.verdict == "no_mismatch" else "unknown"
+        out[hidden, said] = out.get((hidden, said), 0) + 1
+    return out

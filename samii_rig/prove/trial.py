@@ -1,0 +1,166 @@
+"""One concealed trial as the score sees it: what was hidden, what the diagnosis said.
+
+The truth is written by the plant before any diagnosis; the diagnosis is the JSON object of
+`samii-rig diagnose --json`. Both are plain data here, so that neither side's code is needed
+to score them, and old results can be scored again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+Name = tuple[str, str]
+"""(physics, site), in the words of the vocabulary and of the rig file."""
+
+NAMED = ("named", "ambiguous")
+ALL_BUT_TENTH = 0.9  # probability that a set of sites holds
+
+
+@dataclass(frozen=True, slots=True)
+class Hidden:
+    """One concealed effect: its name, its parameters (SI) by symbol."""
+
+    physics: str
+    site: str
+    parameters: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def name(self) -> Name:
+        """(physics, site)."""
+        return self.physics, self.site
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """What a trial conceals.
+
+    kind : `nothing`, `one`, `two` or `outside`.
+    size : sigma that are left when the nearest smaller explanation has been refitted.
+    """
+
+    kind: str
+    seed: int
+    effects: tuple[Hidden, ...]
+    size: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One cause that a diagnosis chose, with everything that it calls equivalent."""
+
+    name: Name
+    probability: float
+    names: frozenset[Name]
+    parameters: Mapping[str, tuple[float, float, float]]
+    """value, low, high of each parameter."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """The parts of a diagnosis that are scored."""
+
+    verdict: str
+    causes: tuple[Cause, ...]
+    sites: tuple[tuple[str, float], ...]
+    gap_closed: float | None
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any]) -> Answer:
+        """From the JSON object of `samii-rig diagnose --json`."""
+        causes = tuple(_cause(c) for c in data["causes"])
+        sites = sorted(((s["site"], s["probability"]) for s in data["sites"]), key=lambda s: -s[1])
+        gap = data["fit"].get("gap_closed")
+        return cls(data["verdict"], causes, tuple(sites), gap["value"] if gap else None)
+
+    @property
+    def speaks(self) -> bool:
+        """Whether it names physics at all, be it up to a class."""
+        return self.verdict in NAMED and bool(self.causes)
+
+    def site_set(self) -> tuple[str, ...]:
+        """The likeliest sites that hold 90 % together."""
+        total, out = 0.0, []
+        for site, probability in self.sites:
+            out.append(site)
+            total += probability
+            if total >= ALL_BUT_TENTH:
+                break
+        return tuple(out)
+
+
+def _cause(data: Mapping[str, Any]) -> Cause:
+    name = (data["physics"], data["site"])
+    twins = [(t["physics"], t["site"]) for t in data.get("equivalent_to", ())]
+    values = {k: (p["value"], p["low"], p["high"]) for k, p in data.get("parameters", {}).items()}
+    return Cause(name, data["probability"], frozenset([name, *twins]), values)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A truth and the answer to it."""
+
+    truth: Truth
+    answer: Answer
+
+    def matches(self) -> tuple[tuple[Hidden, Cause], ...]:
+        """The pairing of effects and causes in which most names are right, right ones only."""
+        return _best(
+            self.truth.effects, self.answer.causes if self.answer.speaks else (), _same_name
+        )
+
+    @property
+    def right(self) -> bool:
+        """All effects named up to their declared classes, and nothing beside them."""
+        effects, causes = self.truth.effects, self.answer.causes
+        if not effects:
+            return self.answer.verdict == "no_mismatch"
+        found = len(self.matches())
+        return self.answer.speaks and found == len(effects) == len(causes)
+
+    @property
+    def place_right(self) -> bool:
+        """Every effect has a cause of its own at its site, or at one declared equivalent."""
+        effects, causes, sites = self.truth.effects, self.answer.causes, self.answer.sites
+        if not causes:  # an unknown may still know the place
+            return len(effects) == 1 and bool(sites) and sites[0][0] == effects[0].site
+        return len(_best(effects, causes, _same_place)) == len(effects)
+
+    @property
+    def place_in_set(self) -> bool:
+        """Every effect's site is in the 90 % set, or equivalent to a cause that is."""
+        inside = set(self.answer.site_set())
+        for cause in self.answer.causes:
+            if cause.name[1] in inside:
+                inside |= {site for _, site in cause.names}
+        return all(e.site in inside for e in self.truth.effects)
+
+    @property
+    def confidence(self) -> float:
+        """Probability that the answer states for what it says (0 where it abstains)."""
+        if not self.answer.speaks:
+            return 0.0
+        return min(c.probability for c in self.answer.causes)
+
+
+def _same_name(effect: Hidden, cause: Cause) -> bool:
+    return effect.name in cause.names
+
+
+def _same_place(effect: Hidden, cause: Cause) -> bool:
+    return any(site == effect.site for _, site in cause.names)
+
+
+def _best(
+    effects: Sequence[Hidden], causes: Sequence[Cause], same: Callable[[Hidden, Cause], bool]
+) -> tuple[tuple[Hidden, Cause], ...]:
+    if not effects or not causes:
+        return ()
+    fits = np.array([[same(effect, cause) for cause in causes] for effect in effects], float)
+    rows, columns = linear_sum_assignment(fits, maximize=True)
+    pairs = zip(rows.tolist(), columns.tolist(), strict=True)
+    return tuple((effects[i], causes[j]) for i, j in pairs if fits[i, j])
