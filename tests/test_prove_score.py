@@ -8,49 +8,13 @@ that boasts has a large one; intervals that cover nine in ten score nine in ten.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
+from prove_kit import MASS, NOTHING, SPRING, UNKNOWN, diagnosis, trial
 
 from samii_rig.prove.score import auroc, by_size, confusion, frequency, median, scores
-from samii_rig.prove.trial import Answer, Hidden, Trial, Truth
-
-
-def diagnosis(
-    verdict: str, *causes: tuple[str, str, float], twins: tuple[tuple[str, str], ...] = ()
-) -> dict[str, Any]:
-    return {
-        "verdict": verdict,
-        "sites": [{"site": site, "probability": p} for _, site, p in causes],
-        "causes": [
-            {
-                "physics": physics,
-                "site": site,
-                "probability": p,
-                "equivalent_to": [{"physics": a, "site": b} for a, b in twins],
-                "parameters": {"k": {"value": 1.02, "unit": "N m/rad", "low": 0.9, "high": 1.1}},
-            }
-            for physics, site, p in causes
-        ],
-        "fit": {"gap_closed": {"value": 0.95, "low": 0.9, "high": 1.0}},
-    }
-
-
-def trial(kind: str, data: dict[str, Any], *effects: tuple[str, str], size: float = 50.0) -> Trial:
-    hidden = tuple(Hidden(p, s, {"k": 1.0}) for p, s in effects)
-    return Trial(Truth(kind, 1, hidden, size), Answer.of(data))
-
-
-SPRING = ("torsional_compliance", "joint_1")
-MASS = ("added_mass", "link_2")
-NOTHING = {"verdict": "no_mismatch", "sites": [], "causes": [], "fit": {}}
-UNKNOWN = {
-    "verdict": "unknown",
-    "sites": [{"site": "joint_1", "probability": 0.7}],
-    "causes": [],
-    "fit": {},
-}
+from samii_rig.prove.trial import Answer, Trial
 
 
 def test_a_name_is_right_at_its_place_or_up_to_its_class() -> None:

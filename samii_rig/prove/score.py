@@ -28,12 +28,25 @@ CALIBRATION_BINS = 10
 RESAMPLES = 200
 
 
+Goal = tuple[float, float]
+
+
+def at_least(x: float) -> Goal:
+    """x or more."""
+    return x, math.inf
+
+
+def at_most(x: float) -> Goal:
+    """x or less."""
+    return -math.inf, x
+
+
 @dataclass(frozen=True, slots=True)
 class Score:
     """One figure of merit.
 
     value, low, high : NaN where no trial tells. n : trials that tell.
-    goal : the bound; met when value is at least it (`at_least`) or at most it.
+    goal : (lowest, highest) value that meets it; None where nothing is aimed at.
     """
 
     what: str
@@ -41,60 +54,54 @@ class Score:
     low: float
     high: float
     n: int
-    goal: float | None = None
-    at_least: bool = True
+    goal: Goal | None = None
 
     @property
     def met(self) -> bool | None:
         """None where there is no goal or nothing to judge it by."""
         if self.goal is None or math.isnan(self.value):
             return None
-        return self.value >= self.goal if self.at_least else self.value <= self.goal
+        return self.goal[0] <= self.value <= self.goal[1]
 
 
-def frequency(
-    what: str, hits: Sequence[bool], goal: float | None = None, at_least: bool = True
-) -> Score:
+def frequency(what: str, hits: Sequence[bool], goal: Goal | None = None) -> Score:
     """How often, with Wilson's interval."""
     n = len(hits)
     if n == 0:
-        return Score(what, math.nan, math.nan, math.nan, 0, goal, at_least)
+        return Score(what, math.nan, math.nan, math.nan, 0, goal)
     p, z = sum(hits) / n, float(stats.norm.ppf((1 + LEVEL) / 2))
     middle = (p + z * z / (2 * n)) / (1 + z * z / n)
     half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return Score(what, p, max(0.0, middle - half), min(1.0, middle + half), n, goal, at_least)
+    return Score(what, p, max(0.0, middle - half), min(1.0, middle + half), n, goal)
 
 
-def median(
-    what: str, values: Sequence[float], goal: float | None = None, at_least: bool = True
-) -> Score:
+def median(what: str, values: Sequence[float], goal: Goal | None = None) -> Score:
     """Median with the interval between order statistics (at least 90 %)."""
     x, n = np.sort(np.asarray(values, float)), len(values)
     if n == 0:
-        return Score(what, math.nan, math.nan, math.nan, 0, goal, at_least)
+        return Score(what, math.nan, math.nan, math.nan, 0, goal)
     k = int(stats.binom.ppf((1 - LEVEL) / 2, n, 0.5))
     low, high = x[max(k - 1, 0)], x[min(n - k, n - 1)]
-    return Score(what, float(np.median(x)), float(low), float(high), n, goal, at_least)
+    return Score(what, float(np.median(x)), float(low), float(high), n, goal)
 
 
 def bootstrap(
     what: str,
     trials: Sequence[T],
     statistic: Callable[[Sequence[T]], float],
-    goal: float | None = None,
-    at_least: bool = True,
+    goal: Goal | None = None,
 ) -> Score:
     """Any statistic of what each trial yields, with a percentile interval over resampled trials."""
     value = statistic(trials)
     if math.isnan(value):
-        return Score(what, math.nan, math.nan, math.nan, len(trials), goal, at_least)
+        return Score(what, math.nan, math.nan, math.nan, len(trials), goal)
     rng = np.random.default_rng(len(trials))
     drawn = [
         statistic([trials[i] for i in rng.integers(len(trials), size=len(trials))])
         for _ in range(RESAMPLES)
     ]
     low, high = np.nanquantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
-    return Score(what, value, float(low), float(high), len(trials), goal, at_least)
+    return Score(what, value, float(low), float(high), len(trials), goal)
 
 
 def auroc(positive: Sequence[float], negative: Sequence[float]) -> float:
@@ -163,22 +170,26 @@ def scores(trials: Sequence[Trial]) -> list[Score]:
         frequency(
             "false alarms where nothing is missing",
             [t.answer.verdict != "no_mismatch" for t in nothing],
-            0.01,
-            at_least=False,
+            at_most(0.01),
         )
     ]
     for sigma, place, name in ((10.0, 0.90, 0.90), (30.0, 0.98, 0.97)):
         big = above(one, sigma)
         text = f"from {sigma:g} sigma"
-        out.append(frequency(f"place right, {text}", [t.place_right for t in big], place))
-        out.append(frequency(f"place in the 90 % set, {text}", [t.place_in_set for t in big], 0.98))
-        out.append(frequency(f"name right up to its class, {text}", [t.right for t in big], name))
+        out.append(frequency(f"place right, {text}", [t.place_right for t in big], at_least(place)))
+        out.append(
+            frequency(
+                f"place in the 90 % set, {text}", [t.place_in_set for t in big], at_least(0.98)
+            )
+        )
+        out.append(
+            frequency(f"name right up to its class, {text}", [t.right for t in big], at_least(name))
+        )
     out.append(
         frequency(
             "confidently wrong",
             [t.confidence > SURE and not t.right for t in trials],
-            0.02,
-            at_least=False,
+            at_most(0.02),
         )
     )
     strange = above(outside, 30.0)
@@ -186,7 +197,7 @@ def scores(trials: Sequence[Trial]) -> list[Score]:
         frequency(
             "outside the vocabulary, from 30 sigma: unknown or ambiguous",
             [t.answer.verdict in ("unknown", "ambiguous") for t in strange],
-            0.90,
+            at_least(0.90),
         )
     )
     familiar = above(one, 30.0)
@@ -198,30 +209,33 @@ def scores(trials: Sequence[Trial]) -> list[Score]:
                 [1 - t.confidence for t in some if t.truth.kind == "outside"],
                 [1 - t.confidence for t in some if t.truth.kind == "one"],
             ),
-            0.95,
+            at_least(0.95),
         )
     )
-    out.append(frequency("two effects: both found", [t.right for t in above(two, 10.0)], 0.80))
+    out.append(
+        frequency("two effects: both found", [t.right for t in above(two, 10.0)], at_least(0.80))
+    )
     out.append(
         bootstrap(
             "expected calibration error",
             [stated(t) for t in trials],
             calibration_error,
-            0.05,
-            at_least=False,
+            at_most(0.05),
         )
     )
     errors, covered = parameter_errors(above(one, 30.0))
-    out.append(median("parameter error, from 30 sigma", errors, 0.05, at_least=False))
-    out.append(frequency("90 % intervals of parameters cover", covered))
+    out.append(median("parameter error, from 30 sigma", errors, at_most(0.05)))
+    out.append(frequency("90 % intervals of parameters cover", covered, (0.85, 0.95)))
     gaps = [
         t.answer.gap_closed for t in familiar if t.answer.speaks and t.answer.gap_closed is not None
     ]
-    out.append(median("gap closed on data not used, from 30 sigma", gaps, 0.9))
+    out.append(median("gap closed on data not used, from 30 sigma", gaps, at_least(0.9)))
     every = [
         t.answer.gap_closed for t in trials if t.answer.speaks and t.answer.gap_closed is not None
     ]
-    out.append(frequency("named though the gap did not close", [g < 0 for g in every], 0.0, False))
+    out.append(
+        frequency("named though the gap did not close", [g < 0 for g in every], at_most(0.0))
+    )
     return out
 
 
