@@ -53,7 +53,7 @@ def tabulate(rig: Rig, made: Realisation, inner: int) -> Tables:
     """Tables of the first actuator's response at `inner` steps a sample."""
     h = 1.0 / (rig.rate_hz * inner)
     p = made.poles
-    whole, delta = _split(rig.actuator[0].delay, h)
+    whole, delta = _split(rig.actuator[0].delay + float(made.late[0]), h)
     pipeline, change = divmod(whole, inner)
     new = _phi(p, h - delta)
     old = _phi(p, h) - new

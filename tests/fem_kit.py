@@ -2,29 +2,46 @@
 
 from typing import Any
 
+from samii_rig.rig import elements
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig, TorsionalSpring
 
-UNITS = {
-    "EI": "N m^2", "mu": "kg/m", "L": "m", "eta": "1", "tau": "s", "r": "m", "m": "kg",
-    "I": "kg m^2", "k": "N m/rad", "c": "N m s/rad", "K": "rad/(s V)", "p": "rad/s",
-}  # fmt: skip
 SOURCE = ("source", "angular_velocity_source", {"K": 0.5, "p": 150.0})
-Part = tuple[str, str, dict[str, float]]
+Part = tuple[str, str, dict[str, Any]]
+KINDS = {
+    kind.model_fields["kind"].annotation.__args__[0]: kind
+    for kind in (
+        *elements.SOURCES, *elements.BEAMS, elements.RigidLink, elements.LumpedMass,
+        elements.TorsionalSpring, elements.TranslationalSpring, elements.TorsionalGroundSpring,
+        elements.TranslationalGroundSpring, elements.GravityStiffness, elements.OilColumn,
+        elements.HydraulicLine, elements.Branch,
+    )
+}  # fmt: skip
+GAIN = {"torque_source": "N m/V", "force_source": "N/V"}  # others: rad/(s V)
+
+
+def element(name: str, kind: str, values: dict[str, Any]) -> dict[str, Any]:
+    """The table of an element; numbers become parameters in the unit that the kind asks for."""
+    table: dict[str, Any] = {"name": name, "kind": kind}
+    if kind.endswith(("source", "source_2")):
+        table["input"] = "v"
+    for key, value in values.items():
+        if not isinstance(value, float):
+            table[key] = value
+            continue
+        quantity = elements.quantities(KINDS[kind]).get(key)
+        unit = GAIN.get(kind, "rad/(s V)") if quantity is None else quantity.unit
+        table[key] = {"value": value, "unit": unit, "source": "test"}
+    return table
 
 
 def chain(*parts: Part, base: str = "clamped", tip: str = "free", sensors: Any = None) -> Rig:
     """A chain of (name, kind, values), by default with an encoder at its element "source"."""
-    elements = []
-    for name, kind, numbers in parts:
-        values = {k: {"value": x, "unit": UNITS[k], "source": "test"} for k, x in numbers.items()}
-        extra = {"input": "v"} if kind == "angular_velocity_source" else {}
-        elements.append({"name": name, "kind": kind, **values, **extra})
     angle = {"name": "y", "kind": "relative_angle", "across": ["source"], "unit": "rad"}
     return Rig.model_validate(
         {
-            "name": "test", "base": base, "tip": tip, "rate_hz": 500.0, "element": elements,
-            "sensor": sensors or [angle],
+            "name": "test", "base": base, "tip": tip, "rate_hz": 500.0,
+            "element": [element(*part) for part in parts], "sensor": sensors or [angle],
             "actuator": [{"name": "v", "unit": "V", "low": -1.0, "high": 1.0}],
         }
     )  # fmt: skip
@@ -48,18 +65,18 @@ def without_springs(rig: Rig, names: set[str]) -> Rig:
 
 def with_stiffness(rig: Rig, values: dict[str, float]) -> Rig:
     """The rig with other stiffnesses of some joints, N m/rad."""
-    elements = tuple(
+    changed = tuple(
         e.model_copy(update={"k": e.k.model_copy(update={"value": values[e.name]})})
         if isinstance(e, TorsionalSpring) and e.name in values
         else e
         for e in rig.element
     )
-    return rig.model_copy(update={"element": elements})
+    return rig.model_copy(update={"element": changed})
 
 
 def undamped(rig: Rig) -> Rig:
     """The rig without any damping, for the transfer matrices' natural frequencies."""
-    elements = tuple(
+    kept = tuple(
         e.model_copy(
             update={
                 symbol: getattr(e, symbol).model_copy(update={"value": 0.0})
@@ -69,4 +86,4 @@ def undamped(rig: Rig) -> Rig:
         )
         for e in rig.element
     )
-    return rig.model_copy(update={"element": elements})
+    return rig.model_copy(update={"element": kept})

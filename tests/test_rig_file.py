@@ -29,7 +29,8 @@ def rejected(text: str, where: str = "my.toml") -> str:
 
 
 def test_shipped_rigs_load_and_say_where_every_number_comes_from() -> None:
-    assert shipped() == ("samii", "sflr")
+    assert set(shipped()) >= {"samii", "samii_joint_3", "samii_braced", "sflr"}
+    assert {"samii_torque_vertical", "samii_torque_horizontal"} < set(shipped())
     for name in shipped():
         rig, _ = load_rig(name)
         for element in rig.element:
@@ -52,11 +53,22 @@ def test_samii_carries_table_ii_of_paper_1() -> None:
     ("old", "new", "says"),
     [
         ('unit = "N m^2"', 'unit = "N/m"', r"element\[beam\].EI.*'N/m'; expected 'N m\^2'"),
-        ("value = 2.674e5", "value = -2.674e5", r"clamp.*-267400.*more than 0"),
+        ("value = 2.674e5", "value = -2.674e5", r"clamp.*-267400.*0 or more"),
         ("value = 2.674e5", "value = nan", r"clamp.*k\.value.*finite"),
         ("value = 2.674e5", 'value = "stiff"', r"clamp.*k\.value is 'stiff'"),
         ('base = "clamped"', 'base = "glued"', r"base is 'glued'.*'clamped'"),
-        ('base = "clamped"\n', "", r"base: missing; expected a value"),
+        ('base = "clamped"\n', "", r"base: missing; expected one of clamped, pinned, free$"),
+        ('tip = "free"\n', "", r"tip: missing; expected one of clamped, pinned, free$"),
+        (
+            'name = "v_2"\n',
+            'name = "v_2"\ndelay = -0.1\n',
+            r"actuator\[v_2\].delay is -0.1.*or equal to 0",
+        ),
+        (
+            "value = 150.0",
+            "value = -150.0",
+            r"joint_2_source.*p: value -150 rad/s; expected more than 0",
+        ),
         ("rate_hz = 500.0", "rate_hz = 0.0", r"rate_hz is 0.0.*greater than 0"),
         ('name = "a_1"', 'name = "a_0"', r"'a_0' occurs twice"),
         ('on = "link_1"', 'on = "link_9"', r"a_1.*'link_9' does not exist.*'link_1'"),
@@ -87,7 +99,7 @@ def test_a_mistake_is_named_with_field_value_and_remedy(old: str, new: str, says
 
 def test_a_rig_without_elements_or_a_missing_file_is_refused(tmp_path: Path) -> None:
     assert "element" in rejected(re.sub(r"(?ms)^\[\[element\]\].*?(?=^#|^\[\[sensor)", "", SAMII))
-    with pytest.raises(InputError, match=r"--rig is 'nowhere'.*samii, sflr"):
+    with pytest.raises(InputError, match=r"--rig is 'nowhere'.*samii, .*sflr"):
         load_rig("nowhere")
     with pytest.raises(InputError, match="readable rig file"):
         load_rig(str(tmp_path))
@@ -100,6 +112,77 @@ def test_a_rig_without_elements_or_a_missing_file_is_refused(tmp_path: Path) -> 
 def test_no_text_gets_anything_but_an_input_error_out_of_the_loader(text: str) -> None:
     with pytest.raises(InputError):
         parse(Rig, text, "fuzz.toml")
+
+
+def value(number: float, unit: str) -> str:
+    return f'{{ value = {number}, unit = "{unit}", source = "test" }}'
+
+
+LINE = f"""
+[[element]]
+name = "line"
+kind = "hydraulic_line"
+source = "joint_2_source"
+D = {value(1e-5, "m^3/rad")}
+L = {value(1.0, "m")}
+A = {value(1e-4, "m^2")}
+rho = {value(870.0, "kg/m^3")}
+B = {value(1e9, "Pa")}
+"""
+BRANCH = f"""
+[[element]]
+name = "hose"
+kind = "branch"
+
+[[element.element]]
+name = "mount"
+kind = "torsional_spring"
+k = {value(40.0, "N m/rad")}
+"""
+SENSORS = SAMII.index("[[sensor]]")
+
+
+def with_element(text: str) -> str:
+    """SAMII with one more element at its tip."""
+    return SAMII[:SENSORS] + text + SAMII[SENSORS:]
+
+
+def test_an_element_of_a_branch_is_named_by_its_place() -> None:
+    rig = parse(Rig, with_element(BRANCH), "my.toml")
+    assert rig.element[-1].name == "hose"
+    line = rejected(with_element(BRANCH.replace("40.0", "-40.0")))
+    assert re.search(r"element\[hose\].element\[mount\].k: value -40 .*0 or more", line), line
+    line = rejected(with_element(BRANCH.replace('"mount"', '"clamp"')))
+    assert "'clamp' occurs twice" in line
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        (LINE, r"element line: source 'joint_2_source' is no angular velocity source right before"),
+        (
+            BRANCH.replace("[[element.element]]", "[[element.part]]"),
+            r"element\[hose\].element: missing",
+        ),
+        (
+            BRANCH.replace('kind = "torsional', 'kind = "magic'),
+            r"mount\].kind is 'magic_spring'.*one of",
+        ),
+        (
+            f'[[element]]\nname = "push"\nkind = "force_source"\ninput = "v_2"\n'
+            f"K = {value(1.0, 'N m/V')}\n",
+            r"element push: K has unit 'N m/V'; expected 'N/V'",
+        ),
+        (
+            f'[[element]]\nname = "nothing"\nkind = "translational_spring"\n'
+            f"k = {value(0.0, 'N/m')}\n",
+            r"element\[nothing\]: k and c are both 0; expected one above 0",
+        ),
+    ],
+)
+def test_a_mistake_in_a_new_kind_of_element_is_named(text: str, says: str) -> None:
+    line = rejected(with_element(text))
+    assert re.search(says, line), line
 
 
 LINES = SAMII.splitlines()

@@ -11,6 +11,7 @@ import mpmath as mp
 import numba
 import numpy as np
 import pytest
+from elements_kit import ANGLE, SOURCE, part, rig
 
 from samii_rig.model import waves
 from samii_rig.model.tmm import Chain
@@ -20,10 +21,16 @@ from samii_rig.rig.schema import (
     Acceleration,
     Beam,
     Element,
+    LumpedMass,
+    OilColumn,
     RelativeAngle,
     Rig,
     RigidLink,
+    TimoshenkoBeam,
+    TorsionalGroundSpring,
     TorsionalSpring,
+    TranslationalGroundSpring,
+    TranslationalSpring,
     parameters,
 )
 
@@ -51,6 +58,23 @@ def beam(s: mp.mpc, EI: mp.mpf, mu: mp.mpf, L: mp.mpf, eta: mp.mpf, tau: mp.mpf)
     )
 
 
+def thick(
+    s: mp.mpc, EI: mp.mpf, mu: mp.mpf, L: mp.mpf, eta: mp.mpf, tau: mp.mpf, GA: mp.mpf, J: mp.mpf
+) -> mp.matrix:
+    """exp(A L) by its power series, 2^-k of it k times squared."""
+    g = 1 + 1j * eta + s * tau
+    A = mp.zeros(5)
+    A[0, 1], A[0, 3], A[1, 2] = 1, -1 / (GA * g), 1 / (EI * g)
+    A[2, 1], A[2, 3], A[3, 0] = J * s**2, 1, -mu * s**2
+    # Scaled to like sizes before the norm of a matrix of mixed units is taken.
+    D = [mp.mpf(1), 1 / L, EI / L**2, EI / L**3, mp.mpf(1)]
+    A = mp.matrix(5, 5) + mp.matrix(
+        [[A[i, j] * L * D[j] / D[i] for j in range(5)] for i in range(5)]
+    )
+    U = mp.expm(A, method="taylor")
+    return mp.matrix([[U[i, j] * D[i] / D[j] for j in range(5)] for i in range(5)])
+
+
 def matrix(e: Element, s: mp.mpc, v: Values) -> mp.matrix:
     def value(symbol: str) -> mp.mpf:
         return v[e.name, symbol]
@@ -65,8 +89,21 @@ def matrix(e: Element, s: mp.mpc, v: Values) -> mp.matrix:
         U[3, 0], U[3, 1] = -m * s**2, -m * r * s**2
     elif isinstance(e, TorsionalSpring):
         U[1, 2] = 1 / (value("c") * s + value("k"))
+    elif isinstance(e, TimoshenkoBeam):
+        return thick(s, *(value(x) for x in ("EI", "mu", "L", "eta", "tau", "GA", "J")))
+    elif isinstance(e, LumpedMass):
+        U[2, 1], U[3, 0] = value("I") * s**2, -value("m") * s**2
+    elif isinstance(e, TranslationalSpring):
+        U[0, 3] = -1 / (value("c") * s + value("k"))
+    elif isinstance(e, TranslationalGroundSpring):
+        U[3, 0] = -(value("c") * s + value("k"))
+    elif isinstance(e, TorsionalGroundSpring):
+        U[2, 1] = value("c") * s + value("k")
+    elif isinstance(e, OilColumn):
+        U[1, 2] = value("C_h") / value("D") ** 2
     else:
-        U[1, 4] = value("K") * value("p") / (s * (s + value("p")))
+        late = mp.exp(-s * value("tau"))
+        U[1, 4] = value("K") * value("p") / (s * (s + value("p"))) * late
     return U
 
 
@@ -100,7 +137,10 @@ def reference(rig: Rig, f: float, v: Values) -> list[mp.mpc]:
         elif isinstance(sensor, Acceleration):
             j = names.index(sensor.on)
             x = mp.mpf(sensor.position)
-            if isinstance(rig.element[j], Beam) and x > 0:
+            if isinstance(rig.element[j], TimoshenkoBeam):
+                part = {k: v[sensor.on, k] for k in ("EI", "mu", "eta", "tau", "GA", "J")}
+                out.append(s**2 * (thick(s, L=x, **part) * z[j])[0])
+            elif isinstance(rig.element[j], Beam) and x > 0:
                 part = {k: v[sensor.on, k] for k in ("EI", "mu", "eta", "tau")}
                 out.append(s**2 * (beam(s, L=x, **part) * z[j])[0])
             else:
@@ -143,10 +183,33 @@ def unlike_the_shipped_ones() -> Rig:
     return Rig.model_validate(data)
 
 
+def with_other_elements() -> Rig:
+    """A thick beam, joints and supports of every kind; stiff and soft beyond reason."""
+    at = {"kind": "acceleration", "on": "thick", "unit": "m/s^2"}
+    return rig(
+        SOURCE,
+        part("oil_column", "oil", D=1e-3, C_h=2e-8),
+        part("torsional_ground_spring", "foot", k=30.0, c=2.0),
+        part("timoshenko_beam", "thick", EI=3.0, mu=0.2, L=0.7, GA=2e3, J=1e-3, tau=2e-6, eta=0.01),
+        part("translational_ground_spring", "wall", k=1e12, c=0.1),
+        part("translational_spring", "slide", k=1e-3, c=1e-6),
+        part("lumped_mass", "lump", m=0.1, I=0.003),
+        base="clamped",
+        tip="free",
+        sensor=[
+            {**ANGLE, "across": ["source", "oil"]},
+            {**at, "name": "middle", "position": 0.3},
+            {"name": "held", "kind": "absolute_angle", "after": "wall", "unit": "rad"},
+            {"name": "torque", "kind": "moment", "after": "source", "unit": "N m"},
+        ],
+    )
+
+
 RIGS: dict[str, Callable[[], Rig]] = {
     "samii": lambda: load_rig("samii")[0],
     "sflr": lambda: load_rig("sflr")[0],
     "other": unlike_the_shipped_ones,
+    "elements": with_other_elements,
 }
 
 
@@ -171,7 +234,7 @@ def test_twelve_digits_at_ten_kilohertz_where_the_plain_product_has_none(name: s
                 assert error(H[i, j, 0], true) < 1e-12, (x, rig.sensor[j].name)
 
 
-@pytest.mark.parametrize("name", RIGS)
+@pytest.mark.parametrize("name", ["samii", "sflr", "other"])
 def test_gradients_have_eight_digits(name: str) -> None:
     rig = RIGS[name]()
     chain = Chain(rig)

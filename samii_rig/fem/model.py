@@ -20,7 +20,8 @@ from scipy.sparse.linalg import splu
 from samii_rig.errors import InputError
 from samii_rig.fem import modal
 from samii_rig.fem.assemble import assemble
-from samii_rig.rig.schema import Beam, Rig
+from samii_rig.rig.elements import BEAMS, flattened
+from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 
 
@@ -109,9 +110,11 @@ class Fem:
             rhs = np.zeros((n + n_c, n_in), complex)
             for joint in m.feedback:
                 rhs[joint.coordinate, joint.column] += joint.gain
+            for load in m.loads:
+                rhs[load.coordinate, load.column] += load.law.at(complex(at))
             for source in m.sources:
                 row = n + m.Phi.shape[0] + locks.index(source.element)
-                rhs[row, source.column] += unit * source.gain / (at * (at + source.p))
+                rhs[row, source.column] += unit * source.law.at(complex(at))
             try:
                 x = splu(pattern).solve(rhs)
             except RuntimeError as error:  # exactly singular
@@ -154,8 +157,8 @@ class Fem:
 
     def refuse_loss(self) -> None:
         """InputError if a beam has a constant loss factor."""
-        for e in self.rig.element:
-            if self.lossy and isinstance(e, Beam) and e.eta.value > 0:
+        for e in flattened(self.rig.element):
+            if self.lossy and isinstance(e, BEAMS) and e.eta.value > 0:
                 raise InputError(
                     self.rig.name,
                     f"{e.name}.eta",

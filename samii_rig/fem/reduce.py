@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse.linalg import splu
 
 from samii_rig.errors import InputError
-from samii_rig.fem.assemble import Source
+from samii_rig.fem.drive import Load, Prescribed, refuse_dead_time, states
 from samii_rig.fem.model import Fem, multiplier_unit, positive_hz, saddle
 from samii_rig.types import Complex, Float
 
@@ -40,8 +40,11 @@ class Reduced:
     (eq. 14). shapes : (n_q, n) [phi_r phi_f] in the coordinates of the full model.
     coordinates : names of the n_rigid joints. inputs, outputs : names; inputs are the rig's
     actuators, then "T_<joint>" in N m for each joint driven by a torque.
-    force : (n, n_in) generalised forces; sources : joints whose rotation is prescribed.
-    position, velocity, acceleration : (n_out, n) rows, sensors = sum of row times derivative.
+    force : (n, n_in) generalised forces without a law; sources : joints whose rotation is
+        prescribed. loads : torques and forces with a law; applied : (n, n_loads) generalised
+        force of a unit of each.
+    position, velocity, acceleration : (n_out, n) rows, sensors = sum of row times derivative
+        and of `carried` (n_out, n_loads) times load.
     """
 
     M: Float
@@ -52,10 +55,13 @@ class Reduced:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     force: Float
-    sources: tuple[Source, ...]
+    sources: tuple[Prescribed, ...]
+    loads: tuple[Load, ...]
+    applied: Float
     position: Float
     velocity: Float
     acceleration: Float
+    carried: Float
 
     @property
     def n_rigid(self) -> int:
@@ -63,32 +69,42 @@ class Reduced:
         return len(self.coordinates)
 
     def state_space(self) -> tuple[Float, Float, Float, Float]:
-        """(A, B, C, D) with states [theta_s, theta_s', eta_x, eta_x'] (SI units).
+        """(A, B, C, D) with states [of each source's law, of each load's law, eta_x, eta_x'].
 
-        theta_s are the rotations that velocity sources prescribe, with the lag
-        theta_s'' = K p v - p theta_s' (paper 2, eq. 1); eta_x all other coordinates.
+        A law's states are its output and derivatives of it, so a source of first order has
+        theta, theta' with theta'' = K p v - p theta' (paper 2, eq. 1). eta_x are all
+        coordinates that no source prescribes.
         """
         n, n_in = self.force.shape
+        parts: tuple[Prescribed | Load, ...] = (*self.sources, *self.loads)
         s = [self.coordinates.index(d.element) for d in self.sources]
         x = [i for i in range(n) if i not in s]
-        n_s, n_x = len(s), len(x)
-        size = 2 * (n_s + n_x)
+        starts = np.cumsum([0, *(part.law.order for part in parts)])
+        n_law, n_x = int(starts[-1]), len(x)
+        size = n_law + 2 * n_x
+        A, B = np.zeros((size, size)), np.zeros((size, n_in))
+        # Output and its derivatives of each law: rows on the states, on the inputs.
+        outs: list[list[tuple[Float, Float]]] = []
+        for part, start in zip(parts, starts[:-1], strict=True):
+            at = slice(int(start), int(start) + part.law.order)
+            A[at, at], B[at, part.column] = states(part.law)
+            outs.append(_derivatives(part, int(start), size, n_in))
         # eta = E0 state, eta' = E1 state, eta'' = E2 state + F u.
         E0, E1, E2, F = *(np.zeros((n, size)) for _ in range(3)), np.zeros((n, n_in))
-        E0[s, :n_s] = np.eye(n_s)
-        E1[s, n_s : 2 * n_s] = np.eye(n_s)
-        E0[x, 2 * n_s : 2 * n_s + n_x] = np.eye(n_x)
-        E1[x, 2 * n_s + n_x :] = np.eye(n_x)
-        for at, source in zip(s, self.sources, strict=True):
-            E2[at] = -source.p * E1[at]
-            F[at, source.column] = source.gain
+        for i, out in zip(s, outs, strict=False):
+            (E0[i], _), (E1[i], _), (E2[i], F[i]) = out
+        E0[x, n_law : n_law + n_x] = np.eye(n_x)
+        E1[x, n_law + n_x :] = np.eye(n_x)
+        loads = outs[len(s) :]
+        on_states = np.array([out[0][0] for out in loads]).reshape(-1, size)
+        on_inputs = np.array([out[0][1] for out in loads]).reshape(-1, n_in)
         inner, across = self.M[np.ix_(x, x)], self.M[np.ix_(x, s)]
-        E2[x] = np.linalg.solve(inner, -self.K[x] @ E0 - self.C[x] @ E1 - across @ E2[s])
-        F[x] = np.linalg.solve(inner, self.force[x] - across @ F[s])
-        A = np.vstack([E1[s], E2[s], E1[x], E2[x]])
-        B = np.vstack([np.zeros((n_s, n_in)), F[s], np.zeros((n_x, n_in)), F[x]])
+        pull = self.applied[x] @ on_states - self.K[x] @ E0 - self.C[x] @ E1 - across @ E2[s]
+        push = self.applied[x] @ on_inputs + self.force[x] - across @ F[s]
+        E2[x], F[x] = np.linalg.solve(inner, pull), np.linalg.solve(inner, push)
+        A[n_law:], B[n_law:] = np.vstack([E1[x], E2[x]]), np.vstack([np.zeros((n_x, n_in)), F[x]])
         C = self.position @ E0 + self.velocity @ E1 + self.acceleration @ E2
-        return A, B, C, self.acceleration @ F
+        return A, B, C + self.carried @ on_states, self.acceleration @ F + self.carried @ on_inputs
 
     def response(self, frequency_hz: ArrayLike) -> Complex:
         """(n_freq, n_out, n_in) as `Fem.response`, of the reduced model."""
@@ -110,11 +126,13 @@ def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced
     torque, besides the rig's sources, which all have one; a locked joint is then free.
 
     Raises InputError for an unknown joint, more flexible modes than there are or than leave a
-    joint driven by a torque any inertia, a beam with `eta` (no equation in time), a chain that
-    floats when its actuators are held.
+    joint driven by a torque any inertia, a beam with `eta` or a source with a dead time (no
+    equation in time), a load on a part without mass, a chain that floats when its actuators are
+    held.
     """
     fem.refuse_loss()
     m, rig = fem.mechanism, fem.rig
+    refuse_dead_time(rig.name, (*m.sources, *m.loads))
     driven = [*(a.element for a in m.sources), *(a.element for a in m.feedback)]
     passive = [name for name in m.joints if name not in driven]
     for name in torque:
@@ -127,12 +145,18 @@ def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced
     omega = basis.modes.omega
     if not 0 <= flexible <= omega.size:
         raise InputError(rig.name, "flexible", flexible, f"0 to {omega.size} modes")
+    adrift = np.max(np.abs(basis.massless), initial=0.0) * ROUNDING
+    for load in m.loads:
+        if np.any(np.abs(basis.massless[load.coordinate]) > adrift):
+            raise InputError.saying(
+                rig.name, load.element, "acts on a part without mass; expected a mass beside it"
+            )
     if omega.size and omega[0] ** 2 < FLOATS * basis.scale:
         raise InputError.saying(rig.name, "base", "the chain floats; expected an end that holds it")
 
     static = _Static(fem, joints)
-    turned = np.array([static.unit(static.lock(j))[0] for j in joints]).T
-    phi = np.hstack([turned.reshape(-1, len(joints)), basis.modes.shapes[:, :flexible]])
+    turned = [static.unit(static.lock(j))[0][:, None] for j in joints]
+    phi = np.hstack([*turned, basis.modes.shapes[:, :flexible]])
     M, K = phi.T @ m.M @ phi, phi.T @ m.K @ phi
     K[abs(K) < ROUNDING * (abs(phi).T @ abs(m.K) @ abs(phi))] = 0.0
 
@@ -145,14 +169,17 @@ def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced
 
     position, acceleration = m.angle @ phi, m.acceleration @ phi
     velocity = np.zeros_like(position)
+    carried = np.zeros((len(position), len(m.loads)))
+    at_loads = [load.coordinate for load in m.loads]
     for sensor, row in m.moment:
         # By reciprocity the multiplier that holds the load r is v^T r, v the static shape of a
-        # unit gap at that constraint; r are the forces of inertia and damping, so that the
-        # moment has the static part of all modes left out.
+        # unit gap at that constraint; r are the loads and the forces of inertia and damping, so
+        # that the moment has the static part of all modes left out.
         v, reaction = static.unit(row)
         position[sensor, : len(joints)] = [reaction[static.lock(j)] for j in joints]
         velocity[sensor] = -v @ (fem.C @ phi)
         acceleration[sensor] = -v @ (m.M @ phi)
+        carried[sensor] = v[at_loads]
     inputs = (*(a.name for a in rig.actuator), *(f"T_{name}" for name in torque))
     force = np.zeros((len(K), len(inputs)))
     for i, joint in enumerate(m.feedback, len(m.sources)):
@@ -169,10 +196,31 @@ def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced
         tuple(s.name for s in rig.sensor),
         force,
         m.sources,
+        m.loads,
+        phi[at_loads].T,
         position,
         velocity,
         acceleration,
+        carried,
     )
+
+
+def _derivatives(
+    part: Prescribed | Load, start: int, size: int, n_in: int
+) -> list[tuple[Float, Float]]:
+    """Rows on the states and on the inputs of a law's output; of its first two derivatives too
+    if it prescribes a motion."""
+    order = part.law.order
+    rows: list[tuple[Float, Float]] = []
+    for derivative in range(3 if isinstance(part, Prescribed) else 1):
+        on_state, on_input = np.zeros(size), np.zeros(n_in)
+        if derivative < order:
+            on_state[start + derivative] = 1.0
+        else:
+            on_state[start : start + order] = states(part.law)[0][-1:].sum(axis=0)
+            on_input[part.column] = part.law.gain
+        rows.append((on_state, on_input))
+    return rows
 
 
 class _Static:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from samii_rig.model.block import recall_beam
-from samii_rig.model.gradient import contributions, integrals
-from samii_rig.model.lanes import LANES, get, inverse, part, scaled, store
+from samii_rig.model.gradient import contributions, integrals, point
+from samii_rig.model.lanes import LANES, get, part, scaled, store
 from samii_rig.model.registers import (
     BEAM_KIND,
     COMPLIANCE,
+    HINGE,
+    JUMP,
     RESULT,
     SPRING,
+    WAVES,
     Flag,
-    S,
     System,
     Work,
     Z,
@@ -22,17 +24,17 @@ from samii_rig.types import Complex, Float, Int
 
 @part
 def element_states(x: System, k: Work, elements: Flag, jump: int, more: bool, out: Float) -> None:
-    """Set or add to out[e] the state behind element e (of a spring M alone), and for a beam
-    also before it."""
+    """Set or add to out[e] the state behind element e (of a spring M alone), and for a beam or
+    waves also before it."""
     for e in range(x.kinds.shape[0]):
         if elements[e]:
-            only = x.kinds[e] == SPRING
+            only = x.kinds[e] in (SPRING, HINGE)
             port_state(k, e + 1, jump, True, only)
             if only:
                 _keep(out[e, 4 * LANES : 6 * LANES], k.W[(Z + 4) * LANES :], 2, more)
             else:
                 _keep(out[e], k.W[Z * LANES :], 8, more)
-            if x.kinds[e] == BEAM_KIND:
+            if x.kinds[e] >= BEAM_KIND:
                 port_state(k, e, jump, False, False)
                 _keep(out[e, 8 * LANES :], k.W[Z * LANES :], 8, more)
 
@@ -55,32 +57,48 @@ def _scatter(W: Float, slot: Int, K: float, n: int, target: Complex) -> None:
 
 
 @part
-def source_parameters(
-    x: System, W: Float, source: int, answers: Float, slot: Int, n: int, dH: Complex
+def _scatter_point(
+    W: Float, slope: Complex, slot: Int, K: float, start: int, n: int, target: Complex
 ) -> None:
-    """dH/dK and dH/dp of a source from the answers to p/(s (s + p))."""
-    e, actuator = x.source[source, 0], x.source[source, 1]
-    K, p = x.pars[e, 0], x.pars[e, 1]
-    for i in range(n):
-        s = get(W, S, i)
-        lag = scaled(s * inverse(complex(s.real + p, s.imag)), K / p)
-        for j in range(answers.shape[0]):
-            y = complex(answers[j, i], answers[j, LANES + i])
-            if slot[0] >= 0:
-                dH[i, j, actuator, slot[0]] += y
-            if slot[1] >= 0:
-                dH[i, j, actuator, slot[1]] += y * lag
+    for m in range(slot.shape[0]):
+        if slot[m] >= 0:
+            for i in range(n):
+                target[i, slot[m]] += scaled(get(W, RESULT, i) * slope[m, start + i], K)
+
+
+@part
+def source_parameters(
+    actuator: int, slopes: Complex, answers: Float, slot: Int, start: int, n: int, dH: Complex
+) -> None:
+    """dH by the parameters of a source and its line from the answers to f; slopes (n_par, n)."""
+    for m in range(slopes.shape[0]):
+        if slot[m] >= 0:
+            for i in range(n):
+                relative = slopes[m, start + i]
+                for j in range(answers.shape[0]):
+                    y = complex(answers[j, i], answers[j, LANES + i])
+                    dH[i, j, actuator, slot[m]] += y * relative
 
 
 @part
 def element_parameters(
-    x: System, k: Work, elements: Flag, slots: Int, z: Float, zh: Float, n: int, dH: Complex
+    x: System,
+    jump_d: Complex,
+    k: Work,
+    elements: Flag,
+    slots: Int,
+    z: Float,
+    zh: Float,
+    start: int,
+    n: int,
+    dH: Complex,
 ) -> None:
-    """Add the derivatives by the parameters of all elements but sources to dH."""
+    """Add the derivatives by the parameters of all elements but sources and waves to dH."""
     for e in range(x.kinds.shape[0]):
-        if not elements[e]:
+        kind = x.kinds[e]
+        if not elements[e] or kind == WAVES:
             continue
-        if x.kinds[e] == BEAM_KIND:
+        if kind == BEAM_KIND:
             recall_beam(k, e)
             integrals(k.W, k.regimes[e])
         for j in range(x.feed.shape[0]):
@@ -89,8 +107,26 @@ def element_parameters(
                 if x.term[t, 0] == j and x.term[t, 2] == COMPLIANCE and x.term[t, 3] == e:
                     direct += x.term_c[t, 2]
             for source in range(x.source.shape[0]):
-                contributions(
-                    k.W, x.kinds[e], x.pars[e], k.regimes[e], direct, z[source, e], zh[j, e]
-                )
-                K = x.pars[x.source[source, 0], 0]
-                _scatter(k.W, slots[e], K, n, dH[:, j, x.source[source, 1]])
+                target = dH[:, j, x.source[source, 1]]
+                K = x.source_c[source, 4]
+                if kind in (HINGE, JUMP):
+                    point(k.W, x.place[e, 0], direct, z[source, e], zh[j, e])
+                    _scatter_point(k.W, jump_d[x.place[e, 1]], slots[e], K, start, n, target)
+                else:
+                    contributions(
+                        k.W, kind, x.pars[e], k.regimes[e], direct, z[source, e], zh[j, e]
+                    )
+                    _scatter(k.W, slots[e], K, n, target)
+
+
+@part
+def keep_waves(x: System, elements: Flag, z: Float, start: int, n: int, target: Complex) -> None:
+    """target[row, start:, :, solution]: the states behind and before every WAVES."""
+    for e in range(x.kinds.shape[0]):
+        if elements[e] and x.kinds[e] == WAVES:
+            for solution in range(z.shape[0]):
+                for m in range(8):
+                    for i in range(n):
+                        target[x.place[e, 1], start + i, m, solution] = get(
+                            z[solution, e], 2 * m, i
+                        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from samii_rig.model.basis import boundary
 from samii_rig.model.beam import prepare
 from samii_rig.model.lanes import LANES, get, load, part, put, store
 from samii_rig.model.registers import (
@@ -11,13 +12,14 @@ from samii_rig.model.registers import (
     BEAM_ROWS,
     X_ROWS,
     B,
+    Factors,
     Flag,
     S,
     System,
     Work,
     X,
 )
-from samii_rig.model.sweep import boundary, step
+from samii_rig.model.sweep import step
 from samii_rig.types import Complex, Float
 
 
@@ -43,7 +45,9 @@ def recall_beam(k: Work, e: int) -> None:
 
 
 @part
-def block(x: System, k: Work, s: Complex, start: int, first: int, last: int, wanted: Flag) -> int:
+def block(
+    x: System, f: Factors, k: Work, s: Complex, start: int, first: int, last: int, wanted: Flag
+) -> int:
     """Sweep s[start:] from the base to port `last` and from the tip to `first`.
 
     Fills columns_p and columns_q of the wanted ports, changes_p and changes_q of every
@@ -72,7 +76,7 @@ def block(x: System, k: Work, s: Complex, start: int, first: int, last: int, wan
             e = port - 1 if mirrored else port
             if x.kinds[e] == BEAM_KIND:
                 recall_beam(k, e)
-            if step(W, x.kinds[e], x.pars[e], mirrored, k.regimes[e]):
+            if step(W, x.kinds[e], x.pars[e], x.place[e], f, mirrored, k.regimes[e], start):
                 store(changes[e], W, B, B_ROWS)
         port = first if mirrored else last
         if wanted[port]:

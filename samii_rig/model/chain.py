@@ -6,84 +6,136 @@ beam that carries an accelerometer is divided there, so it counts as two element
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from samii_rig.errors import InputError
+from samii_rig.model.laws import POINTS, SOURCE_LAWS
 from samii_rig.model.registers import (
-    ACCELERATION,
     BEAM_KIND,
     CLAMPED,
-    COMPLIANCE,
     FREE_END,
+    HINGE,
     IDENTITY,
+    JUMP,
     LINK,
-    ONE,
     PINNED,
     SPRING,
+    THETA_M,
+    WAVES,
     System,
 )
+from samii_rig.model.sensing import source_feed, terms
 from samii_rig.rig.schema import (
-    AbsoluteAngle,
+    BEAMS,
+    SOURCES,
     Acceleration,
-    AngularVelocitySource,
     Beam,
+    Branch,
     Element,
-    Moment,
-    RelativeAngle,
+    HydraulicLine,
+    LumpedMass,
     Rig,
     RigidLink,
+    TimoshenkoBeam,
     TorsionalSpring,
     parameters,
 )
 from samii_rig.types import Float, Int
 
 ENDS = {"free": FREE_END, "pinned": PINNED, "clamped": CLAMPED}
-L_OF_BEAM = 2  # place of L among the beam's parameters
+WIDTH = 7  # the most parameters that an element has
+L_OF_BEAM = 2  # place of L among the beams' parameters
+SOURCE_WIDTH = 4 + 6  # the most parameters of a source and of a hydraulic line behind it
+LINE_AT = 4  # place of the line's first among them
 
 
 @dataclass(frozen=True, slots=True)
 class CompiledChain:
     """The arrays of the kernels, and how to read them.
 
+    system : of the kernels; what depends on s comes from `factors.bind`.
     parameters : (element, symbol) of every parameter, in the file's order.
-    slots : (n_op, 5) index into `parameters` of each element's parameters, -1 for none.
+    slots : (n_op, 7) index into `parameters` of each element's parameters, -1 for none.
+    source_slots : (n_source, 10) the same of each source and of the line behind it;
+        source_values the values there.
+    fixed, source_fixed : what is added to the parameters there: a beam's part is shorter
+        than the beam by what lies before it.
+    kinds : kind of each element, by name; sources : of each source.
+    lines : (n_source,) whether a line follows.
+    points, waves, poles : the elements of kind JUMP or HINGE, of kind WAVES, and those whose
+        law may have poles.
     at_end : (sensor, port, index into `parameters`) of an accelerometer at the very end of a
         beam, and of that beam's L.
     places : for each port (element, m from its upstream end); the base is at 0 of the first.
+    branches : (element of the kernels, chain, index into `parameters` of its first).
+    rigid : indices into `parameters` that cannot change without a new chain, as a sensor or a
+        position divides the beam whose length they are.
     """
 
     system: System
     parameters: tuple[tuple[str, str], ...]
+    values: Float
     slots: Int
+    source_slots: Int
+    fixed: Float
+    source_fixed: Float
+    source_values: Float
+    kinds: tuple[str, ...]
+    sources: tuple[str, ...]
+    lines: tuple[bool, ...]
+    points: tuple[int, ...]
+    waves: tuple[int, ...]
+    poles: tuple[int, ...]
     at_end: tuple[tuple[int, int, int], ...]
     places: tuple[tuple[str, float], ...]
+    branches: tuple[tuple[int, CompiledChain, int], ...]
+    rigid: frozenset[int]
+
+    def with_values(self, values: Float) -> CompiledChain:
+        """The same chain with other values of all parameters; none of `rigid` may change."""
+        padded = np.append(values, 0.0)
+        pars = padded[self.slots] + self.fixed
+        source = padded[self.source_slots] + self.source_fixed
+        branches = tuple(
+            (e, c.with_values(values[first : first + len(c.parameters)]), first)
+            for e, c, first in self.branches
+        )
+        system = self.system._replace(pars=pars)
+        if self.sources:
+            dual = np.column_stack([system.source_c[:, :4], source[:, 0]])
+            system = system._replace(source_c=dual)
+        return replace(self, system=system, values=values, source_values=source, branches=branches)
 
 
 def _kind(element: Element) -> int:
     match element:
         case Beam():
             return BEAM_KIND
-        case RigidLink():
+        case TimoshenkoBeam() | Branch():
+            return WAVES
+        case RigidLink() | LumpedMass():
             return LINK
         case TorsionalSpring():
             return SPRING
-        case AngularVelocitySource():
-            return IDENTITY
+    if isinstance(element, SOURCES):
+        return IDENTITY
+    return HINGE if POINTS[element.kind].pair == THETA_M else JUMP
 
 
 def _cuts(rig: Rig, extra: Mapping[str, Sequence[float]]) -> dict[str, list[float]]:
     """Where each beam is divided: at accelerometers inside it and at `extra` positions."""
     cuts: dict[str, list[float]] = {}
-    beams = [e.name for e in rig.element if isinstance(e, Beam)]
+    beams = [e.name for e in rig.element if isinstance(e, BEAMS)]
     for name in extra:
         if name not in beams:
             raise InputError("positions", "", name, f"a beam of {beams}")
     for element in rig.element:
-        if not isinstance(element, Beam):
+        if not isinstance(element, BEAMS):
             continue
         wanted = {float(x) for x in extra.get(element.name, ())}
         for sensor in rig.sensor:
@@ -97,63 +149,84 @@ def _cuts(rig: Rig, extra: Mapping[str, Sequence[float]]) -> dict[str, list[floa
     return cuts
 
 
-def _terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Float, Int, Float]:
-    """`feed`, `term` and `term_c` of `System`."""
-    elements = {e.name: e for e in rig.element}
-    behind = {name: port for port, (name, _) in enumerate(places)}  # the last of its ports
-    before = {}
-    port = 0
-    for name in elements:
-        before[name] = port
-        port = behind[name]
-    sources = [e.name for e in rig.element if isinstance(e, AngularVelocitySource)]
-    feed = np.zeros((len(rig.sensor), len(sources)))
-    term: list[tuple[int, int, int, int]] = []
-    term_c: list[tuple[float, float, float, float]] = []
+class _Parts:
+    """The elements of the kernels as they are listed, one list for each array."""
 
-    def add(
-        port: int,
-        w: float = 0.0,
-        theta: float = 0.0,
-        M: float = 0.0,
-        factor: int = ONE,
-        spring: int = -1,
-    ) -> None:
-        term.append((i, port, factor, spring))
-        term_c.append((w, theta, M, 0.0))
+    def __init__(self, cuts: Mapping[str, Sequence[float]], inputs: Sequence[str]) -> None:
+        self.cuts, self.inputs = cuts, inputs
+        self.keys: list[tuple[str, str]] = []
+        self.values: list[float] = []
+        self.op: list[tuple[int, int, int]] = []  # kind, pair, row
+        self.kinds: list[str] = []
+        self.slots: list[list[int]] = []
+        self.fixed: list[list[float]] = []
+        self.places: list[tuple[str, float]] = []
+        self.sources: list[str] = []
+        self.source: list[tuple[int, int]] = []
+        self.source_slots: list[list[int]] = []
+        self.lines: list[bool] = []
+        self.branches: list[tuple[int, CompiledChain, int]] = []
+        self.rigid: set[int] = set()
+        self.rows = {JUMP: 0, WAVES: 0}
 
-    for i, sensor in enumerate(rig.sensor):
-        match sensor:
-            case RelativeAngle():
-                # Summed over the parts, not theta behind less theta before: the rotation of
-                # the whole may be much larger than that of the joint.
-                for name in sensor.across:
-                    match elements[name]:
-                        case AngularVelocitySource():
-                            feed[i, sources.index(name)] = 1.0
-                        case TorsionalSpring():
-                            add(before[name], M=1.0, factor=COMPLIANCE, spring=before[name])
-                        case Beam():
-                            add(behind[name], theta=1.0)
-                            add(before[name], theta=-1.0)
-                        case RigidLink():
-                            pass
-            case AbsoluteAngle():
-                add(behind[sensor.after], theta=1.0)
-            case Moment():
-                add(behind[sensor.after], M=1.0)
-            case Acceleration() if isinstance(elements[sensor.on], Beam):
-                if sensor.position == 0:
-                    add(before[sensor.on], w=1.0, factor=ACCELERATION)
+    def add(self, element: Element) -> None:
+        first = len(self.keys)
+        own = parameters(element)
+        self.keys += [(element.name, symbol) for symbol in own]
+        self.values += [p.value for p in own.values()]
+        index = [*range(first, first + len(own))]
+        if not self.places:
+            self.places.append((element.name, 0.0))
+        if isinstance(element, SOURCES):
+            self._source(element, dict(zip(own, index, strict=True)))
+            index = []
+        elif isinstance(element, HydraulicLine):
+            self.lines[-1] = True
+            self.source_slots[-1][LINE_AT:] = index
+        elif isinstance(element, LumpedMass):
+            index = [-1, -1, *index]  # a link of no length
+        elif isinstance(element, Branch):
+            inner = compile_branch(element)
+            self.keys += inner.parameters
+            self.values += list(inner.values)
+            self.branches.append((len(self.op), inner, first))
+        length = element.L.value if isinstance(element, (*BEAMS, RigidLink)) else 0.0
+        inside = self.cuts.get(element.name, ())
+        for start, stop in pairwise([0.0, *inside, length]):
+            slot, fixed = index + [-1] * (WIDTH - len(index)), [0.0] * WIDTH
+            if isinstance(element, BEAMS):
+                if stop == length:
+                    # A position is fixed, so a longer beam is longer behind the last one.
+                    fixed[L_OF_BEAM] = -start
                 else:
-                    add(places.index((sensor.on, sensor.position)), w=1.0, factor=ACCELERATION)
-            case Acceleration():
-                add(before[sensor.on], w=1.0, theta=sensor.position, factor=ACCELERATION)
-    return (
-        feed,
-        np.array(term, dtype=np.int64).reshape(-1, 4),
-        np.array(term_c, dtype=np.float64).reshape(-1, 4),
-    )
+                    slot[L_OF_BEAM], fixed[L_OF_BEAM] = -1, stop - start
+            self._op(element, slot, fixed)
+            self.places.append((element.name, stop))
+        if isinstance(element, BEAMS) and inside:
+            self.rigid.add(index[L_OF_BEAM])
+
+    def _op(self, element: Element, slot: list[int], fixed: list[float]) -> None:
+        kind = _kind(element)
+        pair, row = -1, -1
+        if kind in (JUMP, HINGE):
+            pair, row = POINTS[element.kind].pair, self.rows[JUMP]
+            self.rows[JUMP] += 1
+        elif kind == WAVES:
+            row = self.rows[WAVES]
+            self.rows[WAVES] += 1
+        self.op.append((kind, pair, row))
+        self.kinds.append(element.kind)
+        self.slots.append(slot)
+        self.fixed.append(fixed)
+
+    def _source(self, element: Element, index: dict[str, int]) -> None:
+        assert isinstance(element, SOURCES)
+        symbols = [s for s in type(element).model_fields if s not in ("name", "kind", "input")]
+        slots = [index.get(symbol, -1) for symbol in symbols]
+        self.source.append((len(self.op), self.inputs.index(element.input)))
+        self.source_slots.append(slots + [-1] * (SOURCE_WIDTH - len(slots)))
+        self.sources.append(element.kind)
+        self.lines.append(False)
 
 
 def compile_chain(rig: Rig, extra: Mapping[str, Sequence[float]] | None = None) -> CompiledChain:
@@ -161,51 +234,101 @@ def compile_chain(rig: Rig, extra: Mapping[str, Sequence[float]] | None = None) 
 
     Raises InputError for a position that does not lie on its beam.
     """
-    cuts = _cuts(rig, extra or {})
-    keys: list[tuple[str, str]] = []
-    kinds: list[int] = []
-    pars: list[list[float]] = []
-    slots: list[list[int]] = []
-    places = [(rig.element[0].name, 0.0)]
-    source: list[tuple[int, int]] = []
-    actuators = [a.name for a in rig.actuator]
+    parts = _Parts(_cuts(rig, extra or {}), [a.name for a in rig.actuator])
     for element in rig.element:
-        values = [p.value for p in parameters(element).values()]
-        index = [len(keys) + i for i in range(len(values))]
-        keys += [(element.name, symbol) for symbol in parameters(element)]
-        if isinstance(element, AngularVelocitySource):
-            source.append((len(kinds), actuators.index(element.input)))
-        length = values[list(parameters(element)).index("L")] if "L" in parameters(element) else 0.0
-        edges = [0.0, *cuts.get(element.name, ()), length]
-        for start, stop in pairwise(edges):
-            part, slot = list(values), list(index)
-            if isinstance(element, Beam):
-                part[L_OF_BEAM] = stop - start
-                # A position is fixed, so a longer beam is longer behind the last one.
-                slot[L_OF_BEAM] = index[L_OF_BEAM] if stop == length else -1
-            kinds.append(_kind(element))
-            pars.append(part + [0.0] * (5 - len(part)))
-            slots.append(slot + [-1] * (5 - len(slot)))
-            places.append((element.name, stop))
-    feed, term, term_c = _terms(rig, places)
-    ends = {(e.name, e.L.value) for e in rig.element if isinstance(e, Beam)}
+        parts.add(element)
+    term, term_c = terms(rig, parts.places)
+    ends = {(e.name, e.L.value) for e in rig.element if isinstance(e, BEAMS)}
     at_end = tuple(
-        (i, places.index((sensor.on, sensor.position)), keys.index((sensor.on, "L")))
+        (i, parts.places.index((sensor.on, sensor.position)), parts.keys.index((sensor.on, "L")))
         for i, sensor in enumerate(rig.sensor)
         if isinstance(sensor, Acceleration) and (sensor.on, sensor.position) in ends
     )
+    parts.rigid.update(index for _, _, index in at_end)
+    dual = np.array([SOURCE_LAWS[kind].dual for kind in parts.sources]).reshape(-1, 4)
+    return _assemble(
+        parts,
+        (rig.base, rig.tip),
+        np.array(parts.source),
+        dual,
+        source_feed(rig),
+        term,
+        term_c,
+        at_end,
+    )
+
+
+def compile_branch(branch: Branch) -> CompiledChain:
+    """A side chain with its root clamped: sources that move the root by w and theta of 1, and
+    sensors of M and V there, so that its response is the impedance of the branch."""
+    parts = _Parts({}, [])
+    for element in branch.element:
+        parts.add(element)
+    dual = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -1.0, 0.0]])  # w and theta jump by +1
+    term = np.array([[0, 0, 0, -1], [1, 0, 0, -1]])
+    term_c = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    at_root = np.array([[0, 0], [0, 1]])
+    return _assemble(
+        parts, ("clamped", branch.tip), at_root, dual, np.zeros((2, 2)), term, term_c, ()
+    )
+
+
+def _where(kinds: Int, wanted: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(e for e, kind in enumerate(kinds.tolist()) if kind in wanted)
+
+
+def _assemble(
+    parts: _Parts,
+    ends: tuple[str, str],
+    source: Int,
+    dual: Float,
+    feed: Float,
+    term: Int,
+    term_c: Float,
+    at_end: tuple[tuple[int, int, int], ...],
+) -> CompiledChain:
+    values = np.array(parts.values)
+    slots = np.array(parts.slots, dtype=np.int64)
+    fixed = np.array(parts.fixed)
+    source_slots = np.array(parts.source_slots, dtype=np.int64).reshape(-1, SOURCE_WIDTH)
+    if not parts.sources:
+        source_slots = np.full((len(dual), SOURCE_WIDTH), -1)  # the root of a branch
+    source_fixed = np.zeros(source_slots.shape)
+    for i, kind in enumerate(parts.sources):
+        if kind in ("torque_source", "force_source") and source_slots[i, 1] < 0:
+            source_fixed[i, 1] = math.inf  # no lag
+    padded = np.append(values, 0.0)
+    source_values = padded[source_slots] + source_fixed
+    op = np.array(parts.op, dtype=np.int64)
+    kinds = np.ascontiguousarray(op[:, 0])
+    gain = source_values[:, 0] if parts.sources else np.ones(len(dual))  # a branch's are jumps of 1
     return CompiledChain(
         system=System(
-            kinds=np.array(kinds, dtype=np.int64),
-            pars=np.array(pars),
-            ends=np.array([ENDS[rig.base], ENDS[rig.tip]], dtype=np.int64),
+            kinds=kinds,
+            pars=padded[slots] + fixed,
+            place=np.ascontiguousarray(op[:, 1:]),
+            ends=np.array([ENDS[end] for end in ends], dtype=np.int64),
             source=np.array(source, dtype=np.int64).reshape(-1, 2),
+            source_c=np.column_stack([dual, gain]),
             feed=feed,
             term=term,
             term_c=term_c,
         ),
-        parameters=tuple(keys),
-        slots=np.array(slots, dtype=np.int64),
+        parameters=tuple(parts.keys),
+        values=values,
+        slots=slots,
+        source_slots=source_slots,
+        fixed=fixed,
+        source_fixed=source_fixed,
+        source_values=source_values,
+        kinds=tuple(parts.kinds),
+        sources=tuple(parts.sources),
+        lines=tuple(parts.lines),
+        points=_where(kinds, (JUMP, HINGE)),
+        waves=_where(kinds, (WAVES,)),
+        poles=_where(kinds, (SPRING, JUMP, HINGE)),
         at_end=at_end,
-        places=tuple(places),
+        places=tuple(parts.places),
+        branches=tuple(parts.branches),
+        rigid=frozenset(parts.rigid),
     )

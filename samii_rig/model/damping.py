@@ -18,15 +18,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
+from samii_rig.errors import InputError
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.schema import Beam, Rig
+from samii_rig.rig.schema import BEAMS, Rig, flattened
 from samii_rig.types import Complex, Float
 
 PER_DECADE = 2.0  # relaxations
 OUTSIDE = 2.2  # factor by which the relaxations reach beyond the band on each side
 POINTS = 200  # frequencies of the fit
 ALONE = 0.05  # half width around a zero without relaxation to its left (a viscous beam's)
-EI, ETA, TAU = 0, 3, 4  # places among the beam's parameters
+EI, ETA, TAU, GA = 0, 3, 4, 5  # places among the beams' parameters; a Beam has 0 for GA
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +98,19 @@ def fit_loss(eta: float, tau: float, low_hz: float, high_hz: float) -> Relaxatio
 
 
 def relaxed_beams(rig: Rig, low_hz: float, high_hz: float) -> dict[str, Relaxations]:
-    """The stand-in of every beam with a loss factor, by name."""
-    return {
-        e.name: fit_loss(e.eta.value, e.tau.value, low_hz, high_hz)
-        for e in rig.element
-        if isinstance(e, Beam) and e.eta.value > 0
-    }
+    """The stand-in of every beam with a loss factor, by name.
+
+    Raises InputError for one in a branch.
+    """
+    out = {}
+    for e in flattened(rig.element):
+        if isinstance(e, BEAMS) and e.eta.value > 0:
+            if e not in rig.element:
+                raise InputError(
+                    rig.name, f"{e.name}.eta", e.eta.value, "0 in a branch, with tau instead"
+                )
+            out[e.name] = fit_loss(e.eta.value, e.tau.value, low_hz, high_hz)
+    return out
 
 
 class CausalChain:
@@ -139,7 +147,8 @@ class CausalChain:
         sign = np.where(s.imag < 0, -1.0, 1.0)  # the chain turns that of eta there
         for i in range(s.size):
             for rows, m in zip(self._rows, moduli, strict=True):
-                self._pars[rows, EI] = self._given[rows, EI] * m[i].real
+                for stiffness in (EI, GA):
+                    self._pars[rows, stiffness] = self._given[rows, stiffness] * m[i].real
                 self._pars[rows, ETA] = sign[i] * m[i].imag / m[i].real
                 self._pars[rows, TAU] = 0.0
             yield s[i : i + 1]

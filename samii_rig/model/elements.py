@@ -13,15 +13,23 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
+from samii_rig.model.laws import POINTS, SOURCE_LAWS
 from samii_rig.rig.schema import (
-    AngularVelocitySource,
+    SOURCES,
     Beam,
+    Branch,
     Element,
+    ForceSource,
+    LumpedMass,
     RigidLink,
+    TimoshenkoBeam,
+    TorqueSource,
     TorsionalSpring,
+    parameters,
 )
-from samii_rig.types import Complex
+from samii_rig.types import Complex, Float
 
 # w V^ - V w^ - theta M^ + M theta^ is the same on both sides of every element without a
 # source: U^T J U = J for the leading 4x4 block.
@@ -112,16 +120,76 @@ def angular_velocity_source_matrix(s: Complex, K: float, p: float) -> Complex:
     return U
 
 
+def timoshenko_matrix(
+    s: Complex, EI: float, mu: float, L: float, eta: float, tau: float, GA: float, J: float
+) -> Complex:
+    """exp(A L) of the beam of `schema.TimoshenkoBeam`, shape (..., 5, 5)."""
+    s = np.asarray(s, dtype=complex)
+    g = 1 + 1j * eta * np.where(s.imag < 0, -1.0, 1.0) + s * tau
+    A = np.zeros((*s.shape, 4, 4), complex)
+    A[..., 0, 1] = A[..., 2, 3] = 1.0
+    A[..., 0, 3] = -1 / (GA * g)
+    A[..., 1, 2] = 1 / (EI * g)
+    A[..., 2, 1] = J * s**2
+    A[..., 3, 0] = -mu * s**2
+    U = _identity(s)
+    U[..., :4, :4] = expm(A * L)
+    return U
+
+
+# Rows and columns of the pairs of `laws`, and the rows and signs of the sources' jumps.
+_PLACES = ((1, 2), (0, 3), (2, 1), (3, 0))
+
+
+def point_matrix(kind: str, s: Complex, p: Float) -> Complex:
+    """Any point element of `laws` with parameters p, shape (..., 5, 5)."""
+    s = np.asarray(s, dtype=complex)
+    U = _identity(s)
+    law = POINTS[kind]
+    U[(..., *_PLACES[law.pair])] = law.value(s.ravel(), p).reshape(s.shape)
+    return U
+
+
+def branch_matrix(branch: Branch, s: Complex) -> Complex:
+    """M and V lose what the side chain takes at its root, moved by w and theta, (..., 5, 5)."""
+    s = np.asarray(s, dtype=complex)
+    whole = _identity(s)
+    for element in branch.element:
+        whole = matrix(element, s) @ whole
+    zero = {"clamped": [0, 1], "pinned": [0, 2], "free": [2, 3]}[branch.tip]
+    rows = whole[..., zero, :]
+    U = _identity(s)
+    U[..., 2:4, :2] = np.linalg.solve(rows[..., 2:4], rows[..., :2])
+    return U
+
+
 def matrix(element: Element, s: Complex) -> Complex:
-    """The (..., 5, 5) matrix of any element of a rig file at s, rad/s."""
+    """The (..., 5, 5) matrix of any element of a rig file at s, rad/s.
+
+    A line's source has no line in it here: it lets all of its flow through.
+    """
+    p = {symbol: parameter.value for symbol, parameter in parameters(element).items()}
     match element:
         case Beam():
-            e = element
-            return beam_matrix(s, e.EI.value, e.mu.value, e.L.value, e.eta.value, e.tau.value)
+            return beam_matrix(s, **p)
+        case TimoshenkoBeam():
+            return timoshenko_matrix(s, **p)
         case RigidLink():
-            e_ = element
-            return rigid_link_matrix(s, e_.L.value, e_.r.value, e_.m.value, e_.I.value)
+            return rigid_link_matrix(s, **p)
+        case LumpedMass():
+            return rigid_link_matrix(s, 0.0, 0.0, **p)
         case TorsionalSpring():
-            return torsional_spring_matrix(s, element.k.value, element.c.value)
-        case AngularVelocitySource():
-            return angular_velocity_source_matrix(s, element.K.value, element.p.value)
+            return torsional_spring_matrix(s, **p)
+        case Branch():
+            return branch_matrix(element, s)
+    if not isinstance(element, SOURCES):
+        return point_matrix(element.kind, s, np.array([*p.values()]))
+    s = np.asarray(s, dtype=complex)
+    values = [*p.values()]
+    if isinstance(element, TorqueSource | ForceSource) and element.p is None:
+        values.insert(1, np.inf)
+    jump = SOURCE_LAWS[element.kind].value(s.ravel(), np.array(values)).reshape(s.shape)
+    row, sign = {"torque_source": (2, -1.0), "force_source": (3, 1.0)}.get(element.kind, (1, 1.0))
+    U = _identity(s)
+    U[..., row, 4] = sign * element.K.value * jump
+    return U

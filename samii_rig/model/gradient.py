@@ -25,7 +25,22 @@ import numpy as np
 
 from samii_rig.model.beam import stiffness
 from samii_rig.model.lanes import LANES, conj, get, inverse, load, norm2, part, put, scaled
-from samii_rig.model.registers import BEAM, BETA4, IS_LONG, LINK, LONG, RESULT, SPRING, ZH, K, S, Z
+from samii_rig.model.registers import (
+    BEAM,
+    BETA4,
+    IS_LONG,
+    LINK,
+    LONG,
+    M_THETA,
+    RESULT,
+    SPRING,
+    THETA_M,
+    W_V,
+    ZH,
+    K,
+    S,
+    Z,
+)
 from samii_rig.types import Float
 
 _TERMS = 8  # (2 beta)^(4n) / (4n)! < 1e-16 at the threshold
@@ -63,6 +78,26 @@ def integrals(W: Float, regime: int) -> None:
                 put(W, K, i, complex(z.real + _SERIES[row, n], z.imag))
         for i in range(2 * LANES):
             W[(K + 2 + 2 * row) * LANES + i] = W[K * LANES + i]
+
+
+@part
+def point(W: Float, pair: int, direct: float, z: Float, zh: Float) -> None:
+    """RESULT: dy/dx of a point element, z+ = z- + e_i x e_j^T z-: -zh^T J e_i z_j."""
+    if pair == THETA_M:
+        # `direct`: a sensor across the element reads direct * x M itself.
+        for i in range(LANES):
+            Mh = get(zh, 4, i)
+            put(W, RESULT, i, -get(z, 4, i) * complex(Mh.real - direct, Mh.imag))
+        return
+    # Signs of J; which state by which dual.
+    if pair == W_V:
+        row, sign = 6, 1.0
+    elif pair == M_THETA:
+        row, sign = 2, 1.0
+    else:
+        row, sign = 0, -1.0
+    for i in range(LANES):
+        put(W, RESULT, i, scaled(get(z, row, i) * get(zh, row, i), sign))
 
 
 @part

@@ -24,7 +24,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 # numba recompiles a cached function when its own file has changed; these also when another
 # kernel's file has, as they call each other.
 _FILES = (
-    "lanes", "registers", "waves", "beam", "sweep", "block",
+    "lanes", "registers", "waves", "beam", "basis", "points", "sweep", "block",
     "solve", "gradient", "adjoint", "respond",
 )  # fmt: skip
 _STAMP = tuple(

@@ -1,6 +1,6 @@
 """All poles of a chain in a region of the s-plane, found so that none can be missed.
 
-The poles of a chain are the zeros of its characteristic function D(s) (paper 2, eq. 15: the
+The poles of a chain are the zeros of its characteristic function D(s) (paper 1, eq. 17: the
 boundary conditions leave a 2 x 2 determinant), which is analytic wherever no beam's complex
 modulus vanishes. By the argument principle the number of zeros inside a contour is the number
 of turns of D(s) around the origin as s runs along it. A box that holds zeros is cut until
@@ -167,18 +167,32 @@ def _pieces(region: Region) -> list[_Box]:
 
 def _turns(D: Characteristic, box: _Box) -> int | None:
     """Zeros inside the box; None if one lies on its boundary, as far as can be told."""
-    t = np.linspace(0.0, 4.0, 4 * START + 1)
-    s = box.along(t)
-    slope, mantissa, log_scale = _log_derivative(D, s, NUDGE * box.size / START)
+    turned = phase_along(D, box.along, np.linspace(0.0, 4.0, 4 * START + 1), box.size / START)
+    return None if turned is None else round(turned / (2 * np.pi))
+
+
+def phase_along(
+    D: Characteristic, path: Callable[[Float], Complex], t: Float, spacing: float
+) -> float | None:
+    """By how much arg D turns as s = path(t) runs over the increasing t (n,), rad.
+
+    spacing : rad/s, of the order of the distance between neighbouring path(t). Intervals are
+    halved until phase and modulus agree with the derivative of log D; None if that never
+    happens, as the path runs through a zero.
+    """
+    s = path(t)
+    slope, mantissa, log_scale = _log_derivative(D, s, NUDGE * spacing)
+    if np.any(mantissa == 0):
+        return None
     open_ = np.ones(len(t) - 1, dtype=bool)
     for halving in range(MAX_HALVINGS):
         at = np.flatnonzero(open_)
         if not at.size:
-            return round(float(np.sum(np.angle(mantissa[1:] / mantissa[:-1]))) / (2 * np.pi))
+            return float(np.sum(np.angle(mantissa[1:] / mantissa[:-1])))
         middle = (t[at] + t[at + 1]) / 2
-        new = box.along(middle)
-        g, value, scale = _log_derivative(D, new, NUDGE * box.size / START / 2**halving)
-        if not (np.all(np.abs(value) > 0) and np.all(np.abs(mantissa) > 0)):
+        new = path(middle)
+        g, value, scale = _log_derivative(D, new, NUDGE * spacing / 2**halving)
+        if np.any(value == 0):
             return None
         first = np.log(value / mantissa[at]) + scale - log_scale[at]
         second = np.log(mantissa[at + 1] / value) + log_scale[at + 1] - scale
@@ -202,7 +216,7 @@ def _log_derivative(D: Characteristic, s: Complex, h: float) -> tuple[Complex, C
     """D'/D by a central difference of width h, and D as mantissa and scale."""
     mantissa, log_scale = D(np.concatenate([s, s + h, s - h]))
     n = s.size
-    here = np.where(mantissa[:n] == 0, np.nan, mantissa[:n])
+    here = np.where(mantissa[:n] == 0, 1.0, mantissa[:n])  # a zero is seen by who asked
     up = mantissa[n : 2 * n] / here * np.exp(np.clip(log_scale[n : 2 * n] - log_scale[:n], -9, 9))
     down = mantissa[2 * n :] / here * np.exp(np.clip(log_scale[2 * n :] - log_scale[:n], -9, 9))
     return (up - down) / (2 * h), mantissa[:n], log_scale[:n]

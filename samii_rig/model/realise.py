@@ -22,9 +22,25 @@ import numpy as np
 from samii_rig.errors import InputError
 from samii_rig.model.damping import CausalChain, relaxed_beams
 from samii_rig.model.poles import CLUSTER, PoleSet, Region, contour_residues, find_poles
-from samii_rig.model.sampled import filter_poles, filter_residues, filter_response
+from samii_rig.model.sampled import (
+    dead_time,
+    filter_poles,
+    filter_residues,
+    filter_response,
+    immediate,
+    lowpass_poles,
+)
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.schema import AngularVelocitySource, Beam, Rig, SensorBase
+from samii_rig.rig.schema import (
+    BEAMS,
+    AngularVelocitySource,
+    AngularVelocitySource2,
+    ForceSource,
+    Rig,
+    SensorBase,
+    TorqueSource,
+    flattened,
+)
 from samii_rig.types import Complex, Float
 
 BAND_OVER_RATE = 4.0  # default band of the pole search over the sample rate
@@ -46,6 +62,8 @@ FIT_HIGH = 1.0  # highest of them over the rate: aliases of the first zone count
 class Realisation:
     """A rig's continuous response, filters included, delays and hold not.
 
+    late : (n_input,) s, the dead time of each actuator's sources: a delay as well.
+
     poles : (n,) complex rad/s, Im >= 0; one with Im > 0 stands for its conjugate as well.
     residues : (n, n_sensor, n_input) complex.
     direct : (n_sensor, n_input) feedthrough.
@@ -59,6 +77,7 @@ class Realisation:
     direct: Float
     structure: PoleSet
     error: Float
+    late: Float
 
     def response(self, frequency_hz: Float) -> Complex:
         """(n_freq, n_sensor, n_input) at these frequencies."""
@@ -99,6 +118,7 @@ def realise(rig: Rig, band_hz: float | None = None) -> Realisation:
     from LOSS_LOW times the rate to half the rate. InputError if the chain is unstable or has
     a pole of higher order.
     """
+    late, rig = dead_time(rig), immediate(rig)
     beams = relaxed_beams(rig, LOSS_LOW * rig.rate_hz, 0.5 * rig.rate_hz)
     chain = CausalChain(rig, beams) if beams else Chain(rig)
     band = BAND_OVER_RATE * rig.rate_hz if band_hz is None else band_hz
@@ -140,7 +160,7 @@ def realise(rig: Rig, band_hz: float | None = None) -> Realisation:
         size = np.maximum(size, FLOOR * size.max() + 1e-300)
         for j in range(len(rig.actuator)):
             r[poles.size + q.size :, j], direct[i, j] = _fit(
-                s, rest[:, j], size[:, j], relaxations, sensor.antialias is None
+                s, rest[:, j], size[:, j], relaxations, lowpass_poles(sensor).size == 0
             )
         off = np.abs(_sum(s, at, r) + direct[i] - target)
         error[i] = np.max((off / size)[judged])
@@ -148,7 +168,7 @@ def realise(rig: Rig, band_hz: float | None = None) -> Realisation:
         whole[:, i] = r
         blocks.append((at, whole))
     joined, residues = _collect(blocks)
-    return Realisation(joined, residues, direct, found, error)
+    return Realisation(joined, residues, direct, found, error, late)
 
 
 def search_region(rig: Rig, band_hz: float) -> Region:
@@ -158,8 +178,8 @@ def search_region(rig: Rig, band_hz: float) -> Region:
     left = -top
     wanted: list[tuple[float, float]] = []
     relaxed = relaxed_beams(rig, LOSS_LOW * rig.rate_hz, 0.5 * rig.rate_hz)
-    for e in rig.element:
-        if not isinstance(e, Beam):
+    for e in flattened(rig.element):
+        if not isinstance(e, BEAMS):
             continue
         if e.name in relaxed:
             wanted += relaxed[e.name].holes()
@@ -182,11 +202,26 @@ def search_region(rig: Rig, band_hz: float) -> Region:
 def _with_sources(rig: Rig, poles: Complex) -> Complex:
     """The chain's poles and the sources' own, each place once."""
     out = [complex(p) for p in poles]
-    p_values = [e.p.value for e in rig.element if isinstance(e, AngularVelocitySource)]
-    for own in (0.0, *(-p for p in p_values)):
+    for own in source_poles(rig):
         if not any(abs(own - x) <= CLUSTER for x in out):
             out.append(complex(own))
     return np.array(out, dtype=np.complex128)
+
+
+def source_poles(rig: Rig) -> list[complex]:
+    """The poles of all sources, Im >= 0."""
+    out: list[complex] = []
+    for e in rig.element:
+        match e:
+            case AngularVelocitySource():
+                out += [0j, complex(-e.p.value)]
+            case AngularVelocitySource2():
+                w, zeta = e.omega.value, e.zeta.value
+                roots = np.roots([1.0, 2 * zeta * w, w**2])
+                out += [0j, *(complex(x) for x in roots if x.imag >= 0)]
+            case TorqueSource() | ForceSource():
+                out += [complex(-e.p.value)] if e.p else []
+    return out
 
 
 def _apart(sensor: SensorBase, poles: Complex) -> SensorBase:
@@ -198,7 +233,10 @@ def _apart(sensor: SensorBase, poles: Complex) -> SensorBase:
         distance[np.arange(q.size), poles.size + np.arange(q.size)] = np.inf
         if not np.any(distance < APART * np.abs(q)[:, None]):
             break
-        changes: dict[str, object] = {"highpass_hz": sensor.highpass_hz * (1 + 2 * APART)}
+        changes: dict[str, object] = {
+            "highpass_hz": sensor.highpass_hz * (1 + 2 * APART),
+            "lag": sensor.lag * (1 + 3 * APART),
+        }
         if sensor.antialias:
             corner = sensor.antialias.corner_hz * (1 + 5 * APART)
             changes["antialias"] = sensor.antialias.model_copy(update={"corner_hz": corner})

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samii_rig.model.lanes import LANES, part
-from samii_rig.types import Float, Int
+from samii_rig.types import Complex, Float, Int
 
 # Register rows. X: w1 theta1 M1 V1 w2 M2 V2 (complex) and theta2, which is 0 between elements.
 X = 0
@@ -44,7 +44,7 @@ RESULT = FREE + 44  # up to five complex results
 K = FREE + 54  # scratch, then ten complex integrals of a short beam
 ROWS = FREE + 76
 
-# Factors of a sensor's terms: 1, s^2, a spring's 1/(c s + k).
+# Factors of a sensor's terms: 1, s^2, the compliance of a spring or hinge.
 ONE, ACCELERATION, COMPLIANCE = 0, 1, 2
 
 # Columns change places when column 2 has a pivot more than 100 times that of column 1:
@@ -52,8 +52,11 @@ ONE, ACCELERATION, COMPLIANCE = 0, 1, 2
 EXCHANGE = 100.0**2
 HUGE = 1e60  # columns are rescaled when the square of a pivot leaves 1/HUGE to HUGE
 
-IDENTITY, LINK, SPRING, BEAM_KIND = 0, 1, 2, 3
+# From SPRING on an element changes the basis. A JUMP has one of the pairs of `laws` but
+# THETA_M, which is a HINGE; WAVES is any 4x4 matrix in the form of `timoshenko`.
+IDENTITY, LINK, SPRING, HINGE, JUMP, BEAM_KIND, WAVES = 0, 1, 2, 3, 4, 5, 6
 FREE_END, PINNED, CLAMPED = 0, 1, 2
+THETA_M, W_V, M_THETA, V_W = 0, 1, 2, 3  # (state that jumps, state that makes it jump)
 
 Flag = NDArray[np.bool_]
 
@@ -61,21 +64,41 @@ Flag = NDArray[np.bool_]
 class System(NamedTuple):
     """A compiled chain, made by `chain.compile_chain`.
 
-    kinds (n_op,), pars (n_op, 5) : the elements, their parameters in the schema's order.
+    kinds (n_op,), pars (n_op, 7) : the elements, their parameters in the schema's order.
+    place (n_op, 2) : of a point element its pair and its row in `Factors.jump`, of WAVES -1
+        and its row in `Factors.matrix`.
     ends (2,) : boundary condition of base and tip.
-    source (n_source, 2) : element and actuator of each angular velocity source.
+    source (n_source, 2) : port and actuator of each source; source_c (n_source, 5) the
+        sensor its jump is dual to, and its K.
     feed (n_sensor, n_source) : what a sensor reads of the source's own jump.
-    term (n_term, 4) : sensor, port, kind of factor, spring of each term of the sensors, in
-        the sensors' order; term_c (n_term, 4) its coefficients on w, theta, M, V.
+    term (n_term, 4) : sensor, port, kind of factor, spring or hinge of each term of the
+        sensors, in the sensors' order; term_c (n_term, 4) its coefficients on w, theta, M, V.
     """
 
     kinds: Int
     pars: Float
+    place: Int
     ends: Int
     source: Int
+    source_c: Float
     feed: Float
     term: Int
     term_c: Float
+
+
+class Factors(NamedTuple):
+    """What depends on s, at the n values of one call, made by `factors.bind`.
+
+    jump (n_jump, n), matrix (n_matrix, 2, 34, n) : x of `laws`, and `timoshenko.matrix`.
+    drive (n_source, n) : f of each source, its jump at K = 1.
+    jump_d (n_jump, 7, n), drive_d (n_source, n_par, n) : their derivatives, for gradients.
+    """
+
+    jump: Complex
+    matrix: Complex
+    drive: Complex
+    jump_d: Complex
+    drive_d: Complex
 
 
 class Work(NamedTuple):

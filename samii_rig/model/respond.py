@@ -10,7 +10,12 @@ import math
 
 import numpy as np
 
-from samii_rig.model.adjoint import element_parameters, element_states, source_parameters
+from samii_rig.model.adjoint import (
+    element_parameters,
+    element_states,
+    keep_waves,
+    source_parameters,
+)
 from samii_rig.model.block import block, recall_beam
 from samii_rig.model.lanes import LANES, conj, get, kernel, norm2, part, put, scaled
 from samii_rig.model.registers import (
@@ -24,8 +29,8 @@ from samii_rig.model.registers import (
     SCALE,
     SPRING,
     B,
+    Factors,
     Flag,
-    S,
     System,
     Work,
     Z,
@@ -34,7 +39,7 @@ from samii_rig.model.registers import (
 from samii_rig.model.solve import (
     port_state,
     read_sensors,
-    set_source_factor,
+    set_factor,
     set_term_factor,
     solve,
 )
@@ -43,63 +48,78 @@ from samii_rig.types import Complex, Float, Int
 RESPOND, FIELD, CHARACTERISTIC = 0, 1, 2
 _NO_FLOAT = np.zeros(0)
 _NO_COMPLEX = np.zeros(0, complex)
+_NO_STATES = np.zeros((0, 0, 0, 0), complex)
+_NO_INT = np.zeros((0, 0), np.int64)
 
 
-def gradient(x: System, s: Complex, slots: Int, H: Complex, dH: Complex) -> None:
+def gradient(
+    x: System, f: Factors, s: Complex, slots: Int, source_slots: Int, H: Complex, dH: Complex
+) -> tuple[Complex, Complex]:
     """Add the response of all sensors to all actuators to H (n, n_sensor, n_actuator), and
     its derivatives to dH (n, n_sensor, n_actuator, n_wanted).
 
-    slots (n_op, 5): where in dH the derivative by this parameter of this element goes
-    (added, as the parts of a divided beam share theirs), -1 for nowhere.
+    slots (n_op, 7), source_slots (n_source, n_par): where in dH the derivative by this
+    parameter of this element or source goes (added, as the parts of a divided beam share
+    theirs), -1 for nowhere.
+
+    What WAVES add is left to the caller: returned are the states behind (4) and before (4)
+    each, (n_matrix, n, 8, n_source) at unit f and K, and those of the sensors' dual solutions,
+    (n_matrix, n, 8, n_sensor).
     """
+    n_sensor, n_source = x.feed.shape
+    z = np.zeros((f.matrix.shape[0], s.size, 8, n_source), complex)
+    zh = np.zeros((f.matrix.shape[0], s.size, 8, n_sensor), complex)
     _run(
-        x, s, RESPOND, slots, np.zeros(0, np.int64), np.zeros((0, 4)), False,
-        H, dH, np.zeros((0, 0, 0, 0), complex), _NO_COMPLEX, _NO_FLOAT,
+        x, f, s, RESPOND, slots, source_slots, np.zeros(0, np.int64), np.zeros((0, 4)),
+        H, dH, z, zh, _NO_COMPLEX, _NO_FLOAT,
+    )  # fmt: skip
+    return z, zh
+
+
+def response(x: System, f: Factors, s: Complex, H: Complex) -> None:
+    """`gradient` without derivatives."""
+    _run(
+        x, f, s, RESPOND, np.full((x.kinds.shape[0], 7), -1), np.full((x.source.shape[0], 1), -1),
+        np.zeros(0, np.int64), np.zeros((0, 4)), H, np.zeros((*H.shape, 0), complex),
+        _NO_STATES, _NO_STATES, _NO_COMPLEX, _NO_FLOAT,
     )  # fmt: skip
 
 
-def response(x: System, s: Complex, H: Complex) -> None:
-    """`gradient` without derivatives."""
-    gradient(x, s, np.full((x.kinds.shape[0], 5), -1), H, np.zeros((*H.shape, 0), complex))
-
-
-def fields(x: System, s: Complex, jumps: Int, jump_c: Float, out: Complex) -> None:
+def fields(x: System, f: Factors, s: Complex, jumps: Int, jump_c: Float, out: Complex) -> None:
     """out (n, n_jump, n_op + 1, 4): the states at all ports for jumps at ports `jumps`.
 
     jump_c (n_jump, 4): the sensor to which each is dual, see `solve`. At the jump's own
     port the state upstream of it.
     """
     _run(
-        x, s, FIELD, np.zeros((0, 5), np.int64), jumps, jump_c, False,
-        np.zeros((0, 0, 0), complex), np.zeros((0, 0, 0, 0), complex), out,
-        _NO_COMPLEX, _NO_FLOAT,
+        x, f, s, FIELD, _NO_INT, _NO_INT, jumps, jump_c,
+        np.zeros((0, 0, 0), complex), _NO_STATES, out, _NO_STATES, _NO_COMPLEX, _NO_FLOAT,
     )  # fmt: skip
 
 
-def characteristic(x: System, s: Complex, clear: bool, mantissa: Complex, log: Float) -> None:
-    """mantissa exp(log) = D(s): the tip's conditions on the columns from the base.
-
-    clear: times (1 + c s / k) for every spring.
-    """
+def characteristic(x: System, f: Factors, s: Complex, mantissa: Complex, log: Float) -> None:
+    """mantissa exp(log) = D(s), the tip's conditions on the columns from the base; still times
+    E1 E2 of every WAVES."""
     _run(
-        x, s, CHARACTERISTIC, np.zeros((0, 5), np.int64), np.zeros(0, np.int64), np.zeros((0, 4)),
-        clear, np.zeros((0, 0, 0), complex), np.zeros((0, 0, 0, 0), complex),
-        np.zeros((0, 0, 0, 0), complex), mantissa, log,
+        x, f, s, CHARACTERISTIC, _NO_INT, _NO_INT, np.zeros(0, np.int64), np.zeros((0, 4)),
+        np.zeros((0, 0, 0), complex), _NO_STATES, _NO_STATES, _NO_STATES, mantissa, log,
     )  # fmt: skip
 
 
 @kernel
 def _run(
     x: System,
+    f: Factors,
     s: Complex,
     task: int,
     slots: Int,
+    source_slots: Int,
     jumps: Int,
     jump_c: Float,
-    clear: bool,
     H: Complex,
     dH: Complex,
     out: Complex,
+    duals: Complex,
     mantissa: Complex,
     log: Float,
 ) -> None:
@@ -119,7 +139,7 @@ def _run(
             elements[e] = x.kinds[e] != IDENTITY and slots[e].max() >= 0
             if elements[e]:
                 wanted[e + 1] = True
-                wanted[e] |= x.kinds[e] == BEAM_KIND
+                wanted[e] |= x.kinds[e] >= BEAM_KIND
     else:
         wanted[:] = True
     adjoint = elements.any()
@@ -134,36 +154,40 @@ def _run(
         if wanted[port]:
             low, high = min(low, port), max(high, port)
     for start in range(0, s.shape[0], LANES):
-        n = block(x, k, s, start, first, last, wanted)
+        n = block(x, f, k, s, start, first, last, wanted)
         if task == CHARACTERISTIC:
-            _characteristic(x, k, start, n, clear, mantissa, log)
+            _characteristic(x, k, start, n, mantissa, log)
         elif task == FIELD:
             _fields(x, k, start, n, jumps, jump_c, wanted, out)
         else:
             for source in range(n_source):
                 jump = x.source[source, 0]
-                set_source_factor(x, k.W, jump)
-                # A unit jump of theta is dual to minus the moment.
-                solve(x, k, jump, np.array([0.0, 0.0, -1.0, 0.0]), low, high, wanted)
-                read_sensors(x, k, source, answers)
+                set_factor(k.W, f.drive[source], start)
+                solve(x, k, jump, x.source_c[source, :4], low, high, wanted)
+                read_sensors(x, f, k, source, answers, start)
                 _store_answers(x, source, answers, n, H[start:])
-                if slots[jump].max() >= 0:
-                    source_parameters(x, k.W, source, answers, slots[jump], n, dH[start:])
+                if source_slots[source].max() >= 0:
+                    slot = source_slots[source]
+                    source_parameters(
+                        x.source[source, 1], f.drive_d[source], answers, slot, start, n, dH[start:]
+                    )
                 if adjoint:
                     element_states(x, k, elements, jump, False, z[source])
             if adjoint:
                 for t in range(n_term):
                     jump = x.term[t, 1]
-                    set_term_factor(x, k.W, t)
+                    set_term_factor(x, f.jump, k.W, t, start)
                     solve(x, k, jump, x.term_c[t], low, high, wanted)
                     more = t > 0 and x.term[t, 0] == x.term[t - 1, 0]
                     element_states(x, k, elements, jump, more, zh[x.term[t, 0]])
-                element_parameters(x, k, elements, slots, z, zh, n, dH[start:])
+                element_parameters(x, f.jump_d, k, elements, slots, z, zh, start, n, dH[start:])
+                keep_waves(x, elements, z, start, n, out)
+                keep_waves(x, elements, zh, start, n, duals)
 
 
 @part
 def _store_answers(x: System, source: int, answers: Float, n: int, H: Complex) -> None:
-    K = x.pars[x.source[source, 0], 0]
+    K = x.source_c[source, 4]
     actuator = x.source[source, 1]
     for j in range(answers.shape[0]):
         for i in range(n):
@@ -187,9 +211,7 @@ def _fields(
 
 
 @part
-def _characteristic(
-    x: System, k: Work, start: int, n: int, clear: bool, mantissa: Complex, log: Float
-) -> None:
+def _characteristic(x: System, k: Work, start: int, n: int, mantissa: Complex, log: Float) -> None:
     n_op = x.kinds.shape[0]
     X = k.columns_p[n_op]
     for i in range(n):
@@ -205,15 +227,12 @@ def _characteristic(
             continue
         if x.kinds[e] == BEAM_KIND:
             recall_beam(k, e)
-        slope = x.pars[e, 1] / x.pars[e, 0] if clear else 0.0
         for i in range(n):
             log[start + i] -= math.log(k.changes_p[e, (SCALE - B) * LANES + i])
             if x.kinds[e] == BEAM_KIND:
                 # B also holds E1 E2: its modulus goes to the scale, its phase is undone.
                 mantissa[start + i] *= conj(get(k.W, PHASE, i))
                 log[start + i] += k.W[DECAY * LANES + i]
-            else:
-                mantissa[start + i] *= 1.0 + scaled(get(k.W, S, i), slope)
     for i in range(start, start + n):
         size = math.sqrt(norm2(mantissa[i]))
         mantissa[i] = scaled(mantissa[i], 1.0 / size) if size > 0 else mantissa[i]

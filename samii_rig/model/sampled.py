@@ -17,7 +17,7 @@ import numpy as np
 
 from samii_rig.errors import InputError
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.schema import Rig, SensorBase
+from samii_rig.rig.schema import SOURCES, Parameter, Rig, SensorBase
 from samii_rig.types import Complex, Float
 
 ALIAS_TOLERANCE = 1e-5  # of each response, change by the last doubling of the aliases
@@ -34,15 +34,16 @@ def hold_response(frequency_hz: Float, rate_hz: float, delay: float = 0.0) -> Co
 
 
 def lowpass_poles(sensor: SensorBase) -> Complex:
-    """Poles of the sensor's anti-alias Butterworth filter, rad/s, (order,)."""
+    """Poles of the sensor's anti-alias Butterworth filter, then of its lag, rad/s."""
+    lag = np.full(1 if sensor.lag > 0 else 0, -1 / sensor.lag if sensor.lag > 0 else 0.0)
     if sensor.antialias is None:
-        return np.zeros(0, dtype=np.complex128)
+        return lag.astype(np.complex128)
     n = sensor.antialias.order
     angle = np.pi * (2 * np.arange(n) + n + 1) / (2 * n)
     unit = np.exp(1j * angle)
     if n % 2:
         unit[n // 2] = -1.0  # the odd one is real; rounding would leave it beside the axis
-    return np.asarray(2 * np.pi * sensor.antialias.corner_hz * unit)
+    return np.append(2 * np.pi * sensor.antialias.corner_hz * unit, lag)
 
 
 def filter_poles(sensor: SensorBase) -> Complex:
@@ -54,9 +55,9 @@ def filter_poles(sensor: SensorBase) -> Complex:
 
 
 def filter_response(sensor: SensorBase, s: Complex) -> Complex:
-    """Anti-alias filter times high-pass s/(s + w_hp) at complex s, without the delay."""
+    """gain times anti-alias filter, lag and high-pass s/(s + w_hp) at complex s, no delay."""
     s = np.asarray(s, dtype=np.complex128)
-    value = np.ones_like(s)
+    value = np.full_like(s, sensor.gain)
     for q in lowpass_poles(sensor):
         value = value * (-q / (s - q))
     if sensor.highpass_hz > 0:
@@ -75,7 +76,7 @@ def filter_residues(sensor: SensorBase) -> Complex:
     if corner > 0:
         out = [r * q / (q + corner) for r, q in zip(out, low, strict=True)]
         out.append(-corner * np.prod(-low / (-corner - low)))
-    return np.array(out, dtype=np.complex128)
+    return sensor.gain * np.array(out, dtype=np.complex128)
 
 
 def sensor_response(sensors: Sequence[SensorBase], frequency_hz: Float) -> Complex:
@@ -84,6 +85,31 @@ def sensor_response(sensors: Sequence[SensorBase], frequency_hz: Float) -> Compl
     s = np.asarray(2j * np.pi * f, dtype=np.complex128)
     columns = [filter_response(x, s) * np.exp(-s * x.delay) for x in sensors]
     return np.stack(columns, axis=1)
+
+
+def dead_time(rig: Rig) -> Float:
+    """(n_input,) s by which the sources of each actuator are late.
+
+    Raises InputError if sources of one actuator differ: that is no delay of the input.
+    """
+    out = []
+    for actuator in rig.actuator:
+        own = {
+            e.tau.value for e in rig.element if isinstance(e, SOURCES) and e.input == actuator.name
+        }
+        if len(own) != 1:
+            raise InputError(
+                rig.name, f"{actuator.name}: tau", sorted(own), "one value for all its sources"
+            )
+        out.append(own.pop())
+    return np.array(out)
+
+
+def immediate(rig: Rig) -> Rig:
+    """The same rig, its sources without dead time."""
+    none = {"tau": Parameter(value=0.0, unit="s", source="left out")}
+    elements = (e.model_copy(update=none) if isinstance(e, SOURCES) else e for e in rig.element)
+    return rig.model_copy(update={"element": tuple(elements)})
 
 
 def feedthrough(chain: Chain) -> Float:
@@ -146,12 +172,15 @@ def _half_jumps(rig: Rig, chain: Chain, f: Float) -> Complex:
 
     A Fourier sum gives the mean of both sides of a jump; the sample is the side before it.
     """
-    D = feedthrough(chain)
+    late = dead_time(rig)
+    D = feedthrough(Chain(immediate(rig)) if late.any() else chain)
     out = np.zeros((f.size, len(rig.sensor), len(rig.actuator)), dtype=np.complex128)
     for i, sensor in enumerate(rig.sensor):
         for j, actuator in enumerate(rig.actuator):
-            periods = (actuator.delay + sensor.delay) * rig.rate_hz
-            if sensor.antialias is None and abs(periods - round(periods)) < 1e-9:
+            periods = (actuator.delay + late[j] + sensor.delay) * rig.rate_hz
+            if lowpass_poles(sensor).size == 0 and abs(periods - round(periods)) < 1e-9:
                 lag = np.exp(-2j * np.pi * f * round(periods) / rig.rate_hz)
-                out[:, i, j] = D[i, j] / 2 * lag * (1 - np.exp(-2j * np.pi * f / rig.rate_hz))
+                out[:, i, j] = (
+                    sensor.gain * D[i, j] / 2 * lag * (1 - np.exp(-2j * np.pi * f / rig.rate_hz))
+                )
     return out

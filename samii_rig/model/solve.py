@@ -24,11 +24,13 @@ from samii_rig.model.registers import (
     FACTOR,
     FLAG,
     GAMMA,
+    HINGE,
     OUT,
     RHO,
     SCALE,
     SPRING,
     B,
+    Factors,
     Flag,
     S,
     System,
@@ -36,25 +38,26 @@ from samii_rig.model.registers import (
     X,
     Z,
 )
-from samii_rig.types import Float
+from samii_rig.types import Complex, Float
 
 
 @part
-def set_source_factor(x: System, W: Float, e: int) -> None:
-    """FACTOR = p / (s (s + p)) of source element e, at K = 1 (paper 2, eq. 1)."""
-    p = x.pars[e, 1]
+def set_factor(W: Float, values: Complex, start: int) -> None:
+    """FACTOR = values[start:], the last one repeated."""
+    last = values.shape[0] - 1
     for i in range(LANES):
-        s = get(W, S, i)
-        put(W, FACTOR, i, scaled(inverse(s * complex(s.real + p, s.imag)), p))
+        put(W, FACTOR, i, values[min(start + i, last)])
 
 
 @part
-def set_term_factor(x: System, W: Float, t: int) -> None:
-    """FACTOR of term t: 1, s^2 or the compliance 1/(c s + k) of a spring."""
+def set_term_factor(x: System, jump: Complex, W: Float, t: int, start: int) -> None:
+    """FACTOR of term t: 1, s^2 or the compliance of a spring or hinge."""
     kind, spring = x.term[t, 2], x.term[t, 3]
     if kind == ACCELERATION:
         for i in range(LANES):
             put(W, FACTOR, i, get(W, S + 2, i))
+    elif kind == COMPLIANCE and x.kinds[spring] == HINGE:
+        set_factor(W, jump[x.place[spring, 1]], start)
     elif kind == COMPLIANCE:
         k, c = x.pars[spring, 0], x.pars[spring, 1]
         for i in range(LANES):
@@ -93,7 +96,7 @@ def _coefficients(W: Float, p: Float, q: Float, c: Float) -> None:
 @part
 def _carry(c: Float, kind: int, change: Float) -> None:
     """The two coefficients c (4 rows), from behind an element to before it."""
-    if kind == SPRING:
+    if kind in (SPRING, HINGE):
         for i in range(LANES):
             a, b = get(c, 0, i), get(c, 2, i)
             flag = change[(FLAG - B) * LANES + i]
@@ -179,10 +182,16 @@ def _read(W: Float, columns: Float, coefficients: Float, c: Float, mirrored: boo
         y2 = scaled(get(columns, X + 8, i), cw) + scaled(get(columns, X + 10, i), cM)
         y = y1 * get(coefficients, 0, i) + y2 * get(coefficients, 2, i)
         put(W, OUT, i, get(W, OUT, i) + y * get(W, FACTOR, i))
+    cV = -c[3] if mirrored else c[3]
+    if cV != 0.0:  # only at the root of a branch
+        for i in range(LANES):
+            y = get(columns, X + 6, i) * get(coefficients, 0, i)
+            y += get(columns, X + 12, i) * get(coefficients, 2, i)
+            put(W, OUT, i, get(W, OUT, i) + scaled(y, cV) * get(W, FACTOR, i))
 
 
 @part
-def read_sensors(x: System, k: Work, source: int, answers: Float) -> None:
+def read_sensors(x: System, f: Factors, k: Work, source: int, answers: Float, start: int) -> None:
     """answers (n_sensor, 2 LANES): every sensor's answer to the solved source (K = 1)."""
     W = k.W
     jump = x.source[source, 0]
@@ -190,12 +199,12 @@ def read_sensors(x: System, k: Work, source: int, answers: Float) -> None:
     for sensor in range(x.feed.shape[0]):
         feed = x.feed[sensor, source]
         if feed != 0.0:
-            set_source_factor(x, W, jump)
+            set_factor(W, f.drive[source], start)
         for i in range(2 * LANES):
             W[OUT * LANES + i] = W[FACTOR * LANES + i] * feed
         while t < x.term.shape[0] and x.term[t, 0] == sensor:
             port = x.term[t, 1]
-            set_term_factor(x, W, t)
+            set_term_factor(x, f.jump, W, t, start)
             mirrored = port > jump
             columns = k.columns_q[port] if mirrored else k.columns_p[port]
             coefficients = k.gammas[port] if mirrored else k.alphas[port]

@@ -22,167 +22,82 @@ U^-1 is the U of the mirrored element.
 
 from __future__ import annotations
 
-from samii_rig.model.lanes import (
-    LANES,
-    TINY,
-    conj,
-    get,
-    inverse,
-    norm2,
-    part,
-    pick,
-    put,
-    scaled,
-)
+from samii_rig.model.basis import exchange, restore
+from samii_rig.model.lanes import LANES, TINY, conj, get, norm2, part, pick, put, scaled
+from samii_rig.model.points import hinge, jump, link, spring
 from samii_rig.model.registers import (
     BEAM,
     BEAM_KIND,
-    CLAMPED,
     EXCHANGE,
     FLAG,
-    FREE_END,
-    HUGE,
+    HINGE,
     IS_LONG,
+    JUMP,
     LINK,
     LONG,
     MIXED,
-    NUMERATOR,
-    RHO,
-    SCALE,
     SHORT,
     SPRING,
     THETA2,
-    X_ROWS,
+    WAVES,
     B,
+    Factors,
     S,
     X,
     Y,
 )
-from samii_rig.types import Float
-
-# Rows of columns 1 and 2, of X and of B.
-_PAIRS = ((X, X + 8), (X + 2, THETA2), (X + 4, X + 10), (X + 6, X + 12), (B, B + 2), (B + 4, B + 6))
+from samii_rig.types import Complex, Float, Int
 
 
 @part
-def boundary(W: Float, kind: int) -> None:
-    """The two columns of an end: w = theta = 0 clamped, w = M = 0 pinned, M = V = 0 free."""
-    # The sign makes det[column 1, column 2] that of (w, theta) in this order.
-    one = X + 4 if kind == CLAMPED else X + 2
-    two, value = (X + 8, -1.0) if kind == FREE_END else (X + 12, 1.0)
-    for i in range(X_ROWS * LANES):
-        W[X * LANES + i] = 0.0
+def waves(W: Float, m: Complex, start: int) -> None:
+    """Carry X over a matrix given by its waves, as `long_beam`; m (34, n) see `timoshenko`."""
+    last = m.shape[1] - 1
+    swaps = 0
     for i in range(LANES):
-        W[one * LANES + i] = 1.0
-    for i in range(LANES):
-        W[two * LANES + i] = value
-
-
-@part
-def link(W: Float, L: float, r: float, m: float, inertia: float) -> None:
-    """Carry X over a rigid link; see `elements.rigid_link_matrix`."""
-    for i in range(LANES):
-        s2 = get(W, S + 2, i)
-        theta1 = get(W, X + 2, i)
-        w1, V1 = get(W, X, i), get(W, X + 6, i)
-        w2, V2 = get(W, X + 8, i), get(W, X + 12, i)
-        ms2 = scaled(s2, m)
-        A1 = ms2 * (w1 + scaled(theta1, r))
-        A2 = ms2 * w2
-        put(W, X, i, w1 + scaled(theta1, L))
-        M1 = get(W, X + 4, i) + scaled(V1, L) - scaled(A1, L - r)
-        put(W, X + 4, i, M1 + scaled(s2, inertia) * theta1)
-        put(W, X + 6, i, V1 - A1)
-        put(W, X + 10, i, get(W, X + 10, i) + scaled(V2, L) - scaled(A2, L - r))
-        put(W, X + 12, i, V2 - A2)
-
-
-@part
-def _awkward(a: complex, b: complex) -> bool:
-    """Should the columns be exchanged or scaled, for pivots a and b of columns 1 and 2?"""
-    size = norm2(a)
-    return (norm2(b) > EXCHANGE * size) | (size > HUGE) | (size < 1.0 / HUGE)
-
-
-@part
-def _exchange(W: Float, a: int, b: int, scaling: bool) -> None:
-    """Make the column with the larger of the pivots in rows a and b column 1, of size 1.
-
-    Columns (1, 2) become (2, -1), which keeps the determinant. Sets FLAG and SCALE.
-    Lane by lane and with branches, as few need it.
-    """
-    for i in range(LANES):
-        x, y = get(W, a, i), get(W, b, i)
-        flag = norm2(y) > EXCHANGE * norm2(x)
-        pivot = y if flag else x
-        size = abs(pivot.real) + abs(pivot.imag)
-        scale = 1.0 / size if scaling and size > 0 else 1.0
-        W[FLAG * LANES + i] = 1.0 if flag else 0.0
-        W[SCALE * LANES + i] = scale
-        for one, other in _PAIRS:
-            x, y = get(W, one, i), get(W, other, i)
-            if flag:
-                x, y = y, -x
-            put(W, one, i, scaled(x, scale))
-            put(W, other, i, y)
-
-
-@part
-def spring(W: Float, k: float, c: float) -> None:
-    """Carry X over theta+ = theta- + C M, C = 1/(c s + k), and restore theta2 = 0.
-
-    Behind the spring the columns' rotations are theta1 + C M1 and C M2; column 2 less
-    rho times column 1 has none. Its moment, a difference of large numbers if computed so,
-    is M2 theta1 over the pivot's rotation.
-    """
-    awkward = 0
-    for i in range(LANES):
-        s = get(W, S, i)
-        C = inverse(complex(k + c * s.real, c * s.imag))
-        theta1, M1, M2 = get(W, X + 2, i), get(W, X + 4, i), get(W, X + 10, i)
-        t1 = theta1 + C * M1
-        t2 = C * M2
-        put(W, NUMERATOR, i, M2 * theta1)
-        put(W, X + 2, i, t1)
-        put(W, THETA2, i, t2)
-        awkward += _awkward(t1, t2)
-    if awkward > 0:
-        _exchange(W, X + 2, THETA2, True)
+        n = min(start + i, last)
+        w, t, M, V = get(W, X, i), get(W, X + 2, i), get(W, X + 4, i), get(W, X + 6, i)
+        a1 = m[0, n] * w + m[1, n] * t + m[2, n] * M + m[3, n] * V
+        put(W, X, i, a1)
+        for k in range(1, 4):
+            r = 4 * k
+            y = m[r, n] * w + m[r + 1, n] * t + m[r + 2, n] * M + m[r + 3, n] * V
+            put(W, X + 2 * k, i, y)
+        w, M, V = get(W, X + 8, i), get(W, X + 10, i), get(W, X + 12, i)
+        a2 = m[0, n] * w + m[2, n] * M + m[3, n] * V
+        put(W, X + 8, i, a2)
+        put(W, THETA2, i, m[4, n] * w + m[6, n] * M + m[7, n] * V)
+        put(W, X + 10, i, m[8, n] * w + m[10, n] * M + m[11, n] * V)
+        put(W, X + 12, i, m[12, n] * w + m[14, n] * M + m[15, n] * V)
+        swaps += norm2(a2) > EXCHANGE * norm2(a1)
+    if swaps > 0:
+        exchange(W, X, X + 8, False)
     else:
         for i in range(LANES):
             W[FLAG * LANES + i] = 0.0
-            W[SCALE * LANES + i] = 1.0
     for i in range(LANES):
-        t = get(W, X + 2, i)
-        scale = W[SCALE * LANES + i]
-        divide = scaled(conj(t), 1.0 / (norm2(t) + TINY))
-        rho = get(W, THETA2, i) * divide
-        put(W, X + 8, i, get(W, X + 8, i) - rho * get(W, X, i))
-        # The pivot has been scaled, the numerator not.
-        put(W, X + 10, i, scaled(get(W, NUMERATOR, i) * divide, scale))
-        put(W, X + 12, i, get(W, X + 12, i) - rho * get(W, X + 6, i))
-        put(W, RHO, i, rho)
-
-
-@part
-def restore(W: Float) -> None:
-    """Restore theta2 = 0 behind a beam and complete its B."""
-    awkward = 0
-    for i in range(LANES):
-        awkward += _awkward(get(W, X + 2, i), get(W, THETA2, i))
-    if awkward > 0:
-        _exchange(W, X + 2, THETA2, True)
-    else:
-        for i in range(LANES):
-            W[SCALE * LANES + i] = 1.0
-    for i in range(LANES):
-        t = get(W, X + 2, i)
-        rho = get(W, THETA2, i) * scaled(conj(t), 1.0 / (norm2(t) + TINY))
-        put(W, X + 8, i, get(W, X + 8, i) - rho * get(W, X, i))
-        put(W, X + 10, i, get(W, X + 10, i) - rho * get(W, X + 4, i))
-        put(W, X + 12, i, get(W, X + 12, i) - rho * get(W, X + 6, i))
-        put(W, B + 2, i, get(W, B + 2, i) - rho * get(W, B, i))
-        put(W, B + 6, i, get(W, B + 6, i) - rho * get(W, B + 4, i))
+        n = min(start + i, last)
+        E1, E2 = m[32, n], m[33, n]
+        a, b, c, d = get(W, X, i), get(W, X + 2, i), get(W, X + 4, i), get(W, X + 6, i)
+        rho = get(W, X + 8, i) * scaled(conj(a), 1.0 / (norm2(a) + TINY))
+        bo = get(W, THETA2, i) - rho * b
+        co = get(W, X + 10, i) - rho * c
+        do = get(W, X + 12, i) - rho * d
+        b, c, d = b * (E1 * E1), c * (E1 / E2), d * (E1 * E2)
+        bo, do = bo * (E1 * E2), do * (E2 * E2)
+        for k in range(4):
+            r = 16 + 4 * k
+            put(W, X + 2 * k, i, m[r, n] * a + m[r + 1, n] * b + m[r + 2, n] * c + m[r + 3, n] * d)
+        put(W, X + 8, i, m[17, n] * bo + m[18, n] * co + m[19, n] * do)
+        put(W, THETA2, i, m[21, n] * bo + m[22, n] * co + m[23, n] * do)
+        put(W, X + 10, i, m[25, n] * bo + m[26, n] * co + m[27, n] * do)
+        put(W, X + 12, i, m[29, n] * bo + m[30, n] * co + m[31, n] * do)
+        flag = W[FLAG * LANES + i]
+        keep = 1.0 - flag
+        put(W, B, i, scaled(E1, keep))
+        put(W, B + 2, i, complex(-flag - keep * rho.real, -keep * rho.imag) * E2)
+        put(W, B + 4, i, scaled(E1, flag))
+        put(W, B + 6, i, complex(keep - flag * rho.real, -flag * rho.imag) * E2)
 
 
 @part
@@ -258,7 +173,7 @@ def long_beam(W: Float) -> None:
         put(W, X + 12, i, pick(upper, c, d))
         swaps += norm2(a2) > EXCHANGE * norm2(a1)
     if swaps > 0:
-        _exchange(W, X, X + 8, False)
+        exchange(W, X, X + 8, False)
     else:
         for i in range(LANES):
             W[FLAG * LANES + i] = 0.0
@@ -310,7 +225,9 @@ def _keep_short(W: Float) -> None:
 
 
 @part
-def step(W: Float, kind: int, par: Float, mirrored: bool, regime: int) -> bool:
+def step(
+    W: Float, kind: int, par: Float, place: Int, f: Factors, mirrored: bool, regime: int, start: int
+) -> bool:
     """Carry X over one element; True if that changed the basis."""
     if kind == LINK:
         r = par[0] - par[1] if mirrored else par[1]
@@ -318,6 +235,16 @@ def step(W: Float, kind: int, par: Float, mirrored: bool, regime: int) -> bool:
         return False
     if kind == SPRING:
         spring(W, par[0], par[1])
+        return True
+    if kind == HINGE:
+        hinge(W, f.jump[place[1]], start)
+        return True
+    if kind == JUMP:
+        jump(W, place[0], f.jump[place[1]], start)
+        return True
+    if kind == WAVES:
+        waves(W, f.matrix[place[1], 1 if mirrored else 0], start)
+        restore(W)
         return True
     if kind == BEAM_KIND:
         # If lanes lie on both sides of the threshold, both forms; each lane keeps its own.

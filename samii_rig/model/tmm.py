@@ -12,16 +12,28 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import ValidationError
+from pydantic import BaseModel
 
 from samii_rig.errors import InputError
-from samii_rig.model import respond
-from samii_rig.model.chain import compile_chain
-from samii_rig.rig.schema import Element, Rig, parameters
+from samii_rig.model import respond, timoshenko
+from samii_rig.model.chain import L_OF_BEAM, compile_chain
+from samii_rig.model.factors import bind, characteristic, differentiate
+from samii_rig.model.sensing import STANDARD_GRAVITY
+from samii_rig.rig.elements import contradiction, quantities
+from samii_rig.rig.schema import (
+    Acceleration,
+    Branch,
+    Element,
+    Rig,
+    Sensor,
+    flattened,
+    parameters,
+)
 from samii_rig.types import Complex, Float
 
 State = Literal["w", "theta", "M", "V"]
@@ -38,29 +50,48 @@ _DUAL = {
 class Chain:
     """The transfer matrix model of `rig`, compiled; it never changes.
 
-    rig : the rig with the values in use.
     parameters : (element, symbol) of every physical parameter, in the file's order.
     """
 
     def __init__(self, rig: Rig) -> None:
-        self.rig = rig
+        self._rig = rig
         self._c = compile_chain(rig)
+        self._changed: dict[tuple[str, str], float] = {}
+        self._index = {key: i for i, key in enumerate(self._c.parameters)}
+        self._checks = _checks(rig)
         self.parameters = self._c.parameters
+
+    @property
+    def rig(self) -> Rig:
+        """The rig with the values in use."""
+        if self._changed:
+            self._rig, self._changed = _with(self._rig, self._changed), {}
+        return self._rig
 
     def values(self) -> Float:
         """(n_param,) the values of `parameters`, SI units."""
-        return np.array([p.value for e in self.rig.element for p in parameters(e).values()])
+        return self._c.values.copy()
 
     def with_values(self, values: Mapping[tuple[str, str], float]) -> Chain:
         """The same chain with other values of some `parameters`.
 
         Raises InputError for an unknown parameter or a value that the rig file would not allow.
         """
-        for key in values:
-            if key not in self.parameters:
-                raise InputError("with_values", ".".join(key), values[key], "a known parameter")
-        elements = tuple(_changed(element, values) for element in self.rig.element)
-        return Chain(self.rig.model_copy(update={"element": elements}))
+        new, index = self._c.values.copy(), self._index
+        for key, value in values.items():
+            if key not in index:
+                raise InputError("with_values", ".".join(key), value, "a known parameter")
+            new[index[key]] = value
+        for name in {name for name, _ in values}:
+            self._checks[name].refuse(self._c.parameters, new, values)
+        if any(index[key] in self._c.rigid for key in values):
+            return Chain(_with(self.rig, values))
+        other = Chain.__new__(Chain)
+        other._rig = self._rig
+        other._changed = {**self._changed, **values}
+        other._c = self._c.with_values(new)
+        other._index, other._checks, other.parameters = index, self._checks, self.parameters
+        return other
 
     def response(self, frequency_hz: ArrayLike) -> Complex:
         """(n_freq, n_sensor, n_actuator) response of the continuous system, SI units.
@@ -79,9 +110,9 @@ class Chain:
         not finite.
         """
         s, c = _vector(s), self._c
-        H = np.zeros((s.size, len(self.rig.sensor), len(self.rig.actuator)), complex)
+        H = np.zeros((s.size, len(self._rig.sensor), len(self._rig.actuator)), complex)
         if s.size:
-            respond.response(c.system, s, H)
+            respond.response(c.system, bind(c, s), s, H)
         return H
 
     def gradient(
@@ -102,16 +133,25 @@ class Chain:
             if key not in self.parameters or key in keys[:i]:
                 raise InputError("gradient", "wrt", ".".join(key), "known parameters, each once")
             place[self.parameters.index(key)] = i
-        H = np.zeros((s.size, len(self.rig.sensor), len(self.rig.actuator)), complex)
-        dH = np.zeros((*H.shape, len(keys)), complex)
-        if s.size:
-            respond.gradient(c.system, s, place[c.slots], H, dH)
+        sensors = self._rig.sensor
+        H, dH = differentiate(c, s, place, len(keys), len(sensors), len(self._rig.actuator))
         for sensor, port, parameter in c.at_end:
             # The kernel moves this one along with the beam's end.
             if s.size and place[parameter] >= 0:
-                theta = self.field_at(s)[:, :, port, 1]
-                dH[:, sensor, :, place[parameter]] -= (s**2)[:, None] * theta
+                z = self.field_at(s)[:, :, port]
+                slope, bend = self._end_slopes(s, parameter, z)
+                moved = (s**2)[:, None] * slope + _tilt(sensors[sensor]) * bend
+                dH[:, sensor, :, place[parameter]] -= moved
         return H, dH
+
+    def _end_slopes(self, s: Complex, parameter: int, z: Complex) -> tuple[Complex, Complex]:
+        """w' and theta' at the end of the beam whose L the parameter is."""
+        c = self._c
+        e = int(np.flatnonzero(c.slots[:, L_OF_BEAM] == parameter)[-1])
+        p = c.system.pars[e].copy()
+        if c.kinds[e] == "beam":
+            p[timoshenko.GA] = math.inf
+        return timoshenko.end_slopes(s, p, z)
 
     def characteristic(self, s: ArrayLike, clear: bool = False) -> tuple[Complex, Float]:
         """D(s) = mantissa * exp(log_scale), each of shape (n,); |mantissa| is 1, or 0 at a root.
@@ -121,18 +161,16 @@ class Chain:
         s = 0 and s = -p of a source). It is real on the real axis and conjugate symmetric;
         analytic but for
 
-        - a simple pole at s = -k/c of each spring with c > 0; `clear` multiplies it out
-          (by 1 + c s/k), and D is then free of it,
+        - a simple pole at s = -k/c of each spring with c > 0, the poles of tanh of each
+          hydraulic line and those of each branch with its root clamped; `clear` multiplies
+          them out (by 1 + c s/k, c s/c for k = 0, cosh, the branch's own D), and D is then
+          free of them,
         - an essential singularity at s = -1/tau of each beam with tau > 0, where poles of
           the response accumulate; nothing removes it, so stay right of it,
         - a jump across the real axis if a beam has eta > 0 (a constant loss factor is not
           causal).
         """
-        s, c = _vector(s), self._c
-        mantissa, log_scale = np.zeros(s.size, complex), np.zeros(s.size)
-        if s.size:
-            respond.characteristic(c.system, s, clear, mantissa, log_scale)
-        return mantissa, log_scale
+        return characteristic(self._c, _vector(s), clear)
 
     def places(
         self, positions: Mapping[str, Sequence[float]] | None = None
@@ -175,44 +213,102 @@ class Chain:
         """`field` at complex s. Very near a pole it is the mode shape times 1/(s - pole)."""
         s, c = _vector(s), compile_chain(self.rig, positions)
         n_port = len(c.places)
+        x, f = c.system, bind(c, s)
         if jumps is None:
-            at = [(int(port), "theta") for port in c.system.source[:, 0]]
+            ports, duals = (
+                np.ascontiguousarray(x.source[:, 0]),
+                np.ascontiguousarray(x.source_c[:, :4]),
+            )
         else:
             at = [(operator.index(port), state) for port, state in jumps]
-        for port, state in at:
-            if not 0 <= port < n_port:
-                raise InputError("field", "jumps", port, f"a port from 0 to {n_port - 1}")
-            if state not in _DUAL:
-                raise InputError("field", "jumps", state, f"one of {', '.join(_DUAL)}")
-        out = np.zeros((s.size, len(at), n_port, 4), complex)
-        if s.size and at:
+            for port, state in at:
+                if not 0 <= port < n_port:
+                    raise InputError("field", "jumps", port, f"a port from 0 to {n_port - 1}")
+                if state not in _DUAL:
+                    raise InputError("field", "jumps", state, f"one of {', '.join(_DUAL)}")
             ports = np.array([port for port, _ in at], dtype=np.int64)
-            respond.fields(c.system, s, ports, np.array([_DUAL[state] for _, state in at]), out)
+            duals = np.array([_DUAL[state] for _, state in at])
+        out = np.zeros((s.size, ports.size, n_port, 4), complex)
+        if s.size and ports.size:
+            respond.fields(x, f, s, ports, duals, out)
         if jumps is not None:
             return out
-        driven = np.zeros((s.size, len(self.rig.actuator), n_port, 4), complex)
-        for i, (e, actuator) in enumerate(c.system.source):
-            K, p = c.system.pars[e, :2]
-            driven[:, actuator] += out[:, i] * (K * p / (s * (s + p)))[:, None, None]
+        driven = np.zeros((s.size, len(self._rig.actuator), n_port, 4), complex)
+        for i, actuator in enumerate(x.source[:, 1]):
+            driven[:, actuator] += out[:, i] * (x.source_c[i, 4] * f.drive[i])[:, None, None]
         return driven
 
 
-def _changed(element: Element, values: Mapping[tuple[str, str], float]) -> Element:
-    new = {
+@dataclass(frozen=True, slots=True)
+class _Check:
+    """What the values of one element must be.
+
+    first : place of its first parameter among the chain's. reach : m, the farthest sensor on it.
+    """
+
+    kind: type[BaseModel]
+    first: int
+    symbols: tuple[str, ...]
+    reach: float
+
+    def refuse(
+        self,
+        keys: Sequence[tuple[str, str]],
+        values: Float,
+        given: Mapping[tuple[str, str], float],
+    ) -> None:
+        allowed = quantities(self.kind)
+        for i, symbol in enumerate(self.symbols):
+            key = keys[self.first + i]
+            if key in given:
+                value = float(values[self.first + i])
+                quantity = allowed.get(symbol)
+                wrong = quantity.refusal(value) if quantity else None
+                if wrong is None and not math.isfinite(value):
+                    wrong = f"value {value:g}; expected a finite number"
+                if wrong is None and symbol == "L" and value < self.reach:
+                    wrong = (
+                        f"value {value:g} m; expected at least {self.reach:g}, where a sensor is"
+                    )
+                if wrong:
+                    raise InputError.saying("with_values", ".".join(key), wrong)
+        own = dict(zip(self.symbols, values[self.first :].tolist(), strict=False))
+        wrong = contradiction(self.kind, own)
+        if wrong:
+            raise InputError.saying("with_values", keys[self.first][0], wrong)
+
+
+def _checks(rig: Rig) -> dict[str, _Check]:
+    out, first = {}, 0
+    for element in flattened(rig.element):
+        symbols = tuple(parameters(element))
+        on = [
+            x.position for x in rig.sensor if isinstance(x, Acceleration) and x.on == element.name
+        ]
+        out[element.name] = _Check(type(element), first, symbols, max(on, default=0.0))
+        first += len(symbols)
+    return out
+
+
+def _with(rig: Rig, values: Mapping[tuple[str, str], float]) -> Rig:
+    """The rig with other values, which have been checked."""
+    elements = tuple(_element_with(element, values) for element in rig.element)
+    return rig.model_copy(update={"element": elements})
+
+
+def _element_with(element: Element, values: Mapping[tuple[str, str], float]) -> Element:
+    new: dict[str, object] = {
         symbol: parameter.model_copy(update={"value": float(values[element.name, symbol])})
         for symbol, parameter in parameters(element).items()
         if (element.name, symbol) in values
     }
-    if not new:
-        return element
-    try:
-        return type(element).model_validate(element.model_copy(update=new).model_dump())
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        symbol = str(first["loc"][0])
-        message = first["msg"].removeprefix("Value error, ")
-        value = values.get((element.name, symbol))
-        raise InputError("with_values", f"{element.name}.{symbol}", value, message) from error
+    if isinstance(element, Branch):
+        new["element"] = tuple(_element_with(e, values) for e in element.element)
+    return element.model_copy(update=new) if new else element
+
+
+def _tilt(sensor: Sensor) -> float:
+    return sensor.tilt * STANDARD_GRAVITY if isinstance(sensor, Acceleration) else 0.0
 
 
 def _s(frequency_hz: ArrayLike) -> Complex:

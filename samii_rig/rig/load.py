@@ -6,7 +6,7 @@ import tomllib
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -49,7 +49,7 @@ def parse(model: type[Model], text: str, where: str) -> Model:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise _one_line(error, data, where) from error
+        raise _one_line(model, error, data, where) from error
 
 
 def load_rig(name: str) -> tuple[Rig, str]:
@@ -76,11 +76,14 @@ def load_named(
     return parse(model, text, str(path)), text
 
 
-def _one_line(error: ValidationError, data: dict[str, object], where: str) -> InputError:
+def _one_line(
+    model: type[BaseModel], error: ValidationError, data: dict[str, object], where: str
+) -> InputError:
     first = error.errors(include_url=False)[0]
     field = ""
     node: object = data
-    for key in first["loc"]:
+    last = len(first["loc"]) - 1
+    for i, key in enumerate(first["loc"]):
         if isinstance(key, int) and isinstance(node, list) and key < len(node):
             node = node[key]
             named = node.get("name") if isinstance(node, dict) else None
@@ -88,7 +91,7 @@ def _one_line(error: ValidationError, data: dict[str, object], where: str) -> In
         elif isinstance(node, dict) and key in node:
             node = node[key]
             field += f".{key}"
-        elif first["type"] == "missing":
+        elif first["type"] == "missing" and i == last:
             field += f".{key}"
         # Otherwise the key is the tag of a union, which the file does not show.
     field = field.lstrip(".")
@@ -97,7 +100,12 @@ def _one_line(error: ValidationError, data: dict[str, object], where: str) -> In
         case "value_error":
             return InputError.saying(where, field, message)
         case "missing":
-            return InputError.saying(where, field, "missing; expected a value")
+            # Of a field of the file itself that has a choice of words, the words.
+            wanted = model.model_fields.get(field)
+            words = get_args(wanted.annotation) if wanted else ()
+            choice = all(isinstance(word, str) for word in words) and words
+            expected = f"one of {', '.join(words)}" if choice else "a value"
+            return InputError.saying(where, field, f"missing; expected {expected}")
         case "extra_forbidden":
             return InputError.saying(where, field, "no such field; expected a known name")
         case "union_tag_not_found":

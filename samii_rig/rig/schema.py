@@ -1,9 +1,6 @@
 """The rig file: a serial chain, its sensors, its actuator, its limits.
 
-Every physical parameter carries its unit, its tolerance and where the number came from.
-The state vector along the chain is z = [w, theta, M, V, 1] (paper 2, eq. 8), its sign
-convention w' = theta, theta' = M/EI, M' = V, V' = -mu s^2 w (paper 1, eq. 1-5, where the
-first state is written -w).
+The elements of the chain stand in `samii_rig.rig.elements` and are found here as well.
 """
 
 from __future__ import annotations
@@ -12,117 +9,87 @@ import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    Field,
-    field_validator,
-    model_validator,
+import numpy as np
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from samii_rig.rig.elements import (
+    ANGLE_SOURCES,
+    BEAMS,
+    SOURCES,
+    AngularVelocitySource,
+    AngularVelocitySource2,
+    Beam,
+    Branch,
+    Element,
+    End,
+    Finite,
+    ForceSource,
+    GravityStiffness,
+    HydraulicLine,
+    LumpedMass,
+    Name,
+    NonNegative,
+    OilColumn,
+    Parameter,
+    Positive,
+    RigidLink,
+    Source,
+    Strict,
+    TimoshenkoBeam,
+    TorqueSource,
+    TorsionalGroundSpring,
+    TorsionalSpring,
+    TranslationalGroundSpring,
+    TranslationalSpring,
+    flattened,
+    parameters,
 )
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-
-
-class Strict(BaseModel):
-    """A table of the rig file: unknown keys are errors, values cannot be changed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="constants")
-
-
-class Parameter(Strict):
-    """A physical parameter.
-
-    tolerance : relative standard deviation of `value` as a prior, 0 for exact.
-    source : where the number came from, e.g. "[published] paper 1, Table II".
-    """
-
-    value: Finite
-    unit: str
-    tolerance: NonNegative = 0.0
-    source: str = Field(min_length=1)
-
-
-def _checked(unit: str, *, positive: bool) -> AfterValidator:
-    def check(parameter: Parameter) -> Parameter:
-        if parameter.unit != unit:
-            raise ValueError(f"unit {parameter.unit!r}; expected {unit!r}")
-        if positive and parameter.value <= 0:
-            raise ValueError(f"value {parameter.value:g} {unit}; expected more than 0")
-        if not positive and parameter.value < 0:
-            raise ValueError(f"value {parameter.value:g} {unit}; expected 0 or more")
-        return parameter
-
-    return AfterValidator(check)
-
-
-def _zero(unit: str) -> Parameter:
-    return Parameter(value=0.0, unit=unit, source="absent from the rig file: none")
-
-
-class Beam(Strict):
-    """Euler-Bernoulli beam (paper 1, eq. 1-9).
-
-    Its complex stiffness is EI (1 + j eta + s tau): `eta` is a constant loss factor
-    (not causal, so the simulated rig replaces it by a causal fit), `tau` a viscous
-    (Kelvin-Voigt) damping time, which is causal.
-    """
-
-    kind: Literal["beam"]
-    name: Name
-    EI: Annotated[Parameter, _checked("N m^2", positive=True)]
-    mu: Annotated[Parameter, _checked("kg/m", positive=True)]
-    L: Annotated[Parameter, _checked("m", positive=True)]
-    eta: Annotated[Parameter, _checked("1", positive=False)] = _zero("1")
-    tau: Annotated[Parameter, _checked("s", positive=False)] = _zero("s")
-
-
-class RigidLink(Strict):
-    """Rigid body: length L, centre of gravity r from its upstream joint, mass m,
-    second moment of inertia I about the centre of gravity."""
-
-    kind: Literal["rigid_link"]
-    name: Name
-    L: Annotated[Parameter, _checked("m", positive=False)]
-    r: Annotated[Parameter, _checked("m", positive=False)]
-    m: Annotated[Parameter, _checked("kg", positive=False)]
-    I: Annotated[Parameter, _checked("kg m^2", positive=False)]  # noqa: E741 the papers' symbol
-
-
-class TorsionalSpring(Strict):
-    """Torsional spring and damper in parallel: theta+ = theta- + M/(c s + k)."""
-
-    kind: Literal["torsional_spring"]
-    name: Name
-    k: Annotated[Parameter, _checked("N m/rad", positive=True)]
-    c: Annotated[Parameter, _checked("N m s/rad", positive=False)] = _zero("N m s/rad")
-
-
-class AngularVelocitySource(Strict):
-    """Angular velocity source with a first-order lag (paper 2, eq. 1):
-    theta+ = theta- + K p v / (s (s + p)), v the input called `input`.
-
-    The unit of K is rad/s per unit of that input, "rad/(s V)" for volts.
-    """
-
-    kind: Literal["angular_velocity_source"]
-    name: Name
-    input: Name
-    K: Parameter
-    p: Annotated[Parameter, _checked("rad/s", positive=True)]
-
-
-Element = Annotated[
-    Beam | RigidLink | TorsionalSpring | AngularVelocitySource, Field(discriminator="kind")
+__all__ = [
+    "ANGLE_SOURCES",
+    "BEAMS",
+    "SOURCES",
+    "AbsoluteAngle",
+    "Acceleration",
+    "ActuatorSpec",
+    "AngularVelocitySource",
+    "AngularVelocitySource2",
+    "AntiAlias",
+    "Beam",
+    "Branch",
+    "Centring",
+    "Device",
+    "Element",
+    "Feedback",
+    "Finite",
+    "ForceSource",
+    "GravityStiffness",
+    "HydraulicLine",
+    "Limit",
+    "LumpedMass",
+    "Moment",
+    "Name",
+    "NonNegative",
+    "OilColumn",
+    "Parameter",
+    "Positive",
+    "RelativeAngle",
+    "Rig",
+    "RigidLink",
+    "Sensor",
+    "SensorBase",
+    "Source",
+    "Strict",
+    "TimoshenkoBeam",
+    "TorqueSource",
+    "TorsionalGroundSpring",
+    "TorsionalSpring",
+    "TranslationalGroundSpring",
+    "TranslationalSpring",
+    "flattened",
+    "parameters",
+    "places",
 ]
-
-
-def parameters(element: BaseModel) -> dict[str, Parameter]:
-    """The element's physical parameters by symbol, in the order of its class."""
-    return {k: v for k, v in iter(element) if isinstance(v, Parameter)}
 
 
 class AntiAlias(Strict):
@@ -140,6 +107,8 @@ class SensorBase(Strict):
     offset : constant error in `unit`.
     low, high : ends of the converter's range in `unit`.
     highpass_hz : corner of a first-order high-pass (a piezo's), 0 for none.
+    gain : what the channel shows over what is there, 1 for a true calibration.
+    lag : s, time constant of a first-order low-pass in the sensor's chain, 0 for none.
     delay : s from the instant of sampling as stamped back to the value's own time.
     stale_after : s without a new sample after which the channel is stale.
     """
@@ -153,6 +122,8 @@ class SensorBase(Strict):
     high: float = math.inf
     highpass_hz: NonNegative = 0.0
     antialias: AntiAlias | None = None
+    gain: Finite = 1.0
+    lag: NonNegative = 0.0
     delay: NonNegative = 0.0
     stale_after: Positive = 0.05
     calibration: str = Field(default="", description="how unit and scale are known")
@@ -194,12 +165,14 @@ class AbsoluteAngle(SensorBase):
 
 
 class Acceleration(SensorBase):
-    """Lateral acceleration s^2 w at `position` metres from the upstream end of a rigid
-    link or beam."""
+    """Lateral acceleration s^2 w + tilt g theta at `position` metres from the upstream end of
+    a rigid link or beam; tilt is 1 for a sensor that turns with it in the vertical plane and
+    reads gravity as an acceleration towards positive w, -1 the other way round."""
 
     kind: Literal["acceleration"]
     on: Name
     position: NonNegative
+    tilt: Finite = 0.0
     unit: Annotated[str, _unit("m/s^2")]
 
 
@@ -269,29 +242,126 @@ class Centring(Strict):
     kp: NonNegative
 
 
+MOST_STATES = 8  # of one feedback filter; a damping loop has one to four
+Root = Finite | tuple[Finite, Finite]
+Roots = Annotated[tuple[Root, ...], Field(max_length=MOST_STATES)]
+Coefficients = Annotated[tuple[Finite, ...], Field(max_length=MOST_STATES + 1)]
+
+
+class Feedback(Strict):
+    """A loop that the device closes from a sensor to an actuator, beside the centring:
+
+        v = u + kp (theta_ref - theta) + sum over the loops of clip(F(s) y, -max, max).
+
+    F(s) = gain prod(s - zeros)/prod(s - poles) or gain numerator/denominator, one of the two
+    forms; it runs at the sample rate (`samii_rig.model.feedback`) whenever the output is live.
+
+    unit : of F(s), actuator unit per sensor unit.
+    zeros, poles : rad/s; [re, im] with im above 0 is a pair and counts its conjugate too.
+    numerator, denominator : coefficients of falling powers of s.
+    max : largest |output| of this loop, in the actuator's unit; the device clips it there.
+    """
+
+    name: Name
+    sensor: Name
+    actuator: Name
+    gain: Finite
+    unit: str
+    zeros: Roots = ()
+    poles: Roots = ()
+    numerator: Coefficients = ()
+    denominator: Coefficients = ()
+    max: Positive
+
+    def zpk(self) -> tuple[list[complex], list[complex], float]:
+        """All zeros and poles of F(s), conjugates included, and its leading gain."""
+        if not self.denominator:
+            return _conjugates(self.zeros), _conjugates(self.poles), self.gain
+        zeros = [complex(x) for x in np.roots(self.numerator)]
+        poles = [complex(x) for x in np.roots(self.denominator)]
+        return zeros, poles, self.gain * self.numerator[0] / self.denominator[0]
+
+    @model_validator(mode="after")
+    def _filter(self) -> Self:
+        if (self.zeros or self.poles) and (self.numerator or self.denominator):
+            raise ValueError("zeros and poles beside numerator and denominator; expected one form")
+        if bool(self.numerator) != bool(self.denominator):
+            raise ValueError("half of a fraction; expected numerator and denominator")
+        for name in ("numerator", "denominator"):
+            row = getattr(self, name)
+            if row and row[0] == 0:
+                raise ValueError(f"{name} {list(row)}; expected a first coefficient that is not 0")
+        zeros, poles, _ = self.zpk()
+        if len(poles) > MOST_STATES:
+            raise ValueError(f"{len(poles)} poles; expected at most {MOST_STATES}")
+        if len(zeros) > len(poles):
+            raise ValueError(
+                f"{len(zeros)} zeros over {len(poles)} poles: not proper; "
+                "expected no more zeros than poles"
+            )
+        for pole in poles:
+            if not pole.real < 0:
+                raise ValueError(
+                    f"pole at {pole:.4g} rad/s: not stable; expected a real part below 0"
+                )
+        return self
+
+
+def _conjugates(roots: tuple[Root, ...]) -> list[complex]:
+    """Roots as they stand in the file, with the conjugate of every one above the real axis."""
+    out: list[complex] = []
+    for root in roots:
+        value = complex(*root) if isinstance(root, tuple) else complex(root)
+        if value.imag < 0:
+            raise ValueError(f"root {value:.4g} rad/s; expected the one of the pair with im > 0")
+        out += [value, value.conjugate()] if value.imag > 0 else [value]
+    return out
+
+
+def _unlike(names: list[str]) -> None:
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise ValueError(f"name {name!r} occurs twice; expected each once")
+
+
+def _driven(e: Source, inputs: dict[str, ActuatorSpec]) -> None:
+    """ValueError if the source has no input or its gain another unit."""
+    if e.input not in inputs:
+        raise ValueError(
+            f"element {e.name}: input {e.input!r} is no actuator; expected one of {sorted(inputs)}"
+        )
+    unit = inputs[e.input].unit
+    match e:
+        case TorqueSource():
+            expected = f"N m/{unit}"
+        case ForceSource():
+            expected = f"N/{unit}"
+        case _:
+            expected = f"rad/(s {unit})"
+    if e.K.unit != expected:
+        raise ValueError(f"element {e.name}: K has unit {e.K.unit!r}; expected {expected!r}")
+
+
 class Rig(Strict):
     """A rig file. Elements stand in the order base to tip."""
 
     name: str = Field(min_length=1)
     description: str = ""
-    base: Literal["clamped", "pinned", "free"]
-    tip: Literal["clamped", "pinned", "free"]
+    base: End
+    tip: End
     rate_hz: Positive
     element: Annotated[tuple[Element, ...], Field(min_length=1)]
     sensor: Annotated[tuple[Sensor, ...], Field(min_length=1)]
     actuator: Annotated[tuple[ActuatorSpec, ...], Field(min_length=1)]
     limit: tuple[Limit, ...] = ()
     centring: Centring | None = None
+    feedback: tuple[Feedback, ...] = ()
     device: Device = Device()
 
-    @field_validator("element", "sensor", "actuator")
+    @field_validator("element", "sensor", "actuator", "feedback")
     @classmethod
     def _unique(cls, items: tuple[Any, ...]) -> tuple[Any, ...]:
-        seen: set[str] = set()
-        for item in items:
-            if item.name in seen:
-                raise ValueError(f"name {item.name!r} occurs twice; expected each once")
-            seen.add(item.name)
+        _unlike([item.name for item in items])
         return items
 
     @model_validator(mode="after")
@@ -299,26 +369,24 @@ class Rig(Strict):
         elements = {e.name: e for e in self.element}
         order = [e.name for e in self.element]
         inputs = {a.name: a for a in self.actuator}
-        for e in self.element:
-            if isinstance(e, RigidLink) and e.m.value == 0 and e.I.value > 0:
-                raise ValueError(f"element {e.name}: I without m; expected a mass above 0")
-            if isinstance(e, AngularVelocitySource):
-                if e.input not in inputs:
-                    raise ValueError(
-                        f"element {e.name}: input {e.input!r} is no actuator; "
-                        f"expected one of {sorted(inputs)}"
-                    )
-                unit = f"rad/(s {inputs[e.input].unit})"
-                if e.K.unit != unit:
-                    raise ValueError(
-                        f"element {e.name}: K has unit {e.K.unit!r}; expected {unit!r}"
-                    )
-        driven = {e.input for e in self.element if isinstance(e, AngularVelocitySource)}
+        _unlike([e.name for e in flattened(self.element)])
+        for before, e in zip((None, *self.element), self.element, strict=False):
+            if isinstance(e, SOURCES):
+                _driven(e, inputs)
+            elif isinstance(e, HydraulicLine) and not (
+                isinstance(before, ANGLE_SOURCES) and before.name == e.source
+            ):
+                raise ValueError(
+                    f"element {e.name}: source {e.source!r} is no angular velocity source right "
+                    "before it; expected one, as the line carries its flow"
+                )
+        driven = {e.input for e in self.element if isinstance(e, SOURCES)}
         for a in self.actuator:
             if a.name not in driven:
                 raise ValueError(
                     f"actuator {a.name}: drives no element; expected one with this input"
                 )
+        lines = {e.source: e.name for e in self.element if isinstance(e, HydraulicLine)}
         for s in self.sensor:
             for name in places(s):
                 if name not in elements:
@@ -332,9 +400,15 @@ class Rig(Strict):
                         f"sensor {s.name}: across {list(s.across)} are not neighbours in this "
                         f"order; expected consecutive elements of {order}"
                     )
+                for name in s.across:
+                    if name in lines and lines[name] not in s.across:
+                        raise ValueError(
+                            f"sensor {s.name}: across {name} without {lines[name]}; expected "
+                            "both, as the source's flow turns the vane at the line's other end"
+                        )
             if isinstance(s, Acceleration):
                 host = elements[s.on]
-                if not isinstance(host, Beam | RigidLink):
+                if not isinstance(host, Beam | TimoshenkoBeam | RigidLink):
                     raise ValueError(
                         f"sensor {s.name}: {s.on} has no extent; expected a link or beam"
                     )
@@ -362,6 +436,21 @@ class Rig(Strict):
                 f"centring: sensor {self.centring.sensor!r} does not exist; "
                 f"expected one of {[s.name for s in self.sensor]}"
             )
+        for loop in self.feedback:
+            for what, name, known in (
+                ("sensor", loop.sensor, [s.name for s in self.sensor]),
+                ("actuator", loop.actuator, [a.name for a in self.actuator]),
+            ):
+                if name not in known:
+                    raise ValueError(
+                        f"feedback {loop.name}: {what} {name!r} does not exist; "
+                        f"expected one of {known}"
+                    )
+            unit = f"{units[loop.actuator]}/({units[loop.sensor]})"
+            if loop.unit != unit:
+                raise ValueError(
+                    f"feedback {loop.name}: unit {loop.unit!r} of F(s); expected {unit!r}"
+                )
         return self
 
     def units(self) -> dict[str, str]:

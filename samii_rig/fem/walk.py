@@ -1,0 +1,321 @@
+"""The walk along a chain that collects coordinates, matrices and constraints.
+
+Every beam node and every rigid body has coordinates (w, theta) of its own, every joint its
+relative motion; a point where something acts from the ground is a node too. The walk carries
+the rows that give w and theta where it stands; the next part is joined there by constraints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array, csc_array
+
+from samii_rig.errors import InputError
+from samii_rig.fem import hermite
+from samii_rig.fem.drive import Feedback, Load, Prescribed, law
+from samii_rig.fem.mechanism import Mechanism, Places
+from samii_rig.rig.elements import End
+from samii_rig.rig.schema import (
+    AbsoluteAngle,
+    Acceleration,
+    AngularVelocitySource,
+    AngularVelocitySource2,
+    Beam,
+    Branch,
+    Element,
+    ForceSource,
+    GravityStiffness,
+    LumpedMass,
+    Moment,
+    OilColumn,
+    RelativeAngle,
+    Rig,
+    RigidLink,
+    Sensor,
+    TimoshenkoBeam,
+    TorqueSource,
+    TorsionalGroundSpring,
+    TorsionalSpring,
+    TranslationalGroundSpring,
+    TranslationalSpring,
+)
+from samii_rig.types import Float
+
+G_EARTH = 9.80665  # m/s^2, standard gravity
+Row = dict[int, float]  # a linear function of the coordinates: coefficient by coordinate
+
+
+@dataclass
+class _Entries:
+    """A sparse matrix while it is filled."""
+
+    i: list[int] = field(default_factory=list)
+    j: list[int] = field(default_factory=list)
+    value: list[float] = field(default_factory=list)
+
+    def add(self, at: list[int], block: ArrayLike) -> None:
+        for i, line in zip(at, np.atleast_2d(block), strict=True):
+            self.i += [i] * len(at)
+            self.j += at
+            self.value += line.tolist()
+
+    def matrix(self, n: int) -> csc_array:
+        return csc_array(coo_array((self.value, (self.i, self.j)), shape=(n, n)))
+
+
+class Walk:
+    """Goes from base to tip; `w` and `theta` are the motion at the place reached, `x` m on."""
+
+    def __init__(self, rig: Rig, elements: int) -> None:
+        self._rig, self._n_beam = rig, elements
+        self._n = 0  # coordinates so far
+        self._M, self._C, self._H, self._K, self._G = (_Entries() for _ in range(5))
+        self._constraints: list[Row] = []
+        self._waiting: list[str] = []  # elements since the last joining constraint
+        self._moment: dict[str, int] = {}
+        self._span: dict[str, tuple[Row, Row]] = {}  # rotation before and after each element
+        self._nodes: dict[str, int] = {}  # first coordinate of each beam and body
+        self._locks: dict[str, int] = {}
+        self._joints: dict[str, int] = {}
+        self._sources: list[Prescribed] = []
+        self._feedback: list[Feedback] = []
+        self._loads: list[Load] = []
+        self._places: list[tuple[float, str, Row, Row]] = []
+        self.w: Row = {}
+        self.theta: Row = {}
+        self.x = 0.0
+
+    def base(self) -> None:
+        """Fix the base as the rig file says."""
+        if self._rig.base == "free":
+            self.w = self._new()
+        if self._rig.base != "clamped":
+            self.theta = self._new()
+        self._place("")
+
+    def over(
+        self,
+        e: Element,
+        rigid: Collection[str] = (),
+        feedback: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:
+        """Add one element and go on to its other end."""
+        before = self.theta
+        match e:
+            case Beam() | TimoshenkoBeam():
+                self._beam(e)
+            case RigidLink():
+                self._body(e.L.value, e.r.value, e.m.value, e.I.value, e.name)
+            case LumpedMass():
+                self._body(0.0, 0.0, e.m.value, e.I.value, e.name)
+            case TorsionalSpring():
+                j = self._joint(e.name)
+                if e.name in rigid:
+                    self._locks[e.name] = j
+                else:
+                    self._spring(j, e.k.value, e.c.value)
+            case OilColumn():
+                # A volume D turns by pressure times C_h: compliance C_h/D^2.
+                if e.C_h.value > 0:
+                    self._spring(self._joint(e.name), e.D.value**2 / e.C_h.value)
+            case TranslationalSpring():
+                self.w = {**self.w, **self._new()}
+                self._spring(self._n - 1, e.k.value, e.c.value)
+            case TorsionalGroundSpring():
+                self._spring(self._point(e.name) + 1, e.k.value, e.c.value)
+            case GravityStiffness():
+                self._spring(self._point(e.name) + 1, e.k.value)
+            case TranslationalGroundSpring():
+                self._spring(self._point(e.name), e.k.value, e.c.value)
+            case AngularVelocitySource() | AngularVelocitySource2():
+                self._source(e, (feedback or {}).get(e.name))
+            case TorqueSource():
+                self._load(e, self._point(e.name) + 1)
+            case ForceSource():
+                self._load(e, self._point(e.name))
+            case Branch():
+                self._branch(e, rigid)
+            case _:
+                expected = "an element with a finite number of coordinates"
+                raise InputError(self._rig.name, e.name, e.kind, expected)
+        self._waiting.append(e.name)
+        self._span[e.name] = before, self.theta
+        self._place(e.name)
+
+    def _beam(self, e: Beam | TimoshenkoBeam) -> None:
+        n, h = self._n_beam, e.L.value / self._n_beam
+        first = self._nodes[e.name] = self._n
+        self._n += 2 * (n + 1)
+        self._join(first)
+        phi, J = _shear(e, h), e.J.value if isinstance(e, TimoshenkoBeam) else 0.0
+        k = hermite.stiffness(e.EI.value, h, phi)
+        m = hermite.consistent_mass(e.mu.value, h, phi, J)
+        for i in range(n):
+            at = list(range(first + 2 * i, first + 2 * i + 4))
+            self._K.add(at, k)
+            self._M.add(at, m)
+            self._C.add(at, e.tau.value * k)
+            self._H.add(at, e.eta.value * k)
+            if i < n - 1:
+                self.x += h
+                self.w, self.theta = {at[2]: 1.0}, {at[3]: 1.0}
+                self._place(e.name)
+        self.x += h
+        self.w, self.theta = {first + 2 * n: 1.0}, {first + 2 * n + 1: 1.0}
+
+    def _body(self, L: float, r: float, m: float, I: float, name: str) -> None:  # noqa: E741
+        first = self._nodes[name] = self._n
+        self._n += 2
+        self._join(first, -r)
+        self._M.add([first, first + 1], np.diag([m, I]))
+        self.x += L
+        self.w, self.theta = {first: 1.0, first + 1: L - r}, {first + 1: 1.0}
+
+    def _point(self, name: str) -> int:
+        """A node without mass: what acts from the ground changes M or V from here on."""
+        self._body(0.0, 0.0, 0.0, 0.0, name)
+        return self._nodes[name]
+
+    def _spring(self, coordinate: int, k: float, c: float = 0.0) -> None:
+        self._K.add([coordinate], k)
+        self._C.add([coordinate], c)
+
+    def _source(
+        self,
+        e: AngularVelocitySource | AngularVelocitySource2,
+        feedback: tuple[float, float] | None,
+    ) -> None:
+        j, column = self._joint(e.name), self._column(e.input)
+        if feedback is None:
+            self._locks[e.name] = j
+            self._sources.append(Prescribed(e.name, j, column, law(e)))
+        else:
+            g_v, g_a = feedback
+            self._G.add([j], g_v)
+            self._feedback.append(Feedback(e.name, j, column, g_v * g_a))
+
+    def _load(self, e: TorqueSource | ForceSource, coordinate: int) -> None:
+        self._loads.append(Load(e.name, coordinate, self._column(e.input), law(e)))
+
+    def _column(self, name: str) -> int:
+        return [a.name for a in self._rig.actuator].index(name)
+
+    def _branch(self, e: Branch, rigid: Collection[str]) -> None:
+        self._point(e.name)
+        here = self.w, self.theta, self.x, self._waiting
+        self._waiting = []  # no sensor stands on a branch
+        for part in e.element:
+            self.over(part, rigid)
+        self.tip(e.tip)
+        self.w, self.theta, self.x, self._waiting = here
+
+    def tip(self, end: End) -> None:
+        """Fix the end reached as the rig file says."""
+        if end != "free":
+            self._constraints.append(_minus({}, self.w))
+        if end == "clamped":
+            self._join_rotation({})
+
+    def mechanism(self) -> Mechanism:
+        """What the walk has collected."""
+        n, sensors = self._n, self._rig.sensor
+        x, element, w, theta = zip(*self._places, strict=True)
+        return Mechanism(
+            self._M.matrix(n),
+            self._C.matrix(n),
+            self._H.matrix(n),
+            self._K.matrix(n),
+            self._G.matrix(n),
+            _stack(self._constraints, n),
+            self._locks,
+            self._joints,
+            tuple(self._sources),
+            tuple(self._feedback),
+            tuple(self._loads),
+            _stack([self._angle(s) for s in sensors], n),
+            _stack([self._acceleration(s) for s in sensors], n),
+            tuple(
+                (i, self._moment[s.after])
+                for i, s in enumerate(sensors)
+                if isinstance(s, Moment) and s.after in self._moment
+            ),
+            Places(np.array(x), element, _stack(w, n), _stack(theta, n)),
+        )
+
+    def _new(self) -> Row:
+        self._n += 1
+        return {self._n - 1: 1.0}
+
+    def _joint(self, name: str) -> int:
+        j = self._joints[name] = self._n
+        self.theta = {**self.theta, **self._new()}
+        return j
+
+    def _join(self, node: int, offset: float = 0.0) -> None:
+        """Put the point `offset` m beside a node where the walk stands."""
+        self._constraints.append(_minus({node: 1.0, node + 1: offset}, self.w))
+        self._join_rotation({node + 1: 1.0})
+
+    def _join_rotation(self, theta: Row) -> None:
+        # What crosses this constraint is the moment after all elements since the last one.
+        self._moment.update(dict.fromkeys(self._waiting, len(self._constraints)))
+        self._waiting.clear()
+        self._constraints.append(_minus(theta, self.theta))
+
+    def _place(self, name: str) -> None:
+        self._places.append((self.x, name, self.w, self.theta))
+
+    def _angle(self, sensor: Sensor) -> Row:
+        match sensor:
+            case AbsoluteAngle():
+                return self._span[sensor.after][1]
+            case Acceleration():
+                theta = self._along(sensor, hermite.rotation, {1: 1.0})
+                return {i: sensor.tilt * G_EARTH * x for i, x in theta.items() if sensor.tilt}
+            case RelativeAngle():
+                return _minus(self._span[sensor.across[-1]][1], self._span[sensor.across[0]][0])
+        return {}
+
+    def _acceleration(self, sensor: Sensor) -> Row:
+        if not isinstance(sensor, Acceleration):
+            return {}
+        host = self._host(sensor)
+        arm = sensor.position - host.r.value if isinstance(host, RigidLink) else 0.0
+        return self._along(sensor, hermite.shape, {0: 1.0, 1: arm})
+
+    def _along(
+        self, sensor: Acceleration, on_beam: Callable[[float, float, float], Float], on_body: Row
+    ) -> Row:
+        """A row on the coordinates of the element that carries the sensor."""
+        host, first = self._host(sensor), self._nodes[sensor.on]
+        if isinstance(host, RigidLink):
+            return {first + i: value for i, value in on_body.items()}
+        h = host.L.value / self._n_beam
+        i = min(int(sensor.position / h), self._n_beam - 1)
+        values = on_beam(sensor.position - i * h, h, _shear(host, h)).tolist()
+        return {first + 2 * i + a: value for a, value in enumerate(values)}
+
+    def _host(self, sensor: Acceleration) -> Beam | TimoshenkoBeam | RigidLink:
+        host = next(e for e in self._rig.element if e.name == sensor.on)
+        assert isinstance(host, Beam | TimoshenkoBeam | RigidLink)  # the schema allows no other
+        return host
+
+
+def _shear(e: Beam | TimoshenkoBeam, h: float) -> float:
+    """12 EI/(GA h^2): shear over bending flexibility of an element, 0 for Euler-Bernoulli."""
+    return 12 * e.EI.value / (e.GA.value * h**2) if isinstance(e, TimoshenkoBeam) else 0.0
+
+
+def _minus(a: Row, b: Row) -> Row:
+    return {i: a.get(i, 0.0) - b.get(i, 0.0) for i in a | b}
+
+
+def _stack(rows: list[Row] | tuple[Row, ...], n: int) -> csc_array:
+    i = [line for line, row in enumerate(rows) for _ in row]
+    j = [column for row in rows for column in row]
+    value = [coefficient for row in rows for coefficient in row.values()]
+    return csc_array(coo_array((value, (i, j)), shape=(len(rows), n), dtype=float))

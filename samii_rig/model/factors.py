@@ -1,0 +1,177 @@
+"""What of a chain depends on s: the point elements' laws, the sources, beams as waves, branches.
+
+All of it is computed here with numpy, once for all s of a call, and given to the kernels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from samii_rig.model import respond, timoshenko
+from samii_rig.model.chain import LINE_AT, SOURCE_WIDTH, WIDTH, CompiledChain
+from samii_rig.model.laws import POINTS, SOURCE_LAWS, line_filter, line_filter_relative
+from samii_rig.model.registers import Factors
+from samii_rig.types import Complex, Float
+
+_TURN = np.array([1.0, -1.0, 1.0, -1.0])  # theta and V of a mirrored chain
+
+
+def bind(c: CompiledChain, s: Complex, slopes: bool = False) -> Factors:
+    """What depends on s at s (n,); `slopes`: with derivatives for gradients."""
+    pars = c.system.pars
+    jump = np.zeros((len(c.points), s.size), complex)
+    jump_d = np.zeros((len(c.points) if slopes else 0, WIDTH, s.size), complex)
+    for row, e in enumerate(c.points):
+        law = POINTS[c.kinds[e]]
+        jump[row] = law.value(s, pars[e])
+        if slopes:
+            d = law.slopes(s, pars[e])
+            jump_d[row, : d.shape[0]] = d
+    drive, drive_d = _drive(c, s, slopes)
+    return Factors(jump, _matrices(c, s), drive, jump_d, drive_d)
+
+
+def _drive(c: CompiledChain, s: Complex, slopes: bool) -> tuple[Complex, Complex]:
+    if not c.sources:  # the root of a branch: jumps of 1
+        n = c.system.source.shape[0]
+        return np.ones((n, s.size), complex), np.zeros((0, SOURCE_WIDTH, s.size), complex)
+    drive = np.empty((len(c.sources), s.size), complex)
+    slopes_of: list[Complex] = []
+    for i, (kind, p, line) in enumerate(zip(c.sources, c.source_values, c.lines, strict=True)):
+        law = SOURCE_LAWS[kind]
+        drive[i] = law.value(s, p)
+        d = law.relative(s, p) if slopes else np.zeros((0, s.size), complex)
+        if line:
+            drive[i] *= line_filter(s, p[LINE_AT:])
+            if slopes:
+                padded = np.zeros((SOURCE_WIDTH, s.size), complex)
+                padded[: d.shape[0]] = d
+                padded[LINE_AT:] = p[0] * line_filter_relative(s, p[LINE_AT:])
+                d = padded
+        slopes_of.append(d)
+    if len(slopes_of) == 1:
+        return drive, slopes_of[0][None]
+    drive_d = np.zeros((len(slopes_of), max(d.shape[0] for d in slopes_of), s.size), complex)
+    for i, d in enumerate(slopes_of):
+        drive_d[i, : d.shape[0]] = d
+    return drive, drive_d
+
+
+def _matrices(c: CompiledChain, s: Complex) -> Complex:
+    out = np.zeros((len(c.waves), 2, timoshenko.ROWS, s.size), complex)
+    branches = {e: inner for e, inner, _ in c.branches}
+    for row, e in enumerate(c.waves):
+        if e in branches:
+            out[row] = _branch_matrix(impedance(branches[e], s))
+        else:
+            out[row] = timoshenko.matrix(s, c.system.pars[e])
+    return out
+
+
+def impedance(inner: CompiledChain, s: Complex) -> Complex:
+    """(n, 2, 2) moment and shear force that move a branch's root by w and theta."""
+    Z = np.zeros((s.size, 2, 2), complex)
+    if s.size:
+        respond.response(inner.system, bind(inner, s), s, Z)
+    return Z
+
+
+def _branch_matrix(Z: Complex) -> Complex:
+    """M+ = M- - Z (w, theta), in the form of `timoshenko.matrix`."""
+    U = np.zeros((Z.shape[0], 4, 4), complex)
+    U[:] = np.eye(4)
+    U[:, 2:, :2] = -Z
+    back = 2 * np.eye(4) - U
+    out = np.zeros((2, timoshenko.ROWS, Z.shape[0]), complex)
+    for side, u in enumerate((U, _TURN[:, None] * back * _TURN)):
+        out[side, :16] = timoshenko.SORT.ravel()[:, None]
+        out[side, 16:32] = (u @ timoshenko.SORT).reshape(-1, 16).T
+    out[:, 32:] = 1.0
+    return out
+
+
+def add_waves(
+    c: CompiledChain, s: Complex, place: np.ndarray, z: Complex, zh: Complex, dH: Complex
+) -> None:
+    """Add to dH what the parameters of beams as waves and of branches do.
+
+    place (n_param + 1,) : where in dH each parameter's derivative goes, -1 for nowhere.
+    z, zh : as returned by `respond.gradient`.
+    """
+    x = c.system
+    branches = {e: (inner, first) for e, inner, first in c.branches}
+    for row, e in enumerate(c.waves):
+        if e in branches:
+            inner, first = branches[e]
+            slots = np.arange(first, first + len(inner.parameters))
+        else:
+            slots = c.slots[e]
+        to = place[slots]
+        if to.max(initial=-1) < 0:
+            continue
+        if e in branches:
+            by = _branch_gradient(inner, s, z[row], zh[row])
+        else:
+            by = timoshenko.gradient(s, x.pars[e], z[row], zh[row])
+        for m in np.flatnonzero((to >= 0) & (slots >= 0)):
+            for source, (_, actuator) in enumerate(x.source):
+                dH[:, :, actuator, to[m]] += x.source_c[source, 4] * by[m, :, :, source]
+
+
+def _branch_gradient(inner: CompiledChain, s: Complex, z: Complex, zh: Complex) -> Complex:
+    """(n_param, n, n_sensor, n_source): -zh^T J dU z with dU = -dZ, see `gradient`."""
+    n = len(inner.parameters)
+    _, dZ = differentiate(inner, s, np.append(np.arange(n), -1), n, 2, 2)
+    dM = np.einsum("nkp,nkb->pnb", dZ[:, 0], z[:, :2])
+    dV = np.einsum("nkp,nkb->pnb", dZ[:, 1], z[:, :2])
+    w, theta = zh[:, 0, :, None], zh[:, 1, :, None]
+    return np.asarray(w * dV[:, :, None] - theta * dM[:, :, None])
+
+
+def differentiate(
+    c: CompiledChain, s: Complex, place: np.ndarray, n_wanted: int, n_out: int, n_in: int
+) -> tuple[Complex, Complex]:
+    """H (n, n_out, n_in) and dH (..., n_wanted) of a compiled chain, `place` as in `add_waves`."""
+    H = np.zeros((s.size, n_out, n_in), complex)
+    dH = np.zeros((*H.shape, n_wanted), complex)
+    if s.size:
+        f = bind(c, s, slopes=True)
+        slots = place[c.slots]
+        for e, inner, first in c.branches:
+            # Not a place of its own: only that the states at the branch are wanted.
+            slots[e, 0] = place[first : first + len(inner.parameters)].max()
+        z, zh = respond.gradient(c.system, f, s, slots, place[c.source_slots], H, dH)
+        add_waves(c, s, place, z, zh, dH)
+    return H, dH
+
+
+def clearing(c: CompiledChain, s: Complex) -> tuple[Complex, Float]:
+    """mantissa exp(log) that clears the poles of point elements and branches from D(s)."""
+    mantissa, log = np.ones_like(s), np.zeros(s.size)
+    for e in c.poles:
+        factor, more = POINTS[c.kinds[e]].clear(s, c.system.pars[e])
+        mantissa, log = mantissa * factor, log + more
+    for _, inner, _ in c.branches:
+        factor, more = characteristic(inner, s, True)
+        mantissa, log = mantissa * factor, log + more
+    return mantissa, log
+
+
+def characteristic(c: CompiledChain, s: Complex, clear: bool) -> tuple[Complex, Float]:
+    """D(s) of a compiled chain, see `tmm.Chain.characteristic`."""
+    mantissa, log = np.zeros(s.size, complex), np.zeros(s.size)
+    if not s.size:
+        return mantissa, log
+    respond.characteristic(c.system, bind(c, s), s, mantissa, log)
+    branches = {e for e, _, _ in c.branches}
+    for e in c.waves:
+        if e not in branches:
+            factor, more = timoshenko.scaling(s, c.system.pars[e])
+            mantissa, log = mantissa * factor, log + more
+    if not clear:
+        return mantissa, log
+    factor, more = clearing(c, s)
+    mantissa, log = mantissa * factor, log + more
+    size = np.abs(mantissa)
+    safe = np.where(size > 0, size, 1.0)
+    return np.asarray(mantissa / safe), np.asarray(log + np.log(safe))

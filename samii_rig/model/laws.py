@@ -1,0 +1,247 @@
+"""The laws of point elements and sources: what each does to the state, as data.
+
+A point element adds to one state x times another, z+ = z- + e_i x(s) e_j^T z-, and is a row
+(pair, law): `pair` names i and j, the law gives x at each s, its derivatives by the element's
+parameters and, where x has poles, the factor that clears them from the characteristic
+function. Only the four pairs of conjugate states keep the symplectic product (`elements.J`).
+
+A source is a jump of the state by K f(s) v, and is a row (dual, sign, law): see `solve` for the
+dual of a jump.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from samii_rig.model.registers import M_THETA, THETA_M, V_W, W_V
+from samii_rig.types import Complex, Float
+
+Clearing = tuple[Complex | float, Float | float]
+"""A factor as mantissa exp(log)."""
+
+
+def _clears_nothing(s: Complex, p: Float) -> Clearing:
+    return 1.0, 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Law:
+    """x(s) of a point element with parameters p, in the order of its class.
+
+    value : (s (n,), p) -> (n,). slopes : -> (n_param, n), derivatives by p.
+    clear : -> a factor that is entire and vanishes at the poles of x.
+    """
+
+    pair: int
+    value: Callable[[Complex, Float], Complex]
+    slopes: Callable[[Complex, Float], Complex]
+    clear: Callable[[Complex, Float], Clearing] = _clears_nothing
+
+
+@dataclass(frozen=True, slots=True)
+class SourceLaw:
+    """A jump by K f(s): f with parameters p, p[0] = K.
+
+    dual : coefficients on w, theta, M, V of the sensor to which the jump is dual.
+    relative : (s, p) -> (n_param, n), derivatives of K f by p, divided by f.
+    """
+
+    dual: tuple[float, float, float, float]
+    value: Callable[[Complex, Float], Complex]
+    relative: Callable[[Complex, Float], Complex]
+
+
+def _inverse(z: Complex) -> Complex:
+    # 0 at a pole itself: a response there is of no use, but D is asked for and needs no source.
+    return np.divide(1.0, z, out=np.zeros_like(z), where=z != 0)
+
+
+def _impedance(s: Complex, p: Float) -> Complex:
+    return np.asarray(p[0] + p[1] * s)
+
+
+def _compliance(s: Complex, p: Float) -> Complex:
+    return _inverse(_impedance(s, p))
+
+
+def _compliance_slopes(s: Complex, p: Float) -> Complex:
+    x2 = _compliance(s, p) ** 2
+    return np.stack([-x2, -s * x2])
+
+
+def _clear_spring(s: Complex, p: Float) -> Clearing:
+    if p[1] == 0:
+        return 1.0, 0.0
+    return _impedance(s, p) / (p[0] if p[0] > 0 else p[1]), 0.0
+
+
+def _impedance_slopes(s: Complex, p: Float) -> Complex:
+    return np.stack([np.ones_like(s), s])
+
+
+def _oil(s: Complex, p: Float) -> Complex:
+    return np.full_like(s, p[1] / p[0] ** 2)
+
+
+def _oil_slopes(s: Complex, p: Float) -> Complex:
+    D, C_h = p[0], p[1]
+    return np.stack([np.full_like(s, -2 * C_h / D**3), np.full_like(s, 1 / D**2)])
+
+
+def _constant(s: Complex, p: Float) -> Complex:
+    return np.full_like(s, p[0])
+
+
+def _constant_slopes(s: Complex, p: Float) -> Complex:
+    return np.ones((1, s.size), complex)
+
+
+SMALL_LINE = 1e-3  # |G|^2 below which series replace quotients of G; their error is |G|^6/1e4
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """A hydraulic line at each s, p = (D, L, A, rho, B, R): see `schema.HydraulicLine`.
+
+    G = sqrt(q), q = L^2 (rho s/A + R) A s/B. All functions are even in G.
+    t = tanh(G)/G, dt its derivative by q; h = 1/cosh(G), dh = d log h/dq.
+    """
+
+    s: Complex
+    p: Float
+
+    @property
+    def q(self) -> Complex:
+        _, L, A, rho, B, R = self.p[:6]
+        return np.asarray(L**2 * (rho * self.s / A + R) * A * self.s / B)
+
+    def q_slopes(self) -> Complex:
+        """dq by D, L, A, rho, B, R, (6, n)."""
+        s = self.s
+        _, L, A, _, B, R = self.p[:6]
+        q, zero = self.q, np.zeros_like(s)
+        return np.stack(
+            [zero, 2 * q / L, L**2 * R * s / B, L**2 * s**2 / B, -q / B, L**2 * A * s / B]
+        )
+
+    def tanh(self) -> tuple[Complex, Complex, Complex]:
+        """tanh(G)/G, its derivative by q, and 1/cosh(G)."""
+        q = self.q
+        series = np.abs(q) < SMALL_LINE
+        G = np.sqrt(np.where(series, 1.0, q))
+        E = np.exp(-2 * G)  # Re G >= 0
+        t = (1 - E) / (1 + E) / G
+        h = 2 * np.exp(-G) / (1 + E)
+        dt = (h**2 - t) / (2 * np.where(series, 1.0, q))
+        small = np.where(series, q, 0.0)
+        t = np.where(series, 1 - small / 3 + 2 * small**2 / 15 - 17 * small**3 / 315, t)
+        dt = np.where(series, -1 / 3 + 4 * small / 15 - 17 * small**2 / 105, dt)
+        h = np.where(series, 1 - small / 2 + 5 * small**2 / 24 - 61 * small**3 / 720, h)
+        return np.asarray(t), np.asarray(dt), np.asarray(h)
+
+
+def _line(s: Complex, p: Float) -> Complex:
+    D, L, A, _, B, _ = p[:6]
+    return np.asarray(A * L / (B * D**2) * _Line(s, p).tanh()[0])
+
+
+def _line_slopes(s: Complex, p: Float) -> Complex:
+    D, L, A, _, B, _ = p[:6]
+    line = _Line(s, p)
+    t, dt, _ = line.tanh()
+    C = A * L / (B * D**2)
+    out = C * dt * line.q_slopes()
+    out[0] -= 2 * C * t / D
+    out[1] += C * t / L
+    out[2] += C * t / A
+    out[4] -= C * t / B
+    return np.asarray(out)
+
+
+def _clear_line(s: Complex, p: Float) -> Clearing:
+    """cosh(G)."""
+    G = np.sqrt(_Line(s, p).q)
+    return np.exp(1j * G.imag) * (1 + np.exp(-2 * G)) / 2, G.real
+
+
+def line_filter(s: Complex, p: Float) -> Complex:
+    """1/cosh(G): what arrives of a flow at the blocked end of a line."""
+    return _Line(s, p).tanh()[2]
+
+
+def line_filter_relative(s: Complex, p: Float) -> Complex:
+    """(6, n) derivatives of log(1/cosh G) by the line's parameters: -tanh(G)/(2 G) dq."""
+    line = _Line(s, p)
+    return np.asarray(-line.tanh()[0] / 2 * line.q_slopes())
+
+
+# By kind of element, parameters in the order of its class.
+POINTS: dict[str, Law] = {
+    "torsional_spring": Law(THETA_M, _compliance, _compliance_slopes, _clear_spring),
+    "translational_spring": Law(
+        W_V,
+        lambda s, p: -_compliance(s, p),
+        lambda s, p: -_compliance_slopes(s, p),
+        _clear_spring,
+    ),
+    "torsional_ground_spring": Law(M_THETA, _impedance, _impedance_slopes),
+    "translational_ground_spring": Law(
+        V_W, lambda s, p: -_impedance(s, p), lambda s, p: -_impedance_slopes(s, p)
+    ),
+    "gravity_stiffness": Law(M_THETA, _constant, _constant_slopes),
+    "oil_column": Law(THETA_M, _oil, _oil_slopes),
+    "hydraulic_line": Law(THETA_M, _line, _line_slopes, _clear_line),
+}
+
+
+def _late(s: Complex, tau: float) -> Complex | float:
+    return np.exp(-s * tau) if tau > 0 else 1.0
+
+
+def _first(s: Complex, p: Float) -> Complex:
+    """Paper 2, eq. (1): p = K, p, tau."""
+    f = s + p[1]
+    f *= s
+    np.divide(p[1], f, out=f, where=f != 0)  # in place, as it counts in the time of a response
+    return np.asarray(f if p[2] == 0 else f * _late(s, p[2]))
+
+
+def _first_relative(s: Complex, p: Float) -> Complex:
+    K = p[0]
+    return np.stack([np.ones_like(s), K / p[1] * s / (s + p[1]), -K * s])
+
+
+def _second(s: Complex, p: Float) -> Complex:
+    """Paper 2, eq. (2): p = K, omega, zeta, tau."""
+    w = p[1]
+    return np.asarray(w**2 * _inverse(s * (s**2 + 2 * p[2] * w * s + w**2)) * _late(s, p[3]))
+
+
+def _second_relative(s: Complex, p: Float) -> Complex:
+    K, w, zeta = p[0], p[1], p[2]
+    N = s**2 + 2 * zeta * w * s + w**2
+    return np.stack(
+        [np.ones_like(s), K * (2 / w - (2 * zeta * s + 2 * w) / N), -2 * K * w * s / N, -K * s]
+    )
+
+
+def _effort(s: Complex, p: Float) -> Complex:
+    """Torque or force: p = K, p (infinite for no lag), tau."""
+    return np.asarray(_inverse(1 + s / p[1]) * _late(s, p[2]))
+
+
+def _effort_relative(s: Complex, p: Float) -> Complex:
+    K = p[0]
+    return np.stack([np.ones_like(s), K * s / p[1] ** 2 / (1 + s / p[1]), -K * s])
+
+
+_ANGLE = (0.0, 0.0, -1.0, 0.0)  # theta jumps by +1
+SOURCE_LAWS: dict[str, SourceLaw] = {
+    "angular_velocity_source": SourceLaw(_ANGLE, _first, _first_relative),
+    "angular_velocity_source_2": SourceLaw(_ANGLE, _second, _second_relative),
+    "torque_source": SourceLaw((0.0, -1.0, 0.0, 0.0), _effort, _effort_relative),  # M by -1
+    "force_source": SourceLaw((-1.0, 0.0, 0.0, 0.0), _effort, _effort_relative),  # V by +1
+}
