@@ -1,13 +1,13 @@
-"""What identification is worth: coverage, starts, recordings, the valley, real data.
+"""What identification is worth: coverage, starts, recordings, the encoder, g_v, the valley.
 
 python benchmarks/identify_study.py coverage --seeds 200
 python benchmarks/identify_study.py recordings --runs 20
 python benchmarks/identify_study.py starts
 python benchmarks/identify_study.py encoder
+python benchmarks/identify_study.py gains
 python benchmarks/identify_study.py modes --runs 60
 python benchmarks/identify_study.py numbers
 python benchmarks/identify_study.py valley --figure valley.svg
-python benchmarks/identify_study.py sflr --data FOLDER
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
 from experiments.swept_sine import SweptSine
 from samii_rig.identify.actuator import (
@@ -32,16 +31,15 @@ from samii_rig.identify.actuator import (
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.identify.conservative import Conservative
 from samii_rig.identify.maximum_likelihood import identify, problem
+from samii_rig.identify.methods import LIGHT
 from samii_rig.identify.modal import estimate_modes
 from samii_rig.identify.parameters import Free
 from samii_rig.identify.result import Identification
-from samii_rig.identify.table import summary_table
 from samii_rig.identify.targets import Target, braced, method_1, method_2, valley
+from samii_rig.identify.velocity_feedback import curves, fit_gain, in_series
 from samii_rig.model.realise import realise
 from samii_rig.model.sampled import sampled_response
 from samii_rig.model.tmm import Chain
-from samii_rig.record.importer import import_file
-from samii_rig.record.maps import load_map
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.run.protocols import CommandBlock, DeviceLoop
@@ -54,7 +52,6 @@ JOINTS = ("clamp", "joint_1", "joint_2", "joint_3")
 STIFFNESSES = tuple(f"{joint}.k" for joint in JOINTS)
 # What a lab does not know of SAMII beside the stiffnesses: damping, gain and pole of the valve.
 FREE = (*STIFFNESSES, *(f"{joint}.c" for joint in JOINTS), "joint_2_source.K", "joint_2_source.p")
-LIGHT = 0.3  # damping ratio below which a zero shows
 SETTLED = 11.0  # s of rest behind a sweep
 
 
@@ -217,21 +214,67 @@ def starts(options: argparse.Namespace) -> None:
         )
 
 
+SOURCE = "joint_2_source"
+G_V = {"samii": (SOURCE, "theta_2", 500.0), "samii_joint_3": ("joint_3_source", "theta_3", 150.0)}
+"""Source, encoder and gain of the velocity feedback, N m s/rad: paper 1, Table II."""
+
+
 def encoder(options: argparse.Namespace) -> None:
-    """Data of an encoder at one place, held against models with either place."""
+    """Data of an encoder at one place, held against models with either place: with an ideal
+    velocity source, and with paper 1's intrinsic velocity feedback."""
+    base = load_rig("samii")[0]
     places = {
-        "across source and spring": ("joint_2_source", "joint_2"),
-        "at the actuator": ("joint_2_source",),
+        "across source and spring": base,
+        "at the actuator": with_encoder(base, "theta_2", (SOURCE,)),
     }
-    rigs = {name: with_encoder(load_rig("samii")[0], "theta_2", p) for name, p in places.items()}
-    for name, rig in rigs.items():
-        response = estimate([record(rig, swept(), options.seed)])[0]
-        for outputs in (None, ["theta_2"]):
-            done = compare_variants([response], rigs, FREE, outputs=outputs)
-            print(f"truth {name}, {outputs or 'all outputs'}. {choice(done)}")
-            for v in done:
-                error = 100 * (v.found.values[:4] / truth(rig)[:4] - 1)
-                print(f"  {v.name}: stiffnesses off by {np.round(error, 1)} %")
+    fed = {name: in_series(rig, SOURCE, G_V["samii"][2]) for name, rig in places.items()}
+    for said, rigs, free in (
+        ("velocity source", places, FREE),
+        ("velocity feedback", fed, (*FREE, f"{SOURCE}_feedback.c")),
+    ):
+        for name, rig in rigs.items():
+            response = estimate([record(rig, swept(), options.seed)])[0]
+            for outputs in (None, ["theta_2"]):
+                done = compare_variants([response], rigs, free, outputs=outputs)
+                print(f"{said}, truth {name}, {outputs or 'all outputs'}. {choice(done)}")
+                for v in done:
+                    error = 100 * (v.found.values[:4] / truth(rig)[:4] - 1)
+                    print(f"  {v.name}: stiffnesses off by {np.round(error, 1)} %")
+
+
+def gains(options: argparse.Namespace) -> None:
+    """Modes over g_v by both methods; g_v of joints 2 and 3 from the amplitudes of recordings."""
+    rig = with_encoder(load_rig("samii")[0], "theta_2", (SOURCE,))
+    grid = np.array([1e5, 1e4, 1000, 500, 300, 200, 100, 50, 30, 10])
+    fine = np.union1d(np.geomspace(10, 1e5, 80), grid)
+    found = {by: curves(rig, SOURCE, fine, by=by) for by in ("tmm", "fem")}
+    of = found["tmm"]
+    print("| g_v | mode 1, Hz | damping | mode 2, Hz | damping |\n|---|---|---|---|---|")
+    for g in grid:
+        i = int(np.flatnonzero(of.g_v == g)[0])
+        cells = [f"{of.frequency_hz[i, k]:.3f} | {of.damping[i, k]:.3f}" for k in range(2)]
+        print(f"| {g:g} | {' | '.join(cells)} |")
+    for k in range(2):
+        where = ", ".join(f"{100 * x:g} % at {of.leaves(k, x):.3g}" for x in (0.01, 0.02, 0.05))
+        print(f"mode {k + 1} has moved by {where} N m s/rad")
+    apart = np.nanmax(np.abs(found["fem"].frequency_hz / of.frequency_hz - 1))
+    print(f"finite elements against transfer matrices: frequencies within {apart:.1g}")
+    for name, (source, output, g_v) in G_V.items():
+        base = load_rig(name)[0]
+        rig = with_encoder(base, output, (source,))
+        sweep = {**swept().model_dump(), "actuator": rig.actuator[0].name}
+        run = record(in_series(rig, source, g_v), SweptSine.model_validate(sweep), options.seed)
+        response = estimate([run])[0]
+        for off in (0.3, 3.0):
+            fit = fit_gain([response], in_series(rig, source, off * g_v), output, band=(0.8, 30.0))
+            print(
+                f"{name}, start {off:g} of the truth: g_v = {fit.values[0]:.1f} from the amplitude "
+                f"(truth {g_v:g}), {fit.gain_db:.2g} dB and {fit.phase_deg:.2g} degrees left"
+            )
+        free = (*STIFFNESSES, f"{source}_feedback.c")
+        best = identify([response], in_series(rig, source, 0.7 * g_v), free, starts=1)
+        low, high = (x[-1] for x in best.interval())
+        print(f"  maximum likelihood: {best.values[-1]:.1f}, 90 % {low:.1f} to {high:.1f}")
 
 
 def modes(options: argparse.Namespace) -> None:
@@ -336,50 +379,6 @@ def valleys(options: argparse.Namespace) -> None:
         figure.savefig(options.figure)
 
 
-BAND = (1.0, 24.0)  # Hz in which the recordings of SFLR hold more than noise
-SFLR_FREE = (
-    "motor.K", "motor.p", "spring.k", "spring.c", "clamp.k", "clamp.c", "beam.EI", "beam.mu",
-    "base_mass.I", "accelerometer_mass.m",
-)  # fmt: skip
-
-
-def sflr(options: argparse.Namespace) -> None:
-    """Identified on the recordings of SFLR at 50 counts, judged on those at 25 and 75."""
-    rig = load_rig("sflr")[0]
-    layout, text = load_map("sflr")
-    levels = {}
-    for level in (25, 50, 75):
-        files = sorted(options.data.glob(f"*full-robot_swept_sine_amp-{level}_*"))
-        runs = [import_file(f, layout, text) for f in files]
-        levels[level] = estimate(runs, gaps="exclude")[0]
-    gain = identify([levels[50]], rig, ["motor.K"], band=BAND)
-    held = identify([levels[50]], rig, SFLR_FREE, band=BAND, prior=True)
-    free = identify([levels[50]], rig, SFLR_FREE, band=BAND)
-    Console(width=150).print(summary_table(held))
-    print(
-        "\n| model | "
-        + " | ".join(f"{o}, {n}" for n in levels for o in ("theta", "a"))
-        + " | chi-square at 50 |"
-    )
-    print("|---|" + "---|" * (2 * len(levels) + 1))
-    for name, model, fit in (
-        ("rig file", rig, gain.start_fit),
-        ("gain alone", gain.rig, gain.fit),
-        ("all, with priors", held.rig, held.fit),
-        ("all, without", free.rig, free.fit),
-    ):
-        cells = [f"{100 * e:.1f} %" for r in levels.values() for e in normalised(model, r)]
-        print(f"| {name} | {' | '.join(cells)} | {fit.ratio:.1f} |")
-
-
-def normalised(rig: Rig, response: FrequencyResponse) -> np.ndarray:
-    """|H_model - H|/|H| in the band, each summed in squares, per output."""
-    inside = (response.frequency >= BAND[0]) & (response.frequency <= BAND[1])
-    H = response.H[inside]
-    error = sampled_response(rig, response.frequency[inside]) - H
-    return np.linalg.norm(error, axis=0)[:, 0] / np.linalg.norm(H, axis=0)[:, 0]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("study", choices=sorted(STUDIES))
@@ -388,7 +387,6 @@ def main() -> None:
     parser.add_argument("--thin", type=int, default=4, help="every n-th line (coverage)")
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--figure", type=Path)
-    parser.add_argument("--data", type=Path, default=Path("../shared/recordings/sflr"))
     options = parser.parse_args()
     STUDIES[options.study](options)
 
@@ -398,10 +396,10 @@ STUDIES: dict[str, Callable[[argparse.Namespace], None]] = {
     "recordings": recordings,
     "starts": starts,
     "encoder": encoder,
+    "gains": gains,
     "modes": modes,
     "numbers": from_numbers,
     "valley": valleys,
-    "sflr": sflr,
 }
 
 if __name__ == "__main__":

@@ -221,13 +221,13 @@ def test_pooling_keeps_its_degrees_of_freedom_when_the_noise_resonates(colour):
     found = []
     for _ in range(150):
         e = shape[:, None] * (rng.normal(size=(2, 300, 2)) + 1j * rng.normal(size=(2, 300, 2)))
-        C, nu, _ = noise.pooled(e, 2, 15)
-        found.append(C[:, 0, 0].real / (2 * shape**2))
+        of = noise.pooled(e, 2, 15)
+        found.append(of.covariance[:, 0, 0].real / (2 * shape**2))
     ratio = np.array(found)
     np.testing.assert_allclose(ratio.mean(axis=0), 1, atol=0.2)
     assert ratio.mean() == pytest.approx(1, abs=0.03)
     # One variance of nu complex degrees of freedom scatters by 1/sqrt(nu).
-    assert np.median(ratio.std(axis=0)) == pytest.approx(1 / np.sqrt(nu[0]), rel=0.15)
+    assert np.median(ratio.std(axis=0)) == pytest.approx(1 / np.sqrt(of.dof[0]), rel=0.15)
 
 
 def test_bad_requests_are_answered_in_one_line(bursts):

@@ -10,7 +10,6 @@ from samii_rig.cli.common import JsonOption, Logs, rig_of, say_json
 from samii_rig.cli.estimate import (
     BandOption,
     GapsOption,
-    OutputOption,
     RigOverride,
     estimated,
     read_all,
@@ -27,7 +26,20 @@ def identify(
             "Without it all that the rig file gives a tolerance, which is then used as a prior."
         ),
     ] = None,
-    output: OutputOption = None,
+    method: Annotated[
+        str,
+        typer.Option(
+            help="likelihood, or the methods of paper 1: 1 (two frequencies and a zero), "
+            "2 (braced base: a frequency and a mode shape ratio)."
+        ),
+    ] = "likelihood",
+    output: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Output channel; may be repeated. Methods 1 and 2: the accelerometers whose "
+            "zero or mode shape ratio counts."
+        ),
+    ] = None,
     gaps: GapsOption = "refuse",
     band: BandOption = None,
     json: JsonOption = False,
@@ -38,19 +50,38 @@ def identify(
 
     Example: samii-rig identify runs/*.mcap --free joint_1.k --free joint_2.k
     """
+    from typing import cast
+
     from rich.console import Console
 
     from samii_rig.errors import InputError
+    from samii_rig.identify import methods
     from samii_rig.identify.maximum_likelihood import identify as maximum_likelihood
     from samii_rig.identify.parameters import uncertain
-    from samii_rig.identify.table import summary_table
+    from samii_rig.identify.table import method_table, summary_table
 
+    if method not in ("likelihood", "1", "2"):
+        raise InputError("--method", "", method, "likelihood, 1 or 2")
+    if method != "likelihood" and not free:
+        raise InputError("--free", "", None, "what to identify, for example --free joint_1.k")
     recordings = read_all(logs)
     held = rig_of(recordings, rig)
     if held is None:
         raise InputError("--rig", "", None, "a rig: these recordings carry none")
-    responses = estimated(recordings, None, output, "auto", gaps, band)
     console = Console(highlight=False)
+    if method != "likelihood":
+        responses = estimated(recordings, None, None, "auto", gaps, band)
+        with console.status("identifying ..."):
+            by = methods.from_responses(
+                cast("methods.Method", method), responses, held[0], free or (), outputs=output,
+                band=band,
+            )  # fmt: skip
+        if json:
+            say_json(by.plain())
+        else:
+            console.print(method_table(by))
+        return
+    responses = estimated(recordings, None, output, "auto", gaps, band)
     with console.status("identifying ..."):
         found = maximum_likelihood(
             responses, held[0], free or uncertain(held[0]), prior=not free, band=band

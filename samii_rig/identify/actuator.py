@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.errors import InputError
-from samii_rig.identify.likelihood import log_misfit, minimise
+from samii_rig.identify.likelihood import FAR, Misfit, log_misfit, minimise
 from samii_rig.identify.maximum_likelihood import STARTS, identify, problem
 from samii_rig.identify.parameters import Free
 from samii_rig.identify.result import Identification
@@ -63,11 +63,22 @@ def fit_actuator(
     free : other parameters than `actuated_joint`. Raises InputError as `identify` does.
     """
     chosen = actuated_joint(rig, output) if free is None else free
-    posed = problem(responses, rig, chosen, band=band, outputs=[output])
-    posed.predictor.update_aliases(np.zeros(len(posed.space.names)))
-    found = minimise(
-        log_misfit, posed.data, posed.space, posed.predictor, np.zeros(len(posed.space.names))
-    )
+    return bode_fit(log_misfit, responses, rig, output, chosen, band)
+
+
+def bode_fit(
+    misfit: Misfit,
+    responses: Sequence[FrequencyResponse],
+    rig: Rig,
+    output: str,
+    free: Sequence[str | Free],
+    band: tuple[float, float] | None,
+) -> BodeFit:
+    """Least squares on one output's Bode diagram by `misfit`. Raises as `identify` does."""
+    posed = problem(responses, rig, free, band=band, outputs=[output])
+    start = np.zeros(len(posed.space.names))
+    posed.predictor.update_aliases(start)
+    found = minimise(misfit, posed.data, posed.space, posed.predictor, start, damping=FAR)
     H = posed.predictor.response(found.x)
     left = np.concatenate(
         [np.log(h / d.H).ravel() for h, d in zip(H, posed.data.lines, strict=True)]

@@ -15,7 +15,8 @@ from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.types import Float
 
-DAMPING = ("c", "tau", "eta")  # symbols of what is set to zero
+DAMPING = ("c", "tau", "eta", "R")  # symbols of what is set to zero
+HELD = 1e15  # N m/rad, of a joint that is a damper alone: its source holds it (g_v to infinity)
 NO_LAG = 1e15  # rad/s, a pole this far away turns nothing
 GRID = 300  # points over the band in which changes of sign are looked for
 REFINED = 24  # points put into each interval that holds one
@@ -35,6 +36,8 @@ class Conservative:
             for symbol in parameters(e):
                 if symbol in DAMPING:
                     update[e.name, symbol] = 0.0
+                elif symbol == "k" and getattr(e, symbol).value == 0:
+                    update[e.name, symbol] = HELD
                 elif symbol == "p":
                     update[e.name, symbol] = NO_LAG
         self._chain = Chain(changed(rig, update))
@@ -42,7 +45,7 @@ class Conservative:
         self._grid = np.geomspace(*band, GRID)
 
     def frequencies(self) -> Float:
-        """Natural frequencies in the band, Hz, increasing: paper 2 eq. 15."""
+        """Natural frequencies in the band, Hz, increasing: paper 1, eq. 17."""
         return self._changes(None)
 
     def zeros(self, output: str, actuator: int = 0) -> Float:

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from samii_rig.identify.data import Data
 from samii_rig.identify.parameters import Space
@@ -22,7 +21,12 @@ from samii_rig.types import Complex, Float
 # A logarithm of a response is not taken to be known better than this: 10 % of gain or 6
 # degrees. Below it the first stage would look at what only the second can resolve.
 LOG_FLOOR = 0.1
-STEPS = 60  # of either stage at most; 5 to 15 are usual
+STEPS = 60  # evaluations of either stage at most; 4 to 15 are usual
+# First damping, of the squared norm of a column of the Jacobian, near the minimum and far from
+# it. With a tenth of FAR 5 of 100 starts within 30 % of the truth end in another minimum.
+NEAR, FAR = 1e-3, 0.1
+LEAST_SCALE = 1e-8  # of the largest norm: a parameter that nothing depends on stays in place
+AGREES = 0.25  # of the decrease that the linear model expects, at least, to end there
 
 Evaluated = tuple[Float, Float]
 
@@ -42,6 +46,16 @@ def noise_misfit(data: Data, space: Space, predictor: Predictor, x: Float) -> Ev
 
 def log_misfit(data: Data, space: Space, predictor: Predictor, x: Float) -> Evaluated:
     """Residuals of log(model/measurement), phases within half a turn, and their Jacobian."""
+    return _real(*_logarithms(data, predictor, x), space, x)
+
+
+def gain_misfit(data: Data, space: Space, predictor: Predictor, x: Float) -> Evaluated:
+    """Residuals of log|model/measurement|, without the phase, and their Jacobian."""
+    rows, slopes = _logarithms(data, predictor, x)
+    return _real([_gain(r) for r in rows], [_gain(s) for s in slopes], space, x)
+
+
+def _logarithms(data: Data, predictor: Predictor, x: Float) -> tuple[list[Complex], list[Complex]]:
     H, dH = predictor.gradient(x)
     rows: list[Complex] = []
     slopes: list[Complex] = []
@@ -50,8 +64,12 @@ def log_misfit(data: Data, space: Space, predictor: Predictor, x: Float) -> Eval
         weight = 1 / np.sqrt(LOG_FLOOR**2 + d.sd**2 / np.where(size > 0, size, 1e-300))
         left: Complex = np.log(h / np.where(size > 0, d.H, h))
         rows.append((weight * left)[:, :, None])
-        slopes.append(weight[:, :, None] * dh / h[:, :, None])
-    return _real(rows, slopes, space, x)
+        slopes.append((weight / h)[:, :, None] * dh)
+    return rows, slopes
+
+
+def _gain(logarithm: Complex) -> Complex:
+    return np.asarray(logarithm.real + 0j)
 
 
 def chi_square(data: Data, predictor: Predictor, x: Float) -> list[Float]:
@@ -85,48 +103,58 @@ def minimise(
     *,
     fixed: int | None = None,
     tolerance: float = 1e-9,
+    damping: float = NEAR,
 ) -> Minimum:
-    """A local minimum by a trust region method within the bounds.
+    """A local minimum within the bounds by the method of Levenberg and Marquardt.
+
+    The normal equations: with a few parameters they cost nothing beside the model, and the
+    columns are scaled by their norms (More, 1978), so that what is lost in digits is what the
+    noise has long taken. Each step moves the parameters that no bound holds and ends at the
+    bounds (projection).
 
     fixed : index of a parameter that stays at its start (profile likelihood).
     tolerance : of the cost and of x, relative, at which it ends.
+    damping : the first one; `FAR` where the start may be far away.
     """
-    moving = np.array([i for i in range(start.size) if i != fixed], dtype=np.int64)
-    held: dict[bytes, Evaluated] = {}
-
-    def at(free: Float) -> Evaluated:
-        # The solver asks for residuals and Jacobian one after the other; they cost as one.
-        key = free.tobytes()
-        if key not in held:
-            x = start.copy()
-            x[moving] = free
-            held.clear()
-            held[key] = misfit(data, space, predictor, x)
-        return held[key]
-
-    margin = 1e-9 * (space.upper - space.lower)[moving]
-    inside = np.clip(start[moving], space.lower[moving] + margin, space.upper[moving] - margin)
-
-    def residual(free: Float) -> Float:
-        return at(free)[0]
-
-    def slope(free: Float) -> Float:
-        return at(free)[1][:, moving]
-
-    result = least_squares(
-        residual,
-        inside,
-        jac=slope,
-        bounds=(space.lower[moving], space.upper[moving]),
-        x_scale="jac",
-        ftol=tolerance,
-        xtol=tolerance,
-        gtol=None,
-        max_nfev=STEPS,
-    )
-    x = start.copy()
-    x[moving] = result.x
-    return Minimum(x, float(result.cost), at(result.x)[1], bool(result.status > 0))
+    free = np.ones(start.size, bool)
+    if fixed is not None:
+        free[fixed] = False
+    x = np.where(free, np.clip(start, space.lower, space.upper), start)
+    r, J = misfit(data, space, predictor, x)
+    cost, growth = float(r @ r) / 2, 2.0
+    scale = np.zeros(start.size)
+    for _ in range(STEPS - 1):
+        slope, curvature = J.T @ r, J.T @ J
+        scale = np.maximum(scale, np.sqrt(np.diagonal(curvature)))
+        floor = LEAST_SCALE * float(scale.max(initial=0.0)) + np.finfo(float).tiny
+        held = ((x <= space.lower) & (slope > 0)) | ((x >= space.upper) & (slope < 0))
+        moving = np.flatnonzero(free & ~held)
+        if not moving.size:
+            return Minimum(x, cost, J, True)
+        damped = curvature[np.ix_(moving, moving)]
+        damped = damped + np.diag(damping * np.maximum(scale, floor)[moving] ** 2)
+        trial = x.copy()
+        trial[moving] -= np.linalg.solve(damped, slope[moving])
+        trial = np.where(free, np.clip(trial, space.lower, space.upper), start)
+        step = trial - x
+        expected = -float(step @ slope + step @ curvature @ step / 2)
+        small = float(np.linalg.norm(step)) < tolerance * (tolerance + float(np.linalg.norm(x)))
+        if small or expected <= 0:
+            return Minimum(x, cost, J, True)
+        r_new, J_new = misfit(data, space, predictor, trial)
+        new = float(r_new @ r_new) / 2
+        gain = (cost - new) / expected
+        if gain > 0:
+            ends = cost - new < tolerance * cost and gain > AGREES
+            x, r, J, cost = trial, r_new, J_new, new
+            damping, growth = damping * max(1 / 9, 1 - (2 * gain - 1) ** 3), 2.0
+            if ends:
+                return Minimum(x, cost, J, True)
+        else:
+            if expected < tolerance * cost:
+                return Minimum(x, cost, J, True)
+            damping, growth = damping * growth, 2 * growth
+    return Minimum(x, cost, J, False)
 
 
 def _real(rows: list[Complex], slopes: list[Complex], space: Space, x: Float) -> Evaluated:

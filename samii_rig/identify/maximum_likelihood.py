@@ -18,6 +18,7 @@ from samii_rig.errors import InputError
 from samii_rig.identify.data import Data, collect
 from samii_rig.identify.identifiability import identifiability
 from samii_rig.identify.likelihood import (
+    FAR,
     Minimum,
     chi_square,
     log_misfit,
@@ -49,8 +50,9 @@ class Problem:
 
     def from_start(self, x: Float) -> Minimum:
         """The optimum that x leads to: first on the logarithm, then in noise units."""
-        near = minimise(log_misfit, self.data, self.space, self.predictor, x, tolerance=COARSE)
-        return minimise(noise_misfit, self.data, self.space, self.predictor, near.x)
+        to = (self.data, self.space, self.predictor)
+        near = minimise(log_misfit, *to, x, tolerance=COARSE, damping=FAR)
+        return minimise(noise_misfit, *to, near.x)
 
     def polished(self, found: Minimum) -> Minimum:
         """The optimum with the aliases of the optimum."""

@@ -23,8 +23,16 @@ class Predictor:
 
     def __init__(self, rig: Rig, data: Data, space: Space) -> None:
         self._space, self._data = space, data
-        self._chain = Chain(rig.model_copy(update={"rate_hz": data.lines[0].response.rate_hz}))
-        rig = self._chain.rig
+        # Of the sensors only those measured: each costs a solution of its own.
+        used = np.unique(np.concatenate([d.sensor for d in data.lines]))
+        self._row = [np.searchsorted(used, d.sensor) for d in data.lines]
+        kept = {
+            "rate_hz": data.lines[0].response.rate_hz,
+            "sensor": tuple(rig.sensor[i] for i in used),
+            "feedback": (),  # the loops of the device are not in the chain's response
+        }
+        rig = rig.model_copy(update=kept)
+        self._chain = Chain(rig)
         f = data.frequency
         hold = [hold_response(f, rig.rate_hz, a.delay) for a in rig.actuator]
         self._factor = (
@@ -49,7 +57,8 @@ class Predictor:
     def gradient(self, x: Float) -> tuple[list[Complex], list[Complex]]:
         """The same, and its derivatives by x, (n, p, n_free) each."""
         H, dH = self.chain(x).gradient(self._data.frequency, self._space.keys)
-        dH *= self._factor[..., None] * self._space.values(x)
+        dH *= self._factor[..., None]
+        dH *= self._space.values(x)
         return self._split(self._whole(H)), self._split(dH)
 
     def _whole(self, H: Complex) -> Complex:
@@ -57,4 +66,7 @@ class Predictor:
         return H if self.aliases is None else H + self.aliases
 
     def _split(self, H: Complex) -> list[Complex]:
-        return [H[d.place[:, None], d.sensor, d.actuator] for d in self._data.lines]
+        return [
+            H[d.place[:, None], row, d.actuator]
+            for d, row in zip(self._data.lines, self._row, strict=True)
+        ]

@@ -124,6 +124,7 @@ class Identification:
                 }
                 for i, name in enumerate(self.names)
             },
+            "log_covariance": (self.log_covariance * self.inflation() ** 2).tolist(),
             "chi_square_per_dof": self.fit.ratio,
             "p_value": self.fit.p_value,
             "residuals": [asdict(r) for r in self.residuals],

@@ -7,6 +7,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from samii_rig.identify.methods import Found
 from samii_rig.identify.modal import Modes, Value
 from samii_rig.identify.result import Identification, Residual
 
@@ -49,6 +50,29 @@ def _channels(found: Identification) -> Table:
             f"at {worst.low_hz:.2g} to {worst.high_hz:.2g} Hz",
         )
     return table
+
+
+def method_table(found: Found) -> RenderableType:
+    """What method 1 or 2 measured, what the model has instead, and the parameters."""
+    numbers = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for column in ("number", "measured", "model"):
+        numbers.add_column(column)
+    for (name, value), model in zip(found.numbers.items(), found.match.model, strict=True):
+        numbers.add_row(name, _value(value), f"{model:.5g}")
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for column in ("parameter", "identified", "change"):
+        table.add_column(column)
+    m = found.match
+    for name, value, start in zip(m.names, m.values, found.start, strict=True):
+        table.add_row(name, f"{value:.5g}", f"{100 * (value / start - 1):+.1f} %")
+    if found.gain:
+        for name, value in zip(found.gain.names, found.gain.values, strict=True):
+            table.add_row(f"{name} (from the amplitude)", f"{value:.5g}", "")
+    said = Text(
+        f"Method {found.method} of paper 1 at {found.level:g} {found.level_unit}, "
+        f"e = {m.error:.2g}. It gives no intervals; without --method maximum likelihood does."
+    )
+    return Group(said, Text(""), numbers, Text(""), table)
 
 
 def modes_table(modes: Modes) -> RenderableType:

@@ -129,8 +129,7 @@ def method_1(
 
     frequencies_hz : the first natural frequencies, lowest first (the paper has two).
     zero_hz : first zero of the way from the driven joint's angle to `output` (a_0).
-    The paper's second stage sets the gains g_v of its actuator from the amplitudes; a chain
-    whose sources are velocity sources has none, and for others `identify` finds them.
+    The second stage, the gains g_v from the amplitudes, is `velocity_feedback.fit_gain`.
     """
     targets = [Target("frequency", f, i) for i, f in enumerate(frequencies_hz)]
     return match(rig, free, [*targets, Target("zero", zero_hz, 0, output)], damped)

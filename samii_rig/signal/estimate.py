@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samii_rig.errors import EstimateError, InputError
-from samii_rig.signal import local, periodic, repeats, welch
+from samii_rig.signal import local, periodic, repeats, stepped, welch
 from samii_rig.signal.choose import Method, at_rest, choose, drop_foreign, drop_stuck
 from samii_rig.signal.distortion import Distortion, distortion
 from samii_rig.signal.gather import Gaps, gather
@@ -68,9 +68,10 @@ def estimate(
 
     Returns
     -------
-    One `FrequencyResponse` per group, in order of appearance. `method` and `why` say what
-    was done; `findings` what was noticed, excluded or weakened. `input_rms` is the rms of
-    the sine at the time the sweep passes a frequency (periodic: of the line).
+    One `FrequencyResponse` per group, in order of appearance, those of stepped sines first.
+    `method` and `why` say what was done; `findings` what was noticed, excluded or weakened.
+    `input_rms` is the rms of the sine at the time the sweep passes a frequency (periodic: of
+    the line).
 
     Raises
     ------
@@ -84,9 +85,16 @@ def estimate(
         raise InputError("estimate", "gaps", gaps, f"one of {', '.join(get_args(Gaps))}")
     if band is not None and not 0 <= band[0] < band[1]:
         raise InputError("estimate", "band", band, "(low, high) in Hz, low below high")
-    groups = gather(recordings, input=input, outputs=outputs, reference=reference, gaps=gaps)
     out: list[FrequencyResponse] = []
     failed: list[EstimateError] = []
+    if method in ("auto", "periodic"):
+        sines, recordings = stepped.split(recordings)
+        out, failed = stepped.estimate_stepped(
+            sines, input=input, outputs=outputs, reference=reference, gaps=gaps, band=band
+        )
+    groups: list[Group] = []
+    if recordings or not (out or failed):
+        groups = gather(recordings, input=input, outputs=outputs, reference=reference, gaps=gaps)
     usable: list[Group] = []
     for group in groups:
         try:
@@ -123,20 +131,21 @@ def _repeats(
 ) -> FrequencyResponse:
     pieces = group.pieces
     periods: periodic.Periods | None = None
+    shared, correlation = 1.0, 0.0
     if method == "burst":
         spectra, shared = burst_spectra(pieces, group.rate_hz)
         if rests(pieces[0].r)[0] < LEAD_IN * len(pieces[0]):
             group.findings.append(_no_lead_in(pieces[0].name))
     elif method == "settled":
         skip = group.unsettled
-        spectra, shared = settled_spectra(pieces[skip - 1 :], group.rate_hz), 1.0
+        spectra, correlation = settled_spectra(pieces[skip - 1 :], group.rate_hz)
         for piece in pieces[:skip]:
             text = f"{piece.name} left out: the motion had not settled since it started from rest"
             group.findings.append(Finding("leakage", "note", text, segment=piece.name))
         pieces = pieces[skip:]
     else:
         periods = periodic.periods(group)
-        pieces, spectra, shared = periods.pieces, periods.independent, 1.0
+        pieces, spectra = periods.pieces, periods.independent
         why = f"{why}; {periods.why}" if periods.why else why
     lines = comb(spectra, band) if method == "periodic" else excited(spectra, band)
     n, p = len(spectra), len(group.selection.outputs)
@@ -156,7 +165,7 @@ def _repeats(
         if len(periods.spectra) > 1:
             # Each realisation is rounded in its own way, so that the scatter shows it.
             floor, findings = np.zeros_like(floor), {}
-    result = repeats.over_repeats(R, Z, wanted, floor, shared)
+    result = repeats.over_repeats(R, Z, wanted, floor, shared, correlation)
     scatter = np.diagonal(result.noise, axis1=1, axis2=2).real
     for i, message in findings.items():
         part = float(np.mean(scatter[:, i] < floor[i]))

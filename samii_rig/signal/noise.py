@@ -2,17 +2,21 @@
 
 A few repeats of several channels give a covariance of low rank at each line. Neighbouring
 lines see nearly the same noise, except where a disturbance has passed through the plant:
-its spectrum then has the plant's resonances. So the residuals are first whitened by a vector
-autoregressive model of the noise over the band, the whitened residuals are pooled, and the
-whitening is undone. The model need not be right: the pooling measures what it left. It is a
-linear map at each line, so the pooled matrix stays complex Wishart with the degrees of
-freedom of the pooling.
+its spectrum then has the plant's resonances. So the residuals are first whitened by a model
+of the noise over the band, the whitened residuals are pooled, and the whitening is undone. The
+model is a disturbance at the input (see `disturbance`) or none, whichever is the better, and a
+vector autoregressive model of what that leaves. It need not be right: the pooling measures
+what it left. It is a linear map at each line, so the pooled matrix stays complex Wishart with
+the degrees of freedom of the pooling.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
+from samii_rig.signal import disturbance
 from samii_rig.types import Complex, Float
 
 # Orders tried; the best by BIC. One complex pole of the band per output and order.
@@ -21,20 +25,53 @@ ORDERS = (0, 1, 2, 3, 4, 6, 8)
 DATA_PER_COEFFICIENT = 20
 
 
-def pooled(e: Complex, dof_per_line: float, lines: int) -> tuple[Complex, Float, int]:
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """A pooled covariance.
+
+    covariance : (n_freq, p, p) of one residual. dof : (n_freq,). order : of the
+    autoregressive model. through_input : whether it is one of what a disturbance at the input
+    leaves.
+    """
+
+    covariance: Complex
+    dof: Float
+    order: int
+    through_input: bool
+
+    @property
+    def remark(self) -> str:
+        """How it was whitened, in words; "" where it was not."""
+        parts = ["a disturbance at the input"] if self.through_input else []
+        parts += [f"a model of order {self.order}"] if self.order else []
+        return f"noise whitened by {' and '.join(parts)}, " if parts else ""
+
+
+def pooled(e: Complex, dof_per_line: float, lines: int, H: Complex | None = None) -> Noise:
     """Covariance of the residuals at each line, from `lines` neighbouring lines.
 
     e : (n, n_freq, p), n residuals at each line that together have `dof_per_line` degrees
         of freedom.
-    Returns (covariance (n_freq, p, p) of one residual, nu (n_freq,), order of the model).
+    H : (n_freq, p) response from the input to the outputs, through which a disturbance may
+        have come; None where there is none to speak of.
     Windows keep their width at the ends of the band, where they lie to one side.
     """
     _, n_freq, p = e.shape
     lines = min(lines, n_freq)
     rms = np.sqrt(np.mean(np.abs(e) ** 2, axis=(0, 1)))
+    lively = bool(np.all(rms > 0))
     rms = np.where(rms > 0, rms, 1.0)
     unit = e / rms
-    factor, order = _shape(unit, dof_per_line)
+    score, factor, order = _shape(unit, dof_per_line)
+    through_input = False
+    if H is not None and lively and n_freq >= disturbance.WINDOW:
+        L, log_det = disturbance.shape(unit, disturbance.from_neighbours(H) / rms, dof_per_line)
+        left = np.linalg.solve(L, unit.transpose(1, 2, 0)).transpose(2, 0, 1)
+        other, rest, rest_order = _shape(np.asarray(left), dof_per_line)
+        # One more number, S, was fitted.
+        data = dof_per_line * n_freq
+        if other + data * log_det + np.log(data) / 2 < score:
+            factor, order, through_input = L @ rest, rest_order, True
     white = np.linalg.solve(factor, unit.transpose(1, 2, 0))
     power = white @ white.conj().transpose(0, 2, 1)
     total = np.concatenate([np.zeros((1, p, p)), np.cumsum(power, axis=0)])
@@ -44,15 +81,16 @@ def pooled(e: Complex, dof_per_line: float, lines: int) -> tuple[Complex, Float,
     nu = np.full(n_freq, dof_per_line * lines - lost * lines)
     mean = (total[start + lines] - total[start]) / nu[:, None, None]
     covariance = factor @ mean @ factor.conj().transpose(0, 2, 1)
-    return covariance * rms[:, None] * rms[None, :], nu, order
+    return Noise(covariance * rms[:, None] * rms[None, :], nu, order, through_input)
 
 
-def _shape(e: Complex, dof_per_line: float) -> tuple[Complex, int]:
-    """L (n_freq, p, p) with L L^H the shape of the noise over the band, and the order.
+def _shape(e: Complex, dof_per_line: float) -> tuple[float, Complex, int]:
+    """Score, L (n_freq, p, p) with L L^H the shape of the noise over the band, and the order.
 
     The lines of the band are taken as the spectrum of a complex signal sampled at the
     band's width; the Yule-Walker equations come from its circular autocovariance
-    (Priestley, Spectral Analysis and Time Series, 1981, section 9.4).
+    (Priestley, Spectral Analysis and Time Series, 1981, section 9.4). The score is half the
+    BIC but for a constant; it is infinite where there is no shape to find.
     """
     _, n_freq, p = e.shape
     data = dof_per_line * n_freq
@@ -72,7 +110,7 @@ def _shape(e: Complex, dof_per_line: float) -> tuple[Complex, int]:
             turn = np.exp(-2j * np.pi * np.outer(np.arange(n_freq), np.arange(order + 1)) / n_freq)
             response = np.einsum("fs,spq->fpq", turn, np.concatenate([eye[None], A]))
             best = (score, np.linalg.solve(response, np.linalg.cholesky(sigma)), order)
-    return best[1], best[2]
+    return best
 
 
 def _yule_walker(gamma: Complex, order: int) -> tuple[Complex, Complex]:

@@ -38,11 +38,20 @@ class Lines:
     remark: str
 
 
-def over_repeats(R: Complex, Z: Complex, lines: int, floor: Float, shared: float = 1.0) -> Lines:
+def over_repeats(
+    R: Complex,
+    Z: Complex,
+    lines: int,
+    floor: Float,
+    shared: float = 1.0,
+    correlation: float = 0.0,
+) -> Lines:
     """Estimate from R (n, n_freq) and Z (n, n_freq, 1 + p), n >= 2 repeats.
 
     lines : how many neighbouring lines share one covariance.
     shared : how many lines count as one independent line (tapered records).
+    correlation : of the noise of neighbouring repeats: the scatter shows too little of it by
+        1 - 2 correlation/n, and the mean has more by 1 + 2 correlation (n - 1)/n.
     floor : (p,) variance per line of errors that repeat with the reference (quantisation of
         a deterministic signal); repeats do not show them, so what of the floor is not in the
         scatter is added, and does not fall with the number of repeats.
@@ -54,22 +63,23 @@ def over_repeats(R: Complex, Z: Complex, lines: int, floor: Float, shared: float
     S_rr = np.einsum("nf,nf->f", R, R.conj()).real
     H = S_yr / S_vr[:, None]
     e = Y - H * V[:, :, None]
-    noise, nu, order = pooled(e, n - 1, lines)
+    found = pooled(e, n - 1, lines, H)
+    noise = found.covariance / (1 - 2 * correlation / n)
+    more = 1 + 2 * correlation * (n - 1) / n
     # Of an output's own quantisation only; what the recorded input did is known.
     scatter = np.diagonal(noise, axis1=1, axis2=2).real
     hidden = np.maximum(floor - scatter, 0.0)
     per_line = (S_rr / np.abs(S_vr) ** 2)[:, None, None]
     repeated = (n * np.eye(H.shape[1])) * hidden[:, None, :]
-    covariance = (noise + repeated) * per_line
-    remark = f"noise whitened by a model of order {order}, " if order else ""
+    covariance = (noise * more + repeated) * per_line
     return Lines(
         H=H,
         covariance=covariance,
-        dof=nu / shared,
+        dof=found.dof / shared,
         noise=noise,
         gain=S_vr / S_rr,
         input_power=np.mean(np.abs(V) ** 2, axis=0),
-        remark=f"{remark}{min(lines, len(H))} lines pooled",
+        remark=f"{found.remark}{min(lines, len(H))} lines pooled",
     )
 
 

@@ -115,12 +115,12 @@ def _against_scatter(ends: Float, highest: float) -> Float:
     lines = min(bins, -(-4 * p // (n - 1)))
     if p == 0 or (n - 1) * lines <= p or not np.any(scatter):
         return np.where(lively & np.any(mean, axis=0), np.inf, np.zeros(outputs))
-    covariance, nu, _ = pooled(scatter, n - 1, lines)
-    t2 = hotelling(mean[:, lively], covariance / n)
-    if hotelling_p(t2, p, np.maximum(nu, p)).min() >= RINGING / bins:
+    noise = pooled(scatter, n - 1, lines)
+    t2 = hotelling(mean[:, lively], noise.covariance / n)
+    if hotelling_p(t2, p, np.maximum(noise.dof, p)).min() >= RINGING / bins:
         return np.zeros(outputs)
-    noise = np.sqrt(np.mean(np.abs(spectra - mean) ** 2, axis=(0, 1)) / (n - 1)) + 1e-300
-    return np.asarray(np.abs(mean).max(axis=0) / noise * lively)
+    rms = np.sqrt(np.mean(np.abs(spectra - mean) ** 2, axis=(0, 1)) / (n - 1)) + 1e-300
+    return np.asarray(np.abs(mean).max(axis=0) / rms * lively)
 
 
 def _against_itself(end: Float, peak: Float) -> Float:

@@ -94,13 +94,15 @@ def burst_spectra(pieces: Sequence[Piece], rate_hz: float) -> tuple[list[Spectru
     return out, float(1 + 2 * np.sum(share[1:] ** 2))
 
 
-def settled_spectra(pieces: Sequence[Piece], rate_hz: float) -> list[Spectrum]:
+def settled_spectra(pieces: Sequence[Piece], rate_hz: float) -> tuple[list[Spectrum], float]:
     """Spectra of all but the first of bursts that run into each other, each a whole period.
 
     The tail of the burst before still rings at the start of the next one, and in the settled
     motion that is exactly what is missing after its own end. In the rest after the reference
     each piece is faded over into its predecessor, which changes nothing in the motion, since the
     two are one there, but lets the noise run on smoothly from the end to the start.
+
+    Also the correlation of white noise between neighbours, which share the tail faded over.
     """
     tail = min(rests(pieces[0].r)[1] // 2, int(TAPER * len(pieces[0])))
     fade = np.cos(np.pi / 2 * (np.arange(tail) + 0.5) / max(tail, 1))[:, None] ** 2
@@ -110,7 +112,8 @@ def settled_spectra(pieces: Sequence[Piece], rate_hz: float) -> list[Spectrum]:
         end = slice(len(piece) - tail, None)
         z[end] = fade * z[end] + (1 - fade) * before.z[end]
         out.append(spectrum(replace(piece, z=z), rate_hz))
-    return out
+    both = float(np.sum(fade * (1 - fade)))
+    return out, both / (len(pieces[0]) - 2 * both)
 
 
 def rests(r: Float) -> tuple[int, int]:
