@@ -1,8 +1,8 @@
 """The inner loop: plant, converters and the device's own control, sample by sample.
 
 What an embedded controller does at sample n: read the sensors, form
-v[n] = u[n] + kp (theta_ref[n] - theta[n]), keep its limits and its deadman, put v[n] out. The
-plant then moves on by one sample in `inner` exact steps.
+v[n] = u[n] + kp (theta_ref[n] - theta[n]) + feedback[n], keep its limits and its deadman, put
+v[n] out. The plant then moves on by one sample in `inner` exact steps.
 """
 
 from __future__ import annotations
@@ -56,6 +56,21 @@ class Control(NamedTuple):
     slew: float
     max_angle: float
     deadman: int
+
+
+class Filters(NamedTuple):
+    """The device's feedback loops: cascades of sections, see `samii_rig.model.feedback`.
+
+    sensor, most : (n,) index of the sensor that each loop reads, and its largest |output|.
+    first : (n + 1,) its sections are first[i] to first[i + 1].
+    rows : (n_section, 5) b0 b1 b2 a1 a2. memory : (n_section, 2), changed in place.
+    """
+
+    sensor: Int
+    most: Float
+    first: Int
+    rows: Float
+    memory: Float
 
 
 class Drive(NamedTuple):
@@ -135,10 +150,36 @@ def _convert(c: Converters, i: int, n: int, y: float, noise: float) -> tuple[flo
 
 
 @njit(cache=True)
+def _feedback(f: Filters, y: Float) -> float:
+    """Sum of the loops' outputs for the sensors' values y, (m,), each clipped."""
+    total = 0.0
+    for i in range(f.sensor.shape[0]):
+        value = y[f.sensor[i]]
+        for j in range(f.first[i], f.first[i + 1]):
+            w, row = f.memory[j], f.rows[j]
+            out = row[0] * value + w[0]
+            w[0] = row[1] * value - row[3] * out + w[1]
+            w[1] = row[2] * value - row[4] * out
+            value = out
+        total += min(max(value, -f.most[i]), f.most[i])
+    return total
+
+
+@njit(cache=True)
+def _lost(k: Control, f: Filters, y: Float) -> bool:
+    """Whether theta is beyond its limit, or a sensor that a loop reads gives no number."""
+    lost = not abs(y[k.theta]) <= k.max_angle
+    for i in f.sensor:
+        lost = lost or not np.isfinite(y[i])
+    return lost
+
+
+@njit(cache=True)
 def _command(
-    c: Converters, k: Control, s: State, u: float, ref: float, given: bool, theta: float
+    c: Converters, k: Control, f: Filters, s: State, u: float, ref: float, given: bool, y: Float
 ) -> tuple[float, int]:
-    """v of this sample, and whether a limit or the deadman changed it."""
+    """v of this sample from the sensors' values y, and whether a limit or the deadman changed
+    it. The filters stand at zero whenever the output is not live."""
     flag = s.flag
     if given:
         flag[LIVE], flag[DRY], flag[DEAD] = 1, 0, 0
@@ -146,13 +187,12 @@ def _command(
         flag[DRY] += 1
         if k.deadman >= 0 and flag[DRY] > k.deadman:
             flag[LIVE], flag[DEAD] = 0, 1
-    if flag[LIVE] and not flag[TRIPPED] and not abs(theta) <= k.max_angle:
+    if flag[LIVE] and not flag[TRIPPED] and _lost(k, f, y):
         flag[TRIPPED] = 1
-    if flag[TRIPPED] or flag[DEAD]:
-        return 0.0, LIMITED
-    if not flag[LIVE]:
-        return 0.0, 0
-    wanted = u + k.kp * (ref - theta)
+    if flag[TRIPPED] or flag[DEAD] or not flag[LIVE]:
+        f.memory[:] = 0.0
+        return 0.0, LIMITED if flag[TRIPPED] or flag[DEAD] else 0
+    wanted = u + k.kp * (ref - y[k.theta]) + _feedback(f, y)
     low = max(-k.max_output, c.v_low, s.number[LAST_V] - k.slew)
     high = min(k.max_output, c.v_high, s.number[LAST_V] + k.slew)
     v = min(max(wanted, low), high)
@@ -189,6 +229,7 @@ def advance(
     t: Tables,
     c: Converters,
     k: Control,
+    f: Filters,
     d: Drive,
     s: State,
     u: Float,
@@ -227,7 +268,7 @@ def advance(
             number[LAST_REF] = theta_ref[n]
         reference = u[n] if given[n] else 0.0
         v, limited = _command(
-            c, k, s, reference, number[LAST_REF], given[n] != 0, values[n, SENSORS + k.theta]
+            c, k, f, s, reference, number[LAST_REF], given[n] != 0, values[n, SENSORS:]
         )
         values[n, U], values[n, THETA_REF], values[n, V] = reference, number[LAST_REF], v
         quality[n, U], quality[n, THETA_REF], quality[n, V] = 0, 0, limited

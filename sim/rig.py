@@ -6,25 +6,27 @@ at n / rate on the device's clock.
 
 The device, at each sample:
 
-- With a reference queued for it: v = u + kp (theta_ref - theta), theta as measured.
+- With a reference queued for it: v = u + kp (theta_ref - theta) + feedback, theta and the
+  feedback's sensors as measured. The filters start from zero state when the output goes live.
 - Queue dry: u = 0 and the last theta_ref stay, the loop keeps centring; after `deadman` s of
   that v = 0, until a new reference comes. Samples that come too late are ignored.
 - |v| and its rate are kept within the limits of `DeviceLoop` and the converter's range;
-  |theta| beyond max_angle (or theta lost) drops v to zero until it is configured again. A
-  changed v is flagged `Quality.LIMITED`.
+  |theta| beyond max_angle (or theta lost, or a sensor of a feedback) drops v to zero until it
+  is configured again. A changed v is flagged `Quality.LIMITED`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
 
 from samii_rig.errors import DeviceError, InputError
+from samii_rig.model.feedback import sections
 from samii_rig.model.realise import Realisation, realise
 from samii_rig.model.sampled import filter_response
-from samii_rig.rig.schema import AngularVelocitySource, Rig
+from samii_rig.rig.schema import SOURCES, AngularVelocitySource2, Feedback, Rig
 from samii_rig.run.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.types import Channel, Flags, Float, Int, SampleBlock
 from sim import kernel
@@ -34,7 +36,7 @@ from sim.settings import SimSettings, read_settings
 NEVER = np.iinfo(np.int64).max  # a sample that does not come
 CHUNK = 4096  # samples in one call of the inner loop, so that memory stays bounded
 NS = 1_000_000_000
-UNRELATED = {"description", "limit", "centring", "device"}  # to the continuous response
+UNRELATED = {"description", "limit", "centring", "feedback", "device"}  # to the continuous response
 
 
 class SimulatedDevice:
@@ -56,6 +58,7 @@ class SimulatedDevice:
         self._drive = _drive(rig, settings)
         self._state = kernel.rest(self._tables)
         self._control = kernel.Control(0, 0.0, 0.0, np.inf, np.inf, self._patience())
+        self._filters = _filters(rig, ())
         noise, disturbance = np.random.SeedSequence(settings.seed).spawn(2)
         self._noise = np.random.default_rng(noise)
         self._disturbance = np.random.default_rng(disturbance)
@@ -66,12 +69,16 @@ class SimulatedDevice:
     # Actuator
 
     def configure(self, loop: DeviceLoop) -> None:
-        """Set loop and limits; DeviceError while the loop is closed or if the sensor is none."""
+        """Set loops and limits; DeviceError while one is closed or if its sensor is none."""
         if self._state.flag[kernel.LIVE] and self._state.number[kernel.LAST_V] != 0.0:
             raise DeviceError(f"{self.name}: configured while the output is not zero")
         names = [s.name for s in self._rig.sensor]
-        if loop.sensor not in names:
-            raise DeviceError(f"{self.name}: no sensor {loop.sensor!r} to close the loop on")
+        for sensor in (loop.sensor, *(f.sensor for f in loop.feedback)):
+            if sensor not in names:
+                raise DeviceError(f"{self.name}: no sensor {sensor!r} to close the loop on")
+        for f in loop.feedback:
+            if f.actuator != self.name:
+                raise DeviceError(f"{self.name}: feedback {f.name} drives {f.actuator}, not this")
         numbers = (loop.kp, loop.max_output, loop.max_rate, loop.max_angle)
         if not all(x >= 0.0 for x in numbers) or not np.isfinite(loop.kp):
             raise DeviceError(f"{self.name}: negative or missing number in {loop}")
@@ -83,6 +90,7 @@ class SimulatedDevice:
             float(loop.max_angle),
             self._patience(),
         )
+        self._filters = _filters(self._rig, loop.feedback)
         self._state.flag[kernel.TRIPPED] = 0
         self._state.flag[kernel.DEAD] = 0
 
@@ -100,6 +108,7 @@ class SimulatedDevice:
         state = self._state
         state.flag[kernel.LIVE] = state.flag[kernel.DRY] = state.flag[kernel.DEAD] = 0
         state.waiting[:] = 0.0
+        self._filters.memory[:] = 0.0
         state.number[kernel.LAST_V] = state.number[kernel.APPLIED] = 0.0
 
     # Sensor
@@ -156,6 +165,7 @@ class SimulatedDevice:
             self._tables,
             self._converters,
             self._control,
+            self._filters,
             self._drive,
             self._state,
             u,
@@ -273,12 +283,26 @@ def _converters(rig: Rig, settings: SimSettings) -> kernel.Converters:
     )
 
 
-def _drive(rig: Rig, settings: SimSettings) -> kernel.Drive:
-    p = next(
-        e.p.value
-        for e in rig.element
-        if isinstance(e, AngularVelocitySource) and e.input == rig.actuator[0].name
+def _filters(rig: Rig, feedback: Sequence[Feedback]) -> kernel.Filters:
+    """The loops as tables, from zero state."""
+    names = [s.name for s in rig.sensor]
+    rows = [sections(f, rig.rate_hz) for f in feedback]
+    table = np.concatenate([np.zeros((0, 5)), *rows])
+    return kernel.Filters(
+        np.array([names.index(f.sensor) for f in feedback], dtype=np.int64),
+        np.array([f.max for f in feedback], dtype=np.float64),
+        np.cumsum([0, *(len(r) for r in rows)], dtype=np.int64),
+        table,
+        np.zeros((len(table), 2)),
     )
+
+
+def _drive(rig: Rig, settings: SimSettings) -> kernel.Drive:
+    # The disturbance passes the source's lag; a source without a first-order one lets it through.
+    sources = [e for e in rig.element if isinstance(e, SOURCES)]
+    own = next(e for e in sources if e.input == rig.actuator[0].name)
+    lag = None if isinstance(own, AngularVelocitySource2) else own.p
+    p = lag.value if lag else np.inf
     return kernel.Drive(
         # White noise: its mean over `inner` steps has this rms.
         settings.disturbance_rms * np.sqrt(settings.inner),

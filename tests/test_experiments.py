@@ -197,7 +197,15 @@ def test_any_values_give_a_plan_or_one_line(changes):
 # Finding files
 
 
-@pytest.mark.parametrize(("rig", "kind"), [("samii", "swept_sine"), ("sflr", "swept_sine_sflr")])
+@pytest.mark.parametrize(
+    ("rig", "kind"),
+    [
+        ("samii", "swept_sine"),
+        ("samii_joint_3", "swept_sine_joint_3"),
+        ("samii_braced", "swept_sine_braced"),
+        ("sflr", "swept_sine_sflr"),
+    ],
+)
 def test_each_rig_has_its_swept_sine(rig, kind):
     loaded, _ = load_rig(rig)
     experiment, text = load_experiment("swept_sine", loaded)
@@ -215,7 +223,8 @@ def test_the_shipped_campaign_takes_ten_minutes():
 
 
 def test_every_shipped_file_is_found_and_loads():
-    assert set(shipped()) >= {"swept_sine", "swept_sine_sflr"}
+    kinds = {"mode_scan", "multisine", "stepped_sine", "swept_sine", "torque_test"}
+    assert set(shipped()) >= {*kinds, "swept_sine_sflr", "swept_sine_samii_braced"}
     for name in shipped():
         load_experiment(name, RIG)
 
@@ -230,8 +239,8 @@ def test_a_file_is_loaded_by_its_path(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "experiment is None; expected one of multisine"),
-        ('experiment = "braced"', "experiment is 'braced'; expected one of multisine"),
+        ("", "experiment is None; expected one of mode_scan, multisine"),
+        ('experiment = "braced"', "experiment is 'braced'; expected one of mode_scan, multisine"),
         ("experiment = 3", "experiment is 3"),
         ("experiment = ", "valid TOML"),
     ],

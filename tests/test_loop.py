@@ -15,6 +15,7 @@ from fake_device import RATE, FakeDevice, fake_rig
 
 from samii_rig.errors import DeviceError, GateError, InputError
 from samii_rig.run.clock import MonotonicClock
+from samii_rig.run.dwell import Reference
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import run
 from samii_rig.run.pace import LoopSettings
@@ -647,7 +648,7 @@ def test_a_device_that_echoes_its_reference_is_believed():
         ("u", "V", "reference"),
         ("theta_ref", "rad", "reference"),
     ]
-    assert Collector(RIG, plan(), channels, 10).take() is None
+    assert Collector(RIG, plan(), Reference(plan()), channels, 10).take() is None
 
 
 def test_the_joint_ends_where_the_centring_loop_holds_it():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 from contextlib import nullcontext
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,7 +22,13 @@ from samii_rig.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from samii_rig.report.compare import ModelCurve
+    from samii_rig.run.campaign import Outcome
     from samii_rig.run.dryrun import DryRun
+    from samii_rig.run.protocols import Plan
+    from samii_rig.run.setups import Setup
 
 # Exit codes of a run that did not go through; the recording is whole in each case.
 EXIT = {"completed": 0, "stopped": 130, "tripped": 5, "failed": 6}
@@ -28,7 +36,11 @@ EXIT = {"completed": 0, "stopped": 130, "tripped": 5, "failed": 6}
 
 def run(
     experiment: Annotated[
-        str, typer.Argument(help="Name of a shipped experiment, or the path of its file.")
+        str,
+        typer.Argument(
+            help="Name of a shipped experiment (swept_sine, stepped_sine, multisine, torque_test, "
+            "mode_scan), or the path of its file."
+        ),
     ],
     rig: RigOption = "samii",
     out: Annotated[
@@ -37,6 +49,9 @@ def run(
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Predict, say the margins, move nothing.")
+    ] = False,
+    describe: Annotated[
+        bool, typer.Option("--describe", help="Say what the experiment's file can hold, and end.")
     ] = False,
     seed: Annotated[
         int | None,
@@ -52,56 +67,177 @@ def run(
 
     Before anything moves, the model predicts every peak; a plan that would break a limit is
     refused with the amplitude that would not. Ctrl-C ends at zero output with a whole recording.
+    An experiment of several runs asks, on a real rig, for what is to be changed between them.
 
     Example: samii-rig run swept_sine --rig samii
     """
     from rich.console import Console
 
-    from samii_rig.errors import InputError
-    from samii_rig.report.summary import LiveProgress, show_dry_run, summary
+    from samii_rig.errors import EstimateError, InputError
+    from samii_rig.report.summary import show_dry_run
     from samii_rig.rig.load import load_rig
-    from samii_rig.run.campaign import carry_out
     from samii_rig.run.dryrun import predict
     from samii_rig.run.experiments import load_experiment
+    from samii_rig.run.setups import Concludes, setups_of
 
     console = Console(highlight=False)
     if out is not None and out.suffix != ".mcap":
         raise InputError("samii-rig run", "--out", str(out), "a name that ends in .mcap")
     the_rig, rig_text = load_rig(rig)
-    plan_file, experiment_text = load_experiment(experiment, the_rig)
-    plan = plan_file.plan(the_rig)
+    the_experiment, experiment_text = load_experiment(experiment, the_rig)
+    if describe:
+        _describe(the_experiment, experiment_text)
+        return
+    setups = setups_of(the_experiment, the_rig, rig_text)
+    plans = [the_experiment.plan(s.rig) for s in setups]
     with nullcontext() if json else console.status("predicting the run ..."):
-        predicted = predict(plan, the_rig)
+        predicted = [predict(p, s.rig) for p, s in zip(plans, setups, strict=True)]
     if not json:
-        show_dry_run(predicted, console)
+        # Of several runs the one that comes nearest to a limit.
+        worst = min(range(len(setups)), key=lambda i: predicted[i].margins[0].margin)
+        if len(setups) > 1:
+            which = f"{setups[worst].instruction}, nearest to a limit of {len(setups)} runs"
+            console.print(f"run {worst + 1}, {which}:")
+        show_dry_run(predicted[worst], console)
+    elif dry_run and len(setups) == 1:
+        say_json({"status": "predicted", "dry_run": _prediction(predicted[0])})
     elif dry_run:
-        say_json({"status": "predicted", "dry_run": _prediction(predicted)})
-    predicted.refuse()
+        say_json({"status": "predicted", "dry_runs": [_prediction(p) for p in predicted]})
+    for p in predicted:
+        p.refuse()
     if dry_run:
         return
     slug = re.sub(r"[^a-z0-9]+", "_", the_rig.name.lower()).strip("_")
-    path = out or Path("runs") / f"{datetime.now():%Y-%m-%dT%H-%M-%S}_{slug}_{plan.experiment}.mcap"
+    name = plans[0].experiment
+    path = out or Path("runs") / f"{datetime.now():%Y-%m-%dT%H-%M-%S}_{slug}_{name}.mcap"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         expected = f"a folder that can be made ({error.strerror})"
         raise InputError("samii-rig run", "--out", str(path.parent), expected) from error
+    done: list[_Done] = []
+    for i, (setup, plan) in enumerate(zip(setups, plans, strict=True)):
+        if setup.instruction:
+            _ask(setup, i, len(setups), console, json)
+        own = path.with_name(f"{path.stem}_{setup.name}.mcap") if setup.name else path
+        settings: dict[str, object] = {} if seed is None else {"seed": seed + i}
+        done.append(
+            _carry_out(
+                setup,
+                experiment_text,
+                plan,
+                predicted[i],
+                own,
+                settings,
+                operator,
+                console,
+                report=not no_report,
+                json=json,
+            )
+        )
+        if done[-1].outcome.stop.status != "completed":
+            break
+    lines: tuple[str, ...] = ()
+    written: tuple[Path, ...] = ()
+    last = done[-1].outcome.stop.status
+    if last == "completed" and isinstance(the_experiment, Concludes):
+        outcomes = [d.outcome for d in done]
+        try:
+            found = the_experiment.conclude([s.rig for s in setups], outcomes, path.with_suffix(""))
+            lines, written = found.lines, found.written
+        except EstimateError as error:
+            lines = (f"no conclusion: {error}",)
+    if json:
+        runs = [d.as_json() for d in done]
+        concluded = {"conclusion": lines, "written": written} if lines else {}
+        say_json({**(runs[0] if len(setups) == 1 else {"status": last, "runs": runs}), **concluded})
+    else:
+        if lines:
+            console.print()
+        for line in lines:
+            console.print(line, soft_wrap=True)
+        for file in written:
+            console.print(f"written    {file}", soft_wrap=True)
+    raise typer.Exit(EXIT.get(last, 1))
+
+
+def _describe(experiment: object, text: str) -> None:
+    """The file as it is, then what each of its classes says of the fields."""
+    from samii_rig.rig.schema import Strict
+
+    typer.echo(text.rstrip())
+    for kind in type(experiment).__mro__:
+        if issubclass(kind, Strict) and kind is not Strict and kind.__doc__:
+            typer.echo(f"\n{inspect.cleandoc(kind.__doc__)}")
+
+
+def _ask(setup: Setup, i: int, n: int, console: Console, json: bool) -> None:
+    """Have a person do what comes before a run; a simulated rig is so by itself."""
+    text = f"run {i + 1} of {n}: {setup.instruction}"
+    if setup.rig.device.driver == "simulated":
+        if not json:
+            console.print(f"\n{text} (simulated)")
+        return
+    typer.confirm(f"{text}. Done?", abort=True, err=True)
+
+
+@dataclass(frozen=True, slots=True)
+class _Done:
+    """One run, with what is said of it."""
+
+    outcome: Outcome
+    predicted: DryRun
+    curve: ModelCurve | None
+    page: Path | None
+
+    def as_json(self) -> dict[str, Any]:
+        """As plain data."""
+        o = self.outcome
+        return {
+            "status": o.stop.status,
+            "reason": o.stop.reason,
+            "recording": o.path,
+            "report": self.page,
+            "trouble": o.trouble,
+            "dry_run": _prediction(self.predicted),
+            "responses": [response_json(r) for r in o.responses],
+            "model_over_measurement": comparisons(o.responses, self.curve),
+        }
+
+
+def _carry_out(
+    setup: Setup,
+    experiment_text: str,
+    plan: Plan,
+    predicted: DryRun,
+    path: Path,
+    settings: dict[str, object],
+    operator: str,
+    console: Console,
+    *,
+    report: bool,
+    json: bool,
+) -> _Done:
+    """One run with its page, and its summary on the console."""
+    from samii_rig.report.summary import LiveProgress, summary
+    from samii_rig.run.campaign import carry_out
+
     live = LiveProgress(console, plan.duration)
     with nullcontext() if json else live:
         outcome = carry_out(
-            the_rig,
-            rig_text,
+            setup.rig,
+            setup.rig_toml,
             experiment_text,
             plan,
             predicted,
             path,
-            settings={} if seed is None else {"seed": seed},
+            settings=settings,
             operator=operator,
             progress=None if json else live,
         )
-    curve = model_curve(the_rig, outcome.responses)
+    curve = model_curve(setup.rig, outcome.responses)
     page = None
-    if not no_report:
+    if report:
         from samii_rig.record.reader import read_events
         from samii_rig.report.page import write_report
 
@@ -109,24 +245,11 @@ def run(
             path.with_suffix(".html"),
             outcome.recording,
             outcome.responses,
-            rig=the_rig,
+            rig=setup.rig,
             model=curve,
             events=read_events(path),
         )
-    if json:
-        say_json(
-            {
-                "status": outcome.stop.status,
-                "reason": outcome.stop.reason,
-                "recording": path,
-                "report": page,
-                "trouble": outcome.trouble,
-                "dry_run": _prediction(predicted),
-                "responses": [response_json(r) for r in outcome.responses],
-                "model_over_measurement": comparisons(outcome.responses, curve),
-            }
-        )
-    else:
+    if not json:
         console.print()
         console.print(summary([outcome.recording], outcome.responses, curve))
         if outcome.trouble:
@@ -134,12 +257,13 @@ def run(
         console.print(f"\nrecording  {path}", soft_wrap=True)
         if page:
             console.print(f"report     {page}", soft_wrap=True)
-    raise typer.Exit(EXIT.get(outcome.stop.status, 1))
+    return _Done(outcome, predicted, curve, page)
 
 
 def _prediction(predicted: DryRun) -> dict[str, Any]:
     return {
         "duration_s": predicted.duration,
+        "shortest_s": predicted.shortest,
         "margins": [
             {
                 "channel": m.channel,

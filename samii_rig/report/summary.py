@@ -195,7 +195,10 @@ def dry_run_summary(predicted: DryRun) -> RenderableType:
         rows.setdefault(key, {})[b.channel] = f"{100 * b.relative:.2g} %"
     for key, cells in rows.items():
         errors.add_row(key, *(cells.get(c, "") for c in channels))
-    head = Text(f"The plan takes {duration(predicted.duration)}. Predicted by the model:")
+    takes = duration(predicted.duration)
+    if predicted.shortest < predicted.duration:
+        takes = f"{duration(predicted.shortest)} to {takes}"
+    head = Text(f"The plan takes {takes}. Predicted by the model:")
     return Group(head, margins, Text(""), errors) if rows else Group(head, margins)
 
 

@@ -3,22 +3,25 @@
 The whole plan is one signal, so that what an earlier burst leaves behind (a mode that rings
 for a minute, an integrator's drift) is part of the prediction. The sampled closed loop
 
-    v(z) = (u(z) + kp theta_ref(z)) / (1 + kp H_theta(z)),      y(z) = H_y(z) v(z)
+    v(z) = (u(z) + kp theta_ref(z)) / (1 + L(z)),   L = kp H_theta - sum F_i H_i,   y = H_y v
 
-is evaluated on the circle z = exp((sigma + j w) T) a little outside the unit circle, and the
-time series is brought back with exp(sigma t). On that circle an integrator is finite, and what
-a discrete Fourier transform wraps around comes back smaller by exp(-sigma T_plan).
+with the filters F_i of the rig's feedback loops is evaluated on the circle
+z = exp((sigma + j w) T) a little outside the unit circle, and the time series is brought back
+with exp(sigma t). On that circle an integrator is finite, and what a discrete Fourier transform
+wraps around comes back smaller by exp(-sigma T_plan).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft
 
 from samii_rig.errors import InputError, LimitError
+from samii_rig.model.feedback import reach
+from samii_rig.model.loops import Loops, loops_of
 from samii_rig.model.sampled import filter_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import AngularVelocitySource, Moment, Rig, Sensor
@@ -34,49 +37,22 @@ PAD = 0.05
 # Aliases on each side. The hold has its zeros there, so the next ones add under 0.1 % to a
 # response below a tenth of the rate.
 ALIASES = 1
-SIGMAS = 5.0  # of the sensor's noise; passed once in 1.7 million samples
 # A closed loop without poles outside the circle does not wind around 0 at all.
 MOST_WINDING = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class Margin:
-    """One limit and what the plan comes to at its worst.
-
-    what : `limit` or `rate` of the gate (for the actuator the bound |u| + kp (|theta_ref| +
-        |theta|) by which the gate judges), `range` of the converter.
-    predicted, limit : in `unit`. segment, level : where the worst is.
-    largest_level : `level` at which the limit would just be reached if all levels were
-        scaled alike; 0 if the sensor's noise or offset alone reaches it.
-    """
-
-    channel: str
-    what: str
-    unit: str
-    predicted: float
-    limit: float
-    reason: str
-    segment: str
-    level: float
-    level_unit: str
-    largest_level: float
-
-    @property
-    def margin(self) -> float:
-        """1 - predicted/limit; below 0 when the limit is broken."""
-        return 1.0 - self.predicted / self.limit
 
 
 @dataclass(frozen=True, slots=True)
 class DryRun:
     """The prediction for a whole plan.
 
-    duration : s. channels, units : of `peaks` : (n_segment, n_channel), largest |value| of
-    the command v, of each sensor and of the moment at each actuated joint, in the segment.
+    duration, shortest : s, with every dwell in full and as short as it may be.
+    channels, units : of `peaks` : (n_segment, n_channel), largest |value| of the command v,
+    of each sensor and of the moment at each actuated joint, in the segment.
     margins : worst first.
     """
 
     duration: float
+    shortest: float
     channels: tuple[str, ...]
     units: tuple[str, ...]
     peaks: Float
@@ -106,9 +82,32 @@ class DryRun:
 def predict(plan: Plan, rig: Rig) -> DryRun:
     """Peaks, margins and the FRF's expected error of a plan, from the model alone.
 
-    Raises LimitError if the centring loop itself would be unstable, InputError if the rig
+    A plan whose dwells may be left early is predicted twice, with each in full and with each
+    as short as it may be: the less time, the more of one frequency's start is left in the next.
+    Peaks and margins are the worse of the two, the duration and the expected errors those in full.
+
+    Raises LimitError if the rig's own loops would be unstable, InputError if the rig
     could never be armed, or its source moves nothing.
     """
+    full = _predict(plan, rig)
+    if plan.shortest is None:
+        return full
+    short = _predict(plan.shortest, rig)
+    worse = {(m.channel, m.what, m.reason): m for m in full.margins}
+    for m in short.margins:
+        known = worse.get((m.channel, m.what, m.reason))
+        if known is None or m.margin < known.margin:
+            worse[m.channel, m.what, m.reason] = m
+    return replace(
+        full,
+        shortest=short.duration,
+        peaks=np.maximum(full.peaks, short.peaks),
+        slew=max(full.slew, short.slew),
+        margins=tuple(sorted(worse.values(), key=lambda m: m.margin)),
+    )
+
+
+def _predict(plan: Plan, rig: Rig) -> DryRun:
     if find_actuator(rig, plan.actuator, rig.name).deadman is None:
         expected = "the device's own, in s; without one it is never armed"
         raise InputError(rig.name, f"actuator[{plan.actuator}].deadman", None, expected)
@@ -120,31 +119,40 @@ def predict(plan: Plan, rig: Rig) -> DryRun:
     n = fft.next_fast_len(math.ceil(len(u) * (1 + PAD)), real=True)
     sigma = -math.log(WRAP) * plan.rate_hz / n
     omega = 2 * np.pi * plan.rate_hz * np.arange(n // 2 + 1) / n
-    H = _sampled(seen, plan.actuator, np.asarray(sigma + 1j * omega, dtype=np.complex128))
+    s = np.asarray(sigma + 1j * omega, dtype=np.complex128)
+    H = _sampled(seen, plan.actuator, s)
     names = [s.name for s in seen.sensor]
     if not np.any(np.abs(H) > 0.0):
         expected = f"an end that {plan.actuator} can push against; it moves nothing"
         raise InputError(rig.name, "base", rig.base, expected)
-    if plan.kp != 0.0:
-        sensitivity = 1.0 + plan.kp * H[:, names.index(plan.centring_sensor)]
-        _refuse_unstable(sensitivity, plan)
-    else:
-        sensitivity = np.ones(len(omega), dtype=np.complex128)
+    loops = _loops(rig, plan)
+    filters = loops.filters(np.exp(s / plan.rate_hz), plan.rate_hz)
+    sensitivity = 1.0 + loops.gain(H[:, :, None], filters)
+    if plan.kp != 0.0 or loops.feedback:
+        _refuse_unstable(sensitivity, plan, loops)
     shrink = np.exp(-sigma * np.arange(len(u)) / plan.rate_hz)
     drive = fft.rfft((u + plan.kp * theta_ref) * shrink, n)
     command = drive / sensitivity
     v = fft.irfft(command, n)[: len(u)] / shrink
     y = np.stack([fft.irfft(command * H[:, i], n)[: len(u)] / shrink for i in range(len(names))])
+    added = {
+        loop.name: fft.irfft(command * filters[:, k] * H[:, i], n)[: len(u)] / shrink
+        for k, (i, loop) in enumerate(loops.feedback)
+    }
 
     series = {plan.actuator: v, **dict(zip(names, y, strict=True))}
     units = {**rig.units(), **{m.name: m.unit for m in moments}}
     ends = np.cumsum([len(s.u) for s in plan.segments])
     parts = [slice(int(e) - len(s.u), int(e)) for s, e in zip(plan.segments, ends, strict=True)]
     peaks = np.array([[np.abs(x[part]).max() for x in series.values()] for part in parts])
-    margins = _margins(plan, rig, limits, series, parts)
+    margins = [
+        *_margins(plan, rig, limits, series, parts),
+        *_feedback_margins(plan, rig, limits, added, parts),
+    ]
     spectrum = np.abs(H[:, : len(rig.sensor)])
     return DryRun(
         duration=plan.duration,
+        shortest=plan.duration,
         channels=tuple(series),
         units=tuple(units[name] for name in series),
         peaks=peaks,
@@ -152,6 +160,12 @@ def predict(plan: Plan, rig: Rig) -> DryRun:
         margins=tuple(sorted(margins, key=lambda m: m.margin)),
         bands=tuple(expected_errors(plan, rig, v, parts, omega / (2 * np.pi), spectrum)),
     )
+
+
+def _loops(rig: Rig, plan: Plan) -> Loops:
+    """The loops of a plan on its actuator, the only column that is looked at."""
+    theta = [s.name for s in rig.sensor].index(plan.centring_sensor)
+    return replace(loops_of(rig, plan.actuator), actuator=0, theta=theta, kp=plan.kp)
 
 
 def _joint_moments(rig: Rig, actuator: str) -> tuple[Moment, ...]:
@@ -182,15 +196,16 @@ def _sampled(rig: Rig, actuator: str, s: Complex) -> Complex:
     return total
 
 
-def _refuse_unstable(sensitivity: Complex, plan: Plan) -> None:
-    """Nyquist: 1 + kp H has no pole outside the circle and is 1 far out, so the times it
+def _refuse_unstable(sensitivity: Complex, plan: Plan, loops: Loops) -> None:
+    """Nyquist: 1 + L has no pole outside the circle and is 1 far out, so the times it
     winds around 0 along the circle are the closed loop's poles outside."""
     turns = float(np.abs(np.diff(np.unwrap(np.angle(sensitivity))).sum()) / np.pi)
     if turns > MOST_WINDING:
-        raise LimitError(
-            f"the centring loop with kp = {plan.kp:g} on {plan.centring_sensor} would be "
-            "unstable by the model; expected a smaller kp"
-        )
+        centring = f"the centring loop with kp = {plan.kp:g} on {plan.centring_sensor}"
+        names = ", ".join(f"{f.name} on {f.sensor}" for _, f in loops.feedback)
+        what = f"{centring} and the feedback {names}" if names else centring
+        smaller = "a smaller kp or gain" if names else "a smaller kp"
+        raise LimitError(f"{what} would be unstable by the model; expected {smaller}")
 
 
 def _noise(sensor: Sensor) -> float:
@@ -211,6 +226,9 @@ def _margins(
         if math.isfinite(limit):
             out.append(_worst(plan, channel, what, unit, x, fixed, limit, reason))
 
+    authority = sum(a.loop.max for a in limits.feedback)
+    slewing = [(a.slew, sensors[a.loop.sensor]) for a in limits.feedback]
+    slew_noise = sum(slew * _noise(sensor) for slew, sensor in slewing)
     centring = sensors.get(plan.centring_sensor) if kp > 0 else None
     theta = series[centring.name] if centring else np.zeros(1)
     theta_noise = _noise(centring) if centring else 0.0
@@ -230,14 +248,16 @@ def _margins(
         bound.append(float((np.abs(s.u) + kp * np.abs(s.theta_ref)).max() + kp * angle.max()))
         # The step out of a segment counts for it too: it leads back to rest after the last.
         step = steps[part.start : part.stop + 1].max()
-        slew.append(float(step + kp * turning[seen].max()) * rate)
-    add(output.channel, "limit", output.unit, bound, kp * theta_noise, output.max, output.reason)
+        turn_of = sum(k * float(np.abs(series[x.name][seen]).max()) for k, x in slewing)
+        slew.append(float(step + kp * turning[seen].max()) * rate + turn_of)
+    fixed_bound = kp * theta_noise + authority
+    add(output.channel, "limit", output.unit, bound, fixed_bound, output.max, output.reason)
     add(
         output.channel,
         "rate",
         f"{output.unit}/s",
         slew,
-        2 * kp * theta_noise * rate,
+        2 * kp * theta_noise * rate + slew_noise,
         output.max_rate,
         output.reason,
     )
@@ -254,6 +274,25 @@ def _margins(
         down = [float(-series[sensor.name][part].min()) for part in parts]
         add(sensor.name, "range", sensor.unit, up, _noise(sensor), sensor.high, reason)
         add(sensor.name, "range", sensor.unit, down, _noise(sensor), -sensor.low, reason)
+    return out
+
+
+def _feedback_margins(
+    plan: Plan, rig: Rig, limits: GateLimits, added: dict[str, Float], parts: list[slice]
+) -> list[Margin]:
+    """Whether each feedback loop stays inside its `max`."""
+    out = []
+    for a in limits.feedback:
+        loop = a.loop
+        sensor = next(s for s in rig.sensor if s.name == loop.sensor)
+        bounds = reach(loop, plan.rate_hz)
+        steady = bounds.peak * (abs(sensor.offset) + sensor.resolution / 2)
+        fixed = steady + SIGMAS * sensor.noise_rms * bounds.rms
+        size = [float(np.abs(added[loop.name][part]).max()) for part in parts]
+        reason = "the device clips this loop there"
+        out.append(
+            _worst(plan, loop.name, "max", limits.output.unit, size, fixed, loop.max, reason)
+        )
     return out
 
 

@@ -21,7 +21,8 @@ class BandError:
     """Predicted standard deviation of sensor/command in one band at one level.
 
     std : sqrt(E|dH|^2) in sensor unit per actuator unit, median over the lines of the band,
-        each 1/duration of a segment wide (of a periodic reference, the lines that it drives),
+        each 1/duration of a segment wide (of a periodic reference, the lines that it drives;
+        of stepped sines, their frequencies, each dwell in full),
         all repeats averaged. Averaging n neighbouring lines divides it by sqrt(n).
     relative : std/|H|, median.
     """
@@ -40,10 +41,11 @@ def expected_errors(
 ) -> list[BandError]:
     """Noise over command: dY = N - H dV vanishes but for the sensor's own noise, because the
     command is read back; a sensor's noise is spread evenly over the n lines of a segment."""
-    out: list[BandError] = []
+    out = _stepped(plan, rig, v, parts, hz, size)
     levels: dict[tuple[float, str], list[tuple[PlannedSegment, slice]]] = {}
     for s, part in zip(plan.segments, parts, strict=True):
-        levels.setdefault((s.level, s.unit), []).append((s, part))
+        if s.dwell is None:
+            levels.setdefault((s.level, s.unit), []).append((s, part))
     for (level, unit), members in levels.items():
         s, part = members[0]
         part, driven = _used(s, part, plan)
@@ -69,6 +71,34 @@ def expected_errors(
                         float(np.median(std / H)),
                     )
                 )
+    return out
+
+
+def _stepped(
+    plan: Plan, rig: Rig, v: Float, parts: list[slice], hz: Float, size: Float
+) -> list[BandError]:
+    """Of dwells at one frequency each, in full; the median over the frequencies of a band."""
+    levels: dict[tuple[float, str], list[tuple[float, float, int]]] = {}
+    for s, part in zip(plan.segments, parts, strict=True):
+        if s.dwell is not None:
+            n = s.dwell.blocks * s.dwell.block
+            f = s.dwell.cycles * plan.rate_hz / s.dwell.block
+            x = v[part][s.dwell.last - n : s.dwell.last]
+            V = abs(np.exp(-2j * np.pi * f * np.arange(n) / plan.rate_hz) @ x)
+            levels.setdefault((s.level, s.unit), []).append((f, float(V), n))
+    out: list[BandError] = []
+    for (level, unit), points in levels.items():
+        at, drive, length = np.array(sorted(points)).T
+        for low, high in _octaves(float(at[0]), float(at[-1])):
+            inside = (at >= low) & (at <= high)
+            if not inside.any():
+                continue
+            for i, sensor in enumerate(rig.sensor):
+                sigma = math.hypot(sensor.noise_rms, sensor.resolution / math.sqrt(12))
+                std = sigma * np.sqrt(length[inside]) / drive[inside]
+                relative = std / np.interp(at[inside], hz, size[:, i])
+                middle = float(np.median(std)), float(np.median(relative))
+                out.append(BandError(sensor.name, level, unit, low, high, *middle))
     return out
 
 

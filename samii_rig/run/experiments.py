@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from importlib import metadata, resources
 from importlib.resources.abc import Traversable
@@ -38,12 +39,14 @@ def load_experiment(name: str, rig: Rig) -> tuple[Experiment, str]:
     """The experiment called `name` and the text of its file.
 
     name : a shipped file's, or a path. `swept_sine` finds `swept_sine_sflr` on the rig
-        SFLR if there is one: a rig's own variant comes first.
+        SFLR and `swept_sine_samii_braced` on "SAMII braced" if there is one: a rig's own
+        variant comes first.
 
     InputError if there is none, if its kind is not known, or if a field is wrong.
     """
     files = shipped()
-    for candidate in (f"{name}_{rig.name.lower()}", name):
+    own = re.sub(r"[^a-z0-9]+", "_", rig.name.lower()).strip("_")
+    for candidate in (f"{name}_{own}", name):
         if candidate in files:
             return _load(files[candidate].read_text("utf-8"), f"{candidate}.toml")
     path = Path(name)

@@ -225,9 +225,10 @@ def _standstill(c: ChannelLimit, latest: Latest, i: int) -> Decision | None:
 def command_violation(block: CommandBlock, latest: Latest, limits: GateLimits) -> Decision | None:
     """What is wrong with a reference before it reaches the wire, as a FAULT.
 
-    The device adds kp (theta_ref - theta), so the output is bounded by
-    |u| + kp (|theta_ref| + |theta|) with the largest |theta| of the newest block, and its
-    slew likewise, over the border to the last block too.
+    The device adds kp (theta_ref - theta) and its feedback, so the output is bounded by
+    |u| + kp (|theta_ref| + |theta|) + sum max with the largest |theta| of the newest block,
+    and its slew likewise, over the border to the last block too; a feedback's slew is bounded
+    by the largest value of its sensor in the newest block.
     """
     n = len(block)
     if n == 0 or block.u.shape != (n,) or block.theta_ref.shape != (n,):
@@ -262,7 +263,8 @@ def command_violation(block: CommandBlock, latest: Latest, limits: GateLimits) -
     for i, c in enumerate(limits.channels):
         if c.channel == limits.centring_sensor:
             angle, angle_rate = latest.peak[i], latest.rate[i]
-    bound = float((np.abs(block.u) + kp * np.abs(block.theta_ref)).max()) + kp * angle
+    added = sum(a.loop.max for a in limits.feedback)
+    bound = float((np.abs(block.u) + kp * np.abs(block.theta_ref)).max()) + kp * angle + added
     if bound > output.max:
         return _over(output, bound, output.max, "limit", output.unit)
     step = abs(float(block.u[0]) - latest.u) + kp * abs(
@@ -272,7 +274,9 @@ def command_violation(block: CommandBlock, latest: Latest, limits: GateLimits) -
         u, theta_ref = block.u, block.theta_ref
         steps = np.abs(u[1:] - u[:-1]) + kp * np.abs(theta_ref[1:] - theta_ref[:-1])
         step = max(step, float(steps.max()))
-    slew = step * limits.rate_hz + kp * angle_rate
+    peaks = {c.channel: latest.peak[i] for i, c in enumerate(limits.channels)}
+    turning = sum(a.slew * peaks[a.loop.sensor] for a in limits.feedback)
+    slew = step * limits.rate_hz + kp * angle_rate + turning
     if slew > output.max_rate:
         return _over(output, slew, output.max_rate, "rate", f"{output.unit}/s")
     return None

@@ -6,10 +6,12 @@ import math
 from dataclasses import dataclass, replace
 
 from samii_rig.errors import InputError
+from samii_rig.model.feedback import reach
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     ActuatorSpec,
     AngularVelocitySource,
+    Feedback,
     RelativeAngle,
     Rig,
     Sensor,
@@ -79,15 +81,26 @@ class ChannelLimit:
 
 
 @dataclass(frozen=True, slots=True)
+class Addition:
+    """What one feedback loop may add to the output: its `loop.max`, which the device keeps,
+    and `slew`, the change per second for each unit of its sensor."""
+
+    loop: Feedback
+    slew: float
+
+
+@dataclass(frozen=True, slots=True)
 class GateLimits:
     """Everything that the gate decides by.
 
     output : limit on the actuator's own channel, the command before the wire and the
         read-back after it.
-    sensors : limits on sensors, the centring sensor among them whenever kp is not 0.
+    sensors : limits on sensors; those that a loop reads are among them, so that none acts
+        on a dead one.
     kp, centring_sensor : the device's loop v = u + kp (theta_ref - theta).
     heartbeat_age : s without a sign of the operator's client; inf where none is needed.
     max_ahead : s from the newest sample to the last of a reference.
+    feedback : the device's loops beside the centring.
     """
 
     rate_hz: float
@@ -97,6 +110,7 @@ class GateLimits:
     centring_sensor: str
     heartbeat_age: float = math.inf
     max_ahead: float = MAX_AHEAD
+    feedback: tuple[Addition, ...] = ()
 
     @property
     def channels(self) -> tuple[ChannelLimit, ...]:
@@ -112,6 +126,7 @@ class GateLimits:
             max_output=self.output.max,
             max_rate=self.output.max_rate,
             max_angle=min(angle, default=math.inf),
+            feedback=tuple(a.loop for a in self.feedback),
         )
 
 
@@ -129,6 +144,7 @@ def gate_limits(
 ) -> GateLimits:
     """The limits of a rig file for a run that drives `actuator` and centres by `sensor`.
 
+    The feedback loops of the rig on that actuator are part of the run.
     Several limits on one channel: the tightest of each number holds. The ends of the
     actuator's converter are a limit too.
     """
@@ -142,14 +158,22 @@ def gate_limits(
         spec.deadman or READBACK_STALE,
         spec.resolution,
     )
+    feedback = tuple(
+        Addition(f, reach(f, rig.rate_hz).slew) for f in rig.feedback if f.actuator == actuator
+    )
     sensors = []
     for s in rig.sensor:
         limited = any(True for _ in rig.limits_on(s.name))
-        if limited or (kp != 0.0 and s.name == sensor):
+        read = [a.loop.name for a in feedback if a.loop.sensor == s.name]
+        if limited or read or (kp != 0.0 and s.name == sensor):
             reason = "the loop that centres the joint reads it"
+            if read:
+                reason = f"the feedback {read[0]} reads it"
             c = _channel(rig, s.name, s.unit, math.inf, reason, s.stale_after, 0.0)
             sensors.append(replace(c, stuck=_stuck(rig, spec, s, c.max)))
-    return GateLimits(rig.rate_hz, output, tuple(sensors), kp, sensor, heartbeat_age)
+    return GateLimits(
+        rig.rate_hz, output, tuple(sensors), kp, sensor, heartbeat_age, feedback=feedback
+    )
 
 
 def _stuck(rig: Rig, actuator: ActuatorSpec, sensor: Sensor, most: float) -> Stuck:

@@ -18,6 +18,7 @@ import numpy as np
 
 from samii_rig.errors import DeviceError, GateError, SamiiRigError
 from samii_rig.rig.schema import Rig
+from samii_rig.run.dwell import Reference, Watch
 from samii_rig.run.ending import Status, Zero, attempt, with_troubles
 from samii_rig.run.gate import Gate, GateEvent
 from samii_rig.run.interrupts import Interrupts
@@ -37,8 +38,8 @@ class Progress:
     """How far a run is, for a display.
 
     segment : 1-based, of n_segments; name, level, unit, repeat are the segment's.
-    time_left : s on the device's clock. frequency : Hz now, NaN at rest, inf where the
-        whole band is driven at once.
+    time_left : s on the device's clock, every dwell in full. frequency : Hz now, NaN at rest,
+        inf where the whole band is driven at once.
     channel, margin : the channel nearest to its limit since the last report, 1 - |value|/limit.
     worst_channel, worst_margin : the same over the whole run.
     """
@@ -121,17 +122,16 @@ class _Run:
         simulated = device.metadata.get("clock") == "simulated"
         self.tick = choose_tick(settings, device, plan.rate_hz, simulated)
         self.ahead = math.ceil((settings.ahead + self.tick) * plan.rate_hz)
-        self.u = np.concatenate([s.u for s in plan.segments])
-        self.theta_ref = np.concatenate([s.theta_ref for s in plan.segments])
-        self.ends = np.cumsum([len(s.u) for s in plan.segments])
+        self.reference = Reference(plan)
         self.collector = Collector(
-            rig, plan, self.sensor.channels, max(1, round(GATHER * plan.rate_hz))
+            rig, plan, self.reference, self.sensor.channels, max(1, round(GATHER * plan.rate_hz))
         )
         limits = gate_limits(
             rig, plan.actuator, plan.kp, plan.centring_sensor, settings.heartbeat_age
         )
         self.gate = Gate(device.actuator, limits, self.sensor.channels, self._log)
         self.zero = Zero(device, limits.output)
+        self.watch = Watch(self.reference, self.sensor.channels, plan.actuator)
         # Last: it starts a thread.
         self.queued = None if simulated else QueuedSink(sink)
         self.sink: Sink = self.queued or sink
@@ -198,13 +198,12 @@ class _Run:
         self.gate.start(self.clock.now())
         self.start = self.newest + 1 + self.ahead
         self.collector.start_at(self.start)
-        self._event("plan", start=self.start, samples=len(self.u))
+        self._event("plan", start=self.start, samples=len(self.reference.u))
 
     def _stream(self, stop: Event, interrupts: Interrupts) -> tuple[Status, str]:
-        total = len(self.u)
         due = self.clock.now()
         report = due
-        while self.newest < self.start + total - 1:
+        while self.newest < self.start + len(self.reference.u) - 1:
             if interrupts.reason:
                 return "stopped", f"stopped by {interrupts.reason}"
             if stop.is_set():
@@ -238,8 +237,17 @@ class _Run:
         if len(block):
             self.apart = self.clock.now() - int(block.time[-1])
             self._count(block)
+            self._shorten(block)
             self.margin = _nearer(self.margin, self.gate.margin())
             self.worst = _nearer(self.worst, self.margin)
+
+    def _shorten(self, block: SampleBlock) -> None:
+        """Leave a dwell that has measured enough."""
+        if self.start < 0:
+            return
+        left = self.watch.take(block, self.start, self.sent)
+        if left is not None:
+            self._event("dwell", name=left.name, blocks=left.blocks, relative=left.relative)
 
     def _count(self, block: SampleBlock) -> None:
         """Notice samples that were lost or came without values."""
@@ -261,19 +269,20 @@ class _Run:
         if n <= 0:
             return
         u, theta_ref = np.zeros(n), np.zeros(n)
-        part = slice(self.sent, min(upto, len(self.u)))
+        part = slice(self.sent, min(upto, len(self.reference.u)))
         if part.start < part.stop:
-            u[: part.stop - part.start] = self.u[part]
-            theta_ref[: part.stop - part.start] = self.theta_ref[part]
+            u[: part.stop - part.start] = self.reference.u[part]
+            theta_ref[: part.stop - part.start] = self.reference.theta_ref[part]
         self.gate.write(CommandBlock(self.start + self.sent, u, theta_ref), self.clock.now())
         self.sent = upto
 
     def _report_segments(self) -> None:
         """Tell the sink of segments whose last sample has arrived, after their samples."""
-        while self.done < len(self.ends) and self.newest + 1 >= self.start + self.ends[self.done]:
+        ends = self.reference.ends
+        while self.done < len(ends) and self.newest + 1 >= self.start + ends[self.done]:
             self._flush()
-            s = self.plan.segments[self.done]
-            begin = self.start + int(self.ends[self.done]) - len(s.u)
+            s = self.reference.segments[self.done]
+            begin = self.start + self.reference.begin(self.done)
             first, last = s.recorded or (0, len(s.u))
             self.sink.segment(
                 Segment(s.name, s.kind, begin + first, begin + last, s.level, s.unit, s.repeat)
@@ -281,18 +290,19 @@ class _Run:
             self.done += 1
 
     def _progress(self) -> Progress:
-        at = min(max(self.newest - self.start, 0), len(self.u) - 1)
-        i = int(np.searchsorted(self.ends, at, side="right"))
-        s = self.plan.segments[i]
-        inside = at - (int(self.ends[i]) - len(s.u))
+        total = len(self.reference.u)
+        at = min(max(self.newest - self.start, 0), total - 1)
+        i = self.reference.at(at)
+        s = self.reference.segments[i]
+        inside = at - self.reference.begin(i)
         return Progress(
             segment=i + 1,
-            n_segments=len(self.ends),
+            n_segments=len(self.reference.ends),
             name=s.name,
             level=s.level,
             unit=s.unit,
             repeat=s.repeat,
-            time_left=(self.start + len(self.u) - 1 - self.newest) / self.plan.rate_hz,
+            time_left=(self.start + total - 1 - self.newest) / self.plan.rate_hz,
             frequency=float(s.frequency[inside]),
             channel=self.margin[0],
             margin=self.margin[1],

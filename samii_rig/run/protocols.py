@@ -3,7 +3,7 @@
 A host in Python cannot pace a kilohertz, so the device's clock paces. The host streams
 the reference some tens of milliseconds ahead; the device closes the centring loop
 
-    v[n] = u[n] + kp (theta_ref[n] - theta[n])
+    v[n] = u[n] + kp (theta_ref[n] - theta[n]) + feedback[n]
 
 at its own sample rate, holds v[n] until n + 1, keeps its own hard limits and drops its
 output to zero when nothing came for `deadman` seconds. Samples stream back in blocks.
@@ -11,10 +11,12 @@ output to zero when nothing came for `deadman` seconds. Samples stream back in b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol, runtime_checkable
 
-from samii_rig.rig.schema import Rig
+import numpy as np
+
+from samii_rig.rig.schema import Feedback, Rig
 from samii_rig.types import Channel, Float, SampleBlock
 
 
@@ -40,6 +42,8 @@ class DeviceLoop:
     kp : actuator unit per unit of the sensor called `sensor`; 0 opens the loop.
     max_output, max_rate : |v| and |dv/dt| in actuator units (per second).
     max_angle : |theta| of `sensor` beyond which the device drops to zero and says so.
+    feedback : filters that run from zero state while the output is live, see `Feedback`; a
+        device that cannot run them refuses in `configure` with DeviceError.
     """
 
     sensor: str
@@ -47,6 +51,7 @@ class DeviceLoop:
     max_output: float
     max_rate: float
     max_angle: float
+    feedback: tuple[Feedback, ...] = ()
 
 
 @runtime_checkable
@@ -110,6 +115,32 @@ class OpenRig:
 
 
 @dataclass(frozen=True, slots=True)
+class Dwell:
+    """A part of a segment that may be left early, once enough is known.
+
+    From sample `first` to `last` of the segment the drive is a sine of `cycles` periods in every
+    `block` samples. It may be left at first + k block, k >= least: what follows `last` then
+    comes at once, and since that is a whole number of periods later, without a step.
+
+    outputs, wanted : it is left when the response of each of these sensors at this frequency
+        has a relative standard deviation sqrt(E|dH|^2)/|H| of at most `wanted`.
+    """
+
+    first: int
+    last: int
+    block: int
+    cycles: int
+    least: int
+    outputs: tuple[str, ...]
+    wanted: float
+
+    @property
+    def blocks(self) -> int:
+        """Blocks in the whole of it."""
+        return (self.last - self.first) // self.block
+
+
+@dataclass(frozen=True, slots=True)
 class PlannedSegment:
     """One thing to do: a reference and what it is called in the recording (see `Segment`).
 
@@ -117,6 +148,7 @@ class PlannedSegment:
     band_hz : where the excitation has its energy.
     frequency : (n,) Hz at each sample, NaN at rest, inf where the whole band is driven at
         once; for the progress display.
+    dwell : the part that may be left early, None for a segment that is done as it is.
     recorded : the samples [start, stop) of u that the recording's segment holds, None for
         all; what is outside (ramps, settling) is recorded too, but belongs to no segment.
     """
@@ -131,6 +163,21 @@ class PlannedSegment:
     band_hz: tuple[float, float]
     frequency: Float
     recorded: tuple[int, int] | None = None
+    dwell: Dwell | None = None
+
+    def shortened(self, leave: int) -> PlannedSegment:
+        """As it is when its dwell is left at sample `leave`, and cannot be left any more."""
+        assert self.dwell is not None
+        kept = np.r_[:leave, self.dwell.last : len(self.u)]
+        first, last = self.recorded or (0, len(self.u))
+        return replace(
+            self,
+            u=self.u[kept],
+            theta_ref=self.theta_ref[kept],
+            frequency=self.frequency[kept],
+            recorded=(first, last - (self.dwell.last - leave)),
+            dwell=None,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,8 +194,19 @@ class Plan:
 
     @property
     def duration(self) -> float:
-        """Seconds, all segments."""
+        """Seconds, all segments; every dwell in full."""
         return sum(len(s.u) for s in self.segments) / self.rate_hz
+
+    @property
+    def shortest(self) -> Plan | None:
+        """The plan with each dwell left as early as it may be; None if it has none."""
+        if not any(s.dwell for s in self.segments):
+            return None
+        cut = [
+            s.shortened(s.dwell.first + s.dwell.least * s.dwell.block) if s.dwell else s
+            for s in self.segments
+        ]
+        return replace(self, segments=tuple(cut))
 
 
 @runtime_checkable

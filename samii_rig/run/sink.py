@@ -14,6 +14,7 @@ import numpy as np
 
 from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Rig
+from samii_rig.run.dwell import Reference
 from samii_rig.run.protocols import Plan
 from samii_rig.types import Channel, Quality, SampleBlock, Segment
 
@@ -119,13 +120,19 @@ def recorded_channels(rig: Rig, plan: Plan, channels: tuple[Channel, ...]) -> tu
 class Collector:
     """Gathers a device's blocks into larger ones with the columns of `recorded_channels`.
 
-    rows : samples after which `full` is true.
+    reference : what is sent, as it stands. rows : samples after which `full` is true.
     """
 
-    def __init__(self, rig: Rig, plan: Plan, channels: tuple[Channel, ...], rows: int) -> None:
+    def __init__(
+        self,
+        rig: Rig,
+        plan: Plan,
+        reference: Reference,
+        channels: tuple[Channel, ...],
+        rows: int,
+    ) -> None:
         self._rows, self._held, self._blocks = rows, 0, list[SampleBlock]()
-        self._u = np.concatenate([s.u for s in plan.segments])
-        self._theta_ref = np.concatenate([s.theta_ref for s in plan.segments])
+        self._reference = reference
         self._start = -1
         self.channels = recorded_channels(rig, plan, channels)
         self._added = len(self.channels) > len(channels)
@@ -154,11 +161,12 @@ class Collector:
         values = np.concatenate([b.values for b in blocks])
         quality = np.concatenate([b.quality for b in blocks])
         if self._added:
-            n = len(self._u)
+            u, theta_ref = self._reference.u, self._reference.theta_ref
+            n = len(u)
             at = sequence - self._start
             inside = (at >= 0) & (at < n) & (self._start >= 0)
             at = np.where(inside, at, 0)
-            columns = [np.where(inside, x[at], 0.0) for x in (self._u, self._theta_ref)]
+            columns = [np.where(inside, x[at], 0.0) for x in (u, theta_ref)]
             values = np.column_stack([values, *columns])
             known = np.full((len(sequence), 2), Quality.GOOD, dtype=np.uint8)
             quality = np.concatenate([quality, known], axis=1)

@@ -1,0 +1,75 @@
+"""Steps and pulses from rest: how a rig with its loops closed comes to rest again."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from experiments.driven import HIGHEST, MOST_SAMPLES, Driven
+from samii_rig.errors import InputError
+from samii_rig.rig.schema import Positive, Rig
+from samii_rig.run.protocols import Plan, PlannedSegment
+
+
+class Step(Driven):
+    """A step experiment file: rest, the level held for `hold`, and rest again.
+
+    A long `hold` makes two steps, up and down; one of half a period of a mode is a pulse that
+    leaves this mode to decay freely.
+
+    lead_in, hold, ring_down : s before, at and after the level.
+    """
+
+    experiment: Literal["step"]
+    lead_in: Positive = 1.0
+    hold: Positive
+    ring_down: Positive
+    repeats: Annotated[int, Field(ge=1, le=1000)] = 1
+
+    def plan(self, rig: Rig) -> Plan:
+        """Every segment's reference at the rig's rate, all repeats of a level one by one.
+
+        InputError if the rig has no such actuator, another unit or no centring sensor, or if
+        one of the times is shorter than a sample.
+        """
+        where = f"experiment {self.name}"
+        kp, sensor = self.loop(rig, where)
+        times = {"lead_in": self.lead_in, "hold": self.hold, "ring_down": self.ring_down}
+        for field, seconds in times.items():
+            if seconds * rig.rate_hz < 1:
+                least = f"at least one sample, {1 / rig.rate_hz:g} s"
+                raise InputError(where, field, seconds, least)
+        n = [round(seconds * rig.rate_hz) for seconds in times.values()]
+        if sum(n) * len(self.amplitudes) * self.repeats > MOST_SAMPLES:
+            longest = f"a plan of at most {MOST_SAMPLES / rig.rate_hz / 3600:.0f} hours"
+            raise InputError(where, "ring_down", self.ring_down, longest)
+        shape = np.repeat([0.0, 1.0, 0.0], n)
+        rest = np.zeros_like(shape)
+        segments = []
+        for level in self.amplitudes:
+            wave = level * shape
+            for repeat in range(self.repeats):
+                segments.append(
+                    PlannedSegment(
+                        name=f"{self.name}_{level:g}_{repeat + 1}",
+                        kind="burst",
+                        level=level,
+                        unit=self.unit,
+                        repeat=repeat,
+                        u=wave if self.drive == "output" else rest,
+                        theta_ref=rest if self.drive == "output" else wave,
+                        band_hz=(1 / sum(times.values()), HIGHEST * rig.rate_hz),
+                        frequency=np.full(shape.shape, np.nan),
+                    )
+                )
+        return Plan(
+            experiment=self.name,
+            rate_hz=rig.rate_hz,
+            actuator=self.actuator,
+            kp=kp,
+            centring_sensor=sensor,
+            segments=tuple(segments),
+            seed=self.seed,
+        )
