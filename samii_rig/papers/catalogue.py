@@ -1,0 +1,131 @@
+"""All results of the papers, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from typing import cast
+
+from samii_rig.errors import InputError
+from samii_rig.papers.result import Result
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One result. where : in the papers. function : `module:name` in this package.
+    records : whether it drives the simulated rig first, which takes longer."""
+
+    id: str
+    where: str
+    title: str
+    function: str
+    records: bool = False
+
+    def compute(self) -> Result:
+        """The result."""
+        module, _, name = self.function.partition(":")
+        made = cast("Callable[[], Result]", getattr(import_module(f"{__package__}.{module}"), name))
+        return made()
+
+
+ENTRIES: tuple[Entry, ...] = (
+    Entry("table-1", "paper 1, Table I", "natural frequencies, perfect joints", "tables:table_1"),
+    Entry(
+        "table-2",
+        "paper 1, Table II",
+        "the four stiffnesses from a recording",
+        "identification:table_2",
+        True,
+    ),
+    Entry(
+        "table-3", "paper 1, Table III", "natural frequencies, flexible joints", "tables:table_3"
+    ),
+    Entry(
+        "fig-3",
+        "paper 1, Fig. 3; paper 2, Fig. 3, eq. 1, 2",
+        "a perfect source misses mode 2",
+        "spring_damper:figure_3",
+        True,
+    ),
+    Entry(
+        "p1-section-4a",
+        "paper 1, section IV-A",
+        "g_v changes damping, not frequencies",
+        "velocity_feedback:section_4a",
+    ),
+    Entry(
+        "limits",
+        "paper 1, section IV-A; paper 2, section 4",
+        "g_v and k to infinity",
+        "velocity_feedback:limits",
+    ),
+    Entry(
+        "method-1",
+        "paper 1, section IV-C",
+        "three numbers for four stiffnesses",
+        "identification:method_1_result",
+    ),
+    Entry(
+        "stage-2",
+        "paper 1, section IV-C, step 2",
+        "g_v from the amplitudes",
+        "identification:stage_2",
+        True,
+    ),
+    Entry(
+        "method-2",
+        "paper 1, section IV-D, eq. 19",
+        "braced base",
+        "identification:method_2_result",
+        True,
+    ),
+    Entry(
+        "encoder",
+        "paper 1, section IV-B, C",
+        "non-collocated encoder",
+        "identification:encoder",
+        True,
+    ),
+    Entry("p1-fig-5", "paper 1, Fig. 5", "v_2 to theta_2", "overlays:figure_5", True),
+    Entry(
+        "p1-fig-6",
+        "paper 1, Fig. 6",
+        "theta_2 to a_0 and its first zero",
+        "overlays:figure_6",
+        True,
+    ),
+    Entry("p1-joint-3", "paper 1, section IV-C", "v_3 to theta_3", "overlays:joint_3", True),
+    Entry("p1-fig-8-9", "paper 1, Fig. 8 and 9", "mode shapes 1 and 2", "shapes:figures_8_9", True),
+    Entry("p1-offset", "paper 1, Fig. 8", "the offset of mode 1", "shapes:offset"),
+    Entry("p1-section-5", "paper 1, section V", "generality and effort", "effort:section_5"),
+    Entry(
+        "p2-fig-5",
+        "paper 2, Fig. 5",
+        "velocity feedback: dip, then rise",
+        "velocity_feedback:figure_5",
+    ),
+    Entry(
+        "p2-fig-8-10",
+        "paper 2, Fig. 8 to 10",
+        "torque test, vertical and horizontal",
+        "torque:figures_8_9_10",
+        True,
+    ),
+    Entry(
+        "p2-fig-12",
+        "paper 2, Fig. 12",
+        "source with spring-damper: dip, recovery",
+        "spring_damper:figure_12",
+        True,
+    ),
+)
+
+
+def entries(ids: list[str]) -> tuple[Entry, ...]:
+    """The entries called `ids`, all without; InputError for one that there is not."""
+    known = {e.id: e for e in ENTRIES}
+    for name in ids:
+        if name not in known:
+            raise InputError("samii-rig papers", "ID", name, f"one of {', '.join(known)}")
+    return tuple(known[name] for name in ids) if ids else ENTRIES
