@@ -229,7 +229,7 @@ def test_thinning_keeps_every_extreme(values, pixels):
     assert len(t) <= max(len(y), 2 * pixels)
 
 
-@pytest.mark.parametrize("name", ["samii", "sflr"])
+@pytest.mark.parametrize("name", ["samii", "samii_braced", "samii_torque_vertical", "sflr"])
 def test_the_drawing_names_every_part(name):
     rig, _ = load_rig(name)
     texts = [e.text for e in ElementTree.fromstring(draw(rig)).iter("text")]
@@ -267,7 +267,7 @@ def test_a_dry_run_says_its_margins_and_errors():
     band = BandError("theta_2", 4.0, "V", 1.0, 2.0, 1e-5, 0.013)
     peaks_ = np.zeros((1, 1))
     said = printed(
-        dry_run_summary(DryRun(95.0, ("v_2",), ("V",), peaks_, 0.0, (over, margin), (band,)))
+        dry_run_summary(DryRun(95.0, 95.0, ("v_2",), ("V",), peaks_, 0.0, (over, margin), (band,)))
     )
     for part in ("95 s", "33 m/s\u00b2", "-10 %", "20 %", "1\u20132 Hz", "1.3 %"):
         assert part in said

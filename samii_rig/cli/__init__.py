@@ -13,7 +13,7 @@ def main() -> None:
     from samii_rig.errors import SamiiRigError
 
     try:
-        sys.exit(app(standalone_mode=False))
+        sys.exit(app(prog_name="samii-rig", standalone_mode=False))
     except SamiiRigError as error:
         print(f"samii-rig: {error}", file=sys.stderr)
         sys.exit(error.exit_code)

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import samii_rig
-from samii_rig.cli import estimate, files, identify, record
+from samii_rig.cli import control, diagnose, estimate, files, identify, papers, prove, record
 
 app = typer.Typer(
     name="samii-rig",
@@ -42,5 +42,9 @@ app.command("import")(files.import_)
 app.command("frf")(estimate.frf)
 app.command("report")(estimate.report)
 app.command("identify")(identify.identify)
+app.command("diagnose")(diagnose.diagnose)
+app.command("control")(control.control)
+app.command("papers")(papers.papers)
+app.command("prove")(prove.prove)
 app.command("verify")(files.verify)
 app.command("recover")(files.recover)

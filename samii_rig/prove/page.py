@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -27,17 +28,15 @@ def write_page(path: Path, trials: Sequence[Trial], title: str = "The proof") ->
 
 def render(trials: Sequence[Trial], title: str) -> str:
     """The page as text."""
-    kinds = {
-        k: sum(t.truth.kind == k for t in trials) for k in ("nothing", "one", "two", "outside")
-    }
+    kinds = Counter(t.truth.kind for t in trials)
     failed = sorted((t for t in trials if not acceptable(t)), key=lambda t: -t.truth.size)
     sizes = by_size(trials)
     style = (resources.files("samii_rig.report") / "assets" / "page.css").read_text("utf-8")
     return _template().render(
         title=title,
         subtitle=f"{len(trials)} concealed trials: {kinds['nothing']} hide nothing, "
-        f"{kinds['one']} one effect, {kinds['two']} two, {kinds['outside']} something outside "
-        "the vocabulary. Every interval holds 90 %.",
+        f"{kinds['one']} one effect, {kinds['two']} two, "
+        f"{kinds['joints']} the give of every joint, {kinds['outside']} something outside the vocabulary. Every interval holds 90 %.",
         style=Markup(style),
         scores=[_row(s) for s in scores(trials)],
         calibration=Markup(figures.calibration(trials)),

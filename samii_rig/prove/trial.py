@@ -39,7 +39,7 @@ class Hidden:
 class Truth:
     """What a trial conceals.
 
-    kind : `nothing`, `one`, `two` or `outside`.
+    kind : `nothing`, `one`, `two`, `outside`, or `joints` (every joint gives).
     size : sigma that are left when the nearest smaller explanation has been refitted.
     """
 

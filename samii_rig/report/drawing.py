@@ -5,53 +5,74 @@ Colours come from the page's style sheet through the classes of the shapes.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from html import escape
 
 from samii_rig.report.compare import pretty
-from samii_rig.rig.schema import (
-    AbsoluteAngle,
-    Acceleration,
-    AngularVelocitySource,
+from samii_rig.rig.elements import (
+    SOURCES,
     Beam,
     Element,
-    Moment,
-    RelativeAngle,
-    Rig,
+    GravityStiffness,
     RigidLink,
+    TimoshenkoBeam,
+    TorsionalGroundSpring,
     TorsionalSpring,
+    TranslationalGroundSpring,
+    TranslationalSpring,
+    parameters,
 )
+from samii_rig.rig.schema import AbsoluteAngle, Acceleration, Moment, RelativeAngle, Rig
 
 # All in user units of the drawing, about a pixel.
-_WIDTHS = {
-    "beam": 190.0,
-    "rigid_link": 96.0,
-    "torsional_spring": 44.0,
-    "angular_velocity_source": 56.0,
-}
+_BEAM, _LINK, _SPRING, _SOURCE, _OTHER = 190.0, 96.0, 44.0, 56.0, 70.0  # widths
+_DROP = 34.0  # from the chain down to the ground beside it
+_SERIES = (TorsionalSpring, TranslationalSpring)
+_TO_GROUND = (TorsionalGroundSpring, TranslationalGroundSpring, GravityStiffness)
 _MARGIN = 64.0
 _AXIS = 118.0  # height of the chain's line
 _LABEL_ROWS = (176.0, 222.0)  # names stand in two rows by turns, so that none touch
 _SENSOR_ROWS = (22.0, 52.0)
 _HEIGHT = 262.0
 _HALF = 13.0  # half height of a link
+_HALO = 25.0  # half height of the field behind a suspect
 
 
-def draw(rig: Rig) -> str:
-    """An SVG drawing of `rig`, from base (left) to tip (right)."""
+@dataclass(frozen=True, slots=True)
+class Suspect:
+    """How an element or sensor is marked. label : said beside its name. weight : 0 to 1, of its
+    colour. chosen : whether it is drawn as found rather than as possible."""
+
+    label: str
+    weight: float
+    chosen: bool
+
+
+def draw(rig: Rig, suspects: Mapping[str, Suspect] | None = None) -> str:
+    """An SVG drawing of `rig`, from base (left) to tip (right), `suspects` marked by name."""
+    suspects = suspects or {}
     x = _MARGIN
     spans: dict[str, tuple[float, float]] = {}
     shapes: list[str] = []
     for number, element in enumerate(rig.element):
-        end = x + _WIDTHS[element.kind]
+        end = x + _width(element)
         spans[element.name] = (x, end)
+        row = _LABEL_ROWS[number % 2]
+        if element.name in suspects:
+            shapes.insert(0, _halo(suspects[element.name], x, end))
+            shapes.append(_suspicion(suspects[element.name], (x + end) / 2, row))
         shapes.append(_element(element, x, end))
-        shapes.append(_label(element, (x + end) / 2, _LABEL_ROWS[number % 2]))
+        shapes.append(_label(element, (x + end) / 2, row))
         x = end
     width = x + _MARGIN
     shapes.append(_end(rig.base, _MARGIN, -1))
     shapes.append(_end(rig.tip, x, +1))
-    shapes += _sensors(rig, spans)
+    shapes += _sensors(rig, spans, suspects)
     title = f"Chain of {rig.name}: {', '.join(e.name for e in rig.element)}"
+    if suspects:
+        marked = (f"{name} {suspect.label}" for name, suspect in suspects.items())
+        title += f". Suspect: {', '.join(marked)}"
     return (
         f'<svg class="chain" viewBox="0 0 {width:.0f} {_HEIGHT:.0f}" role="img" '
         f'style="max-width:{1.35 * width:.0f}px">'
@@ -59,10 +80,21 @@ def draw(rig: Rig) -> str:
     )
 
 
+def _width(element: Element) -> float:
+    match element:
+        case Beam() | TimoshenkoBeam():
+            return _BEAM
+        case RigidLink():
+            return _LINK
+    if isinstance(element, _SERIES + _TO_GROUND):
+        return _SPRING
+    return _SOURCE if isinstance(element, SOURCES) else _OTHER
+
+
 def _element(element: Element, a: float, b: float) -> str:
     y, middle = _AXIS, (a + b) / 2
     match element:
-        case Beam():
+        case Beam() | TimoshenkoBeam():
             return f'<rect class="beam" x="{a:.1f}" y="{y - 4}" width="{b - a:.1f}" height="8"/>'
         case RigidLink():
             span = element.L.value
@@ -72,7 +104,7 @@ def _element(element: Element, a: float, b: float) -> str:
                 f'height="{2 * _HALF}" rx="7"/>'
                 f'<circle class="centre" cx="{at:.1f}" cy="{y}" r="3.5"/>'
             )
-        case TorsionalSpring():
+        case TorsionalSpring() | TranslationalSpring():
             steps = 6
             w = (b - a - 12) / steps
             path = f"M{a:.1f} {y}h6" + "".join(
@@ -80,32 +112,65 @@ def _element(element: Element, a: float, b: float) -> str:
                 for k in range(steps)
             )
             return f'<path class="spring" d="{path}h6"/>'
-        case AngularVelocitySource():
-            up = y + 17
-            return (
-                f'<path class="spring" d="M{a:.1f} {y}H{b:.1f}"/>'
-                f'<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
-                f'<path class="arrow" d="M{middle - 8:.1f} {up - 12:.1f}a10 10 0 1 1 15 0'
-                f'm-5 -1l5 1l1 -6"/>'
-            )
-    raise TypeError(type(element))
+    along = f'<path class="spring" d="M{a:.1f} {y}H{b:.1f}"/>'
+    if isinstance(element, SOURCES):
+        up = y + 17
+        return (
+            f'{along}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
+            f'<path class="arrow" d="M{middle - 8:.1f} {up - 12:.1f}a10 10 0 1 1 15 0'
+            f'm-5 -1l5 1l1 -6"/>'
+        )
+    if isinstance(element, _TO_GROUND):
+        turns = "".join(
+            f"l{7 if k % 2 == 0 else -7} 3l{-7 if k % 2 == 0 else 7} 3" for k in range(4)
+        )
+        hatch = "".join(f"M{middle - 14 + 7 * k:.1f} {y + _DROP}l-5 5" for k in range(5))
+        return (
+            f'{along}<path class="spring" d="M{middle:.1f} {y}v5{turns}v5"/>'
+            f'<path class="ground" d="M{middle - 16:.1f} {y + _DROP}h32{hatch}"/>'
+        )
+    return (
+        f'{along}<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
+        f'height="{2 * _HALF}"/>'
+    )
 
 
 def _label(element: Element, x: float, y: float) -> str:
     match element:
-        case Beam():
+        case Beam() | TimoshenkoBeam():
             detail = f"EI {_si(element.EI.value, pretty('N m^2'))}, {element.L.value:.3g} m"
         case RigidLink():
             detail = f"{element.m.value:.3g} kg, {element.L.value:.3g} m"
-        case TorsionalSpring():
-            detail = f"k {_si(element.k.value, 'N m/rad')}"
-        case AngularVelocitySource():
+        case _ if isinstance(element, SOURCES):
             detail = f"input {element.input}"
+        case _:
+            found = parameters(element)
+            detail = element.kind.replace("_", " ")
+            if found:
+                symbol, p = next(iter(found.items()))
+                detail = f"{symbol} {_si(p.value, pretty(p.unit))}"
+    top = _AXIS + (_DROP + 8 if isinstance(element, _TO_GROUND) else 22)
+    leader = f'<path class="leader" d="M{x:.1f} {top}V{y - 15:.1f}"/>' if top < y - 15 else ""
     return (
-        f'<path class="leader" d="M{x:.1f} {_AXIS + 22}V{y - 15:.1f}"/>'
+        f"{leader}"
         f'<text class="name" x="{x:.1f}" y="{y:.1f}">{escape(element.name)}</text>'
         f'<text class="detail" x="{x:.1f}" y="{y + 15:.1f}">{escape(detail)}</text>'
     )
+
+
+def _halo(suspect: Suspect, a: float, b: float) -> str:
+    """A field behind an element, the darker the more suspect; dashed where it is only possible."""
+    style = "halo chosen" if suspect.chosen else "halo"
+    fill = 0.10 + 0.35 * suspect.weight
+    return (
+        f'<rect class="{style}" x="{a - 7:.1f}" y="{_AXIS - _HALO:.1f}" width="{b - a + 14:.1f}" '
+        f'height="{2 * _HALO:.1f}" rx="10" style="fill-opacity:{fill:.2f}"/>'
+    )
+
+
+def _suspicion(suspect: Suspect, x: float, y: float) -> str:
+    """What is said of a suspect, below its name and value."""
+    return f'<text class="suspicion" x="{x:.1f}" y="{y + 30:.1f}">{escape(suspect.label)}</text>'
 
 
 def _end(boundary: str, x: float, side: int) -> str:
@@ -120,7 +185,9 @@ def _end(boundary: str, x: float, side: int) -> str:
     return text
 
 
-def _sensors(rig: Rig, spans: dict[str, tuple[float, float]]) -> list[str]:
+def _sensors(
+    rig: Rig, spans: dict[str, tuple[float, float]], suspects: Mapping[str, Suspect]
+) -> list[str]:
     places = []
     for sensor in rig.sensor:
         match sensor:
@@ -131,7 +198,9 @@ def _sensors(rig: Rig, spans: dict[str, tuple[float, float]]) -> list[str]:
             case Acceleration():
                 a, b = spans[sensor.on]
                 host = next(e for e in rig.element if e.name == sensor.on)
-                length = host.L.value if isinstance(host, Beam | RigidLink) else 0.0
+                length = (
+                    host.L.value if isinstance(host, Beam | TimoshenkoBeam | RigidLink) else 0.0
+                )
                 at = a + (b - a) * (sensor.position / length if length > 0 else 0.5)
                 span = (at, at)
         places.append((sum(span) / 2, span, sensor))
@@ -140,10 +209,12 @@ def _sensors(rig: Rig, spans: dict[str, tuple[float, float]]) -> list[str]:
         row = _SENSOR_ROWS[number % 2]
         foot = _AXIS - 20
         mark = f"M{a:.1f} {foot}v-8H{b:.1f}v8M{x:.1f} {foot - 8}" if b > a else f"M{x:.1f} {foot}"
+        text, style = f"{sensor.name} [{pretty(sensor.unit)}]", ""
+        if sensor.name in suspects:
+            text, style = f"{text} {suspects[sensor.name].label}", " marked"
         out.append(
-            f'<path class="sensor" d="{mark}V{row + 6:.1f}"/>'
-            f'<text class="sensorname" x="{x:.1f}" y="{row:.1f}">{escape(sensor.name)} '
-            f"[{escape(pretty(sensor.unit))}]</text>"
+            f'<path class="sensor{style}" d="{mark}V{row + 6:.1f}"/>'
+            f'<text class="sensorname{style}" x="{x:.1f}" y="{row:.1f}">{escape(text)}</text>'
         )
     return out
 

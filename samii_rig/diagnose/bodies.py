@@ -1,0 +1,115 @@
+"""Effects in what the chain is made of: dampers of its joints, masses on its links, its beams."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from samii_rig.diagnose.effect import Effect, Key, Unknown, Values
+from samii_rig.diagnose.scales import PAIRS, REACH, Places, middle, spread
+from samii_rig.rig.schema import BEAMS, Rig, RigidLink, TorsionalSpring, TranslationalSpring
+from samii_rig.types import Float
+
+
+def effects(rig: Rig, where: Places) -> Iterator[Effect]:
+    """All of them on this rig."""
+    yield from _joint_dampers(rig, where)
+    yield from _links(rig, where)
+    yield from _beams(rig)
+
+
+def _joint_dampers(rig: Rig, where: Places) -> Iterator[Effect]:
+    """A damper beside a spring that the chain has: c of the rig file and more."""
+    w = middle(where)
+    for e in rig.element:
+        if not isinstance(e, TorsionalSpring | TranslationalSpring):
+            continue
+        key = (e.name, "c")
+        port = next(i for i, n in enumerate(where.names) if n[-1] == e.name)
+        pair = PAIRS.index(("theta", "M") if isinstance(e, TorsionalSpring) else ("w", "V"))
+        x = where.strength(pair, port)
+        if not 0 < x < math.inf:
+            continue
+        scale = max(e.k.value, 1 / x * 1e-2) / w
+
+        def values(x: Float, nominal: Values, key: Key = key) -> dict[Key, float]:
+            return {key: nominal[key] + float(x[0])}
+
+        bounds = 1e-4 * scale, 1e3 * scale
+        yield Effect(
+            physics="viscous_damping",
+            site=e.name,
+            unknowns=(Unknown("c", e.c.unit, *bounds, spread(*bounds, 8)),),
+            parameters=values,
+            touches=(key,),
+            variant="beside the spring",
+        )
+
+
+def _links(rig: Rig, where: Places) -> Iterator[Effect]:
+    """A mass or inertia somewhere on a rigid link: the link's own m, r and I change."""
+    w = middle(where)
+    for port, e in enumerate(rig.element):
+        if not isinstance(e, RigidLink) or e.L.value == 0 or e.m.value == 0:
+            continue
+        x = where.strength(PAIRS.index(("V", "w")), port + 1)
+        if not 0 < x < math.inf:
+            continue
+        keys = tuple((e.name, s) for s in ("m", "r", "I"))
+        L = e.L.value
+
+        def values(
+            x: Float, nominal: Values, keys: tuple[Key, ...] = keys, L: float = L
+        ) -> dict[Key, float]:
+            m, r, inertia = (nominal[k] for k in keys)
+            more, at = float(x[0]), float(x[1]) * L
+            total = m + more
+            centre = (m * r + more * at) / total
+            own = inertia + m * (r - centre) ** 2 + more * (at - centre) ** 2
+            return dict(zip(keys, (total, centre, own), strict=True))
+
+        scale = x / w**2
+        bounds = scale / REACH[1], scale / REACH[0]
+        yield Effect(
+            physics="added_mass",
+            site=e.name,
+            unknowns=(
+                Unknown("m", "kg", *bounds, spread(*bounds, 8)),
+                Unknown("position", "L", 0.05, 1.0, (0.1, 0.4, 0.9)),
+            ),
+            parameters=values,
+            touches=keys,
+            variant="on the link",
+        )
+
+
+def _beams(rig: Rig) -> Iterator[Effect]:
+    for e in rig.element:
+        if not isinstance(e, BEAMS):
+            continue
+        eta = (e.name, "eta")
+
+        def lossy(x: Float, nominal: Values, key: Key = eta) -> dict[Key, float]:
+            return {key: nominal[key] + float(x[0])}
+
+        yield Effect(
+            physics="structural_damping",
+            site=e.name,
+            unknowns=(Unknown("eta", "1", 1e-5, 1.0, (1e-3, 1e-2, 0.1)),),
+            parameters=lossy,
+            touches=(eta,),
+        )
+        for symbol in ("EI", "mu"):
+            key = (e.name, symbol)
+
+            def scaled(x: Float, nominal: Values, key: Key = key) -> dict[Key, float]:
+                return {key: nominal[key] * float(x[0])}
+
+            yield Effect(
+                physics="beam_property",
+                site=e.name,
+                unknowns=(Unknown(f"{symbol} ratio", "1", 0.2, 5.0, (0.5, 0.75, 1.0, 1.35, 2.0)),),
+                parameters=scaled,
+                touches=(key,),
+                variant=symbol,
+            )

@@ -1,0 +1,109 @@
+"""`diagnose`: from frequency responses and a rig file to what was left out of it.
+
+found = diagnose(estimate(recordings), rig)
+found.verdict, found.causes, found.lines(), found.plain()
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from samii_rig.diagnose import judge as verdict
+from samii_rig.diagnose.classes import without_twins
+from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.locate import traces
+from samii_rig.diagnose.measured import measured
+from samii_rig.diagnose.model import grid
+from samii_rig.diagnose.plan import next_experiment
+from samii_rig.diagnose.result import Diagnosis
+from samii_rig.diagnose.rigfile import explained
+from samii_rig.diagnose.search import Search
+from samii_rig.diagnose.vocabulary import hypotheses
+from samii_rig.rig.schema import Rig
+from samii_rig.types import FrequencyResponse
+
+ALTERNATIVES = 6
+TWIN_POINTS = 40
+
+Progress = Callable[[str], None]
+
+
+def table(rig: Rig, low_hz: float, high_hz: float) -> list[Effect]:
+    """All effects that the table knows on this rig, structural twins as one."""
+    f = np.geomspace(low_hz, high_hz, TWIN_POINTS)
+    return without_twins(rig, hypotheses(rig, low_hz, high_hz), f)
+
+
+def diagnose(
+    responses: Sequence[FrequencyResponse],
+    rig: Rig,
+    *,
+    band: tuple[float, float] | None = None,
+    effects: Sequence[Effect] | None = None,
+    progress: Progress = lambda _stage: None,
+) -> Diagnosis:
+    """What `rig` leaves out, as far as `responses` tell.
+
+    Parameters
+    ----------
+    responses : from `samii_rig.signal.estimate`, all levels and experiments together.
+    band : Hz, where the model is held against them.
+    effects : the table of hypotheses; None for the whole vocabulary.
+    progress : is told each stage as it begins.
+
+    Raises InputError and EstimateError as `samii_rig.identify.data.collect` does.
+    """
+    progress("nominal model")
+    whole = measured(responses, rig, band)
+    seen, show = whole.shown_apart()
+    at = grid(rig, whole.frequency, whole.sensor, whole.actuator)
+    low, high = float(whole.frequency[0]), float(whole.frequency[-1])
+    if effects is None:
+        effects = table(rig, low, high)
+    search = Search(rig, seen, at, effects)
+    nominal = search.nominal.fitted
+    first = search.ratio(nominal)
+    bands = verdict.bands(search, nominal)
+    progress("what is missing")
+    search.run()
+    progress("what cannot be told apart")
+    judged = verdict.judge(search)
+    nominal = search.nominal.fitted
+    best = judged.best
+    shown = verdict.causes_of(judged.classes[0], judged) if best.effects else ()
+    findings = _findings(responses)
+    if judged.verdict != "no_mismatch" or best.effects:
+        findings += verdict.told(judged)
+    why, experiment = next_experiment(search, judged)
+    alternatives = tuple(
+        (verdict.causes_of(c, judged, probability=c.probability), c.probability)
+        for c in judged.classes[1 : 1 + ALTERNATIVES]
+        if c.probability >= verdict.SHOWN
+    )
+    fits = [(search.ratio(f), verdict.per_dof(search, show, f)[0]) for f in (nominal, best.fitted)]
+    return Diagnosis(
+        verdict=judged.verdict,
+        chi2_per_dof=first,
+        threshold=verdict.threshold(seen),
+        bands=bands,
+        sites=tuple(verdict.sites(judged)) if judged.verdict != "no_mismatch" else (),
+        causes=shown if judged.verdict != "no_mismatch" else (),
+        alternatives=alternatives,
+        nominal=fits[0],
+        with_causes=fits[1],
+        noise_floor=1.0,
+        gap=verdict.gap(search, show, nominal, best.fitted),
+        not_physics=tuple(dict.fromkeys(findings)),
+        why=why,
+        experiment=experiment,
+        outside=judged.outside,
+        rig=explained(best.fitted) if best.effects else None,
+        traces=traces(search, judged) if judged.verdict != "no_mismatch" else (),
+    )
+
+
+def _findings(responses: Sequence[FrequencyResponse]) -> list[str]:
+    """What the estimate found wrong with the recordings."""
+    return [f.message for r in responses for f in r.findings if f.severity != "note"]

@@ -1,0 +1,90 @@
+"""An effect: one piece of physics at one place, as a change of the rig file.
+
+An effect is data: what it inserts into or changes in the rig, and how its unknowns become
+parameters of the rig or factors on a channel. Nothing here knows a particular physics; the
+table is in `vocabulary`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from samii_rig.rig.schema import Rig
+from samii_rig.types import Complex, Float
+
+Key = tuple[str, str]
+Values = Mapping[Key, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Unknown:
+    """A positive number to be found, log-uniform between `low` and `high` before the data.
+
+    symbol, unit : as reported. starts : values from which a search may begin.
+    """
+
+    symbol: str
+    unit: str
+    low: float
+    high: float
+    starts: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Factor:
+    """A factor F(s; unknowns) on an input or a sensor.
+
+    value : (s (n,), unknowns) -> (F (n,), [dF/d unknown (n,), ...]).
+    """
+
+    kind: Literal["input", "sensor"]
+    channel: str
+    value: Callable[[Complex, Float], tuple[Complex, list[Complex]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """One hypothesis of what was left out.
+
+    physics, site : by the names of the table and of the rig file.
+    aliases : other (physics, site) names of the very same change.
+    unknowns : its parameters, first the one that says how strong it is.
+    build : the rig with the effect, its own parameters at any value.
+    parameters : the rig's parameters that it sets, from its unknowns and the nominal values.
+    touches : nominal parameters that `parameters` reads.
+    factor : what it does to a channel, if that is no parameter of the rig.
+    write : the rig as a file would have it, from the built rig and the unknowns.
+    weight : prior weight against the other hypotheses.
+    report : physical quantities to be reported, from the unknowns.
+    variant : tells effects with one name and different changes apart.
+    """
+
+    physics: str
+    site: str
+    unknowns: tuple[Unknown, ...] = ()
+    build: Callable[[Rig], Rig] = lambda rig: rig
+    parameters: Callable[[Float, Values], dict[Key, float]] = lambda _x, _nominal: {}
+    touches: tuple[Key, ...] = ()
+    factor: Factor | None = None
+    write: Callable[[Rig, Float], Rig] = lambda rig, _x: rig
+    weight: float = 1.0
+    aliases: tuple[tuple[str, str], ...] = field(default=())
+    report: Callable[[Float], Float] = lambda x: x
+    variant: str = ""
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """(physics, site)."""
+        return self.physics, self.site
+
+    @property
+    def names(self) -> tuple[tuple[str, str], ...]:
+        """All names of the same change, its own first."""
+        return (self.name, *self.aliases)
+
+    @property
+    def key(self) -> str:
+        """Different for different changes."""
+        return f"{self.physics}@{self.site}#{self.variant}"

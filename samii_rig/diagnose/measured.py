@@ -1,0 +1,205 @@
+"""What was measured, in noise units and small enough to refit a model a thousand times.
+
+All lines of all responses count, each with its full covariance. Neighbouring lines are
+combined after the model's own shape has been divided out, which loses nothing where the
+ratio of truth to model is smooth; where it is not, the bin is split (`binned`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samii_rig.errors import InputError
+from samii_rig.identify.data import collect
+from samii_rig.rig.schema import Rig
+from samii_rig.types import Complex, Float, FrequencyResponse, Int
+
+BINS = 300  # to begin with; a refit costs a few milliseconds
+MOST_BINS = 700
+SPLIT = 6.0  # standard deviations of chi-square inside a bin above which it is divided
+SHAPE = 0.6  # weight of the response's own arc (logarithm, radians) against log frequency
+SHOW, TURN = 4, 5  # one line in five is kept apart, to show on what was found
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Lines, or bins of lines, sorted by frequency.
+
+    frequency : (n,) Hz. H : (n, q) of the entries (sensor, actuator), (q,) indices into the
+        rig's. W : (n, q, q) precision such that e^H W e of the truth has the mean `expected`
+        (n,), about twice the entries measured there; 0 where an entry was not measured.
+    level : (n,) index into `levels`, -1 where several were combined.
+    inside : chi-square lost by combining lines, and the mean of that under the truth.
+    real : how many real numbers; spread : relative variance of chi-square over them.
+    """
+
+    frequency: Float
+    H: Complex
+    W: Complex
+    expected: Float
+    level: Int
+    levels: tuple[tuple[float, str], ...]
+    sensor: Int
+    actuator: Int
+    outputs: tuple[str, ...]
+    inside: tuple[float, float]
+    spread: float
+    rate_hz: float
+
+    @property
+    def n(self) -> int:
+        """Lines or bins."""
+        return int(self.frequency.size)
+
+    def root(self) -> Complex:
+        """(n, q, q) R with R^H R = W."""
+        values, vectors = np.linalg.eigh(self.W)
+        return np.asarray(
+            np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.conj().swapaxes(1, 2)
+        )
+
+    def take(self, mask: NDArray[np.bool_]) -> Measured:
+        """Some of the lines."""
+        part = max(float(np.sum(self.expected[mask]) / np.sum(self.expected)), 1e-9)
+        return replace(
+            self,
+            frequency=self.frequency[mask],
+            H=self.H[mask],
+            W=self.W[mask],
+            expected=self.expected[mask],
+            level=self.level[mask],
+            spread=self.spread / part,
+        )
+
+    def shown_apart(self) -> tuple[Measured, Measured]:
+        """The lines that find and decide, and those kept apart; their noise is independent."""
+        turn = np.zeros(self.n, dtype=np.int64)
+        for level in np.unique(self.level):
+            at = np.flatnonzero(self.level == level)
+            turn[at] = np.arange(at.size) % TURN
+        return self.take(turn != SHOW), self.take(turn == SHOW)
+
+    def chi_square(self, h: Complex) -> Float:
+        """(n,) e^H W e of a prediction (n, q)."""
+        e = h - self.H
+        return np.asarray(np.einsum("ni,nij,nj->n", e.conj(), self.W, e).real)
+
+
+def measured(
+    responses: Sequence[FrequencyResponse], rig: Rig, band: tuple[float, float] | None = None
+) -> Measured:
+    """All lines of `responses`, as `identify.data.collect` gives them.
+
+    Raises what `collect` does; InputError where the sample rate is not the rig's.
+    """
+    data = collect(responses, rig, band)
+    rate = data.lines[0].response.rate_hz
+    if abs(rate / rig.rate_hz - 1) > 1e-6:
+        raise InputError("recording", "rate_hz", rate, f"the rig's rate, {rig.rate_hz:g} Hz")
+    pairs = sorted(
+        {(int(s), int(a)) for d in data.lines for s, a in zip(d.sensor, d.actuator, strict=True)}
+    )
+    levels = tuple(dict.fromkeys((d.response.level, d.response.level_unit) for d in data.lines))
+    blocks = []
+    variance = total = 0.0
+    for d in data.lines:
+        at = [pairs.index((int(s), int(a))) for s, a in zip(d.sensor, d.actuator, strict=True)]
+        n, q = len(d.frequency), len(pairs)
+        H = np.zeros((n, q), complex)
+        W = np.zeros((n, q, q), complex)
+        H[:, at] = d.H
+        precision = d.root.conj().swapaxes(1, 2) @ d.root
+        W[:, np.array(at)[:, None], np.array(at)] = 2 * d.factor[:, None, None] * precision
+        expected = 2 * d.factor * d.mean()
+        index = levels.index((d.response.level, d.response.level_unit))
+        blocks.append((d.frequency, H, W, expected, np.full(n, index)))
+        groups = max(1.0, n / d.shared[0])
+        alone = max(1.0, n / d.shared[1])
+        sized = float(np.sum(expected))
+        variance += sized**2 * (1 / alone + 1 / (float(np.mean(d.dof)) * groups)) / d.p
+        total += sized
+    f, H, W, expected, level = (np.concatenate(x) for x in zip(*blocks, strict=True))
+    order = np.argsort(f, kind="stable")
+    return Measured(
+        frequency=f[order],
+        H=H[order],
+        W=W[order],
+        expected=expected[order],
+        level=level[order],
+        levels=levels,
+        sensor=np.array([s for s, _ in pairs], dtype=np.int64),
+        actuator=np.array([a for _, a in pairs], dtype=np.int64),
+        outputs=tuple(rig.sensor[s].name for s, _ in pairs),
+        inside=(0.0, 0.0),
+        spread=variance / total**2,
+        rate_hz=rate,
+    )
+
+
+def binned(lines: Measured, shape: Complex, bins: int = BINS) -> Measured:
+    """Lines combined into bins, each at the line nearest its middle.
+
+    shape : (n, q) a model at the lines. In a bin the truth is taken for the model times one
+    complex factor for each entry; chi-square about that is kept in `inside`, and a bin in
+    which it is too large is divided.
+    """
+    size = np.abs(shape)
+    smooth = np.where(size > 0, shape, 1.0)
+    arc = np.abs(np.diff(np.log(smooth), axis=0).real) + np.abs(np.angle(smooth[1:] / smooth[:-1]))
+    step = np.diff(np.log(lines.frequency)) / np.log(lines.frequency[-1] / lines.frequency[0])
+    metric = step + SHAPE * arc.sum(axis=1) / max(float(arc.sum()), 1e-12)
+    place = np.concatenate([[0.0], np.cumsum(metric)])
+    at = np.searchsorted(place, np.linspace(0, place[-1], min(bins, lines.n) + 1)[:-1])
+    starts = np.unique(_apart(lines.frequency, at))
+    while True:
+        found, chi, mean = _combined(lines, smooth, starts)
+        counts = np.diff(np.append(starts, lines.n))
+        bad = (chi - mean > SPLIT * np.sqrt(2 * np.maximum(mean, 1.0))) & (counts > 1)
+        more = _apart(lines.frequency, (starts + counts // 2)[bad])
+        new = np.unique(np.concatenate([starts, more]))
+        if new.size == starts.size or new.size > MOST_BINS:
+            return found
+        starts = new
+
+
+def _apart(f: Float, at: Int) -> Int:
+    """The same places, moved back to the first line of that frequency (another level's)."""
+    return np.asarray(np.searchsorted(f, f[at]), dtype=np.int64)
+
+
+def _combined(lines: Measured, shape: Complex, starts: Int) -> tuple[Measured, Float, Float]:
+    counts = np.diff(np.append(starts, lines.n))
+    centre = starts + (counts - 1) // 2
+    which = np.repeat(np.arange(starts.size), counts)
+    D = shape / shape[centre][which]
+    DW = D.conj()[:, :, None] * lines.W
+    W = np.add.reduceat(DW * D[:, None, :], starts)
+    right = np.add.reduceat((DW @ lines.H[:, :, None])[:, :, 0], starts)
+    power = np.add.reduceat(
+        np.einsum("ni,nij,nj->n", lines.H.conj(), lines.W, lines.H).real, starts
+    )
+    diagonal = np.diagonal(W, axis1=1, axis2=2).real
+    empty = (diagonal <= 0)[:, :, None] * np.eye(W.shape[1])
+    scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    solved = np.linalg.solve(
+        W / (scale[:, :, None] * scale[:, None, :]) + empty, (right / scale)[:, :, None]
+    )[:, :, 0]
+    H = solved / scale
+    chi = np.maximum(power - np.einsum("ni,ni->n", H.conj(), right).real, 0.0)
+    expected = np.add.reduceat(lines.expected, starts)
+    mean = expected * (1 - 1 / counts)
+    same = np.minimum.reduceat(lines.level, starts) == np.maximum.reduceat(lines.level, starts)
+    found = replace(
+        lines,
+        frequency=lines.frequency[centre],
+        H=np.asarray(H, np.complex128),
+        W=W,
+        expected=expected - mean,
+        level=np.where(same, lines.level[starts], -1),
+        inside=(float(np.sum(chi)), float(np.sum(mean))),
+    )
+    return found, chi, mean

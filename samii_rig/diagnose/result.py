@@ -1,0 +1,195 @@
+"""What a diagnosis says: the contract of `samii-rig diagnose --json`, as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from samii_rig.rig.schema import Rig
+from samii_rig.types import Complex, Float
+
+Verdict = Literal["no_mismatch", "named", "ambiguous", "unknown"]
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A parameter of a cause with its 90 % interval."""
+
+    value: float
+    unit: str
+    low: float
+    high: float
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return {"value": self.value, "unit": self.unit, "low": self.low, "high": self.high}
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One effect of an explanation. equivalents : what these data do not tell from it."""
+
+    physics: str
+    site: str
+    probability: float
+    equivalents: tuple[tuple[str, str], ...]
+    parameters: dict[str, Value]
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "physics": self.physics,
+            "site": self.site,
+            "probability": self.probability,
+            "equivalent_to": [{"physics": p, "site": s} for p, s in self.equivalents],
+            "parameters": {k: v.plain() for k, v in self.parameters.items()},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """What the refitted nominal model leaves of one channel in one band, per degree of freedom."""
+
+    channel: str
+    low_hz: float
+    high_hz: float
+    chi2_per_dof: float
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "channel": self.channel,
+            "low_hz": self.low_hz,
+            "high_hz": self.high_hz,
+            "chi2_per_dof": self.chi2_per_dof,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Part of the gap between refitted nominal model and noise that the causes close, on lines
+    that were used for nothing else, with its 90 % bootstrap interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """x(w) of a place, free of any law: the part that is missing there, by itself.
+
+    x, sd : (n,) complex estimate and its standard deviation, by frequency (n,) Hz.
+    chi2_per_dof : of what no x at this place can explain.
+    """
+
+    site: str
+    jump: str
+    by: str
+    frequency: Float
+    x: Complex
+    sd: Float
+    chi2_per_dof: float
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """Everything that a diagnosis found; `plain()` is the contract.
+
+    chi2_per_dof, threshold : of the refitted nominal model, and what noise would reach in
+        three of a thousand cases.
+    train, held_out : chi-square per degree of freedom of the refitted nominal model and with
+        the causes, each on the lines fitted and on those shown.
+    rig : the nominal rig with the causes; traces : the best places, law-free.
+    """
+
+    verdict: Verdict
+    chi2_per_dof: float
+    threshold: float
+    bands: tuple[Band, ...]
+    sites: tuple[tuple[str, float], ...]
+    causes: tuple[Cause, ...]
+    alternatives: tuple[tuple[tuple[Cause, ...], float], ...]
+    nominal: tuple[float, float]
+    with_causes: tuple[float, float]
+    noise_floor: float
+    gap: Gap
+    not_physics: tuple[str, ...]
+    why: str
+    experiment: str
+    outside: float
+    rig: Rig | None
+    traces: tuple[Trace, ...]
+    model: str = ""
+
+    def plain(self) -> dict[str, Any]:
+        """The contract of `samii-rig diagnose --json`."""
+        return {
+            "verdict": self.verdict,
+            "mismatch": {
+                "chi2_per_dof": self.chi2_per_dof,
+                "threshold": self.threshold,
+                "bands": [b.plain() for b in self.bands],
+            },
+            "sites": [{"site": s, "probability": p} for s, p in self.sites],
+            "causes": [c.plain() for c in self.causes],
+            "alternatives": [
+                {"causes": [c.plain() for c in causes], "probability": p}
+                for causes, p in self.alternatives
+            ],
+            "fit": {
+                "refitted_nominal": {"train": self.nominal[0], "held_out": self.nominal[1]},
+                "with_causes": {"train": self.with_causes[0], "held_out": self.with_causes[1]},
+                "noise_floor": self.noise_floor,
+                "gap_closed": {
+                    "value": self.gap.value,
+                    "low": self.gap.low,
+                    "high": self.gap.high,
+                },
+            },
+            "not_physics": list(self.not_physics),
+            "next_experiment": {"why": self.why, "experiment": self.experiment},
+            "model": self.model,
+        }
+
+    def lines(self) -> tuple[str, ...]:
+        """Three lines for a person: what, how sure and how much better, what next."""
+        return (self._what(), self._how_well(), self._next())
+
+    def _what(self) -> str:
+        match self.verdict:
+            case "no_mismatch":
+                return (
+                    f"Nothing is missing: the model fits to the noise (chi-square per degree of "
+                    f"freedom {self.chi2_per_dof:.3f}, threshold {self.threshold:.3f})."
+                )
+            case "unknown":
+                place = f" It is most likely at {self.sites[0][0]}." if self.sites else ""
+                return f"Something is missing that the table does not name for sure.{place}"
+        named = " and ".join(_said(c) for c in self.causes)
+        if self.verdict == "named":
+            return f"Left out: {named}."
+        return f"Most likely left out: {named}; the data do not settle it."
+
+    def _how_well(self) -> str:
+        before, after = self.nominal[1], self.with_causes[1]
+        if not self.causes:
+            return f"On lines kept apart the refitted model has {before:.3g} of the noise's power."
+        sure = min(c.probability for c in self.causes)
+        return (
+            f"Probability {sure:.0%}; on lines kept apart chi-square per degree of freedom falls "
+            f"from {before:.3g} to {after:.3g}, {self.gap.value:.0%} of the gap to the noise "
+            f"({self.gap.low:.0%} to {self.gap.high:.0%})."
+        )
+
+    def _next(self) -> str:
+        parts = list(self.not_physics[:1])
+        if self.experiment:
+            parts.append(f"Next: {self.experiment} ({self.why}).")
+        return " ".join(parts) or "No further experiment is needed."
+
+
+def _said(cause: Cause) -> str:
+    numbers = ", ".join(f"{k} = {v.value:.3g} {v.unit}" for k, v in cause.parameters.items())
+    said = f"{cause.physics.replace('_', ' ')} at {cause.site}"
+    return f"{said} ({numbers})" if numbers else said

@@ -1,0 +1,330 @@
+"""Which physics, and where: every hypothesis refitted, weighed, added and taken away again.
+
+A screen holds each effect, at starts over its whole range, against what the model so far
+cannot explain, with the uncertain parameters projected out. The best are refitted jointly with
+these parameters. Effects are added while the evidence grows, each is then tried without and
+with every other in its place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.measured import Measured, binned
+from samii_rig.diagnose.model import Grid, Model
+from samii_rig.diagnose.refit import Fitted, Problem, refit
+from samii_rig.diagnose.screen import Screen, Start
+from samii_rig.errors import SamiiRigError
+from samii_rig.rig.schema import Rig
+from samii_rig.types import Float
+
+MOST = 5  # effects in one explanation
+FIRST, LATER = 30, 8  # candidates that are refitted in the first round, and in later ones
+CHANCE = (0.5, 0.4, 0.02)  # before the data: of nothing, one, two effects missing
+FEWER = 0.05  # of each further effect
+NEAR = 25.0  # of the logarithm of evidence: explanations further below the best are let go
+WORTH = 8.0  # of chi-square, gain in the screen below which a candidate is not refitted
+FIVE = 5.0  # standard deviations of chi-square beyond which what is left is more than noise
+ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and bins over which it is looked for
+ENOUGH = 1.15  # chi-square over its mean below which growth looks at one explanation only
+SATURATED = "torsional_compliance"  # joints that give: what is missing in many places at once
+MOST_SATURATED = 12  # of these places
+WEAK = (4, 5, 6)  # tenths of the range at which they start
+BEAM = 2  # explanations that are grown further
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """Some effects, refitted. weight : logarithm of evidence times prior."""
+
+    effects: tuple[Effect, ...]
+    fitted: Fitted
+    weight: float
+
+    @property
+    def key(self) -> frozenset[str]:
+        """The same for the same effects in another order."""
+        return frozenset(e.key for e in self.effects)
+
+
+@dataclass
+class Search:
+    """The search on one set of lines.
+
+    lines : those that are fitted. grid : of all frequencies. table : all single effects.
+    found : every explanation that was refitted, by key.
+    """
+
+    rig: Rig
+    lines: Measured
+    grid: Grid
+    table: Sequence[Effect]
+    found: dict[frozenset[str], Explanation] = field(default_factory=dict)
+    problem: Problem = field(init=False)
+    temperature: float = 1.0
+    _rows: Counter[str] = field(init=False)
+    _total: dict[str, float] = field(init=False)
+    _models: dict[tuple[str, ...], Model | None] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._rows = Counter(e.physics for e in self.table)
+        self._total = {p: sum(e.weight for e in self.table if e.physics == p) for p in self._rows}
+        model = Model(self.rig)
+        at = self.grid.at(self.lines.frequency)
+        x = np.zeros(model.n)
+        self.problem = Problem.of(binned(self.lines, model.response(x, at)), self.grid)
+        nominal = refit(model, self.problem, x)
+        self._rebin(nominal)
+        self._keep((), refit(model, self.problem, nominal.x))
+
+    @property
+    def nominal(self) -> Explanation:
+        """Nothing is missing."""
+        return self.found[frozenset()]
+
+    def ranked(self) -> list[Explanation]:
+        """All explanations, the most probable first."""
+        return sorted(self.found.values(), key=lambda e: -e.weight)
+
+    def weigh(self, effects: Iterable[Effect], fitted: Fitted) -> float:
+        """Logarithm of evidence times prior."""
+        return fitted.evidence(self.temperature) + self.log_prior(effects)
+
+    def temper(self) -> None:
+        """Take the temperature of the explanation that fits best, and weigh all anew.
+
+        What even that leaves is a part of the truth that is not in the table, and has structure
+        along frequency: lines count by how much they and their neighbours say that is new.
+        """
+        best = min(self.found.values(), key=lambda e: e.fitted.cost)
+        self.temperature = self.leftover(best.fitted)
+        for key, e in self.found.items():
+            self.found[key] = replace(e, weight=self.weigh(e.effects, e.fitted))
+
+    def leftover(self, fitted: Fitted) -> float:
+        """Chi-square per degree of freedom times the bins over which what is left is alike; 1
+        where noise would leave as much."""
+        left = self.ratio(fitted)
+        if left <= 1 + FIVE * math.sqrt(self.lines.spread):
+            return 1.0
+        h = fitted.model.response(fitted.x, self.problem.at)
+        r = (self.problem.root @ (h - self.problem.data.H)[:, :, None])[:, :, 0]
+        power = float(np.sum(np.abs(r) ** 2))
+        alike = 1.0
+        for lag in range(1, min(MOST_ALIKE, len(r) - 1)):
+            rho = float(np.sum(r[lag:] * r[:-lag].conj()).real) / power
+            if rho < ALIKE:
+                break
+            alike += 2 * rho
+        return left * alike
+
+    def ratio(self, fitted: Fitted) -> float:
+        """Chi-square per degree of freedom over all lines, also inside the bins."""
+        found, mean = self.problem.data.inside
+        # Directions that the data determine take chi-square away.
+        taken = float(np.trace(np.linalg.solve(fitted.precision(), fitted.information)))
+        return (fitted.chi2 + found) / max(self.problem.expected + mean - taken, 1.0)
+
+    def run(self) -> list[Explanation]:
+        """Grow, swap, prune; all explanations, the most probable first."""
+        self.grow(self.nominal, FIRST)
+        self.temper()
+        for turn in range(MOST - 1):
+            before = self.ranked()[0]
+            if not before.effects:
+                break
+            self._renew(before)
+            if turn == 0 and not self._enough(self.ranked()[0]):
+                self.saturate(SATURATED)
+            for base in self._beam():
+                self.grow(base, LATER)
+            self.temper()
+            self.prune()
+            if self.ranked()[0].key == before.key:
+                break
+        best = self.ranked()[0]
+        if len(best.effects) > 1:
+            self.swap(best)
+            self.temper()
+            self.prune()
+        return self.ranked()
+
+    def log_prior(self, effects: Iterable[Effect]) -> float:
+        """Before the data: of how many, which rows, which sites of a row."""
+        effects = tuple(effects)
+        n = len(effects)
+        chance = CHANCE[n] if n < len(CHANCE) else CHANCE[-1] * FEWER ** (n - len(CHANCE) + 1)
+        each = (math.log(e.weight / self._total[e.physics] / len(self._rows)) for e in effects)
+        return math.log(chance) + math.lgamma(n + 1) + sum(each)
+
+    def grow(self, base: Explanation, most: int) -> None:
+        """Refit `base` with each of the most promising further effects."""
+        if len(base.effects) >= MOST:
+            return
+        screened = self.screen(base)
+        best = max((e.fitted.cost for e in self.found.values()), default=math.inf)
+        for drop, effect, starts in screened[:most]:
+            if drop < WORTH:
+                break
+            effects = (*base.effects, effect)
+            if frozenset(e.key for e in effects) in self.found:
+                continue
+            ends = []
+            for start in starts:
+                end = self._refit(effects, base, np.log(start).tolist(), best)
+                if end is not None:
+                    ends.append(end)
+            if ends:
+                end = min(ends, key=lambda end: end.cost)
+                self._keep(effects, end)
+                best = min(best, end.cost + 2 * NEAR)
+
+    def screen(self, base: Explanation) -> list[tuple[float, Effect, list[Start]]]:
+        """How far chi-square should fall with each further effect, and one or two starts for its
+        refit; the largest first."""
+        look = Screen.of(self.problem, base.fitted)
+        names = {e.key for e in base.effects}
+        out = []
+        for effect in self.table:
+            model = None if effect.key in names else self._model((*base.effects, effect))
+            found = look.look(model, _moved(base, model), effect) if model else None
+            if found is not None:
+                out.append((found[0], effect, found[1]))
+        out.sort(key=lambda item: -item[0])
+        return out
+
+    def saturate(self, physics: str) -> None:
+        """Every place of one physics at once, taken away again one by one while that is better.
+
+        What is missing everywhere in small parts is not found by adding one part after another.
+        """
+        effects = tuple(e for e in self.table if e.physics == physics)
+        if not 2 <= len(effects) <= MOST_SATURATED:
+            return
+        ends = []
+        for tenth in WEAK:
+            start = [
+                math.log(u.starts[tenth * len(u.starts) // 10]) for e in effects for u in e.unknowns
+            ]
+            end = self._refit(effects, self.nominal, start)
+            ends += [end] if end is not None else []
+        if not ends:
+            return
+        end = min(ends, key=lambda end: end.cost)
+        whole = Explanation(effects, end, self.weigh(effects, end))
+        while whole.effects:
+            less = [self.without(whole, i) for i in range(len(whole.effects))]
+            best = max((e for e in less if e is not None), key=lambda e: e.weight, default=None)
+            if best is None or best.weight < whole.weight:
+                break
+            whole = best
+        self._keep(whole.effects, whole.fitted)
+
+    def prune(self) -> None:
+        """Try the best explanation without each of its effects, until none can go."""
+        while True:
+            best = self.ranked()[0]
+            if len(best.effects) < 2:
+                return
+            for i in range(len(best.effects)):
+                self.without(best, i)
+            if self.ranked()[0].key == best.key:
+                return
+
+    def without(self, whole: Explanation, i: int) -> Explanation | None:
+        """`whole` less its effect i, refitted."""
+        effects = whole.effects[:i] + whole.effects[i + 1 :]
+        key = frozenset(e.key for e in effects)
+        if key not in self.found:
+            model = whole.fitted.model
+            first = model.n_nominal + sum(len(e.unknowns) for e in whole.effects[:i])
+            gone = range(first, first + len(whole.effects[i].unknowns))
+            less = replace(whole.fitted, x=np.delete(whole.fitted.x, list(gone)))
+            base = Explanation(effects, less, 0.0)
+            end = self._refit(effects, base)
+            if end is None:
+                return None
+            self._keep(effects, end)
+        return self.found[key]
+
+    def swap(self, whole: Explanation) -> None:
+        """Every effect of `whole` taken out, and every other tried in its place."""
+        for i in range(len(whole.effects)):
+            base = self.without(whole, i)
+            if base is not None:
+                self.grow(base, LATER)
+
+    def _beam(self) -> list[Explanation]:
+        ranked = self.ranked()
+        best = ranked[0]
+        size = len(best.effects)
+        near = [e for e in ranked if len(e.effects) == size]
+        return near[:1] if self._enough(best) else near[:BEAM]
+
+    def _enough(self, explanation: Explanation) -> bool:
+        """Whether what an explanation leaves is near what noise would."""
+        return explanation.fitted.chi2 < ENOUGH * self.problem.expected
+
+    def _renew(self, best: Explanation) -> None:
+        """Bins anew about the best explanation, and what may still compete refitted on them."""
+        keep = [e for e in self.ranked()[:FIRST] if e.weight > best.weight - 4 * NEAR]
+        nominal = self.nominal
+        self._rebin(best.fitted)
+        self.found.clear()
+        for e in {e.key: e for e in (*keep, nominal)}.values():
+            end = self._refit(e.effects, e)
+            if end is not None:
+                self._keep(e.effects, end)
+
+    def _rebin(self, fitted: Fitted) -> None:
+        at = self.grid.at(self.lines.frequency)
+        shape = fitted.model.response(fitted.x, at)
+        self.problem = Problem.of(binned(self.lines, shape), self.grid)
+
+    def _model(self, effects: tuple[Effect, ...]) -> Model | None:
+        """The model with these effects; None if the rig does not allow them together."""
+        key = tuple(e.key for e in effects)
+        if key not in self._models:
+            try:
+                self._models[key] = Model(self.rig, effects)
+            except SamiiRigError:
+                self._models[key] = None
+        return self._models[key]
+
+    def _refit(
+        self,
+        effects: tuple[Effect, ...],
+        base: Explanation,
+        more: Sequence[float] = (),
+        give_up: float = math.inf,
+    ) -> Fitted | None:
+        """From where `base` ended, and `more` logarithms of further unknowns."""
+        model = self._model(effects)
+        if model is None:
+            return None
+        start = np.append(_moved(base, model), more)
+        try:
+            return refit(model, self.problem, start, give_up=give_up)
+        except (SamiiRigError, np.linalg.LinAlgError):
+            return None
+
+    def _keep(self, effects: tuple[Effect, ...], fitted: Fitted) -> None:
+        made = Explanation(effects, fitted, self.weigh(effects, fitted))
+        old = self.found.get(made.key)
+        if old is None or made.weight > old.weight:
+            self.found[made.key] = made
+
+
+def _moved(base: Explanation, model: Model) -> Float:
+    """x of `base` for a model of more effects: some nominal parameters may be gone or back."""
+    old, x = base.fitted.model, base.fitted.x
+    if model.keys == old.keys:
+        return x
+    held = dict(zip(old.keys, x[: old.n_nominal].tolist(), strict=True))
+    return np.array([held.get(k, 0.0) for k in model.keys] + x[old.n_nominal :].tolist())

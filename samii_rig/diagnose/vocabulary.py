@@ -1,0 +1,263 @@
+"""The table of physics: what may have been left out of a rig file, as data.
+
+A row of `POINTS` is a jump of one state at a port, driven by its conjugate (diagnosis of point
+faults), the element that makes it, and its unknowns. Rows of channels are factors. A lab adds
+a row, or a function to `EXTRA` that yields effects.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from samii_rig.diagnose import bodies, channels, insert
+from samii_rig.diagnose.effect import Effect, Key, Unknown, Values
+from samii_rig.diagnose.scales import PAIRS, REACH, Places, middle, places, spread
+from samii_rig.model.tmm import State
+from samii_rig.rig.elements import quantities
+from samii_rig.rig.schema import (
+    ANGLE_SOURCES,
+    GravityStiffness,
+    LumpedMass,
+    OilColumn,
+    RelativeAngle,
+    Rig,
+    TorsionalGroundSpring,
+    TorsionalSpring,
+    TranslationalGroundSpring,
+    TranslationalSpring,
+)
+from samii_rig.types import Float
+
+Law = Literal["spring", "softness", "damper", "slip", "mass"]
+LOSS = (1e-4, 10.0)  # damping force over spring force in mid band
+LOSS_STARTS = (0.05,)
+JOINTS = (TorsionalSpring, TranslationalSpring, *ANGLE_SOURCES)
+DISPLACEMENT = 1.475e-5  # m^3/rad, of a vane motor of a joint; C_h is stated for this one
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A row: physics at a port.
+
+    jump, by : the state that jumps and the one that drives it.
+    law : what x(s) is: softness 1/(k + c s), slip 1/(c s), spring k + c s, damper c s, mass
+        m s^2. strong, loss : symbols of its parameters, loss "" where there is none.
+    kind : the element that it adds to the rig file.
+    at_source : whether it belongs to a source only.
+    """
+
+    physics: str
+    jump: State
+    by: State
+    law: Law
+    strong: str
+    loss: str
+    kind: type[Any]
+    at_source: bool = False
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the element's parameters, by symbol."""
+        return {symbol: q.unit for symbol, q in quantities(self.kind).items()}  # type: ignore[arg-type]
+
+
+POINTS: tuple[Point, ...] = (
+    Point("torsional_compliance", "theta", "M", "softness", "k", "c", TorsionalSpring),
+    Point("translational_compliance", "w", "V", "softness", "k", "c", TranslationalSpring),
+    Point("added_mass", "V", "w", "mass", "m", "", LumpedMass),
+    Point("added_inertia", "M", "theta", "mass", "I", "", LumpedMass),
+    Point("ground_spring", "M", "theta", "spring", "k", "c", TorsionalGroundSpring),
+    Point("ground_spring", "V", "w", "spring", "k", "c", TranslationalGroundSpring),
+    Point("gravity_stiffness", "M", "theta", "spring", "k", "", GravityStiffness),
+    Point("viscous_damping", "M", "theta", "damper", "c", "", TorsionalGroundSpring),
+    Point("viscous_damping", "V", "w", "damper", "c", "", TranslationalGroundSpring),
+    Point("velocity_feedback", "theta", "M", "slip", "c", "", TorsionalSpring, True),
+    Point("hydraulic_compressibility", "theta", "M", "softness", "C_h", "", OilColumn, True),
+)
+
+REPORTED = {"velocity_feedback": {"c": "g_v"}, "added_inertia": {"I": "J"}}
+
+
+def hypotheses(rig: Rig, low_hz: float, high_hz: float) -> list[Effect]:
+    """Every single effect that the table knows on this rig; ranges are those of the band."""
+    where = places(rig, low_hz, high_hz)
+    out: list[Effect] = []
+    for row in POINTS:
+        for port in range(len(where.names)):
+            out += _point(rig, where, row, port)
+    out += _oscillators(rig, where)
+    out += bodies.effects(rig, where)
+    out += channels.effects(rig, low_hz, high_hz)
+    for extra in EXTRA:
+        out += extra(rig, low_hz, high_hz)
+    return out
+
+
+EXTRA: list[Callable[[Rig, float, float], Iterator[Effect]]] = []
+
+
+def _scale(row: Point, where: Places, port: int) -> float:
+    """The value of the strong unknown at which the jump begins to matter."""
+    x = where.strength(PAIRS.index((row.jump, row.by)), port)
+    w = middle(where)
+    match row.law:
+        case "softness":
+            return 1 / x
+        case "slip":
+            return 1 / (x * w)
+        case "spring":
+            return x
+        case "damper":
+            return x / w
+        case "mass":
+            return x / w**2
+    raise ValueError(row.law)
+
+
+def _point(rig: Rig, where: Places, row: Point, port: int) -> Iterator[Effect]:
+    scale = _scale(row, where, port)
+    if not 0 < scale < math.inf:
+        return
+    kinds = {e.name: e for e in rig.element}
+    names = where.names[port]
+    if row.at_source and not any(isinstance(kinds[n], ANGLE_SOURCES) for n in names):
+        return
+    low, high = (scale * x for x in REACH)
+    if row.law in ("spring", "damper", "mass"):
+        low, high = scale / REACH[1], scale / REACH[0]
+    if row.strong == "C_h":  # C_h/D^2 is the compliance
+        low, high = DISPLACEMENT**2 / high, DISPLACEMENT**2 / low
+    w = middle(where)
+    unknowns = [Unknown(row.strong, row.units[row.strong], low, high, spread(low, high, 10))]
+    if row.loss:
+        unknowns.append(Unknown(row.loss, row.units[row.loss], *LOSS, LOSS_STARTS))
+    unknowns[0] = _renamed(row, unknowns[0])
+    after = names[0] if port > 0 else None
+    for seen, tail in _readings(rig, row, names, port):
+        name = f"{insert.PREFIX}{_TAGS[row.physics]}{port}{tail}"
+
+        def build(r: Rig, name: str = name, seen: tuple[str, ...] = seen) -> Rig:
+            made = insert.element_of(row.kind, name, row.units)
+            return insert.inserted(r, after, made, seen)
+
+        def values(x: Float, _: Values, name: str = name) -> dict[Key, float]:
+            out = dict.fromkeys(((name, s) for s in row.units), 0.0)
+            if "D" in row.units:
+                out[name, "D"] = DISPLACEMENT
+            out[name, row.strong] = float(x[0])
+            if row.loss:
+                out[name, row.loss] = float(x[0] * x[1] / w)
+            return out
+
+        def report(x: Float) -> Float:
+            return np.array([x[0], x[0] * x[1] / w]) if row.loss else x
+
+        site, others = _site(rig, row, names)
+        yield Effect(
+            physics=row.physics,
+            site=site,
+            unknowns=tuple(unknowns),
+            build=build,
+            parameters=values,
+            aliases=tuple((row.physics, o) for o in others),
+            report=report,
+            variant=name,
+        )
+
+
+_TAGS = {
+    "torsional_compliance": "spring_",
+    "translational_compliance": "shear_spring_",
+    "added_mass": "mass_",
+    "added_inertia": "inertia_",
+    "ground_spring": "brace_",
+    "gravity_stiffness": "gravity_",
+    "viscous_damping": "damper_",
+    "velocity_feedback": "slip_",
+    "hydraulic_compressibility": "oil_",
+}
+
+
+def _renamed(row: Point, unknown: Unknown) -> Unknown:
+    symbol = REPORTED.get(row.physics, {}).get(unknown.symbol, unknown.symbol)
+    return Unknown(symbol, unknown.unit, unknown.low, unknown.high, unknown.starts)
+
+
+def _readings(
+    rig: Rig, row: Point, names: tuple[str, ...], port: int
+) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Which relative angles at whose end the part stands see it: none, or all of them."""
+    tail = "w" if row.jump in ("w", "V") else ""
+    yield (), tail
+    if row.jump != "theta":
+        return
+    edge = tuple(
+        s.name
+        for s in rig.sensor
+        if isinstance(s, RelativeAngle) and sum(n in s.across for n in names) == 1
+    )
+    if edge:
+        yield edge, f"{tail}e"
+
+
+def _site(rig: Rig, row: Point, names: tuple[str, ...]) -> tuple[str, tuple[str, ...]]:
+    """The element that the place is called by, and the other name that it has."""
+    kinds = {e.name: e for e in rig.element}
+
+    def joint(name: str) -> bool:
+        return isinstance(kinds[name], JOINTS)
+
+    bodily = row.law == "mass"
+    ranked = sorted(names, key=lambda n: joint(n) if bodily else not joint(n))
+    return ranked[0], tuple(ranked[1:])
+
+
+def _oscillators(rig: Rig, where: Places) -> Iterator[Effect]:
+    w = middle(where)
+    low_w, high_w = (2 * math.pi * float(where.frequency[i]) for i in (0, -1))
+    pair = PAIRS.index(("V", "w"))
+    row = Point("attached_oscillator", "V", "w", "mass", "m", "", LumpedMass)
+    for port, names in enumerate(where.names):
+        x = where.strength(pair, port)
+        if not 0 < x < math.inf:
+            continue
+        scale = x / w**2
+        name = f"{insert.PREFIX}oscillator_{port}"
+        after = names[0] if port > 0 else None
+
+        def build(r: Rig, name: str = name, after: str | None = after) -> Rig:
+            return insert.inserted(r, after, insert.oscillator(name))
+
+        def values(x: Float, _: Values, name: str = name) -> dict[Key, float]:
+            m, k, c = _oscillating(x)
+            return {
+                (f"{name}_spring", "k"): float(k),
+                (f"{name}_spring", "c"): float(c),
+                (f"{name}_mass", "m"): float(m),
+            }
+
+        site, others = _site(rig, row, names)
+        yield Effect(
+            physics="attached_oscillator",
+            site=site,
+            unknowns=(
+                Unknown("m", "kg", 1e-4 * scale, 30 * scale, (0.03 * scale,)),
+                Unknown("k", "N/m", low_w / 2, 2 * high_w, spread(low_w, high_w, 12)),
+                Unknown("c", "N s/m", 1e-3, 1.0, (0.03,)),
+            ),
+            build=build,
+            parameters=values,
+            aliases=tuple(("attached_oscillator", o) for o in others),
+            report=_oscillating,
+            variant=name,
+        )
+
+
+def _oscillating(x: Float) -> Float:
+    """m, k, c from mass, natural frequency and damping ratio."""
+    return np.array([x[0], x[0] * x[1] ** 2, 2 * x[2] * x[0] * x[1]])

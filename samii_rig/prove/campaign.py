@@ -1,0 +1,194 @@
+"""Concealed trials, made and diagnosed on all cores or on a cluster, resumable at any point.
+
+    OUT/recordings/<trial>/*.mcap      what the diagnosis reads
+    OUT/truth/<trial>.json             what it must not read, written before
+    OUT/answers/<trial>.json           what it said
+
+The plant that makes the recordings is found by its entry point (`samii_rig.plants`), as devices
+are: nothing here knows it. A process that diagnoses refuses to open a truth (an audit hook, which
+nothing in the process can take back), and checks that the recordings carry the truth's hash.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module, metadata
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, ClassVar
+
+from samii_rig.errors import InputError, SamiiRigError
+from samii_rig.prove.trial import Answer, Hidden, Trial, Truth
+from samii_rig.record.export import replacing
+from samii_rig.record.reader import read_notes
+
+GROUP = "samii_rig.plants"
+KINDS = ("nothing", "one", "two", "outside", "joints")
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One trial to be made and diagnosed."""
+
+    kind: str
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign:
+    """Where the trials are, the rig that they hide something in, the plant that makes them.
+
+    keep : whether recordings stay once they have been diagnosed.
+    """
+
+    out: Path
+    rig_toml: str
+    plant: str = "concealed"
+    keep: bool = False
+
+
+def jobs(counts: Mapping[str, int], seed: int) -> list[Job]:
+    """`counts` trials of each kind with seeds from `seed` on, kinds in turn, so that a
+    campaign that is stopped early has some of each."""
+    rows = [[Job(k, seed + i) for i in range(counts.get(k, 0))] for k in KINDS]
+    place = [
+        ((i + 0.5) / len(row), k, job) for k, row in enumerate(rows) for i, job in enumerate(row)
+    ]
+    return [job for _, _, job in sorted(place, key=lambda x: x[:2])]
+
+
+def carry_out(
+    campaign: Campaign,
+    todo: Iterable[Job],
+    executor: Executor,
+    progress: Callable[[int, int], None] = lambda _done, _all: None,
+) -> list[str]:
+    """Make and diagnose every trial that has no answer yet; returns what failed, in words.
+
+    A trial that fails leaves no answer, and is done again by the next call.
+    """
+    waiting: dict[Future[None], Job] = {
+        executor.submit(_one, campaign, job.kind, job.seed): job for job in todo
+    }
+    failures = []
+    for n, future in enumerate(as_completed(waiting), 1):
+        job = waiting[future]
+        try:
+            future.result()
+        except SamiiRigError as error:
+            failures.append(f"{job.kind} {job.seed}: {error}")
+        progress(n, len(waiting))
+    return failures
+
+
+@contextmanager
+def workers(n: int | None, scheduler: str = "") -> Iterator[Executor]:
+    """An executor: `n` processes here (None: one a core), or a dask.distributed cluster."""
+    if scheduler:
+        try:
+            distributed: Any = import_module("distributed")
+        except ImportError as error:
+            expected = "dask.distributed to be installed (pip install samii-rig[cluster])"
+            raise InputError("samii-rig prove", "--scheduler", scheduler, expected) from error
+        try:
+            client = distributed.Client(scheduler, timeout="10s")
+        except (OSError, ValueError) as error:
+            expected = "the address of a dask scheduler that answers"
+            raise InputError("samii-rig prove", "--scheduler", scheduler, expected) from error
+        with client:
+            yield client.get_executor(pure=False)
+        return
+    # Fresh processes: a forked one would share the threads of numerical libraries.
+    with ProcessPoolExecutor(n or os.cpu_count(), mp_context=get_context("spawn")) as pool:
+        yield pool
+
+
+def _one(campaign: Campaign, kind: str, seed: int) -> None:
+    """Make one trial, then have a process that sees no truth diagnose it."""
+    folder = plant(campaign.plant)(kind, seed, campaign.out, campaign.rig_toml)
+    answer = campaign.out / "answers" / f"{folder.name}.json"
+    if answer.exists():
+        return
+    truth = campaign.out / "truth" / f"{folder.name}.json"
+    _check_hash(folder, truth)
+    said = _Reader.of(campaign.out / "truth").diagnose(folder)
+    if "error" in said:
+        raise SamiiRigError(said["error"])
+    answer.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(answer) as part:
+        part.write_text(json.dumps(said, indent=1), encoding="utf-8")
+    if not campaign.keep:
+        for log in folder.glob("*.mcap"):
+            log.unlink()
+
+
+def plant(name: str) -> Callable[[str, int, Path, str], Path]:
+    """The plant of this name: (kind, seed, out, rig file's text) -> folder of the recordings."""
+    known = {point.name: point for point in metadata.entry_points(group=GROUP)}
+    if name not in known:
+        raise InputError("samii-rig prove", "--plant", name, f"one of {', '.join(sorted(known))}")
+    loaded: Callable[[str, int, Path, str], Path] = known[name].load()
+    return loaded
+
+
+def _check_hash(folder: Path, truth: Path) -> None:
+    digest = hashlib.sha256(truth.read_bytes()).hexdigest()
+    for log in folder.glob("*.mcap"):
+        if read_notes(log).get("truth_sha256") != digest:
+            raise SamiiRigError(f"{log}: its truth is not the one that it was made with")
+
+
+class _Reader:
+    """The diagnosing process of this process; one serves many trials, as its imports take long."""
+
+    _running: ClassVar[dict[Path, _Reader]] = {}
+
+    def __init__(self, truths: Path) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "samii_rig.prove.reader", str(truths)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            encoding="utf-8",
+        )
+
+    @classmethod
+    def of(cls, truths: Path) -> _Reader:
+        """The one that must not see `truths`; started when there is none or it has died."""
+        reader = cls._running.get(truths)
+        if reader is None or reader._process.poll() is not None:
+            reader = cls._running[truths] = cls(truths)
+        return reader
+
+    def diagnose(self, folder: Path) -> dict[str, Any]:
+        """What it says of a folder of recordings."""
+        stdin, stdout = self._process.stdin, self._process.stdout
+        assert stdin is not None
+        assert stdout is not None
+        stdin.write(f"{folder}\n")
+        stdin.flush()
+        line = stdout.readline()
+        if not line:
+            raise SamiiRigError(f"{folder}: the diagnosis ended without an answer")
+        said: dict[str, Any] = json.loads(line)
+        return said
+
+
+def results(out: Path) -> list[Trial]:
+    """Every trial that has an answer, in the order of kind and seed."""
+    trials = []
+    for answer in sorted((out / "answers").glob("*.json")):
+        truth = json.loads((out / "truth" / answer.name).read_text("utf-8"))
+        said = json.loads(answer.read_text("utf-8"))
+        effects = tuple(Hidden(e["physics"], e["site"], e["parameters"]) for e in truth["effects"])
+        hidden = Truth(truth["kind"], truth["seed"], effects, truth["size"])
+        trials.append(Trial(hidden, Answer.of(said)))
+    return sorted(trials, key=lambda t: (KINDS.index(t.truth.kind), t.truth.seed))

@@ -1,0 +1,110 @@
+"""What can be concealed: every row of the vocabulary, and what lies outside it.
+
+A row is data: where it can sit, and a function that puts it into a plant. To add one, write that
+function in `linear` or `nonlinear` and a line in `ROWS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.concealed import linear, nonlinear
+from sim.concealed.parts import Description
+from sim.concealed.scales import Concealed
+
+Put = Callable[[Description, str, float, np.random.Generator], Concealed]
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of the table.
+
+    at : which parts or sensors can have it. linear : whether its response does not depend on
+    the level. most : the largest multiple. fixed : whether it is there or not, without a size.
+    """
+
+    physics: str
+    at: str
+    put: Put
+    linear: bool = True
+    most: float = 3.0
+    fixed: bool = False
+    outside: bool = False
+
+
+def clamp_of(plant: Description) -> str:
+    """The spring at the base, "" if there is none. Its damper is what lets the whole structure come
+    to rest: without it no burst would settle within a run, whatever else is concealed."""
+    first = plant.parts[0]
+    return first.name if first.kind == "torsional_spring" else ""
+
+
+def places(plant: Description, row: Row) -> list[str]:
+    """Names of the elements or sensors at which a row can sit."""
+
+    def kinds(*wanted: str) -> list[str]:
+        return [p.name for p in plant.parts if p.kind in wanted]
+
+    angles = [s.name for s in plant.sensors if s.kind != "acceleration"]
+    accelerations = [s.name for s in plant.sensors if s.kind == "acceleration"]
+    loose = [name for name in kinds("torsional_spring") if name != clamp_of(plant)]
+    spanned = {n for s in plant.sensors if s.kind == "relative_angle" for n in s.across}
+    return {
+        "joint": kinds("torsional_spring"),
+        "loose": loose,
+        "junction": loose + kinds("beam"),
+        "support": kinds("torsional_spring") + kinds("beam"),
+        "body": kinds("rigid_link", "beam"),
+        "link": kinds("rigid_link"),
+        "beam": kinds("beam"),
+        "source": kinds("angular_velocity_source"),
+        "friction": kinds("torsional_spring") + kinds("angular_velocity_source"),
+        "sensor": angles + accelerations,
+        "accelerometer": accelerations,
+        "encoder": [s.name for s in plant.sensors if len(s.across) > 1 and s.across[0] in spanned],
+    }[row.at]
+
+
+ROWS = (
+    Row("torsional_compliance", "junction", linear.compliance),
+    Row("translational_compliance", "support", linear.sideways),
+    Row("added_mass", "body", linear.mass),
+    Row("added_inertia", "body", linear.inertia),
+    Row("ground_spring", "body", linear.ground_spring, most=30.0),
+    Row("gravity_stiffness", "link", linear.gravity, most=30.0),
+    Row("viscous_damping", "loose", linear.damping),
+    Row("viscous_damping", "body", linear.damping, most=10.0),
+    Row("structural_damping", "beam", linear.loss, most=10.0),
+    Row("beam_property", "beam", linear.beam, most=5.0),
+    Row("attached_oscillator", "body", linear.oscillator, most=5.0),
+    Row("actuator_lag", "source", linear.lag, most=10.0),
+    Row("valve_dynamics", "source", linear.valve, most=10.0),
+    Row("transport_delay", "source", linear.dead_time, most=20.0),
+    Row("velocity_feedback", "source", linear.give_way),
+    Row("hydraulic_compressibility", "source", linear.oil, most=5.0),
+    Row("sensor_delay", "sensor", linear.sensor_delay, most=20.0),
+    Row("sensor_lag", "sensor", linear.sensor_lag, most=10.0),
+    Row("sensor_gain", "sensor", linear.sensor_gain, most=20.0),
+    Row("sensor_highpass", "accelerometer", linear.sensor_highpass, most=20.0),
+    Row("gravity_cross_sensitivity", "accelerometer", linear.tilt, fixed=True),
+    Row("noncollocated_encoder", "encoder", linear.encoder, fixed=True),
+    Row("coulomb_friction", "friction", nonlinear.friction, linear=False, most=10.0),
+    Row("valve_deadband", "source", nonlinear.overlap, linear=False, most=5.0),
+    Row("backlash", "joint", nonlinear.play, linear=False, most=20.0),
+    Row("cubic_stiffness", "joint", nonlinear.cubic, linear=False, most=100.0),
+    Row("flow_saturation", "source", nonlinear.flow, linear=False, most=10.0),
+    Row("output_saturation", "source", nonlinear.clipped, linear=False, most=20.0),
+)
+OUTSIDE = (
+    Row("hysteresis", "joint", nonlinear.slip, linear=False, most=10.0, outside=True),
+    Row("time_varying_joint", "joint", nonlinear.drift, linear=False, most=6.0, outside=True),
+    Row("fractional_damper", "joint", linear.fractional, most=20.0, outside=True),
+)
+
+
+def physics() -> Iterator[str]:
+    """The vocabulary's names, each once."""
+    yield from dict.fromkeys(row.physics for row in ROWS)

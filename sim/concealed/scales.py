@@ -1,0 +1,54 @@
+"""The units in which effects are sized on a rig, and what is noted of an effect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sim.concealed.parts import Description
+
+RIGID = 1e9  # N m/rad: what a rig file says of a joint that is believed to be rigid
+RIGID_SOURCE = "taken as rigid"
+UNDAMPED_SOURCE = "taken as undamped"
+DISPLACEMENT = 0.01475e-3  # m^3/rad, of the papers' vane motor: turns a stiffness into C_h
+
+
+@dataclass(frozen=True, slots=True)
+class Scales:
+    """Of a plant: a joint's stiffness N m/rad, all mass kg, all rotary inertia kg m^2, a
+    link's length m. Effects are multiples of them; the multiple is what is scaled."""
+
+    k: float
+    m: float
+    J: float
+    length: float
+
+    @classmethod
+    def of(cls, plant: Description) -> Scales:
+        """Geometric mean of the springs, sums of the links."""
+        stiffness = [p.values["k"] for p in plant.parts if p.kind == "torsional_spring"]
+        springs = [k for k in stiffness if k < RIGID]
+        links = [p.values for p in plant.parts if p.kind == "rigid_link"]
+        beams = [p.values for p in plant.parts if p.kind == "beam"]
+        m = sum(v["m"] for v in links) + sum(v["mu"] * v["L"] for v in beams)
+        J = sum(v["I"] + v["m"] * v["r"] ** 2 for v in links)
+        length = float(np.mean([v["L"] for v in links])) if links else 1.0
+        k = float(np.exp(np.mean(np.log(springs)))) if springs else J * 400.0
+        return cls(k, m, J, length)
+
+
+@dataclass(slots=True)
+class Concealed:
+    """One effect as it was put in.
+
+    site : of the rig file. parameters : SI, by the vocabulary's symbols. edits : what the nominal
+    rig file must not know, {(element, symbol): (value, source)}. across : {sensor: elements} that
+    the nominal rig file gives instead.
+    """
+
+    physics: str
+    site: str
+    parameters: dict[str, float]
+    edits: dict[tuple[str, str], tuple[float, str]] = field(default_factory=dict)
+    where: str = ""
