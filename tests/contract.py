@@ -22,14 +22,18 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from samii_rig.errors import DeviceError
-from samii_rig.rig.schema import Rig
+from samii_rig.model.feedback import sections
+from samii_rig.rig.schema import Feedback, Rig
 from samii_rig.run.limits import GateLimits, gate_limits
 from samii_rig.run.protocols import Actuator, Clock, CommandBlock, DeviceLoop, OpenRig, Sensor
 from samii_rig.types import Float, Quality, SampleBlock
 
 AHEAD = 0.06  # s between a reference and its first sample
+FLIGHT = 0.03  # s for which samples from before a command may still arrive after it
+FEEDBACK = 0.5  # of the output: what the kit's feedback would add if it were not clipped
 
 
 class DeviceContract:
@@ -74,11 +78,14 @@ class DeviceContract:
     # Samples
 
     def test_samples_come_without_a_gap_at_the_rate(self, bench: Bench) -> None:
-        before = len(bench.sequence)
+        before, clock = len(bench.sequence), bench.device.clock
+        start = clock.now()
         bench.wait(0.5)
+        passed = (clock.now() - start) * 1e-9 * self.rig.rate_hz
         sequence, time = bench.sequence, bench.time
         assert np.array_equal(np.diff(sequence), np.ones(len(sequence) - 1))
-        assert len(sequence) - before == pytest.approx(0.5 * self.rig.rate_hz, abs=3)
+        flight = FLIGHT * self.rig.rate_hz
+        assert len(sequence) - before == pytest.approx(passed, abs=flight)
         step = np.diff(time) * 1e-9 * self.rig.rate_hz
         assert step.min() > 0.5
         assert step.mean() == pytest.approx(1.0, rel=1e-3)
@@ -128,6 +135,65 @@ class DeviceContract:
             bench.v_at(first, len(ref)), bench.kp * (ref - theta), atol=2 * bench.step
         )
 
+    # Feedback: run as the rig file states it, or refused
+
+    def test_it_runs_a_feedback_or_refuses_it(self, bench: Bench) -> None:
+        """v = u + kp (theta_ref - theta) + clip(F theta, -max, max), F by Tustin's rule from
+        zero state; a device that has no filters says so in `configure`, and stays at zero."""
+        loop = bench.feedback()
+        before = bench.device_now()
+        if not bench.takes(loop):
+            bench.wait(0.1)
+            assert not bench.v[bench.sequence > before].any()
+            bench.configure(bench.kp)
+            return
+        first, u = bench.play(bench.wave(0.4))
+        theta = bench.at(first, len(u), bench.sensor)
+        added = bench.filtered(loop, theta)
+        assert np.abs(added).max() > 4 * bench.step, "too little to be seen"
+        assert (np.abs(added) == loop.max).any(), "it was never clipped"
+        np.testing.assert_allclose(
+            bench.v_at(first, len(u)), u - bench.kp * theta + added, atol=3 * bench.step
+        )
+
+    def test_its_feedback_starts_from_zero_state_after_zero(self, bench: Bench) -> None:
+        loop = bench.feedback()
+        if not bench.takes(loop):
+            pytest.skip("runs no feedback and says so")
+        bench.start(bench.wave(0.5) + bench.size)
+        bench.wait(0.3)
+        bench.zero()
+        bench.wait(0.1)
+        assert bench.v[-1] == 0.0
+        assert bench.takes(loop)
+        bench.wait(0.1)
+        assert bench.v[-1] == 0.0
+        first, u = bench.play(np.zeros(round(0.1 * self.rig.rate_hz)))
+        theta = bench.at(first, len(u), bench.sensor)
+        np.testing.assert_allclose(
+            bench.v_at(first, len(u)),
+            -bench.kp * theta + bench.filtered(loop, theta),
+            atol=3 * bench.step,
+        )
+
+    def test_its_deadman_ends_a_feedback_too(self, bench: Bench) -> None:
+        deadman = bench.device.actuator.deadman
+        if deadman is None or not bench.takes(bench.feedback()):
+            pytest.skip("no deadman, or no feedback")
+        first, u = bench.start(np.full(round(0.1 * self.rig.rate_hz), bench.size))
+        bench.wait(0.1 + AHEAD + deadman + 0.5)
+        end = first + len(u) + math.ceil(deadman * self.rig.rate_hz) + 1
+        assert bench.v_at(first, len(u)).any()
+        assert not bench.v[bench.sequence >= end].any()
+
+    def test_it_refuses_a_feedback_of_a_sensor_that_it_does_not_have(self, bench: Bench) -> None:
+        loop = bench.feedback()
+        before = bench.device_now()
+        for changes in ({"sensor": "no_such_sensor"}, {"actuator": "no_such_output"}):
+            assert not bench.takes(loop.model_copy(update=changes))
+        bench.wait(0.1)
+        assert not bench.v[bench.sequence > before].any()
+
     # Ways to zero
 
     def test_zero_is_zero_from_then_on(self, bench: Bench) -> None:
@@ -135,20 +201,21 @@ class DeviceContract:
         bench.start(bench.wave(1.0) + bench.size)
         bench.wait(0.2)
         assert bench.v[-1] != 0.0
-        bench.device.actuator.zero()
+        bench.zero()
         at = bench.device_now()
         bench.wait(0.3)
-        assert not bench.v[bench.sequence > at + 1].any()
+        flight = math.ceil(FLIGHT * self.rig.rate_hz)
+        assert not bench.v[bench.sequence > at + flight].any()
 
     def test_zero_may_be_called_at_any_time_and_twice(self, bench: Bench) -> None:
         for _ in range(2):
-            bench.device.actuator.zero()
+            bench.zero()
         bench.configure(bench.kp)
-        bench.device.actuator.zero()
+        bench.zero()
         bench.start(bench.wave(0.5))
         bench.wait(0.1)
         for _ in range(2):
-            bench.device.actuator.zero()
+            bench.zero()
         bench.wait(0.2)
         assert bench.v[-1] == 0.0
 
@@ -156,7 +223,7 @@ class DeviceContract:
         bench.configure(0.0)
         bench.start(bench.wave(0.5))
         bench.wait(0.1)
-        bench.device.actuator.zero()
+        bench.zero()
         bench.configure(0.0)
         first, u = bench.play(bench.wave(0.2))
         np.testing.assert_allclose(bench.v_at(first, len(u)), u, atol=bench.step)
@@ -204,7 +271,7 @@ class DeviceContract:
         bench.configure(0.0)
         bench.play(np.full(round(0.3 * self.rig.rate_hz), bench.size))
         reached = float(np.abs(bench.column(bench.sensor)).max())
-        bench.device.actuator.zero()
+        bench.zero()
         bench.configure(0.0, max_angle=reached / 4)
         first, u = bench.play(np.full(round(0.3 * self.rig.rate_hz), bench.size))
         assert reached > 0.0
@@ -254,9 +321,12 @@ class Bench:
         self.step = max(self.spec.resolution, 1e-9)  # how well the output can be set
         self.size = level * self.limits.output.max
         self.blocks: list[SampleBlock] = []
+        self.first = 0  # of what is being sent, and how much of it was
+        self.sent = 0
+        self.u = self.theta_ref = np.zeros(0)
         self.wait(0.05)
 
-    def configure(self, kp: float, **changes: float) -> None:
+    def configure(self, kp: float, feedback: tuple[Feedback, ...] = (), **changes: float) -> None:
         loop = self.limits.device_loop()
         numbers = {
             "max_output": loop.max_output,
@@ -264,13 +334,64 @@ class Bench:
             "max_angle": loop.max_angle,
             **changes,
         }
-        self.device.actuator.configure(DeviceLoop(self.sensor, kp, **numbers))
+        self.device.actuator.configure(DeviceLoop(self.sensor, kp, **numbers, feedback=feedback))
 
-    def wait(self, seconds: float, tick: float = 0.02) -> None:
+    def feedback(self) -> Feedback:
+        """A low-pass from the centring sensor that is clipped at a quarter of `size`."""
+        corner = 2 * np.pi * self.rig.rate_hz / 50
+        unit = next(s.unit for s in self.rig.sensor if s.name == self.sensor)
+        most = max(self.size / 4, 8 * self.step)
+        return Feedback(
+            name="kit",
+            sensor=self.sensor,
+            actuator=self.spec.name,
+            gain=-FEEDBACK * corner * self.size / self.reached(),
+            unit=f"{self.spec.unit}/({unit})",
+            poles=(-corner,),
+            max=most,
+        )
+
+    def reached(self) -> float:
+        """How far the centring sensor goes when the output is `wave`, centred."""
+        self.configure(self.kp)
+        first, u = self.play(self.wave(0.4))
+        self.zero()
+        self.wait(0.1)
+        return float(np.abs(self.at(first, len(u), self.sensor)).max())
+
+    def takes(self, loop: Feedback) -> bool:
+        """Whether the device can run this loop beside its centring; it is then configured."""
+        try:
+            self.configure(self.kp, (loop,))
+        except DeviceError:
+            return False
+        return True
+
+    def filtered(self, loop: Feedback, y: Float) -> Float:
+        """What the loop adds to the output, from zero state."""
+        sos = np.insert(sections(loop, self.rig.rate_hz), 3, 1.0, axis=1)
+        return np.clip(signal.sosfilt(sos, y), -loop.max, loop.max)
+
+    def wait(self, seconds: float) -> None:
         """Let time pass and keep what arrives."""
-        for _ in range(round(seconds / tick)):
-            self.device.clock.sleep(tick)
+        clock = self.device.clock
+        # A late tick must not starve the deadman; simulated time is never late.
+        tick = 0.02 if self.device.metadata.get("clock") == "simulated" else 0.005
+        until = clock.now() + round(seconds * 1e9)
+        while clock.now() < until:
+            clock.sleep(min(tick, (until - clock.now()) * 1e-9))
             self.blocks.append(self.device.sensor.read())
+            if self.sent < len(self.u):
+                self.feed(tick)
+
+    def feed(self, tick: float) -> None:
+        """Send on what is due, as the loop does: a deadman may count from the last of it."""
+        ahead = math.ceil((AHEAD + tick) * self.rig.rate_hz)
+        part = slice(self.sent, max(self.device_now() + ahead - self.first, self.sent))
+        block = CommandBlock(self.first + self.sent, self.u[part], self.theta_ref[part])
+        self.sent += len(block)
+        if len(block):
+            self.device.actuator.write(block)
 
     def device_now(self) -> int:
         """Number of the newest sample."""
@@ -282,15 +403,22 @@ class Bench:
         return self.size * np.sin(2 * np.pi * np.arange(n) / n)
 
     def start(self, u: Float, theta_ref: Float | None = None) -> tuple[int, Float]:
-        """Send a reference for a moment a little ahead; its first sample."""
-        first = self.device_now() + math.ceil(AHEAD * self.rig.rate_hz)
-        ref = np.zeros_like(u) if theta_ref is None else theta_ref
-        self.device.actuator.write(CommandBlock(first, u, ref))
-        return first, u
+        """Send a reference for a moment a little ahead; its first sample. `wait` sends it on."""
+        self.first, self.sent = self.device_now() + math.ceil(AHEAD * self.rig.rate_hz), 0
+        self.u, self.theta_ref = u, np.zeros_like(u) if theta_ref is None else theta_ref
+        self.feed(0.02)
+        return self.first, u
+
+    def zero(self) -> None:
+        """Zero, and nothing more is sent."""
+        self.u = self.theta_ref = np.zeros(0)
+        self.device.actuator.zero()
 
     def play(self, u: Float, theta_ref: Float | None = None) -> tuple[int, Float]:
-        """Send a reference and wait until it is over."""
-        first, u = self.start(u, theta_ref)
+        """Send a reference, and rest after it, and wait until it is over."""
+        rest = np.zeros(math.ceil(2 * AHEAD * self.rig.rate_hz))
+        ref = np.zeros_like(u) if theta_ref is None else theta_ref
+        first, _ = self.start(np.concatenate((u, rest)), np.concatenate((ref, rest)))
         self.wait(len(u) / self.rig.rate_hz + AHEAD + 0.04)
         return first, u
 

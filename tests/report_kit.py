@@ -1,4 +1,7 @@
-"""A measured response as a lab would have it: a small modal model, its noise, its covariance."""
+"""A measured response as a lab would have it: a small modal model, its noise, its covariance;
+and a page as a browser has it."""
+
+from html.parser import HTMLParser
 
 import numpy as np
 
@@ -87,3 +90,33 @@ def recorded(n: int = 6000, lost: int = 0) -> Recording:
         metadata={"experiment": "swept_sine", "version_numpy": "2", "seed": "7"},
         source="run_1.mcap",
     )
+
+
+class Page(HTMLParser):
+    """What a browser would find in a page: addresses, texts, scripts, ids."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.addresses, self.ids, self.scripts = [], [], {}
+        self.text, self.policy = "", ""
+        self._script = None
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "action", "data", "srcset")]
+        self.ids += [found["id"]] if "id" in found else []
+        if found.get("http-equiv") == "Content-Security-Policy":
+            self.policy = found["content"]
+        self._script = tag in ("script", "style") and (found.get("id") or f"{tag}{len(self.ids)}")
+
+    def handle_data(self, data):
+        if self._script:
+            self.scripts[self._script] = self.scripts.get(self._script, "") + data
+        else:
+            self.text += data
+
+    def handle_endtag(self, tag):
+        if tag in ("script", "style"):
+            self._script = None

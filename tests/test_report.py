@@ -7,7 +7,6 @@ import json
 import math
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from report_kit import MODES, measured, model, recorded
+from report_kit import MODES, Page, measured, model, recorded
 from rich.console import Console
 
 from samii_rig.errors import InputError
@@ -28,39 +27,10 @@ from samii_rig.report.peaks import peaks
 from samii_rig.report.summary import LiveProgress, dry_run_summary, progress_line, summary
 from samii_rig.report.verdicts import verdicts
 from samii_rig.rig.load import load_rig
-from samii_rig.run.dryrun import DryRun, Margin
+from samii_rig.run.dryrun import DryRun
 from samii_rig.run.expected import BandError
+from samii_rig.run.margins import Margin
 from samii_rig.types import Finding, StopRecord
-
-
-class Page(HTMLParser):
-    """What a browser would find in a page: addresses, texts, scripts, ids."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.addresses, self.ids, self.scripts = [], [], {}
-        self.text, self.policy = "", ""
-        self._script = None
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag, attrs):
-        found = dict(attrs)
-        self.addresses += [v for k, v in attrs if k in ("src", "href", "action", "data", "srcset")]
-        self.ids += [found["id"]] if "id" in found else []
-        if found.get("http-equiv") == "Content-Security-Policy":
-            self.policy = found["content"]
-        self._script = tag in ("script", "style") and (found.get("id") or f"{tag}{len(self.ids)}")
-
-    def handle_data(self, data):
-        if self._script:
-            self.scripts[self._script] = self.scripts.get(self._script, "") + data
-        else:
-            self.text += data
-
-    def handle_endtag(self, tag):
-        if tag in ("script", "style"):
-            self._script = None
 
 
 @pytest.fixture(scope="module")

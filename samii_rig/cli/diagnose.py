@@ -27,7 +27,8 @@ def diagnose(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for the new rig file (diagnosed.toml) and the diagnosis (diagnosis.json)."
+            help="Folder for the page (diagnosis.html), the new rig file (diagnosed.toml) and the "
+            "diagnosis as data (diagnosis.json)."
         ),
     ] = None,
     output: OutputOption = None,
@@ -56,10 +57,25 @@ def diagnose(
     with console.status("frequency responses ...") as status:
         responses = estimated(recordings, None, output, "auto", gaps, band)
         found = found_by(
-            responses, held[0], band=band, progress=lambda stage: status.update(f"{stage} ...")
+            responses,
+            held[0],
+            band=band,
+            progress=lambda stage: status.update(f"{stage} ..."),
+            runs=recordings,
         )
+    page = None
     if out is not None:
+        from samii_rig.report.diagnosis import write_diagnosis
+
         found = replace(found, model=_write(out, found))
+        page = write_diagnosis(
+            out / "diagnosis.html",
+            found,
+            responses,
+            held[0],
+            recordings=recordings,
+            band_hz=band or (0.0, float("inf")),
+        )
     if json:
         say_json(found.plain())
         return
@@ -67,6 +83,8 @@ def diagnose(
         console.print(line, soft_wrap=True)
     if found.model:
         console.print(f"written  {found.model}", soft_wrap=True)
+    if page:
+        console.print(f"page     {page}", soft_wrap=True)
 
 
 def _write(folder: Path, found: Diagnosis) -> str:

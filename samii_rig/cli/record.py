@@ -24,6 +24,7 @@ from samii_rig.cli.common import (
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from samii_rig.diagnose.result import Diagnosis
     from samii_rig.report.compare import ModelCurve
     from samii_rig.run.campaign import Outcome
     from samii_rig.run.dryrun import DryRun
@@ -61,6 +62,9 @@ def run(
     ] = None,
     operator: Annotated[str, typer.Option(help="Who stands at the rig; recorded.")] = "",
     no_report: Annotated[bool, typer.Option("--no-report", help="Write no HTML page.")] = False,
+    no_diagnosis: Annotated[
+        bool, typer.Option("--no-diagnosis", help="Do not look for what the model leaves out.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Run an experiment: predict, drive, record, estimate, report.
@@ -132,14 +136,18 @@ def run(
                 operator,
                 console,
                 report=not no_report,
+                diagnosis=not no_diagnosis,
                 json=json,
             )
         )
-        if done[-1].outcome.stop.status != "completed":
+        if done[-1].outcome.stop.status != "completed" or done[-1].outcome.interrupted:
             break
     lines: tuple[str, ...] = ()
     written: tuple[Path, ...] = ()
     last = done[-1].outcome.stop.status
+    if last == "completed" and len(done) < len(setups):
+        # A signal came while the last run was estimated: nothing moves any more.
+        last = "stopped"
     if last == "completed" and isinstance(the_experiment, Concludes):
         outcomes = [d.outcome for d in done]
         try:
@@ -189,6 +197,7 @@ class _Done:
     predicted: DryRun
     curve: ModelCurve | None
     page: Path | None
+    diagnosis: Diagnosis | None
 
     def as_json(self) -> dict[str, Any]:
         """As plain data."""
@@ -202,6 +211,7 @@ class _Done:
             "dry_run": _prediction(self.predicted),
             "responses": [response_json(r) for r in o.responses],
             "model_over_measurement": comparisons(o.responses, self.curve),
+            "diagnosis": self.diagnosis.plain() if self.diagnosis else None,
         }
 
 
@@ -216,6 +226,7 @@ def _carry_out(
     console: Console,
     *,
     report: bool,
+    diagnosis: bool,
     json: bool,
 ) -> _Done:
     """One run with its page, and its summary on the console."""
@@ -236,6 +247,7 @@ def _carry_out(
             progress=None if json else live,
         )
     curve = model_curve(setup.rig, outcome.responses)
+    found = _diagnosed(setup, outcome, console, json=json) if diagnosis else None
     page = None
     if report:
         from samii_rig.record.reader import read_events
@@ -248,16 +260,45 @@ def _carry_out(
             rig=setup.rig,
             model=curve,
             events=read_events(path),
+            diagnosis=found,
         )
     if not json:
         console.print()
         console.print(summary([outcome.recording], outcome.responses, curve))
         if outcome.trouble:
             console.print(f"\nno frequency response: {outcome.trouble}")
+        if found:
+            console.print()
+            for line in found.lines():
+                console.print(line, soft_wrap=True)
         console.print(f"\nrecording  {path}", soft_wrap=True)
         if page:
             console.print(f"report     {page}", soft_wrap=True)
-    return _Done(outcome, predicted, curve, page)
+    return _Done(outcome, predicted, curve, page, found)
+
+
+def _diagnosed(setup: Setup, outcome: Outcome, console: Console, *, json: bool) -> Diagnosis | None:
+    """What the rig file leaves out; None where the run has nothing to tell that from."""
+    from samii_rig.diagnose.diagnose import diagnose
+    from samii_rig.errors import EstimateError, InputError
+
+    if not outcome.responses:
+        return None
+    try:
+        with nullcontext() if json else console.status("diagnosis ...") as status:
+            return diagnose(
+                outcome.responses,
+                setup.rig,
+                progress=lambda stage: status.update(f"diagnosis: {stage} ...") if status else None,
+            )
+    except (EstimateError, InputError) as error:
+        why = str(error)
+    except KeyboardInterrupt:
+        # The run itself is over and whole; its page is still to be written.
+        why = "stopped by Ctrl-C; `samii-rig diagnose` makes it up"
+    if not json:
+        console.print(f"no diagnosis: {why}", soft_wrap=True)
+    return None
 
 
 def _prediction(predicted: DryRun) -> dict[str, Any]:

@@ -27,6 +27,11 @@ def packed(values: Float) -> dict[str, str]:
     return out
 
 
+def unpacked(array: dict[str, str]) -> Float:
+    """What `packed` was given, of one dimension."""
+    return np.frombuffer(base64.b64decode(array["bdata"]), "<f4").astype(np.float64)
+
+
 def axis(title: str) -> dict[str, Any]:
     """What every axis has in common."""
     return {
@@ -143,9 +148,11 @@ def line(
     *,
     hover: str,
     legend: bool = True,
+    style: dict[str, Any] | None = None,
 ) -> None:
-    """Add a curve: of the measurement at the `level`-th amplitude, dashed of the model (None)."""
-    style = {"width": 2.2, "color": "@ink", "dash": "dash"}
+    """Add a curve: of the measurement at the `level`-th amplitude, dashed of the model (None)
+    unless `style` says otherwise."""
+    style = style or {"width": 2.2, "color": "@ink", "dash": "dash"}
     if level is not None:
         style = {"width": 1.4, "color": f"@level{level % N_COLOURS}"}
     figure["data"].append(
@@ -157,7 +164,7 @@ def line(
             "y": packed(values),
             "yaxis": axis,
             "line": style,
-            "legendgroup": "model" if level is None else f"level{level}",
+            "legendgroup": name if level is None else f"level{level}",
             "showlegend": legend,
             "hovertemplate": hover,
         }

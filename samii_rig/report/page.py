@@ -1,53 +1,27 @@
-"""The report: one HTML file that holds all it shows and asks no one for anything.
-
-The page may load nothing: its own policy (Content-Security-Policy) forbids every address
-and every script but the two inside, which it knows by their hashes.
-"""
+"""The report: one HTML file that holds all it shows and asks no one for anything."""
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import json
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cache
-from importlib import resources
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
 from samii_rig.errors import InputError
 from samii_rig.record.events import Event
-from samii_rig.record.export import replacing
 from samii_rig.report import facts, plots, series
-from samii_rig.report.canvas import Figure
 from samii_rig.report.compare import ModelCurve, compare, pretty
 from samii_rig.report.drawing import draw
+from samii_rig.report.shell import Plot, check_suffix, page_text, put
 from samii_rig.report.verdicts import verdicts
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
 
-_WORDS = {"good": "good", "note": "note", "warning": "look", "bad": "attention"}
-
-
-@dataclass(frozen=True, slots=True)
-class Plot:
-    """One figure of the page and what is said above it."""
-
-    id: str
-    title: str
-    caption: str
-    figure: Figure
-    options: tuple[str, ...] = ()
-
-    @property
-    def json(self) -> Markup:
-        """The figure as JSON that cannot end its script element."""
-        text = json.dumps(self.figure, separators=(",", ":"), allow_nan=False)
-        return Markup(text.replace("<", "\\u003c"))
+if TYPE_CHECKING:
+    from samii_rig.diagnose.result import Diagnosis
+    from samii_rig.report.diagnosis import Section
 
 
 def write_report(
@@ -61,28 +35,37 @@ def write_report(
     spectrogram_channel: str = "",
     band_hz: tuple[float, float] = (0.0, np.inf),
     events: Sequence[Event] = (),
+    diagnosis: Diagnosis | None = None,
 ) -> Path:
     """Write the page about `recordings` and what was estimated from them to `path`.
 
     responses : one for each amplitude level, all with the same inputs and outputs.
     model : laid over every response. band_hz : where it is compared in numbers.
     spectrogram_channel : "" takes the last sensor. events : of the gate and the loop.
+    diagnosis : of `rig` by `responses`, shown first.
 
     Raises
     ------
     InputError : a name that does not end in .html, responses of different channels, an unknown
-        channel, a place that cannot be written to; nothing half-written is left.
+        channel, a diagnosis without its rig, a place that cannot be written to; nothing
+        half-written is left.
     """
     path = Path(path)
-    if path.suffix.lower() != ".html":
-        raise InputError("report", "suffix", path.suffix, ".html")
+    check_suffix(path)
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     responses = sorted(responses, key=lambda r: (not np.isfinite(r.level), r.level))
     _check(recordings, responses, spectrogram_channel)
-    page = render(recordings, responses, rig, model, title, spectrogram_channel, band_hz, events)
-    with replacing(path) as part:
-        part.write_text(page, encoding="utf-8")
-    return path
+    found: Section | None = None
+    if diagnosis is not None:
+        if rig is None or not responses:
+            raise InputError("report", "diagnosis", "without its data", "its rig and responses")
+        from samii_rig.report.diagnosis import section  # loads the model and its compiler
+
+        found = section(diagnosis, responses, rig, band_hz)
+    page = render(
+        recordings, responses, rig, model, title, spectrogram_channel, band_hz, events, found
+    )
+    return put(path, page)
 
 
 def render(
@@ -94,6 +77,7 @@ def render(
     spectrogram_channel: str,
     band_hz: tuple[float, float],
     events: Sequence[Event],
+    diagnosis: Section | None,
 ) -> str:
     """The page as text; `responses` in the order in which they are drawn."""
     comparisons = (
@@ -115,15 +99,13 @@ def render(
                     figure = plots.ratio(curves, i, j, model)
                     ratios.append(Plot(f"ratio-{id_}", name, "dashed: agreement", figure))
     time, spectrum = _recorded(recordings, spectrogram_channel)
-    style, script, plotly = _asset("page.css"), _asset("page.js"), _plotly()
-    return _template().render(
+    plots_ = [p for p in (*headlines, *bodes, *ratios, time, spectrum) if p]
+    return page_text(
+        "page.html.j2",
+        [*(diagnosis.plots if diagnosis else ()), *plots_],
+        diagnosis=diagnosis,
         title=title or facts.title(recordings, rig),
         subtitle=facts.subtitle(recordings, rig),
-        policy=_policy(plotly, script),
-        style=Markup(style),
-        script=Markup(script),
-        plotly=Markup(plotly),
-        words=_WORDS,
         verdicts=verdicts(recordings, responses, comparisons),
         headlines=headlines,
         bode=bodes,
@@ -142,7 +124,6 @@ def render(
         findings=facts.finding_rows(responses),
         files=facts.files(recordings),
         metadata=facts.metadata(recordings),
-        all_plots=[p for p in (*headlines, *bodes, *ratios, time, spectrum) if p],
     )
 
 
@@ -179,38 +160,3 @@ def _check(
         names_ = [c.name for c in recording.channels]
         if channel not in names_:
             raise InputError("report", "spectrogram channel", channel, f"one of {names_}")
-
-
-def _policy(*scripts: str) -> str:
-    """Content-Security-Policy: nothing from anywhere, and of scripts these alone.
-
-    plotly sets styles on elements, so inline styles are allowed; blob and data images are its
-    "save as PNG".
-    """
-    hashes = " ".join(
-        f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'"
-        for s in scripts
-    )
-    return (
-        f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; "
-        "img-src data: blob:; form-action 'none'; base-uri 'none'"
-    )
-
-
-def _template() -> jinja2.Template:
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    return environment.from_string(_asset("page.html.j2"))
-
-
-def _asset(name: str) -> str:
-    return (resources.files("samii_rig.report") / "assets" / name).read_text("utf-8")
-
-
-@cache
-def _plotly() -> str:
-    """plotly.js, once. Its line ends are made the ones that a browser hashes."""
-    from plotly.offline import get_plotlyjs
-
-    return str(get_plotlyjs()).replace("\r\n", "\n").replace("\r", "\n")

@@ -26,6 +26,7 @@ from samii_rig.types import Channel, Float, FrequencyResponse, Int
 
 _BINS = 1200  # of log-frequency; more than the pixels of a wide screen
 _NOISE_PART = 0.004  # of the lines may lie outside a gain axis
+DEGREES = "%{y:.1f}\u00b0"
 _PEAK_LABELS = 4  # more would stand on each other
 
 
@@ -60,12 +61,12 @@ def headline(
     figure = stacked(1, [f"{y.name}/{u.name} [{unit(y, u)}]"], 330)
     log_scale(figure["layout"]["yaxis"])
     for k, c in enumerate(curves):
-        _gain(figure, c, k, output, input)
+        gain_curve(figure, c, k, output, input)
     curve = np.empty(0)
     if model is not None:
-        curve = _model_gain(figure, responses, model, y.name, u.name)
-    _frame(figure, responses)
-    _fit_gain(figure, responses, output, input, curve)
+        curve = model_gain(figure, responses, model, y.name, u.name)
+    frame(figure, responses)
+    fit_gain(figure, responses, output, input, curve)
     worst = telling(comparisons).get((y.name, u.name))
     if worst is not None:
         figure["layout"]["shapes"] = [shade(span) for span in worst.spans_hz]
@@ -111,39 +112,21 @@ def bode(
     anchor: Float | None = None
     for k, c in enumerate(curves):
         r = c.response
-        at = _lines(r, output, input)
+        at = lines_of(r, output, input)
         f = r.frequency[at]
-        _gain(figure, c, k, output, input)
-        angle = c.angle[at, output, input]
-        if anchor is None:
-            anchor = np.stack([f, angle])
-        angle = _same_turn(f, angle, anchor)
-        half = c.half[at, output, input]
-        known = half < 90.0  # beyond, the curve would be noise over whole turns
-        width = np.where(known, half, np.nan)
-        band(figure, f, angle - width, angle + width, "y2", k)
-        shown = np.where(known, angle, np.nan)
-        line(figure, f, shown, _label(r), "y2", k, legend=False, hover="%{y:.1f}\u00b0")
+        gain_curve(figure, c, k, output, input)
+        anchor = phase_curve(figure, c, k, output, input, anchor)
         coherence = r.coherence[at, output]
-        line(figure, f, coherence, _label(r), "y3", k, legend=False, hover="%{y:.3f}")
+        line(figure, f, coherence, label(r), "y3", k, legend=False, hover="%{y:.3f}")
     curve = np.empty(0)
     if model is not None and anchor is not None:
-        curve = _model_gain(figure, responses, model, y.name, u.name)
-        f = _common(responses, model)
-        H = model.at(f, y.name, u.name)
-        angle = _same_turn(f, np.rad2deg(_unwrapped(H)), anchor)
-        line(
-            figure,
-            f,
-            angle,
-            f"model {model.name}",
-            "y2",
-            None,
-            legend=False,
-            hover="%{y:.1f}\u00b0",
-        )
-    _frame(figure, responses)
-    _fit_gain(figure, responses, output, input, curve)
+        curve = model_gain(figure, responses, model, y.name, u.name)
+        f = common(responses, model)
+        angle = same_turn(f, np.rad2deg(unwrapped(model.at(f, y.name, u.name))), anchor)
+        name = f"model {model.name}"
+        line(figure, f, angle, name, "y2", None, legend=False, hover=DEGREES)
+    frame(figure, responses)
+    fit_gain(figure, responses, output, input, curve)
     return figure
 
 
@@ -167,15 +150,15 @@ def _distortion(figure: Figure, responses: Sequence[FrequencyResponse], i: int, 
     log_scale(figure["layout"]["yaxis4"])
     shown: list[Float] = []
     for k, r in enumerate(responses):
-        f, label = r.frequency, _label(r)
+        f, level_name = r.frequency, label(r)
         sigma = 100 * np.sqrt(r.variance()[:, i, j]) / np.abs(r.H[:, i, j])
-        name = f"standard deviation, {label}"
+        name = f"standard deviation, {level_name}"
         line(figure, f, sigma, name, "y4", k, legend=False, hover="%{y:.2g} %")
         shown.append(sigma)
         for name, level, full in (("even", r.even, False), ("odd", r.odd, True)):
             if level is not None:
                 values = 100 * level[:, i]
-                points(figure, f, values, f"{name}, {label}", "y4", k, full=full)
+                points(figure, f, values, f"{name}, {level_name}", "y4", k, full=full)
                 shown.append(values)
     logs = np.concatenate([np.log10(x[np.isfinite(x) & (x > 0)]) for x in shown])
     if logs.size:
@@ -198,7 +181,7 @@ def ratio(
     quotients: list[Float] = []
     for k, c in enumerate(curves):
         r = c.response
-        at = _lines(r, output, input)
+        at = lines_of(r, output, input)
         f = r.frequency[at]
         H = model.at(f, y.name, u.name)
         size = np.abs(H)
@@ -208,13 +191,13 @@ def ratio(
             upper = np.where(low > 0, size / low, np.nan)
             band(figure, f, size / high, upper, "y", k)
         quotients.append(np.abs(quotient))
-        line(figure, f, np.abs(quotient), _label(r), "y", k, hover="\u00d7 %{y:.3f}")
+        line(figure, f, np.abs(quotient), label(r), "y", k, hover="\u00d7 %{y:.3f}")
         angle = np.rad2deg(np.angle(quotient))
         half = c.half[at, output, input]
         band_half = np.where(half < 180.0, half, np.nan)
         band(figure, f, angle - band_half, angle + band_half, "y2", k)
-        line(figure, f, angle, _label(r), "y2", k, legend=False, hover="%{y:.1f}\u00b0")
-    _frame(figure, responses)
+        line(figure, f, angle, label(r), "y2", k, legend=False, hover="%{y:.1f}\u00b0")
+    frame(figure, responses)
     shown = np.concatenate(quotients)
     shown = np.log10(shown[np.isfinite(shown) & (shown > 0)])
     if shown.size:
@@ -230,14 +213,32 @@ def unit(output: Channel, input: Channel) -> str:
     return f"({over})/{under}" if "/" in over else f"{over}/{under}"
 
 
-def _frame(figure: Figure, responses: Sequence[FrequencyResponse]) -> None:
+def phase_curve(figure: Figure, c: Curves, k: int, i: int, j: int, anchor: Float | None) -> Float:
+    """Add the phase of the k-th response with its band to the second panel, in the turns of
+    `anchor`, (2, n) frequency and angle of the first; returns the anchor."""
+    r = c.response
+    at = lines_of(r, i, j)
+    f, angle = r.frequency[at], c.angle[at, i, j]
+    if anchor is None:
+        anchor = np.stack([f, angle])
+    angle = same_turn(f, angle, anchor)
+    half = c.half[at, i, j]
+    known = half < 90.0  # beyond, the curve would be noise over whole turns
+    width = np.where(known, half, np.nan)
+    band(figure, f, angle - width, angle + width, "y2", k)
+    shown = np.where(known, angle, np.nan)
+    line(figure, f, shown, label(r), "y2", k, legend=False, hover=DEGREES)
+    return anchor
+
+
+def frame(figure: Figure, responses: Sequence[FrequencyResponse]) -> None:
     """Frequency axis over the measured band, ticks at 1, 2, 5 until the reader zooms."""
     low = min(float(r.frequency[r.frequency > 0][0]) for r in responses)
     high = max(float(r.frequency[-1]) for r in responses)
     figure["layout"]["xaxis"] |= ticked(np.log10(low), np.log10(high))
 
 
-def _fit_gain(
+def fit_gain(
     figure: Figure, responses: Sequence[FrequencyResponse], i: int, j: int, model: Float
 ) -> None:
     """Gain axis over the curves; a few lines that are all noise do not stretch it."""
@@ -253,35 +254,38 @@ def _fit_gain(
     figure["layout"]["yaxis"] |= ticked(low - room, high + 4 * room)
 
 
-def _gain(figure: Figure, c: Curves, k: int, i: int, j: int) -> None:
+def gain_curve(figure: Figure, c: Curves, k: int, i: int, j: int) -> None:
+    """Add the gain of the k-th response with its band to the first panel."""
     r = c.response
-    at = _lines(r, i, j)
+    at = lines_of(r, i, j)
     f = r.frequency[at]
     low, high = c.low[at, i, j], c.high[at, i, j]
     gain = np.abs(r.H[at, i, j])
     # On a logarithmic axis zero is nowhere; a tenth of the estimate is "may be nothing".
     band(figure, f, np.maximum(low, 0.1 * gain), high, "y", k)
-    line(figure, f, gain, _label(r), "y", k, hover="%{y:.4g}")
+    line(figure, f, gain, label(r), "y", k, hover="%{y:.4g}")
 
 
-def _model_gain(
+def model_gain(
     figure: Figure,
     responses: Sequence[FrequencyResponse],
     model: ModelCurve,
     y: str,
     u: str,
 ) -> Float:
-    f = _common(responses, model)
+    """Add a model's gain to the first panel; returns it."""
+    f = common(responses, model)
     gain = np.abs(model.at(f, y, u))
     line(figure, f, gain, f"model {model.name}", "y", None, hover="%{y:.4g}")
     return gain
 
 
-def _label(r: FrequencyResponse) -> str:
+def label(r: FrequencyResponse) -> str:
+    """A response by its level."""
     return f"{r.level:g} {r.level_unit}" if np.isfinite(r.level) else "measured"
 
 
-def _lines(r: FrequencyResponse, i: int, j: int) -> Int:
+def lines_of(r: FrequencyResponse, i: int, j: int) -> Int:
     """Indices of the lines to draw: all, or the extremes in each bin of log-frequency."""
     f, gain = r.frequency, np.abs(r.H[:, i, j])
     usable = np.flatnonzero((f > 0) & np.isfinite(gain))
@@ -295,7 +299,7 @@ def _lines(r: FrequencyResponse, i: int, j: int) -> Int:
     return np.unique(usable[chosen])
 
 
-def _common(responses: Sequence[FrequencyResponse], model: ModelCurve) -> Float:
+def common(responses: Sequence[FrequencyResponse], model: ModelCurve) -> Float:
     """The model's own lines within the band that was measured."""
     low = min(r.frequency[r.frequency > 0][0] for r in responses)
     high = max(r.frequency[-1] for r in responses)
@@ -303,11 +307,12 @@ def _common(responses: Sequence[FrequencyResponse], model: ModelCurve) -> Float:
     return np.asarray(f[(f >= low) & (f <= high)])
 
 
-def _unwrapped(H: Any) -> Float:
+def unwrapped(H: Any) -> Float:
+    """Phase without jumps, rad."""
     return np.unwrap(np.angle(np.where(np.isfinite(H), H, 1.0)))
 
 
-def _same_turn(f: Float, angle: Float, anchor: Float) -> Float:
+def same_turn(f: Float, angle: Float, anchor: Float) -> Float:
     """`angle` moved by whole turns to lie next to the first curve."""
     if not len(f):
         return angle

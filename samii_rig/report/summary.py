@@ -31,7 +31,7 @@ _BAR = 30  # characters
 
 
 class ProgressLike(Protocol):
-    """How far a run is: the fields of `samii_rig.run.loop.Progress` that are shown."""
+    """How far a run is: the fields of `samii_rig.run.progress.Progress` that are shown."""
 
     @property
     def segment(self) -> int:

@@ -19,7 +19,8 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run.devices import open_device
 from samii_rig.run.dryrun import DryRun
 from samii_rig.run.interrupts import Interrupts
-from samii_rig.run.loop import Progress, run
+from samii_rig.run.loop import run
+from samii_rig.run.progress import Progress
 from samii_rig.run.protocols import OpenRig, Plan
 from samii_rig.run.sink import recorded_channels
 from samii_rig.signal.estimate import estimate
@@ -31,13 +32,18 @@ VERSIONS_OF = ("samii-rig", "numpy", "scipy", "numba", "mcap")
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a run left behind. `trouble` says why there are no responses, "" if there are."""
+    """What a run left behind. `trouble` says why there are no responses, "" if there are.
+
+    interrupted : the signal that came at any time before the device was closed, perhaps after
+        the run was done; no other run may follow by itself.
+    """
 
     path: Path
     recording: Recording
     responses: tuple[FrequencyResponse, ...]
     stop: StopRecord
     trouble: str
+    interrupted: str = ""
 
 
 def carry_out(
@@ -96,7 +102,7 @@ def carry_out(
     finally:
         _close(device)
     responses = tuple(read_frequency_responses(path))
-    return Outcome(path, read_recording(path), responses, ended, trouble)
+    return Outcome(path, read_recording(path), responses, ended, trouble, interrupts.came)
 
 
 def _close(device: OpenRig) -> None:

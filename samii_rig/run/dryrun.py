@@ -20,13 +20,14 @@ import numpy as np
 from scipy import fft
 
 from samii_rig.errors import InputError, LimitError
-from samii_rig.model.feedback import reach
 from samii_rig.model.loops import Loops, loops_of
 from samii_rig.model.sampled import filter_response
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.schema import AngularVelocitySource, Moment, Rig, Sensor
+from samii_rig.rig.schema import ANGLE_SOURCES, SOURCES, GravityStiffness, Moment, Rig, flattened
+from samii_rig.run.dwell import ways
 from samii_rig.run.expected import BandError, expected_errors
-from samii_rig.run.limits import GateLimits, find_actuator, gate_limits
+from samii_rig.run.limits import find_actuator, gate_limits
+from samii_rig.run.margins import Margin, margins, worse_of
 from samii_rig.run.protocols import Plan
 from samii_rig.types import Complex, Float
 
@@ -39,6 +40,9 @@ PAD = 0.05
 ALIASES = 1
 # A closed loop without poles outside the circle does not wind around 0 at all.
 MOST_WINDING = 0.5
+# Where on the real axis a chain that falls over is looked for: parts of the sample rate (rad/s
+# over Hz), and points.
+LOWEST_FALL, HIGHEST_FALL, FALLS = 1e-6, 10.0, 2000
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,28 +86,27 @@ class DryRun:
 def predict(plan: Plan, rig: Rig) -> DryRun:
     """Peaks, margins and the FRF's expected error of a plan, from the model alone.
 
-    A plan whose dwells may be left early is predicted twice, with each in full and with each
-    as short as it may be: the less time, the more of one frequency's start is left in the next.
-    Peaks and margins are the worse of the two, the duration and the expected errors those in full.
+    A plan whose dwells may be left early is predicted several ways (see `dwell.ways`), as the
+    time spent at one frequency decides what of it is left in the next. Peaks and margins are the
+    worst of all, the duration and the expected errors those of every dwell in full.
 
-    Raises LimitError if the rig's own loops would be unstable, InputError if the rig
-    could never be armed, or its source moves nothing.
+    Raises LimitError if the chain or the rig's own loops would be unstable, InputError if the
+    rig could never be armed, its source moves nothing, a dwell would leave a step, or the plan
+    has another sample rate.
     """
-    full = _predict(plan, rig)
-    if plan.shortest is None:
+    if plan.rate_hz != rig.rate_hz:
+        where, expected = f"experiment {plan.experiment}", f"{rig.rate_hz:g}, the rig's own"
+        raise InputError(where, "rate_hz", plan.rate_hz, expected)
+    _refuse_falling(rig)
+    full, *others = [_predict(way, rig) for way in ways(plan)]
+    if not others:
         return full
-    short = _predict(plan.shortest, rig)
-    worse = {(m.channel, m.what, m.reason): m for m in full.margins}
-    for m in short.margins:
-        known = worse.get((m.channel, m.what, m.reason))
-        if known is None or m.margin < known.margin:
-            worse[m.channel, m.what, m.reason] = m
     return replace(
         full,
-        shortest=short.duration,
-        peaks=np.maximum(full.peaks, short.peaks),
-        slew=max(full.slew, short.slew),
-        margins=tuple(sorted(worse.values(), key=lambda m: m.margin)),
+        shortest=min(other.duration for other in others),
+        peaks=np.max([full.peaks, *(other.peaks for other in others)], axis=0),
+        slew=max(full.slew, *(other.slew for other in others)),
+        margins=worse_of([full.margins, *(other.margins for other in others)]),
     )
 
 
@@ -113,7 +116,6 @@ def _predict(plan: Plan, rig: Rig) -> DryRun:
         raise InputError(rig.name, f"actuator[{plan.actuator}].deadman", None, expected)
     moments = _joint_moments(rig, plan.actuator)
     seen = rig.model_copy(update={"sensor": (*rig.sensor, *moments)})
-    limits = gate_limits(rig, plan.actuator, plan.kp, plan.centring_sensor)
     u = np.concatenate([s.u for s in plan.segments])
     theta_ref = np.concatenate([s.theta_ref for s in plan.segments])
     n = fft.next_fast_len(math.ceil(len(u) * (1 + PAD)), real=True)
@@ -125,6 +127,7 @@ def _predict(plan: Plan, rig: Rig) -> DryRun:
     if not np.any(np.abs(H) > 0.0):
         expected = f"an end that {plan.actuator} can push against; it moves nothing"
         raise InputError(rig.name, "base", rig.base, expected)
+    limits = gate_limits(rig, plan.actuator, plan.kp, plan.centring_sensor)
     loops = _loops(rig, plan)
     filters = loops.filters(np.exp(s / plan.rate_hz), plan.rate_hz)
     sensitivity = 1.0 + loops.gain(H[:, :, None], filters)
@@ -145,10 +148,9 @@ def _predict(plan: Plan, rig: Rig) -> DryRun:
     ends = np.cumsum([len(s.u) for s in plan.segments])
     parts = [slice(int(e) - len(s.u), int(e)) for s, e in zip(plan.segments, ends, strict=True)]
     peaks = np.array([[np.abs(x[part]).max() for x in series.values()] for part in parts])
-    margins = [
-        *_margins(plan, rig, limits, series, parts),
-        *_feedback_margins(plan, rig, limits, added, parts),
-    ]
+    for name, x in series.items():
+        if not np.isfinite(x).all():
+            raise LimitError(f"the model gives no number for {name} of {rig.name}; nothing is sent")
     spectrum = np.abs(H[:, : len(rig.sensor)])
     return DryRun(
         duration=plan.duration,
@@ -157,7 +159,7 @@ def _predict(plan: Plan, rig: Rig) -> DryRun:
         units=tuple(units[name] for name in series),
         peaks=peaks,
         slew=float(np.abs(np.diff(v, prepend=0.0)).max() * plan.rate_hz),
-        margins=tuple(sorted(margins, key=lambda m: m.margin)),
+        margins=margins(plan, rig, limits, series, added, parts),
         bands=tuple(expected_errors(plan, rig, v, parts, omega / (2 * np.pi), spectrum)),
     )
 
@@ -169,12 +171,33 @@ def _loops(rig: Rig, plan: Plan) -> Loops:
 
 
 def _joint_moments(rig: Rig, actuator: str) -> tuple[Moment, ...]:
-    """A perfect moment sensor behind each source that the actuator drives."""
-    return tuple(
-        Moment(kind="moment", name=f"M_{e.name}"[:40], unit="N m", after=e.name)
-        for e in rig.element
-        if isinstance(e, AngularVelocitySource) and e.input == actuator
-    )
+    """A perfect moment sensor at each source that the actuator drives: M, which an angular
+    velocity source passes on; of a torque or a force what the chain towards the base carries."""
+    out = []
+    for before, e in zip((None, *rig.element), rig.element, strict=False):
+        name = f"M_{e.name}"[:40]
+        if isinstance(e, SOURCES) and e.input == actuator and name not in rig.units():
+            at = e if before is None or isinstance(e, ANGLE_SOURCES) else before
+            out.append(Moment(kind="moment", name=name, unit="N m", after=at.name))
+    return tuple(out)
+
+
+def _refuse_falling(rig: Rig) -> None:
+    """LimitError if the chain by itself falls over: what is predicted holds for a stable one.
+
+    Only what stands on a joint can do that. A chain with stiffness and gravity falls without
+    swinging: its pole is real, where D, which is real there, changes its sign.
+    """
+    if not any(isinstance(e, GravityStiffness) and e.k.value < 0 for e in flattened(rig.element)):
+        return
+    s = np.geomspace(LOWEST_FALL, HIGHEST_FALL, FALLS) * rig.rate_hz
+    D, _ = Chain(rig).characteristic(s.astype(np.complex128), clear=True)
+    turns = np.flatnonzero(np.diff(np.sign(D.real)))
+    if turns.size:
+        raise LimitError(
+            f"{rig.name} falls over by itself, by e in {1 / s[turns[-1]]:.2g} s by the model; "
+            "expected more stiffness than gravity takes away"
+        )
 
 
 def _sampled(rig: Rig, actuator: str, s: Complex) -> Complex:
@@ -206,113 +229,6 @@ def _refuse_unstable(sensitivity: Complex, plan: Plan, loops: Loops) -> None:
         what = f"{centring} and the feedback {names}" if names else centring
         smaller = "a smaller kp or gain" if names else "a smaller kp"
         raise LimitError(f"{what} would be unstable by the model; expected {smaller}")
-
-
-def _noise(sensor: Sensor) -> float:
-    """The largest part of a reading that no level scales: offset, noise, half a step."""
-    return abs(sensor.offset) + SIGMAS * sensor.noise_rms + sensor.resolution / 2
-
-
-def _margins(
-    plan: Plan, rig: Rig, limits: GateLimits, series: dict[str, Float], parts: list[slice]
-) -> list[Margin]:
-    sensors = {s.name: s for s in rig.sensor}
-    rate, kp, output = plan.rate_hz, abs(plan.kp), limits.output
-    out: list[Margin] = []
-
-    def add(
-        channel: str, what: str, unit: str, x: list[float], fixed: float, limit: float, reason: str
-    ) -> None:
-        if math.isfinite(limit):
-            out.append(_worst(plan, channel, what, unit, x, fixed, limit, reason))
-
-    authority = sum(a.loop.max for a in limits.feedback)
-    slewing = [(a.slew, sensors[a.loop.sensor]) for a in limits.feedback]
-    slew_noise = sum(slew * _noise(sensor) for slew, sensor in slewing)
-    centring = sensors.get(plan.centring_sensor) if kp > 0 else None
-    theta = series[centring.name] if centring else np.zeros(1)
-    theta_noise = _noise(centring) if centring else 0.0
-    bound, slew = [], []
-    # The whole plan's steps, from rest and back to rest: segments are sent without a border.
-    u, theta_ref = (
-        np.concatenate([[0.0], *(getattr(s, name) for s in plan.segments), [0.0]])
-        for name in ("u", "theta_ref")
-    )
-    steps = np.abs(np.diff(u)) + kp * np.abs(np.diff(theta_ref))
-    turning = np.abs(np.diff(theta, prepend=0.0)) if centring else np.zeros(len(u) - 2)
-    reach = math.ceil(limits.max_ahead * rate)
-    for s, part in zip(plan.segments, parts, strict=True):
-        # The gate judges a reference by the angle of up to `reach` samples before.
-        seen = slice(max(0, part.start - reach), part.stop)
-        angle = np.abs(theta[seen]) if centring else np.zeros(1)
-        bound.append(float((np.abs(s.u) + kp * np.abs(s.theta_ref)).max() + kp * angle.max()))
-        # The step out of a segment counts for it too: it leads back to rest after the last.
-        step = steps[part.start : part.stop + 1].max()
-        turn_of = sum(k * float(np.abs(series[x.name][seen]).max()) for k, x in slewing)
-        slew.append(float(step + kp * turning[seen].max()) * rate + turn_of)
-    fixed_bound = kp * theta_noise + authority
-    add(output.channel, "limit", output.unit, bound, fixed_bound, output.max, output.reason)
-    add(
-        output.channel,
-        "rate",
-        f"{output.unit}/s",
-        slew,
-        2 * kp * theta_noise * rate + slew_noise,
-        output.max_rate,
-        output.reason,
-    )
-    for c in limits.sensors:
-        x, fixed = series[c.channel], _noise(sensors[c.channel])
-        size = [float(np.abs(x[part]).max()) for part in parts]
-        add(c.channel, "limit", c.unit, size, fixed, c.max, c.reason)
-        turns = np.abs(np.diff(x, prepend=0.0))
-        turn = [float(turns[part].max()) * rate for part in parts]
-        add(c.channel, "rate", f"{c.unit}/s", turn, 2 * fixed * rate, c.max_rate, c.reason)
-    for sensor in rig.sensor:
-        reason = "end of the converter's range"
-        up = [float(series[sensor.name][part].max()) for part in parts]
-        down = [float(-series[sensor.name][part].min()) for part in parts]
-        add(sensor.name, "range", sensor.unit, up, _noise(sensor), sensor.high, reason)
-        add(sensor.name, "range", sensor.unit, down, _noise(sensor), -sensor.low, reason)
-    return out
-
-
-def _feedback_margins(
-    plan: Plan, rig: Rig, limits: GateLimits, added: dict[str, Float], parts: list[slice]
-) -> list[Margin]:
-    """Whether each feedback loop stays inside its `max`."""
-    out = []
-    for a in limits.feedback:
-        loop = a.loop
-        sensor = next(s for s in rig.sensor if s.name == loop.sensor)
-        bounds = reach(loop, plan.rate_hz)
-        steady = bounds.peak * (abs(sensor.offset) + sensor.resolution / 2)
-        fixed = steady + SIGMAS * sensor.noise_rms * bounds.rms
-        size = [float(np.abs(added[loop.name][part]).max()) for part in parts]
-        reason = "the device clips this loop there"
-        out.append(
-            _worst(plan, loop.name, "max", limits.output.unit, size, fixed, loop.max, reason)
-        )
-    return out
-
-
-def _worst(
-    plan: Plan,
-    channel: str,
-    what: str,
-    unit: str,
-    x: list[float],
-    fixed: float,
-    limit: float,
-    reason: str,
-) -> Margin:
-    i = int(np.argmax(x))
-    s = plan.segments[i]
-    room = max(0.0, limit - fixed)
-    largest = s.level * room / x[i] if x[i] > 0 else math.inf
-    return Margin(
-        channel, what, unit, x[i] + fixed, limit, reason, s.name, s.level, s.unit, largest
-    )
 
 
 def _round_down(x: float) -> str:

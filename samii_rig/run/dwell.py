@@ -6,22 +6,91 @@ first end of a block that has not been sent yet. What is sent stays sent.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from samii_rig.run.protocols import Dwell, Plan
+from samii_rig.errors import InputError
+from samii_rig.run.protocols import Dwell, Plan, PlannedSegment
 from samii_rig.signal.stepped import line
 from samii_rig.types import Channel, Complex, Int, Quality, SampleBlock
+
+# Of the largest sample, by how much blocks of a dwell may differ: rounding.
+ALIKE = 1e-9
+MIXED = 4  # ways through a plan that are looked at beside the longest and the shortest
+
+
+def check_segments(plan: Plan) -> None:
+    """InputError for a segment whose rows differ in length, or whose dwell cannot be left
+    without a step, or never.
+
+    What is left out must be whole blocks of a reference that repeats in blocks, so that the next
+    sample sent is the one that would have come.
+    """
+    where = f"experiment {plan.experiment}"
+    for s in plan.segments:
+        shapes = {x.shape for x in (s.u, s.theta_ref, s.frequency)}
+        if shapes != {(s.u.size,)} or s.u.size == 0:
+            expected = "u, theta_ref and frequency of one length, at least one sample"
+            raise InputError(where, s.name, sorted(shapes), expected)
+        wrong = _wrong(s, s.dwell) if s.dwell else None
+        if wrong:
+            what, value, expected = wrong
+            raise InputError(where, f"{s.name}.dwell.{what}", value, expected)
+
+
+def _wrong(s: PlannedSegment, d: Dwell) -> tuple[str, object, str] | None:
+    n = len(s.u)
+    if not 0 <= d.first < d.last <= n:
+        return "last", (d.first, d.last), f"0 <= first < last <= {n}, the segment's samples"
+    if d.block < 1 or (d.last - d.first) % d.block:
+        return "block", d.block, f"a divisor of the {d.last - d.first} samples of the dwell"
+    if not 2 <= d.least <= d.blocks:
+        return "least", d.least, f"2 to {d.blocks}, the blocks of the dwell"
+    if not d.outputs:
+        return "outputs", d.outputs, "at least one sensor"
+    start, stop = s.recorded or (0, n)
+    if not (start <= d.first and d.last <= stop):
+        return "first", (d.first, d.last), f"inside what is recorded, {start} to {stop}"
+    for x in (s.u, s.theta_ref):
+        blocks = x[d.first : d.last].reshape(d.blocks, d.block)
+        if not np.abs(blocks - blocks[0]).max() <= ALIKE * max(1.0, np.abs(blocks[0]).max()):
+            return "block", d.block, "a reference that is the same in every block"
+    return None
+
+
+def ways(plan: Plan) -> tuple[Plan, ...]:
+    """The plan with every dwell in full; if it has any, with each as short as it may be, and
+    with `MIXED` draws between, always the same. InputError as `check_segments`.
+
+    What rings on from one frequency meets the next in another phase each way, so neither the
+    longest nor the shortest is the worst of all.
+    """
+    check_segments(plan)
+    if plan.shortest is None:
+        return (plan,)
+    draw = np.random.default_rng(plan.seed)
+    mixed = []
+    for _ in range(MIXED):
+        segments = []
+        for s in plan.segments:
+            if s.dwell is not None:
+                blocks = int(draw.integers(s.dwell.least, s.dwell.blocks + 1))
+                s = s.shortened(s.dwell.first + blocks * s.dwell.block)
+            segments.append(s)
+        mixed.append(replace(plan, segments=tuple(segments)))
+    return (plan, plan.shortest, *mixed)
 
 
 class Reference:
     """The samples of a plan in one row, and where its segments are in it.
 
-    u, theta_ref : (n,); changed only at samples that are still to be sent.
+    u, theta_ref : (n,); changed only at samples that are still to be sent. InputError as
+    `check_segments`.
     """
 
     def __init__(self, plan: Plan) -> None:
+        check_segments(plan)
         self.segments = list(plan.segments)
         self._lay()
 
@@ -88,6 +157,8 @@ class Watch:
         if n == self._whole or n < segment.dwell.least:
             return None
         self._whole = n
+        if self._sum[whole, 0].sum() == 0.0:
+            return None  # an output that never moved, below half a step of its converter
         found = line(np.ones(n, dtype=np.complex128), self._sum[whole])
         relative = float(found.relative.max())
         if not relative <= segment.dwell.wanted:

@@ -21,10 +21,13 @@ class Interrupts:
     recording is being closed) further signals are ignored. `give_up` is for work in between
     that can be left out: the next signal raises KeyboardInterrupt, the rest are ignored. Only
     Python's main thread may handle signals; in any other this does nothing.
+
+    came : name of the first signal, also of one that was ignored: whoever would go on to
+    another run must not.
     """
 
     def __init__(self) -> None:
-        self.reason = ""
+        self.reason = self.came = ""
         self.ending = False
         self._optional = False
         self._before: dict[int, object] = {}
@@ -56,9 +59,10 @@ class Interrupts:
             self._optional, self.ending = False, True
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
+        name = signal.Signals(number).name
+        self.came = self.came or name
         if self.ending:
             return
-        name = signal.Signals(number).name
         if self._optional:
             self.ending = True
             raise KeyboardInterrupt(name)

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from samii_rig.errors import InputError
 from samii_rig.model.feedback import reach
 from samii_rig.rig.schema import (
+    ANGLE_SOURCES,
     AbsoluteAngle,
     ActuatorSpec,
-    AngularVelocitySource,
     Feedback,
     RelativeAngle,
     Rig,
@@ -147,6 +147,8 @@ def gate_limits(
     The feedback loops of the rig on that actuator are part of the run.
     Several limits on one channel: the tightest of each number holds. The ends of the
     actuator's converter are a limit too.
+
+    InputError for a loop on a sensor that could stand still unseen, see `_refuse_blind`.
     """
     spec = find_actuator(rig, actuator, rig.name)
     output = _channel(
@@ -170,7 +172,9 @@ def gate_limits(
             if read:
                 reason = f"the feedback {read[0]} reads it"
             c = _channel(rig, s.name, s.unit, math.inf, reason, s.stale_after, 0.0)
-            sensors.append(replace(c, stuck=_stuck(rig, spec, s, c.max)))
+            stuck = _stuck(rig, spec, s, c.max)
+            _refuse_blind(rig, spec, s, stuck, centring=kp != 0.0 and s.name == sensor, read=read)
+            sensors.append(replace(c, stuck=stuck))
     return GateLimits(
         rig.rate_hz, output, tuple(sensors), kp, sensor, heartbeat_age, feedback=feedback
     )
@@ -190,9 +194,43 @@ def _stuck(rig: Rig, actuator: ActuatorSpec, sensor: Sensor, most: float) -> Stu
     return Stuck(abs(gain), STUCK_AFTER, travel, at_once, noise_after, effort)
 
 
+def _refuse_blind(
+    rig: Rig,
+    actuator: ActuatorSpec,
+    sensor: Sensor,
+    stuck: Stuck,
+    *,
+    centring: bool,
+    read: list[str],
+) -> None:
+    """InputError if a loop reads a sensor that the gate could not see standing still in time.
+
+    Centring on a dead sensor drives the joint away with nothing to hold it, so only an angle
+    whose travel is known from the output will do: that of an angular velocity source. A torque
+    or a force turns a joint by what its inertia and springs let it. A feedback is held by its
+    `max` meanwhile, so its sensor's missing noise is a sign that comes in time.
+    """
+    where, follows = f"sensor[{sensor.name}]", _angle_gain(rig, actuator.name, sensor) != 0.0
+    if centring and not follows:
+        expected = (
+            f"an angle that {actuator.name} turns through an angular velocity source, or kp = 0: "
+            "the gate sees no other one stand still in time"
+        )
+        raise InputError(
+            rig.name, f"{where}.kind, read by the centring loop", sensor.kind, expected
+        )
+    if read and not follows and not math.isfinite(stuck.noise_after):
+        expected = (
+            f"above {NOISY:g} of its resolution, or the gate cannot see it stand still while the "
+            f"feedback {read[0]} reads it"
+        )
+        raise InputError(rig.name, f"{where}.noise_rms", sensor.noise_rms, expected)
+
+
 def _angle_gain(rig: Rig, actuator: str, sensor: Sensor) -> float:
     """Low-frequency rad/s of the sensor per unit of the actuator; 0 if the angle does not
-    follow it: slowly turned, springs and beams of a clamped chain turn along."""
+    follow it: slowly turned, springs and beams of a clamped chain turn along. A torque or a
+    force turns nothing at a known speed."""
     order = [e.name for e in rig.element]
     if isinstance(sensor, RelativeAngle):
         seen = set(sensor.across)
@@ -203,7 +241,7 @@ def _angle_gain(rig: Rig, actuator: str, sensor: Sensor) -> float:
     return sum(
         e.K.value
         for e in rig.element
-        if isinstance(e, AngularVelocitySource) and e.input == actuator and e.name in seen
+        if isinstance(e, ANGLE_SOURCES) and e.input == actuator and e.name in seen
     )
 
 

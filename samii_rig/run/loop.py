@@ -11,7 +11,6 @@ import math
 import traceback
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass
 from threading import Event
 
 import numpy as np
@@ -25,39 +24,13 @@ from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.judgement import State
 from samii_rig.run.limits import gate_limits
 from samii_rig.run.pace import LoopSettings, choose_tick
+from samii_rig.run.progress import Progress, nearer
 from samii_rig.run.protocols import CommandBlock, OpenRig, Plan
 from samii_rig.run.sink import Collector, QueuedSink, Sink
 from samii_rig.types import Quality, SampleBlock, Segment, StopRecord
 
 FIRST_SAMPLE = 1.0  # s to wait for the device's first sample
 GATHER = 0.25  # s of samples in one message to the recorder
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a run is, for a display.
-
-    segment : 1-based, of n_segments; name, level, unit, repeat are the segment's.
-    time_left : s on the device's clock, every dwell in full. frequency : Hz now, NaN at rest,
-        inf where the whole band is driven at once.
-    channel, margin : the channel nearest to its limit since the last report, 1 - |value|/limit.
-    worst_channel, worst_margin : the same over the whole run.
-    """
-
-    segment: int
-    n_segments: int
-    name: str
-    level: float
-    unit: str
-    repeat: int
-    time_left: float
-    frequency: float
-    channel: str
-    margin: float
-    worst_channel: str
-    worst_margin: float
-    late_ticks: int
-    missing_samples: int
 
 
 def run(
@@ -238,8 +211,8 @@ class _Run:
             self.apart = self.clock.now() - int(block.time[-1])
             self._count(block)
             self._shorten(block)
-            self.margin = _nearer(self.margin, self.gate.margin())
-            self.worst = _nearer(self.worst, self.margin)
+            self.margin = nearer(self.margin, self.gate.margin())
+            self.worst = nearer(self.worst, self.margin)
 
     def _shorten(self, block: SampleBlock) -> None:
         """Leave a dwell that has measured enough."""
@@ -347,7 +320,3 @@ class _Run:
 
     def _event(self, kind: str, **fields: str | int | float) -> None:
         self.sink.event(self.clock.now() - self.apart, kind, fields)
-
-
-def _nearer(a: tuple[str, float], b: tuple[str, float]) -> tuple[str, float]:
-    return a if a[1] <= b[1] else b

@@ -1,0 +1,343 @@
+"""A diagnosis in words: the banner, what each cause is, why the others lost."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from samii_rig.diagnose.result import Band, Cause, Diagnosis, Trace, Value
+from samii_rig.report.diagnosis_laws import Jump, jump_of
+from samii_rig.report.verdicts import Mark, without_folders
+
+PLAIN = {
+    "torsional_compliance": "a joint or clamp that gives",
+    "translational_compliance": "a support that gives sideways",
+    "added_mass": "a mass",
+    "added_inertia": "a rotary inertia",
+    "ground_spring": "a spring to ground",
+    "gravity_stiffness": "the stiffness of gravity",
+    "viscous_damping": "a damper",
+    "structural_damping": "the beam's own damping",
+    "beam_property": "a beam other than given",
+    "attached_oscillator": "something that hangs on and resonates",
+    "actuator_lag": "a lag of the drive",
+    "valve_dynamics": "a valve of second order",
+    "transport_delay": "a dead time of the drive",
+    "velocity_feedback": "a drive that gives way to torque",
+    "hydraulic_compressibility": "oil that is compressed",
+    "sensor_delay": "a delay of the sensor",
+    "sensor_lag": "a lag of the sensor",
+    "sensor_gain": "a gain of the sensor",
+    "sensor_highpass": "a high-pass of the sensor",
+    "gravity_cross_sensitivity": "an accelerometer that tilts",
+    "noncollocated_encoder": "an encoder across other parts",
+    "coulomb_friction": "dry friction",
+    "valve_deadband": "a dead band of the valve",
+    "backlash": "play",
+    "cubic_stiffness": "a joint that stiffens or softens",
+    "flow_saturation": "a flow that saturates",
+    "output_saturation": "a clipped command",
+}
+WORDS = {
+    "no_mismatch": "no mismatch",
+    "named": "named",
+    "ambiguous": "ambiguous",
+    "unknown": "unknown",
+}
+_PREFIXES = {"N": ((1e9, "G"), (1e6, "M"), (1e3, "k")), "s": ((1.0, ""), (1e-3, "m"), (1e-6, "µ"))}
+_POWERS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+FAINT = 0.02  # probability of a site below which it is not marked
+NEVER = 1e-4  # a probability below it is not written in digits
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """A cause for a person. parameters : (symbol, value, 90 % interval)."""
+
+    plain: str
+    physics: str
+    site: str
+    probability: str
+    parameters: tuple[tuple[str, str, str], ...]
+    equivalents: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Banner:
+    """What is read in five seconds. word : the verdict. facts : (name, value, explanation)."""
+
+    mark: Mark
+    word: str
+    title: str
+    text: str
+    causes: tuple[Named, ...] = ()
+    facts: tuple[tuple[str, str, str], ...] = field(default=())
+
+
+def banner(found: Diagnosis) -> Banner:
+    """The verdict, its causes and how good it is."""
+    mark, title, text = _verdict(found)
+    causes = tuple(named(c) for c in answer(found))
+    return Banner(mark, WORDS[found.verdict], title, text, causes, tuple(_facts(found)))
+
+
+def answer(found: Diagnosis) -> tuple[Cause, ...]:
+    """The causes, if the diagnosis believes in them."""
+    return found.causes if found.verdict in ("named", "ambiguous") else ()
+
+
+def suspects(found: Diagnosis) -> dict[str, float]:
+    """Probability of each site, the most suspect first; what is not in the table has no site."""
+    seen = {site: p * (1 - found.outside) for site, p in found.sites}
+    return {site: p for site, p in seen.items() if p >= FAINT}
+
+
+def named(cause: Cause) -> Named:
+    """One cause in words, with its parameters."""
+    others: dict[str, list[str]] = {}
+    for physics, site in cause.equivalents:
+        others.setdefault("" if physics == cause.physics else said(physics), []).append(site)
+    same = tuple(f"{what} at {' or '.join(sites)}".strip() for what, sites in others.items())
+    numbers = tuple((symbol, *quantity(v)) for symbol, v in cause.parameters.items())
+    return Named(
+        PLAIN.get(cause.physics, said(cause.physics)),
+        said(cause.physics),
+        cause.site,
+        percent(cause.probability),
+        numbers,
+        same,
+    )
+
+
+def said(physics: str) -> str:
+    """`added_mass` as `added mass`."""
+    return physics.replace("_", " ")
+
+
+def listed(parts: Sequence[str]) -> str:
+    """`a, b and c`."""
+    return f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "".join(parts)
+
+
+def percent(p: float) -> str:
+    """A probability: never 0 %% or 100 %%, which no data give."""
+    if p > 0.999:
+        return "over 99.9 %"
+    if p < 0.001:
+        return "under 0.1 %"
+    if p > 0.99 or p < 0.01:
+        return f"{100 * p:.1f} %"
+    return f"{100 * p:.0f} %"
+
+
+def share(value: float, half: float) -> str:
+    """A part of 1, and half its interval where that shows in two decimals."""
+    return f"{value:.2f} \u00b1 {half:.2f}" if half >= 0.005 else f"{value:.2f}"
+
+
+def quantity(v: Value) -> tuple[str, str]:
+    """A value with its unit, and its 90 % interval, all three with one prefix."""
+    factor, prefix = 1.0, ""
+    family = "s" if v.unit == "s" else v.unit[:1]
+    size = abs(v.value)
+    for f, p in _PREFIXES.get(family, ()):
+        if size >= f:
+            factor, prefix = f, p
+            break
+    unit = re.sub(r"\^(-?\d+)", lambda m: m[1].translate(_POWERS), v.unit)
+    unit = "" if unit == "1" else f"\u00a0{prefix}{unit}"
+    value, low, high = (_digits(x / factor) for x in (v.value, v.low, v.high))
+    return f"{value}{unit}", f"{low} to {high}{unit}"
+
+
+def _digits(x: float) -> str:
+    if not np.isfinite(x) or x == 0 or 1e-3 <= abs(x) < 1e4:
+        return f"{x:.3g}" if abs(x) < 1e3 or not np.isfinite(x) else f"{x:.0f}"
+    mantissa, power = f"{x:.2e}".split("e")
+    return f"{mantissa}\u00b710{str(int(power)).translate(_POWERS)}"
+
+
+def _verdict(found: Diagnosis) -> tuple[Mark, str, str]:
+    parts = _together(found.causes)
+    match found.verdict:
+        case "no_mismatch":
+            if found.not_physics:
+                text = findings(found)[0]
+                if _mended(found):
+                    text += " With that, the model fits to the noise."
+                return "warning", "No physics is missing, but the recordings are not right", text
+            text = "What model and measurement differ by is no more than the noise."
+            return "good", "Nothing is missing from the model", text
+        case "named":
+            return "good", f"Left out of the model: {parts}", ""
+        case "ambiguous":
+            text = "The data do not settle it: see what else it may be, and what would tell."
+            return "warning", f"Most likely left out of the model: {parts}", text
+    places = suspects(found)
+    where = "The data do not tell where it is."
+    if places:
+        site, p = next(iter(places.items()))
+        where = f"It is most likely at {site} ({percent(p)})."
+    text = f"No entry of the table of physics explains it. {where}"
+    return "bad", "Something is missing that has no name here", text
+
+
+def _together(causes: Sequence[Cause]) -> str:
+    """All causes; those of one kind with their sites together."""
+    sites: dict[str, list[str]] = {}
+    for c in causes:
+        sites.setdefault(c.physics, []).append(c.site)
+    return listed([f"{said(p)} at {listed(where)}" for p, where in sites.items()])
+
+
+def _facts(found: Diagnosis) -> list[tuple[str, str, str]]:
+    before, after = found.nominal[1], found.with_causes[1]
+    if _mended(found):
+        value = f"{ratio(before)} \u2192 {ratio(after)}"
+        return [("Chi-square per degree of freedom", value, "with that set right; noise leaves 1")]
+    if not answer(found):
+        limit = f"of the refitted model; noise passes {found.threshold:.3g} in 3 of 1000 cases"
+        return [("Chi-square per degree of freedom", ratio(found.chi2_per_dof), limit)]
+    sure = min(c.probability for c in found.causes)
+    g = found.gap
+    return [
+        ("Probability", percent(sure), "that this is what is missing"),
+        (
+            "Gap closed",
+            f"{100 * g.value:.3g} %",
+            f"{100 * g.low:.3g} to {100 * g.high:.3g} %, on lines kept apart",
+        ),
+        (
+            "Chi-square per degree of freedom",
+            f"{ratio(before)} \u2192 {ratio(after)}",
+            "refitted nominal model \u2192 with the causes; noise leaves 1",
+        ),
+    ]
+
+
+def ratio(x: float) -> str:
+    """A chi-square per degree of freedom, or its root."""
+    return f"{x:.2f}" if x < 10 else f"{x:.3g}" if x < 1000 else f"{x:,.0f}"
+
+
+def _mended(found: Diagnosis) -> bool:
+    """Whether what is not physics explains all that the refitted nominal model leaves."""
+    wrong = found.chi2_per_dof > found.threshold
+    return wrong and not found.causes and found.with_causes[0] <= found.threshold
+
+
+def fit_rows(found: Diagnosis) -> list[tuple[str, str, str]]:
+    """(model, on lines fitted, on lines kept apart): chi-square per degree of freedom."""
+    rows = [("refitted nominal model", found.nominal)]
+    if answer(found):
+        rows.append(("with the causes", found.with_causes))
+    elif found.causes:
+        rows.append(("with the best of the table", found.with_causes))
+    elif _mended(found):
+        rows.append(("with what is not physics", found.with_causes))
+    rows.append(("noise", (found.noise_floor, found.noise_floor)))
+    return [(name, ratio(train), ratio(held)) for name, (train, held) in rows]
+
+
+def rivals(found: Diagnosis) -> list[dict[str, str]]:
+    """The chosen explanation and those that lost: what, probability, why."""
+    if not found.causes:
+        return []
+    chosen = min(c.probability for c in found.causes)
+    best = {(t.site, (t.jump, t.by)): t for t in found.traces}
+    first = "chosen" if answer(found) else "the best of the table, and not good enough"
+    rows = [
+        {"what": _together(found.causes), "probability": percent(chosen), "why": first},
+    ]
+    for causes, p in found.alternatives:
+        what = _together(causes) or "nothing, or no physics"
+        values = "; ".join(
+            f"{symbol}\u00a0=\u00a0{quantity(v)[0]}"
+            for c in causes
+            for symbol, v in c.parameters.items()
+        )
+        rows.append(
+            {
+                "what": f"{what} ({values})" if values else what,
+                "probability": percent(p),
+                "why": _why(causes, p, found, chosen, best),
+            }
+        )
+    if found.outside > NEVER:
+        why = "what the chosen one leaves does not look like noise" if found.outside > 0.5 else ""
+        row = {"what": "something that the table does not hold", "why": why}
+        rows.append(row | {"probability": percent(found.outside)})
+    return rows
+
+
+def _why(
+    causes: Sequence[Cause],
+    p: float,
+    found: Diagnosis,
+    chosen: float,
+    best: dict[tuple[str, Jump], Trace],
+) -> str:
+    odds = chosen / max(p, NEVER)
+    parts = [f"{odds:.2g} times less probable" if odds > 1.5 else "about as probable"]
+    more = len(causes) - len(found.causes)
+    if more > 0:
+        parts.append(f"{more} more part{'s' if more > 1 else ''} for what it explains")
+    elif more < 0:
+        parts.append("leaves out a part that the data ask for")
+    here = {c.site for c in found.causes}
+    for cause in causes if len(causes) == 1 else ():
+        jump = jump_of(cause)
+        trace = best.get((cause.site, jump)) if jump else None
+        if trace is not None and cause.site not in here and trace.chi2_per_dof > found.threshold:
+            parts.append(
+                f"a part of any law at {cause.site} leaves {ratio(trace.chi2_per_dof)} of "
+                "chi-square per degree of freedom"
+            )
+    return "; ".join(parts)
+
+
+def findings(found: Diagnosis) -> list[str]:
+    """What is wrong with the recordings, as sentences."""
+    return [_sentence(without_folders(text)) for text in found.not_physics]
+
+
+def _sentence(text: str) -> str:
+    text = text.strip()
+    if text[:1].islower() and " " in text and text.split()[0].isalpha():  # no channel's name
+        text = text[0].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+@dataclass(frozen=True, slots=True)
+class Left:
+    """One cell of what the refitted nominal model leaves. weight : 0 to 1, of its colour."""
+
+    text: str
+    weight: float
+
+
+Table = tuple[list[str], list[tuple[str, list[Left]]]]
+
+
+def band_table(bands: Sequence[Band], threshold: float) -> Table:
+    """Columns (frequency bands) and rows (channel, cells) of chi-square per degree of freedom."""
+    spans = sorted({(b.low_hz, b.high_hz) for b in bands})
+    channels = list(dict.fromkeys(b.channel for b in bands))
+    of = {(b.channel, b.low_hz, b.high_hz): b.chi2_per_dof for b in bands}
+    worst = max((b.chi2_per_dof for b in bands), default=1.0)
+    scale = np.log(max(worst / max(threshold, 1.0), 2.0))
+    rows = []
+    for channel in channels:
+        cells = []
+        for span in spans:
+            x = of.get((channel, *span))
+            if x is None:
+                cells.append(Left("", 0.0))
+                continue
+            weight = float(np.clip(np.log(max(x / max(threshold, 1.0), 1.0)) / scale, 0.0, 1.0))
+            cells.append(Left(ratio(x), round(weight, 2)))
+        rows.append((channel, cells))
+    return [f"{low:.3g}\u2013{high:.3g} Hz" for low, high in spans], rows
