@@ -31,7 +31,7 @@ from samii_rig.run.limits import GateLimits, gate_limits
 from samii_rig.run.protocols import Actuator, Clock, CommandBlock, DeviceLoop, OpenRig, Sensor
 from samii_rig.types import Float, Quality, SampleBlock
 
-AHEAD = 0.06  # s between a reference and its first sample
+AHEAD = 0.15  # s between a reference and its first sample; a loaded machine may be late
 FLIGHT = 0.03  # s for which samples from before a command may still arrive after it
 FEEDBACK = 0.5  # of the output: what the kit's feedback would add if it were not clipped
 

@@ -320,7 +320,7 @@ class AnyOrder(RuleBasedStateMachine):
     @rule(deadman=st.sampled_from([None, 0.05]))
     def change_device(self, deadman):
         # A device says what it has when it is asked; nothing is out when it changes.
-        if not self.bench.device.live:
+        if self.bench.gate.state in (State.SAFE, State.FAULT):
             self.bench.device.deadman = deadman
 
     @rule()

@@ -26,6 +26,9 @@ from samii_rig.signal.excitation import swept_sine
 U, F = swept_sine(500.0, 2.0, 20.0, 0.6, ramp=0.1, lead_in=0.1, ring_down=0.3)
 
 
+QUIET = ("--no-diagnosis",)
+
+
 class Thrice:
     """Three runs; before the later ones something is to be moved, if `asks`."""
 
@@ -80,12 +83,20 @@ class Bench:
 
         return Closing(device, device, device, "fake", {"clock": "simulated"})
 
-    def go(self, answers: str = "", *, asks: bool = True, options: tuple[str, ...] = ()):
+    def go(self, answers: str = "", *, asks: bool = True, options: tuple[str, ...] = QUIET):
         self.kind = Thrice(asks)
         self.patch.setattr(experiments, "load_experiment", lambda name, rig: (self.kind, ""))
         out = str(self.path / "t.mcap")
-        command = ["run", "thrice", "--rig", str(self.rig), "--out", out, "--no-report", *options]
-        result = CliRunner().invoke(app, command, input=answers)
+        command = [
+            "run",
+            "thrice",
+            "--rig",
+            str(self.rig),
+            "--out",
+            out,
+            "--no-report",
+        ]
+        result = CliRunner().invoke(app, [*command, *options], input=answers)
         for device in self.devices:
             assert device in self.closed
             assert not device.live
@@ -179,7 +190,7 @@ def test_ctrl_c_while_a_run_is_estimated_starts_no_other(bench, monkeypatch, ask
         signal.raise_signal(number)
 
     monkeypatch.setattr(campaign, "estimate", waits)
-    result, left = bench.go("y\ny\ny\n", asks=asks, options=("--json",))
+    result, left = bench.go("y\ny\ny\n", asks=asks, options=(*QUIET, "--json"))
     assert result.exit_code == 130, result.output
     assert left == ["t_1.mcap"]
     assert bench.status("t_1.mcap") == "completed"
@@ -187,6 +198,20 @@ def test_ctrl_c_while_a_run_is_estimated_starts_no_other(bench, monkeypatch, ask
     said = json.loads(result.stdout[result.stdout.index("{") :])
     assert said["status"] == "stopped"
     assert bench.kind.concluded == 0
+
+
+def test_ctrl_c_while_a_run_is_diagnosed_starts_no_other(bench, monkeypatch):
+    from samii_rig.diagnose import diagnose
+
+    def waits(*args, **how):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(diagnose, "diagnose", waits)
+    result, left = bench.go(asks=False, options=())
+    assert result.exit_code == 130, result.output
+    assert left == ["t_1.mcap"]
+    assert bench.status("t_1.mcap") == "completed"
+    assert "stopped by Ctrl-C" in result.output
 
 
 def test_a_signal_while_the_recording_is_closed_is_not_lost(bench, monkeypatch):

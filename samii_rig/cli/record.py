@@ -40,7 +40,7 @@ def run(
         str,
         typer.Argument(
             help="Name of a shipped experiment (swept_sine, stepped_sine, multisine, torque_test, "
-            "mode_scan), or the path of its file."
+            "mode_scan, step), or the path of its file."
         ),
     ],
     rig: RigOption = "samii",
@@ -140,13 +140,13 @@ def run(
                 json=json,
             )
         )
-        if done[-1].outcome.stop.status != "completed" or done[-1].outcome.interrupted:
+        if done[-1].outcome.stop.status != "completed" or done[-1].interrupted:
             break
     lines: tuple[str, ...] = ()
     written: tuple[Path, ...] = ()
     last = done[-1].outcome.stop.status
     if last == "completed" and len(done) < len(setups):
-        # A signal came while the last run was estimated: nothing moves any more.
+        # A signal came while the last run was estimated or diagnosed: nothing moves any more.
         last = "stopped"
     if last == "completed" and isinstance(the_experiment, Concludes):
         outcomes = [d.outcome for d in done]
@@ -191,13 +191,14 @@ def _ask(setup: Setup, i: int, n: int, console: Console, json: bool) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Done:
-    """One run, with what is said of it."""
+    """One run, with what is said of it. interrupted : a person asked for an end meanwhile."""
 
     outcome: Outcome
     predicted: DryRun
     curve: ModelCurve | None
     page: Path | None
     diagnosis: Diagnosis | None
+    interrupted: bool
 
     def as_json(self) -> dict[str, Any]:
         """As plain data."""
@@ -247,7 +248,9 @@ def _carry_out(
             progress=None if json else live,
         )
     curve = model_curve(setup.rig, outcome.responses)
-    found = _diagnosed(setup, outcome, console, json=json) if diagnosis else None
+    found, given_up = None, False
+    if diagnosis:
+        found, given_up = _diagnosed(setup, outcome, console, json=json)
     page = None
     if report:
         from samii_rig.record.reader import read_events
@@ -274,31 +277,38 @@ def _carry_out(
         console.print(f"\nrecording  {path}", soft_wrap=True)
         if page:
             console.print(f"report     {page}", soft_wrap=True)
-    return _Done(outcome, predicted, curve, page, found)
+    interrupted = given_up or bool(outcome.interrupted)
+    return _Done(outcome, predicted, curve, page, found, interrupted)
 
 
-def _diagnosed(setup: Setup, outcome: Outcome, console: Console, *, json: bool) -> Diagnosis | None:
-    """What the rig file leaves out; None where the run has nothing to tell that from."""
+def _diagnosed(
+    setup: Setup, outcome: Outcome, console: Console, *, json: bool
+) -> tuple[Diagnosis | None, bool]:
+    """What the rig file leaves out, None where the run has nothing to tell that from; and
+    whether a person gave it up."""
     from samii_rig.diagnose.diagnose import diagnose
     from samii_rig.errors import EstimateError, InputError
 
+    given_up = False
     if not outcome.responses:
-        return None
+        return None, given_up
     try:
         with nullcontext() if json else console.status("diagnosis ...") as status:
-            return diagnose(
+            found = diagnose(
                 outcome.responses,
                 setup.rig,
                 progress=lambda stage: status.update(f"diagnosis: {stage} ...") if status else None,
             )
+            return found, given_up
     except (EstimateError, InputError) as error:
         why = str(error)
     except KeyboardInterrupt:
-        # The run itself is over and whole; its page is still to be written.
+        # The run itself is over and whole; its page is still to be written, no other run follows.
+        given_up = True
         why = "stopped by Ctrl-C; `samii-rig diagnose` makes it up"
     if not json:
         console.print(f"no diagnosis: {why}", soft_wrap=True)
-    return None
+    return None, given_up
 
 
 def _prediction(predicted: DryRun) -> dict[str, Any]:

@@ -110,7 +110,8 @@ class Poles:
             text += f"; left out are squares on {shown}, where poles gather without end"
         for name, own in self.own.items():
             places = ", ".join(f"{p.real:g}" if p.imag == 0 else f"{p:.6g}" for p in own)
-            text += f"; the source driven by {name} has poles of its own at {places or 'none'}"
+            has = f"poles of its own at {places}" if places else "no pole of its own"
+            text += f"; the source driven by {name} has {has}"
         return text
 
 

@@ -62,7 +62,7 @@ def _panel(axes: Axes, panel: Panel, last: bool) -> None:
         if mark.axis == "y":
             _horizontal(axes, mark.low, mark.high, mark.text)
         else:
-            _vertical(axes, mark.low, mark.high, mark.text)
+            _vertical(axes, mark.low, mark.high, mark.text, mark.foot)
     for label in panel.labels:
         axes.annotate(
             label.text,
@@ -137,7 +137,7 @@ def _thin(axes: Axes, x: Float, count: int) -> Int:
     return np.unique(np.searchsorted(place, np.linspace(place[0], place[-1], count)))
 
 
-def _vertical(axes: Axes, low: float, high: float | None, text: str) -> None:
+def _vertical(axes: Axes, low: float, high: float | None, text: str, foot: bool) -> None:
     if high is not None:
         axes.axvspan(low, high, color=PUBLISHED, alpha=0.13, lw=0, zorder=0)
         middle = float(np.sqrt(low * high)) if axes.get_xscale() == "log" else (low + high) / 2
@@ -147,13 +147,13 @@ def _vertical(axes: Axes, low: float, high: float | None, text: str) -> None:
     if text:
         axes.annotate(
             text,
-            (middle, 0.98),
+            (middle, 0.02 if foot else 0.98),
             xycoords=("data", "axes fraction"),
             rotation=90,
             fontsize=SMALL,
             color=PUBLISHED,
             ha="center" if high is not None else "right",
-            va="top",
+            va="bottom" if foot else "top",
         )
 
 

@@ -127,9 +127,9 @@ def figure_6() -> Result:
     panels = bode_panels(
         _three(held.response.frequency, Q, sd, true, fitted),
         "(m/s²)/rad",
-        (Mark(f"z_1 = {damped:.1f} Hz", damped),),
+        (Mark(f"z_1 = {damped:.1f} Hz", damped, foot=True),),
         near=180.0,
-        legend="upper left",
+        legend="lower center",
     )
     return Result(
         tuple(numbers),
@@ -202,7 +202,10 @@ def overlay(
         Chain(truth).response(GRID)[:, column, 0],
         Chain(fitted).response(GRID)[:, column, 0],
     )
-    return Picture(name, title, bode_panels(bodes, "rad/V", (Mark("mode 2: 7.4 Hz", MODE_2),)))
+    gain = np.abs(Chain(truth).response(np.array([BAND[0], MODE_2, BAND[1]]))[:, column, 0])
+    high = bool(gain[1] ** 2 > gain[0] * gain[2])  # in the upper half of the picture
+    mark = Mark("mode 2: 7.4 Hz", MODE_2, foot=high)
+    return Picture(name, title, bode_panels(bodes, "rad/V", (mark,)))
 
 
 def _three(f: Float, H: Complex, sd: Float, true: Complex, fitted: Complex) -> tuple[Bode, ...]:

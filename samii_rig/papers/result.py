@@ -12,7 +12,7 @@ import numpy as np
 from samii_rig.types import Complex, Float
 
 Kind = Literal["line", "dashed", "points", "broad"]
-Corner = Literal["upper left", "upper right", "lower left", "lower right"]
+Corner = Literal["upper left", "upper right", "lower left", "lower right", "lower center"]
 
 
 PLAIN = (-4, 6)  # powers of ten between which a number is written without one
@@ -129,12 +129,16 @@ class Curve:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What the paper says of a figure: a stretch of x, or a value of x or y, with its words."""
+    """What the paper says of a figure: a stretch of x, or a value of x or y, with its words.
+
+    foot : the words stand at the lower end of the line, where a curve crosses the upper one.
+    """
 
     text: str
     low: float
     high: float | None = None
     axis: Literal["x", "y"] = "x"
+    foot: bool = False
 
 
 @dataclass(frozen=True, slots=True)
