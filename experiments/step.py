@@ -54,7 +54,7 @@ class Step(Driven):
                 segments.append(
                     PlannedSegment(
                         name=f"{self.name}_{level:g}_{repeat + 1}",
-                        kind="burst",
+                        kind="transient",
                         level=level,
                         unit=self.unit,
                         repeat=repeat,

@@ -70,6 +70,12 @@ class SampleBlock:
         return int(self.time.shape[0])
 
 
+Kind = Literal["burst", "periodic", "single", "transient"]
+"""What a segment promises: a `burst` starts and ends at rest; a `periodic` one is a whole number
+of periods of a periodic reference; a `single` one promises neither; a `transient` (a step) is for
+looking at in time, and no frequency response is estimated from it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Segment:
     """A part of a recording in which one thing was done: one sweep at one amplitude.
@@ -77,12 +83,10 @@ class Segment:
     start, stop : sequence numbers, half open; lead-in and ring-down are inside.
     level : peak amplitude of the reference in `unit`; levels are never pooled silently.
     repeat : 0, 1, ...; segments of equal `kind` and `level` with the same reference.
-    kind : `burst` starts and ends at rest; `periodic` is a whole number of periods
-        of a periodic reference; `single` promises neither.
     """
 
     name: str
-    kind: Literal["burst", "periodic", "single"]
+    kind: Kind
     start: int
     stop: int
     level: float

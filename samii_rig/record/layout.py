@@ -11,14 +11,14 @@ import json
 import re
 import zlib
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, cast, get_args
 
 import numpy as np
 from mcap.opcode import Opcode
 
 from samii_rig.errors import RecordingError
 from samii_rig.record.cdr import ENCAPSULATION
-from samii_rig.types import Channel, Role, Segment, StopRecord
+from samii_rig.types import Channel, Kind, Role, Segment, StopRecord
 
 FORMAT = "samii-rig recording 1"
 
@@ -210,7 +210,7 @@ def segment_from_map(data: dict[str, str]) -> Segment:
     """The inverse; RecordingError on anything else."""
     try:
         kind = data["kind"]
-        if kind not in ("burst", "periodic", "single"):
+        if kind not in get_args(Kind):
             raise ValueError(kind)
         return Segment(
             name=data["name"],

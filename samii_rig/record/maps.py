@@ -19,7 +19,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from samii_rig.rig.load import load_named, names_in
 from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Strict
-from samii_rig.types import Role
+from samii_rig.types import Kind, Role
 
 _FOLDER = resources.files("samii_rig.record") / "data"
 
@@ -161,10 +161,8 @@ class SegmentMap(Strict):
     first_repeat : the number that the files give the first repeat.
     """
 
-    kind: Literal["burst", "periodic", "single"] = "single"
-    kind_by_name: dict[Pattern, Literal["burst", "periodic", "single"]] = Field(
-        default_factory=dict
-    )
+    kind: Kind = "single"
+    kind_by_name: dict[Pattern, Kind] = Field(default_factory=dict)
     level: Pattern
     level_unit: str = Field(min_length=1)
     repeat: Pattern = ""

@@ -52,7 +52,7 @@ def verdicts(
     run = _run(recordings)
     rest = [
         *_model(comparisons),
-        *_measured(responses),
+        *_measured(recordings, responses),
         *_levels(responses),
         *_data(responses),
     ]
@@ -90,7 +90,12 @@ def _jumped(r: Recording) -> int:
     return int(r.sequence[-1] - r.sequence[0]) + 1 - len(r) if len(r) else 0
 
 
-def _measured(responses: Sequence[FrequencyResponse]) -> list[Verdict]:
+def _measured(
+    recordings: Sequence[Recording], responses: Sequence[FrequencyResponse]
+) -> list[Verdict]:
+    kinds = {s.kind for r in recordings for s in r.segments}
+    if not responses and kinds == {"transient"}:
+        return [Verdict("note", "A transient", "Recorded to be looked at in time: no response.")]
     if not responses:
         return [Verdict("bad", "No response was estimated", "Nothing can be said of the rig.")]
     parts = []

@@ -138,6 +138,8 @@ def _estimate_into(writer: RunWriter, interrupts: Interrupts) -> str:
             recording = read_recording(writer.partial_path, partial=True)
             if not recording.segments:
                 return "no segment was completed"
+            if all(s.kind == "transient" for s in recording.segments):
+                return ""
             responses = estimate([replace(recording, source=str(writer.path))])
         for response in responses:
             writer.frequency_response(response)

@@ -44,7 +44,7 @@ def expected_errors(
     out = _stepped(plan, rig, v, parts, hz, size)
     levels: dict[tuple[float, str], list[tuple[PlannedSegment, slice]]] = {}
     for s, part in zip(plan.segments, parts, strict=True):
-        if s.dwell is None:
+        if s.dwell is None and s.kind != "transient":
             levels.setdefault((s.level, s.unit), []).append((s, part))
     for (level, unit), members in levels.items():
         s, part = members[0]

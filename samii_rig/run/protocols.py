@@ -12,12 +12,12 @@ output to zero when nothing came for `deadman` seconds. Samples stream back in b
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from samii_rig.rig.schema import Feedback, Rig
-from samii_rig.types import Channel, Float, SampleBlock
+from samii_rig.types import Channel, Float, Kind, SampleBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +154,7 @@ class PlannedSegment:
     """
 
     name: str
-    kind: Literal["burst", "periodic", "single"]
+    kind: Kind
     level: float
     unit: str
     repeat: int

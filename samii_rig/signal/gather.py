@@ -53,6 +53,8 @@ def gather(
                 f"first one {', '.join(selection.names)}; name input and outputs, or estimate apart"
             )
         for segment in segments_of(recording):
+            if segment.kind == "transient":
+                continue
             cut = recording.cut(segment)
             found, usable, names = _examine(cut, segment, own, reference, gaps)
             if not usable:
@@ -78,6 +80,8 @@ def gather(
             group.pieces.append(Piece(name, r[kept], z[kept], breaks, follows))
             if recording.source and recording.source not in group.sources:
                 group.sources.append(recording.source)
+    if not groups and not lost:
+        raise EstimateError("steps and other transients only: no response can be estimated")
     if not groups:
         reasons = "; ".join(f.message for f in lost[:3])
         raise EstimateError(f"no segment is usable: {reasons}")
