@@ -6,6 +6,7 @@ itself estimated. Few hypotheses compete in each test; the whole table is for th
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from samii_rig.diagnose import vocabulary
 from samii_rig.diagnose.classes import distance
 from samii_rig.diagnose.diagnose import diagnose, table
 from samii_rig.diagnose.locate import locate, moebius
-from samii_rig.diagnose.measured import binned, measured
+from samii_rig.diagnose.measured import binned, measured, usable
 from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.refit import Problem, refit
 from samii_rig.diagnose.rigfile import toml
@@ -146,6 +147,26 @@ def test_bins_lose_nothing_when_the_model_is_right():
     whole = lines.chi_square(h).sum()
     apart = few.chi_square(model.response(np.zeros(model.n), at.at(few.frequency))).sum()
     assert apart + few.inside[0] == pytest.approx(whole, rel=1e-6)
+
+
+def test_what_decides_and_what_shows_took_no_part_in_the_fit():
+    bursts = [replace(concealing(seed=s), method="settled", level=1.0) for s in (1, 2)]
+    levels = (0.5, 1.0, 2.0)
+    sines = [replace(concealing(seed=9), method="periodic", level=x) for x in levels]
+    single = replace(concealing(seed=5), method="local", n_averages=1)
+    whole = measured(usable([*bursts, *sines, single]), samii())
+    fit, decide, show = whole.splits()
+    assert {whole.levels[k][0] for k in decide.level} == {0.5, 2.0}
+    assert {whole.levels[k][0] for k in show.level} == {1.0}
+    assert not any(whole.periodic[k] for k in fit.level)
+    assert fit.n + decide.n + show.n == whole.n
+    assert usable([single]) == [single]
+
+
+def test_lines_of_few_cycles_a_record_are_left_to_the_drift():
+    f = np.arange(1, 400) * 0.05
+    lines = measured([replace(concealing(f=f), method="settled")], samii())
+    assert lines.frequency[0] == pytest.approx(0.25)
 
 
 def test_every_output_is_a_moebius_function_of_the_missing_part(problem):

@@ -14,15 +14,16 @@ from samii_rig.diagnose import judge as verdict
 from samii_rig.diagnose.classes import without_twins
 from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.locate import traces
-from samii_rig.diagnose.measured import measured
+from samii_rig.diagnose.measured import measured, usable
 from samii_rig.diagnose.model import grid
+from samii_rig.diagnose.nonlinear import compete, next_levels, settle
 from samii_rig.diagnose.plan import next_experiment
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.rigfile import explained
 from samii_rig.diagnose.search import Search
 from samii_rig.diagnose.vocabulary import hypotheses
 from samii_rig.rig.schema import Rig
-from samii_rig.types import FrequencyResponse
+from samii_rig.types import FrequencyResponse, Recording
 
 ALTERNATIVES = 6
 TWIN_POINTS = 40
@@ -43,6 +44,7 @@ def diagnose(
     band: tuple[float, float] | None = None,
     effects: Sequence[Effect] | None = None,
     progress: Progress = lambda _stage: None,
+    runs: Sequence[Recording] = (),
 ) -> Diagnosis:
     """What `rig` leaves out, as far as `responses` tell.
 
@@ -52,12 +54,14 @@ def diagnose(
     band : Hz, where the model is held against them.
     effects : the table of hypotheses; None for the whole vocabulary.
     progress : is told each stage as it begins.
+    runs : recordings on whose inputs a nonlinear force is confirmed by simulation.
 
     Raises InputError and EstimateError as `samii_rig.identify.data.collect` does.
     """
     progress("nominal model")
-    whole = measured(responses, rig, band)
-    seen, show = whole.shown_apart()
+    sound = usable(responses)
+    whole = measured(sound, rig, band)
+    seen, decide, show = whole.splits()
     at = grid(rig, whole.frequency, whole.sensor, whole.actuator)
     low, high = float(whole.frequency[0]), float(whole.frequency[-1])
     if effects is None:
@@ -68,19 +72,24 @@ def diagnose(
     bands = verdict.bands(search, nominal)
     progress("what is missing")
     search.run()
+    progress("amplitude levels")
+    compete(search, sound)
     progress("what cannot be told apart")
-    judged = verdict.judge(search)
+    judged = verdict.judge(search, decide)
     nominal = search.nominal.fitted
     best = judged.best
-    shown = verdict.causes_of(judged.classes[0], judged) if best.effects else ()
+    gap = verdict.gap(search, show, nominal, best.fitted)
+    judged, said = settle(verdict.shown(judged, gap), search, sound, runs)
+    shown = verdict.causes_of(judged.classes[0], judged) if judged.verdict in verdict.SAID else ()
     findings = _findings(responses)
     if judged.verdict != "no_mismatch" or best.effects:
         findings += verdict.told(judged)
-    why, experiment = next_experiment(search, judged)
+    findings += said
+    why, experiment = next_levels(judged) or next_experiment(search, judged)
     alternatives = tuple(
         (verdict.causes_of(c, judged, probability=c.probability), c.probability)
-        for c in judged.classes[1 : 1 + ALTERNATIVES]
-        if c.probability >= verdict.SHOWN
+        for c in judged.classes[len(shown) > 0 :][:ALTERNATIVES]
+        if c.probability >= verdict.SHOWN and judged.verdict != "no_mismatch"
     )
     fits = [(search.ratio(f), verdict.per_dof(search, show, f)[0]) for f in (nominal, best.fitted)]
     return Diagnosis(
@@ -89,12 +98,12 @@ def diagnose(
         threshold=verdict.threshold(seen),
         bands=bands,
         sites=tuple(verdict.sites(judged)) if judged.verdict != "no_mismatch" else (),
-        causes=shown if judged.verdict != "no_mismatch" else (),
+        causes=shown,
         alternatives=alternatives,
         nominal=fits[0],
         with_causes=fits[1],
         noise_floor=1.0,
-        gap=verdict.gap(search, show, nominal, best.fitted),
+        gap=gap,
         not_physics=tuple(dict.fromkeys(findings)),
         why=why,
         experiment=experiment,

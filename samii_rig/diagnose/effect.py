@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
+
+if TYPE_CHECKING:
+    from samii_rig.diagnose.nonlinear_model import Quasi
 
 Key = tuple[str, str]
 Values = Mapping[Key, float]
@@ -55,6 +58,7 @@ class Effect:
     parameters : the rig's parameters that it sets, from its unknowns and the nominal values.
     touches : nominal parameters that `parameters` reads.
     factor : what it does to a channel, if that is no parameter of the rig.
+    quasi : the nonlinear force that it is, if it is one; the first unknown is its strength.
     write : the rig as a file would have it, from the built rig and the unknowns.
     weight : prior weight against the other hypotheses.
     report : physical quantities to be reported, from the unknowns.
@@ -68,6 +72,7 @@ class Effect:
     parameters: Callable[[Float, Values], dict[Key, float]] = lambda _x, _nominal: {}
     touches: tuple[Key, ...] = ()
     factor: Factor | None = None
+    quasi: Quasi | None = None
     write: Callable[[Rig, Float], Rig] = lambda rig, _x: rig
     weight: float = 1.0
     aliases: tuple[tuple[str, str], ...] = field(default=())

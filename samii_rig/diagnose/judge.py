@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -14,9 +14,9 @@ from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.classes import Class, classes
 from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.measured import Measured
-from samii_rig.diagnose.refit import Fitted
+from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Band, Cause, Gap, Value, Verdict
-from samii_rig.diagnose.search import Explanation, Search
+from samii_rig.diagnose.search import NEAR, Explanation, Search
 from samii_rig.signal.statistics import octaves
 from samii_rig.types import Float
 
@@ -25,8 +25,10 @@ NOTHING = 0.2  # probability of nothing missing below which it is called missing
 SURE = 0.8  # probability of a class from which it is named
 MOST_NAMES = 4  # of a class; more is no answer
 OUTSIDE = 6.0  # logarithm of what an unexplained rest must be worth before it is one
+IN_DATA = 12.0  # of chi-square, that an effect must explain of the data to be called missing
 MOSTLY = 0.5  # of the mismatch; explained by a cause, it is shown although something is left
 DRAWS = 400
+SAID = ("named", "ambiguous")  # verdicts that come with causes
 SHOWN = 0.01  # probability of an alternative from which it is listed
 # What a factor between two units is: their names are told, not physics.
 UNITS = {57.29578: "degrees for radians", 9.80665: "g for m/s^2", 1000.0: "milli for one",
@@ -60,15 +62,19 @@ def threshold(data: Measured) -> float:
     return float(stats.gamma.isf(FALSE_ALARM, 1 / data.spread, scale=data.spread))
 
 
-def judge(search: Search) -> Judgement:
-    """Probabilities of all explanations that were looked at, and the verdict."""
-    ranked = search.ranked()
+def judge(search: Search, decide: Measured | None = None) -> Judgement:
+    """Probabilities of all explanations that were looked at, and the verdict.
+
+    decide : lines that took no part in the fit, on which the best explanation must hold too.
+    """
+    inflation = search.temperature
+    ranked = _decided(search, decide) if decide is not None else search.ranked()
     best = ranked[0]
     left = search.ratio(best.fitted)
-    inflation = search.temperature
     weights = np.array([e.weight for e in ranked])
-    n = 2 / search.lines.spread
-    gain = 0.5 * n * (left - 1 - math.log(left)) if left > 1 else 0.0
+    gain = _worth(left, search.lines.spread)
+    if decide is not None:
+        gain += _worth(_held(search, decide, best.fitted), decide.spread)
     outside = float(np.max(weights)) + gain - OUTSIDE - (0.0 if best.effects else 2.0)
     p = np.exp(weights - np.max(weights))
     beyond = 1 / (1 + float(np.sum(p)) * math.exp(min(np.max(weights) - outside, 700.0)))
@@ -76,13 +82,66 @@ def judge(search: Search) -> Judgement:
     grouped = classes(ranked, p.tolist(), search.problem, inflation)
     nothing = sum(c.probability for c in grouped if not c.first.effects)
     closed = _closed(search, best)
+    said = _verdict(grouped, nothing, beyond, closed)
+    if said in SAID and not _seen(search, grouped, nothing):
+        said = "no_mismatch"
     return Judgement(
-        verdict=_verdict(grouped, nothing, beyond, closed),
+        verdict=said,
         classes=tuple(_chosen_first(grouped, nothing)),
         nothing=nothing,
         outside=beyond,
         inflation=inflation,
     )
+
+
+def shown(judged: Judgement, gap: Gap) -> Judgement:
+    """The same, but nothing is named that makes data worse which it was not fitted to."""
+    if judged.verdict in SAID and gap.value < 0:
+        return replace(judged, verdict="unknown")
+    return judged
+
+
+def _worth(left: float, spread: float) -> float:
+    """Logarithm of what an explanation of `left`, chi-square per degree of freedom, would gain."""
+    return (left - 1 - math.log(left)) / spread if left > 1 else 0.0
+
+
+def _decided(search: Search, lines: Measured) -> list[Explanation]:
+    """The explanations that may still compete, and that nothing is missing, weighed anew by how
+    likely each makes lines that were not fitted; the most probable first."""
+    ranked = search.ranked()
+    rivals = [e for e in ranked if e.weight > ranked[0].weight - NEAR or not e.effects]
+    heard = []
+    for e in rivals:
+        chi2, spread = _predicted(search, lines, e.fitted)
+        heard.append(replace(e, weight=e.weight - 0.5 * (chi2 / search.temperature + spread)))
+    return sorted(heard, key=lambda e: -e.weight)
+
+
+def _held(search: Search, lines: Measured, fitted: Fitted) -> float:
+    """Chi-square over its mean on lines that were not fitted."""
+    return _predicted(search, lines, fitted)[0] / float(np.sum(lines.expected))
+
+
+def _predicted(search: Search, lines: Measured, fitted: Fitted) -> tuple[float, float]:
+    """Chi-square on lines that were not fitted, with the covariance of the noise and of the
+    fit's own error there together; and the logarithm of that covariance's determinant over
+    the noise's."""
+    there = Problem.of(lines, search.grid)
+    h, dh = fitted.model.gradient(fitted.x, there.at)
+    J, r = there.whiten(dh), there.residual(h)
+    own, information = J.T @ r, J.T @ J
+    before = fitted.precision()
+    both = before + information
+    chi2 = float(r @ r - own @ np.linalg.solve(both, own))
+    return chi2, float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(before)[1])
+
+
+def _seen(search: Search, grouped: Sequence[Class], nothing: float) -> bool:
+    """Whether the data themselves gain: what a refit of the nominal parameters absorbs, at
+    the cost of values that their tolerances make unlikely, is not in the data."""
+    chosen = _chosen_first(grouped, nothing)[0].first.fitted
+    return search.nominal.fitted.chi2 - chosen.chi2 > IN_DATA * search.temperature
 
 
 def _chosen_first(grouped: Sequence[Class], nothing: float) -> list[Class]:
@@ -194,6 +253,11 @@ def told(judged: Judgement) -> list[str]:
             case _ if unit:
                 g = found["gain"]
                 out.append(f"{effect.site} is {g.value:.4g} times what it should be: {unit}")
+    many = judged.classes[0].names()
+    if many > MOST_NAMES:
+        alike = [" and ".join(" at ".join(e.name) for e in m.effects)
+                 for m in judged.classes[0].members[:MOST_NAMES]]  # fmt: skip
+        out.append(f"{many} names fit these data alike, among them {'; '.join(alike)}")
     return out
 
 
@@ -229,7 +293,7 @@ def bands(search: Search, fitted: Fitted) -> tuple[Band, ...]:
 
 def per_dof(search: Search, lines: Measured, fitted: Fitted) -> tuple[float, Float]:
     """Chi-square per degree of freedom on other lines, and of each line its share."""
-    h = fitted.model.response(fitted.x, search.grid.at(lines.frequency))
+    h = fitted.model.response(fitted.x, search.grid.at(lines.frequency, lines.level))
     chi = lines.chi_square(h)
     return float(np.sum(chi) / np.sum(lines.expected)), chi
 
@@ -243,7 +307,8 @@ def gap(search: Search, show: Measured, before: Fitted, after: Fitted) -> Gap:
     floor = show.expected
     num = (chi_before - chi_after)[rows].sum(axis=1)
     den = (chi_before - floor)[rows].sum(axis=1)
-    value = (a - b) / (a - 1) if a > 1 else 0.0
+    # Where nothing is left to be closed, only the sign of the change says anything.
+    value = (a - b) / (a - 1) if a > 1 else min(a - b, 0.0)
     drawn = num / np.where(np.abs(den) > 0, den, np.inf)
     low, high = np.quantile(drawn, [0.05, 0.95])
     return Gap(float(value), float(low), float(high))

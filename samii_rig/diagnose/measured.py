@@ -18,11 +18,18 @@ from samii_rig.identify.data import collect
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse, Int
 
-BINS = 300  # to begin with; a refit costs a few milliseconds
+BINS = 180  # to begin with; a refit costs a few milliseconds
 MOST_BINS = 700
 SPLIT = 6.0  # standard deviations of chi-square inside a bin above which it is divided
 SHAPE = 0.6  # weight of the response's own arc (logarithm, radians) against log frequency
 SHOW, TURN = 4, 5  # one line in five is kept apart, to show on what was found
+PERIODIC = ("periodic", "stepped")  # methods of excitations that repeat themselves
+# Methods of which a line is a whole number of cycles a record (or a period).
+WHOLE = ("burst", "settled", "periodic")
+# Cycles a record up to which a slow drift leaves more than the covariance, pooled over
+# neighbouring lines, says: what is left of it falls with the square of the frequency.
+DRIFTING = 4.5
+TRANSIENTS = "local"  # method of responses from single transients: see `usable`
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,9 +39,11 @@ class Measured:
     frequency : (n,) Hz. H : (n, q) of the entries (sensor, actuator), (q,) indices into the
         rig's. W : (n, q, q) precision such that e^H W e of the truth has the mean `expected`
         (n,), about twice the entries measured there; 0 where an entry was not measured.
-    level : (n,) index into `levels`, -1 where several were combined.
+    level : (n,) index into `levels`, -1 where several were combined; a periodic excitation
+        and a transient of one level have an index each (`periodic`: of each level, whether it
+        is one).
+    scatter : (n,) each line's part of the variance of chi-square.
     inside : chi-square lost by combining lines, and the mean of that under the truth.
-    real : how many real numbers; spread : relative variance of chi-square over them.
     """
 
     frequency: Float
@@ -42,18 +51,24 @@ class Measured:
     W: Complex
     expected: Float
     level: Int
+    scatter: Float
     levels: tuple[tuple[float, str], ...]
+    periodic: tuple[bool, ...]
     sensor: Int
     actuator: Int
     outputs: tuple[str, ...]
     inside: tuple[float, float]
-    spread: float
     rate_hz: float
 
     @property
     def n(self) -> int:
         """Lines or bins."""
         return int(self.frequency.size)
+
+    @property
+    def spread(self) -> float:
+        """Relative variance of chi-square over all lines."""
+        return float(np.sum(self.scatter) / max(float(np.sum(self.expected)), 1e-300) ** 2)
 
     def root(self) -> Complex:
         """(n, q, q) R with R^H R = W."""
@@ -64,7 +79,6 @@ class Measured:
 
     def take(self, mask: NDArray[np.bool_]) -> Measured:
         """Some of the lines."""
-        part = max(float(np.sum(self.expected[mask]) / np.sum(self.expected)), 1e-9)
         return replace(
             self,
             frequency=self.frequency[mask],
@@ -72,21 +86,49 @@ class Measured:
             W=self.W[mask],
             expected=self.expected[mask],
             level=self.level[mask],
-            spread=self.spread / part,
+            scatter=self.scatter[mask],
         )
 
-    def shown_apart(self) -> tuple[Measured, Measured]:
-        """The lines that find and decide, and those kept apart; their noise is independent."""
+    def splits(self) -> tuple[Measured, Measured | None, Measured]:
+        """The lines to fit, to decide on and to show on; their noise is independent.
+
+        Transients (bursts) are fitted. Of a periodic excitation the middle level shows and the
+        others decide whether what was fitted holds; of less than three levels, lines in turn.
+        Where there is but one kind of excitation, one line in five of it shows, and nothing but
+        the fit decides.
+        """
         turn = np.zeros(self.n, dtype=np.int64)
         for level in np.unique(self.level):
             at = np.flatnonzero(self.level == level)
-            turn[at] = np.arange(at.size) % TURN
-        return self.take(turn != SHOW), self.take(turn == SHOW)
+            turn[at] = np.arange(at.size)
+        repeats = np.array(self.periodic)[self.level]
+        if repeats.any() and not repeats.all():
+            own = sorted(np.unique(self.level[repeats]), key=lambda k: self.levels[k][0])
+            middle = own[len(own) // 2]
+            decides = self.level != middle if len(own) > 2 else turn % 2 == 0
+            return (
+                self.take(~repeats),
+                self.take(repeats & decides),
+                self.take(repeats & ~decides),
+            )
+        shown = turn % TURN == SHOW
+        return self.take(~shown), None, self.take(shown)
 
     def chi_square(self, h: Complex) -> Float:
         """(n,) e^H W e of a prediction (n, q)."""
         e = h - self.H
         return np.asarray(np.einsum("ni,nij,nj->n", e.conj(), self.W, e).real)
+
+
+def usable(responses: Sequence[FrequencyResponse]) -> list[FrequencyResponse]:
+    """The responses whose intervals a chi-square test can rest on.
+
+    Those of one transient (a step, a single sweep) have no repeats to take the noise from, and
+    what the local models leave of the transient is not in their covariance. They are used only
+    where there is nothing else.
+    """
+    sound = [r for r in responses if r.method.split()[0] != TRANSIENTS or r.n_averages > 1]
+    return sound or list(responses)
 
 
 def measured(
@@ -103,9 +145,8 @@ def measured(
     pairs = sorted(
         {(int(s), int(a)) for d in data.lines for s, a in zip(d.sensor, d.actuator, strict=True)}
     )
-    levels = tuple(dict.fromkeys((d.response.level, d.response.level_unit) for d in data.lines))
+    levels = tuple(dict.fromkeys(_level(d.response) for d in data.lines))
     blocks = []
-    variance = total = 0.0
     for d in data.lines:
         at = [pairs.index((int(s), int(a))) for s, a in zip(d.sensor, d.actuator, strict=True)]
         n, q = len(d.frequency), len(pairs)
@@ -115,14 +156,15 @@ def measured(
         precision = d.root.conj().swapaxes(1, 2) @ d.root
         W[:, np.array(at)[:, None], np.array(at)] = 2 * d.factor[:, None, None] * precision
         expected = 2 * d.factor * d.mean()
-        index = levels.index((d.response.level, d.response.level_unit))
-        blocks.append((d.frequency, H, W, expected, np.full(n, index)))
+        index = levels.index(_level(d.response))
         groups = max(1.0, n / d.shared[0])
         alone = max(1.0, n / d.shared[1])
         sized = float(np.sum(expected))
-        variance += sized**2 * (1 / alone + 1 / (float(np.mean(d.dof)) * groups)) / d.p
-        total += sized
-    f, H, W, expected, level = (np.concatenate(x) for x in zip(*blocks, strict=True))
+        variance = sized**2 * (1 / alone + 1 / (float(np.mean(d.dof)) * groups)) / d.p
+        scatter = variance * expected / sized
+        block = (d.frequency, H, W, expected, np.full(n, index), scatter)
+        blocks.append([x[_clear_of_drift(d.response, d.frequency)] for x in block])
+    f, H, W, expected, level, noise = (np.concatenate(x) for x in zip(*blocks, strict=True))
     order = np.argsort(f, kind="stable")
     return Measured(
         frequency=f[order],
@@ -130,14 +172,27 @@ def measured(
         W=W[order],
         expected=expected[order],
         level=level[order],
-        levels=levels,
+        scatter=noise[order],
+        levels=tuple((value, unit) for value, unit, _ in levels),
+        periodic=tuple(repeats for _, _, repeats in levels),
         sensor=np.array([s for s, _ in pairs], dtype=np.int64),
         actuator=np.array([a for _, a in pairs], dtype=np.int64),
         outputs=tuple(rig.sensor[s].name for s, _ in pairs),
         inside=(0.0, 0.0),
-        spread=variance / total**2,
         rate_hz=rate,
     )
+
+
+def _level(response: FrequencyResponse) -> tuple[float, str, bool]:
+    return response.level, response.level_unit, response.method.split()[0] in PERIODIC
+
+
+def _clear_of_drift(response: FrequencyResponse, f: Float) -> NDArray[np.bool_]:
+    """Which lines a drift does not reach; all of them where that would be few."""
+    whole = response.method.split()[0] in WHOLE and response.frequency.size > 2 * DRIFTING
+    if not whole:
+        return np.ones(f.size, dtype=bool)
+    return np.asarray(f > DRIFTING * float(np.min(np.diff(response.frequency))))
 
 
 def binned(lines: Measured, shape: Complex, bins: int = BINS) -> Measured:
@@ -200,6 +255,7 @@ def _combined(lines: Measured, shape: Complex, starts: Int) -> tuple[Measured, F
         W=W,
         expected=expected - mean,
         level=np.where(same, lines.level[starts], -1),
+        scatter=np.add.reduceat(lines.scatter, starts),
         inside=(float(np.sum(chi)), float(np.sum(mean))),
     )
     return found, chi, mean

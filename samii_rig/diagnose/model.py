@@ -32,8 +32,9 @@ class Grid:
     sensor: Int
     actuator: Int
 
-    def at(self, frequency: Float) -> Grid:
-        """The same on some of the frequencies."""
+    def at(self, frequency: Float, level: Int | None = None) -> Grid:
+        """The same on some of the frequencies; what depends on their level is in `LevelGrid`."""
+        del level
         i = np.searchsorted(self.frequency, frequency)
         return Grid(frequency, self.factor[i], self.aliases[i], self.sensor, self.actuator)
 

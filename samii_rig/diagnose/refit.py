@@ -21,6 +21,8 @@ LOG_STEPS = 20
 LOG_FLOOR = 0.1  # of the response's logarithm: see identify.likelihood
 FAR = 20.0  # chi-square per degree of freedom above which the logarithm is fitted first
 LONGEST = 1.2  # a step of an effect's logarithm at most
+FIRST, LEAST = 10.0, 1e-2  # damping: of chi-square, for a step of the largest allowed size
+CORRECTIONS = 4  # of a step that left the valley
 SETTLED = 0.02  # of chi-square, improvement of a step at which a refit ends
 HOPELESS = 0.02  # of the way to a chi-square that matters, gained by a step
 SPAN = math.sqrt(12.0)  # of a uniform distribution in its standard deviations
@@ -37,7 +39,7 @@ class Problem:
     @classmethod
     def of(cls, data: Measured, at: Grid) -> Problem:
         """The problem on the data's own frequencies."""
-        return cls(data, data.root(), at.at(data.frequency))
+        return cls(data, data.root(), at.at(data.frequency, data.level))
 
     @property
     def expected(self) -> float:
@@ -123,7 +125,7 @@ def refit(
     cost = _cost(model, problem, x, h)
     if far and cost > FAR * scaled:
         x, h, dh, cost = _logarithm(model, problem, x, h, dh, cost)
-    damping = 1e-3
+    damping = FIRST
     for step in range(steps):
         J, r = problem.whiten(dh), problem.residual(h)
         x_new, h_new, new, damping = _step(model, problem, x, J, r, cost, damping)
@@ -155,25 +157,41 @@ def _step(
     """A Levenberg-Marquardt step that lowers the cost; None where there is none."""
     n = model.n_nominal
     A = J.T @ J
-    g = J.T @ r
+    downhill = J.T @ r
     A[np.arange(n), np.arange(n)] += 1 / model.prior[:n] ** 2
-    g[:n] += x[:n] / model.prior[:n] ** 2
+    downhill[:n] += x[:n] / model.prior[:n] ** 2
     for _ in range(7):
-        new = _move(model, x, A, g, damping)
+        new = _move(model, x, A, downhill, damping)
         if new is None:
-            damping = max(damping * 10, 1e-6)
+            damping = max(damping * 5, LEAST)
             continue
         try:
             h = model.response(new, problem.at)
         except SamiiRigError:
-            damping = max(damping * 10, 1e-6)
+            damping = max(damping * 5, LEAST)
             continue
         there = _cost(model, problem, new, h)
+        for _ in range(CORRECTIONS):
+            if there < cost:
+                break
+            # Back into the curved valley along which the step went, by the same derivatives.
+            g = J.T @ problem.residual(h)
+            g[:n] += new[:n] / model.prior[:n] ** 2
+            back = _move(model, new, A, g, damping)
+            if back is None:
+                break
+            try:
+                h = model.response(back, problem.at)
+            except SamiiRigError:
+                break
+            new, before, there = back, there, _cost(model, problem, back, h)
+            if there > 0.9 * before and there >= cost:
+                break
         if there < cost:
-            return new, h, there, damping * 0.1
+            return new, h, there, max(damping * 0.3, LEAST)
         if np.max(np.abs(new - x)) < 1e-7:
             break
-        damping = max(damping * 10, 1e-6)
+        damping = max(damping * 5, LEAST)
     return x, None, cost, damping
 
 
@@ -184,13 +202,15 @@ def _move(model: Model, x: Float, A: Float, g: Float, damping: float) -> Float |
     on = np.flatnonzero(~held)
     if on.size == 0:
         return None
+    limit = np.where(on < model.n_nominal, 4 * np.minimum(model.prior[on], 1e3), LONGEST)
     S = A[np.ix_(on, on)] / np.outer(scale[on], scale[on])
-    S[np.diag_indices(on.size)] += damping + 1e-10
+    # Damped by what a parameter may move, not by what the data say of it: parameters that
+    # the data hardly tell apart would otherwise creep along their common valley.
+    S[np.diag_indices(on.size)] += damping / (limit * scale[on]) ** 2 + 1e-12
     try:
         d = -np.linalg.solve(S, g[on] / scale[on]) / scale[on]
     except np.linalg.LinAlgError:
         return None
-    limit = np.where(on < model.n_nominal, 4 * np.minimum(model.prior[on], 1e3), LONGEST)
     d *= min(1.0, float(1 / np.max(np.abs(d) / limit)) if np.any(d) else 1.0)
     new = x.copy()
     new[on] += d

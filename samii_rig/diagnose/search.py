@@ -18,14 +18,16 @@ import numpy as np
 from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.measured import Measured, binned
 from samii_rig.diagnose.model import Grid, Model
+from samii_rig.diagnose.nonlinear_model import model_of
 from samii_rig.diagnose.refit import Fitted, Problem, refit
 from samii_rig.diagnose.screen import Screen, Start
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Float
 
-MOST = 5  # effects in one explanation
-FIRST, LATER = 30, 8  # candidates that are refitted in the first round, and in later ones
+MOST = 5  # effects in one explanation, if all are of one physics
+MIXED = 2  # effects of different physics: with more, sums of them mimic what is in no table
+FIRST, LATER = 30, 6  # candidates that are refitted in the first round, and in later ones
 CHANCE = (0.5, 0.4, 0.02)  # before the data: of nothing, one, two effects missing
 FEWER = 0.05  # of each further effect
 NEAR = 25.0  # of the logarithm of evidence: explanations further below the best are let go
@@ -167,12 +169,15 @@ class Search:
         """Refit `base` with each of the most promising further effects."""
         if len(base.effects) >= MOST:
             return
+        kinds = {e.physics for e in base.effects}
         screened = self.screen(base)
         best = max((e.fitted.cost for e in self.found.values()), default=math.inf)
         for drop, effect, starts in screened[:most]:
             if drop < WORTH:
                 break
             effects = (*base.effects, effect)
+            if len(effects) > MIXED and kinds != {effect.physics}:
+                continue
             if frozenset(e.key for e in effects) in self.found:
                 continue
             ends = []
@@ -292,7 +297,7 @@ class Search:
         key = tuple(e.key for e in effects)
         if key not in self._models:
             try:
-                self._models[key] = Model(self.rig, effects)
+                self._models[key] = model_of(self.rig, effects)
             except SamiiRigError:
                 self._models[key] = None
         return self._models[key]

@@ -246,9 +246,11 @@ def _oscillators(rig: Rig, where: Places) -> Iterator[Effect]:
             physics="attached_oscillator",
             site=site,
             unknowns=(
-                Unknown("m", "kg", 1e-4 * scale, 30 * scale, (0.03 * scale,)),
-                Unknown("k", "N/m", low_w / 2, 2 * high_w, spread(low_w, high_w, 12)),
-                Unknown("c", "N s/m", 1e-3, 1.0, (0.03,)),
+                Unknown(
+                    "m", "kg", 1e-4 * scale, 30 * scale, (3e-4 * scale, 3e-3 * scale, 0.03 * scale)
+                ),
+                Unknown("k", "N/m", low_w / 2, 2 * high_w, spread(low_w, high_w, 48)),
+                Unknown("c", "N s/m", 1e-3, 1.0, (0.05,)),
             ),
             build=build,
             parameters=values,

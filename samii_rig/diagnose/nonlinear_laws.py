@@ -1,0 +1,80 @@
+"""Describing functions: what a nonlinear force is at one frequency, by the amplitude there.
+
+A force f(y) that meets a sine of amplitude A answers with N(A) y and harmonics (Gelb and Vander
+Velde, Multiple-Input Describing Functions, 1968). One that meets a random-phase multisine of
+standard deviation sigma answers with E[f'] y and distortion (Bussgang's theorem).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import erf
+
+from samii_rig.types import Complex, Float
+
+PHASES = 64  # instants of a period over which the flow's fundamental is summed
+
+
+@dataclass(frozen=True, slots=True)
+class Law:
+    """A force with one strength p.
+
+    sine : (A (n,), p) -> N (n,). gauss : (sigma (n,), p) -> N (n,). force : (y, p) -> f.
+    of_speed : whether y is the speed of what is read, not its place.
+    """
+
+    sine: Callable[[Float, float], Float]
+    gauss: Callable[[Float, float], Float]
+    force: Callable[[Float, float], Float]
+    of_speed: bool = False
+
+
+def clipped(A: Float, limit: float) -> Float:
+    """N of clip(y, -limit, limit): 1 below the limit."""
+    r = np.minimum(limit / np.maximum(A, 1e-300), 1.0)
+    return np.asarray(2 / np.pi * (np.arcsin(r) + r * np.sqrt(1 - r**2)))
+
+
+def clipped_gauss(sigma: Float, limit: float) -> Float:
+    """The same for a Gaussian y: the chance that it is below the limit."""
+    return np.asarray(erf(limit / (np.sqrt(2) * np.maximum(sigma, 1e-300))))
+
+
+FRICTION = Law(
+    sine=lambda A, T: 4 * T / (np.pi * np.maximum(A, 1e-300)),
+    gauss=lambda sigma, T: np.sqrt(2 / np.pi) * T / np.maximum(sigma, 1e-300),
+    force=lambda y, T: T * np.sign(y),
+    of_speed=True,
+)
+CUBIC = Law(
+    sine=lambda A, k: 0.75 * k * A**2,
+    gauss=lambda sigma, k: 3 * k * sigma**2,
+    force=lambda y, k: k * y**3,
+)
+# What a dead zone of this whole width takes away from y.
+GAP = Law(
+    sine=lambda A, width: clipped(A, width / 2),
+    gauss=lambda sigma, width: clipped_gauss(sigma, width / 2),
+    force=lambda y, width: np.clip(y, -width / 2, width / 2),
+)
+# What a limit takes away from y.
+EXCESS = Law(
+    sine=lambda A, limit: 1 - clipped(A, limit),
+    gauss=lambda sigma, limit: 1 - clipped_gauss(sigma, limit),
+    force=lambda y, limit: y - np.clip(y, -limit, limit),
+)
+
+
+def starved(flow: Complex, M: Complex, T_s: float) -> Complex:
+    """Fundamental of q sqrt(1 + sign(q) M/T_s) - q: an orifice whose supply holds a torque T_s.
+
+    flow, M : (n,) phasors; M is the chain's moment, which pushes against a positive flow when
+    negative.
+    """
+    turn = np.exp(2j * np.pi * np.arange(PHASES) / PHASES)
+    q, m = np.real(flow[:, None] * turn), np.real(M[:, None] * turn)
+    gone = q * (np.sqrt(np.maximum(1 + np.sign(q) * m / T_s, 0.0)) - 1)
+    return np.asarray(2 * np.mean(gone * turn.conj(), axis=1))

@@ -1,0 +1,201 @@
+"""How strongly each level drove a rig at each line, and a nonlinear force's own loop there.
+
+A sine that sweeps has its own amplitude at every frequency; the lines of a random-phase multisine
+act at once, so that what counts is the standard deviation of them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samii_rig.diagnose.measured import PERIODIC, Measured
+from samii_rig.diagnose.model import STEP, Grid
+from samii_rig.diagnose.nonlinear_laws import Law, starved
+from samii_rig.model.sampled import hold_response, sensor_response
+from samii_rig.rig.schema import Rig
+from samii_rig.types import Complex, Float, FrequencyResponse, Int
+
+if TYPE_CHECKING:
+    from samii_rig.diagnose.nonlinear_model import Quasi
+
+SWEEPS, SETTLED = 40, 1e-9  # of the amplitude, at most; change of x at which they end
+FLOW_SWEEPS = 8
+LEAST = 1e-3  # of the motion without the force: friction that holds is a very stiff damper
+
+
+@dataclass(frozen=True, slots=True)
+class LevelGrid(Grid):
+    """A grid that knows how strongly each level drove each frequency.
+
+    hold, filter : (n,), (n, q) the parts of `factor`. driven : (n_level, n) mean square of the
+    input; random : (n_level,) whether all lines were driven at once. level, power : (n,) of the
+    lines themselves, in a grid that `at` made; power of all lines of a random level adds up to
+    that of its input.
+    """
+
+    hold: Complex
+    filter: Complex
+    driven: Float
+    random: NDArray[np.bool_]
+    level: Int | None = None
+    power: Float | None = None
+
+    def at(self, frequency: Float, level: Int | None = None) -> LevelGrid:
+        """The same on lines of these levels."""
+        i = np.searchsorted(self.frequency, frequency)
+        power = None
+        if level is not None:
+            power = self.driven[level, i]
+            for k in np.flatnonzero(self.random):
+                mine = np.flatnonzero(level == k)
+                if mine.size:
+                    edges = (frequency[mine][1:] + frequency[mine][:-1]) / 2
+                    which = np.searchsorted(edges, self.frequency)
+                    power[mine] = np.bincount(which, self.driven[k], mine.size)
+        return LevelGrid(
+            frequency, self.factor[i], self.aliases[i], self.sensor, self.actuator,
+            self.hold[i], self.filter[i], self.driven, self.random, level, power,
+        )  # fmt: skip
+
+
+def level_grid(
+    rig: Rig,
+    at: Grid,
+    lines: Measured,
+    responses: Sequence[FrequencyResponse],
+) -> LevelGrid | None:
+    """The grid with the input's strength by level; None where it is not known, or where more
+    than one input was driven."""
+    if len(set(at.actuator.tolist())) != 1:
+        return None
+    driven = np.zeros((len(lines.levels), at.frequency.size))
+    random = np.zeros(len(lines.levels), dtype=bool)
+    for k, (level, periodic) in enumerate(zip(lines.levels, lines.periodic, strict=True)):
+        own = [
+            r
+            for r in responses
+            if (r.level, r.level_unit) == level and (r.method.split()[0] in PERIODIC) == periodic
+        ]
+        if not own:
+            return None
+        rms = [
+            np.interp(at.frequency, r.frequency, np.abs(r.input_rms[:, 0]), left=0.0, right=0.0)
+            for r in own
+        ]
+        if not np.all(np.isfinite(rms)):
+            return None
+        random[k] = all(r.method.startswith("periodic") for r in own)
+        if random[k]:
+            # The lines of a comb count once each, wherever else a line may be.
+            rms = [np.where(np.isin(at.frequency, r.frequency), x, 0.0)
+                   for r, x in zip(own, rms, strict=True)]  # fmt: skip
+        driven[k] = np.max(rms, axis=0) ** 2
+    spec = rig.actuator[int(at.actuator[0])]
+    return LevelGrid(
+        at.frequency, at.factor, at.aliases, at.sensor, at.actuator,
+        hold_response(at.frequency, rig.rate_hz, spec.delay),
+        sensor_response(rig.sensor, at.frequency)[:, at.sensor],
+        driven, random,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """The force's own loop at the lines: readings per unit command and per unit force."""
+
+    s: Complex
+    l0: Complex  # (n, m)
+    l1: Complex
+    at: LevelGrid
+
+    def amplitude(self, reading: Complex) -> Float:
+        """(n,) amplitude of a sine; of a line of a multisine the standard deviation of all."""
+        assert self.at.power is not None
+        return np.asarray(np.sqrt(self.added(np.abs(reading) ** 2 * self.at.power)))
+
+    def added(self, power: Float) -> Float:
+        """(n, ...) twice a sine's mean square; a random level's lines all added up."""
+        assert self.at.level is not None
+        out = 2 * power
+        for k in np.flatnonzero(self.at.random):
+            mine = self.at.level == k
+            out[mine] = power[mine].sum(axis=0)
+        return out
+
+    def gain(self, law: Law, A: Float, p: float) -> Float:
+        """(n,) N of each line's kind of excitation."""
+        assert self.at.level is not None
+        random = self.at.random[self.at.level]
+        if not random.any():
+            return law.sine(A, p)
+        return np.where(random, law.gauss(A, p), law.sine(A, p))
+
+    def parts(self, law: Law) -> tuple[Complex, Complex]:
+        """l0 and l1 of what the law reads."""
+        rate = self.s if law.of_speed else np.ones_like(self.s)
+        return rate * self.l0[:, 0], rate * self.l1[:, 0]
+
+    def force(self, quasi: Quasi, p: float, scale: float = 1.0) -> tuple[Complex, Float]:
+        """(n,) e per unit command, and x."""
+        if quasi.law is None:
+            return self._flow(p), np.zeros(0)
+        l0, l1 = self.parts(quasi.law)
+        least = LEAST * self.amplitude(l0)
+        x = np.zeros(self.s.size)
+        for _ in range(SWEEPS):
+            A = np.maximum(self.amplitude(l0 / (1 - x * l1)), least)
+            new = 0.5 * (x + quasi.sign * scale * self.gain(quasi.law, A, p))
+            moved = np.max(np.abs(new - x) / np.maximum(np.abs(new), 1e-300))
+            x = new
+            if moved < SETTLED:
+                break
+        return np.asarray(x * l0 / (1 - x * l1)), x
+
+    def slopes(
+        self, quasi: Quasi, p: float, scale: float, x: Float, changes: tuple[Complex, Complex]
+    ) -> tuple[Complex, Complex, Complex]:
+        """(n, m) derivatives of e by what changes l0 and l1 as `changes` (n, m), then (n,) by the
+        logarithms of p and of the scale."""
+        law = quasi.law
+        assert law is not None
+        assert self.at.power is not None
+        l0, l1 = self.parts(law)
+        rate = self.s[:, None] if law.of_speed else 1.0
+        d0, d1 = (rate * c for c in changes)
+        D = 1 - x * l1
+        y = l0 / D
+        A = np.maximum(self.amplitude(y), LEAST * self.amplitude(l0))
+        sized = quasi.sign * scale
+        N_A = sized * (self.gain(law, A * (1 + STEP), p) - self.gain(law, A, p)) / (A * STEP)
+        N_p = sized * (self.gain(law, A, p * (1 + STEP)) - self.gain(law, A, p)) / STEP
+        y_x = l0 * l1 / D**2
+        weight = self.at.power / A
+
+        def through(dy: Complex, dx: Float) -> Complex:
+            """de where the reading would change by dy and x by dx, were its amplitude held."""
+            direct = dy + y_x[:, None] * dx
+            moved = self.added(weight[:, None] * np.real(y.conj()[:, None] * direct))
+            held = 1 - N_A * self.added(weight * np.real(y.conj() * y_x))
+            dx = dx + N_A[:, None] * moved / held[:, None]
+            return np.asarray(dx * y[:, None] + x[:, None] * (dy + y_x[:, None] * dx))
+
+        zero = np.zeros((self.s.size, 1))
+        by_chain = through(d0 / D[:, None] + (x * l0 / D**2)[:, None] * d1, np.zeros(d0.shape))
+        by_p = through(zero.astype(complex), N_p[:, None])[:, 0]
+        by_scale = through(zero.astype(complex), x[:, None])[:, 0]
+        return by_chain, by_p, by_scale
+
+    def _flow(self, T_s: float) -> Complex:
+        assert self.at.power is not None
+        a = np.sqrt(2 * self.at.power)
+        size = np.where(a > 0, a, 1.0)
+        q, e = self.s * self.l0[:, 0], np.zeros_like(self.s)
+        for _ in range(FLOW_SWEEPS):
+            M = self.l0[:, 1] + self.l1[:, 1] * e
+            e = 0.5 * (e + starved(q * a, M * a, T_s) / size)
+        return e
