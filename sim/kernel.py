@@ -225,6 +225,58 @@ def _friction(d: Drive, speed: float, u: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
+def sense(t: Tables, c: Converters, s: State, noise: Float, values: Float, quality: Flags) -> None:
+    """Read all sensors at the state's sample into values and quality, (m,). noise : (m,)."""
+    sample = s.flag[SAMPLE]
+    slot = sample % s.early.shape[0]
+    for i in range(t.ahead.shape[0]):
+        if t.ahead[i] == 0:
+            y = _read(t, s, i, s.number[APPLIED], 0.0, s.number[EXTRA])
+        else:
+            y = s.early[slot, i]
+        y, q = _convert(c, i, sample, y, noise[i])
+        if sample >= c.stuck[i]:
+            y, q = s.held[i], s.held_flag[i]
+        s.held[i], s.held_flag[i] = y, q
+        values[i], quality[i] = y, q
+
+
+@njit(cache=True)
+def move(t: Tables, d: Drive, s: State, v: float, disturbance: Float) -> None:
+    """Put v out at the state's sample and go on to the next. disturbance : (inner,)."""
+    m = t.ahead.shape[0]
+    slots = s.early.shape[0]
+    number, sample = s.number, s.flag[SAMPLE]
+    number[LAST_V] = v
+    s.waiting[sample % s.waiting.shape[0]] = v
+    for j in range(t.inner):
+        old = number[APPLIED]
+        new = old
+        share = 0.0
+        if j == t.change:
+            new = s.waiting[(sample - t.pipeline) % s.waiting.shape[0]]
+            share = t.mean
+        extra = d.disturbance * disturbance[j] if d.disturbance > 0.0 else 0.0
+        if d.friction > 0.0:
+            push = share * old + (1.0 - share) * new + extra
+            pull, number[SPEED] = _friction(d, number[SPEED], push)
+            extra += pull
+        for i in range(m):
+            if t.ahead[i] > 0 and (j + t.ahead[i]) % t.inner == 0:
+                at = (sample + (j + t.ahead[i]) // t.inner) % slots
+                s.early[at, i] = _read(t, s, i, old, new, extra)
+        both = new + extra
+        before = old + extra
+        for q in range(s.x.shape[1]):
+            re = t.decay[0, q] * s.x[0, q] - t.decay[1, q] * s.x[1, q]
+            im = t.decay[1, q] * s.x[0, q] + t.decay[0, q] * s.x[1, q]
+            s.x[0, q] = re + t.old[0, q] * before + t.new[0, q] * both
+            s.x[1, q] = im + t.old[1, q] * before + t.new[1, q] * both
+        number[APPLIED], number[EXTRA] = new, extra
+    s.flag[SAMPLE] = sample + 1
+
+
+@njit(cache=True)
 def advance(
     t: Tables,
     c: Converters,
@@ -245,58 +297,15 @@ def advance(
     given : (n,) 1 where the queue held a reference. noise : (n, m), disturbance : (n, inner),
     standard normal; empty if there is none.
     """
-    m = t.ahead.shape[0]
-    n_pole = s.x.shape[1]
-    slots = s.early.shape[0]
-    number, flag = s.number, s.flag
-    noisy = noise.shape[0] > 0
+    none = np.zeros(max(t.ahead.shape[0], t.inner))
     for n in range(u.shape[0]):
-        sample = flag[SAMPLE]
-        slot = sample % slots
-        for i in range(m):
-            if t.ahead[i] == 0:
-                y = _read(t, s, i, number[APPLIED], 0.0, number[EXTRA])
-            else:
-                y = s.early[slot, i]
-            y, q = _convert(c, i, sample, y, noise[n, i] if noisy else 0.0)
-            if sample >= c.stuck[i]:
-                y, q = s.held[i], s.held_flag[i]
-            s.held[i], s.held_flag[i] = y, q
-            values[n, SENSORS + i], quality[n, SENSORS + i] = y, q
-
+        y = values[n, SENSORS:]
+        sense(t, c, s, noise[n] if noise.shape[0] > 0 else none, y, quality[n, SENSORS:])
         if given[n]:
-            number[LAST_REF] = theta_ref[n]
+            s.number[LAST_REF] = theta_ref[n]
         reference = u[n] if given[n] else 0.0
-        v, limited = _command(
-            c, k, f, s, reference, number[LAST_REF], given[n] != 0, values[n, SENSORS:]
-        )
-        values[n, U], values[n, THETA_REF], values[n, V] = reference, number[LAST_REF], v
+        ref = s.number[LAST_REF]
+        v, limited = _command(c, k, f, s, reference, ref, given[n] != 0, y)
+        values[n, U], values[n, THETA_REF], values[n, V] = reference, ref, v
         quality[n, U], quality[n, THETA_REF], quality[n, V] = 0, 0, limited
-        number[LAST_V] = v
-        s.waiting[sample % s.waiting.shape[0]] = v
-
-        for j in range(t.inner):
-            old = number[APPLIED]
-            new = old
-            share = 0.0
-            if j == t.change:
-                new = s.waiting[(sample - t.pipeline) % s.waiting.shape[0]]
-                share = t.mean
-            extra = d.disturbance * disturbance[n, j] if d.disturbance > 0.0 else 0.0
-            if d.friction > 0.0:
-                push = share * old + (1.0 - share) * new + extra
-                pull, number[SPEED] = _friction(d, number[SPEED], push)
-                extra += pull
-            for i in range(m):
-                if t.ahead[i] > 0 and (j + t.ahead[i]) % t.inner == 0:
-                    at = (sample + (j + t.ahead[i]) // t.inner) % slots
-                    s.early[at, i] = _read(t, s, i, old, new, extra)
-            both = new + extra
-            before = old + extra
-            for q in range(n_pole):
-                re = t.decay[0, q] * s.x[0, q] - t.decay[1, q] * s.x[1, q]
-                im = t.decay[1, q] * s.x[0, q] + t.decay[0, q] * s.x[1, q]
-                s.x[0, q] = re + t.old[0, q] * before + t.new[0, q] * both
-                s.x[1, q] = im + t.old[1, q] * before + t.new[1, q] * both
-            number[APPLIED], number[EXTRA] = new, extra
-        flag[SAMPLE] = sample + 1
+        move(t, d, s, v, disturbance[n] if disturbance.shape[0] > 0 else none)

@@ -52,10 +52,10 @@ class SimulatedDevice:
         spec = rig.actuator[0]
         self.name, self.deadman = spec.name, spec.deadman
         self.channels = device_channels(rig)
-        self.realisation = _realised(rig.model_dump_json(exclude=UNRELATED), settings.band_hz)
+        self.realisation = realised(rig.model_dump_json(exclude=UNRELATED), settings.band_hz)
         self._tables = tabulate(rig, self.realisation, settings.inner)
-        self._converters = _converters(rig, settings)
-        self._drive = _drive(rig, settings)
+        self._converters = converters(rig, settings)
+        self._drive = drive(rig, settings)
         self._state = kernel.rest(self._tables)
         self._control = kernel.Control(0, 0.0, 0.0, np.inf, np.inf, self._patience())
         self._filters = _filters(rig, ())
@@ -221,7 +221,7 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
 
 
 @lru_cache(maxsize=16)
-def _realised(rig_json: str, band_hz: float | None) -> Realisation:
+def realised(rig_json: str, band_hz: float | None) -> Realisation:
     """Campaigns open the same rig many times; the pole search is the slow part of that."""
     return realise(Rig.model_validate_json(rig_json), band_hz)
 
@@ -253,7 +253,8 @@ def device_channels(rig: Rig) -> tuple[Channel, ...]:
     )
 
 
-def _converters(rig: Rig, settings: SimSettings) -> kernel.Converters:
+def converters(rig: Rig, settings: SimSettings) -> kernel.Converters:
+    """What stands between the analogue values and the numbers."""
     sensors, spec = rig.sensor, rig.actuator[0]
     ideal = 0.0 if not settings.noise else 1.0
 
@@ -297,7 +298,8 @@ def _filters(rig: Rig, feedback: Sequence[Feedback]) -> kernel.Filters:
     )
 
 
-def _drive(rig: Rig, settings: SimSettings) -> kernel.Drive:
+def drive(rig: Rig, settings: SimSettings) -> kernel.Drive:
+    """What acts on the drive beside the command."""
     # The disturbance passes the source's lag; a source without a first-order one lets it through.
     sources = [e for e in rig.element if isinstance(e, SOURCES)]
     own = next(e for e in sources if e.input == rig.actuator[0].name)

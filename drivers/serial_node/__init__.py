@@ -1,0 +1,8 @@
+"""The serial I/O node: a microcontroller that closes the loop; see docs/serial-node.md.
+
+The C files beside this are the portable part of its firmware; a board needs `node.h`.
+"""
+
+from drivers.serial_node.rig import open_rig
+
+__all__ = ["open_rig"]

@@ -1,0 +1,220 @@
+"""The port of a serial I/O node: for one program alone, read by a thread, written on demand."""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+import time
+from collections import deque
+from pathlib import Path
+
+import serial
+from serial.tools import list_ports
+
+from drivers.serial_node.wire import (
+    WORD,
+    Answer,
+    Code,
+    Decoder,
+    Event,
+    Hello,
+    OtherVersion,
+    Reboot,
+    Samples,
+    Type,
+    frame,
+    reason_text,
+)
+from samii_rig.errors import DeviceError
+
+HELLO_WITHIN = 3.0  # s; a board that resets when its port opens needs two to boot
+ASK_EVERY = 0.25  # s
+ANSWER_WITHIN = 0.25  # s
+TRIES = 3  # of a request whose answer did not come
+WRITE_WITHIN = 0.05  # s; a port that takes no bytes for a deadman's time is as good as gone
+READ_WAIT = 0.05  # s between looks at whether to go on
+KEPT = 8192  # SAMPLES frames that wait for read(); over a minute, what is older is lost
+
+
+class Link:
+    """One open port. Only `send` and `request` transmit, and nothing here calls them.
+
+    samples : frames that arrived and nobody took yet. events : the node's, newest last.
+    trouble : why nothing more will come, "" while all is well.
+    """
+
+    def __init__(self, port: str, baud: int) -> None:
+        self.name = port
+        self.decoder = Decoder()
+        self.samples: deque[Samples] = deque(maxlen=KEPT)
+        self.events: deque[Event] = deque(maxlen=KEPT)
+        self.trouble = ""
+        self.refused = 0
+        self._port = _open(port, baud)
+        self._seq = 0
+        self._hello: Hello | None = None
+        self._other: OtherVersion | None = None
+        self._answers: dict[int, Answer] = {}
+        self._news = threading.Condition()
+        self._writing = threading.Lock()
+        self._ending = threading.Event()
+        self._reader = threading.Thread(target=self._read, name=f"reader of {port}", daemon=True)
+        self._reader.start()
+
+    def identify(self, baud: int) -> Hello:
+        """Ask who is there; DeviceError in one line if that is no node of this version."""
+        until = time.monotonic() + HELLO_WITHIN
+        while time.monotonic() < until:
+            self._transmit(frame(Type.IDENTIFY, 0, 0))
+            with self._news:
+                self._news.wait_for(self._known, ASK_EVERY)
+                if self._hello is not None:
+                    # The node takes only what is newer than the last host's last frame.
+                    self._seq = self._hello.host_seq
+                    return self._hello
+                if self._other is not None:
+                    raise DeviceError(
+                        f"{self.name}: the node speaks protocol version {self._other.version}, "
+                        "this driver version 1; install the firmware that belongs to it"
+                    )
+                if self.trouble:
+                    raise DeviceError(self.trouble)
+        if self.decoder.received:
+            raise DeviceError(
+                f"{self.name}: {self.decoder.received} bytes came and no frame of a node among "
+                f"them; is device.settings.baud = {baud} the node's, and is it a node?"
+            )
+        raise DeviceError(
+            f"{self.name}: nothing answers in {HELLO_WITHIN:g} s; is the node powered, is it this "
+            "port, and does it run its firmware?"
+        )
+
+    def send(self, kind: Type, body: bytes = b"") -> int:
+        """Transmit one frame; its number. DeviceError if the port does not take it."""
+        assert self._hello is not None
+        with self._writing:
+            self._seq = (self._seq + 1) % WORD
+            self._put(frame(kind, self._hello.boot, self._seq, body))
+            return self._seq
+
+    def request(self, kind: Type, body: bytes = b"") -> Code:
+        """Transmit and wait for what became of it; DeviceError if no answer comes."""
+        self._answers.clear()
+        for _ in range(TRIES):
+            seq = self.send(kind, body)
+            with self._news:
+                self._news.wait_for(lambda s=seq: s in self._answers or self.trouble, ANSWER_WITHIN)  # type: ignore[misc]
+                if seq in self._answers:
+                    return Code(self._answers.pop(seq).code)
+                if self.trouble:
+                    raise DeviceError(self.trouble)
+        raise DeviceError(f"{self.name}: the node does not answer to {kind.name}")
+
+    def close(self) -> None:
+        """Stop reading and give the port back; may be called twice."""
+        self._ending.set()
+        self._reader.join()
+        self._port.close()
+
+    def _known(self) -> bool:
+        return bool(self._hello or self._other or self.trouble)
+
+    def _transmit(self, data: bytes) -> None:
+        with self._writing:
+            self._put(data)
+
+    def _put(self, data: bytes) -> None:
+        try:
+            self._port.write(data)
+        except (OSError, serial.SerialException) as error:
+            raise DeviceError(f"{self.name}: the port takes nothing: {error}") from error
+
+    def _read(self) -> None:
+        """The reader: whatever ends it is trouble, and so never only silence."""
+        try:
+            while not self._ending.is_set():
+                data = self._port.read(max(1, self._port.in_waiting))
+                for message in self.decoder.feed(data):
+                    self._take(message)
+        except Exception as error:
+            self._fail(f"{self.name}: the port is gone: {error}")
+
+    def _fail(self, trouble: str) -> None:
+        with self._news:
+            self.trouble = self.trouble or trouble
+            self._news.notify_all()
+
+    def _take(self, message: object) -> None:
+        match message:
+            case Samples():
+                self.samples.append(message)
+            case Event():
+                self.events.append(message)
+            case Answer(type=Type.STREAM):
+                self.refused += 1
+            case Reboot():
+                self._fail(
+                    f"{self.name}: the node has rebooted (boot {message.boot}); its output is at "
+                    "null; find out why, then start a new run"
+                )
+            case _:
+                with self._news:
+                    if isinstance(message, Hello):
+                        self._hello = message
+                    elif isinstance(message, OtherVersion):
+                        self._other = message
+                    elif isinstance(message, Answer):
+                        self._answers[message.seq] = message
+                    self._news.notify_all()
+
+    def last_reason(self) -> str:
+        """Why the node's state changed last, in words; "" if it did not."""
+        return reason_text(self.events[-1].reason) if self.events else ""
+
+
+def _open(port: str, baud: int) -> serial.Serial:
+    try:
+        opened = serial.Serial(
+            port, baud, timeout=READ_WAIT, write_timeout=WRITE_WITHIN, exclusive=True
+        )
+        opened.reset_input_buffer()
+        return opened
+    except (OSError, ValueError, serial.SerialException) as error:
+        raise DeviceError(_why(port, baud, error)) from error
+
+
+def _why(port: str, baud: int, error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    if number is None and isinstance(error.__context__, OSError):
+        number = error.__context__.errno
+    if number in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY):
+        return f"{port}: in use by {_holder(port)}; end that program first"
+    if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+        found = ", ".join(sorted(p.device for p in list_ports.comports())) or "none"
+        return f"{port}: no such port; ports of this machine: {found}"
+    if number in (errno.EACCES, errno.EPERM):
+        return (
+            f"{port}: no permission; put this user into the group that owns the port (on Linux "
+            "often dialout: sudo usermod -aG dialout $USER) and log in again"
+        )
+    if isinstance(error, ValueError):
+        return f"{port}: device.settings.baud = {baud} is no rate that this port can do"
+    return f"{port}: {error}"
+
+
+def _holder(port: str) -> str:
+    """The program that has locked the port, by number and name where the system tells."""
+    try:
+        stat = Path(port).stat()
+        place = f"{os.major(stat.st_dev):02x}:{os.minor(stat.st_dev):02x}:{stat.st_ino}"
+        for line in Path("/proc/locks").read_text().splitlines():
+            fields = line.split()
+            if len(fields) > 5 and fields[5] == place:
+                pid = fields[4]
+                name = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+                words = b" ".join(name).decode("utf-8", "replace").strip()
+                return f"process {pid} ({words[:60]})"
+    except OSError:
+        pass
+    return "another program"

@@ -1,0 +1,347 @@
+"""A rig behind a serial I/O node: volts and radians on this side, counts on the other."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.serial_node.link import Link
+from drivers.serial_node.settings import Input, SerialSettings, check_node, read_settings
+from drivers.serial_node.wire import (
+    HALF,
+    MAX_STREAM,
+    WORD,
+    Code,
+    Flag,
+    Hello,
+    Samples,
+    State,
+    Type,
+    configure_body,
+    stream_body,
+)
+from samii_rig.errors import DeviceError, InputError
+from samii_rig.rig.schema import Rig
+from samii_rig.run.clock import MonotonicClock
+from samii_rig.run.protocols import CommandBlock, DeviceLoop, OpenRig
+from samii_rig.types import Channel, Quality, SampleBlock
+
+Q16 = 1 << 16
+MOST32 = HALF - 1
+RAILS = (-(1 << 15), (1 << 15) - 1)  # where an ADC is out of its range
+# How far the node's clock may be from its own sample count before one of them was reset.
+CLOCK_SLACK = 2.0  # samples
+CLOCK_DRIFT = 0.01  # of the time between two frames
+REFUSALS = {
+    Code.NOT_NULL: "its output is not at null",
+    Code.LIMIT: "a number is beyond the node's own hard limits",
+    Code.STATE: "it has tripped, or its deadman has ended the run",
+    Code.CAUSE: "the cause of its trip is still there (emergency input, or an input out of range)",
+}
+
+
+class SerialNode:
+    """Actuator and sensor of one node.
+
+    Every frame to the node is sent inside `configure`, `write` or `zero`, so a stream cannot
+    outlive the gate that calls them.
+    """
+
+    def __init__(self, rig: Rig, settings: SerialSettings, link: Link, hello: Hello) -> None:
+        spec = rig.actuator[0]
+        self.name, self.deadman = spec.name, spec.deadman
+        self._rig, self._settings, self._link, self._hello = rig, settings, link, hello
+        self._inputs = [
+            (s.name in settings.encoder, (settings.encoder | settings.adc)[s.name])
+            for s in rig.sensor
+        ]
+        centring = rig.centring.sensor if rig.centring else rig.sensor[0].name
+        self._angle = self._encoder(centring)
+        self.channels = _channels(rig, settings, centring)
+        self._layout = np.dtype(
+            [
+                ("v", "<i2"),
+                ("u", "<i2"),
+                ("theta_ref", "<i4"),
+                ("flags", "u1"),
+                ("encoder", "<i4", (hello.n_encoder,)),
+                ("adc", "<i2", (hello.n_adc,)),
+            ]
+        )
+        self._sample = -1  # of the newest frame's first, counted on past 32 bits
+        self._clock = 0  # us, its time, likewise
+        self._state = hello.state
+        self._rejected: int | None = None
+        self._bad = 0
+        self._trouble = ""
+        self._history: deque[tuple[float, int]] = deque([(time.monotonic(), 0)])
+
+    # Actuator
+
+    def configure(self, loop: DeviceLoop) -> None:
+        """Set loop and limits; DeviceError if the node cannot or will not keep them."""
+        if loop.feedback:
+            raise DeviceError(
+                f"{self.name}: the serial node has no filters, so it cannot run the feedback "
+                f"{loop.feedback[0].name}; take [[feedback]] out of the rig file"
+            )
+        numbers = (loop.max_output, loop.max_rate, loop.max_angle)
+        if not math.isfinite(loop.kp) or not all(x >= 0.0 for x in numbers):
+            raise DeviceError(f"{self.name}: negative or missing number in {loop}")
+        x, out = self._encoder(loop.sensor), self._settings.output_counts_per_unit
+        kp = round(loop.kp * out / x.counts_per_unit * Q16)
+        if abs(kp) > MOST32:
+            raise DeviceError(f"{self.name}: kp = {loop.kp:g} is beyond what the node can count")
+        jump = self._settings.max_jump
+        scale = abs(x.counts_per_unit)
+        most = _counts(loop.max_output * abs(out))
+        if most > self._hello.max_output:
+            limit = self._hello.max_output / abs(out)
+            raise DeviceError(
+                f"{self.name}: a limit of {loop.max_output:g} is beyond the node's own hard limit "
+                f"of {limit:.4g}"
+            )
+        body = configure_body(
+            encoder=x.index,
+            adc_mask=self._watched(),
+            kp_q16=kp,
+            max_output=most,
+            # The node's own step may be the tighter one: then it limits, and says so.
+            max_step=min(
+                _counts(loop.max_rate * abs(out) / self._rig.rate_hz), self._hello.max_step
+            ),
+            max_angle=_counts(loop.max_angle * scale),
+            max_jump=min(self._hello.max_jump, _counts((jump or math.inf) * scale)),
+            centre=x.offset,
+        )
+        self._angle = x
+        code = self._link.request(Type.CONFIGURE, body)
+        if code is Code.STATE:
+            # Latched. Whoever configures has been told to go on by a person.
+            code = self._link.request(Type.CLEAR)
+            code = code or self._link.request(Type.CONFIGURE, body)
+        if code:
+            why = REFUSALS.get(code, code.name)
+            raise DeviceError(f"{self.name}: the node refuses its limits: {why}")
+
+    def write(self, block: CommandBlock) -> None:
+        """Stream reference samples; what comes too late or while tripped, the node ignores."""
+        if block.u.shape != block.theta_ref.shape or block.u.ndim != 1:
+            raise DeviceError(f"{self.name}: u and theta_ref of a block differ in length")
+        if not (np.isfinite(block.u).all() and np.isfinite(block.theta_ref).all()):
+            raise DeviceError(f"{self.name}: a reference sample is not a finite number")
+        u = np.rint(block.u * self._settings.output_counts_per_unit)
+        ref = np.rint(block.theta_ref * self._angle.counts_per_unit + self._angle.offset)
+        if np.abs(u).max(initial=0.0) > RAILS[1] or np.abs(ref).max(initial=0.0) > MOST32:
+            raise DeviceError(f"{self.name}: a reference sample is beyond what the node can count")
+        counts, angles = u.astype(np.int64).tolist(), ref.astype(np.int64).tolist()
+        for i in range(0, len(counts), MAX_STREAM):
+            part = slice(i, i + MAX_STREAM)
+            self._link.send(Type.STREAM, stream_body(block.first + i, counts[part], angles[part]))
+
+    def zero(self) -> None:
+        """Output to null. If the port does not take that, the node's deadman does it."""
+        # No silence: the port's end is what read() raises next.
+        with contextlib.suppress(DeviceError):
+            self._link.send(Type.ZERO)
+
+    # Sensor
+
+    def read(self) -> SampleBlock:
+        """All samples since the last call. DeviceError, after the last one that came, when the
+        port is gone, the node has rebooted or its clock jumped, or too many frames are bad."""
+        if self._trouble:
+            raise DeviceError(self._trouble)
+        trouble = self._link.trouble
+        frames = [self._link.samples.popleft() for _ in range(len(self._link.samples))]
+        if not frames and trouble:
+            raise DeviceError(trouble)
+        self._count_bad(frames)
+        starts = self._unwrapped(frames)
+        frames = frames[: len(starts)]
+        raw = np.frombuffer(b"".join(f.data for f in frames), dtype=self._layout)
+        period = self._hello.period_ns
+        steps = [np.arange(f.n, dtype=np.int64) for f in frames]
+        none = np.zeros(0, dtype=np.int64)
+        sequence = np.concatenate([none, *(s + k for (s, _), k in zip(starts, steps, strict=True))])
+        clock = np.concatenate(
+            [none, *(c * 1000 + k * period for (_, c), k in zip(starts, steps, strict=True))]
+        )
+        values = np.empty((len(raw), len(self.channels)))
+        quality = np.zeros((len(raw), len(self.channels)), dtype=np.uint8)
+        out = self._settings.output_counts_per_unit
+        values[:, 0], values[:, 2] = raw["u"] / out, raw["v"] / out
+        x = self._angle
+        values[:, 1] = (raw["theta_ref"].astype(np.int64) - x.offset) / x.counts_per_unit
+        quality[(raw["flags"] & Flag.LIMITED) != 0, 2] = Quality.LIMITED
+        for i, (is_encoder, x) in enumerate(self._inputs, start=3):
+            counts = raw["encoder" if is_encoder else "adc"][:, x.index].astype(np.int64)
+            values[:, i] = (counts - x.offset) / x.counts_per_unit
+            ends = (values[:, i] <= self.channels[i].low) | (values[:, i] >= self.channels[i].high)
+            if not is_encoder:
+                ends |= (counts <= RAILS[0]) | (counts >= RAILS[1])
+            quality[ends, i] = Quality.CLIPPED
+        return SampleBlock(self.channels, clock, sequence, values, quality)
+
+    @property
+    def counts(self) -> dict[str, str]:
+        """How the line did so far, as text."""
+        d = self._link.decoder
+        return {
+            "frames": str(d.frames),
+            "frames_lost": str(d.lost),
+            "frames_corrupt": str(d.corrupt),
+            "frames_stale": str(d.stale),
+            "frames_refused_by_node": str(self._bad),
+            "streams_refused_by_node": str(self._link.refused),
+            "node_last_reason": self._link.last_reason(),
+        }
+
+    def _unwrapped(self, frames: list[Samples]) -> list[tuple[int, int]]:
+        """Sample number and clock (us) of each frame, without their wraps at 2^32, up to where
+        the clock jumps against the count."""
+        starts: list[tuple[int, int]] = []
+        period = self._hello.period_ns / 1000
+        for f in frames:
+            if self._sample < 0:
+                self._sample, self._clock = f.first, f.clock_us
+            else:
+                ahead = (f.first - self._sample) % WORD
+                expected = self._clock + round(ahead * period)
+                off = (f.clock_us - expected + HALF) % WORD - HALF
+                if not 0 < ahead < HALF or abs(off) > period * (CLOCK_SLACK + CLOCK_DRIFT * ahead):
+                    self._trouble = (
+                        f"{self._link.name}: the node's clock jumped by {off * 1e-6:.3g} s against "
+                        f"its count of samples, at sample {f.first}"
+                    )
+                    break
+                self._sample, self._clock = self._sample + ahead, expected + off
+            starts.append((self._sample, self._clock))
+        return starts
+
+    def _count_bad(self, frames: list[Samples]) -> None:
+        """Notice when a second had more bad frames, of both ways, than are allowed."""
+        for f in frames:
+            before = f.rejected if self._rejected is None else self._rejected
+            self._bad += (f.rejected - before) % (1 << 16)
+            self._rejected = f.rejected
+        d, now = self._link.decoder, time.monotonic()
+        total = d.lost + d.stale + self._bad
+        self._history.append((now, total))
+        while self._history[0][0] < now - 1.0:
+            self._history.popleft()
+        bad = total - self._history[0][1]
+        if bad > self._settings.max_bad_frames:
+            self._trouble = (
+                f"{self._link.name}: {bad} frames lost or damaged within a second; allowed "
+                f"{self._settings.max_bad_frames:g} (device.settings.max_bad_frames); check cable "
+                "and shield"
+            )
+
+    def _encoder(self, sensor: str) -> Input:
+        if sensor not in self._settings.encoder:
+            raise DeviceError(f"{self.name}: no encoder {sensor!r} to close the loop on")
+        return self._settings.encoder[sensor]
+
+    def _watched(self) -> int:
+        """The analogue inputs that trip the node when out of range: those with a limit."""
+        return sum(
+            1 << x.index for name, x in self._settings.adc.items() if any(self._rig.limits_on(name))
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class SerialRig(OpenRig):
+    """Releases the port after the output is at null."""
+
+    node: SerialNode
+    link: Link
+
+    def close(self) -> None:
+        """Output to null, port free."""
+        self.actuator.zero()
+        self.metadata.update(self.node.counts)
+        self.link.close()
+
+
+def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
+    """The rig behind the node at `settings["port"]`, its output at null.
+
+    InputError for a wrong setting or a node that is not the rig's, DeviceError if it does not
+    open; one line each, with the remedy.
+    """
+    chosen = read_settings(rig, settings)
+    centring = rig.centring.sensor if rig.centring else rig.sensor[0].name
+    if centring not in chosen.encoder:
+        raise InputError(
+            rig.name, "device.settings.encoder", sorted(chosen.encoder), f"{centring} among them"
+        )
+    link = Link(chosen.port, chosen.baud)
+    try:
+        hello = link.identify(chosen.baud)
+        check_node(rig, chosen, hello)
+        link.send(Type.ZERO)
+        if hello.state is State.TRIPPED and link.request(Type.CLEAR):
+            raise DeviceError(
+                f"{chosen.port}: the node has tripped and its cause is still there; release the "
+                "emergency input, look at the analogue inputs"
+            )
+    except BaseException:
+        link.close()
+        raise
+    node = SerialNode(rig, chosen, link, hello)
+    return SerialRig(
+        node,
+        node,
+        MonotonicClock(),
+        f"serial node {hello.serial} at {chosen.port}, firmware {hello.firmware}",
+        {
+            "device": "serial_node",
+            "clock": "device",
+            "port": chosen.port,
+            "firmware": hello.firmware,
+            "serial": hello.serial,
+            "boot": str(hello.boot),
+            "null_counts": str(hello.null),
+            "device_settings": chosen.model_dump_json(),
+        },
+        node,
+        link,
+    )
+
+
+def _counts(x: float) -> int:
+    """Rounded down, so that a limit stays one; at most what 32 bits hold."""
+    return math.floor(min(x, MOST32) + 1e-9)
+
+
+def _channels(rig: Rig, settings: SerialSettings, centring: str) -> tuple[Channel, ...]:
+    """Columns: u, theta_ref, v under the actuator's name, the sensors in the rig's order."""
+    spec, unit = rig.actuator[0], rig.units()[centring]
+    inputs = settings.encoder | settings.adc
+    step = 1.0 / abs(settings.output_counts_per_unit)
+    return (
+        Channel("u", spec.unit, "reference", description="reference of the excitation"),
+        Channel("theta_ref", unit, "reference", description=f"reference of {centring}"),
+        Channel(
+            spec.name, spec.unit, "command", spec.low, spec.high, step, "as put out by the node"
+        ),
+        *(
+            Channel(
+                s.name,
+                s.unit,
+                "sensor",
+                s.low,
+                s.high,
+                1.0 / abs(inputs[s.name].counts_per_unit),
+                s.calibration,
+            )
+            for s in rig.sensor
+        ),
+    )

@@ -1,0 +1,241 @@
+"""The simulated rig on a pseudo-terminal, in real time, with faults on command.
+
+Commands, one a line, on standard input or in a script (each with its time in s before it):
+
+    line up|down loss|flip|duplicate|reorder P   the line to or from the node gets worse
+    stall S          nothing passes for S seconds, then everything that waited
+    unplug | plug    the port vanishes; comes back, under another name
+    reboot [SAMPLE [CLOCK]]   the node starts again, counting from SAMPLE, its clock from CLOCK us
+    clock US         the node's clock jumps by so much
+    rest             the same, and the rig itself at rest
+    emergency 0|1    the emergency input
+    jump COUNTS      the first encoder reads so much more from now on
+    rail INDEX 0|1   an analogue input is at the end of its range, or no longer
+    history          one line of JSON: what the output did
+    quit
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import select
+import stat
+import sys
+import time
+import tty
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+
+from samii_rig.errors import InputError
+from samii_rig.rig.schema import Rig
+from sim.settings import SimSettings
+from sim.wire.line import FAULTS, Line
+from sim.wire.node import Node
+from sim.wire.plant import Board, Plant, board
+from sim.wire.protocol import RAILS, WORD, NodeConfig
+
+KEPT = 20_000  # samples of the output's history
+MAX_JUMP = 0.05  # rad a sample of the first encoder beyond which the node trips
+READ = 4096  # bytes
+
+
+class WireRig:
+    """Plant, node and port; `run` paces them."""
+
+    def __init__(self, rig: Rig, settings: SimSettings, link: Path | None) -> None:
+        self.board: Board = board(rig)
+        self._link = link
+        self._plant = Plant(rig, self.board, settings)
+        n_encoder = 1 + max((w.index for w in self.board.encoder.values()), default=-1)
+        n_adc = 1 + max((w.index for w in self.board.adc.values()), default=-1)
+        first = next(iter(self.board.encoder.values()))
+        self._config = NodeConfig(
+            period_ns=round(1e9 / rig.rate_hz),
+            deadman_ms=round((rig.actuator[0].deadman or 0.05) * 1e3),
+            n_encoder=n_encoder,
+            n_adc=n_adc,
+            null=self.board.null,
+            max_jump=round(MAX_JUMP * abs(first.counts_per_unit)),
+        )
+        self._node = Node(self._config, 1)
+        self._clock = 0  # us at the node's boot
+        up, down = np.random.SeedSequence(settings.seed).spawn(2)
+        self._lines = {
+            "up": Line(np.random.default_rng(up)),
+            "down": Line(np.random.default_rng(down)),
+        }
+        self._stalled = 0.0
+        self._emergency, self._jump = False, 0
+        self._rails: set[int] = set()
+        self._taken = 0  # samples since boot
+        self._history: deque[tuple[int, int, int]] = deque(maxlen=KEPT)
+        self._master = self._slave = -1
+        self.port = ""
+        self.plug()
+
+    # Port
+
+    def plug(self) -> None:
+        """A port, under a name that the system chooses; `link` leads to it."""
+        if self._master >= 0:
+            return
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.port = os.ttyname(self._slave)
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+            self._link.symlink_to(self.port)
+
+    def unplug(self) -> None:
+        """The port vanishes under whoever has it open; the node runs on."""
+        if self._master >= 0:
+            os.close(self._slave)
+            os.close(self._master)
+            self._master = self._slave = -1
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+
+    # Time
+
+    def run(self, script: list[tuple[float, str]]) -> None:
+        """Until `quit`, or the end of standard input where that is a pipe."""
+        period = self._config.period_ns
+        start, n = time.monotonic_ns(), 0
+        waiting = sorted(script)
+        stdin = [sys.stdin.fileno()]
+        text = b""
+        while True:
+            due = start + n * period
+            wait = max(0.0, (due - time.monotonic_ns()) * 1e-9)
+            ports = [self._master] if self._master >= 0 else []
+            ready, _, _ = select.select(ports + stdin, [], [], wait)
+            if self._master in ready:
+                self._receive()
+            if stdin and stdin[0] in ready:
+                got = os.read(stdin[0], READ)
+                if not got:
+                    if stat.S_ISFIFO(os.fstat(stdin[0]).st_mode):
+                        return
+                    stdin = []
+                *lines, text = (text + got).split(b"\n")
+                for line in lines:
+                    if not self.obey(line.decode()):
+                        return
+            while time.monotonic_ns() >= start + n * period:
+                n += 1
+                self._step()
+            while waiting and (time.monotonic_ns() - start) * 1e-9 >= waiting[0][0]:
+                if not self.obey(waiting.pop(0)[1]):
+                    return
+            self._transmit()
+
+    def _step(self) -> None:
+        encoders, adcs = self._plant.sense()
+        if self._jump:
+            encoders = (encoders[0] + self._jump, *encoders[1:])
+        if self._rails:
+            adcs = tuple(RAILS[1] if i in self._rails else a for i, a in enumerate(adcs))
+        clock = (self._clock + self._taken * self._config.period_ns // 1000) % WORD
+        sample = self._node.sample
+        dac = self._node.take(clock, encoders, adcs, self._emergency)
+        self._taken += 1
+        self._plant.move(dac)
+        self._history.append((sample, dac - self._config.null, time.monotonic_ns()))
+
+    def _receive(self) -> None:
+        try:
+            data = os.read(self._master, READ)
+        except OSError as error:
+            if error.errno not in (errno.EIO, errno.EAGAIN):
+                raise
+            return
+        self._node.receive(self._lines["up"].pass_on(data, held=self._held))
+
+    def _transmit(self) -> None:
+        self._node.receive(self._lines["up"].pass_on(b"", held=self._held))
+        out = self._lines["down"].pass_on(self._node.transmit(), held=self._held)
+        if out and self._master >= 0:
+            # Nobody reads: the bytes are gone, as on a real line.
+            with contextlib.suppress(BlockingIOError):
+                os.write(self._master, out)
+
+    @property
+    def _held(self) -> bool:
+        return time.monotonic() < self._stalled
+
+    # Commands
+
+    def obey(self, line: str) -> bool:
+        """Carry out one command; False for quit. InputError for what is none."""
+        words = line.split()
+        try:
+            match words:
+                case []:
+                    pass
+                case ["quit"]:
+                    return False
+                case ["line", ("up" | "down") as way, name, p] if name in FAULTS:
+                    setattr(self._lines[way], name, float(p))
+                case ["stall", seconds]:
+                    self._stalled = time.monotonic() + float(seconds)
+                case ["unplug"]:
+                    self.unplug()
+                case ["plug"]:
+                    self.plug()
+                    self.say(self.hello())
+                case ["reboot" | "rest" as what, *start] if len(start) <= 2:
+                    sample, self._clock = [*map(int, start), 0, 0][:2] if start else (0, 0)
+                    self._node = Node(self._config, self._node.boot % 0xFFFF + 1, sample)
+                    self._taken = 0
+                    if what == "rest":
+                        self._emergency, self._jump, self._rails = False, 0, set()
+                        self._plant.rest()
+                        self._history.clear()
+                case ["clock", change]:
+                    self._clock += int(change)
+                case ["emergency", level]:
+                    self._emergency = bool(int(level))
+                case ["jump", counts]:
+                    self._jump += int(counts)
+                case ["rail", index, level]:
+                    (self._rails.add if int(level) else self._rails.discard)(int(index))
+                case ["history"]:
+                    self.say(self.history())
+                case _:
+                    raise ValueError(line)
+        except ValueError as error:
+            raise InputError(
+                "wire rig", "command", line, "one of those in sim/wire/rig.py"
+            ) from error
+        return True
+
+    def hello(self) -> dict[str, object]:
+        """What a program needs to know to open the port."""
+        return {"port": self.port, "settings": self.board.settings(self.port)}
+
+    def history(self) -> dict[str, object]:
+        """What the output did. fed : sample at which a stream was accepted last; live : the last
+        sample with another output than null, and its time on the system's monotonic clock."""
+        node, live = self._node, [h for h in self._history if h[1] != 0]
+        last = live[-1] if live else (-1, 0, 0)
+        return {
+            "sample": node.sample,
+            "state": node.state.name,
+            "boot": node.boot,
+            "rejected": node.rejected,
+            "fed": node.fed,
+            "live": last[0],
+            "live_ns": last[2],
+            "v": self._history[-1][1] if self._history else 0,
+        }
+
+    @staticmethod
+    def say(answer: dict[str, object]) -> None:
+        """One line of JSON to whoever started this."""
+        print(json.dumps(answer), flush=True)

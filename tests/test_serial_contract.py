@@ -1,0 +1,29 @@
+"""The driver of the serial node does all that a device must, over a real port in real time."""
+
+from collections.abc import Iterator
+
+import pytest
+from contract import DeviceContract
+from wire_kit import Wire, slow_deadman
+
+from samii_rig.run.protocols import OpenRig
+
+
+@pytest.fixture(scope="class")
+def wire(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Wire]:
+    # A slow machine may feed late; how soon the deadman acts is tested in test_wire_faults.py.
+    w = Wire(rig=str(slow_deadman(tmp_path_factory.mktemp("rig"))))
+    request.cls.wire, request.cls.rig = w, w.rig
+    yield w
+    w.close()
+
+
+@pytest.mark.usefixtures("wire")
+class TestSerialSamii(DeviceContract):
+    wire: Wire
+
+    def open(self) -> OpenRig:
+        self.wire.rest()
+        return self.wire.open()

@@ -1,0 +1,62 @@
+"""A whole run over the wire, in real time: the same response as of the rig in this process."""
+
+from pathlib import Path
+
+import numpy as np
+from wire_kit import Wire, slow_deadman
+
+from experiments.multisine import Multisine
+from samii_rig.rig.load import load_rig
+from samii_rig.rig.schema import Device, Rig
+from samii_rig.run.campaign import Outcome, carry_out
+from samii_rig.run.dryrun import predict
+from samii_rig.run.protocols import Plan
+
+TRIES = 3  # a loaded machine may be later than the reference was sent ahead; the run then trips
+
+SHORT = Multisine(
+    experiment="multisine",
+    name="short",
+    actuator="v_2",
+    unit="V",
+    drive="output",
+    period=1.0,
+    low_hz=4.0,
+    high_hz=30.0,
+    realisations=1,
+    periods=4,
+    ramp=0.2,
+    amplitudes=(0.5,),
+    seed=1,
+)
+
+
+def done(rig: Rig, plan: Plan, path: Path, settings: dict[str, object]) -> Outcome:
+    return carry_out(rig, "", "", plan, predict(plan, rig), path, settings=settings)
+
+
+def test_the_response_over_the_wire_is_that_of_the_rig_in_this_process(tmp_path):
+    file = slow_deadman(tmp_path)
+    rig = load_rig(str(file))[0]
+    plan = SHORT.plan(rig)
+    wire = Wire("--seed", "3", rig=str(file))
+    for i in range(TRIES):
+        wire.rest()
+        wired = done(wire.rig, plan, tmp_path / f"wire{i}.mcap", {})
+        if wired.stop.status == "completed" and wired.stop.late_ticks == 0:
+            break
+    state = wire.history()
+    wire.close()
+    assert wired.stop.status == "completed", wired.stop.reason
+    assert wired.stop.missing_samples == 0
+    assert (state["state"], state["v"]) == ("IDLE", 0)
+    assert wired.recording.metadata["device_device"] == "serial_node"
+
+    plain = rig.model_copy(update={"device": Device()})
+    inside = done(plain, plan, tmp_path / "inside.mcap", {"seed": 4})
+    (a,), (b,) = wired.responses, inside.responses
+    assert np.array_equal(a.frequency, b.frequency)
+    # In units of the standard deviation of the difference, squared: 1 in the mean.
+    apart = np.abs(a.H - b.H) ** 2 / (a.variance() + b.variance())
+    assert 0.3 < np.median(apart) < 1.5
+    assert np.mean(apart < 9.0) > 0.97

@@ -1,0 +1,106 @@
+"""The simulated rig on a serial port, in its own process, for tests of the real driver."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from samii_rig.rig.load import load_rig
+from samii_rig.rig.schema import Device, Rig
+from samii_rig.run.devices import open_device
+from samii_rig.run.protocols import OpenRig
+
+STARTED_WITHIN = 60.0  # s, with cold caches
+
+
+class Wire:
+    """`python -m sim.wire`, and the rig whose driver leads to it."""
+
+    def __init__(self, *options: str, rig: str = "samii") -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "sim.wire", "--rig", rig, *options],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        plain = load_rig(rig)[0]
+        self.settings = self._answer()["settings"]
+        device = Device(driver="serial_node", settings=self.settings)
+        self.rig: Rig = plain.model_copy(update={"device": device})
+
+    def open(self, **settings: object) -> OpenRig:
+        return open_device(self.rig, settings)
+
+    def rest(self) -> None:
+        """Rig and node as new."""
+        self.tell("rest")
+        assert self.history()["v"] == 0
+
+    def tell(self, *commands: str) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.write("".join(f"{c}\n" for c in commands))
+        self.process.stdin.flush()
+
+    def history(self) -> dict:
+        self.tell("history")
+        return self._answer()
+
+    def plug(self) -> str:
+        """The port's new name."""
+        self.tell("plug")
+        return self._answer()["port"]
+
+    def _answer(self) -> dict:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, "the simulated rig has ended"
+        return json.loads(line)
+
+    def close(self) -> None:
+        assert self.process.stdin is not None
+        self.process.stdin.close()
+        self.process.wait(10)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+    def rig_file(self, folder: Path) -> Path:
+        """The shipped rig with its driver changed, as a file."""
+        text = load_rig("samii")[1]
+        head = text[: text.index("[device]")]
+        tables = [self._table(kind) for kind in ("encoder", "adc")]
+        path = folder / "wired.toml"
+        path.write_text(
+            head + '[device]\ndriver = "serial_node"\n\n[device.settings]\n'
+            f'port = "{self.settings["port"]}"\n'
+            f"output_counts_per_unit = {self.settings['output_counts_per_unit']}\n\n"
+            + "".join(tables)
+        )
+        return path
+
+    def _table(self, kind: str) -> str:
+        rows = [f"[device.settings.{kind}]\n"]
+        for name, w in self.settings[kind].items():
+            rows.append(
+                f"{name} = {{ index = {w['index']}, counts_per_unit = {w['counts_per_unit']}, "
+                f"offset = {w['offset']} }}\n"
+            )
+        return "".join(rows)
+
+
+def slow_deadman(folder: Path) -> Path:
+    """The shipped rig with a deadman of 0.2 s."""
+    path = folder / "slow.toml"
+    path.write_text(load_rig("samii")[1].replace("deadman = 0.05", "deadman = 0.2"))
+    return path
+
+
+def until(what, seconds: float = 2.0) -> float:
+    """Wait until `what()` is true; the time that it took, s."""
+    start = time.monotonic()
+    while not what():
+        assert time.monotonic() - start < seconds, "it did not happen"
+        time.sleep(0.002)
+    return time.monotonic() - start
