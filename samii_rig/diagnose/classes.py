@@ -16,6 +16,7 @@ from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig
 
 SAME = 3.0  # noise units below which two explanations are one
+RIVAL = 4.0  # of the logarithm of evidence, below the first, up to which a member is a name
 LEAST = 1e-3  # probability of an explanation that may begin a class of its own
 LOOKED_AT = 24  # explanations for which distances are computed
 TWIN = 1e-7  # relative difference of responses below which two effects are one by structure
@@ -51,7 +52,11 @@ class Class:
         return [n for n in dict.fromkeys(out) if n != effect.name]
 
     def names(self) -> int:
-        """How many different names of one cause the class holds at most; aliases are one."""
+        """How many different names of one cause the class holds at most; aliases are one.
+
+        A law with more freedom that holds the first as a special case is no further name:
+        the evidence has paid for that freedom.
+        """
         mine = {e.key for e in self.first.effects}
         count = 1
         for effect in self.first.effects:
@@ -59,6 +64,7 @@ class Class:
             others = {
                 e.name
                 for m in self.members[1:]
+                if m.weight > self.first.weight - RIVAL
                 for e in m.effects
                 if e.key not in mine and {x.key for x in m.effects} & mine == kept
             }

@@ -32,7 +32,7 @@ POINTS = 80
 WIDER = 2.0  # how far a band is widened at either end
 STIFF = 1e9  # N m/rad and N/m: a brace that does not give
 KNOWN = 0.1  # of the chain's own mass, a mass that is added
-RIVALS = 2  # classes that are to be told from the leading one
+LIKELY = 0.05  # probability from which another class is to be told apart
 
 
 def next_experiment(search: Search, judged: Judgement) -> tuple[str, str]:
@@ -64,11 +64,17 @@ def _rivals(judged: Judgement) -> tuple[Explanation, Explanation] | None:
     if judged.verdict == "no_mismatch":
         return None
     names = {e.name for e in top.first.effects}
+
+    def rivals(other: Explanation) -> bool:
+        # The same with one part more is no other explanation.
+        return not names <= {e.name for e in other.effects}
+
     for member in top.members[1:]:
-        if {e.name for e in member.effects} != names:
+        if rivals(member):
             return top.first, member
-    if len(judged.classes) > 1 and judged.classes[1].probability > 0.05:
-        return top.first, judged.classes[1].first
+    for other in judged.classes[1:]:
+        if other.probability > LIKELY and (rivals(other.first) or not names):
+            return top.first, other.first
     return None
 
 

@@ -3,6 +3,7 @@
     OUT/recordings/<trial>/*.mcap      what the diagnosis reads
     OUT/truth/<trial>.json             what it must not read, written before
     OUT/answers/<trial>.json           what it said
+    OUT/sizes/<trial>.json             how large the effect is in the data (`prove.size`)
 
 The plant that makes the recordings is found by its entry point (`samii_rig.plants`), as devices
 are: nothing here knows it. A process that diagnoses refuses to open a truth (an audit hook, which
@@ -25,10 +26,14 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+
 from samii_rig.errors import InputError, SamiiRigError
 from samii_rig.prove.trial import Answer, Hidden, Trial, Truth
 from samii_rig.record.export import replacing
-from samii_rig.record.reader import read_notes
+from samii_rig.record.reader import read_notes, read_recording
+from samii_rig.rig.load import parse
+from samii_rig.rig.schema import Rig
 
 GROUP = "samii_rig.plants"
 KINDS = ("nothing", "one", "two", "outside", "joints")
@@ -122,12 +127,32 @@ def _one(campaign: Campaign, kind: str, seed: int) -> None:
     said = _Reader.of(campaign.out / "truth").diagnose(folder)
     if "error" in said:
         raise SamiiRigError(said["error"])
-    answer.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(answer) as part:
-        part.write_text(json.dumps(said, indent=1), encoding="utf-8")
+    _write(campaign.out / "sizes" / answer.name, {"size": _size(folder, truth)})
+    _write(answer, said)
     if not campaign.keep:
         for log in folder.glob("*.mcap"):
             log.unlink()
+
+
+def _size(folder: Path, truth: Path) -> float:
+    """Sigma that the best simpler explanation leaves; the drawn one where nothing was recorded
+    to compute it from."""
+    from samii_rig.prove.size import size_of
+
+    told = json.loads(truth.read_text("utf-8"))
+    arrays = truth.with_suffix(".npz")
+    if not arrays.exists():
+        return float(told["size"])
+    log = min(folder.glob("*.mcap"))
+    rig = parse(Rig, read_recording(log).rig_toml, str(log))
+    with np.load(arrays) as held:
+        return size_of(told, held, rig)
+
+
+def _write(path: Path, data: Mapping[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as part:
+        part.write_text(json.dumps(data, indent=1), encoding="utf-8")
 
 
 def plant(name: str) -> Callable[[str, int, Path, str], Path]:
@@ -189,6 +214,8 @@ def results(out: Path) -> list[Trial]:
         truth = json.loads((out / "truth" / answer.name).read_text("utf-8"))
         said = json.loads(answer.read_text("utf-8"))
         effects = tuple(Hidden(e["physics"], e["site"], e["parameters"]) for e in truth["effects"])
-        hidden = Truth(truth["kind"], truth["seed"], effects, truth["size"])
+        sized = out / "sizes" / answer.name
+        size = json.loads(sized.read_text("utf-8"))["size"] if sized.exists() else truth["size"]
+        hidden = Truth(truth["kind"], truth["seed"], effects, size)
         trials.append(Trial(hidden, Answer.of(said)))
     return sorted(trials, key=lambda t: (KINDS.index(t.truth.kind), t.truth.seed))

@@ -36,7 +36,8 @@ def render(trials: Sequence[Trial], title: str) -> str:
         title=title,
         subtitle=f"{len(trials)} concealed trials: {kinds['nothing']} hide nothing, "
         f"{kinds['one']} one effect, {kinds['two']} two, "
-        f"{kinds['joints']} the give of every joint, {kinds['outside']} something outside the vocabulary. Every interval holds 90 %.",
+        f"{kinds['joints']} the give of every joint, {kinds['outside']} something outside the "
+        "vocabulary. Every interval holds 90 %.",
         style=Markup(style),
         scores=[_row(s) for s in scores(trials)],
         calibration=Markup(figures.calibration(trials)),

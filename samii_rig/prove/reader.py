@@ -42,7 +42,7 @@ def diagnose_folder(folder: Path) -> dict[str, Any]:
         raise InputError(str(folder), "", "no recording", "a folder with .mcap files")
     recordings = [read_recording(log) for log in logs]
     rig = parse(Rig, recordings[0].rig_toml, str(logs[0]))
-    return diagnose(estimate(recordings), rig).plain()
+    return diagnose(estimate(recordings), rig, runs=recordings).plain()
 
 
 def main() -> None:

@@ -15,6 +15,10 @@ from samii_rig.signal.spectra import burst_spectra, excited, period, spectrum
 
 Method = Literal["auto", "burst", "periodic", "local", "h1", "h2", "hv"]
 
+# Standard deviations of a mean beyond which it has moved; bursts in a row of which the first may
+# be left out for that.
+MOVED, ROW_TO_SETTLE = 10.0, 4
+
 
 def drop_stuck(group: Group, *, chosen: bool) -> None:
     """Leave out outputs that never changed in any piece; refuse when they were asked for."""
@@ -99,7 +103,21 @@ def choose(
             )
         group.findings.append(ring.finding)
         return "local", "the bursts do not end at rest: transients are removed by local models"
+    if _in_a_row(group) and n >= ROW_TO_SETTLE and _moves(group):
+        group.unsettled = 1
+        return "settled", (
+            f"the level moves from burst to burst: all but the first of {n} are whole periods of "
+            "one motion, from which a slow drift is taken out"
+        )
     return "burst", f"{n} bursts from rest to rest with one reference: no leakage"
+
+
+def _moves(group: Group) -> bool:
+    """Whether the mean of a channel differs from burst to burst by more than white noise does."""
+    pieces = group.pieces
+    sd = np.std(pieces[-1].z - pieces[-2].z, axis=0)
+    steps = np.abs(np.diff([p.z.mean(axis=0) for p in pieces], axis=0))
+    return bool(np.any(steps > MOVED * sd / np.sqrt(len(pieces[0]))))
 
 
 def _settling(group: Group, ring: Ringing) -> int:

@@ -22,6 +22,7 @@ SMOOTH_LINES = 9  # the ripple of a swept sine's spectrum is shorter
 TAPER = 0.1  # of the length at most, on either end
 # A step from head to tail is one above this many standard deviations.
 STEP_SIGMA = 5.0
+DRIFT_ORDER = 2  # of the polynomial in time; the means of few periods tell no more
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,18 +103,35 @@ def settled_spectra(pieces: Sequence[Piece], rate_hz: float) -> tuple[list[Spect
     each piece is faded over into its predecessor, which changes nothing in the motion, since the
     two are one there, but lets the noise run on smoothly from the end to the start.
 
+    What the means of the settled pieces say of a drift is taken out first: it would be a jump
+    from the end of each period to its start, alike in all of them, which no scatter shows.
+
     Also the correlation of white noise between neighbours, which share the tail faded over.
     """
     tail = min(rests(pieces[0].r)[1] // 2, int(TAPER * len(pieces[0])))
     fade = np.cos(np.pi / 2 * (np.arange(tail) + 0.5) / max(tail, 1))[:, None] ** 2
     out = []
-    for before, piece in pairwise(pieces):
+    for before, piece in pairwise(_steady(pieces)):
         z = piece.z.copy()
         end = slice(len(piece) - tail, None)
         z[end] = fade * z[end] + (1 - fade) * before.z[end]
         out.append(spectrum(replace(piece, z=z), rate_hz))
     both = float(np.sum(fade * (1 - fade)))
     return out, both / (len(pieces[0]) - 2 * both)
+
+
+def _steady(pieces: Sequence[Piece]) -> list[Piece]:
+    """The pieces less a parabola in time through the means of all but the first."""
+    n, settled = len(pieces[0]), len(pieces) - 1
+    if settled < 2:
+        return list(pieces)
+    means = np.stack([p.z.mean(axis=0) for p in pieces[1:]])
+    law = np.polynomial.polynomial.polyfit(np.arange(settled), means, min(settled - 1, DRIFT_ORDER))
+    time = (np.arange(n) + 0.5) / n - 0.5
+    return [
+        replace(p, z=p.z - np.polynomial.polynomial.polyval(time + i, law).T)
+        for i, p in enumerate(pieces, start=-1)
+    ]
 
 
 def rests(r: Float) -> tuple[int, int]:

@@ -1,0 +1,92 @@
+"""How large a concealed effect is in the data: what is left when everything simpler did its best.
+
+The size in sigma is the root of the least chi-square, at the noise of the estimate, of the
+refitted nominal model against the noise-free truth; with two effects of the best model with one
+of them, outside the vocabulary of the best single effect within it. What a refit absorbs is
+not in the data. The truth's own `size` is drawn with a linear refit and is larger where the
+refit goes far.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from samii_rig.diagnose.diagnose import table
+from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.measured import Measured
+from samii_rig.diagnose.model import grid
+from samii_rig.diagnose.search import FIRST, Search
+from samii_rig.rig.schema import Rig
+from samii_rig.types import Complex, Float
+
+ARRAYS = ("frequency", "linear", "level", "reference", "sensitivity", "open_noise")
+
+
+def size_of(truth: Mapping[str, Any], arrays: Mapping[str, Any], rig: Rig) -> float:
+    """The size, sigma, of what `truth` conceals from the nominal `rig`.
+
+    arrays : of the truth: `frequency` (n,) Hz, `linear` (n, q) or `settled` (levels, n, q),
+        `level`, `reference` (n,), `sensitivity` (n,), `open_noise` (n, q, q).
+    """
+    lines = _lines(truth, arrays, rig)
+    at = grid(rig, lines.frequency, lines.sensor, lines.actuator)
+    smaller = _smaller(truth, rig, float(lines.frequency[0]), float(lines.frequency[-1]))
+    search = Search(rig, lines, at, smaller)
+    if smaller:
+        search.grow(search.nominal, FIRST)
+    least = min(e.fitted.chi2 for e in search.found.values())
+    return math.sqrt(least + search.problem.data.inside[0])
+
+
+def _smaller(truth: Mapping[str, Any], rig: Rig, low: float, high: float) -> list[Effect]:
+    """Effects of which one may explain the truth before it counts as more."""
+    if truth["kind"] not in ("two", "outside"):
+        return []
+    every = table(rig, low, high)
+    names = {(e["physics"], e["site"]) for e in truth["effects"]}
+    if truth["kind"] == "two":
+        return [e for e in every if names & set(e.names)]
+    return every
+
+
+def _lines(truth: Mapping[str, Any], arrays: Mapping[str, Any], rig: Rig) -> Measured:
+    f: Float = arrays["frequency"]
+    design = truth["design"]
+    samples = design["burst"] * rig.rate_hz
+    unit = np.abs(arrays["reference"] * arrays["sensitivity"]) ** 2 * (design["bursts"] - 1)
+    C = arrays["open_noise"].astype(complex) * (samples / unit)[:, None, None]
+    # Twice the inverse covariance: real and imaginary parts have half the variance each.
+    W: Complex = 2 * np.linalg.inv(C)
+    settled = arrays.get("settled")
+    levels = [float(x) for x in arrays["level"]]
+    q = W.shape[1]
+    if settled is None:
+        H, W = arrays["linear"], W * sum(x**2 for x in levels)
+        level = np.full(f.size, -1)
+    else:
+        order = np.argsort(np.tile(f, len(levels)), kind="stable")
+        H = np.concatenate(list(settled))[order]
+        W = np.concatenate([W * x**2 for x in levels])[order]
+        level = np.repeat(np.arange(len(levels)), f.size)[order]
+        f = np.tile(f, len(levels))[order]
+    names = [s.name for s in rig.sensor]
+    sensors = truth["design"]["sensors"] or names
+    return Measured(
+        frequency=f,
+        H=np.asarray(H, complex).reshape(f.size, q),
+        W=W,
+        expected=np.full(f.size, 2.0 * q),
+        level=level.astype(np.int64),
+        scatter=np.full(f.size, 4.0 * q),
+        levels=tuple((x, rig.actuator[0].unit) for x in levels),
+        periodic=(False,) * len(levels),
+        sensor=np.array([names.index(s) for s in sensors], dtype=np.int64),
+        actuator=np.zeros(q, dtype=np.int64),
+        outputs=tuple(sensors),
+        inside=(0.0, 0.0),
+        rate_hz=rig.rate_hz,
+    )
