@@ -362,3 +362,18 @@ def test_a_wrong_option_costs_one_line(
     assert error.startswith(said)
     assert error.count("\n") == 1
     assert "--help" in error
+
+
+def test_ctrl_c_during_the_diagnosis_leaves_the_run_and_its_page(
+    sweep: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("samii_rig.diagnose.diagnose.diagnose", stopped)
+    log = tmp_path / "run.mcap"
+    code, said = call("run", sweep, "--rig", "samii", "--out", log, "--seed", 3)
+    assert code == 0
+    assert "no diagnosis: stopped by Ctrl-C" in said
+    assert read_recording(log).stop.status == "completed"
+    assert log.with_suffix(".html").exists()

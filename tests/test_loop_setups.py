@@ -200,20 +200,6 @@ def test_ctrl_c_while_a_run_is_estimated_starts_no_other(bench, monkeypatch, ask
     assert bench.kind.concluded == 0
 
 
-def test_ctrl_c_while_a_run_is_diagnosed_starts_no_other(bench, monkeypatch):
-    from samii_rig.diagnose import diagnose
-
-    def waits(*args, **how):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(diagnose, "diagnose", waits)
-    result, left = bench.go(asks=False, options=())
-    assert result.exit_code == 130, result.output
-    assert left == ["t_1.mcap"]
-    assert bench.status("t_1.mcap") == "completed"
-    assert "stopped by Ctrl-C" in result.output
-
-
 def test_a_signal_while_the_recording_is_closed_is_not_lost(bench, monkeypatch):
     """It disturbs nothing, and the next run does not start."""
     closing = campaign.RunWriter.close

@@ -136,11 +136,12 @@ def run(
                 operator,
                 console,
                 report=not no_report,
-                diagnosis=not no_diagnosis,
+                # Between runs a person waits; `samii-rig diagnose` takes them all together.
+                diagnosis=not no_diagnosis and len(setups) == 1,
                 json=json,
             )
         )
-        if done[-1].outcome.stop.status != "completed" or done[-1].interrupted:
+        if done[-1].outcome.stop.status != "completed" or done[-1].outcome.interrupted:
             break
     lines: tuple[str, ...] = ()
     written: tuple[Path, ...] = ()
@@ -191,14 +192,13 @@ def _ask(setup: Setup, i: int, n: int, console: Console, json: bool) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Done:
-    """One run, with what is said of it. interrupted : a person asked for an end meanwhile."""
+    """One run, with what is said of it."""
 
     outcome: Outcome
     predicted: DryRun
     curve: ModelCurve | None
     page: Path | None
     diagnosis: Diagnosis | None
-    interrupted: bool
 
     def as_json(self) -> dict[str, Any]:
         """As plain data."""
@@ -248,9 +248,7 @@ def _carry_out(
             progress=None if json else live,
         )
     curve = model_curve(setup.rig, outcome.responses)
-    found, given_up = None, False
-    if diagnosis:
-        found, given_up = _diagnosed(setup, outcome, console, json=json)
+    found = _diagnosed(setup, outcome, console, json=json) if diagnosis else None
     page = None
     if report:
         from samii_rig.record.reader import read_events
@@ -277,38 +275,32 @@ def _carry_out(
         console.print(f"\nrecording  {path}", soft_wrap=True)
         if page:
             console.print(f"report     {page}", soft_wrap=True)
-    interrupted = given_up or bool(outcome.interrupted)
-    return _Done(outcome, predicted, curve, page, found, interrupted)
+    return _Done(outcome, predicted, curve, page, found)
 
 
-def _diagnosed(
-    setup: Setup, outcome: Outcome, console: Console, *, json: bool
-) -> tuple[Diagnosis | None, bool]:
-    """What the rig file leaves out, None where the run has nothing to tell that from; and
-    whether a person gave it up."""
+def _diagnosed(setup: Setup, outcome: Outcome, console: Console, *, json: bool) -> Diagnosis | None:
+    """What the rig file leaves out; None where the run has nothing to tell that from."""
     from samii_rig.diagnose.diagnose import diagnose
     from samii_rig.errors import EstimateError, InputError
 
-    given_up = False
-    if not outcome.responses:
-        return None, given_up
+    # Who stopped a run, or whose run tripped, wants to see that first.
+    if not outcome.responses or outcome.stop.status != "completed" or outcome.interrupted:
+        return None
     try:
         with nullcontext() if json else console.status("diagnosis ...") as status:
-            found = diagnose(
+            return diagnose(
                 outcome.responses,
                 setup.rig,
                 progress=lambda stage: status.update(f"diagnosis: {stage} ...") if status else None,
             )
-            return found, given_up
     except (EstimateError, InputError) as error:
         why = str(error)
     except KeyboardInterrupt:
-        # The run itself is over and whole; its page is still to be written, no other run follows.
-        given_up = True
+        # The run itself is over and whole; its page is still to be written.
         why = "stopped by Ctrl-C; `samii-rig diagnose` makes it up"
     if not json:
         console.print(f"no diagnosis: {why}", soft_wrap=True)
-    return None, given_up
+    return None
 
 
 def _prediction(predicted: DryRun) -> dict[str, Any]:
