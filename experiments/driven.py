@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, field_validator
 
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Finite, Name, Positive, Rig, Strict
 from samii_rig.run.limits import find_actuator
+from samii_rig.run.protocols import Plan, PlannedSegment
 from samii_rig.signal.excitation import Interpolation
+from samii_rig.types import Float
 
 # Above this part of the rate a sampled sine looks like another one for the hold and the
 # sensors' filters, and the anti-alias filters cut.
@@ -78,3 +81,22 @@ class Driven(Strict):
         if kp == 0 and self.drive == "reference":
             raise InputError(where, "kp", kp, "above 0: the reference acts through kp alone")
         return kp, centring.sensor if centring else rig.sensor[0].name
+
+    def references(self, wave: Float) -> tuple[Float, Float]:
+        """u and theta_ref, (n,) each, that drive with `wave` (n,); the other one rests."""
+        rest = np.zeros_like(wave)
+        return (wave, rest) if self.drive == "output" else (rest, wave)
+
+    def planned(
+        self, rig: Rig, kp: float, sensor: str, segments: tuple[PlannedSegment, ...]
+    ) -> Plan:
+        """The plan of these segments, with the loop that `loop` gave."""
+        return Plan(
+            experiment=self.name,
+            rate_hz=rig.rate_hz,
+            actuator=self.actuator,
+            kp=kp,
+            centring_sensor=sensor,
+            segments=segments,
+            seed=self.seed,
+        )

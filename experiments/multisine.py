@@ -91,16 +91,11 @@ class Multisine(Driven):
             raise InputError(where, "period", self.period, least)
         shape = schedule_factor(lines.excited / self.period, self.schedule, self.interpolation)
         waves = realisations(n, lines.excited, shape, self.crest, self.realisations, phases)
-        return Plan(
-            experiment=self.name,
-            rate_hz=rig.rate_hz,
-            actuator=self.actuator,
-            kp=kp,
-            centring_sensor=sensor,
-            segments=tuple(
-                self._segment(rig.rate_hz, level, i, waves[i]) for level, i in self._order()
-            ),
-            seed=self.seed,
+        return self.planned(
+            rig,
+            kp,
+            sensor,
+            tuple(self._segment(rig.rate_hz, level, i, waves[i]) for level, i in self._order()),
         )
 
     def _segment(self, rate_hz: float, level: float, i: int, wave: Float) -> PlannedSegment:
@@ -108,16 +103,16 @@ class Multisine(Driven):
         before = ramp + (self.settle - 1) * n
         stop = before + (1 + self.periods) * n
         turn = np.arange(-before, stop - before + ramp) % n
-        u = level * wave[turn] * cosine_ramp(turn.size, rate_hz, ramp / rate_hz)
-        rest = np.zeros_like(u)
+        wave = level * wave[turn] * cosine_ramp(turn.size, rate_hz, ramp / rate_hz)
+        u, theta_ref = self.references(wave)
         return PlannedSegment(
             name=f"{self.name}_{level:g}_{i + 1}",
             kind="periodic",
             level=level,
             unit=self.unit,
             repeat=i,
-            u=u if self.drive == "output" else rest,
-            theta_ref=rest if self.drive == "output" else u,
+            u=u,
+            theta_ref=theta_ref,
             band_hz=(self.low_hz, self.high_hz),
             frequency=np.full(u.shape, np.inf),
             recorded=(before, stop),

@@ -46,10 +46,9 @@ class Step(Driven):
             longest = f"a plan of at most {MOST_SAMPLES / rig.rate_hz / 3600:.0f} hours"
             raise InputError(where, "ring_down", self.ring_down, longest)
         shape = np.repeat([0.0, 1.0, 0.0], n)
-        rest = np.zeros_like(shape)
         segments = []
         for level in self.amplitudes:
-            wave = level * shape
+            u, theta_ref = self.references(level * shape)
             for repeat in range(self.repeats):
                 segments.append(
                     PlannedSegment(
@@ -58,18 +57,10 @@ class Step(Driven):
                         level=level,
                         unit=self.unit,
                         repeat=repeat,
-                        u=wave if self.drive == "output" else rest,
-                        theta_ref=rest if self.drive == "output" else wave,
+                        u=u,
+                        theta_ref=theta_ref,
                         band_hz=(1 / sum(times.values()), HIGHEST * rig.rate_hz),
                         frequency=np.full(shape.shape, np.nan),
                     )
                 )
-        return Plan(
-            experiment=self.name,
-            rate_hz=rig.rate_hz,
-            actuator=self.actuator,
-            kp=kp,
-            centring_sensor=sensor,
-            segments=tuple(segments),
-            seed=self.seed,
-        )
+        return self.planned(rig, kp, sensor, tuple(segments))

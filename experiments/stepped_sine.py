@@ -112,18 +112,15 @@ class SteppedSine(Driven):
             longest_h = MOST_SAMPLES / rig.rate_hz / 3600
             raise InputError(where, "most", self.most, f"a plan of at most {longest_h:.0f} hours")
         factor = schedule_factor(hz, self.schedule, self.interpolation)
-        return Plan(
-            experiment=self.name,
-            rate_hz=rig.rate_hz,
-            actuator=self.actuator,
-            kp=kp,
-            centring_sensor=sensor,
-            segments=tuple(
+        return self.planned(
+            rig,
+            kp,
+            sensor,
+            tuple(
                 self._segment(rig.rate_hz, level, factor[i], *lines[i], settle[i], names)
                 for level in self.amplitudes
                 for i in self._order(hz)
             ),
-            seed=self.seed,
         )
 
     def _wanted_hz(self) -> Float:
@@ -161,18 +158,18 @@ class SteppedSine(Driven):
         t = np.arange(last + ramp)
         f = cycles * rate_hz / block
         # The phase counts from the dwell, so that every block is the very same samples.
-        u = level * factor * np.sin(2 * np.pi * ((t - first) % block) * cycles / block)
-        u[:ramp] *= 0.5 - 0.5 * np.cos(np.pi * t[:ramp] / ramp)
-        u[last:] *= 0.5 + 0.5 * np.cos(np.pi * (t[last:] - last) / ramp)
-        rest = np.zeros_like(u)
+        wave = level * factor * np.sin(2 * np.pi * ((t - first) % block) * cycles / block)
+        wave[:ramp] *= 0.5 - 0.5 * np.cos(np.pi * t[:ramp] / ramp)
+        wave[last:] *= 0.5 + 0.5 * np.cos(np.pi * (t[last:] - last) / ramp)
+        u, theta_ref = self.references(wave)
         return PlannedSegment(
             name=f"{self.name}_{level:g}_{f:.4g}Hz",
             kind="periodic",
             level=level,
             unit=self.unit,
             repeat=0,
-            u=u if self.drive == "output" else rest,
-            theta_ref=rest if self.drive == "output" else u,
+            u=u,
+            theta_ref=theta_ref,
             band_hz=(f, f),
             frequency=np.full(u.shape, f),
             recorded=(first, last),

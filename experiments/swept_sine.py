@@ -98,12 +98,11 @@ class SweptSine(Driven):
             interpolation=self.interpolation,
         )
         band = (min(self.start_hz, self.stop_hz), max(self.start_hz, self.stop_hz))
-        rest = np.zeros_like(shape)
         levels = {level: level * shape for level in self.amplitudes}
         segments = []
         for level, repeat in self._order():
             wave = levels[level]
-            u, theta_ref = (wave, rest) if self.drive == "output" else (rest, wave)
+            u, theta_ref = self.references(wave)
             segments.append(
                 PlannedSegment(
                     name=f"{self.name}_{level:g}_{repeat + 1}",
@@ -117,15 +116,7 @@ class SweptSine(Driven):
                     frequency=frequency,
                 )
             )
-        return Plan(
-            experiment=self.name,
-            rate_hz=rig.rate_hz,
-            actuator=self.actuator,
-            kp=kp,
-            centring_sensor=sensor,
-            segments=tuple(segments),
-            seed=self.seed,
-        )
+        return self.planned(rig, kp, sensor, tuple(segments))
 
     def _order(self) -> list[tuple[float, int]]:
         """(level, repeat) of each segment. Repeats of a level stay in order, so that a
