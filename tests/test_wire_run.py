@@ -56,7 +56,8 @@ def test_the_response_over_the_wire_is_that_of_the_rig_in_this_process(tmp_path)
     inside = done(plain, plan, tmp_path / "inside.mcap", {"seed": 4})
     (a,), (b,) = wired.responses, inside.responses
     assert np.array_equal(a.frequency, b.frequency)
-    # In units of the standard deviation of the difference, squared: 1 in the mean.
+    # In units of the standard deviation of the difference, squared. Over 780 pairs of runs of one
+    # rig the median of these 40 values lay between 0.16 and 0.87; a gain 1 % off makes it 80.
     apart = np.abs(a.H - b.H) ** 2 / (a.variance() + b.variance())
-    assert 0.3 < np.median(apart) < 1.5
-    assert np.mean(apart < 9.0) > 0.97
+    assert 0.05 < np.median(apart) < 1.5
+    assert np.mean(apart < 16.0) > 0.9
