@@ -18,7 +18,7 @@ Complex = NDArray[np.complex128]
 Int = NDArray[np.int64]
 Flags = NDArray[np.uint8]
 
-Role = Literal["reference", "command", "sensor"]
+Role = Literal["reference", "command", "sensor", "monitor"]
 
 
 class Quality(IntFlag):
@@ -36,7 +36,8 @@ class Channel:
     """One column of a recording.
 
     role: `reference` was chosen by us and is known exactly (the excitation u),
-    `command` went out to the actuator (v), `sensor` was measured.
+    `command` went out to the actuator (v), `sensor` was measured, `monitor` says how the rig
+    is (a supply pressure) and no response is estimated from it.
     low, high: ends of the converter's range in `unit`.
     resolution: one step of the converter in `unit`; 0 when unknown.
     """
@@ -108,8 +109,8 @@ class StopRecord:
 class Finding:
     """Something noticed in the data that is not physics, in plain words.
 
-    kind : one of gap, clipping, stuck, repeat, leakage, timing, offset, saturation,
-        closed_loop, distortion, dof.
+    kind : one of gap, clipping, range, stuck, repeat, leakage, timing, clock, offset,
+        saturation, closed_loop, distortion, dof.
     severity : `note` tells, `warning` weakens the result, `error` made us exclude or refuse.
     """
 

@@ -17,6 +17,7 @@ The device, at each sample:
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
@@ -36,7 +37,8 @@ from sim.settings import SimSettings, read_settings
 NEVER = np.iinfo(np.int64).max  # a sample that does not come
 CHUNK = 4096  # samples in one call of the inner loop, so that memory stays bounded
 NS = 1_000_000_000
-UNRELATED = {"description", "limit", "centring", "feedback", "device"}  # to the continuous response
+# To the continuous response.
+UNRELATED = {"description", "limit", "centring", "feedback", "monitor", "device", "service"}
 
 
 class SimulatedDevice:
@@ -52,6 +54,7 @@ class SimulatedDevice:
         spec = rig.actuator[0]
         self.name, self.deadman = spec.name, spec.deadman
         self.channels = device_channels(rig)
+        self._usual = np.array([m.usual for m in rig.monitor])
         self.realisation = realised(rig.model_dump_json(exclude=UNRELATED), settings.band_hz)
         self._tables = tabulate(rig, self.realisation, settings.inner)
         self._converters = converters(rig, settings)
@@ -64,6 +67,7 @@ class SimulatedDevice:
         self._disturbance = np.random.default_rng(disturbance)
         self._queue: list[CommandBlock] = []
         self._now = 0
+        self._began = time.monotonic()
         self._arrived: list[tuple[int, Float, Flags]] = []
 
     # Actuator
@@ -147,14 +151,23 @@ class SimulatedDevice:
         """Move time on, and with it everything else: all samples before the new time."""
         if seconds > 0.0:
             self._now += round(seconds * NS)
+            if self._settings.pace > 0.0:
+                self._wait()
         due = -(-self._now * self._rig.rate_hz // NS)
         while (taken := int(self._state.flag[kernel.SAMPLE])) < due:
             self._advance(taken, min(int(due) - taken, CHUNK))
 
+    def _wait(self) -> None:
+        """Let real time catch up with simulated time, divided by the pace."""
+        behind = self._now * 1e-9 / self._settings.pace - (time.monotonic() - self._began)
+        if behind > 0.0:
+            time.sleep(behind)
+
     def _advance(self, first: int, n: int) -> None:
         u, theta_ref, given = self._references(first, n)
-        values = np.empty((n, len(self.channels)))
-        quality = np.empty((n, len(self.channels)), dtype=np.uint8)
+        columns = len(self.channels) - self._usual.size
+        values = np.empty((n, columns))
+        quality = np.empty((n, columns), dtype=np.uint8)
         none = np.zeros((0, 0))
         noisy = self._settings.noise
         noise = self._noise.standard_normal((n, len(self._rig.sensor))) if noisy else none
@@ -176,6 +189,9 @@ class SimulatedDevice:
             values,
             quality,
         )
+        if self._usual.size:
+            values = np.column_stack([values, np.tile(self._usual, (n, 1))])
+            quality = np.pad(quality, ((0, 0), (0, self._usual.size)))
         self._arrived.append((first, values, quality))
 
     def _references(self, first: int, n: int) -> tuple[Float, Float, Flags]:
@@ -249,6 +265,10 @@ def device_channels(rig: Rig) -> tuple[Channel, ...]:
         *(
             Channel(s.name, s.unit, "sensor", s.low, s.high, s.resolution, s.calibration)
             for s in rig.sensor
+        ),
+        *(
+            Channel(m.name, m.unit, "monitor", m.low, m.high, m.resolution, m.calibration)
+            for m in rig.monitor
         ),
     )
 

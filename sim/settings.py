@@ -39,6 +39,8 @@ class SimSettings(Strict):
         at zero speed while |v| is smaller. The best linear response then depends on the level.
     hum : by sensor name.
     stuck, nan : by sensor name, s from which the sensor repeats its last value, or gives NaN.
+    pace : times real time at which simulated time passes at most, for who wants to watch; 0 for
+        as fast as it can.
     drop : numbers of samples that the device takes but that never arrive.
     """
 
@@ -51,6 +53,7 @@ class SimSettings(Strict):
     hum: dict[Name, Hum] = Field(default_factory=dict)
     stuck: dict[Name, NonNegative] = Field(default_factory=dict)
     nan: dict[Name, NonNegative] = Field(default_factory=dict)
+    pace: NonNegative = 0.0
     drop: tuple[Annotated[int, Field(ge=0)], ...] = ()
 
 

@@ -73,7 +73,8 @@ def fake_rig() -> Rig:
 
 
 class FakeDevice:
-    """Actuator, sensor and clock in one; `spoil` may change or raise on each block read."""
+    """Actuator, sensor and clock in one; `spoil` may change or raise on each block read, `noise`
+    is what the sensor adds, for the device's own loop too."""
 
     name = "v"
     channels = (Channel("v", "V", "command"), Channel("theta", "rad"))
@@ -81,6 +82,7 @@ class FakeDevice:
     def __init__(self, spoil: Callable[[SampleBlock], SampleBlock] | None = None) -> None:
         self.deadman: float | None = 0.05
         self.spoil = spoil or (lambda block: block)
+        self.noise: Callable[[], float] = lambda: 0.0
         self.loop = DeviceLoop("theta", 0.0, 0.0, 0.0, 0.0)
         self.queue: dict[int, tuple[float, float]] = {}
         self.fed = -(10**9)  # ns of the last write
@@ -119,10 +121,10 @@ class FakeDevice:
         while self.taken * 1e9 / RATE <= self.time:
             reference = self.queue.pop(self.taken, None)
             dead = self.deadman is not None and self.time - self.fed > (self.deadman + 0.1) * 1e9
-            self.v = 0.0
+            self.v, measured = 0.0, self.theta + self.noise()
             if reference is not None and not dead:
-                self.v = reference[0] + self.loop.kp * (reference[1] - self.theta)
-            self.rows.append((self.taken, self.v, self.theta))
+                self.v = reference[0] + self.loop.kp * (reference[1] - measured)
+            self.rows.append((self.taken, self.v, measured))
             self.theta += K * self.v / RATE
             self.taken += 1
 

@@ -27,6 +27,7 @@ from samii_rig.run.latest import Latest
 from samii_rig.run.limits import gate_limits
 from samii_rig.run.loop import run
 from samii_rig.run.protocols import CommandBlock, DeviceLoop, Plan, PlannedSegment
+from samii_rig.run.readback import Sent
 from samii_rig.signal.estimate import estimate
 from samii_rig.signal.excitation import swept_sine
 from samii_rig.types import Quality, Recording
@@ -272,11 +273,11 @@ def test_the_gate_reckons_with_all_that_the_loop_may_add():
         block = CommandBlock(10, np.full(5, level), np.zeros(5))
         # Out of the slew's way: the block before ended at this level.
         now = replace(latest, u=level)
-        assert (command_violation(block, now, limits) is None) is passes
-        assert command_violation(block, now, bare) is None
+        assert (command_violation(block, now, limits, Sent()) is None) is passes
+        assert command_violation(block, now, bare, Sent()) is None
     rest = CommandBlock(10, np.zeros(5), np.zeros(5))
     shaken = replace(latest, peak=tuple(300.0 if n == "a_0" else 0.0 for n in names))
-    assert "rate" in command_violation(rest, shaken, limits).reason
+    assert "rate" in command_violation(rest, shaken, limits, Sent()).reason
     assert "a_0" in names
     assert limits.device_loop().feedback == rig_with().feedback
 

@@ -11,6 +11,7 @@ from fake_device import FakeDevice, fake_rig
 from hypothesis import given
 from hypothesis import strategies as st
 
+from samii_rig.rig.schema import Feedback
 from samii_rig.run.judgement import (
     Act,
     Arm,
@@ -28,6 +29,7 @@ from samii_rig.run.judgement import (
 from samii_rig.run.latest import NEVER, Latest, observe
 from samii_rig.run.limits import gate_limits
 from samii_rig.run.protocols import CommandBlock
+from samii_rig.run.readback import Sent, travel
 from samii_rig.types import Quality, SampleBlock
 
 LIMITS = gate_limits(fake_rig(), "v", 4.0, "theta")
@@ -57,6 +59,7 @@ def command(u, theta_ref=None, first=100):
     return CommandBlock(first, u, ref)
 
 
+NOTHING = Sent()
 FINE = seen([[0.0, 0.0], [0.0, 0.0]])
 
 
@@ -85,6 +88,7 @@ def test_a_number_over_its_limit_trips_and_is_named(values, what, number):
     d = verdict(seen(values))
     assert (d.state, d.act, d.accepted, d.what) == (State.FAULT, Act.ZERO, False, what)
     assert d.number == pytest.approx(number)
+    assert d.limit in (0.35, 5.0, 2000.0)
     assert f"{d.limit:g}" in d.reason
 
 
@@ -221,8 +225,12 @@ def test_the_heartbeat_counts_only_where_a_client_is_needed():
 # What a reference says
 
 
-def wrong(block, latest=FINE, limits=LIMITS):
-    return command_violation(block, latest, limits)
+# A joint that may turn as far as it likes: what is left are the limits on the output.
+ROOMY = replace(LIMITS, sensors=(replace(LIMITS.sensors[0], max=9.0),))
+
+
+def wrong(block, latest=FINE, limits=ROOMY, sent=NOTHING):
+    return command_violation(block, latest, limits, sent)
 
 
 def test_a_small_reference_passes():
@@ -272,6 +280,62 @@ def test_a_reference_of_wrong_shape_is_refused():
     assert wrong(CommandBlock(100, np.zeros(0), np.zeros(0))).what == "shape"
     assert wrong(CommandBlock(100, np.zeros(2), np.zeros(3))).what == "shape"
     assert wrong(CommandBlock(100, np.zeros((2, 2)), np.zeros(2))).what == "shape"
+
+
+def test_a_set_point_beyond_the_sensors_limit_is_refused():
+    assert wrong(command([0.0], [0.35]), limits=LIMITS) is None
+    for angle in (0.351, -0.351):
+        d = wrong(command([0.0, 0.0], [0.0, angle]), limits=LIMITS)
+        assert (d.what, d.number, d.limit, d.unit) == ("set point", 0.351, 0.35, "rad")
+        assert "theta's limit of 0.35 rad (the frame)" in d.reason
+
+
+def turned(u, theta_ref, angle, kp, rate=0.001):
+    """Sample by sample what `travel` has in closed form."""
+    furthest = 0.0
+    for a, b in zip(u, theta_ref, strict=True):
+        angle += rate * (a + kp * (b - angle))
+        furthest = max(furthest, abs(angle))
+    return furthest
+
+
+@given(
+    u=st.lists(st.floats(-5, 5), min_size=1, max_size=120),
+    ref=st.floats(-0.3, 0.3),
+    angle=st.floats(-0.3, 0.3),
+    kp=st.floats(0, 10),
+    cut=st.integers(0, 119),
+)
+def test_the_travel_of_a_reference_is_that_of_the_source_alone(u, ref, angle, kp, cut):
+    refs = np.full(len(u), ref)
+    cut = min(cut, len(u) - 1)
+    sent = Sent(0, np.array(u[:cut]), refs[:cut])
+    got = travel(sent, CommandBlock(cut, np.array(u[cut:]), refs[cut:]), angle, 0.001, kp)
+    assert got == pytest.approx(turned(u, refs, angle, kp), rel=1e-9, abs=1e-12)
+
+
+def test_a_reference_that_would_turn_the_joint_too_far_is_refused():
+    """K = 0.5 rad/(s V) at 500 Hz: 1 mrad a sample and volt; 0.42 rad are 1.2 of the limit."""
+    far = seen([[0, 0.34], [0, 0.34]])
+    assert wrong(command([3.4] * 23), far, replace(LIMITS, kp=0.0)) is None
+    d = wrong(command([3.4] * 24), far, replace(LIMITS, kp=0.0))
+    assert (d.what, d.unit) == ("travel", "rad")
+    assert (d.number, d.limit) == (pytest.approx(0.4216), pytest.approx(0.42))
+    assert "would turn theta to 0.4216 rad; allowed 0.42 rad (the frame)" in d.reason
+    under_way = Sent(90, np.full(10, 3.4), np.zeros(10))
+    d = wrong(command([3.4] * 15), replace(far, u=3.4), replace(LIMITS, kp=0.0), under_way)
+    assert d.what == "travel"
+    back = seen([[0, -0.34], [0, -0.34]])
+    assert wrong(command([-3.4] * 25), back, replace(LIMITS, kp=0.0)).what == "travel"
+    assert wrong(command([3.4] * 24), back, replace(LIMITS, kp=0.0)) is None
+    unknown = replace(LIMITS, kp=0.0, turning=0.0)
+    assert wrong(command([3.4] * 100, first=2), far, unknown) is None
+
+
+def test_the_centring_holds_a_joint_that_the_source_alone_would_turn_too_far():
+    far = seen([[0, 0.34], [0, 0.34]])
+    assert wrong(command([2.0] * 60, first=2), far, replace(LIMITS, kp=0.0)).what == "travel"
+    assert wrong(command([2.0] * 60, first=2), far, LIMITS) is None
 
 
 def test_a_reference_must_continue_and_must_not_be_late():
@@ -411,3 +475,28 @@ def test_the_device_gets_the_same_limits():
     loop = LIMITS.device_loop()
     assert (loop.sensor, loop.kp) == ("theta", 4.0)
     assert (loop.max_output, loop.max_rate, loop.max_angle) == (5.0, 2000.0, 0.35)
+
+
+def test_clearing_a_fault_zeroes_once_more_and_names_the_person():
+    d = decided(State.FAULT, Clear("Ada", "looked"))
+    assert (d.state, d.act, d.accepted) == (State.SAFE, Act.ZERO, True)
+    assert (d.what, d.reason) == ("clear", "Ada: looked")
+
+
+def test_an_age_and_a_silence_that_are_just_allowed_do_not_trip():
+    at = 50_000_000
+    old = replace(FINE, good=(0, 0), offset=0, offset_at=at)
+    assert old.age(0, at) == 0.05
+    assert violation(old, LIMITS, at) is None
+    quiet = replace(LIMITS, heartbeat_age=0.05)
+    assert violation(replace(old, heartbeat=0), quiet, at) is None
+
+
+def test_what_a_feedback_may_add_is_no_stray_output():
+    rig = fake_rig()
+    values = {"name": "f", "sensor": "theta", "actuator": "v", "gain": 1.0, "unit": "V/(rad)"}
+    loop = Feedback(**values, poles=(-5.0,), max=0.5)
+    limits = gate_limits(rig.model_copy(update={"feedback": (loop,)}), "v", 4.0, "theta")
+    assert violation(replace(FINE, stray=0.54), limits, FINE.time) is None
+    d = violation(replace(FINE, stray=0.56), limits, FINE.time)
+    assert (d.what, d.limit) == ("readback", pytest.approx(0.55))

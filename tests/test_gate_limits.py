@@ -96,8 +96,8 @@ def test_a_step_counts_from_the_last_sample_sent():
     """2000 V/s at 500 Hz are 4 V a sample; kp = 4 V/rad."""
     assert not refused(bench_after(3.0), -0.9)
     assert refused(bench_after(3.0), -1.1)
-    assert not refused(bench_after(0.0, 0.6), 0.0, -0.3)
-    assert refused(bench_after(0.0, 0.6), 0.0, -0.5)
+    assert not refused(bench_after(2.6, 0.3), 0.0, -0.0)
+    assert refused(bench_after(2.6, 0.3), 0.0, -0.3)
 
 
 def test_after_a_stop_a_step_counts_from_zero():

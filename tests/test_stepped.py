@@ -94,12 +94,9 @@ def test_a_lines_region_covers_as_often_as_it_says():
 
 def noisy(sd, seed=0):
     rng = np.random.default_rng(seed)
-
-    def spoil(block):
-        block.values[:, 1] += sd * rng.standard_normal(len(block))
-        return block
-
-    return FakeDevice(spoil)
+    device = FakeDevice()
+    device.noise = lambda: sd * rng.standard_normal()
+    return device
 
 
 def recorded(plan, device, **how):

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import errno
-import os
+import math
 import threading
 import time
 from collections import deque
-from pathlib import Path
 
 import serial
-from serial.tools import list_ports
 
+from drivers.ports import open_port
 from drivers.serial_node.wire import (
     WORD,
     Answer,
@@ -32,26 +30,29 @@ HELLO_WITHIN = 3.0  # s; a board that resets when its port opens needs two to bo
 ASK_EVERY = 0.25  # s
 ANSWER_WITHIN = 0.25  # s
 TRIES = 3  # of a request whose answer did not come
-WRITE_WITHIN = 0.05  # s; a port that takes no bytes for a deadman's time is as good as gone
-READ_WAIT = 0.05  # s between looks at whether to go on
+ROUND_TRIPS = 4  # of which the shortest says how long a frame is on its way at most
 KEPT = 8192  # SAMPLES frames that wait for read(); over a minute, what is older is lost
 
 
 class Link:
     """One open port. Only `send` and `request` transmit, and nothing here calls them.
 
-    samples : frames that arrived and nobody took yet. events : the node's, newest last.
+    samples : frames that arrived and nobody took yet, each with the host's monotonic time of its
+        arrival, ns. events : the node's, newest last.
     trouble : why nothing more will come, "" while all is well.
+    round_trip : s, the shortest from a question to its answer, inf before any.
     """
 
     def __init__(self, port: str, baud: int) -> None:
         self.name = port
         self.decoder = Decoder()
-        self.samples: deque[Samples] = deque(maxlen=KEPT)
+        self.samples: deque[tuple[int, Samples]] = deque(maxlen=KEPT)
         self.events: deque[Event] = deque(maxlen=KEPT)
+        self._last: Event | None = None
         self.trouble = ""
         self.refused = 0
-        self._port = _open(port, baud)
+        self.round_trip = math.inf
+        self._port = open_port(port, baud)
         self._seq = 0
         self._hello: Hello | None = None
         self._other: OtherVersion | None = None
@@ -89,6 +90,15 @@ class Link:
             f"{self.name}: nothing answers in {HELLO_WITHIN:g} s; is the node powered, is it this "
             "port, and does it run its firmware?"
         )
+
+    def measure(self, baud: int) -> None:
+        """Ask some more and note the shortest time to the answer."""
+        for _ in range(ROUND_TRIPS):
+            with self._news:
+                self._hello = None
+            asked = time.monotonic()
+            self.identify(baud)
+            self.round_trip = min(self.round_trip, time.monotonic() - asked)
 
     def send(self, kind: Type, body: bytes = b"") -> int:
         """Transmit one frame; its number. DeviceError if the port does not take it."""
@@ -148,9 +158,10 @@ class Link:
     def _take(self, message: object) -> None:
         match message:
             case Samples():
-                self.samples.append(message)
+                self.samples.append((time.monotonic_ns(), message))
             case Event():
                 self.events.append(message)
+                self._last = message
             case Answer(type=Type.STREAM):
                 self.refused += 1
             case Reboot():
@@ -170,51 +181,4 @@ class Link:
 
     def last_reason(self) -> str:
         """Why the node's state changed last, in words; "" if it did not."""
-        return reason_text(self.events[-1].reason) if self.events else ""
-
-
-def _open(port: str, baud: int) -> serial.Serial:
-    try:
-        opened = serial.Serial(
-            port, baud, timeout=READ_WAIT, write_timeout=WRITE_WITHIN, exclusive=True
-        )
-        opened.reset_input_buffer()
-        return opened
-    except (OSError, ValueError, serial.SerialException) as error:
-        raise DeviceError(_why(port, baud, error)) from error
-
-
-def _why(port: str, baud: int, error: Exception) -> str:
-    number = getattr(error, "errno", None)
-    if number is None and isinstance(error.__context__, OSError):
-        number = error.__context__.errno
-    if number in (errno.EAGAIN, errno.EWOULDBLOCK, errno.EBUSY):
-        return f"{port}: in use by {_holder(port)}; end that program first"
-    if number in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        found = ", ".join(sorted(p.device for p in list_ports.comports())) or "none"
-        return f"{port}: no such port; ports of this machine: {found}"
-    if number in (errno.EACCES, errno.EPERM):
-        return (
-            f"{port}: no permission; put this user into the group that owns the port (on Linux "
-            "often dialout: sudo usermod -aG dialout $USER) and log in again"
-        )
-    if isinstance(error, ValueError):
-        return f"{port}: device.settings.baud = {baud} is no rate that this port can do"
-    return f"{port}: {error}"
-
-
-def _holder(port: str) -> str:
-    """The program that has locked the port, by number and name where the system tells."""
-    try:
-        stat = Path(port).stat()
-        place = f"{os.major(stat.st_dev):02x}:{os.minor(stat.st_dev):02x}:{stat.st_ino}"
-        for line in Path("/proc/locks").read_text().splitlines():
-            fields = line.split()
-            if len(fields) > 5 and fields[5] == place:
-                pid = fields[4]
-                name = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-                words = b" ".join(name).decode("utf-8", "replace").strip()
-                return f"process {pid} ({words[:60]})"
-    except OSError:
-        pass
-    return "another program"
+        return reason_text(self._last.reason) if self._last else ""

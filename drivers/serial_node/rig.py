@@ -11,26 +11,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.serial_node.link import Link
+from drivers.serial_node.link import KEPT, Link
 from drivers.serial_node.settings import Input, SerialSettings, check_node, read_settings
 from drivers.serial_node.wire import (
     HALF,
     MAX_STREAM,
     WORD,
     Code,
+    Event,
     Flag,
     Hello,
     Samples,
     State,
     Type,
     configure_body,
+    reason_text,
     stream_body,
 )
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.clock import MonotonicClock
-from samii_rig.run.protocols import CommandBlock, DeviceLoop, OpenRig
-from samii_rig.types import Channel, Quality, SampleBlock
+from samii_rig.run.protocols import CommandBlock, DeviceEvent, DeviceLoop, OpenRig
+from samii_rig.types import Channel, Int, Quality, SampleBlock
 
 Q16 = 1 << 16
 MOST32 = HALF - 1
@@ -38,6 +40,8 @@ RAILS = (-(1 << 15), (1 << 15) - 1)  # where an ADC is out of its range
 # How far the node's clock may be from its own sample count before one of them was reset.
 CLOCK_SLACK = 2.0  # samples
 CLOCK_DRIFT = 0.01  # of the time between two frames
+TELL_EVERY = 0.25  # s between two events that count the line's faults
+TRIPPED = "the node had tripped while no program was there"
 REFUSALS = {
     Code.NOT_NULL: "its output is not at null",
     Code.LIMIT: "a number is beyond the node's own hard limits",
@@ -59,7 +63,7 @@ class SerialNode:
         self._rig, self._settings, self._link, self._hello = rig, settings, link, hello
         self._inputs = [
             (s.name in settings.encoder, (settings.encoder | settings.adc)[s.name])
-            for s in rig.sensor
+            for s in (*rig.sensor, *rig.monitor)
         ]
         centring = rig.centring.sensor if rig.centring else rig.sensor[0].name
         self._angle = self._encoder(centring)
@@ -81,6 +85,11 @@ class SerialNode:
         self._bad = 0
         self._trouble = ""
         self._history: deque[tuple[float, int]] = deque([(time.monotonic(), 0)])
+        self._told: dict[str, int] = {}
+        self._tell_at = 0.0
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=KEPT)
+        # The way back is at most the whole round.
+        self.latency = (0.0, link.round_trip)
 
     # Actuator
 
@@ -159,7 +168,8 @@ class SerialNode:
         if self._trouble:
             raise DeviceError(self._trouble)
         trouble = self._link.trouble
-        frames = [self._link.samples.popleft() for _ in range(len(self._link.samples))]
+        came = [self._link.samples.popleft() for _ in range(len(self._link.samples))]
+        frames = [frame for _, frame in came]
         if not frames and trouble:
             raise DeviceError(trouble)
         self._count_bad(frames)
@@ -167,6 +177,11 @@ class SerialNode:
         frames = frames[: len(starts)]
         raw = np.frombuffer(b"".join(f.data for f in frames), dtype=self._layout)
         period = self._hello.period_ns
+        # A frame leaves when its last sample is taken.
+        self._arrivals += [
+            (c * 1000 + (f.n - 1) * period, at)
+            for (_, c), (at, f) in zip(starts, came[: len(starts)], strict=True)
+        ]
         steps = [np.arange(f.n, dtype=np.int64) for f in frames]
         none = np.zeros(0, dtype=np.int64)
         sequence = np.concatenate([none, *(s + k for (s, _), k in zip(starts, steps, strict=True))])
@@ -189,18 +204,45 @@ class SerialNode:
             quality[ends, i] = Quality.CLIPPED
         return SampleBlock(self.channels, clock, sequence, values, quality)
 
+    def arrivals(self) -> Int:
+        """(n, 2) ns: node's and host's time of the frames that `read` gave since the last call."""
+        pairs = np.array(self._arrivals, dtype=np.int64).reshape(-1, 2)
+        self._arrivals.clear()
+        return pairs
+
+    def events(self) -> list[DeviceEvent]:
+        """Changes of the node's state, and the counts of the line when they changed."""
+        node = [self._link.events.popleft() for _ in range(len(self._link.events))]
+        told = [DeviceEvent(self._time_of(e), "node", _change(e)) for e in node]
+        bad = self._bad_counts()
+        if bad != self._told and (time.monotonic() >= self._tell_at or self._trouble):
+            self._told, self._tell_at = bad, time.monotonic() + TELL_EVERY
+            told.append(DeviceEvent(self._clock * 1000, "line", dict(bad)))
+        return told
+
+    def _time_of(self, event: Event) -> int:
+        """ns on the node's clock; the newest sample's before there is any."""
+        ahead = (event.sample - self._sample + HALF) % WORD - HALF
+        return max(0, self._clock * 1000 + ahead * self._hello.period_ns)
+
     @property
     def counts(self) -> dict[str, str]:
         """How the line did so far, as text."""
+        bad = {name: str(n) for name, n in self._bad_counts().items()}
+        return {
+            "frames": str(self._link.decoder.frames),
+            **bad,
+            "node_last_reason": self._link.last_reason(),
+        }
+
+    def _bad_counts(self) -> dict[str, int]:
         d = self._link.decoder
         return {
-            "frames": str(d.frames),
-            "frames_lost": str(d.lost),
-            "frames_corrupt": str(d.corrupt),
-            "frames_stale": str(d.stale),
-            "frames_refused_by_node": str(self._bad),
-            "streams_refused_by_node": str(self._link.refused),
-            "node_last_reason": self._link.last_reason(),
+            "frames_lost": d.lost,
+            "frames_corrupt": d.corrupt,
+            "frames_stale": d.stale,
+            "frames_refused_by_node": self._bad,
+            "streams_refused_by_node": self._link.refused,
         }
 
     def _unwrapped(self, frames: list[Samples]) -> list[tuple[int, int]]:
@@ -285,6 +327,7 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
     link = Link(chosen.port, chosen.baud)
     try:
         hello = link.identify(chosen.baud)
+        link.measure(chosen.baud)
         check_node(rig, chosen, hello)
         link.send(Type.ZERO)
         if hello.state is State.TRIPPED and link.request(Type.CLEAR):
@@ -310,10 +353,16 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
             "boot": str(hello.boot),
             "null_counts": str(hello.null),
             "device_settings": chosen.model_dump_json(),
+            **({"tripped": TRIPPED} if hello.state is State.TRIPPED else {}),
         },
         node,
         link,
     )
+
+
+def _change(event: Event) -> dict[str, str | int | float]:
+    state = State(event.state).name if event.state <= max(State) else str(event.state)
+    return {"state": state, "reason": reason_text(event.reason), "sample": event.sample}
 
 
 def _counts(x: float) -> int:
@@ -336,12 +385,12 @@ def _channels(rig: Rig, settings: SerialSettings, centring: str) -> tuple[Channe
             Channel(
                 s.name,
                 s.unit,
-                "sensor",
+                "sensor" if s in rig.sensor else "monitor",
                 s.low,
                 s.high,
                 1.0 / abs(inputs[s.name].counts_per_unit),
                 s.calibration,
             )
-            for s in rig.sensor
+            for s in (*rig.sensor, *rig.monitor)
         ),
     )

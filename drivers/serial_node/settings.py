@@ -31,7 +31,7 @@ class SerialSettings(Strict):
     """Settings of the driver; an unknown one is an error.
 
     port : of the operating system, such as /dev/ttyACM0 or COM3. baud : of a true serial line.
-    encoder, adc : by sensor name; every sensor of the rig is in one of them.
+    encoder, adc : by sensor name; every sensor and monitor of the rig is in one of them.
     output_counts_per_unit : of the actuator. null : the converter's counts at which the valve
         stands still; the node holds it, this only has to be the same.
     max_jump : largest change of the centring sensor in one sample, in its unit; beyond it the
@@ -69,7 +69,7 @@ def read_settings(rig: Rig, given: Mapping[str, object]) -> SerialSettings:
         ) from error
     if len(rig.actuator) != 1:
         raise InputError(rig.name, "actuator", len(rig.actuator), "one; the node has one output")
-    names = {x.name: x for x in rig.sensor}
+    names = {x.name: x for x in (*rig.sensor, *rig.monitor)}
     for table, inputs in (("encoder", s.encoder), ("adc", s.adc)):
         for name, x in inputs.items():
             if name not in names:

@@ -7,7 +7,19 @@ from typing import Annotated
 import typer
 
 import samii_rig
-from samii_rig.cli import control, diagnose, estimate, files, identify, papers, prove, record
+from samii_rig.cli import (
+    bench,
+    control,
+    diagnose,
+    estimate,
+    files,
+    identify,
+    papers,
+    prove,
+    record,
+    recordings,
+    serve,
+)
 
 app = typer.Typer(
     name="samii-rig",
@@ -48,3 +60,11 @@ app.command("papers")(papers.papers)
 app.command("prove")(prove.prove)
 app.command("verify")(files.verify)
 app.command("recover")(files.recover)
+app.command("recordings")(recordings.recordings)
+app.command("replay")(recordings.replay)
+app.command("serve")(serve.serve)
+app.command("devices")(bench.devices)
+app.command("doctor")(bench.doctor)
+app.command("jog")(bench.jog)
+app.command("calibrate")(bench.calibrate)
+app.command("clear-fault")(bench.clear_fault)

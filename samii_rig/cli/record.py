@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import datetime
@@ -61,6 +62,14 @@ def run(
         ),
     ] = None,
     operator: Annotated[str, typer.Option(help="Who stands at the rig; recorded.")] = "",
+    heartbeat: Annotated[
+        float | None,
+        typer.Option(
+            help="Seconds without a byte on standard input, held by the operator's client, after "
+            "which the run trips [default: none is needed]",
+            min=0.1,
+        ),
+    ] = None,
     no_report: Annotated[bool, typer.Option("--no-report", help="Write no HTML page.")] = False,
     no_diagnosis: Annotated[
         bool, typer.Option("--no-diagnosis", help="Do not look for what the model leaves out.")
@@ -135,6 +144,7 @@ def run(
                 settings,
                 operator,
                 console,
+                heartbeat=heartbeat,
                 report=not no_report,
                 # Between runs a person waits; `samii-rig diagnose` takes them all together.
                 diagnosis=not no_diagnosis and len(setups) == 1,
@@ -226,13 +236,17 @@ def _carry_out(
     operator: str,
     console: Console,
     *,
+    heartbeat: float | None,
     report: bool,
     diagnosis: bool,
     json: bool,
 ) -> _Done:
     """One run with its page, and its summary on the console."""
+    from samii_rig.index.remarks import set_diagnosis
     from samii_rig.report.summary import LiveProgress, summary
     from samii_rig.run.campaign import carry_out
+    from samii_rig.run.heartbeat import Pipe
+    from samii_rig.run.pace import LoopSettings
 
     live = LiveProgress(console, plan.duration)
     with nullcontext() if json else live:
@@ -246,9 +260,13 @@ def _carry_out(
             settings=settings,
             operator=operator,
             progress=None if json else live,
+            alive=Pipe(sys.stdin.fileno()) if heartbeat else None,
+            loop=LoopSettings(heartbeat_age=heartbeat) if heartbeat else None,
         )
     curve = model_curve(setup.rig, outcome.responses)
     found = _diagnosed(setup, outcome, console, json=json) if diagnosis else None
+    if found:
+        set_diagnosis(path, {**found.plain(), "lines": list(found.lines())})
     page = None
     if report:
         from samii_rig.record.reader import read_events

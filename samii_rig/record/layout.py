@@ -179,7 +179,7 @@ def channel_to_json(channel: Channel) -> dict[str, object]:
 def channel_from_json(item: dict[str, Any]) -> Channel:
     """The inverse; KeyError, TypeError or ValueError on anything else."""
     role = item["role"]
-    if role not in ("reference", "command", "sensor"):
+    if role not in get_args(Role):
         raise ValueError(role)
     low, high = item["low"], item["high"]
     return Channel(

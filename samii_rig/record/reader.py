@@ -104,12 +104,26 @@ def _contents(path: Path, *, partial: bool) -> Iterator[tuple[memoryview, Conten
             contents = read_contents(data, tail.summary_start, strict=True)
             if contents.data_crc is None or contents.end != tail.summary_start:
                 raise DamagedError(contents.end, "the summary does not follow the data")
-        run = contents.one_map(layout.RUN)
-        if run is None or run.get("format") != layout.FORMAT:
-            raise RecordingError("it is an MCAP file, but not a recording of samii-rig")
+        check_format(contents)
         yield data, contents
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
+
+
+def check_format(contents: Contents) -> dict[str, str]:
+    """The file's first metadata; RecordingError if it is none that this version reads."""
+    run = contents.one_map(layout.RUN)
+    written = "" if run is None else run.get("format", "")
+    kind, _, version = written.rpartition(" ")
+    ours, _, known = layout.FORMAT.rpartition(" ")
+    if kind == ours and version.isdecimal() and int(version) > int(known):
+        raise RecordingError(
+            f"it was written by a newer samii-rig ({written}); expected {layout.FORMAT}, the "
+            "newest that this version reads"
+        )
+    if run is None or written != layout.FORMAT:
+        raise RecordingError("it is an MCAP file, but not a recording of samii-rig")
+    return run
 
 
 def sample_channel(contents: Contents) -> tuple[int, SampleLayout]:

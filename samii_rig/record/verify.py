@@ -12,7 +12,7 @@ from isal.isal_zlib import crc32
 from samii_rig.errors import RecordingError
 from samii_rig.record import layout, scan
 from samii_rig.record.contents import Contents, Tail, read_contents, read_tail
-from samii_rig.record.reader import sample_channel, sample_records
+from samii_rig.record.reader import check_format, sample_channel, sample_records
 from samii_rig.types import Int, StopRecord
 
 Status = Literal["whole", "lossy", "nothing"]
@@ -76,9 +76,10 @@ def _verify(path: Path, data: memoryview) -> Verdict:
     stop, written = None, None
     segments = 0
     try:
-        run = contents.one_map(layout.RUN)
-        if run is None or run.get("format") != layout.FORMAT:
+        if contents.one_map(layout.RUN) is None:
             problems.append("it is not a recording of samii-rig, or its first metadata are lost")
+        else:
+            check_format(contents)
         contents.one_map(layout.NOTES)
         contents.maps(layout.RESPONSE)
         for item in contents.maps(layout.SEGMENT):

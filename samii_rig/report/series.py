@@ -72,7 +72,12 @@ def _traces(r: Recording, pixels: int) -> list[dict[str, Any]]:
     time = (r.time - r.time[0]) * 1e-9
     gaps = np.flatnonzero(np.diff(r.sequence) > 1)
     traces: list[dict[str, Any]] = []
-    colours = {"reference": "@level3", "command": "@level1", "sensor": "@level0"}
+    colours = {
+        "reference": "@level3",
+        "command": "@level1",
+        "sensor": "@level0",
+        "monitor": "@level2",
+    }
     for row, channel in enumerate(r.channels):
         x, y = thin(time, r.values[:, row], pixels)
         place = "y" if row == 0 else f"y{row + 1}"

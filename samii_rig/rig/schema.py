@@ -68,6 +68,7 @@ __all__ = [
     "Limit",
     "LumpedMass",
     "Moment",
+    "Monitor",
     "Name",
     "NonNegative",
     "OilColumn",
@@ -78,6 +79,7 @@ __all__ = [
     "RigidLink",
     "Sensor",
     "SensorBase",
+    "Service",
     "Source",
     "Strict",
     "TimoshenkoBeam",
@@ -189,6 +191,32 @@ Sensor = Annotated[
 ]
 
 
+class Monitor(Strict):
+    """A channel that says how the rig is and that the chain's model knows nothing of: a supply
+    pressure, an oil temperature, the force in a strut. It is recorded and held to its limits.
+
+    usual : its value on a rig that is well, in `unit`; what a simulated rig shows.
+    low, high, resolution, stale_after : as of a sensor.
+    """
+
+    name: Name
+    unit: str = Field(min_length=1)
+    usual: Finite
+    low: float = -math.inf
+    high: float = math.inf
+    resolution: NonNegative = 0.0
+    stale_after: Positive = 0.05
+    calibration: str = Field(default="", description="how unit and scale are known")
+
+    @model_validator(mode="after")
+    def _range(self) -> Self:
+        if not self.low < self.usual < self.high:
+            raise ValueError(
+                f"low {self.low:g}, usual {self.usual:g}, high {self.high:g}; expected them to rise"
+            )
+        return self
+
+
 class ActuatorSpec(Strict):
     """The input of the rig: the converter that drives an angular velocity source.
 
@@ -216,13 +244,21 @@ class Limit(Strict):
     """What a channel must never exceed while the actuator is live, and why.
 
     max : largest absolute value, in `unit`. max_rate : largest absolute change, unit/s.
+    min : smallest value; of a monitor only, such as a supply pressure.
     """
 
     channel: Name
     unit: str
     max: Positive
+    min: Finite | None = None
     max_rate: Positive | None = None
     reason: str = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _range(self) -> Self:
+        if self.min is not None and not self.min < self.max:
+            raise ValueError(f"min {self.min:g}, max {self.max:g}; expected min below max")
+        return self
 
 
 class Device(Strict):
@@ -230,6 +266,16 @@ class Device(Strict):
 
     driver: str = "simulated"
     settings: dict[str, Any] = Field(default_factory=dict)
+
+
+class Service(Strict):
+    """What `samii-rig serve` does with this rig.
+
+    when_lost : whether a run goes on or stops when the service is gone (killed, crashed) while
+        it drives; a service that is started again finds it, either way.
+    """
+
+    when_lost: Literal["go_on", "stop"] = "go_on"
 
 
 class Centring(Strict):
@@ -353,12 +399,14 @@ class Rig(Strict):
     element: Annotated[tuple[Element, ...], Field(min_length=1)]
     sensor: Annotated[tuple[Sensor, ...], Field(min_length=1)]
     actuator: Annotated[tuple[ActuatorSpec, ...], Field(min_length=1)]
+    monitor: tuple[Monitor, ...] = ()
     limit: tuple[Limit, ...] = ()
     centring: Centring | None = None
     feedback: tuple[Feedback, ...] = ()
     device: Device = Device()
+    service: Service = Service()
 
-    @field_validator("element", "sensor", "actuator", "feedback")
+    @field_validator("element", "sensor", "actuator", "monitor", "feedback")
     @classmethod
     def _unique(cls, items: tuple[Any, ...]) -> tuple[Any, ...]:
         _unlike([item.name for item in items])
@@ -421,6 +469,11 @@ class Rig(Strict):
         clash = set(inputs) & {s.name for s in self.sensor}
         if clash:
             raise ValueError(f"sensor {min(clash)}: an actuator has that name; expected another")
+        clash = {m.name for m in self.monitor} & {x.name for x in (*self.actuator, *self.sensor)}
+        if clash:
+            raise ValueError(
+                f"monitor {min(clash)}: a sensor or actuator has that name; expected another"
+            )
         for limit in self.limit:
             if limit.channel not in units:
                 raise ValueError(
@@ -430,6 +483,11 @@ class Rig(Strict):
                 raise ValueError(
                     f"limit on {limit.channel}: unit {limit.unit!r}; "
                     f"expected {units[limit.channel]!r}"
+                )
+            if limit.min is not None and limit.channel not in {m.name for m in self.monitor}:
+                raise ValueError(
+                    f"limit on {limit.channel}: min {limit.min:g}; expected none, as only a "
+                    "monitor has one"
                 )
         if self.centring and self.centring.sensor not in {s.name for s in self.sensor}:
             raise ValueError(
@@ -454,8 +512,8 @@ class Rig(Strict):
         return self
 
     def units(self) -> dict[str, str]:
-        """Unit of every channel, actuators and sensors, by name."""
-        return {x.name: x.unit for x in (*self.actuator, *self.sensor)}
+        """Unit of every channel, actuators, sensors and monitors, by name."""
+        return {x.name: x.unit for x in (*self.actuator, *self.sensor, *self.monitor)}
 
     def limits_on(self, channel: str) -> Iterator[Limit]:
         """The limits on one channel."""

@@ -6,7 +6,8 @@ import json
 import platform
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -19,12 +20,15 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run.devices import open_device
 from samii_rig.run.dryrun import DryRun
 from samii_rig.run.interrupts import Interrupts
+from samii_rig.run.latch import Latch
 from samii_rig.run.loop import run
+from samii_rig.run.pace import LoopSettings
+from samii_rig.run.priority import prioritised
 from samii_rig.run.progress import Progress
 from samii_rig.run.protocols import OpenRig, Plan
-from samii_rig.run.sink import recorded_channels
+from samii_rig.run.sink import Watched, recorded_channels
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import FrequencyResponse, Recording, StopRecord
+from samii_rig.types import FrequencyResponse, Recording, SampleBlock, StopRecord
 
 # What can change a result and is not in the recording otherwise.
 VERSIONS_OF = ("samii-rig", "numpy", "scipy", "numba", "mcap")
@@ -58,15 +62,27 @@ def carry_out(
     operator: str = "",
     progress: Callable[[Progress], None] | None = None,
     stop: Event | None = None,
+    alive: Callable[[], bool] | None = None,
+    loop: LoopSettings | None = None,
+    watch: Callable[[SampleBlock], None] | None = None,
 ) -> Outcome:
     """Run `plan` on the rig's device into the recording `path`, estimate, close.
 
     However the run ends, the recording is whole and says how; what was measured until then
-    is estimated where it suffices. Raises DeviceError if the rig does not open and
-    RecordingError if the file cannot be written; the output is at zero before either.
+    is estimated where it suffices. A FAULT on a real rig is latched (`samii_rig.run.latch`), and
+    while one is, nothing is opened. alive, loop : see `samii_rig.run.loop.run`. watch : gets
+    every block after it was recorded, for a display; it must neither wait nor raise.
+
+    Raises GateError for a latched fault, DeviceError if the rig does not open or another program
+    drives it, and RecordingError if the file cannot be written; the output is at zero before
+    each of them.
     """
     predicted.refuse()
+    latch = Latch(rig.name, rig.device.driver)
+    latch.refuse()
     device = open_device(rig, settings or {})
+    real = device.metadata.get("clock") != "simulated"
+    cleared = latch.cleared if real else None
     try:
         notes = {
             "experiment": plan.experiment,
@@ -77,9 +93,14 @@ def carry_out(
             "centring": f"{plan.centring_sensor} {plan.kp!r}",
             "predicted_peaks": json.dumps(_peaks(predicted)),
             **{f"device_{key}": value for key, value in device.metadata.items()},
+            **({f"fault_cleared_{k}": v for k, v in asdict(cleared).items()} if cleared else {}),
             **versions(),
         }
+        if real and (tripped := device.metadata.get("tripped")):
+            latch.set(tripped)
+            latch.refuse()
         with (
+            latch.held(device),
             Interrupts() as interrupts,
             RunWriter(
                 path,
@@ -91,7 +112,19 @@ def carry_out(
             ) as writer,
         ):
             try:
-                ended = run(plan, rig, device, writer, progress, stop, interrupts=interrupts)
+                with prioritised() if real else nullcontext():
+                    ended = run(
+                        plan,
+                        rig,
+                        device,
+                        writer if watch is None else Watched(writer, watch),
+                        progress,
+                        stop,
+                        alive=alive,
+                        settings=loop,
+                        interrupts=interrupts,
+                        latch=latch.set if real else None,
+                    )
             except BaseException as error:
                 # Refused before anything moved; the recording says so and is whole.
                 interrupts.ending = True

@@ -32,7 +32,10 @@ from samii_rig.run.judgement import (
 from samii_rig.run.latest import Latest, observe
 from samii_rig.run.limits import GateLimits
 from samii_rig.run.protocols import Actuator, CommandBlock
+from samii_rig.run.readback import Places, Sent, stray
 from samii_rig.types import Channel, SampleBlock
+
+FLIGHT = 0.05  # s that a sample may take from the device to here
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +60,8 @@ class Gate:
     Every method takes `now`, ns on the host's clock. Those that ask raise GateError when
     refused, with the output already at zero.
 
-    FAULT is latched as long as this object lives, which is one run: a new run is a new arming
-    by a person, who has read how the last one ended.
+    FAULT is latched as long as this object lives; `samii_rig.run.latch` carries it on to the
+    next run.
     """
 
     def __init__(
@@ -82,6 +85,8 @@ class Gate:
             for i, c in enumerate(limits.channels)
             if math.isfinite(c.max_rate) or c.channel == limits.centring_sensor
         )
+        self._places = Places.among(channels, limits.output.channel, limits.centring_sensor)
+        self._sent = Sent()
         self._latest = Latest.nothing(len(self._columns))
         self._state = State.SAFE
         self.fault = ""
@@ -106,12 +111,17 @@ class Gate:
     def observe(self, block: SampleBlock, now: int) -> None:
         """Take in all samples that arrived, perhaps none, and judge them."""
         with self._fault_on_error():
-            self._latest = observe(self._latest, block, self._columns, self._rates, now)
+            latest = observe(self._latest, block, self._columns, self._rates, now)
+            if len(block):  # nothing new takes nothing back
+                strayed = stray(self._sent, block, self._places, self._limits.kp)
+                latest = replace(latest, stray=strayed)
+            self._latest = latest
+            self._sent = self._sent.after(latest.sequence)
         self._ask(Check(), now)
 
     def write(self, block: CommandBlock, now: int) -> None:
         """Send a reference."""
-        self._ask(Write(block), now)
+        self._ask(Write(block, self._sent), now)
 
     def stop(self, reason: str, now: int) -> None:
         """End at zero; allowed at any time, more than once."""
@@ -168,14 +178,18 @@ class Gate:
             self._zero()
         elif decision.act is Act.CONFIGURE:
             self._actuator.configure(self._limits.device_loop())
+            # From here on the device must change nothing by itself, but for what was under way.
+            first = self._latest.sequence + 1 + math.ceil(FLIGHT * self._limits.rate_hz)
+            self._latest = replace(self._latest, first=first)
         elif decision.act is Act.WRITE and isinstance(request, Write):
             self._send(request.block)
 
     def _send(self, block: CommandBlock) -> None:
         self._actuator.write(block)
+        self._sent = self._sent.then(block)
         self._latest = replace(
             self._latest,
-            first=block.first if self._latest.first < 0 else self._latest.first,
+            first=min(block.first, self._latest.first),
             next=block.first + len(block),
             u=float(block.u[-1]),
             theta_ref=float(block.theta_ref[-1]),
@@ -187,4 +201,5 @@ class Gate:
         finally:
             # Twice costs nothing and covers a first call that a second Ctrl-C cut short.
             self._actuator.zero()
+            self._sent = Sent()
             self._latest = replace(self._latest, first=-1, next=-1, u=0.0, theta_ref=0.0)

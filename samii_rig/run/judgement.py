@@ -10,7 +10,7 @@ device, so the whole input space can be tested, and mutants of them killed.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -18,6 +18,11 @@ import numpy as np
 from samii_rig.run.latest import Latest
 from samii_rig.run.limits import ChannelLimit, GateLimits
 from samii_rig.run.protocols import CommandBlock
+from samii_rig.run.readback import Sent, travel
+
+# How much beyond its limit a prediction may lead an angle: the source alone knows nothing of the
+# joint's spring, and what is measured beyond the limit trips anyway.
+TRAVEL = 1.2
 
 
 class State(Enum):
@@ -48,9 +53,10 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """Ask to send a reference."""
+    """Ask to send a reference. sent : what was sent before and has not come back."""
 
     block: CommandBlock
+    sent: Sent = field(default_factory=Sent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +163,7 @@ def decide(
         return _wrong_state(state, "write", State.RUNNING)
     return (
         violation(latest, limits, now)
-        or command_violation(request.block, latest, limits)
+        or command_violation(request.block, latest, limits, request.sent)
         or Decision(state, Act.WRITE, True, "write")
     )
 
@@ -172,6 +178,10 @@ def violation(latest: Latest, limits: GateLimits, now: int) -> Decision | None:
             return _fault("not a number", f"{c.channel} gave a value that is not a number")
         if peak > c.max + c.slack:
             return _over(c, peak, c.max, "limit", c.unit)
+        if latest.low[i] < c.min:
+            low = latest.low[i]
+            text = f"{c.channel} at {low:.4g} {c.unit} is under {c.min:g} {c.unit} ({c.reason})"
+            return _fault("least", text, low, c.min, c.unit)
         if rate > c.max_rate + c.slack * limits.rate_hz:
             return _over(c, rate, c.max_rate, "rate", f"{c.unit}/s")
         if latest.clipped[i]:
@@ -190,6 +200,10 @@ def violation(latest: Latest, limits: GateLimits, now: int) -> Decision | None:
             return stuck
     if latest.limited:
         return _fault("device", f"the device itself changed {limits.output.channel}")
+    if latest.stray > limits.readback + limits.authority:
+        c, most = limits.output, limits.readback + limits.authority
+        text = f"{c.channel} read back is {latest.stray:.4g} {c.unit} away from what was commanded"
+        return _fault("readback", f"{text}; allowed {most:.3g}", latest.stray, most, c.unit)
     silence = (now - latest.heartbeat) * 1e-9
     if silence > limits.heartbeat_age:
         return _fault(
@@ -222,13 +236,17 @@ def _standstill(c: ChannelLimit, latest: Latest, i: int) -> Decision | None:
     return None
 
 
-def command_violation(block: CommandBlock, latest: Latest, limits: GateLimits) -> Decision | None:
+def command_violation(
+    block: CommandBlock, latest: Latest, limits: GateLimits, sent: Sent
+) -> Decision | None:
     """What is wrong with a reference before it reaches the wire, as a FAULT.
 
     The device adds kp (theta_ref - theta) and its feedback, so the output is bounded by
     |u| + kp (|theta_ref| + |theta|) + sum max with the largest |theta| of the newest block,
     and its slew likewise, over the border to the last block too; a feedback's slew is bounded
-    by the largest value of its sensor in the newest block.
+    by the largest value of its sensor in the newest block. A set point must lie inside the
+    limit of its sensor, and so must, with some room, the angle to which an angular velocity
+    source will have turned the joint, see `readback.travel`.
     """
     n = len(block)
     if n == 0 or block.u.shape != (n,) or block.theta_ref.shape != (n,):
@@ -263,8 +281,14 @@ def command_violation(block: CommandBlock, latest: Latest, limits: GateLimits) -
     for i, c in enumerate(limits.channels):
         if c.channel == limits.centring_sensor:
             angle, angle_rate = latest.peak[i], latest.rate[i]
-    added = sum(a.loop.max for a in limits.feedback)
-    bound = float((np.abs(block.u) + kp * np.abs(block.theta_ref)).max()) + kp * angle + added
+            beyond = _travel_violation(block, latest.last[i], limits, c, sent)
+            if beyond is not None:
+                return beyond
+    bound = (
+        float((np.abs(block.u) + kp * np.abs(block.theta_ref)).max())
+        + kp * angle
+        + limits.authority
+    )
     if bound > output.max:
         return _over(output, bound, output.max, "limit", output.unit)
     step = abs(float(block.u[0]) - latest.u) + kp * abs(
@@ -279,6 +303,28 @@ def command_violation(block: CommandBlock, latest: Latest, limits: GateLimits) -
     slew = step * limits.rate_hz + kp * angle_rate + turning
     if slew > output.max_rate:
         return _over(output, slew, output.max_rate, "rate", f"{output.unit}/s")
+    return None
+
+
+def _travel_violation(
+    block: CommandBlock, angle: float, limits: GateLimits, c: ChannelLimit, sent: Sent
+) -> Decision | None:
+    """A set point or a way that leads the centring sensor c beyond its limit, as a FAULT."""
+    furthest = float(np.abs(block.theta_ref).max())
+    if furthest > c.max:
+        text = (
+            f"the set point of {furthest:.4g} {c.unit} is beyond {c.channel}'s limit of {c.max:g}"
+        )
+        return _fault("set point", f"{text} {c.unit} ({c.reason})", furthest, c.max, c.unit)
+    rate = limits.turning / limits.rate_hz
+    most = TRAVEL * c.max
+    ahead = travel(sent, block, angle, rate, limits.kp) if rate else 0.0
+    if ahead > most:
+        text = (
+            f"the reference would turn {c.channel} to {ahead:.4g} {c.unit}; allowed {most:.4g} "
+            f"{c.unit} ({c.reason})"
+        )
+        return _fault("travel", text, ahead, most, c.unit)
     return None
 
 

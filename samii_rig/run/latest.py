@@ -25,26 +25,32 @@ class Latest:
     good : (n,) device time of the newest value of each channel that was not blind.
     peak, rate : (n,) largest |value| and |change|/s in the newest block; NaN for a value
         that is not a number and not marked missing; the rate reaches back over the border.
+    low : (n,) smallest value in the newest block, NaN before there was any.
     last : (n,) newest good value.
     since : (n,) time of the newest good value that differed from the one before it.
     travel, effort : (n,) integral of v and of |v| since then, in actuator unit times s.
     clipped : (n,) a converter at its end. limited : the device itself changed the output.
+    stray : how far the output of the newest block was from what the device was told, see
+        `readback.stray`.
     disorder : samples came out of order, now or before.
     sequence, time : of the newest sample. offset : smallest host minus device time, as of
         `offset_at`, host time.
-    first, next : first sample that was commanded, the one that comes next; -1 for none.
+    first : first sample at which the device must not change its output; -1 for none.
+    next : sample that is commanded next; -1 for none.
     u, theta_ref : reference at the last sample commanded.
     """
 
     good: tuple[int, ...]
     peak: tuple[float, ...]
     rate: tuple[float, ...]
+    low: tuple[float, ...]
     last: tuple[float, ...]
     since: tuple[int, ...]
     travel: tuple[float, ...]
     effort: tuple[float, ...]
     clipped: tuple[bool, ...]
     limited: bool = False
+    stray: float = 0.0
     disorder: bool = False
     sequence: int = -1
     time: int = NEVER
@@ -61,7 +67,7 @@ class Latest:
         """Before the first sample."""
         zero = (0.0,) * n
         never, unknown = (NEVER,) * n, (math.nan,) * n
-        return cls(never, zero, zero, unknown, never, zero, zero, (False,) * n)
+        return cls(never, zero, zero, zero, unknown, never, zero, zero, (False,) * n)
 
     def age(self, i: int, now: int) -> float:
         """Seconds since channel i said something new; inf before it said anything.
@@ -89,7 +95,7 @@ def observe(
     time, sequence = block.time, block.sequence
     values = block.values[:, columns]
     quality = block.quality[:, columns]
-    size = np.abs(values)
+    held = lowest = values
     good, last = (int(time[-1]),) * len(columns), tuple(values[-1].tolist())
     clipped, limited = (False,) * len(columns), False
     seen: list[slice | Int] = [slice(None)] * len(columns)
@@ -99,7 +105,8 @@ def observe(
         commanded = sequence >= latest.first if latest.first >= 0 else np.zeros(n, dtype=bool)
         limited = bool(((quality[:, 0] & LIMITED) != 0)[commanded].any())
         # A blind value says nothing: the one before the block stands in its place.
-        size = np.where(blind, np.abs(np.nan_to_num(latest.last)), size)
+        lowest = np.where(blind, latest.last, values)
+        held = np.where(blind, np.nan_to_num(latest.last), values)
         seen = [np.flatnonzero(~b) for b in blind.T]
         ends = [int(rows[-1]) if len(rows) else -1 for rows in seen if not isinstance(rows, slice)]
         good = tuple(int(time[e]) if e >= 0 else g for e, g in zip(ends, latest.good, strict=True))
@@ -108,7 +115,8 @@ def observe(
             for i, (e, x) in enumerate(zip(ends, latest.last, strict=True))
         )
     # Not a number, or infinite, without being marked missing: NaN, which trips.
-    peak = tuple(x if x < math.inf else math.nan for x in size.max(axis=0).tolist())
+    peaks = np.abs(held).max(axis=0).tolist()
+    peak = tuple(x if x < math.inf else math.nan for x in peaks)
     rate = [0.0] * len(columns)
     for i in rates:
         rate[i] = _steepest(latest.last[i], latest.good[i], values[seen[i], i], time[seen[i]])
@@ -122,6 +130,7 @@ def observe(
         good=good,
         peak=peak,
         rate=tuple(rate),
+        low=tuple(np.fmin.reduce(lowest, axis=0).tolist()),
         last=last,
         since=since,
         travel=travel,

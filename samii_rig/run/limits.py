@@ -41,6 +41,12 @@ NOISE_AFTER = 1.0  # s
 NOISE_STEPS = 4.0  # of the actuator's converter: smallest mean |v| that counts as moving
 
 
+# How far the output that a device reads back may be from what it was told, in steps of its
+# converter (it rounds the reference, the product and the sum) and as a part of its limit.
+READBACK_STEPS = 4.0
+READBACK_PART = 0.01
+
+
 @dataclass(frozen=True, slots=True)
 class Stuck:
     """When a value that repeats bit by bit is a fault, while the output v is not zero.
@@ -64,6 +70,7 @@ class ChannelLimit:
     """One channel that must be fresh and small while the output is live.
 
     max, max_rate : largest |value| in `unit` and |change| in `unit` per second; inf for none.
+    min : smallest value in `unit`, -inf for none.
     slack : added to `max` (and one step a sample to the rate) before a trip: one step of
         the converter, so that a device that holds its output at the limit is not blamed
         for its rounding.
@@ -78,6 +85,7 @@ class ChannelLimit:
     reason: str
     slack: float = 0.0
     stuck: Stuck = Stuck()
+    min: float = -math.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,11 +104,14 @@ class GateLimits:
     output : limit on the actuator's own channel, the command before the wire and the
         read-back after it.
     sensors : limits on sensors; those that a loop reads are among them, so that none acts
-        on a dead one.
+        on a dead one. Then those on monitors.
     kp, centring_sensor : the device's loop v = u + kp (theta_ref - theta).
     heartbeat_age : s without a sign of the operator's client; inf where none is needed.
     max_ahead : s from the newest sample to the last of a reference.
     feedback : the device's loops beside the centring.
+    readback : how far v as read back may be from u + kp (theta_ref - theta) + feedback.
+    turning : unit of the centring sensor per s and actuator unit where an angular velocity
+        source turns it, with its sign; 0 where the travel does not follow from the output.
     """
 
     rate_hz: float
@@ -111,6 +122,13 @@ class GateLimits:
     heartbeat_age: float = math.inf
     max_ahead: float = MAX_AHEAD
     feedback: tuple[Addition, ...] = ()
+    readback: float = math.inf
+    turning: float = 0.0
+
+    @property
+    def authority(self) -> float:
+        """The most that all feedback loops together may add to the output."""
+        return sum(a.loop.max for a in self.feedback)
 
     @property
     def channels(self) -> tuple[ChannelLimit, ...]:
@@ -175,8 +193,23 @@ def gate_limits(
             stuck = _stuck(rig, spec, s, c.max)
             _refuse_blind(rig, spec, s, stuck, centring=kp != 0.0 and s.name == sensor, read=read)
             sensors.append(replace(c, stuck=stuck))
+    sensors += [
+        _channel(rig, m.name, m.unit, math.inf, "", m.stale_after, 0.0)
+        for m in rig.monitor
+        if any(True for _ in rig.limits_on(m.name))
+    ]
+    turning = sum(_angle_gain(rig, actuator, s) for s in rig.sensor if s.name == sensor)
+    readback = max(READBACK_STEPS * spec.resolution, READBACK_PART * output.max)
     return GateLimits(
-        rig.rate_hz, output, tuple(sensors), kp, sensor, heartbeat_age, feedback=feedback
+        rig.rate_hz,
+        output,
+        tuple(sensors),
+        kp,
+        sensor,
+        heartbeat_age,
+        feedback=feedback,
+        readback=readback,
+        turning=turning,
     )
 
 
@@ -248,10 +281,12 @@ def _angle_gain(rig: Rig, actuator: str, sensor: Sensor) -> float:
 def _channel(
     rig: Rig, name: str, unit: str, most: float, reason: str, stale_after: float, slack: float
 ) -> ChannelLimit:
-    rate = math.inf
+    rate, least = math.inf, -math.inf
     for limit in rig.limits_on(name):
         if limit.max < most:
             most, reason = limit.max, limit.reason
+        if limit.min is not None:
+            least = max(least, limit.min)
         if limit.max_rate is not None:
             rate = min(rate, limit.max_rate)
-    return ChannelLimit(name, unit, most, rate, stale_after, reason, slack)
+    return ChannelLimit(name, unit, most, rate, stale_after, reason, slack, min=least)

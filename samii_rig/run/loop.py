@@ -15,22 +15,26 @@ from threading import Event
 
 import numpy as np
 
-from samii_rig.errors import DeviceError, GateError, SamiiRigError
+from samii_rig.errors import DeviceError, GateError, RecordingError, SamiiRigError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.dwell import Reference, Watch
 from samii_rig.run.ending import Status, Zero, attempt, with_troubles
 from samii_rig.run.gate import Gate, GateEvent
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.judgement import State
+from samii_rig.run.latest import CLOCK_DRIFT
 from samii_rig.run.limits import gate_limits
-from samii_rig.run.pace import LoopSettings, choose_tick
+from samii_rig.run.pace import COUNTS_AS_LATE, LoopSettings, choose_ahead, choose_tick
 from samii_rig.run.progress import Progress, nearer
-from samii_rig.run.protocols import CommandBlock, OpenRig, Plan
+from samii_rig.run.protocols import CommandBlock, OpenRig, Plan, Reports
 from samii_rig.run.sink import Collector, QueuedSink, Sink
 from samii_rig.types import Quality, SampleBlock, Segment, StopRecord
 
 FIRST_SAMPLE = 1.0  # s to wait for the device's first sample
 GATHER = 0.25  # s of samples in one message to the recorder
+# s that a late tick waits before it reads: a host that was stopped as a whole finds what arrived
+# meanwhile still with the driver's reader.
+CATCH_UP = 0.0005
 
 
 def run(
@@ -44,6 +48,7 @@ def run(
     alive: Callable[[], bool] | None = None,
     settings: LoopSettings | None = None,
     interrupts: Interrupts | None = None,
+    latch: Callable[[str], None] | None = None,
 ) -> StopRecord:
     """Carry out `plan`; always returns, with the output at zero.
 
@@ -58,6 +63,7 @@ def run(
     interrupts : signals that end the run, if the caller handles them already; they are left
         with `ending` set.
     alive : asked each tick whether the operator's client gave a sign of life since.
+    latch : gets the reason when the gate has ended in FAULT, with the output at zero.
 
     Returns
     -------
@@ -73,6 +79,9 @@ def run(
     with nullcontext(interrupts) if interrupts else Interrupts() as signals:
         status, reason = job.until_the_end(stop or Event(), signals)
         signals.ending = True
+        if latch is not None and job.gate.state is State.FAULT:
+            fault = job.gate.fault
+            status, reason = with_troubles(status, reason, [attempt(lambda: latch(fault))])
         return job.close(status, reason)
 
 
@@ -94,7 +103,8 @@ class _Run:
         self.clock, self.sensor = device.clock, device.sensor
         simulated = device.metadata.get("clock") == "simulated"
         self.tick = choose_tick(settings, device, plan.rate_hz, simulated)
-        self.ahead = math.ceil((settings.ahead + self.tick) * plan.rate_hz)
+        self.ahead = math.ceil((choose_ahead(settings, simulated) + self.tick) * plan.rate_hz)
+        self.reports = self.sensor if isinstance(self.sensor, Reports) else None
         self.reference = Reference(plan)
         self.collector = Collector(
             rig, plan, self.reference, self.sensor.channels, max(1, round(GATHER * plan.rate_hz))
@@ -109,38 +119,50 @@ class _Run:
         self.queued = None if simulated else QueuedSink(sink)
         self.sink: Sink = self.queued or sink
         self.newest = -1  # newest sample that arrived
+        self.reckoned, self.reckoned_at = 0.0, 0  # the device's sample by the host's clock, ns
         self.apart = 0  # ns, host's clock minus the device's
         self.start = -1  # sample at which the plan begins
         self.sent = 0  # samples of the plan that were sent, and of the rest after it
         self.done = 0  # segments that are whole and reported
         self.late = self.missing = 0
+        self.latest = 0.0  # s, of the tick that was the latest
+        self.due = self.report = 0  # ns, next tick and next progress report
         self.margin = self.worst = ("", math.inf)
 
     def until_the_end(self, stop: Event, interrupts: Interrupts) -> tuple[Status, str]:
         """Run; when this returns the output is at zero, whatever happened."""
-        status: Status = "failed"
-        reason = ""
         try:
-            self._begin()
-            status, reason = self._stream(stop, interrupts)
-        except GateError as error:
-            # Refused before it was armed: nothing tripped, nothing moved.
-            status = "tripped" if self.gate.state is State.FAULT else "failed"
-            reason = str(error)
-            self._zero(reason)
-        except KeyboardInterrupt:
-            status, reason = "stopped", "KeyboardInterrupt (Ctrl-C)"
-            self._zero(reason)
-        except SamiiRigError as error:
-            reason = str(error)
-            self._zero(reason, failed=True)
+            self.begin()
+            ended = None
+            while ended is None:
+                ended = self.tick_on(stop, interrupts)
+            self._zero(ended[1])
         except BaseException as error:
-            reason = f"{type(error).__name__}: {error}"
-            self._zero(reason, failed=True)
-            attempt(lambda: self._event("error", traceback=traceback.format_exc()))
-        else:
+            return self.ended_by(error)
+        return ended
+
+    def ended_by(self, error: BaseException) -> tuple[Status, str]:
+        """The output at zero first, then how a run ends that raised this."""
+        if isinstance(error, GateError):
+            self._zero(str(error))
+            # Refused before it was armed: nothing tripped, nothing moved.
+            return "tripped" if self.gate.state is State.FAULT else "failed", str(error)
+        if isinstance(error, KeyboardInterrupt):
+            reason = "KeyboardInterrupt (Ctrl-C)"
             self._zero(reason)
-        return status, reason
+            return "stopped", reason
+        if isinstance(error, RecordingError):
+            # The disk is full or broken, the rig is well: a controlled stop.
+            self._zero(str(error))
+            return "failed", str(error)
+        if isinstance(error, SamiiRigError):
+            self._zero(str(error), failed=True)
+            return "failed", str(error)
+        reason = f"{type(error).__name__}: {error}"
+        self._zero(reason, failed=True)
+        text = "".join(traceback.format_exception(error))
+        attempt(lambda: self._event("error", traceback=text))
+        return "failed", reason
 
     def close(self, status: Status, reason: str) -> StopRecord:
         """The output is at zero: take what still arrives, and finish the recording."""
@@ -151,14 +173,19 @@ class _Run:
         status, reason = with_troubles(status, reason, troubles)
         attempt(
             lambda: self._event(
-                "stop", status=status, reason=reason, late_ticks=late, missing_samples=missing
+                "stop",
+                status=status,
+                reason=reason,
+                late_ticks=late,
+                latest_tick=self.latest,
+                missing_samples=missing,
             )
         )
         if self.queued is not None:
             status, reason = with_troubles(status, reason, [attempt(self.queued.close)])
         return StopRecord(status, reason, late, missing)
 
-    def _begin(self) -> None:
+    def begin(self) -> None:
         """Wait for the first sample, arm, start."""
         give_up = self.clock.now() + round(FIRST_SAMPLE * 1e9)
         while self.newest < 0:
@@ -172,33 +199,39 @@ class _Run:
         self.start = self.newest + 1 + self.ahead
         self.collector.start_at(self.start)
         self._event("plan", start=self.start, samples=len(self.reference.u))
+        self.due = self.report = self.reckoned_at = self.clock.now()
 
-    def _stream(self, stop: Event, interrupts: Interrupts) -> tuple[Status, str]:
-        due = self.clock.now()
-        report = due
-        while self.newest < self.start + len(self.reference.u) - 1:
-            if interrupts.reason:
-                return "stopped", f"stopped by {interrupts.reason}"
-            if stop.is_set():
-                return "stopped", "stopped on request"
-            self._send()
+    def tick_on(self, stop: Event, interrupts: Interrupts) -> tuple[Status, str] | None:
+        """One tick: send, wait, read; how the run ended, None if it goes on."""
+        if self.newest >= self.start + len(self.reference.u) - 1:
+            self.gate.stop("the plan is done", self.clock.now())
             self._report_segments()
-            due += round(self.tick * 1e9)
-            self.clock.sleep((due - self.clock.now()) * 1e-9)
-            if self.clock.now() - due > 0.5e9 * self.tick:
-                self.late += 1
-                due = self.clock.now()
-            self._read()
-            if self.collector.full:
-                self._flush()
-            if self.progress is not None and self.clock.now() >= report:
-                report = self.clock.now() + round(self.settings.report * 1e9)
-                self.progress(self._progress())
-                self.margin = ("", math.inf)
-        self.gate.stop("the plan is done", self.clock.now())
+            return "completed", f"all {len(self.plan.segments)} segments done"
+        if interrupts.reason:
+            return "stopped", f"stopped by {interrupts.reason}"
+        if stop.is_set():
+            return "stopped", "stopped on request"
+        self._send()
         self._report_segments()
-        n = len(self.plan.segments)
-        return "completed", f"all {n} segments done"
+        self.due = self._wait(self.due + round(self.tick * 1e9))
+        self._read()
+        if self.collector.full:
+            self._flush()
+        if self.progress is not None and self.clock.now() >= self.report:
+            self.report = self.clock.now() + round(self.settings.report * 1e9)
+            self.progress(self._progress())
+            self.margin = ("", math.inf)
+        return None
+
+    def _wait(self, due: int) -> int:
+        """Sleep until `due`, and notice when it got later; when it is now."""
+        self.clock.sleep((due - self.clock.now()) * 1e-9)
+        late = (self.clock.now() - due) * 1e-9
+        self.latest = max(self.latest, late)
+        if late > max(0.5 * self.tick, COUNTS_AS_LATE):
+            self.late += 1
+            self.clock.sleep(CATCH_UP)
+        return due if late < 0.5 * self.tick else self.clock.now()
 
     def _read(self) -> None:
         """Take what arrived; the gate sees it first."""
@@ -207,6 +240,7 @@ class _Run:
         block = self.sensor.read()
         self.collector.add(block)
         self.gate.observe(block, self.clock.now())
+        self._tell()
         if len(block):
             self.apart = self.clock.now() - int(block.time[-1])
             self._count(block)
@@ -234,10 +268,26 @@ class _Run:
         if block.quality.any():
             self.missing += int(((block.quality & Quality.MISSING) != 0).any(axis=1).sum())
 
+    def _tell(self) -> None:
+        """What the device says beside its samples, into the recording."""
+        if self.reports is not None:
+            for event in self.reports.events():
+                self.sink.event(event.time, event.name, dict(event.fields))
+
     def _send(self) -> None:
         """Send the reference up to `ahead` past the newest sample. After the plan's end go on
-        with rest, so that the deadman stays fed until the last sample has arrived."""
-        upto = self.newest + 1 - self.start + self.ahead
+        with rest, so that the deadman stays fed until the last sample has arrived.
+
+        Samples come in blocks. In between they are reckoned on by the clock, so that every tick
+        sends, and thus feeds the deadman.
+        """
+        now = self.clock.now()
+        # A little slower than its clock may be, and from the promptest block on: a block that is
+        # late itself must not hold up what is sent.
+        since = (now - self.reckoned_at) * 1e-9 * self.plan.rate_hz * (1.0 - CLOCK_DRIFT)
+        self.reckoned = max(float(self.newest), self.reckoned + since)
+        self.reckoned_at = now
+        upto = int(self.reckoned) + 1 - self.start + self.ahead
         n = upto - self.sent
         if n <= 0:
             return
@@ -295,6 +345,7 @@ class _Run:
     def _tail(self) -> None:
         """The samples after the end, which must show the output at zero."""
         self.zero.check(self.tick, self.collector.add, spoke=self.newest >= 0)
+        self._tell()
 
     def _flush(self) -> None:
         block = self.collector.take()

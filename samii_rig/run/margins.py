@@ -135,6 +135,8 @@ def _margins(
         output.reason,
     )
     for c in limits.sensors:
+        if c.channel not in series:
+            continue  # a monitor, which no model predicts
         x, fixed = series[c.channel], _noise(sensors[c.channel])
         size = [float(np.abs(x[part]).max()) for part in parts]
         add(c.channel, "limit", c.unit, size, fixed, c.max, c.reason)

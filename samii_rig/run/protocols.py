@@ -85,6 +85,23 @@ class Sensor(Protocol):
         """All samples that arrived since the last call, oldest first; may be empty."""
 
 
+@dataclass(frozen=True, slots=True)
+class DeviceEvent:
+    """What a device tells beside its samples: `time` in ns of its clock, a word, and fields."""
+
+    time: int
+    name: str
+    fields: dict[str, str | int | float]
+
+
+@runtime_checkable
+class Reports(Protocol):
+    """A sensor that also has events: a change of the device's own state, counts of its line."""
+
+    def events(self) -> list[DeviceEvent]:
+        """All since the last call, oldest first. Never raises."""
+
+
 @runtime_checkable
 class Clock(Protocol):
     """Time, injected so that a simulated hour passes in a second."""

@@ -102,6 +102,19 @@ class QueuedSink:
                 self._error, failed = error, True
 
 
+class Watched:
+    """A sink that shows each block to somebody after it was taken."""
+
+    def __init__(self, sink: Sink, watch: Callable[[SampleBlock], None]) -> None:
+        self._sink, self._watch = sink, watch
+        self.event, self.segment = sink.event, sink.segment
+
+    def write(self, block: SampleBlock) -> None:
+        """Keep the samples, then show them."""
+        self._sink.write(block)
+        self._watch(block)
+
+
 def recorded_channels(rig: Rig, plan: Plan, channels: tuple[Channel, ...]) -> tuple[Channel, ...]:
     """The columns of a run's recording: the device's own `channels`, and the reference.
 

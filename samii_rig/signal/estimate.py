@@ -16,6 +16,7 @@ from samii_rig.signal.distortion import Distortion, distortion
 from samii_rig.signal.gather import Gaps, gather
 from samii_rig.signal.groups import Group, Piece
 from samii_rig.signal.quantisation import floor_of
+from samii_rig.signal.skew import skews_of, with_skew
 from samii_rig.signal.spectra import (
     burst_spectra,
     comb,
@@ -87,6 +88,7 @@ def estimate(
         raise InputError("estimate", "band", band, "(low, high) in Hz, low below high")
     out: list[FrequencyResponse] = []
     failed: list[EstimateError] = []
+    skews = skews_of(recordings)
     if method in ("auto", "periodic"):
         sines, recordings = stepped.split(recordings)
         out, failed = stepped.estimate_stepped(
@@ -119,7 +121,8 @@ def estimate(
     if not out:
         raise failed[0]
     lost = tuple(Finding("repeat", "error", f"not estimated: {error}") for error in failed)
-    return (replace(out[0], findings=(*out[0].findings, *lost)), *out[1:])
+    out[0] = replace(out[0], findings=(*out[0].findings, *lost))
+    return tuple(with_skew(response, skews) for response in out)
 
 
 def _repeats(

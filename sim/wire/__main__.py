@@ -11,6 +11,7 @@ from pathlib import Path
 
 from samii_rig.errors import InputError, SamiiRigError
 from samii_rig.rig.load import load_rig
+from samii_rig.run.priority import prioritised
 from sim.settings import SimSettings
 from sim.wire.rig import WireRig
 
@@ -47,7 +48,9 @@ def main() -> int:
         return error.exit_code
     rig.say(rig.hello())
     try:
-        rig.run(script)
+        # A board's clock waits for no other program.
+        with prioritised():
+            rig.run(script)
     except SamiiRigError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code

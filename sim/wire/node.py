@@ -49,7 +49,8 @@ class Node:
     """One node since its boot number `boot`.
 
     sample : number of the next sample. state, rejected, host_seq : as the protocol has them.
-    fed : sample at which the deadman was fed last.
+    fed : sample at which the deadman was fed last. stray : counts by which the converter is
+    off what it was told, a defect that a test can have.
     """
 
     config: NodeConfig
@@ -65,6 +66,7 @@ class Node:
     age: int = 0
     fed: int = 0
     v: int = 0
+    stray: int = 0
     theta_ref: int = 0
     encoders: tuple[int, ...] | None = None
     emergency: bool = False
@@ -256,7 +258,7 @@ class Node:
             flags |= Flag.NULL | (0 if self.state == State.IDLE else Flag.LIMITED)
         self._report(clock_us, u, flags, encoders, adcs)
         self.sample = (self.sample + 1) % WORD
-        return self.v + self.config.null
+        return self.v + self.stray + self.config.null
 
     def _wanted(self, u: int, encoders: tuple[int, ...]) -> int:
         error = self.theta_ref - encoders[self.loop.encoder]
@@ -293,7 +295,8 @@ class Node:
         if not self.batch:
             self.batch_head = self.sample, clock
         layout = f"<hhiB{c.n_encoder}i{c.n_adc}h"
-        self.batch.append(struct.pack(layout, self.v, u, self.theta_ref, flags, *encoders, *adcs))
+        held = self.v + self.stray
+        self.batch.append(struct.pack(layout, held, u, self.theta_ref, flags, *encoders, *adcs))
         if len(self.batch) == c.batch:
             numbers = len(self.batch), self.state, self.rejected, len(self.queue)
             head = struct.pack("<IIBBHH", *self.batch_head, *numbers)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -37,6 +38,11 @@ class Board:
     adc: dict[str, Wiring]
     output_counts_per_unit: float
     null: int = NULL
+
+    @property
+    def names(self) -> set[str]:
+        """Of all that is wired to an input."""
+        return {*self.encoder, *self.adc}
 
     def settings(self, port: str) -> dict[str, object]:
         """What the driver of such a node needs in [device.settings]."""
@@ -79,6 +85,9 @@ def board(rig: Rig) -> Board:
             analogue[s.name] = Wiring(
                 len(analogue), MOST_COUNTS // end if end < MOST_COUNTS else 1.0
             )
+    for m in rig.monitor:
+        end = max((abs(x) for x in (m.low, m.high) if math.isfinite(x)), default=2 * abs(m.usual))
+        analogue[m.name] = Wiring(len(analogue), MOST_COUNTS / (end or 1.0))
     spec = rig.actuator[0]
     return Board(encoder, analogue, 1.0 / (spec.resolution or spec.high / MOST_COUNTS))
 
@@ -88,13 +97,22 @@ class Plant:
 
     def __init__(self, rig: Rig, wired: Board, settings: SimSettings) -> None:
         self._wired, self._settings = wired, settings
+        inputs = wired.encoder | wired.adc
         self._places = [
-            (s.name in wired.encoder, (wired.encoder | wired.adc)[s.name]) for s in rig.sensor
+            (i, s.name in wired.encoder, inputs[s.name])
+            for i, s in enumerate(rig.sensor)
+            if s.name in inputs
         ]
         # The steps are the node's converters', not those of the rig file.
         stepless = [s.model_copy(update={"resolution": 0.0}) for s in rig.sensor]
         rig = rig.model_copy(update={"sensor": tuple(stepless)})
         made = realised(rig.model_dump_json(exclude=UNRELATED), settings.band_hz)
+        self._usual = {
+            wired.adc[m.name].index: round(
+                m.usual * wired.adc[m.name].counts_per_unit + wired.adc[m.name].offset
+            )
+            for m in rig.monitor
+        }
         self._tables = tabulate(rig, made, settings.inner)
         self._converters = converters(rig, settings)
         self._drive = drive(rig, settings)
@@ -110,13 +128,13 @@ class Plant:
 
     def sense(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Counts of the encoders and of the analogue inputs at this sample."""
-        s, m = self._settings, len(self._places)
+        s, m = self._settings, len(self._values)
         noise = self._rng.standard_normal(m) if s.noise else self._still
         t, c, values = self._tables, self._converters, self._values
         kernel.sense(t, c, self._state, noise, values, self._quality)
-        counts: dict[bool, dict[int, int]] = {True: {}, False: {}}
-        for (is_encoder, w), x in zip(self._places, values.tolist(), strict=True):
-            n = round(x * w.counts_per_unit + w.offset)
+        counts: dict[bool, dict[int, int]] = {True: {}, False: dict(self._usual)}
+        for i, is_encoder, w in self._places:
+            n = round(float(values[i]) * w.counts_per_unit + w.offset)
             counts[is_encoder][w.index] = n if is_encoder else min(max(n, RAILS[0]), RAILS[1])
         return _filled(counts[True]), _filled(counts[False])
 
@@ -127,6 +145,13 @@ class Plant:
         disturbance = self._rng.standard_normal(s.inner) if pushed else self._still
         v = (dac - self._wired.null) / out
         kernel.move(self._tables, self._drive, self._state, v, disturbance)
+
+    def load(self, i: int) -> float:
+        """What is at sensor i at the sample to come, without noise and converter."""
+        t, s = self._tables, self._state
+        applied, extra = s.number[kernel.APPLIED], s.number[kernel.EXTRA]
+        inputs = t.row_old[i] * applied + t.row_extra[i] * extra
+        return float((t.row[i] * s.x).sum() + inputs)
 
 
 def _filled(counts: Mapping[int, int]) -> tuple[int, ...]:

@@ -11,6 +11,10 @@ Commands, one a line, on standard input or in a script (each with its time in s 
     emergency 0|1    the emergency input
     jump COUNTS      the first encoder reads so much more from now on
     rail INDEX 0|1   an analogue input is at the end of its range, or no longer
+    offset NAME COUNTS   a sensor or monitor reads so much more from now on
+    drift NAME COUNTS    it reads so much more every second
+    freeze NAME 0|1      it repeats one value, or no longer
+    stray COUNTS     the converter holds so much more than the node puts out
     history          one line of JSON: what the output did
     quit
 """
@@ -48,7 +52,7 @@ class WireRig:
     """Plant, node and port; `run` paces them."""
 
     def __init__(self, rig: Rig, settings: SimSettings, link: Path | None) -> None:
-        self.board: Board = board(rig)
+        self.board: Board = board(self._wired(rig))
         self._link = link
         self._plant = Plant(rig, self.board, settings)
         n_encoder = 1 + max((w.index for w in self.board.encoder.values()), default=-1)
@@ -63,6 +67,8 @@ class WireRig:
             max_jump=round(MAX_JUMP * abs(first.counts_per_unit)),
         )
         self._node = Node(self._config, 1)
+        self.pace = 1.0  # of real time in one second of the node's clock
+        self._due = 0  # ns, host's time at which the newest sample was due
         self._clock = 0  # us at the node's boot
         up, down = np.random.SeedSequence(settings.seed).spawn(2)
         self._lines = {
@@ -72,7 +78,12 @@ class WireRig:
         self._stalled = 0.0
         self._emergency, self._jump = False, 0
         self._rails: set[int] = set()
+        self._offset: dict[str, float] = {}
+        self._drift: dict[str, float] = {}
+        self._frozen: dict[str, int | None] = {}
+        self._stray = 0
         self._taken = 0  # samples since boot
+        self._told = 0  # sample at which a command was carried out last
         self._history: deque[tuple[int, int, int]] = deque(maxlen=KEPT)
         self._master = self._slave = -1
         self.port = ""
@@ -105,7 +116,7 @@ class WireRig:
 
     def run(self, script: list[tuple[float, str]]) -> None:
         """Until `quit`, or the end of standard input where that is a pipe."""
-        period = self._config.period_ns
+        period = round(self._config.period_ns * self.pace)
         start, n = time.monotonic_ns(), 0
         waiting = sorted(script)
         stdin = [sys.stdin.fileno()]
@@ -113,7 +124,7 @@ class WireRig:
         while True:
             due = start + n * period
             wait = max(0.0, (due - time.monotonic_ns()) * 1e-9)
-            ports = [self._master] if self._master >= 0 else []
+            ports = [fd for fd in self._ports() if fd >= 0]
             ready, _, _ = select.select(ports + stdin, [], [], wait)
             if self._master in ready:
                 self._receive()
@@ -128,6 +139,7 @@ class WireRig:
                     if not self.obey(line.decode()):
                         return
             while time.monotonic_ns() >= start + n * period:
+                self._due = start + n * period
                 n += 1
                 self._step()
             while waiting and (time.monotonic_ns() - start) * 1e-9 >= waiting[0][0]:
@@ -135,18 +147,45 @@ class WireRig:
                     return
             self._transmit()
 
+    def _wired(self, rig: Rig) -> Rig:
+        """The rig as the node's board sees it."""
+        return rig
+
+    def _ports(self) -> list[int]:
+        return [self._master]
+
     def _step(self) -> None:
         encoders, adcs = self._plant.sense()
         if self._jump:
             encoders = (encoders[0] + self._jump, *encoders[1:])
+        if self._offset or self._drift or self._frozen:
+            encoders, adcs = self._spoilt(encoders, adcs)
         if self._rails:
             adcs = tuple(RAILS[1] if i in self._rails else a for i, a in enumerate(adcs))
         clock = (self._clock + self._taken * self._config.period_ns // 1000) % WORD
         sample = self._node.sample
+        self._node.stray = self._stray
         dac = self._node.take(clock, encoders, adcs, self._emergency)
         self._taken += 1
         self._plant.move(dac)
         self._history.append((sample, dac - self._config.null, time.monotonic_ns()))
+
+    def _spoilt(
+        self, encoders: tuple[int, ...], adcs: tuple[int, ...]
+    ) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """The inputs with what is wrong with single sensors."""
+        counts = {True: list(encoders), False: list(adcs)}
+        period = self._config.period_ns * 1e-9
+        for name, change in self._drift.items():
+            self._offset[name] = self._offset.get(name, 0.0) + change * period
+        for kind, wired in ((True, self.board.encoder), (False, self.board.adc)):
+            for name, w in wired.items():
+                n = counts[kind][w.index] + round(self._offset.get(name, 0.0))
+                if name in self._frozen:
+                    held = self._frozen[name]
+                    n = self._frozen[name] = n if held is None else held
+                counts[kind][w.index] = n if kind else min(max(n, RAILS[0]), RAILS[1])
+        return tuple(counts[True]), tuple(counts[False])
 
     def _receive(self) -> None:
         try:
@@ -174,6 +213,8 @@ class WireRig:
     def obey(self, line: str) -> bool:
         """Carry out one command; False for quit. InputError for what is none."""
         words = line.split()
+        if words and words[0] != "history":
+            self._told = self._node.sample
         try:
             match words:
                 case []:
@@ -195,6 +236,8 @@ class WireRig:
                     self._taken = 0
                     if what == "rest":
                         self._emergency, self._jump, self._rails = False, 0, set()
+                        self._offset, self._drift, self._frozen = {}, {}, {}
+                        self._stray = 0
                         self._plant.rest()
                         self._history.clear()
                 case ["clock", change]:
@@ -205,6 +248,15 @@ class WireRig:
                     self._jump += int(counts)
                 case ["rail", index, level]:
                     (self._rails.add if int(level) else self._rails.discard)(int(index))
+                case ["offset" | "drift" as what, name, change] if name in self.board.names:
+                    now = self._offset if what == "offset" else self._drift
+                    now[name] = now.get(name, 0.0) + float(change)
+                case ["freeze", name, level] if name in self.board.names:
+                    self._frozen.pop(name, None)
+                    if int(level):
+                        self._frozen[name] = None
+                case ["stray", counts]:
+                    self._stray = int(counts)
                 case ["history"]:
                     self.say(self.history())
                 case _:
@@ -220,8 +272,9 @@ class WireRig:
         return {"port": self.port, "settings": self.board.settings(self.port)}
 
     def history(self) -> dict[str, object]:
-        """What the output did. fed : sample at which a stream was accepted last; live : the last
-        sample with another output than null, and its time on the system's monotonic clock."""
+        """What the output did. fed : sample at which a stream was accepted last; told : the next
+        one when a command came last; live : the last sample with another output than null, and its
+        time on the system's monotonic clock; most : the largest output kept."""
         node, live = self._node, [h for h in self._history if h[1] != 0]
         last = live[-1] if live else (-1, 0, 0)
         return {
@@ -230,6 +283,8 @@ class WireRig:
             "boot": node.boot,
             "rejected": node.rejected,
             "fed": node.fed,
+            "told": self._told,
+            "most": max((abs(h[1]) for h in self._history), default=0),
             "live": last[0],
             "live_ns": last[2],
             "v": self._history[-1][1] if self._history else 0,

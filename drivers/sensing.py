@@ -1,0 +1,26 @@
+"""What devices that only measure have in common."""
+
+from __future__ import annotations
+
+from samii_rig.errors import DeviceError
+from samii_rig.run.protocols import CommandBlock, DeviceLoop
+
+
+class NoOutput:
+    """The actuator of a device that has none. Without a deadman, no gate arms it."""
+
+    deadman: float | None = None
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def configure(self, loop: DeviceLoop) -> None:
+        """There is nothing to configure: DeviceError."""
+        raise DeviceError(f"{self.name} only measures; it has no loop to close on {loop.sensor}")
+
+    def write(self, block: CommandBlock) -> None:
+        """There is nothing to drive: DeviceError."""
+        raise DeviceError(f"{self.name} only measures; {len(block)} samples were meant for it")
+
+    def zero(self) -> None:
+        """It is."""

@@ -1,0 +1,256 @@
+"""`samii-rig devices`, `doctor`, `jog`, `calibrate`, `clear-fault`: work at the bench."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from samii_rig.cli.common import JsonOption, RigOption, say_json
+
+if TYPE_CHECKING:
+    from samii_rig.rig.schema import Rig
+
+EXIT = {"completed": 0, "stopped": 130, "tripped": 5, "failed": 6}
+OutOption = Annotated[Path, typer.Option("--out", help="Folder of the recordings.")]
+
+
+def devices(rig: RigOption = "samii", json: JsonOption = False) -> None:
+    """Say which drivers and ports there are, and what answers at the rig's own device.
+
+    Nothing moves; opening a device leaves its output at zero.
+
+    Example: samii-rig devices --rig my_rig.toml
+    """
+    from samii_rig.errors import SamiiRigError
+    from samii_rig.rig.load import load_rig
+    from samii_rig.run.devices import drivers
+    from samii_rig.run.latch import Latch
+    from samii_rig.run.session import opened
+
+    the_rig, _ = load_rig(rig)
+    ports = _ports()
+    fault = Latch(the_rig.name, the_rig.device.driver).fault
+    found: dict[str, object] = {
+        "drivers": sorted(drivers()),
+        "ports": ports,
+        "rig": the_rig.name,
+        "driver": the_rig.device.driver,
+        "fault": asdict(fault) if fault else None,
+    }
+    try:
+        with opened(the_rig) as device:
+            found |= {**device.metadata, "device": device.description, "state": "at zero"}
+    except SamiiRigError as error:
+        found["device"] = f"not open: {error}"
+    if json:
+        say_json(found)
+        return
+    typer.echo(f"drivers    {', '.join(sorted(drivers()))}")
+    for i, port in enumerate(ports or ["none"]):
+        typer.echo(f"{'' if i else 'ports':10} {port}")
+    typer.echo(f"rig        {the_rig.name}, driver {the_rig.device.driver}")
+    typer.echo(f"device     {found['device']}")
+    for key in ("firmware", "serial", "boot", "state"):
+        if key in found:
+            typer.echo(f"{key:10} {found[key]}")
+    if fault:
+        typer.echo(f"FAULT      since {fault.time}: {fault.reason}")
+
+
+def _ports() -> list[str]:
+    from serial.tools import list_ports
+
+    found = sorted(list_ports.comports(), key=lambda p: p.device)
+    return [f"{p.device}  {p.description}".removesuffix("  n/a") for p in found]
+
+
+def doctor(
+    rig: RigOption = "samii",
+    out: OutOption = Path("runs"),
+    move: Annotated[
+        bool, typer.Option("--move", help="Push the joint a little to see the encoder's sign.")
+    ] = False,
+    json: JsonOption = False,
+) -> None:
+    """Look at machine, disk, device and sensors; say the remedy of what is wrong.
+
+    Exit code 6 if anything is bad. With --move the joint turns a little, through the gate.
+
+    Example: samii-rig doctor --rig my_rig.toml --move
+    """
+    from samii_rig.rig.load import load_rig
+    from samii_rig.run.doctor import examine
+
+    the_rig, text = load_rig(rig)
+    checks = []
+    for check in examine(the_rig, text, out, move=move):
+        checks.append(check)
+        if not json:
+            typer.echo(
+                f"{check.verdict.upper() if check.verdict == 'bad' else check.verdict:5} "
+                f"{check.what:14} {check.found}"
+            )
+            if check.remedy:
+                typer.echo(f"{'':20} -> {check.remedy}")
+    bad = [c.what for c in checks if c.verdict == "bad"]
+    if json:
+        say_json({"good": not bad, "checks": [asdict(c) for c in checks]})
+    raise typer.Exit(6 if bad else 0)
+
+
+def jog(
+    to: Annotated[
+        float, typer.Option("--to", help="Angle to bring the joint to, in its sensor's unit.")
+    ] = 0.0,
+    speed: Annotated[float, typer.Option(help="Mean speed, unit/s; at most 0.2.")] = 0.05,
+    rig: RigOption = "samii",
+    out: OutOption = Path("runs"),
+    json: JsonOption = False,
+) -> None:
+    """Bring the joint slowly to an angle, through the gate; recorded like a run.
+
+    Example: samii-rig jog --to 0.05 --rig my_rig.toml
+    """
+    from samii_rig.rig.load import load_rig
+    from samii_rig.run.session import jog as go
+
+    the_rig, text = load_rig(rig)
+    move = go(the_rig, text, to, speed, out)
+    if json:
+        say_json({**asdict(move), "recording": str(move.recording)})
+    else:
+        unit = move.unit
+        typer.echo(f"{move.stop.status}: {move.before:.4f} {unit} -> {move.after:.4f} {unit}")
+        if move.stop.status != "completed":
+            typer.echo(move.stop.reason)
+        typer.echo(f"recording  {move.recording}")
+    raise typer.Exit(EXIT.get(move.stop.status, 1))
+
+
+def calibrate(
+    sensor: Annotated[str, typer.Argument(help="An input of the rig's device, or `null`.")],
+    to: Annotated[Path, typer.Option("--to", help="The copy of the rig file to write (.toml).")],
+    rig: RigOption,
+    reads: Annotated[
+        list[float] | None,
+        typer.Option(help="The true value, once for the offset, twice for gain and offset."),
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="Of each measurement.", min=0.1, max=60.0)] = 2.0,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not ask; the rig is as it is said.")
+    ] = False,
+    out: OutOption = Path("runs"),
+) -> None:
+    """Find offset, or gain and offset, of an input, or the valve's null; write a copy of the file.
+
+    For a sensor the rig is brought by hand to each value of --reads (0 without it). `null` lets
+    the output live at zero, the loop open, and finds the counts at which the joint stands still.
+
+    Example: samii-rig calibrate a_0 --reads 9.81 --reads -9.81 --rig my_rig.toml --to new.toml
+    """
+    import numpy as np
+
+    from samii_rig.cli.common import check_target
+    from samii_rig.errors import InputError
+    from samii_rig.rig.load import load_rig
+    from samii_rig.run import calibrate as c
+    from samii_rig.run.session import column, listen, opened
+
+    check_target("--to", to, (".toml",), [Path(rig)])
+    if to.exists():
+        raise InputError("calibrate", "--to", str(to), "a new name")
+    the_rig, text = load_rig(rig)
+    if sensor == "null":
+        new_text, said = _null(the_rig, text, rig, seconds, out)
+    else:
+        known = reads or [0.0]
+        if len(known) > 2:
+            raise InputError("calibrate", "--reads", known, "one or two values")
+        old = c.wiring(the_rig, sensor)
+        unit = the_rig.units()[sensor]
+        read = []
+        for value in known:
+            if not yes:
+                typer.confirm(f"{sensor} is at {value:g} {unit}, and still?", abort=True, err=True)
+            with opened(the_rig) as device:
+                read.append(float(np.mean(column(listen(device, seconds), sensor))))
+        if len(known) == 1:
+            new = c.one_point(old, read[0], known[0])
+        else:
+            new = c.two_points(old, (read[0], read[1]), (known[0], known[1]))
+        new_text = c.rewritten(text, rig, sensor, new)
+        said = (
+            f"{sensor} read {', '.join(f'{x:.5g}' for x in read)} {unit}; counts_per_unit "
+            f"{old.counts_per_unit:.8g} -> {new.counts_per_unit:.8g}, "
+            f"offset {old.offset} -> {new.offset}"
+        )
+    to.write_text(new_text, encoding="utf-8")
+    typer.echo(said)
+    typer.echo(f"written    {to}")
+
+
+def _null(rig: Rig, text: str, where: str, seconds: float, out: Path) -> tuple[str, str]:
+    from samii_rig.errors import DeviceError, InputError
+    from samii_rig.record.reader import read_recording
+    from samii_rig.run import calibrate as c
+    from samii_rig.run.limits import gate_limits
+    from samii_rig.run.session import still
+
+    if rig.centring is None:
+        raise InputError(rig.name, "centring", None, "a sensor that shows the joint standing still")
+    sensor, name = rig.centring.sensor, rig.actuator[0].name
+    turning = gate_limits(rig, name, rig.centring.kp, sensor).turning
+    if turning == 0.0:
+        raise InputError(rig.name, "null", sensor, f"an angle whose speed follows from {name}")
+    per_unit = float(rig.device.settings.get("output_counts_per_unit", 0.0))
+    move = still(rig, text, seconds, out)
+    if move.stop.status != "completed":
+        raise DeviceError(f"{move.stop.status}: {move.stop.reason}")
+    recording = read_recording(move.recording)
+    segment = recording.cut(recording.segments[0])
+    theta = segment.values[:, segment.column(sensor)]
+    volts = c.null_volts(theta, rig.rate_hz, turning)
+    # What the node holds, where the rig file does not say it.
+    told = recording.metadata.get("device_null_counts", "0")
+    old = int(rig.device.settings.get("null", told))
+    new = old + round(volts * per_unit)
+    unit = rig.actuator[0].unit
+    said = (
+        f"the joint stands still at {volts:.4g} {unit}; null {old} -> {new} counts\n"
+        "the node holds its null itself: store it there too, or it is refused as another one's"
+    )
+    return c.rewritten_null(text, where, new), said
+
+
+def clear_fault(
+    name: Annotated[str, typer.Option("--name", help="Who clears it.")],
+    reason: Annotated[str, typer.Option("--reason", help="Why that is safe.")],
+    rig: RigOption,
+) -> None:
+    """Take a latched FAULT back, after a person has looked at the rig.
+
+    The device is opened (its output stays at zero) and must have no cause to trip any more. Who
+    cleared what, and why, is in the next recording.
+
+    Example: samii-rig clear-fault --rig my_rig.toml --name Ada --reason "hose replaced"
+    """
+    from samii_rig.rig.load import load_rig
+    from samii_rig.run.devices import open_device
+    from samii_rig.run.latch import Latch
+
+    the_rig, _ = load_rig(rig)
+    latch = Latch(the_rig.name, the_rig.device.driver)
+    if latch.fault:
+        # It tells the node, too, and refuses while the cause is there.
+        device = open_device(the_rig, {})
+        try:
+            with latch.held(device):
+                pass
+        finally:
+            device.close()
+    cleared = latch.clear(name, reason)
+    typer.echo(f"{the_rig.name}: cleared by {cleared.person}: {cleared.reason}")
+    typer.echo(f"it was     {cleared.fault}")

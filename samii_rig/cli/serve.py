@@ -1,0 +1,90 @@
+"""`samii-rig serve`: the service."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from samii_rig.cli.common import RigOption
+
+if TYPE_CHECKING:
+    from samii_rig.serve.access import Role
+
+
+def serve(
+    rig: RigOption = "samii",
+    folder: Annotated[Path, typer.Option(help="Folder of the recordings.")] = Path("runs"),
+    host: Annotated[
+        str, typer.Option(help="Address to listen at; beyond this machine it wants TLS and tokens.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(help="Port to listen at; 0 for any that is free.")] = 8340,
+    tls_cert: Annotated[
+        Path | None, typer.Option("--tls-cert", help="Certificate chain (PEM).")
+    ] = None,
+    tls_key: Annotated[
+        Path | None, typer.Option("--tls-key", help="Its private key (PEM).")
+    ] = None,
+    tokens: Annotated[
+        Path | None, typer.Option(help="File of hashed tokens; with it everybody needs one.")
+    ] = None,
+    name: Annotated[
+        list[str] | None,
+        typer.Option(help="Name by which browsers call it, as through a proxy. May be repeated."),
+    ] = None,
+    pace: Annotated[
+        float,
+        typer.Option(help="Of a simulated rig: times real time; 0 for as fast as it can.", min=0.0),
+    ] = 1.0,
+    new_token: Annotated[
+        str | None,
+        typer.Option("--new-token", help="Add a token for this person to --tokens, show it, end."),
+    ] = None,
+    role: Annotated[str, typer.Option(help="Of the new token: viewer or operator.")] = "viewer",
+) -> None:
+    """Serve the rig to a lab: API, live data, recordings, a page.
+
+    One person drives, the others watch; everybody can stop. A run goes on when the service is
+    killed (or stops, as the rig file says), and is found again when it is started anew.
+
+    Example: samii-rig serve --rig samii --folder runs --port 8340
+    """
+    from samii_rig.errors import InputError
+    from samii_rig.rig.load import load_rig
+
+    if os.name != "posix":
+        expected = "Linux or macOS, whose signals and locks it uses"
+        raise InputError("samii-rig serve", "", os.name, expected)
+    try:
+        from samii_rig.serve.access import Tokens
+        from samii_rig.serve.app import serve as run
+        from samii_rig.serve.settings import Settings
+    except ModuleNotFoundError as error:
+        expected = "it to be installed: pip install samii-rig[serve]"
+        raise InputError("samii-rig serve", "", error.name, expected) from error
+    known = Tokens(tokens) if tokens else None
+    if new_token is not None:
+        if known is None:
+            raise InputError("--new-token", "--tokens", None, "the file that keeps its hash")
+        if role not in ("viewer", "operator"):
+            raise InputError("--new-token", "--role", role, "viewer or operator")
+        typer.echo(known.add(new_token, cast("Role", role)))
+        return
+    if (tls_cert is None) != (tls_key is None):
+        raise InputError("samii-rig serve", "--tls-cert", str(tls_cert), "--tls-key beside it")
+    the_rig, text = load_rig(rig)
+    run(
+        Settings(
+            rig=the_rig,
+            rig_toml=text,
+            folder=folder,
+            host=host,
+            port=port,
+            tls=(tls_cert, tls_key) if tls_cert and tls_key else None,
+            tokens=known,
+            names=tuple(name or ()),
+            pace=pace,
+        )
+    )

@@ -1,0 +1,238 @@
+"""Who asks, and whether they may: tokens, origins, rates and sizes.
+
+Everything passes the `Guard` before any route sees it, WebSockets too. It is closed by default:
+a path that is not named as open wants a token where there are any.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import json
+import secrets
+import time
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable, MutableMapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from samii_rig.errors import InputError
+
+Role = Literal["viewer", "operator"]
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+STOP = "/api/stop"
+# What needs no token: the page, which shows nothing before it is given one, and the stop.
+OPEN = ("/", "/api/login", STOP)
+OPEN_FOLDER = "/page/"
+COOKIE = "samii_rig_token"
+MAX_BODY = 64 << 10  # bytes of a request that is no upload
+MAX_UPLOAD = 2 << 30  # bytes of an uploaded recording: an hour of ten channels at 5 kHz
+UPLOAD = ("POST", "/api/recordings")
+RATE, BURST = 40.0, 200.0  # requests/s and at once, of one address
+GUESSES, GUESS_BURST = 0.2, 10.0  # wrong tokens/s and at once, of one address
+MOST_ADDRESSES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Person:
+    """Who asks. role : None for somebody who showed no token."""
+
+    name: str
+    role: Role | None
+
+    @property
+    def drives(self) -> bool:
+        """Whether they may move the rig."""
+        return self.role == "operator"
+
+
+class Tokens:
+    """Names, roles and SHA-256 of tokens, in a file of JSON.
+
+    A token is 256 random bits, so that a plain hash of it cannot be guessed back.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.known = self._read()
+
+    def _read(self) -> list[dict[str, str]]:
+        try:
+            found = json.loads(self.path.read_text(encoding="utf-8"))
+            for item in found:
+                if set(item) != {"name", "role", "sha256"} or item["role"] not in (
+                    "viewer",
+                    "operator",
+                ):
+                    raise ValueError(item)
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError, TypeError) as error:
+            raise InputError(
+                "--tokens", "", str(self.path), "a file that --new-token made"
+            ) from error
+        return list(found)
+
+    def add(self, name: str, role: Role) -> str:
+        """A new token, which is shown this once; InputError if it cannot be kept."""
+        if not 0 < len(name) <= 40 or not name.isprintable():
+            raise InputError("--new-token", "", name, "a name of 1 to 40 characters")
+        token = secrets.token_urlsafe(32)
+        self.known.append({"name": name, "role": role, "sha256": _hash(token)})
+        try:
+            self.path.touch(mode=0o600)
+            self.path.write_text(json.dumps(self.known, indent=1) + "\n", encoding="utf-8")
+        except OSError as error:
+            expected = f"a file that can be written ({error.strerror})"
+            raise InputError("--tokens", "", str(self.path), expected) from error
+        return token
+
+    def person(self, token: str) -> Person | None:
+        """Whose token it is; every one is compared, in constant time."""
+        given, found = _hash(token), None
+        for item in self.known:
+            if hmac.compare_digest(given, item["sha256"]):
+                found = item
+        if found is None:
+            return None
+        return Person(found["name"], "operator" if found["role"] == "operator" else "viewer")
+
+
+def _hash(token: str) -> str:
+    return hashlib.sha256(token.encode()).hexdigest()
+
+
+class Buckets:
+    """So many at once and so many a second, by address."""
+
+    def __init__(self, rate: float, burst: float) -> None:
+        self._rate, self._burst = rate, burst
+        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def left(self, address: str) -> float:
+        """What this address has left."""
+        left, at = self._left.get(address, (self._burst, 0.0))
+        return min(self._burst, left + self._rate * (time.monotonic() - at))
+
+    def take(self, address: str) -> bool:
+        """Take one; False if there is none."""
+        left = self.left(address)
+        self._left[address] = (max(0.0, left - 1.0), time.monotonic())
+        self._left.move_to_end(address)
+        while len(self._left) > MOST_ADDRESSES:
+            self._left.popitem(last=False)
+        return left >= 1.0
+
+
+class Guard:
+    """Lets through what may pass, with who asks as `scope["state"]["person"]`.
+
+    hosts : names and ports under which the service may be called; a browser that was led here
+    by another name (DNS rebinding) is refused.
+    """
+
+    def __init__(self, app: App, tokens: Tokens | None, hosts: frozenset[str], tls: bool) -> None:
+        self._app, self._tokens, self._hosts = app, tokens, hosts
+        self._scheme = "https" if tls else "http"
+        self._asked = Buckets(RATE, BURST)
+        self._guessed = Buckets(GUESSES, GUESS_BURST)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Judge one request or WebSocket."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        headers = {k.decode("latin-1").lower(): v.decode("latin-1") for k, v in scope["headers"]}
+        refused = self._judged(scope, headers)
+        if refused is not None:
+            await _refuse(scope, send, *refused)
+            return
+        if scope["type"] == "http":
+            most = MAX_UPLOAD if (scope["method"], scope["path"]) == UPLOAD else MAX_BODY
+            length = headers.get("content-length", "0")
+            if not length.isdecimal() or int(length) > most:
+                await _refuse(
+                    scope, send, 413, f"a request of {length} bytes; expected at most {most}"
+                )
+                return
+            receive = _bounded(receive, most)
+        await self._app(scope, receive, send)
+
+    def _judged(self, scope: Scope, headers: dict[str, str]) -> tuple[int, str] | None:
+        """Status and line of a refusal; None to let it pass."""
+        address = scope["client"][0] if scope.get("client") else ""
+        path = scope["path"]
+        person = Person("local", "operator") if self._tokens is None else Person(address, None)
+        scope.setdefault("state", {})["person"] = person
+        token = _token(headers)
+        # The stop is for everybody, always: no token, no rate, whoever called us by what name.
+        if path == STOP:
+            if self._tokens is not None and token:
+                scope["state"]["person"] = self._tokens.person(token) or person
+            return None
+        host = headers.get("host", "").lower()
+        if host not in self._hosts:
+            return 421, f"called as {host[:80]!r}; expected one of {', '.join(sorted(self._hosts))}"
+        if self._tokens is not None and token:
+            if self._guessed.left(address) < 1.0:
+                return 429, "too many wrong tokens; wait a minute"
+            found = self._tokens.person(token)
+            if found is not None:
+                scope["state"]["person"] = person = found
+            else:
+                self._guessed.take(address)
+        if not self._asked.take(address):
+            return 429, "too many requests; expected fewer than 40 a second"
+        origin = headers.get("origin")
+        if origin is not None and origin.lower() not in {f"{s}://{host}" for s in self._schemes()}:
+            return 403, f"a page of {origin[:80]!r}; expected one of this service"
+        if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
+            return 403, "asked by a page of another site; expected one of this service"
+        if person.role is None and path not in OPEN and not path.startswith(OPEN_FOLDER):
+            return 401, "no valid token; expected Authorization: Bearer TOKEN"
+        return None
+
+    def _schemes(self) -> tuple[str, ...]:
+        # Behind a proxy that ends TLS the page comes by https, and we are asked by http.
+        return (self._scheme,) if self._scheme == "https" else ("http", "https")
+
+
+def _token(headers: dict[str, str]) -> str:
+    kind, _, token = headers.get("authorization", "").partition(" ")
+    if kind.lower() == "bearer":
+        return token.strip()
+    for part in headers.get("cookie", "").split(";"):
+        name, _, value = part.strip().partition("=")
+        if name == COOKIE:
+            return value
+    return ""
+
+
+def _bounded(receive: Receive, most: int) -> Receive:
+    """A body that claims nothing and goes on for ever ends here."""
+    taken = 0
+
+    async def bounded() -> MutableMapping[str, Any]:
+        nonlocal taken
+        message = await receive()
+        taken += len(message.get("body", b""))
+        if taken > most:
+            return {"type": "http.disconnect"}
+        return message
+
+    return bounded
+
+
+async def _refuse(scope: Scope, send: Send, status: int, line: str) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 4000 + status, "reason": line[:120]})
+        return
+    body = json.dumps({"error": line}).encode()
+    headers = [(b"content-type", b"application/json"), (b"connection", b"close")]
+    await send({"type": "http.response.start", "status": status, "headers": headers})
+    await send({"type": "http.response.body", "body": body})

@@ -1,0 +1,161 @@
+"""The service as an ASGI application, and the process that serves it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from importlib import resources
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from starlette.exceptions import HTTPException
+
+import samii_rig
+from samii_rig.errors import SamiiRigError
+from samii_rig.serve import driving, library
+from samii_rig.serve.access import App, Guard
+from samii_rig.serve.rooms import STATUS, NotThereError, Rooms
+from samii_rig.serve.settings import Settings, is_local
+
+MAX_HEADER = 32 << 10  # bytes of a request's head
+MAX_MESSAGE = 4 << 10  # bytes of a WebSocket message to us; none is expected
+PING = 10.0  # s; a viewer that does not answer for that long is let go
+MANY = 500  # recordings whose reading takes seconds, and is told
+# Nothing from elsewhere, nothing that is not a file of ours, in nobody's frame.
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data:; connect-src 'self'; frame-ancestors 'none'; "
+    "base-uri 'none'; form-action 'none'"
+)
+HEADERS = {
+    "Content-Security-Policy": POLICY,
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
+TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
+
+
+def application(rooms: Rooms) -> FastAPI:
+    """The routes; `guarded` puts the guard before them."""
+
+    @asynccontextmanager
+    async def life(app: FastAPI) -> AsyncIterator[None]:
+        work = asyncio.create_task(rooms.work())
+        try:
+            yield
+        finally:
+            work.cancel()
+            with suppress(asyncio.CancelledError):
+                await work
+            rooms.desk.close()
+
+    app = FastAPI(
+        title="samii-rig",
+        description=__doc__,
+        version=samii_rig.__version__,
+        lifespan=life,
+        # Their pages come from another host.
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/api/openapi.json",
+    )
+    app.add_exception_handler(SamiiRigError, _said)
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(HTTPException, _http)
+    app.include_router(driving.routes(rooms))
+    app.include_router(library.routes(rooms))
+    _page(app)
+    return app
+
+
+def guarded(rooms: Rooms, port: int, app: FastAPI | None = None) -> App:
+    """What is served: the routes (or those of `app`) behind their guard."""
+    s = rooms.settings
+    names = {"127.0.0.1", "localhost", "[::1]"} if is_local(s.host) else set()
+    names |= {f"[{s.host}]" if ":" in s.host else s.host}
+    hosts = {f"{name}:{port}" for name in names} | set(s.names)
+    hosts |= {f"{name}:{port}" for name in s.names}
+    if port == (443 if s.tls else 80):
+        hosts |= names
+    return Guard(
+        app or application(rooms), s.tokens, frozenset(h.lower() for h in hosts), s.tls is not None
+    )
+
+
+def _page(app: FastAPI) -> None:
+    folder = resources.files("samii_rig.serve") / "page"
+    files = {f.name: f.read_bytes() for f in folder.iterdir() if f.is_file()}
+
+    def served(name: str) -> Response:
+        if name not in files:
+            raise NotThereError(f"no file {name[:40]!r}")
+        kind = TYPES.get(name.rpartition(".")[2], "application/octet-stream")
+        return Response(files[name], media_type=kind, headers=HEADERS)
+
+    @app.get("/", include_in_schema=False)
+    def index() -> Response:
+        return served("index.html")
+
+    @app.get("/page/{name}", include_in_schema=False)
+    def file(name: str) -> Response:
+        return served(name)
+
+
+async def _said(request: Request, error: Exception) -> JSONResponse:
+    kinds = (STATUS[k] for k in type(error).__mro__ if k in STATUS)
+    return JSONResponse({"error": str(error)}, next(kinds, 400))
+
+
+async def _http(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    return JSONResponse({"error": str(error.detail)}, error.status_code)
+
+
+async def _invalid(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    first: dict[str, Any] = dict(error.errors()[0])
+    where = ".".join(str(part) for part in first["loc"])
+    return JSONResponse({"error": f"{where}: {first['msg']}"}, 422)
+
+
+def _reading(done: int, of: int) -> None:
+    if of > MANY:
+        print(f"index: {done:,} of {of:,} recordings", file=sys.stderr, flush=True)
+
+
+def serve(settings: Settings) -> None:
+    """Check, listen, serve until a signal; InputError for what cannot be."""
+    settings.check()
+    listening = settings.bound()
+    port = listening.getsockname()[1]
+    rooms = Rooms(settings, _reading)
+    host = f"[{settings.host}]" if ":" in settings.host else settings.host
+    scheme = "https" if settings.tls else "http"
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(name)s: %(message)s")
+    config = uvicorn.Config(
+        guarded(rooms, port),
+        http="h11",
+        ws="websockets-sansio",
+        loop="asyncio",
+        ssl_certfile=settings.tls[0] if settings.tls else None,
+        ssl_keyfile=settings.tls[1] if settings.tls else None,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,
+        h11_max_incomplete_event_size=MAX_HEADER,
+        ws_max_size=MAX_MESSAGE,
+        ws_ping_interval=PING,
+        ws_ping_timeout=PING,
+        ws_per_message_deflate=False,
+        timeout_graceful_shutdown=2,
+    )
+    print(f"{settings.rig.name}: {scheme}://{host}:{port}", flush=True)
+    uvicorn.Server(config).run(sockets=[listening])

@@ -1,0 +1,227 @@
+"""Work that takes more than a moment, in processes beside the service's own.
+
+The service's loop must be free for a stop at any moment: predictions, readings of recordings and
+the like are done here. Every function takes and gives plain data; what a person did wrong comes
+back as a line, as an exception of ours cannot pass between processes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import resource
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from samii_rig import errors
+from samii_rig.errors import SamiiRigError
+
+WORKERS = 2
+WITHIN = 120.0  # s that a piece of work may take
+MEMORY = 8 << 30  # bytes of address space of one of them
+MOST_POINTS = 4000  # of one curve in one answer
+
+
+class Desk:
+    """Hands work to the processes; they are started when there is some."""
+
+    def __init__(self) -> None:
+        self._pool = _pool()
+
+    async def do(self, work: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
+        """The answer; raises what the work raised, RecordingError if it broke or took too long."""
+        loop = asyncio.get_running_loop()
+        pool = self._pool
+        try:
+            answer = await asyncio.wait_for(
+                loop.run_in_executor(pool, _answered, work, arguments), WITHIN
+            )
+        except (BrokenProcessPool, TimeoutError) as error:
+            if self._pool is pool:
+                self.close()
+                self._pool = _pool()
+            raise errors.RecordingError(
+                f"it took more than {WITHIN:g} s or {MEMORY >> 30} GB; expected a smaller question"
+            ) from error
+        if "raised" in answer:
+            kind = getattr(errors, answer["raised"])
+            again: SamiiRigError = kind.__new__(kind)
+            Exception.__init__(again, answer["line"])
+            raise again
+        found: dict[str, Any] = answer["found"]
+        return found
+
+    def close(self) -> None:
+        """End them."""
+        processes = list((self._pool._processes or {}).values())
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.kill()
+
+
+def _pool() -> ProcessPoolExecutor:
+    return ProcessPoolExecutor(WORKERS, get_context("spawn"), _begin)
+
+
+def _begin() -> None:
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+
+
+def _answered(work: Callable[..., dict[str, Any]], arguments: tuple[Any, ...]) -> dict[str, Any]:
+    try:
+        return {"found": _plain(work(*arguments))}
+    except SamiiRigError as error:
+        return {"raised": type(error).__name__, "line": str(error)}
+    except MemoryError:
+        return {"raised": "RecordingError", "line": "it does not fit into the memory"}
+
+
+def rig(rig_toml: str) -> dict[str, Any]:
+    """The rig as data, and as a drawing."""
+    from samii_rig.report.drawing import draw
+    from samii_rig.rig.load import parse
+    from samii_rig.rig.schema import Rig
+
+    the_rig = parse(Rig, rig_toml, "rig file")
+    found = the_rig.model_dump(mode="json", exclude={"device": {"settings"}})
+    return {"rig": found, "drawing": draw(the_rig), "text": rig_toml}
+
+
+def dry_run(rig_toml: str, name: str, text: str) -> dict[str, Any]:
+    """What an experiment would do: margins, expected errors, one prediction for each run.
+
+    name : of a shipped experiment, or `text` : of its file. No path from a client is ever opened.
+    refused : the line of what limit would be broken, "" if none. text : of the experiment.
+    """
+    from samii_rig.errors import InputError, LimitError
+    from samii_rig.rig.load import parse
+    from samii_rig.rig.schema import Rig
+    from samii_rig.run.dryrun import predict
+    from samii_rig.run.experiments import load_experiment, shipped
+    from samii_rig.run.setups import setups_of
+    from samii_rig.serve.words import prediction
+
+    the_rig = parse(Rig, rig_toml, "rig file")
+    if bool(name) == bool(text):
+        raise InputError("experiment", "", name, "a name or a text, one of the two")
+    if name:
+        if name not in shipped():
+            raise InputError("experiment", "", name, f"one of {', '.join(shipped())}")
+        _, text = load_experiment(name, the_rig)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "experiment.toml"
+        file.write_text(text, encoding="utf-8")
+        try:
+            experiment, _ = load_experiment(str(file), the_rig)
+        except SamiiRigError as error:
+            raise _renamed(error, str(file)) from error
+    runs, refused = [], ""
+    for setup in setups_of(experiment, the_rig, rig_toml):
+        plan = experiment.plan(setup.rig)
+        predicted = predict(plan, setup.rig)
+        try:
+            predicted.refuse()
+        except LimitError as error:
+            refused = refused or str(error)
+        about = {"setup": setup.name, "instruction": setup.instruction}
+        runs.append({**about, "segments": len(plan.segments), **prediction(predicted)})
+    return {"experiment": experiment.name, "runs": runs, "refused": refused, "text": text}
+
+
+def _renamed(error: SamiiRigError, file: str) -> SamiiRigError:
+    """The same line with a name that means something to who sent the text."""
+    line = str(error).replace(file, "experiment.toml")
+    again = type(error).__new__(type(error))
+    Exception.__init__(again, line)
+    return again
+
+
+def signals(path: str, names: list[str], start: float, stop: float, pixels: int) -> dict[str, Any]:
+    """Channels of a recording as curves of at most 2 `pixels` points whose outline is whole.
+
+    start, stop : s from the first sample; `stop` 0 for the end.
+    """
+    import numpy as np
+
+    from samii_rig.errors import InputError
+    from samii_rig.record.reader import read_recording
+    from samii_rig.report.decimate import thin
+
+    recording = read_recording(Path(path))
+    known = [c.name for c in recording.channels]
+    for name in names:
+        if name not in known:
+            raise InputError("signals", "channel", name, f"one of {', '.join(known)}")
+    if not 1 <= pixels <= MOST_POINTS // 2:
+        raise InputError("signals", "pixels", pixels, f"1 to {MOST_POINTS // 2}")
+    begin = recording.time[0] if len(recording) else 0
+    t = (recording.time - begin) * 1e-9
+    low, high = np.searchsorted(t, [start, stop if stop > 0 else math.inf])
+    curves = []
+    for name in names or known:
+        column = recording.column(name)
+        channel = recording.channels[column]
+        x, y = thin(t[low:high], recording.values[low:high, column], pixels)
+        curves.append(
+            {
+                "name": name,
+                "unit": channel.unit,
+                "role": channel.role,
+                "time": x.tolist(),
+                "values": y.tolist(),
+            }
+        )
+    first = int(recording.sequence[0]) if len(recording) else 0
+    rate = recording.rate_hz
+    return {
+        "rate_hz": rate,
+        "duration_s": float(t[-1]) if len(t) else 0.0,
+        "curves": curves,
+        "gaps": int((np.diff(recording.sequence) > 1).sum()),
+        "segments": [
+            {
+                "name": s.name,
+                "kind": s.kind,
+                "level": s.level,
+                "unit": s.unit,
+                "start_s": (s.start - first) / rate,
+                "stop_s": (s.stop - first) / rate,
+            }
+            for s in recording.segments
+        ],
+    }
+
+
+def responses(path: str) -> dict[str, Any]:
+    """The frequency responses logged in a recording, with the half width of their 90 % bands."""
+    from samii_rig.record.reader import read_frequency_responses
+    from samii_rig.serve.words import response
+
+    return {"responses": [response(r) for r in read_frequency_responses(Path(path))]}
+
+
+def comparison(a: str, b: str) -> dict[str, Any]:
+    """How the frequency responses of two recordings differ, in their own uncertainty."""
+    from samii_rig.record.reader import read_frequency_responses
+    from samii_rig.serve.words import compared
+
+    first, second = (read_frequency_responses(Path(p)) for p in (a, b))
+    return {"pairs": compared(first, second)}
+
+
+def _plain(value: Any) -> Any:
+    """What is no number as null, which JSON can say."""
+    match value:
+        case dict():
+            return {str(k): _plain(v) for k, v in value.items()}
+        case list() | tuple():
+            return [_plain(v) for v in value]
+        case float():
+            return value if math.isfinite(value) else None
+        case _:
+            return value

@@ -1,0 +1,213 @@
+"""Routes that concern the rig: plan, start, stop, queue, lease, faults, live data."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Request, Response, WebSocket, WebSocketDisconnect
+from pydantic import BaseModel, ConfigDict, Field
+
+from samii_rig.errors import LimitError
+from samii_rig.rig.load import MAX_BYTES
+from samii_rig.run.experiments import shipped
+from samii_rig.serve import desk
+from samii_rig.serve.access import COOKIE, STOP
+from samii_rig.serve.lease import EVERY, LASTS
+from samii_rig.serve.rooms import NotThereError, Rooms, operator, person
+from samii_rig.serve.viewers import MOST_VIEWERS
+
+Answer = dict[str, Any]
+
+
+class Body(BaseModel):
+    """A request's body: a field that is not known is an error."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Asked(Body):
+    """An experiment: the name of a shipped one, or the text of a file."""
+
+    experiment: Annotated[str, Field(max_length=80)] = ""
+    experiment_toml: Annotated[str, Field(max_length=min(MAX_BYTES, 48_000))] = ""
+
+
+class Start(Asked):
+    """An experiment to run."""
+
+    operator: Annotated[str, Field(max_length=80)] = ""
+    diagnosis: bool = True
+    seed: Annotated[int | None, Field(ge=0, le=2**53)] = None
+
+
+class Word(Body):
+    """Why a fault may be cleared."""
+
+    name: Annotated[str, Field(max_length=80)]
+    reason: Annotated[str, Field(max_length=400)]
+
+
+def routes(rooms: Rooms) -> APIRouter:
+    """All of them."""
+    router = APIRouter(prefix="/api")
+    _describe(router, rooms)
+    _drive(router, rooms)
+    _lease(router, rooms)
+    _live(router, rooms)
+    return router
+
+
+def _describe(router: APIRouter, rooms: Rooms) -> None:
+    @router.get("/rig")
+    async def rig() -> Answer:
+        """The rig file as data, as text and as a drawing."""
+        return await rooms.desk.do(desk.rig, rooms.settings.rig_toml)
+
+    @router.get("/state")
+    async def state(request: Request) -> Answer:
+        """Run, queue, time left, lease, fault; and who asks."""
+        who = person(request)
+        return {**rooms.state(), "you": {"name": who.name, "role": who.role}}
+
+    @router.get("/experiments")
+    async def experiments() -> Answer:
+        """The shipped experiments with the text of their files."""
+        found = {name: file.read_text("utf-8") for name, file in shipped().items()}
+        return {"experiments": found}
+
+    @router.post("/dry-run")
+    async def dry_run(asked: Asked) -> Answer:
+        """What an experiment would do: margins to every limit, expected errors, duration."""
+        return await _predicted(rooms, asked)
+
+
+async def _predicted(rooms: Rooms, asked: Asked) -> Answer:
+    """The dry run; in a process beside, as an experiment's module may take seconds to load."""
+    rig_toml = rooms.settings.rig_toml
+    return await rooms.desk.do(desk.dry_run, rig_toml, asked.experiment, asked.experiment_toml)
+
+
+def _drive(router: APIRouter, rooms: Rooms) -> None:
+    @router.post("/runs", status_code=202)
+    async def start(request: Request, asked: Start) -> Answer:
+        """Queue an experiment; it starts at once if nothing runs. Wants the lease."""
+        who = rooms.drives(request)
+        if not rooms.supervisor.simulated:
+            rooms.latch.refuse()
+        planned = await _predicted(rooms, asked)
+        if planned["refused"]:
+            raise LimitError(planned["refused"])
+        # The lease may have gone to another while it was predicted.
+        rooms.drives(request)
+        jobs = rooms.supervisor.add(
+            planned["experiment"],
+            planned["text"],
+            planned["runs"],
+            asked.operator or who.name,
+            diagnosis=asked.diagnosis,
+            seed=asked.seed,
+        )
+        return {"jobs": [rooms.supervisor.plain(j) for j in jobs]}
+
+    @router.get("/jobs/{id_}")
+    async def job(id_: str) -> Answer:
+        """One run that was asked for, and how it stands."""
+        found = rooms.supervisor.job(id_)
+        if found is None:
+            raise NotThereError(f"no job {id_[:40]!r}; expected the id of one")
+        return found
+
+    @router.post(STOP.removeprefix("/api"))
+    async def stop(request: Request) -> Answer:
+        """Zero output now. Works for everybody, always: no token, no lease."""
+        client = request.client.host if request.client else "somebody"
+        who = person(request)
+        return {"stopped": rooms.supervisor.stop(f"{who.name} ({client})")}
+
+    @router.delete("/queue/{id_}")
+    async def cancel(request: Request, id_: str) -> Answer:
+        """Take a job out of the queue. Wants the lease."""
+        rooms.drives(request)
+        rooms.supervisor.cancel(id_)
+        return {"cancelled": id_}
+
+    @router.post("/queue/resume")
+    async def resume(request: Request) -> Answer:
+        """Let the queue go on after it was held. Wants the lease."""
+        rooms.drives(request)
+        rooms.supervisor.resume()
+        return rooms.state()
+
+    @router.post("/clear-fault")
+    async def clear_fault(request: Request, word: Word) -> Answer:
+        """Take a latched fault back, with name and reason. Wants the lease."""
+        rooms.drives(request)
+        rooms.latch.clear(word.name, word.reason)
+        return rooms.state()
+
+
+def _lease(router: APIRouter, rooms: Rooms) -> None:
+    @router.post("/lease")
+    async def take(request: Request) -> Answer:
+        """Become the one who drives. Silence for `lasts_s` ends it, and the run with it."""
+        secret = rooms.lease.take(operator(request).name)
+        return {"lease": secret, "every_s": EVERY, "lasts_s": LASTS}
+
+    @router.post("/lease/beat")
+    async def beat(request: Request) -> Answer:
+        """A sign of life of who drives."""
+        rooms.lease.beat(request.headers.get("x-lease", ""))
+        return {"lasts_s": LASTS}
+
+    @router.delete("/lease")
+    async def give_back(request: Request) -> Answer:
+        """Hand over in good order: what runs goes on."""
+        rooms.lease.give_back(request.headers.get("x-lease", ""))
+        return {}
+
+    @router.post("/login")
+    async def login(request: Request, response: Response) -> Answer:
+        """Keep the token of this request as a cookie that no script can read."""
+        who = person(request)
+        token = request.headers.get("authorization", "").partition(" ")[2].strip()
+        if who.role is not None and token:
+            secure = request.url.scheme == "https"
+            response.set_cookie(COOKIE, token, httponly=True, samesite="strict", secure=secure)
+        return {"name": who.name, "role": who.role}
+
+
+def _live(router: APIRouter, rooms: Rooms) -> None:
+    @router.websocket("/live")
+    async def live(socket: WebSocket) -> None:
+        """Samples as binary frames (see `viewers`), the state as JSON. What comes in is ignored."""
+        if len(rooms.viewers) >= MOST_VIEWERS:
+            await socket.close(1013, f"{MOST_VIEWERS} viewers are connected")
+            return
+        await socket.accept()
+        viewer = rooms.viewers.add()
+
+        async def send() -> None:
+            while True:
+                frame = await viewer.next()
+                if isinstance(frame, str):
+                    await socket.send_text(frame)
+                else:
+                    await socket.send_bytes(frame)
+
+        async def listen() -> None:
+            while (await socket.receive())["type"] != "websocket.disconnect":
+                pass
+
+        tasks = [asyncio.create_task(send()), asyncio.create_task(listen())]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            rooms.viewers.remove(viewer)
+            for task in tasks:
+                task.cancel()
+            for outcome in await asyncio.gather(*tasks, return_exceptions=True):
+                if isinstance(outcome, Exception) and not isinstance(
+                    outcome, (WebSocketDisconnect, RuntimeError)
+                ):
+                    raise outcome

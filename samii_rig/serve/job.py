@@ -1,0 +1,202 @@
+"""A run that was asked for, as a folder: what was asked, how it stands, who works on it.
+
+The folder is all that service and runner share on the disk. Whoever runs holds its lock, so that
+a service that was started anew knows who is still alive without trusting a number of a process.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import re
+import secrets
+import signal
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from samii_rig.errors import GateError, RecordingError
+
+ID = re.compile(r"\d{8}T\d{12}-[0-9a-f]{6}")
+REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS = (
+    "request.json",
+    "state.json",
+    "rig.toml",
+    "experiment.toml",
+    "lock",
+    "log.txt",
+    "stops.jsonl",
+)
+
+MOST_STOPS = 20  # that are written down
+
+Phase = Literal[
+    "queued", "starting", "running", "analysing", "done", "refused", "cancelled", "died"
+]
+OVER: tuple[Phase, ...] = ("done", "refused", "cancelled", "died")
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """What was asked for. setup : which run of an experiment of several. recording : its name
+    below the folder. settings : of the device, over those of the rig file."""
+
+    experiment: str
+    recording: str
+    operator: str = ""
+    setup: int = 0
+    instruction: str = ""
+    diagnosis: bool = True
+    duration_s: float = 0.0
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class JobState:
+    """How it stands. status, reason : of the stop record. error : why there is none.
+    live : path of the live data."""
+
+    phase: Phase = "queued"
+    pid: int = 0
+    live: str = ""
+    status: str = ""
+    reason: str = ""
+    error: str = ""
+    trouble: str = ""
+    verdict: str = ""
+    time: str = ""
+
+
+class Job:
+    """One of them. `id` sorts by the time at which it was asked for."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.id = folder.name
+
+    @classmethod
+    def make(cls, jobs: Path, request: Request, rig_toml: str, experiment_toml: str) -> Job:
+        """A new job, queued; RecordingError if the folder cannot be written."""
+        name = f"{datetime.now(UTC):%Y%m%dT%H%M%S%f}-{secrets.token_hex(3)}"
+        folder = jobs / name
+        try:
+            folder.mkdir(parents=True)
+            (folder / RIG).write_text(rig_toml, encoding="utf-8")
+            (folder / EXPERIMENT).write_text(experiment_toml, encoding="utf-8")
+            job = cls(folder)
+            job.set(JobState())
+            # Last: a folder without it is not a job.
+            _put(folder / REQUEST, asdict(request))
+        except OSError as error:
+            raise RecordingError(f"{folder} cannot be written: {error.strerror}") from error
+        return job
+
+    @staticmethod
+    def all(jobs: Path) -> list[Job]:
+        """All jobs, oldest first."""
+        if not jobs.is_dir():
+            return []
+        found = (f for f in jobs.iterdir() if ID.fullmatch(f.name) and (f / REQUEST).is_file())
+        return [Job(f) for f in sorted(found, key=lambda f: f.name)]
+
+    @cached_property
+    def request(self) -> Request:
+        """What was asked for."""
+        return Request(**_get(self.folder / REQUEST))
+
+    @property
+    def written(self) -> JobState:
+        """How it stands, as was written last."""
+        return JobState(**_get(self.folder / STATE))
+
+    @property
+    def state(self) -> JobState:
+        """How it stands; `died` if whoever ran it is gone without a word."""
+        state = self.written
+        if state.phase in ("starting", "running", "analysing") and not self.alive():
+            # It may have ended between the two looks.
+            state = self.written
+            if state.phase not in OVER:
+                return JobState(**{**asdict(state), "phase": "died"})
+        return state
+
+    def set(self, state: JobState) -> None:
+        """Write how it stands, whole or not at all."""
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        _put(self.folder / STATE, {**asdict(state), "time": now})
+
+    def alive(self) -> bool:
+        """Whether somebody runs it now."""
+        try:
+            with (self.folder / LOCK).open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except FileNotFoundError:
+            return False
+        except BlockingIOError:
+            return True
+        return False
+
+    @contextmanager
+    def held(self) -> Iterator[int]:
+        """This process runs it, and so does one that inherits the descriptor that this gives.
+
+        GateError if another does already.
+        """
+        with (self.folder / LOCK).open("ab") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise GateError(f"{self.id} is run by another process") from error
+            yield file.fileno()
+
+    def stop(self, by: str) -> bool:
+        """Have the runner end at zero output; False if there is none. by : recorded.
+
+        A runner that has not even said its number yet finds it written, before anything moves.
+        """
+        if not self.alive():
+            return False
+        # The signal first: what is written about it can wait.
+        pid = self.written.pid
+        if pid:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGTERM)
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
+        if len(self.stops()) >= MOST_STOPS:
+            return True
+        with (self.folder / STOPS).open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"time": now, "by": by}) + "\n")
+        return True
+
+    def stops(self) -> list[dict[str, str]]:
+        """Who asked for a stop, and when."""
+        try:
+            lines = (self.folder / STOPS).read_text(encoding="utf-8").splitlines()
+        except FileNotFoundError:
+            return []
+        return [json.loads(line) for line in lines]
+
+
+def _put(path: Path, data: dict[str, Any]) -> None:
+    handle, name = tempfile.mkstemp(dir=path.parent)
+    with os.fdopen(handle, "w", encoding="utf-8") as file:
+        json.dump(data, file)
+        file.flush()
+        os.fsync(file.fileno())
+    Path(name).replace(path)
+
+
+def _get(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path} cannot be read: {error}") from error
+    if not isinstance(found, dict):
+        raise RecordingError(f"{path} is not what this version writes")
+    return found

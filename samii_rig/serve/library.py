@@ -1,0 +1,169 @@
+"""Routes that concern recordings: list, look, download, compare, note, bring in."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from datetime import UTC, datetime
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import FileResponse
+from pydantic import Field
+from starlette.requests import ClientDisconnect
+
+from samii_rig.errors import RecordingError
+from samii_rig.index.query import MOST
+from samii_rig.index.query import Query as Asked
+from samii_rig.index.remarks import add_note, read_remarks, set_tags
+from samii_rig.index.store import PRIVATE
+from samii_rig.serve import desk, upload
+from samii_rig.serve.driving import Answer, Body
+from samii_rig.serve.rooms import Rooms, operator
+
+Short = Annotated[str, Query(max_length=200)]
+MEDIA = "application/octet-stream"
+
+
+class Tags(Body):
+    """The tags that a recording shall have."""
+
+    tags: Annotated[list[str], Field(max_length=100)]
+
+
+class NewNote(Body):
+    """A note on a recording."""
+
+    text: Annotated[str, Field(max_length=8000)]
+
+
+def routes(rooms: Rooms) -> APIRouter:
+    """All of them."""
+    router = APIRouter(prefix="/api")
+    _search(router, rooms)
+    _look(router, rooms)
+    _change(router, rooms)
+    return router
+
+
+def _search(router: APIRouter, rooms: Rooms) -> None:
+    @router.get("/recordings")
+    def recordings(
+        rig: Short = "",
+        experiment: Short = "",
+        operator: Short = "",
+        status: Short = "",
+        verdict: Short = "",
+        tag: Short = "",
+        since: Short = "",
+        until: Short = "",
+        text: Short = "",
+        limit: Annotated[int, Query(ge=1, le=MOST)] = 100,
+        offset: Annotated[int, Query(ge=0, lt=2**31)] = 0,
+    ) -> Answer:
+        """Recordings that fit, newest first."""
+        asked = Asked(
+            rig=rig,
+            experiment=experiment,
+            operator=operator,
+            status=status,
+            verdict=verdict,
+            tag=tag,
+            since=since,
+            until=until,
+            text=text,
+            limit=limit,
+            offset=offset,
+        )
+        found = rooms.index.search(asked)
+        return {"total": found.total, "recordings": list(found.entries)}
+
+    @router.get("/recordings/words")
+    def words() -> Answer:
+        """What rigs, experiments, operators, statuses and verdicts there are to search by."""
+        return dict(rooms.index.words())
+
+    @router.get("/compare")
+    async def compare(a: Short, b: Short) -> Answer:
+        """The frequency responses of two recordings, in units of their joint uncertainty."""
+        first, second = rooms.entry(a), rooms.entry(b)
+        found = await rooms.desk.do(desk.comparison, str(first[1]), str(second[1]))
+        return {"a": first[0], "b": second[0], **found}
+
+
+def _look(router: APIRouter, rooms: Rooms) -> None:
+    @router.get("/recordings/{id_}")
+    def recording(id_: str) -> Answer:
+        """One recording, its notes and its diagnosis."""
+        entry, path = rooms.entry(id_)
+        try:
+            remarks: Any = read_remarks(path)
+        except RecordingError:
+            remarks = None  # the entry's problem says so
+        return {"recording": entry, "remarks": remarks}
+
+    @router.get("/recordings/{id_}/file", response_class=FileResponse)
+    def file(id_: str) -> FileResponse:
+        """The recording itself (MCAP)."""
+        _, path = rooms.entry(id_)
+        return FileResponse(path, media_type=MEDIA, filename=path.name)
+
+    @router.get("/recordings/{id_}/signals")
+    async def signals(
+        id_: str,
+        channel: Annotated[list[str] | None, Query(max_length=64)] = None,
+        start: Annotated[float, Query(ge=0, allow_inf_nan=False)] = 0.0,
+        stop: Annotated[float, Query(ge=0, allow_inf_nan=False)] = 0.0,
+        pixels: Annotated[int, Query(ge=1, le=desk.MOST_POINTS // 2)] = 800,
+    ) -> Answer:
+        """Channels as curves of a few points with the outline of the whole; times in s."""
+        _, path = rooms.entry(id_)
+        return await rooms.desk.do(desk.signals, str(path), channel or [], start, stop, pixels)
+
+    @router.get("/recordings/{id_}/frf")
+    async def frf(id_: str) -> Answer:
+        """The frequency responses that were logged with the run."""
+        _, path = rooms.entry(id_)
+        return await rooms.desk.do(desk.responses, str(path))
+
+
+def _change(router: APIRouter, rooms: Rooms) -> None:
+    @router.put("/recordings/{id_}/tags")
+    def tag(request: Request, id_: str, body: Tags) -> Answer:
+        """Give a recording these tags."""
+        operator(request)
+        entry, path = rooms.entry(id_)
+        remarks = set_tags(path, body.tags)
+        return {"recording": rooms.index.update(entry.path), "remarks": remarks}
+
+    @router.post("/recordings/{id_}/notes")
+    def note(request: Request, id_: str, body: NewNote) -> Answer:
+        """Add a note to a recording."""
+        who = operator(request)
+        entry, path = rooms.entry(id_)
+        remarks = add_note(path, who.name, body.text)
+        return {"recording": rooms.index.update(entry.path), "remarks": remarks}
+
+    @router.post("/recordings", status_code=201)
+    async def bring(request: Request) -> Answer:
+        """Bring in a recording (the MCAP file as the body). It is checked before it is kept."""
+        operator(request)
+        folder = rooms.index.folder
+        # Neither the client's name for it nor a byte that was not checked gets beyond here.
+        arriving = folder / PRIVATE / f"arriving-{secrets.token_hex(8)}"
+        name = f"uploaded_{datetime.now(UTC):%Y%m%dT%H%M%S}_{secrets.token_hex(3)}.mcap"
+        try:
+            with arriving.open("xb") as out:
+                async for part in request.stream():
+                    out.write(part)
+                out.flush()
+                os.fsync(out.fileno())
+            await upload.checked(arriving)
+            arriving.rename(folder / name)
+        except ClientDisconnect as error:
+            raise RecordingError("it did not arrive whole, or is too large") from error
+        except OSError as error:
+            raise RecordingError(f"it could not be kept: {error.strerror}") from error
+        finally:
+            arriving.unlink(missing_ok=True)
+        return {"recording": rooms.index.update(name)}

@@ -1,0 +1,272 @@
+import { Scope } from "/page/scope.js";
+import { plot } from "/page/curves.js";
+
+const $ = (id) => document.getElementById(id);
+const scope = new Scope($("scope"));
+let lease = "", beating = 0, state = null, heard = 0, job = "", wanted = true;
+
+async function ask(method, path, body, headers = {}) {
+  const answer = await fetch(`/api${path}`, {
+    method,
+    headers: { ...(lease ? { "X-Lease": lease } : {}), ...(body ? { "Content-Type": "application/json" } : {}), ...headers },
+    body: body ? JSON.stringify(body) : undefined,
+  });
+  const found = await answer.json().catch(() => ({}));
+  if (answer.status === 401) { $("login").hidden = false; $("token").focus(); }
+  if (!answer.ok) throw new Error(found.error || `${answer.status} ${answer.statusText}`);
+  return found;
+}
+
+function alarm(text) { $("alarm").textContent = text; $("alarm").hidden = !text; }
+const tried = (work) => async (event) => {
+  if (event) event.preventDefault();
+  try { alarm(""); await work(event); } catch (error) { alarm(error.message); }
+};
+function clock(s) {
+  if (!(s >= 0)) return "–";
+  const m = Math.floor(s / 60);
+  return m ? `${m} min ${String(Math.floor(s % 60)).padStart(2, "0")} s` : `${Math.ceil(s)} s`;
+}
+function put(parent, tag, text, name = "") {
+  const e = document.createElement(tag);
+  e.textContent = text; if (name) e.className = name;
+  parent.append(e);
+  return e;
+}
+
+// The stop: no lease, no token, and Escape from anywhere.
+async function stop() {
+  $("now").textContent = "Stop asked for …";
+  for (let i = 0; i < 3; i++) {
+    try { await fetch("/api/stop", { method: "POST", keepalive: true }); return; } catch { /* again */ }
+  }
+  alarm("THE STOP DID NOT REACH THE SERVICE. Use the emergency stop at the rig.");
+}
+$("stop").addEventListener("click", stop);
+document.addEventListener("keydown", (e) => { if (e.key === "Escape") { e.preventDefault(); stop(); } });
+
+// Live data
+function listen() {
+  const socket = new WebSocket(`${location.protocol.replace("http", "ws")}//${location.host}/api/live`);
+  socket.binaryType = "arraybuffer";
+  socket.onmessage = (message) => {
+    heard = performance.now();
+    if (typeof message.data === "string") show(JSON.parse(message.data)); else scope.take(message.data);
+  };
+  socket.onclose = () => setTimeout(listen, 1000);
+}
+setInterval(() => {
+  const silent = heard ? (performance.now() - heard) / 1000 : Infinity;
+  const on = silent < 3;
+  $("link").textContent = on ? "live" : heard ? `connection lost for ${Math.round(silent)} s` : "connecting";
+  $("link").className = `pill ${on ? "on" : heard ? "off" : ""}`;
+  scope.live = on;
+  if (!on) {
+    scope.why = heard ? `Connection lost ${Math.round(silent)} s ago: this is not live` : "";
+    if (heard) $("now").textContent = "Unknown: the connection to the service is lost. A run may be going on.";
+    $("facts").replaceChildren();
+    $("bar").hidden = true;
+    $("driver").textContent = "";
+  } else scope.why = state && !state.running && !scope.rows.length ? "No run" : "";
+  $("lost").textContent = scope.lost ? `${scope.lost} frames were skipped, as this viewer was slow` : "";
+}, 500);
+
+function show(s) {
+  const before = state;
+  state = s;
+  $("rig-name").textContent = s.rig;
+  document.title = `${s.running ? "▶ " : ""}${s.rig}`;
+  $("driver").textContent = `${s.operator ? `${s.operator} drives` : "nobody drives"}, ${s.viewers} watching`;
+  if (s.channels.length && JSON.stringify(s.channels) !== JSON.stringify(scope.channels)) channels(s.channels);
+  if (s.running && s.running.id !== job) { job = s.running.id; scope.clear(); }
+  const r = s.running, p = r ? r.progress : {};
+  if (!r) $("now").textContent = s.fault ? "FAULT" : "No run.";
+  else if (r.phase === "running" && p.segment) {
+    $("now").textContent = `${r.experiment}: ${p.name}, segment ${p.segment} of ${p.n_segments}`;
+  } else $("now").textContent = `${r.experiment}: ${r.phase}`;
+  $("bar").hidden = !p.segment;
+  if (p.segment) $("bar").value = 1 - Math.max(0, p.time_left) / p.duration;
+  const facts = p.segment ? {
+    "Run left": clock(p.time_left), "Queue left": clock(s.time_left_s),
+    Level: `${p.level} ${p.unit}`, Frequency: p.broadband ? "whole band" : p.frequency ? `${p.frequency.toFixed(2)} Hz` : "at rest",
+    "Nearest limit": p.channel ? `${p.channel}, ${(100 * p.margin).toFixed(0)} % left` : "–",
+    "Worst so far": `${p.worst_channel}, ${(100 * p.worst_margin).toFixed(0)} % left`,
+    "Late ticks": p.late_ticks, "Missing samples": p.missing_samples,
+  } : {};
+  $("facts").replaceChildren();
+  for (const [k, v] of Object.entries(facts)) {
+    const box = put($("facts"), "div", "");
+    put(box, "dt", k); put(box, "dd", v);
+  }
+  $("fault").hidden = !s.fault;
+  if (s.fault) $("fault-text").textContent = `FAULT since ${s.fault.time}: ${s.fault.reason}`;
+  $("held").textContent = s.held ? `Held: ${s.held}` : s.queue.length ? "" : "Empty.";
+  $("resume").hidden = !(s.held && s.queue.length && lease);
+  $("queue").replaceChildren();
+  for (const j of s.queue) {
+    const item = put($("queue"), "li", `${j.experiment}, ${clock(j.duration_s)} `);
+    if (lease) {
+      const b = put(item, "button", "Take out");
+      b.type = "button";
+      b.onclick = tried(() => ask("DELETE", `/queue/${j.id}`));
+    }
+  }
+  const l = s.last;
+  $("last").textContent = l ? `Last: ${l.experiment}, ${l.status || l.phase}. ${l.error || l.reason} ${l.verdict.replace("_", " ")}` : "";
+  if (before && l && (!before.last || before.last.id !== l.id)) find();
+}
+
+function channels(list) {
+  scope.channels = list; scope.clear();
+  const sensors = list.map((c, i) => [c, i]).filter(([c]) => c.role !== "reference").map(([, i]) => i);
+  scope.shown = sensors.slice(0, 4);
+  $("picks").replaceChildren();
+  for (let lane = 0; lane < Math.min(4, list.length); lane++) {
+    const label = put($("picks"), "label", `${lane + 1} `), select = put(label, "select", "");
+    list.forEach((c, i) => { put(select, "option", c.name).value = i; });
+    select.value = scope.shown[lane] ?? lane;
+    scope.shown[lane] = Number(select.value);
+    select.onchange = () => { scope.shown[lane] = Number(select.value); };
+  }
+}
+$("span").onchange = () => { scope.span = Number($("span").value); };
+$("pause").onclick = () => {
+  scope.paused = !scope.paused;
+  $("pause").setAttribute("aria-pressed", scope.paused);
+  $("pause").textContent = scope.paused ? "Go on" : "Pause";
+};
+
+// Driving
+function driving(secret) {
+  lease = secret;
+  clearInterval(beating);
+  $("take").textContent = lease ? "Hand over" : "Take control";
+  $("start").disabled = $("clear").disabled = !lease;
+  if (!lease) return;
+  beating = setInterval(async () => {
+    try { await ask("POST", "/lease/beat"); } catch (error) { driving(""); alarm(error.message); }
+  }, 2000);
+}
+$("take").onclick = tried(async () => {
+  if (lease) { await ask("DELETE", "/lease"); driving(""); } else driving((await ask("POST", "/lease")).lease);
+});
+addEventListener("pagehide", () => {
+  if (lease && !(state && state.running)) fetch("/api/lease", { method: "DELETE", keepalive: true, headers: { "X-Lease": lease } });
+});
+$("plan").onclick = tried(async () => {
+  $("planned").textContent = "predicting …";
+  const found = await ask("POST", "/dry-run", { experiment: $("experiment").value }).catch((e) => { $("planned").textContent = ""; throw e; });
+  const total = found.runs.reduce((sum, r) => sum + r.duration_s, 0), worst = found.runs[0].margins[0];
+  $("planned").textContent = found.refused ? `Refused: ${found.refused}`
+    : `${found.runs.length > 1 ? `${found.runs.length} runs, ` : ""}${clock(total)}; nearest to a limit: ${worst.channel} in ${worst.segment}, ${(100 * worst.margin).toFixed(0)} % left of ${worst.limit} ${worst.unit}`;
+});
+$("start").onclick = tried(async () => {
+  $("planned").textContent = "predicting …";
+  try {
+    await ask("POST", "/runs", { experiment: $("experiment").value, operator: $("operator").value });
+  } finally { $("planned").textContent = ""; }
+});
+$("resume").onclick = tried(() => ask("POST", "/queue/resume"));
+$("clear").onclick = tried(() => ask("POST", "/clear-fault", { name: $("operator").value, reason: $("why").value }));
+$("login").onsubmit = tried(async () => {
+  const who = await ask("POST", "/login", null, { Authorization: `Bearer ${$("token").value}` });
+  if (!who.role) throw new Error("that is no valid token");
+  $("login").hidden = true; $("token").value = "";
+  begin();
+});
+
+// Recordings
+async function find() {
+  const query = new URLSearchParams({ text: $("words").value, experiment: $("by-experiment").value, since: $("since").value, limit: 50 });
+  const found = await ask("GET", `/recordings?${query}`);
+  $("found").textContent = `${found.total} found`;
+  listed = found.recordings;
+  $("list").replaceChildren();
+  for (const e of found.recordings) {
+    const row = put($("list"), "tr", "");
+    const written = state?.running && `${state.running.recording}.partial` === e.path;
+    put(row, "td", e.started.slice(0, 16).replace("T", " "), "time");
+    for (const text of [e.experiment, e.operator, clock(e.duration_s), written ? "being written" : e.problem || e.status, e.verdict.replace("_", " "), e.tags.join(", ")]) put(row, "td", text);
+    const cell = put(row, "td", ""), b = put(cell, "button", e.path);
+    b.type = "button"; b.onclick = tried(() => look(e.id));
+  }
+}
+$("search").onsubmit = tried(find);
+
+let looked = "", listed = [];
+async function look(id) {
+  looked = id;
+  const { recording: e, remarks } = await ask("GET", `/recordings/${id}`);
+  $("one").hidden = false;
+  offer(id);
+  $("h-one").textContent = e.path;
+  $("one-about").textContent = `${e.rig}, ${e.experiment}, ${e.samples.toLocaleString()} samples at ${e.rate_hz} Hz; ${e.status}: ${e.reason} `;
+  const link = put($("one-about"), "a", "download");
+  link.href = `/api/recordings/${id}/file`;
+  $("one-diagnosis").textContent = (remarks?.diagnosis.lines || []).join(" ");
+  $("one-notes").replaceChildren();
+  for (const n of remarks?.notes || []) put($("one-notes"), "li", `${n.time.slice(0, 16).replace("T", " ")} ${n.author}: ${n.text}`);
+  $("one").scrollIntoView({ block: "start" });
+  const signals = await ask("GET", `/recordings/${id}/signals?pixels=700`);
+  const time = $("one-time"), bode = $("one-frf");
+  time.style.height = `${40 + 70 * signals.curves.length}px`;
+  plot(time, signals.curves.map((c) => ({ name: c.name, unit: c.unit, x: c.time, y: c.values })));
+  const { responses } = e.responses ? await ask("GET", `/recordings/${id}/frf`) : { responses: [] };
+  bode.hidden = !responses.length;
+  if (!responses.length) return;
+  const r = responses.at(-1);
+  bode.style.height = `${40 + 110 * r.curves.length}px`;
+  plot(bode, r.curves.map((c) => ({
+    name: `${c.output}/${c.input}`, unit: "dB", x: r.frequency,
+    y: c.re.map((re, i) => (re === null ? null : 20 * Math.log10(Math.hypot(re, c.im[i])))),
+  })), { logarithmic: true, unit: "Hz" });
+}
+// Two recordings, in units of their joint uncertainty
+const COLUMNS = {
+  "Response": (p, r) => `${r.output}/${r.input} at ${p.level} ${p.unit}`,
+  "Lines": (p, r) => r.lines,
+  "Mean square (noise: 1)": (p, r) => r.mean_square?.toPrecision(3) ?? "–",
+  "Lines beyond noise": (p, r) => r.beyond_noise,
+  "Largest": (p, r) => (r.largest === null ? "–" : `${r.largest.toPrecision(2)} sd at ${r.largest_hz.toFixed(2)} Hz`),
+  "Median difference": (p, r) => (r.median_relative === null ? "–" : `${(100 * r.median_relative).toPrecision(2)} %`),
+};
+function offer(id) {
+  $("compared").replaceChildren();
+  $("other").replaceChildren();
+  put($("other"), "option", "another recording …").value = "";
+  for (const e of listed) if (e.id !== id && e.responses) put($("other"), "option", e.path).value = e.id;
+}
+$("other").onchange = tried(async () => {
+  $("compared").replaceChildren();
+  if (!$("other").value) return;
+  const { pairs } = await ask("GET", `/compare?a=${looked}&b=${$("other").value}`);
+  const table = put($("compared"), "table", ""), head = put(put(table, "thead", ""), "tr", "");
+  for (const name of Object.keys(COLUMNS)) put(head, "th", name);
+  const body = put(table, "tbody", "");
+  for (const p of pairs) {
+    for (const r of p.outputs) {
+      const row = put(body, "tr", "");
+      for (const text of Object.values(COLUMNS)) put(row, "td", text(p, r));
+    }
+  }
+  if (!body.children.length) $("compared").textContent = "They have no response on common lines.";
+});
+$("note").onsubmit = tried(async () => {
+  await ask("POST", `/recordings/${looked}/notes`, { text: $("note-text").value });
+  $("note-text").value = "";
+  await look(looked);
+});
+
+async function begin() {
+  const { drawing } = await ask("GET", "/rig");
+  $("drawing").innerHTML = drawing;
+  const { experiments } = await ask("GET", "/experiments");
+  $("experiment").replaceChildren();
+  for (const name of Object.keys(experiments)) put($("experiment"), "option", name);
+  if ("swept_sine" in experiments) $("experiment").value = "swept_sine";
+  const words = await ask("GET", "/recordings/words");
+  for (const name of words.experiment) put($("by-experiment"), "option", name).value = name;
+  await find();
+  if (wanted) { wanted = false; listen(); }
+}
+tried(begin)();

@@ -1,0 +1,85 @@
+"""How the service is started, checked before it listens."""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+import ssl
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from samii_rig.errors import InputError
+from samii_rig.rig.schema import Rig
+from samii_rig.serve.access import Tokens
+
+WHERE = "samii-rig serve"
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """All that the service needs to know. folder : of the recordings.
+
+    tls : certificate and key, None without. tokens : None where everybody who reaches the service
+    may drive: on this machine alone. names : under which it may be called, beside its host.
+    pace : of a simulated rig, times real time; 0 for as fast as it can.
+    """
+
+    rig: Rig
+    rig_toml: str
+    folder: Path
+    host: str = "127.0.0.1"
+    port: int = 8340
+    tls: tuple[Path, Path] | None = None
+    tokens: Tokens | None = None
+    names: tuple[str, ...] = ()
+    pace: float = 1.0
+
+    def check(self) -> None:
+        """InputError for what cannot work or would let strangers drive."""
+        if not 0 <= self.port <= 65535:
+            raise InputError(WHERE, "--port", self.port, "0 to 65535")
+        if not is_local(self.host) and self.tls is None:
+            expected = "127.0.0.1, or --tls-cert and --tls-key to be reached from elsewhere"
+            raise InputError(WHERE, "--host", self.host, expected)
+        if (not is_local(self.host) or self.names) and not (self.tokens and self.tokens.known):
+            expected = "a file with at least one token, as others than this machine can reach it"
+            raise InputError(WHERE, "--tokens", None, expected)
+        if self.tls is not None:
+            try:
+                ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(*self.tls)
+            except (OSError, ssl.SSLError) as error:
+                said = error.strerror or str(error)
+                expected = f"a certificate and its key in PEM ({said})"
+                raise InputError(WHERE, "--tls-cert", str(self.tls[0]), expected) from error
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=self.folder):
+                pass
+        except OSError as error:
+            expected = f"a folder that can be written ({error.strerror})"
+            raise InputError(WHERE, "--folder", str(self.folder), expected) from error
+
+    def bound(self) -> socket.socket:
+        """The socket that listens; InputError if the port is taken or the host is not ours."""
+        family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+        listening = socket.socket(family, socket.SOCK_STREAM)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listening.bind((self.host, self.port))
+            listening.listen(128)
+        except OSError as error:
+            listening.close()
+            expected = f"a free port of this machine ({error.strerror})"
+            raise InputError(WHERE, "--port", f"{self.host}:{self.port}", expected) from error
+        return listening
+
+
+def is_local(host: str) -> bool:
+    """Whether only this machine reaches what listens there."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

@@ -1,0 +1,264 @@
+"""The queue, and the process that runs its first.
+
+Everything that matters is in the folders of the jobs, so that a service that was killed finds the
+run and the queue again when it is started anew.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from samii_rig.errors import GateError, InputError, RecordingError, SamiiRigError
+from samii_rig.index.store import PRIVATE, Index
+from samii_rig.record.recover import recover
+from samii_rig.record.writer import PARTIAL
+from samii_rig.rig.schema import Rig
+from samii_rig.serve.job import ID, LOG, OVER, Job, JobState, Request
+from samii_rig.serve.live import LiveReader
+
+JOBS = "jobs"
+MOST_QUEUED = 50
+KEPT = 200  # jobs that are over
+
+
+class Supervisor:
+    """Runs one job after the other.
+
+    current : what runs. last : what ended last, as data.
+    held : why the queue waits, "" while it does not. A run that did not go through holds it, and
+        so does a start of the service with jobs in the queue: a person looks first.
+    """
+
+    def __init__(self, rig: Rig, rig_toml: str, index: Index, pace: float) -> None:
+        self._rig, self._rig_toml, self._index, self._pace = rig, rig_toml, index, pace
+        self._jobs = index.folder / PRIVATE / JOBS
+        self._children: list[subprocess.Popen[bytes]] = []
+        self._open: list[Job] = []
+        self._readers: dict[str, LiveReader] = {}
+        # One thing after the other, beside the service's loop, which must be free for a stop.
+        self._later = ThreadPoolExecutor(1, thread_name_prefix="filing")
+        self.current: Job | None = None
+        self.last: dict[str, Any] | None = None
+        self.held = ""
+        self._forget()
+        for job in Job.all(self._jobs):
+            with suppress(RecordingError):
+                phase = job.written.phase
+                if phase not in OVER:
+                    self._open.append(job)
+                else:
+                    self.last = self.plain(job)
+                if phase == "queued":
+                    self.held = "the service was started anew"
+        self.turn()
+
+    @property
+    def simulated(self) -> bool:
+        """The rig hurts nobody."""
+        return self._rig.device.driver == "simulated"
+
+    def add(
+        self,
+        name: str,
+        experiment_toml: str,
+        predicted: list[dict[str, Any]],
+        operator: str,
+        *,
+        diagnosis: bool,
+        seed: int | None,
+    ) -> list[Job]:
+        """Queue the runs of an experiment, one job each; InputError if that cannot be,
+        GateError while the queue is held.
+
+        predicted : of each run its `setup`, `instruction` and `duration_s`.
+        """
+        simulated = self.simulated
+        waiting = self.queue()
+        if self.held and waiting:
+            raise GateError(f"the queue is held: {self.held}; expected POST /api/queue/resume")
+        if len(waiting) + len(predicted) > MOST_QUEUED:
+            raise InputError("queue", "", len(predicted), f"at most {MOST_QUEUED} jobs in it")
+        if len(predicted) > 1 and not simulated:
+            expected = "one run; between several a person changes the rig: use samii-rig run"
+            raise InputError("experiment", "", f"{name}, {len(predicted)} runs", expected)
+        settings: dict[str, Any] = {"pace": self._pace} if simulated and self._pace > 0 else {}
+        slug = re.sub(r"[^a-z0-9]+", "_", f"{self._rig.name}_{name}".lower()).strip("_")
+        stem = f"{datetime.now():%Y-%m-%dT%H-%M-%S}_{slug}"
+        made = []
+        for i, run in enumerate(predicted):
+            own = f"{stem}_{run['setup']}" if run["setup"] else stem
+            with_seed = {} if seed is None or not simulated else {"seed": seed + i}
+            request = Request(
+                experiment=name,
+                recording=self._free(own),
+                operator=operator,
+                setup=i,
+                instruction=run["instruction"],
+                diagnosis=diagnosis and len(predicted) == 1,
+                duration_s=run["duration_s"],
+                settings={**settings, **with_seed},
+            )
+            made.append(Job.make(self._jobs, request, self._rig_toml, experiment_toml))
+            self._open.append(made[-1])
+        # Who starts anew, with nothing left to wait for, has looked.
+        self.held = ""
+        self.turn()
+        return made
+
+    def _forget(self) -> None:
+        """Jobs that are over for long are taken away; their recordings stay."""
+        for job in Job.all(self._jobs)[:-KEPT]:
+            with suppress(RecordingError):
+                if job.written.phase in OVER:
+                    shutil.rmtree(job.folder, ignore_errors=True)
+
+    def _free(self, stem: str) -> str:
+        """A name that no recording has, nor one that is asked for."""
+        taken = {job.request.recording for job in self._open}
+        n, name = 1, f"{stem}.mcap"
+        while name in taken or any(
+            (self._index.folder / f"{name}{end}").exists() for end in ("", PARTIAL)
+        ):
+            n, name = n + 1, f"{stem}_{n + 1}.mcap"
+        return name
+
+    def queue(self) -> list[Job]:
+        """What waits, first first."""
+        return [j for j in self._open if j.written.phase == "queued"]
+
+    def cancel(self, id_: str) -> None:
+        """Take a job out of the queue; InputError if it is not in it."""
+        for job in self.queue():
+            if job.id == id_:
+                job.set(JobState(phase="cancelled"))
+                self._open.remove(job)
+                return
+        raise InputError("queue", "", id_, "a job that waits in it")
+
+    def resume(self) -> None:
+        """Let the queue go on."""
+        self.held = ""
+        self.turn()
+
+    def stop(self, by: str) -> bool:
+        """The run ends at zero output, and nothing follows by itself; False if none runs."""
+        stopped = self.current is not None and self.current.stop(by)
+        if stopped or self._open:
+            self.held = f"stop asked by {by}"
+        return stopped
+
+    def turn(self) -> None:
+        """Look after the jobs: take note of what ended, start what is next."""
+        self._children = [c for c in self._children if c.poll() is None]
+        running = None
+        for job in list(self._open):
+            state = job.state
+            if state.phase in OVER:
+                self._ended(job, state)
+            elif state.phase != "queued":
+                running = job
+        self.current = running
+        waiting = self.queue()
+        if running is None and waiting and not self.held:
+            self._start(waiting[0])
+
+    def _start(self, job: Job) -> None:
+        command = [sys.executable, "-m", "samii_rig.serve.runner"]
+        with (job.folder / LOG).open("ab") as log, job.held() as lock:
+            job.set(JobState(phase="starting"))
+            # The lock goes over to the child: from now on somebody holds it until the run is over.
+            child = subprocess.Popen(
+                [*command, str(job.folder), str(self._index.folder), str(lock)],
+                pass_fds=(lock,),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
+        self._children.append(child)
+        self.current = job
+
+    def _ended(self, job: Job, state: JobState) -> None:
+        self._open.remove(job)
+        self._readers.pop(job.id, None)
+        recording = job.request.recording
+        if state.phase == "died" and state.status:
+            # The run itself was over and its recording whole.
+            state = replace(state, phase="done", error="the diagnosis was given up")
+            job.set(state)
+        elif state.phase == "died":
+            partial = self._index.folder / f"{recording}{PARTIAL}"
+            moved = partial.exists() or not job.stops()
+            reason = "its process ended without a word" if moved else "stopped before it moved"
+            state = JobState(phase="died", live=state.live, status="failed", reason=reason)
+            job.set(state)
+        if state.phase != "cancelled" and state.status != "completed":
+            self.held = f"{recording}: {state.status or 'refused'}, {state.reason or state.error}"
+        if state.live:
+            Path(state.live).unlink(missing_ok=True)
+        self._later.submit(self._filed, job, state)
+
+    def _filed(self, job: Job, state: JobState) -> None:
+        """Its recording is whole and in the index before the job is told as the last one."""
+        partial = self._index.folder / f"{job.request.recording}{PARTIAL}"
+        with suppress(SamiiRigError):
+            if state.phase == "died" and partial.exists():
+                recover(partial)
+        with suppress(SamiiRigError):
+            self._index.refresh()
+        self.last = self.plain(job)
+
+    def reader(self) -> LiveReader | None:
+        """The live data of the run, once there are any."""
+        job = self.current
+        if job is None:
+            return None
+        if job.id not in self._readers:
+            with suppress(RecordingError):
+                self._readers = {job.id: LiveReader(Path(job.state.live))}
+        return self._readers.get(job.id)
+
+    def job(self, id_: str) -> dict[str, Any] | None:
+        """A job by its id, among all that are kept; None if there is none."""
+        job = Job(self._jobs / id_) if ID.fullmatch(id_) else None
+        return self.plain(job) if job is not None and job.folder.is_dir() else None
+
+    def plain(self, job: Job) -> dict[str, Any]:
+        """A job as data."""
+        request, state = asdict(job.request), asdict(job.state)
+        for private in ("pid", "live"):
+            state.pop(private)
+        request.pop("settings")
+        return {"id": job.id, **request, **state}
+
+    def state(self) -> dict[str, Any]:
+        """All that a display of the queue and the run shows.
+
+        time_left_s : of the whole queue, as far as it is predicted.
+        """
+        queue = [self.plain(j) for j in self.queue()]
+        left = float(sum(job["duration_s"] for job in queue))
+        running = None
+        if self.current is not None:
+            running = self.plain(self.current)
+            reader = self.reader()
+            running["progress"] = reader.progress() if reader else {}
+            left += running["progress"].get("time_left") or (
+                running["duration_s"] if running["phase"] == "starting" else 0.0
+            )
+        return {"running": running, "queue": queue, "held": self.held, "time_left_s": left}
+
+    def beat(self) -> None:
+        """A sign of life to the run."""
+        reader = self.reader()
+        if reader is not None:
+            reader.beat()

@@ -1,0 +1,106 @@
+"""A real browser, driven over its DevTools protocol: nothing but Chromium and a WebSocket."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import httpx
+import pytest
+from websockets.sync.client import ClientConnection, connect
+
+WITHIN = 90.0  # s
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+
+
+class Browser:
+    """One page of headless Chromium; the test skips where there is none."""
+
+    def __init__(self, profile: Path) -> None:
+        found = next((path for name in NAMES if (path := shutil.which(name))), None)
+        if found is None:
+            pytest.skip(f"no browser: none of {', '.join(NAMES)} is installed")
+        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0"]
+        more = ["--remote-allow-origins=*", f"--user-data-dir={profile}", "about:blank"]
+        quiet = subprocess.DEVNULL
+        self._process = subprocess.Popen([found, *flags, *more], stdout=quiet, stderr=quiet)
+        told = profile / "DevToolsActivePort"
+        self._wait(lambda: told.exists() and "\n" in told.read_text())
+        port = told.read_text().split("\n")[0]
+        pages = httpx.get(f"http://127.0.0.1:{port}/json", timeout=WITHIN).json()
+        url = next(p["webSocketDebuggerUrl"] for p in pages if p["type"] == "page")
+        self._socket: ClientConnection = connect(
+            url, max_size=None, open_timeout=WITHIN
+        ).__enter__()
+        self._asked = 0
+        self.errors: list[str] = []
+        for domain in ("Page", "Runtime", "Log"):
+            self.call(f"{domain}.enable")
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """Ask the browser; what goes wrong in the page meanwhile is kept in `errors`."""
+        self._asked += 1
+        request = {"id": self._asked, "method": method, "params": parameters}
+        self._socket.send(json.dumps(request))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=WITHIN))
+            if answer.get("id") == self._asked:
+                assert "error" not in answer, answer
+                return answer["result"]
+            if answer.get("method") == "Runtime.exceptionThrown":
+                self.errors.append(str(answer["params"]["exceptionDetails"]))
+            entry = answer.get("params", {}).get("entry", {})
+            # That a service is gone, or answers with a refusal, is no fault of the page.
+            if entry.get("level") == "error" and entry.get("source") != "network":
+                self.errors.append(entry["text"])
+
+    def go(self, url: str) -> None:
+        self.call("Page.navigate", url=url)
+
+    def value(self, expression: str) -> Any:
+        """What JavaScript says."""
+        asked = {"expression": expression, "returnByValue": True, "awaitPromise": True}
+        return self.call("Runtime.evaluate", **asked)["result"].get("value")
+
+    def until(self, expression: str) -> None:
+        """Wait until it is true in the page."""
+        self._wait(lambda: self.value(expression), expression)
+
+    def text(self, id_: str) -> str:
+        return str(self.value(f"document.getElementById('{id_}')?.textContent ?? ''"))
+
+    def click(self, id_: str) -> None:
+        self.until(
+            f"document.getElementById('{id_}') && !document.getElementById('{id_}').disabled"
+        )
+        self.value(f"document.getElementById('{id_}').click()")
+
+    def press(self, key: str) -> None:
+        """A key, as from a keyboard."""
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._socket.close()
+        self._process.terminate()
+        self._process.wait(WITHIN)
+
+    @staticmethod
+    def _wait(what: Any, said: str = "") -> None:
+        start = time.monotonic()
+        while not what():
+            assert time.monotonic() - start < WITHIN, f"it did not happen: {said}"
+            time.sleep(0.05)

@@ -1,0 +1,184 @@
+"""What the tests of the service share: one in this process, and one in its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import ssl
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+from weakref import WeakKeyDictionary
+
+import httpx
+from fastapi import FastAPI
+
+from samii_rig.rig.load import load_rig
+from samii_rig.serve.access import Tokens
+from samii_rig.serve.app import application, guarded
+from samii_rig.serve.rooms import Rooms
+from samii_rig.serve.settings import Settings
+
+# The routes of a service are made once; each client has a guard of its own.
+_APPS: WeakKeyDictionary[Rooms, FastAPI] = WeakKeyDictionary()
+HOST = "127.0.0.1:8340"
+WITHIN = 90.0  # s for what takes a few on a machine with nothing else to do
+
+# Some seconds of a quiet sweep.
+SWEEP = """
+experiment = "swept_sine"
+name = "short"
+actuator = "v_2"
+unit = "V"
+drive = "output"
+sweep = "linear"
+start_hz = 1.0
+stop_hz = 20.0
+duration = {duration}
+ramp = 0.5
+lead_in = 0.5
+ring_down = 1.0
+amplitudes = [0.02]
+repeats = {repeats}
+order = "by_level"
+seed = 1
+"""
+
+
+def sweep(duration: float = 4.0, repeats: int = 2) -> str:
+    return SWEEP.format(duration=duration, repeats=repeats)
+
+
+def settings(folder: Path, tokens: Tokens | None = None, **more: Any) -> Settings:
+    rig, text = load_rig("samii")
+    return Settings(rig, text, folder, tokens=tokens, **more)
+
+
+def client(rooms: Rooms, headers: dict[str, str] | None = None) -> httpx.AsyncClient:
+    """Talks to a service in this process; what it does by itself is not done."""
+    if rooms not in _APPS:
+        _APPS[rooms] = application(rooms)
+    transport = httpx.ASGITransport(app=guarded(rooms, 8340, _APPS[rooms]))  # type: ignore[arg-type]
+    return httpx.AsyncClient(transport=transport, base_url=f"http://{HOST}", headers=headers or {})
+
+
+class Service:
+    """`samii-rig serve` in a process of its own, at a free port."""
+
+    def __init__(self, folder: Path, *options: str, trust: str = "", token: str = "") -> None:
+        self.folder, self.options, self.port = folder, options, "0"
+        self.trust = ssl.create_default_context(cafile=trust) if trust else True
+        self.headers = {"authorization": f"Bearer {token}"} if token else {}
+        self.begin()
+
+    def begin(self) -> None:
+        program = "from samii_rig.cli import main; main()"
+        options = ["--folder", str(self.folder), "--port", self.port, *self.options]
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", program, "serve", *options],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        assert line, "the service did not start"
+        self.url = line.split(": ", 1)[1].strip()
+        self.port = self.url.rpartition(":")[2]  # the same when it is started again
+        self.http = httpx.Client(
+            base_url=self.url, timeout=WITHIN, verify=self.trust, headers=self.headers
+        )
+        self.until(lambda: self.http.get("/api/state").status_code == 200)
+
+    def kill(self) -> None:
+        self.process.send_signal(signal.SIGKILL)
+        self._gone()
+
+    def _gone(self) -> None:
+        self.process.wait(WITHIN)
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+        self.http.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self.process.poll() is None:
+            self.process.terminate()
+        self._gone()
+
+    def state(self) -> dict[str, Any]:
+        return self.http.get("/api/state").json()
+
+    @contextmanager
+    def lease(self, silent: threading.Event | None = None) -> Iterator[dict[str, str]]:
+        """Take it, as the headers that show it; signs of life go out until it is given back, or
+        until `silent` is set."""
+        answer = self.http.post("/api/lease")
+        assert answer.status_code == 200, answer.text
+        headers = {"x-lease": answer.json()["lease"]}
+        done = silent or threading.Event()
+
+        def live() -> None:
+            while not done.wait(1.0):
+                # A service that is killed is what some tests are about.
+                with suppress(httpx.TransportError):
+                    httpx.post(f"{self.url}/api/lease/beat", headers=headers, timeout=WITHIN)
+
+        beats = threading.Thread(target=live, daemon=True)
+        beats.start()
+        try:
+            yield headers
+        finally:
+            done.set()
+            beats.join(WITHIN)
+            with suppress(httpx.TransportError, RuntimeError):
+                self.http.delete("/api/lease", headers=headers)
+
+    def start(self, lease: dict[str, str], text: str, **more: Any) -> str:
+        """Queue a run; its job's id."""
+        body = {"experiment_toml": text, "diagnosis": False, "seed": 1, **more}
+        answer = self.http.post("/api/runs", headers=lease, json=body)
+        assert answer.status_code == 202, answer.text
+        return str(answer.json()["jobs"][0]["id"])
+
+    def job(self, id_: str) -> dict[str, Any]:
+        return self.http.get(f"/api/jobs/{id_}").json()
+
+    def until(self, what: Any) -> Any:
+        """Wait until it is true."""
+        start = time.monotonic()
+        while True:
+            try:
+                found = what()
+            except (httpx.TransportError, json.JSONDecodeError):
+                found = None
+            if found:
+                return found
+            assert time.monotonic() - start < WITHIN, "it did not happen"
+            time.sleep(0.05)
+
+    def progressing(self) -> bool:
+        """Samples come."""
+        running = self.state()["running"]
+        return bool(running and running["progress"].get("segment"))
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True

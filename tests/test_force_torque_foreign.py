@@ -1,0 +1,112 @@
+"""Wherever another sender's frame falls between the sensor's own, it never becomes a sample, and
+where the sensor's own are lost beside, nothing but whole pairs does."""
+
+from types import SimpleNamespace
+from unittest.mock import patch
+
+import can
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.force_torque.frames import Frames
+from drivers.force_torque.reader import GIVE_UP, Reader
+from sim.wire.can_sensor import Sensor
+
+BASE = 0x20
+FRAMES = Frames(BASE)
+PERIOD = 2_000_000
+OWN, FOREIGN = 60.0, -300.0  # N m
+SENSOR = Sensor(BASE, lambda: np.array([0, 0, 0, 0, 0, OWN]), 400.0)
+OTHER = Sensor(BASE, lambda: np.array([0, 0, 0, 0, 0, FOREIGN]), 400.0)
+
+
+def message(identifier: int, data: bytes) -> can.Message:
+    return can.Message(arbitration_id=identifier, is_extended_id=False, data=data)
+
+
+def pair(sensor: Sensor) -> list[can.Message]:
+    return [message(*frame) for frame in sensor.answer(0x200, b"")]
+
+
+TRUE = FRAMES.gauges(*(bytes(m.data) for m in pair(SENSOR))).counts.tolist()
+FALSE = FRAMES.gauges(*(bytes(m.data) for m in pair(OTHER))).counts.tolist()
+STRANGERS = [*pair(OTHER), message(0x200, bytes(3)), message(0x207, bytes(8)), message(0x20C, b"")]
+
+
+class Bus:
+    """Takes requests; `asked` tells that one for a sample came, `sync` one after a lost reply."""
+
+    channel_info = "a bus"
+
+    def __init__(self) -> None:
+        self.asked = self.sync = False
+
+    def send(self, frame: can.Message, timeout: float) -> None:
+        self.asked = frame.arbitration_id == 0x200
+        self.sync = frame.arbitration_id == 0x205
+
+
+def play(script: list[tuple[int | None, int | None, int | None, bool, bool]]) -> Reader:
+    """One request after the other: strangers before, between and after the two frames of each
+    reply, of which the first or the second may be lost."""
+    clock = SimpleNamespace(now=0, monotonic=lambda: 0.0)
+    clock.monotonic_ns = lambda: clock.now
+    with patch("drivers.force_torque.reader.time", clock):
+        return carried_out(script, clock)
+
+
+def carried_out(script, clock) -> Reader:
+    bus = Bus()
+    reader = Reader(bus, FRAMES, PERIOD)  # type: ignore[arg-type]
+    for before, between, after, first, second in script:
+        now = clock.now = clock.now + PERIOD
+        bus.asked = bus.sync = False
+        reader._go_on(now)
+        if bus.sync:
+            reader._take(message(*SENSOR.answer(0x205, b"")[0]), now)
+        frames: list[can.Message] = []
+        own = pair(SENSOR) if bus.asked else []
+        for stranger, mine, kept in ((before, 0, first), (between, 1, second)):
+            frames += [STRANGERS[stranger]] if stranger is not None else []
+            frames += own[mine : mine + 1] if kept else []
+        frames += [STRANGERS[after]] if after is not None else []
+        for frame in frames:
+            reader._take(frame, now)
+            if reader.trouble:
+                return reader
+        if not (first and second):
+            clock.now += GIVE_UP
+    clock.now += GIVE_UP
+    reader._go_on(clock.now)
+    return reader
+
+
+stranger = st.none() | st.integers(0, len(STRANGERS) - 1)
+
+
+@settings(max_examples=300)
+@given(st.lists(st.tuples(stranger, stranger, stranger, st.just(True), st.just(True)), max_size=8))
+def test_a_foreign_frame_is_never_a_part_of_a_sample(script):
+    reader = play(script)
+    assert all(r.gauges.counts.tolist() == TRUE for r in reader.samples)
+    if any(x is not None for row in script for x in row[:3]):
+        assert "another sender" in reader.trouble
+        assert reader.counts.foreign == 1
+    else:
+        assert not reader.trouble
+        assert len(reader.samples) == len(script)
+
+
+@settings(max_examples=300)
+@given(
+    st.lists(st.tuples(st.none(), st.none(), st.none(), st.booleans(), st.booleans()), max_size=12)
+)
+def test_frames_that_are_lost_are_counted_and_blamed_on_nobody(script):
+    reader = play(script)
+    assert not reader.trouble
+    assert reader.counts.foreign == 0
+    assert all(r.gauges.counts.tolist() == TRUE for r in reader.samples)
+    # The newest request has no reply yet.
+    assert reader.counts.requests - len(reader.samples) - reader.counts.lost in (0, 1)
+    assert TRUE != FALSE

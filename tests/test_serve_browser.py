@@ -1,0 +1,78 @@
+"""The page in a real browser: plan, start, watch, stop by Escape, a service that is killed.
+
+Skips where no Chromium is installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from browser_kit import Browser
+from index_kit import write_small
+from serve_kit import Service
+
+from samii_rig.record.reader import read_recording
+
+# Some of the scope's pixels are of a channel's colour: a curve is drawn.
+DRAWN = """
+(() => { const c = document.getElementById('scope'), g = c.getContext('2d');
+  const d = g.getImageData(100, 0, c.width - 120, c.height - 30).data; let n = 0;
+  for (let i = 0; i < d.length; i += 4)
+    if (d[i + 3] > 200 && Math.max(d[i], d[i+1], d[i+2]) - Math.min(d[i], d[i+1], d[i+2]) > 90) n++;
+  return n > 500; })()
+"""
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
+
+
+def test_an_afternoon_at_the_page(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SAMII_RIG_STATE", str(tmp_path / "state"))
+    # Markup in what people write stays text.
+    write_small(tmp_path / "runs" / "old.mcap", operator="<img src=x onerror=alert(1)>")
+    with Service(tmp_path / "runs", "--pace", "2") as service:
+        browser.go(service.url)
+        browser.until("document.getElementById('link').textContent === 'live'")
+        assert browser.text("rig-name") == "SAMII"
+        browser.until("document.querySelectorAll('#drawing svg text').length > 10")
+        browser.until("document.querySelectorAll('#list tr').length === 1")
+        assert browser.value("document.querySelectorAll('#list img').length") == 0
+        assert browser.value("document.getElementById('start').disabled")
+
+        browser.value("document.getElementById('experiment').value = 'step'")
+        browser.click("plan")
+        browser.until("document.getElementById('planned').textContent.includes('nearest to a')")
+        browser.click("take")
+        browser.click("start")
+        browser.until("document.getElementById('now').textContent.includes('segment 1 of 2')")
+        browser.until("document.getElementById('facts').textContent.includes('Run left')")
+        browser.until(DRAWN)
+
+        # The service dies: nothing on the page looks live, and the run goes on.
+        service.kill()
+        browser.until("document.getElementById('link').textContent.includes('connection lost')")
+        assert "Unknown" in browser.text("now")
+        assert browser.text("facts") == ""
+        service.begin()
+        browser.until("document.getElementById('link').textContent === 'live'")
+        browser.until("document.getElementById('now').textContent.includes('segment')")
+
+        browser.press("Escape")
+        browser.until("document.getElementById('now').textContent === 'No run.'")
+        browser.until("document.querySelectorAll('#list tr').length === 2")
+        (path,) = (tmp_path / "runs").glob("*_step.mcap")
+        recording = read_recording(path)
+        assert recording.stop.reason == "stopped by SIGTERM"
+        assert recording.values[-1, recording.column("v_2")] == 0.0
+
+        browser.value("document.querySelector('#list button').click()")
+        browser.until("document.getElementById('one-about').textContent.includes('stopped')")
+        browser.until("document.getElementById('one-notes').textContent.includes('stop asked by')")
+    assert browser.errors == []

@@ -1,0 +1,217 @@
+"""Runs through the service, in processes as in a lab.
+
+Plan: runs from start to recording, the queue and the stop; the lease and its loss; what is killed:
+the service during a run, the runner.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from serve_kit import Service, sweep
+
+from samii_rig.index.store import Index
+from samii_rig.record.reader import read_recording
+from samii_rig.record.verify import verify
+from samii_rig.rig.load import load_rig
+from samii_rig.serve.job import Job, JobState, Request
+from samii_rig.serve.supervisor import Supervisor
+
+PACE = "20"  # times real time: minutes of a rig in seconds
+LONG = sweep(duration=60.0, repeats=20)  # a minute at that pace, never waited for
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SAMII_RIG_STATE", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
+@pytest.fixture(scope="module")
+def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    with Service(tmp_path_factory.mktemp("lab"), "--pace", PACE) as started:
+        yield started
+
+
+def ended(service: Service, id_: str) -> dict:
+    def over() -> dict | None:
+        job = service.job(id_)
+        # In the state too: the service has taken note of it.
+        last = service.state()["last"]
+        return job if last and last["id"] == id_ else None
+
+    return service.until(over)
+
+
+def recording_of(service: Service, job: dict) -> Path:
+    return service.folder / job["recording"]
+
+
+def test_a_lab_s_afternoon(service: Service) -> None:
+    """Three runs are asked for; one is stopped by somebody, one taken back, one goes through."""
+    with service.lease() as lease:
+        first = service.start(lease, LONG)
+        second = service.start(lease, sweep())
+        third = service.start(lease, sweep())
+        service.until(service.progressing)
+        state = service.state()
+        assert state["running"]["progress"]["n_segments"] == 20
+        assert [j["id"] for j in state["queue"]] == [second, third]
+        left = [
+            state["running"]["progress"]["time_left"],
+            *(j["duration_s"] for j in state["queue"]),
+        ]
+        assert state["time_left_s"] == pytest.approx(sum(left))
+        assert service.http.delete(f"/api/queue/{third}", headers=lease).status_code == 200
+        assert service.job(third)["phase"] == "cancelled"
+
+        # By another, with nothing to show.
+        answer = service.http.post("/api/stop", headers={"origin": "http://elsewhere"})
+        assert answer.json() == {"stopped": True}
+        job = ended(service, first)
+        assert (job["status"], job["reason"]) == ("stopped", "stopped by SIGTERM")
+        recording = read_recording(recording_of(service, job))
+        assert recording.values[-1, recording.column("v_2")] == 0.0
+        found = service.http.get("/api/recordings", params={"text": "stop asked by local"})
+        assert found.json()["recordings"][0]["path"] == job["recording"]
+
+        # What was stopped is looked at by a person before anything moves again.
+        state = service.state()
+        assert state["running"] is None
+        assert "stopped by SIGTERM" in state["held"]
+        assert [j["id"] for j in state["queue"]] == [second]
+        refused = service.http.post("/api/runs", headers=lease, json={"experiment": "step"})
+        assert refused.status_code == 409
+        service.http.post("/api/queue/resume", headers=lease)
+        job = ended(service, second)
+        assert (job["phase"], job["status"], job["error"]) == ("done", "completed", "")
+
+    path = recording_of(service, job)
+    assert verify(path).status == "whole"
+    asked = {"experiment": "short", "status": "completed"}
+    (entry,) = service.http.get("/api/recordings", params=asked).json()["recordings"]
+    assert entry["path"] == path.name
+    frf = service.http.get(f"/api/recordings/{entry['id']}/frf").json()["responses"]
+    assert frf[0]["curves"][0]["input"] == "v_2"
+    assert service.http.get(f"/api/recordings/{entry['id']}/file").content == path.read_bytes()
+
+
+def test_a_stop_while_it_starts_keeps_anything_from_moving(service: Service) -> None:
+    with service.lease() as lease:
+        id_ = service.start(lease, LONG)
+        assert service.http.post("/api/stop").json() == {"stopped": True}
+        job = ended(service, id_)
+        assert job["phase"] in ("refused", "died")
+        assert "before " in job["error"] + job["reason"]
+        assert not recording_of(service, job).exists()
+
+
+def test_without_the_lease_nothing_starts(service: Service) -> None:
+    with service.lease() as lease:
+        for headers in ({}, {"x-lease": "guess"}):
+            answer = service.http.post("/api/runs", headers=headers, json={"experiment": "step"})
+            assert answer.status_code == 409
+            assert "not your lease" in answer.json()["error"]
+        assert service.http.post("/api/lease").status_code == 409
+        assert service.http.delete("/api/lease", headers=lease).status_code == 200
+
+
+def test_a_plan_beyond_a_limit_is_refused_with_the_amplitude_that_is_not(service: Service) -> None:
+    with service.lease() as lease:
+        hard = sweep().replace("[0.02]", "[9.0]")
+        answer = service.http.post("/api/runs", headers=lease, json={"experiment_toml": hard})
+        assert answer.status_code == 400
+        assert "largest level that would not" in answer.json()["error"]
+        planned = service.http.post("/api/dry-run", json={"experiment_toml": hard}).json()
+        assert planned["refused"] == answer.json()["error"]
+        assert planned["runs"][0]["margins"][0]["margin"] < 0.0
+
+
+def test_an_operator_who_goes_silent_stops_the_run(service: Service) -> None:
+    silent = threading.Event()
+    with service.lease(silent) as lease:
+        id_ = service.start(lease, LONG)
+        service.until(service.progressing)
+        silent.set()
+        job = ended(service, id_)
+        assert job["status"] == "stopped"
+        found = service.http.get("/api/recordings", params={"text": "local gave no sign of life"})
+        assert found.json()["recordings"][0]["path"] == job["recording"]
+
+
+def test_a_diagnosis_that_is_killed_leaves_the_run_as_it_ended(tmp_path: Path) -> None:
+    jobs = tmp_path / ".samii-rig" / "jobs"
+    request = Request("short", "run.mcap")
+    for phase, status in (("analysing", "completed"), ("starting", "")):
+        job = Job.make(jobs, request, "", "")
+        job.set(JobState(phase=phase, pid=1, status=status))  # type: ignore[arg-type]
+    rig, text = load_rig("samii")
+    found = Supervisor(rig, text, Index(tmp_path), 0.0)
+    states = [job.written for job in Job.all(jobs)]
+    assert [(s.phase, s.status) for s in states] == [("done", "completed"), ("died", "failed")]
+    assert found.current is None
+    assert "without a word" in found.held
+
+
+def test_a_runner_that_is_killed_leaves_what_it_recorded(service: Service) -> None:
+    with service.lease() as lease:
+        id_ = service.start(lease, LONG)
+        service.until(service.progressing)
+        job = Job(service.folder / ".samii-rig" / "jobs" / id_)
+        time.sleep(1.5)  # the recorder is on the disk within a second
+        os.kill(job.written.pid, signal.SIGKILL)
+        done = ended(service, id_)
+        assert (done["phase"], done["status"]) == ("died", "failed")
+        (back,) = service.folder.glob("*.recovered.mcap")
+        assert len(read_recording(back)) > 0
+
+
+KILLS = 3
+
+
+def test_a_service_that_is_killed_loses_nothing(tmp_path: Path) -> None:
+    """Killed three times during a run, and started again: the run goes on as if nothing were."""
+    with Service(tmp_path, "--pace", "4") as service:
+        with service.lease() as lease:
+            id_ = service.start(lease, sweep(repeats=10))
+            for i in range(KILLS):
+                if i:
+                    service.until(service.progressing)
+                service.kill()
+                service.begin()
+                running = service.state()["running"]
+                assert running is not None
+                assert running["id"] == id_
+            job = ended(service, id_)
+        assert (job["phase"], job["status"], job["error"]) == ("done", "completed", "")
+        found = service.http.get("/api/recordings").json()["recordings"]
+        assert [(e["path"], e["status"]) for e in found] == [(job["recording"], "completed")]
+    recording = read_recording(tmp_path / job["recording"])
+    assert verify(tmp_path / job["recording"]).status == "whole"
+    assert len(recording.segments) == 10
+    assert recording.stop.missing_samples == 0
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_a_run_stops_without_the_service_if_the_rig_file_says_so(tmp_path: Path) -> None:
+    file = tmp_path / "careful.toml"
+    file.write_text(load_rig("samii")[1] + '\n[service]\nwhen_lost = "stop"\n')
+    started = Service(tmp_path / "runs", "--pace", "2", "--rig", str(file))
+    with started as service, service.lease() as lease:
+        id_ = service.start(lease, LONG)
+        service.until(service.progressing)
+        service.kill()
+        job = Job(service.folder / ".samii-rig" / "jobs" / id_)
+        service.until(lambda: not job.alive())
+        service.begin()
+        done = ended(service, id_)
+        assert done["status"] == "stopped"
+        found = service.http.get("/api/recordings", params={"text": "service gave no sign"})
+        assert found.json()["recordings"][0]["path"] == done["recording"]
