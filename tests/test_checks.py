@@ -125,7 +125,7 @@ def test_time_that_stands_still_is_refused():
 def test_a_wrong_rate_and_jitter_are_named():
     recording = sweeps()
     wrong = replace(recording, time=(recording.time * 1.01).astype(np.int64))
-    assert kinds(wrong) == {"timing"}
+    assert kinds(wrong) == {"clock"}
     late = recording.time + np.random.default_rng(0).integers(0, 4_000_000, len(recording))
     assert kinds(replace(recording, time=late)) == {"timing"}
 

@@ -8,6 +8,7 @@ that boasts has a large one; intervals that cover nine in ten score nine in ten.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -115,3 +116,19 @@ def test_sizes_and_confusion_count_every_single_effect_once() -> None:
     assert confusion(trials) == {(SPRING[0], SPRING[0]): 2}
     wrong = trial("one", diagnosis("named", (SPRING[0], "clamp", 0.9)), SPRING)
     assert confusion([wrong]) == {(SPRING[0], "torsional_compliance, elsewhere"): 1}
+
+
+def test_a_class_is_held_against_the_names_that_the_data_cannot_tell_apart() -> None:
+    right = trial("one", diagnosis("named", (*SPRING, 0.9)), SPRING, size=50)
+    truth = replace(right.truth, names=2, sites=1, said=3)
+    found = {s.what: s for s in scores([replace(right, truth=truth)] * 5)}
+    assert found["names in a class over those an oracle would give, from 10 sigma"].value == 1.5
+    assert found["sites in the 90 % set over those an oracle would give, from 10 sigma"].value == 1
+
+
+def test_every_joint_has_to_come_back_and_nothing_beside() -> None:
+    names = (SPRING, MASS)
+    all_ = trial("joints", diagnosis("named", *((*n, 0.9) for n in names)), *names)
+    less = trial("joints", diagnosis("named", (*SPRING, 0.9)), *names)
+    found = {s.what: s for s in scores([all_, less])}
+    assert found["every joint gives: all found"].value == 0.5

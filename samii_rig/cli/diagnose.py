@@ -32,7 +32,7 @@ def diagnose(
         ),
     ] = None,
     output: OutputOption = None,
-    gaps: GapsOption = "refuse",
+    gaps: GapsOption = "exclude",
     band: BandOption = None,
     json: JsonOption = False,
 ) -> None:

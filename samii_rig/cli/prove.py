@@ -41,6 +41,12 @@ def prove(
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep the recordings (12 MB a trial).")
     ] = False,
+    calibrate: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the weights of stated probabilities that these trials give to this file."
+        ),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Conceal physics from the diagnosis, trial by trial, and score what it says.
@@ -93,6 +99,12 @@ def prove(
         for failure in failures:
             console.print(f"failed     {failure}", soft_wrap=True)
         console.print(f"\npage       {page}", soft_wrap=True)
+    if calibrate is not None:
+        from samii_rig.prove import calibrate as regression
+
+        rows = trials.evidence(campaign.out)
+        origin = f"{len(rows)} trials with an effect found, of seeds from {seed}"
+        regression.write(calibrate, regression.fit(rows), origin)
     if failures:
         raise typer.Exit(1)
 

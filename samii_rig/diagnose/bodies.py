@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from samii_rig.diagnose.effect import Effect, Key, Unknown, Values
+import numpy as np
+
+from samii_rig.diagnose.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.scales import PAIRS, REACH, Places, middle, spread
 from samii_rig.rig.schema import BEAMS, Rig, RigidLink, TorsionalSpring, TranslationalSpring
 from samii_rig.types import Float
@@ -15,7 +17,7 @@ def effects(rig: Rig, where: Places) -> Iterator[Effect]:
     """All of them on this rig."""
     yield from _joint_dampers(rig, where)
     yield from _links(rig, where)
-    yield from _beams(rig)
+    yield from _beams(rig, where)
 
 
 def _joint_dampers(rig: Rig, where: Places) -> Iterator[Effect]:
@@ -42,6 +44,7 @@ def _joint_dampers(rig: Rig, where: Places) -> Iterator[Effect]:
             unknowns=(Unknown("c", e.c.unit, *bounds, spread(*bounds, 8)),),
             parameters=values,
             touches=(key,),
+            jump=Jump(f"beside {e.name}", lambda s, x: np.asarray(s * x[:, :1])),
             variant="beside the spring",
         )
 
@@ -79,11 +82,12 @@ def _links(rig: Rig, where: Places) -> Iterator[Effect]:
             ),
             parameters=values,
             touches=keys,
+            jump=Jump(f"on {e.name}", lambda s, x: np.asarray(s**2 * x[:, :1]), fixed=1),
             variant="on the link",
         )
 
 
-def _beams(rig: Rig) -> Iterator[Effect]:
+def _beams(rig: Rig, where: Places) -> Iterator[Effect]:
     for e in rig.element:
         if not isinstance(e, BEAMS):
             continue
@@ -98,6 +102,7 @@ def _beams(rig: Rig) -> Iterator[Effect]:
             unknowns=(Unknown("eta", "1", 1e-5, 1.0, (1e-3, 1e-2, 0.1)),),
             parameters=lossy,
             touches=(eta,),
+            causal=(e.name, middle(where) / (2 * math.pi)),
         )
         for symbol in ("EI", "mu"):
             key = (e.name, symbol)

@@ -25,13 +25,19 @@ from samii_rig.types import Complex, Float
 Law = Callable[[Complex, Float], tuple[Complex, list[Complex]]]
 
 # Not physics: wiring, units and signs. They compete with physics and are reported apart.
-NOT_PHYSICS = ("channel_swap", "sign_error", "common_gain")
+NOT_PHYSICS = ("channel_swap", "sign_error", "common_gain", "time_offset", "unit_rest")
 
 
 def dead_time(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
     """exp(-s tau)."""
     F = np.exp(-s * x[0])
     return F, [-s * F]
+
+
+def lead(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
+    """exp(s tau): read before the other channels, which no physics does."""
+    F = np.exp(s * x[0])
+    return F, [s * F]
 
 
 def lag(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
@@ -178,6 +184,12 @@ def _sensor(name: str, low_hz: float, high_hz: float) -> Iterator[Effect]:
     corner = _unknown("corner", "Hz", 1e-4 * low_hz, 10 * low_hz)
     yield one("sensor_highpass", highpass, corner, lambda f: {"highpass_hz": f})
     yield Effect(physics="sign_error", site=name, factor=Factor("sensor", name, minus))
+    yield Effect(
+        physics="time_offset",
+        site=name,
+        unknowns=(_times(high_hz),),
+        factor=Factor("sensor", name, lead),
+    )
 
 
 def _tilted(name: str) -> Iterator[Effect]:

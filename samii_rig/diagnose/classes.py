@@ -17,6 +17,7 @@ from samii_rig.rig.schema import Rig
 
 SAME = 3.0  # noise units below which two explanations are one
 RIVAL = 4.0  # of the logarithm of evidence, below the first, up to which a member is a name
+AS_PROBABLE = 2.0  # of the logarithm of evidence: a member with less freedom goes first
 LEAST = 1e-3  # probability of an explanation that may begin a class of its own
 LOOKED_AT = 24  # explanations for which distances are computed
 TWIN = 1e-7  # relative difference of responses below which two effects are one by structure
@@ -54,8 +55,8 @@ class Class:
     def names(self) -> int:
         """How many different names of one cause the class holds at most; aliases are one.
 
-        A law with more freedom that holds the first as a special case is no further name:
-        the evidence has paid for that freedom.
+        A law with more freedom is no further name: it is as near because it holds the first as
+        a special case, as a heavy mass on a spring holds a damper.
         """
         mine = {e.key for e in self.first.effects}
         count = 1
@@ -66,7 +67,9 @@ class Class:
                 for m in self.members[1:]
                 if m.weight > self.first.weight - RIVAL
                 for e in m.effects
-                if e.key not in mine and {x.key for x in m.effects} & mine == kept
+                if e.key not in mine
+                and {x.key for x in m.effects} & mine == kept
+                and len(e.unknowns) <= len(effect.unknowns)
             }
             count = max(count, len(others | {effect.name}))
         return count
@@ -114,9 +117,20 @@ def classes(
                 total += q
             else:
                 rest.append((other, q))
-        out.append(Class(tuple(members), tuple(far), min(total, 1.0)))
+        order = _plainest_first(members)
+        out.append(
+            Class(tuple(members[i] for i in order), tuple(far[i] for i in order), min(total, 1.0))
+        )
         left = rest + left[LOOKED_AT:]
     return sorted(out, key=lambda c: -c.probability)
+
+
+def _plainest_first(members: Sequence[Explanation]) -> list[int]:
+    """Indices of the members, first the one with the fewest unknowns of those as probable as the
+    first: what a law with more freedom says beyond it the data do not show."""
+    near = [i for i, m in enumerate(members) if m.weight > members[0].weight - AS_PROBABLE]
+    first = min(near, key=lambda i: (sum(len(e.unknowns) for e in members[i].effects), i))
+    return [first, *(i for i in range(len(members)) if i != first)]
 
 
 def without_twins(rig: Rig, table: Sequence[Effect], frequency: np.ndarray) -> list[Effect]:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from samii_rig.diagnose import findings
 from samii_rig.diagnose import judge as verdict
 from samii_rig.diagnose.classes import without_twins
 from samii_rig.diagnose.effect import Effect
@@ -59,37 +60,44 @@ def diagnose(
     Raises InputError and EstimateError as `samii_rig.identify.data.collect` does.
     """
     progress("nominal model")
-    sound = usable(responses)
+    clean = findings.sound(responses, rig, band)
+    sound = usable(clean.responses)
     whole = measured(sound, rig, band)
     seen, decide, show = whole.splits()
     at = grid(rig, whole.frequency, whole.sensor, whole.actuator)
     low, high = float(whole.frequency[0]), float(whole.frequency[-1])
     if effects is None:
         effects = table(rig, low, high)
-    search = Search(rig, seen, at, effects)
+    search = Search(rig, seen, at, clean.competing(effects))
     nominal = search.nominal.fitted
     first = search.ratio(nominal)
     bands = verdict.bands(search, nominal)
     progress("what is missing")
     search.run()
     progress("amplitude levels")
-    compete(search, sound)
+    compete(search, sound, runs)
     progress("what cannot be told apart")
     judged = verdict.judge(search, decide)
     nominal = search.nominal.fitted
     best = judged.best
     gap = verdict.gap(search, show, nominal, best.fitted)
-    judged, said = settle(verdict.shown(judged, gap), search, sound, runs)
+    holds, said = settle(judged, search, sound, runs)
+    judged = verdict.shown(verdict.confirmed(judged) if holds else judged, gap)
+    if clean.doubt:
+        judged = verdict.doubted(judged, clean.doubt.most)
     shown = verdict.causes_of(judged.classes[0], judged) if judged.verdict in verdict.SAID else ()
-    findings = _findings(responses)
+    told = list(clean.told)
     if judged.verdict != "no_mismatch" or best.effects:
-        findings += verdict.told(judged)
-    findings += said
+        told += verdict.told(judged)
+    told += (*said, *clean.lacks)
     why, experiment = next_levels(judged) or next_experiment(search, judged)
+    if clean.doubt and judged.verdict != "no_mismatch":
+        why, experiment = clean.doubt.why, clean.doubt.experiment
+    ranked = list(zip(judged.classes, judged.shares, strict=True))[len(shown) > 0 :]
     alternatives = tuple(
-        (verdict.causes_of(c, judged, probability=c.probability), c.probability)
-        for c in judged.classes[len(shown) > 0 :][:ALTERNATIVES]
-        if c.probability >= verdict.SHOWN and judged.verdict != "no_mismatch"
+        (verdict.causes_of(c, judged, share), share)
+        for c, share in ranked[:ALTERNATIVES]
+        if share >= verdict.SHOWN and judged.verdict != "no_mismatch"
     )
     fits = [(search.ratio(f), verdict.per_dof(search, show, f)[0]) for f in (nominal, best.fitted)]
     return Diagnosis(
@@ -104,15 +112,14 @@ def diagnose(
         with_causes=fits[1],
         noise_floor=1.0,
         gap=gap,
-        not_physics=tuple(dict.fromkeys(findings)),
+        not_physics=tuple(dict.fromkeys(told)),
         why=why,
         experiment=experiment,
         outside=judged.outside,
         rig=explained(best.fitted) if best.effects else None,
         traces=traces(search, judged) if judged.verdict != "no_mismatch" else (),
+        evidence={
+            **judged.evidence.plain(),
+            "causes": [c.plain() for c in verdict.causes_of(judged.classes[0], judged)],
+        },
     )
-
-
-def _findings(responses: Sequence[FrequencyResponse]) -> list[str]:
-    """What the estimate found wrong with the recordings."""
-    return [f.message for r in responses for f in r.findings if f.severity != "note"]

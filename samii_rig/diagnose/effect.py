@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
+from samii_rig.model.tmm import State
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 
@@ -48,6 +49,25 @@ class Factor:
 
 
 @dataclass(frozen=True, slots=True)
+class Jump:
+    """A part that acts through one complex number at each frequency.
+
+    It turns a state at its place into a jump of another, z+ = z- + e_j x(s) (e_i' z-), so that
+    every output is a Moebius function of x with the same coefficients for all parts there.
+
+    place : the same for parts that differ in x alone.
+    x : (s (n,), unknowns (m, k)) -> (m, n), up to a sign or constant that belongs to the place.
+    states : the one that jumps and the one that drives it; None for a part inside an element.
+    fixed : how many of the unknowns, the last ones, belong to the place.
+    """
+
+    place: str
+    x: Callable[[Complex, Float], Complex]
+    states: tuple[State, State] | None = None
+    fixed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Effect:
     """One hypothesis of what was left out.
 
@@ -58,6 +78,8 @@ class Effect:
     parameters : the rig's parameters that it sets, from its unknowns and the nominal values.
     touches : nominal parameters that `parameters` reads.
     factor : what it does to a channel, if that is no parameter of the rig.
+    causal : (beam, Hz) whose loss factor it brings, and where the stiffness is as in the file.
+    jump : its place and x(s), if it acts through one number; as `build` and `parameters` do.
     quasi : the nonlinear force that it is, if it is one; the first unknown is its strength.
     write : the rig as a file would have it, from the built rig and the unknowns.
     weight : prior weight against the other hypotheses.
@@ -72,6 +94,8 @@ class Effect:
     parameters: Callable[[Float, Values], dict[Key, float]] = lambda _x, _nominal: {}
     touches: tuple[Key, ...] = ()
     factor: Factor | None = None
+    jump: Jump | None = None
+    causal: tuple[str, float] | None = None
     quasi: Quasi | None = None
     write: Callable[[Rig, Float], Rig] = lambda rig, _x: rig
     weight: float = 1.0

@@ -17,16 +17,18 @@ from samii_rig.diagnose.measured import Measured
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Band, Cause, Gap, Value, Verdict
 from samii_rig.diagnose.search import NEAR, Explanation, Search
+from samii_rig.diagnose.stated import TINY, Evidence, probability
 from samii_rig.signal.statistics import octaves
 from samii_rig.types import Float
 
 FALSE_ALARM = 0.003  # of the chi-square test of the nominal model alone
 NOTHING = 0.2  # probability of nothing missing below which it is called missing
-SURE = 0.8  # probability of a class from which it is named
+SURE = 0.8  # probability of an answer from which it is named
+DOUBT = 0.3  # probability of an answer below which none is given
+MOSTLY = 0.5  # of the mismatch; one cause that explains it is told whatever else is missing
 MOST_NAMES = 4  # of a class; more is no answer
-OUTSIDE = 6.0  # logarithm of what an unexplained rest must be worth before it is one
-IN_DATA = 12.0  # of chi-square, that an effect must explain of the data to be called missing
-MOSTLY = 0.5  # of the mismatch; explained by a cause, it is shown although something is left
+IN_DATA = 45.0  # of chi-square, that an effect must explain of the data to be called missing
+UNEXPLAINED = 3e-4  # chance that noise leaves as much as makes an empty answer "unknown"
 DRAWS = 400
 SAID = ("named", "ambiguous")  # verdicts that come with causes
 SHOWN = 0.01  # probability of an alternative from which it is listed
@@ -38,17 +40,18 @@ UNIT_WITHIN = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """classes : the most probable first; empty effects mean that nothing is missing.
+    """classes : the most probable first; empty effects mean that nothing is missing. Their
+        probabilities are among what was looked at.
 
-    nothing, outside : probabilities of nothing missing, and of something (also) missing that
-        is not in the table; those of the classes are given that it is.
-    inflation : factor on covariances for what the best explanation leaves.
+    nothing : probability of nothing missing. right : that the chosen explanation is right, up to
+        its class, by its evidence. inflation : factor on covariances for what it leaves.
     """
 
     verdict: Verdict
     classes: tuple[Class, ...]
     nothing: float
-    outside: float
+    right: float
+    evidence: Evidence
     inflation: float
 
     @property
@@ -56,10 +59,24 @@ class Judgement:
         """The chosen explanation."""
         return self.classes[0].first
 
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Probability of each class; what is left to one is of what was not looked at."""
+        if not self.best.effects:
+            return tuple(c.probability for c in self.classes)
+        others = [c.probability for c in self.classes[1:]]
+        scale = min((1 - self.right) / sum(others), 1.0) if sum(others) > 0 else 0.0
+        return (self.right, *(scale * p for p in others))
 
-def threshold(data: Measured) -> float:
-    """Chi-square per degree of freedom that noise alone exceeds with `FALSE_ALARM`."""
-    return float(stats.gamma.isf(FALSE_ALARM, 1 / data.spread, scale=data.spread))
+    @property
+    def outside(self) -> float:
+        """Probability of something that was not looked at."""
+        return max(0.0, 1 - sum(self.shares))
+
+
+def threshold(data: Measured, chance: float = FALSE_ALARM) -> float:
+    """Chi-square per degree of freedom that noise alone exceeds with this chance."""
+    return float(stats.gamma.isf(chance, 1 / data.spread, scale=data.spread))
 
 
 def judge(search: Search, decide: Measured | None = None) -> Judgement:
@@ -67,31 +84,97 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
 
     decide : lines that took no part in the fit, on which the best explanation must hold too.
     """
-    inflation = search.temperature
     ranked = _decided(search, decide) if decide is not None else search.ranked()
-    best = ranked[0]
-    left = search.ratio(best.fitted)
     weights = np.array([e.weight for e in ranked])
-    gain = _worth(left, search.lines.spread)
-    if decide is not None:
-        gain += _worth(_held(search, decide, best.fitted), decide.spread)
-    outside = float(np.max(weights)) + gain - OUTSIDE - (0.0 if best.effects else 2.0)
     p = np.exp(weights - np.max(weights))
-    beyond = 1 / (1 + float(np.sum(p)) * math.exp(min(np.max(weights) - outside, 700.0)))
-    p /= p.sum()
-    grouped = classes(ranked, p.tolist(), search.problem, inflation)
+    grouped = classes(ranked, (p / p.sum()).tolist(), search.problem, search.temperature)
     nothing = sum(c.probability for c in grouped if not c.first.effects)
-    closed = _closed(search, best)
-    said = _verdict(grouped, nothing, beyond, closed)
-    if said in SAID and not _seen(search, grouped, nothing):
-        said = "no_mismatch"
+    ordered = tuple(_chosen_first(grouped, nothing))
+    evidence = _evidence(search, ordered, ranked, decide)
     return Judgement(
-        verdict=said,
-        classes=tuple(_chosen_first(grouped, nothing)),
+        verdict=_verdict(ordered[0], evidence, search, decide),
+        classes=ordered,
         nothing=nothing,
-        outside=beyond,
-        inflation=inflation,
+        right=probability(evidence),
+        evidence=evidence,
+        inflation=search.temperature,
     )
+
+
+def _evidence(
+    search: Search,
+    ordered: Sequence[Class],
+    ranked: Sequence[Explanation],
+    decide: Measured | None,
+) -> Evidence:
+    chosen = ordered[0]
+    first = chosen.first
+    # Sums, not 1 - p: odds of a million are told from odds of a billion.
+    others = sum(c.probability for c in ordered[1:])
+    empty = next((e.weight for e in ranked if not e.effects), -math.inf)
+    before, left = search.ratio(search.nominal.fitted), search.ratio(first.fitted)
+    return Evidence(
+        odds=math.log(max(chosen.probability, TINY) / max(others, TINY)),
+        left=left,
+        held=_held(search, decide, first.fitted) if decide is not None else 1.0,
+        effects=len(first.effects),
+        forced=any(e.quasi is not None for e in first.effects),
+        confirmed=False,
+        gain=min(first.weight - empty, 1e6),
+        drop=(search.nominal.fitted.chi2 - first.fitted.chi2) / search.temperature,
+        names=chosen.names(),
+        pair=len(first.effects) == 2 and len({e.physics for e in first.effects}) == 1,
+        closed=(before - left) / (before - 1) if before > 1 else 0.0,
+    )
+
+
+def confirmed(judged: Judgement) -> Judgement:
+    """The same once a nonlinear force was confirmed in time."""
+    evidence = replace(judged.evidence, confirmed=True)
+    said = "unknown" if evidence.names > MOST_NAMES else _said(evidence)
+    return replace(judged, verdict=said, right=probability(evidence), evidence=evidence)
+
+
+def _verdict(
+    chosen: Class,
+    evidence: Evidence,
+    search: Search,
+    decide: Measured | None,
+) -> Verdict:
+    if not chosen.first.effects:
+        return "unknown" if _unexplained(evidence, search, decide) else "no_mismatch"
+    if evidence.drop <= IN_DATA:
+        # What a refit of the nominal parameters absorbs, at the cost of values that their
+        # tolerances make unlikely, is not in the data.
+        return "unknown" if _unexplained(evidence, search, decide) else "no_mismatch"
+    if evidence.names > MOST_NAMES:
+        return "unknown"
+    if all(e.physics in NOT_PHYSICS for e in chosen.first.effects):
+        return "no_mismatch"
+    said = _said(evidence)
+    # A nonlinear force is named once it was confirmed in time: see `confirmed`.
+    return "ambiguous" if said == "named" and evidence.forced else said
+
+
+def _unexplained(evidence: Evidence, search: Search, decide: Measured | None) -> bool:
+    """Whether more than noise is left on lines that were fitted or on those that were not: what
+    changes from run to run is seen by the latter alone."""
+    held = decide is not None and evidence.held > threshold(decide, UNEXPLAINED)
+    return held or evidence.left > threshold(search.lines, UNEXPLAINED)
+
+
+def _said(evidence: Evidence) -> Verdict:
+    right = probability(evidence)
+    if right >= DOUBT:
+        return "named" if right >= SURE else "ambiguous"
+    one = evidence.effects == 1 and evidence.closed > MOSTLY
+    return "ambiguous" if one else "unknown"
+
+
+def doubted(judged: Judgement, most: Verdict) -> Judgement:
+    """The same where something is wrong with the recordings that could pass for physics: no more
+    is said than `most`."""
+    return replace(judged, verdict=most) if judged.verdict in SAID else judged
 
 
 def shown(judged: Judgement, gap: Gap) -> Judgement:
@@ -99,11 +182,6 @@ def shown(judged: Judgement, gap: Gap) -> Judgement:
     if judged.verdict in SAID and gap.value < 0:
         return replace(judged, verdict="unknown")
     return judged
-
-
-def _worth(left: float, spread: float) -> float:
-    """Logarithm of what an explanation of `left`, chi-square per degree of freedom, would gain."""
-    return (left - 1 - math.log(left)) / spread if left > 1 else 0.0
 
 
 def _decided(search: Search, lines: Measured) -> list[Explanation]:
@@ -137,44 +215,15 @@ def _predicted(search: Search, lines: Measured, fitted: Fitted) -> tuple[float, 
     return chi2, float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(before)[1])
 
 
-def _seen(search: Search, grouped: Sequence[Class], nothing: float) -> bool:
-    """Whether the data themselves gain: what a refit of the nominal parameters absorbs, at
-    the cost of values that their tolerances make unlikely, is not in the data."""
-    chosen = _chosen_first(grouped, nothing)[0].first.fitted
-    return search.nominal.fitted.chi2 - chosen.chi2 > IN_DATA * search.temperature
-
-
 def _chosen_first(grouped: Sequence[Class], nothing: float) -> list[Class]:
     """Nothing missing last, unless that is the answer."""
     alarmed = nothing < NOTHING
     return sorted(grouped, key=lambda c: (bool(c.first.effects) != alarmed, -c.probability))
 
 
-def _closed(search: Search, best: Explanation) -> float:
-    """Part of what the refitted nominal model leaves over the noise that `best` explains."""
-    before, after = search.ratio(search.nominal.fitted), search.ratio(best.fitted)
-    return (before - after) / (before - 1) if before > 1 else 0.0
-
-
-def _verdict(grouped: Sequence[Class], nothing: float, outside: float, closed: float) -> Verdict:
-    if outside > 0.5:
-        return "ambiguous" if closed > MOSTLY else "unknown"
-    if nothing >= NOTHING:
-        return "no_mismatch"
-    best = _chosen_first(grouped, nothing)[0]
-    if not best.first.effects:
-        return "no_mismatch"
-    if best.names() > MOST_NAMES:
-        return "unknown"
-    if all(e.physics in NOT_PHYSICS for e in best.first.effects):
-        return "no_mismatch"
-    return "named" if best.probability >= SURE else "ambiguous"
-
-
-def causes_of(
-    chosen: Class, judged: Judgement, *, probability: float | None = None
-) -> tuple[Cause, ...]:
-    """The physics of a class's first member, each with its own marginal probability."""
+def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> tuple[Cause, ...]:
+    """The physics of a class's first member. Each has its own marginal probability, or that of
+    the whole class where it is given."""
     first = chosen.first
     values = _values(first, judged.inflation)
     out = []
@@ -182,13 +231,13 @@ def causes_of(
         if effect.physics in NOT_PHYSICS or unit_of(effect, found):
             continue
         same = {effect.name, *chosen.equivalents(effect)}
-        p = probability
+        p = share
         if p is None:
             p = sum(
-                c.probability
-                for c in judged.classes
+                q
+                for c, q in zip(judged.classes, judged.shares, strict=True)
                 if any(n in same for e in c.first.effects for n in e.names)
-            ) * (1 - judged.outside)
+            )
         equivalents = tuple(n for n in chosen.equivalents(effect))
         out.append(Cause(effect.physics, effect.site, min(p, 1.0), equivalents, found))
     return tuple(out)
@@ -244,6 +293,12 @@ def told(judged: Judgement) -> list[str]:
                 out.append(f"{effect.site} and {effect.aliases[0][1]} are swapped")
             case "sign_error":
                 out.append(f"{effect.site} has the wrong sign")
+            case "time_offset":
+                t = found["tau"]
+                out.append(
+                    f"{effect.site} is {1e3 * t.value:.4g} ms ({1e3 * t.low:.4g} to "
+                    f"{1e3 * t.high:.4g}) ahead of the other channels: stamped or read too early"
+                )
             case "common_gain":
                 g = found["gain"]
                 out.append(
@@ -264,9 +319,9 @@ def told(judged: Judgement) -> list[str]:
 def sites(judged: Judgement) -> list[tuple[str, float]]:
     """Probability of each site over all explanations, the most probable first."""
     total: dict[str, float] = defaultdict(float)
-    for c in judged.classes:
+    for c, share in zip(judged.classes, judged.shares, strict=True):
         for site in {e.site for e in c.first.effects if e.physics not in NOT_PHYSICS}:
-            total[site] += c.probability
+            total[site] += share
     ranked = sorted(total.items(), key=lambda item: -item[1])
     return [(s, min(p, 1.0)) for s, p in ranked if p >= SHOWN]
 

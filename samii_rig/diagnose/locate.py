@@ -1,18 +1,16 @@
 """Where, without assuming a law: the missing part's own response x(w) at each place.
 
 A part left out at a port turns the state i there into a jump of state j, z+ = z- + e_j x e_i'z-.
-Every output is then a Moebius function of x with a common denominator,
+Every output is then a Moebius function of x with a common denominator (`moebius`),
 
     y_k = a_k + b_k x/(1 - c x)     =>     x (b_k + c (y_k - a_k)) = y_k - a_k,
 
-linear in x: least squares at each frequency. b and c follow from the model itself with
-the jump at two strengths. With two outputs or more, what no x can explain tells whether the
-part can be there; the uncertain nominal parameters are projected out of it.
+linear in x: least squares at each frequency. With two outputs or more, what no x can explain
+tells whether the part can be there; the uncertain nominal parameters are projected out of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,21 +18,18 @@ import numpy as np
 from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.model import Model
+from samii_rig.diagnose.moebius import Place, place_of
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Trace
-from samii_rig.diagnose.search import Search
+from samii_rig.diagnose.search import Explanation, Search
 from samii_rig.types import Complex, Float
 
 ROUNDS = 4  # of nominal parameters and x in turn
 SHOWN = 3  # places whose x(w) is kept
 
-# x(s) of a part with one strength and nothing else: by its physics, and its jump in words.
-PROBES: dict[str, tuple[str, str, Callable[[Complex, float], Complex]]] = {
-    "torsional_compliance": ("theta", "M", lambda s, k: np.full(s.shape, 1 / k, complex)),
-    "translational_compliance": ("w", "V", lambda s, k: np.full(s.shape, -1 / k, complex)),
-    "added_mass": ("V", "w", lambda s, m: -m * s**2),
-    "added_inertia": ("M", "theta", lambda s, J: J * s**2),
-}
+PROBES = ("torsional_compliance", "translational_compliance", "added_mass", "added_inertia")
+# Jumps that a part makes downwards: z+ = z- - e_j x e_i'z- for its x.
+DOWN = (("w", "V"), ("V", "w"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,32 +52,25 @@ class Located:
         return self.chi2 / max(self.dof, 1.0)
 
 
-def moebius(
-    rig_model: Model, effect: Effect, problem: Problem, x: Float
-) -> tuple[Complex, Complex, Complex]:
-    """a (n, q), b (n, q) and c (n,) of the effect's jump, about a model at x."""
-    law = PROBES[effect.physics][2]
-    s = np.asarray(2j * np.pi * problem.at.frequency, np.complex128)
+def moebius(rig_model: Model, effect: Effect, problem: Problem, x: Float) -> tuple[Complex, Place]:
+    """a (n, q), and the place of an effect with a jump, about a model at x."""
     a = rig_model.response(x, problem.at)
     trial = Model(rig_model.rig, (*rig_model.effects, effect))
-    middle = np.sqrt(effect.unknowns[0].low * effect.unknowns[0].high)
-    g, strength = [], []
-    for value in (middle, 3 * middle):
-        start = [value, *(1e-9 for _ in effect.unknowns[1:])]
-        y = trial.response(np.append(x, np.log(start)), problem.at)
-        strength.append(law(s, value))
-        g.append((y - a) / strength[-1][:, None])
-    # g = b/(1 - c x): the ratio of two gives c, from the entry that moves most.
-    k = np.argmax(np.abs(g[0]), axis=1)[:, None]
-    R = (np.take_along_axis(g[0], k, 1) / np.take_along_axis(g[1], k, 1))[:, 0]
-    c = (R - 1) / (R * strength[0] - strength[1])
-    return a, g[0] * (1 - c * strength[0])[:, None], c
+    fixed = tuple(u.starts[0] for u in effect.unknowns[_free(effect) :])
+    return a, place_of(trial, x, effect, problem.at, a, fixed)
 
 
-def locate(base: Fitted, effect: Effect, problem: Problem) -> Located:
-    """The best x(w) of one place with the nominal parameters refitted in the same fit."""
+def _free(effect: Effect) -> int:
+    assert effect.jump is not None
+    return len(effect.unknowns) - effect.jump.fixed
+
+
+def locate(base: Fitted, effect: Effect, problem: Problem, *, held: bool = False) -> Located:
+    """The best x(w) of one place with the nominal parameters refitted in the same fit, or `held`
+    where the base has them."""
     model = base.model
-    a, b, c = moebius(model, effect, problem, base.x)
+    a, place = moebius(model, effect, problem, base.x)
+    b, c = place.b, place.c
     d = problem.data.H
     J = base.jacobian
     n, q = d.shape
@@ -92,7 +80,7 @@ def locate(base: Fitted, effect: Effect, problem: Problem) -> Located:
     delta = np.zeros(J.shape[1])
     prior = np.where(np.isfinite(model.prior), model.prior, 10.0)
     x = np.zeros(n, complex)
-    for _ in range(ROUNDS):
+    for _ in range(1 if held else ROUNDS):
         shift = (slopes @ delta)[:, :, None]
         u = W @ (d - a)[:, :, None] - shift
         v = W @ (b + c[:, None] * (d - a))[:, :, None]
@@ -107,36 +95,61 @@ def locate(base: Fitted, effect: Effect, problem: Problem) -> Located:
         ee = (P @ e).reshape(half)
         A = np.concatenate([Je.real, Je.imag, np.diag(1 / prior)])
         r = np.concatenate([ee.real, ee.imag, -base.x / prior * np.isfinite(model.prior)])
-        delta = np.linalg.lstsq(A, r, rcond=None)[0]
-    left = r - A @ delta
+        if not held:
+            delta = np.linalg.lstsq(A, r, rcond=None)[0]
+    left = np.concatenate([ee.real, ee.imag]) if held else r - A @ delta
     weight = np.sum(problem.data.expected) / (2 * half)
     sd = np.sqrt(2 / np.maximum(np.sum(np.abs(s) ** 2, axis=(1, 2)), 1e-300))
     return Located(effect, x, sd, float(left @ left), weight * 2 * (half - n))
 
 
 def traces(search: Search, judged: Judgement) -> tuple[Trace, ...]:
-    """x(w) of the places that explain most, about the refitted nominal model."""
-    nominal = search.nominal.fitted
-    if search.problem.data.H.shape[1] < 1:
-        return ()
-    found = [
-        locate(nominal, e, search.problem)
-        for e in search.table
-        if e.physics in PROBES
-        and len(e.unknowns) <= 2
-        and not any(u.symbol == "position" for u in e.unknowns)
-    ]
-    del judged
-    best = sorted(found, key=lambda item: item.chi2)[:SHOWN]
-    return tuple(
-        Trace(
-            site=item.effect.site,
-            jump=PROBES[item.effect.physics][0],
-            by=PROBES[item.effect.physics][1],
-            frequency=search.problem.data.frequency,
-            x=item.x,
-            sd=item.sd,
-            chi2_per_dof=item.ratio,
-        )
-        for item in best
+    """x(w) of the places that explain most.
+
+    Each effect that is said to be missing and acts through one number comes first, at its own
+    place, about the rig with all the others in it and the nominal parameters as they were
+    found; then the places that explain most about the rig without the first. Where nothing is
+    said to be missing, all are about the refitted nominal model.
+    """
+    best = judged.best
+    shown: list[Located] = []
+    for i, effect in enumerate(best.effects):
+        base = _without(search, best, i)
+        if base is not None and effect.jump is not None and effect.jump.states is not None:
+            shown.append(locate(base.fitted, effect, search.problem, held=True))
+    base = _without(search, best, 0) if best.effects else search.nominal
+    if base is not None:
+        taken = {i.effect.jump.place for i in shown if i.effect.jump is not None}
+        mine = {e.key for e in base.effects}
+        found = [
+            locate(base.fitted, e, search.problem)
+            for e in search.table
+            if e.physics in PROBES
+            and e.jump is not None
+            and e.jump.fixed == 0
+            and e.jump.place not in taken
+            and e.key not in mine
+        ]
+        shown += sorted(found, key=lambda item: item.chi2)
+    return tuple(_trace(item, search) for item in shown[:SHOWN])
+
+
+def _without(search: Search, best: Explanation, i: int) -> Explanation | None:
+    """The explanation without one effect; None where a force of its own is left in it."""
+    base = search.bare(best, i)
+    return None if base is None or any(e.quasi for e in base.effects) else base
+
+
+def _trace(item: Located, search: Search) -> Trace:
+    assert item.effect.jump is not None
+    assert item.effect.jump.states is not None
+    jump, by = item.effect.jump.states
+    return Trace(
+        site=item.effect.site,
+        jump=jump,
+        by=by,
+        frequency=search.problem.data.frequency,
+        x=-item.x if (jump, by) in DOWN else item.x,
+        sd=item.sd,
+        chi2_per_dof=item.ratio,
     )

@@ -19,8 +19,9 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse, Int
 
 BINS = 180  # to begin with; a refit costs a few milliseconds
-MOST_BINS = 700
+MOST_BINS = 400
 SPLIT = 6.0  # standard deviations of chi-square inside a bin above which it is divided
+COARSE = 0.01  # of a model's misfit, over noise, that may be lost in a bin
 SHAPE = 0.6  # weight of the response's own arc (logarithm, radians) against log frequency
 SHOW, TURN = 4, 5  # one line in five is kept apart, to show on what was found
 PERIODIC = ("periodic", "stepped")  # methods of excitations that repeat themselves
@@ -195,13 +196,21 @@ def _clear_of_drift(response: FrequencyResponse, f: Float) -> NDArray[np.bool_]:
     return np.asarray(f > DRIFTING * float(np.min(np.diff(response.frequency))))
 
 
-def binned(lines: Measured, shape: Complex, bins: int = BINS) -> Measured:
+def binned(
+    lines: Measured,
+    shape: Complex,
+    bins: int = BINS,
+    most: int = MOST_BINS,
+    misfit: float = 1.0,
+) -> Measured:
     """Lines combined into bins, each at the line nearest its middle.
 
     shape : (n, q) a model at the lines. In a bin the truth is taken for the model times one
     complex factor for each entry; chi-square about that is kept in `inside`, and a bin in
-    which it is too large is divided.
+    which it is too large is divided, up to `most` bins. misfit : chi-square over its mean that
+    the model has anyhow; where it is gross, bins need not be fine.
     """
+    split = SPLIT * max(1.0, COARSE * misfit)
     size = np.abs(shape)
     smooth = np.where(size > 0, shape, 1.0)
     arc = np.abs(np.diff(np.log(smooth), axis=0).real) + np.abs(np.angle(smooth[1:] / smooth[:-1]))
@@ -211,12 +220,12 @@ def binned(lines: Measured, shape: Complex, bins: int = BINS) -> Measured:
     at = np.searchsorted(place, np.linspace(0, place[-1], min(bins, lines.n) + 1)[:-1])
     starts = np.unique(_apart(lines.frequency, at))
     while True:
-        found, chi, mean = _combined(lines, smooth, starts)
+        found, chi, mean = combined(lines, smooth, starts)
         counts = np.diff(np.append(starts, lines.n))
-        bad = (chi - mean > SPLIT * np.sqrt(2 * np.maximum(mean, 1.0))) & (counts > 1)
+        bad = (chi - mean > split * np.sqrt(2 * np.maximum(mean, 1.0))) & (counts > 1)
         more = _apart(lines.frequency, (starts + counts // 2)[bad])
         new = np.unique(np.concatenate([starts, more]))
-        if new.size == starts.size or new.size > MOST_BINS:
+        if new.size == starts.size or new.size > most:
             return found
         starts = new
 
@@ -226,7 +235,8 @@ def _apart(f: Float, at: Int) -> Int:
     return np.asarray(np.searchsorted(f, f[at]), dtype=np.int64)
 
 
-def _combined(lines: Measured, shape: Complex, starts: Int) -> tuple[Measured, Float, Float]:
+def combined(lines: Measured, shape: Complex, starts: Int) -> tuple[Measured, Float, Float]:
+    """Lines in bins that begin at `starts`, as `binned`; chi-square inside each and its mean."""
     counts = np.diff(np.append(starts, lines.n))
     centre = starts + (counts - 1) // 2
     which = np.repeat(np.arange(starts.size), counts)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from samii_rig.diagnose.causal import CausalChain
 from samii_rig.diagnose.effect import Effect, Key
 from samii_rig.model.sampled import hold_response, sampled_response, sensor_response
 from samii_rig.model.tmm import Chain
@@ -15,6 +16,7 @@ from samii_rig.rig.schema import Rig, parameters
 from samii_rig.types import Complex, Float, Int
 
 ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smooth between
+ORDERS = (-1, 1, -2, 2)  # aliases that a factor on a channel changes
 STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
 
 
@@ -23,12 +25,15 @@ class Grid:
     """Frequencies (n,) with what does not change between models there.
 
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
+    folded : (order, n, q) of these the ones of `ORDERS`, or none. rate_hz : of the samples.
     sensor, actuator : (q,) entries.
     """
 
     frequency: Float
     factor: Complex
     aliases: Complex
+    folded: Complex
+    rate_hz: float
     sensor: Int
     actuator: Int
 
@@ -36,25 +41,42 @@ class Grid:
         """The same on some of the frequencies; what depends on their level is in `LevelGrid`."""
         del level
         i = np.searchsorted(self.frequency, frequency)
-        return Grid(frequency, self.factor[i], self.aliases[i], self.sensor, self.actuator)
+        return Grid(
+            frequency, self.factor[i], self.aliases[i], self.folded[:, i], self.rate_hz,
+            self.sensor, self.actuator,
+        )  # fmt: skip
+
+    def orders(self) -> list[Complex]:
+        """s (n,) of each order of `folded`."""
+        known = ORDERS[: len(self.folded)]
+        f = (self.frequency + k * self.rate_hz for k in known)
+        return [np.asarray(2j * np.pi * x, np.complex128) for x in f]
 
 
 def grid(rig: Rig, frequency: Float, sensor: Int, actuator: Int) -> Grid:
     """The grid of a rig at sorted frequencies, Hz."""
     f = np.unique(frequency)
-    hold = np.stack([hold_response(f, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
-    factor = sensor_response(rig.sensor, f)[:, sensor] * hold[:, actuator]
+
+    def around(f: Float) -> Complex:
+        hold = np.stack([hold_response(f, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
+        return np.asarray(sensor_response(rig.sensor, f)[:, sensor] * hold[:, actuator])
+
     few = np.geomspace(f[0], f[-1], min(ALIAS_POINTS, f.size))
     few[0], few[-1] = f[0], f[-1]
     chain = Chain(rig)
-    held = np.stack([hold_response(few, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
-    part = sensor_response(rig.sensor, few)[:, sensor] * held[:, actuator]
-    rest = (
-        sampled_response(rig, few, chain)[:, sensor, actuator]
-        - chain.response(few)[:, sensor, actuator] * part
-    )
-    aliases = np.stack([np.interp(f, few, r) for r in rest.T], axis=1)
-    return Grid(f, factor, aliases, sensor, actuator)
+
+    def spread(few_: Complex) -> Complex:
+        return np.stack([np.interp(f, few, r) for r in few_.T], axis=1)
+
+    def term(f: Float) -> Complex:
+        return np.asarray(chain.response(f)[:, sensor, actuator] * around(f))
+
+    rest = sampled_response(rig, few, chain)[:, sensor, actuator] - term(few)
+    folded = []
+    for k in ORDERS:
+        there = term(np.abs(few + k * rig.rate_hz))
+        folded.append(spread(there if k > 0 else there.conj()))
+    return Grid(f, around(f), spread(rest), np.stack(folded), rig.rate_hz, sensor, actuator)
 
 
 class Model:
@@ -71,7 +93,7 @@ class Model:
         for effect in effects:
             built = effect.build(built)
         self.built = built
-        self.chain = Chain(built)
+        self.chain = self.chain_of(built)
         known = {(e.name, s): p for e in rig.element for s, p in parameters(e).items()}
         have = set(self.chain.parameters)
         self.keys: tuple[Key, ...] = tuple(
@@ -86,6 +108,14 @@ class Model:
         self.prior[:n] = [known[k].tolerance for k in self.keys]
         self.lower = np.concatenate([-6 * self.prior[:n], [math.log(u.low) for u in unknowns]])
         self.upper = np.concatenate([6 * self.prior[:n], [math.log(u.high) for u in unknowns]])
+
+    def chain_of(self, rig: Rig) -> Chain | CausalChain:
+        """The chain of a rig, as the effects have it."""
+        chain = Chain(rig)
+        causal = dict(e.causal for e in self.effects if e.causal is not None)
+        if not causal:
+            return chain
+        return CausalChain(chain, tuple(causal), next(iter(causal.values())))
 
     def parts(self, x: Float) -> list[Float]:
         """The values of each effect's unknowns."""
@@ -112,7 +142,7 @@ class Model:
         chain = self.chain.with_values(self.values(x))
         G = chain.response(at.frequency)[:, at.sensor, at.actuator]
         F, _ = self._factors(x, at, slopes=False)
-        return np.asarray(G * at.factor * F + at.aliases)
+        return np.asarray(G * at.factor * F + self._aliases(x, at, slopes=False)[0])
 
     def gradient(self, x: Float, at: Grid) -> tuple[Complex, Complex]:
         """The same, and its derivatives (n, q, n_x)."""
@@ -121,21 +151,39 @@ class Model:
         chain = self.chain.with_values(values)
         G, dG = chain.gradient(at.frequency, keys)
         G, dG = G[:, at.sensor, at.actuator], dG[:, at.sensor, at.actuator]
-        map_ = np.zeros((len(keys), self.n))
-        for i, key in enumerate(self.keys):
-            if key in values:
-                map_[i, i] = values[key]
-        for j in self._reading():
-            ahead = x.copy()
-            ahead[j] += STEP
-            there = self.values(ahead)
-            map_[:, j] = [(there[k] - values[k]) / STEP for k in keys]
         F, slopes = self._factors(x, at, slopes=True)
         factor = at.factor * F
-        dH = (dG @ map_) * factor[:, :, None]
+        dG *= factor[:, :, None]
+        dH = np.zeros((*G.shape, self.n), complex)
+        n = self.n_nominal
+        dH[:, :, :n] = dG[:, :, :n] * np.array([values[k] for k in self.keys])
+        read = self._reading()
+        if read:
+            map_ = np.zeros((len(keys), len(read)))
+            for i, j in enumerate(read):
+                ahead = x.copy()
+                ahead[j] += STEP
+                there = self.values(ahead)
+                map_[:, i] = [(there[k] - values[k]) / STEP for k in keys]
+            dH[:, :, read] = dG @ map_
         for j, dlog in slopes:
             dH[:, :, j] += G * at.factor * dlog
-        return G * factor + at.aliases, dH
+        aliases, more = self._aliases(x, at, slopes=True)
+        for j, slope in more:
+            dH[:, :, j] += slope
+        return G * factor + aliases, dH
+
+    def _aliases(
+        self, x: Float, at: Grid, *, slopes: bool
+    ) -> tuple[Complex, list[tuple[int, Complex]]]:
+        """What the aliases add where factors act on them too, and its slopes."""
+        total, more = at.aliases, []
+        if any(e.factor is not None for e in self.effects):
+            for s, part in zip(at.orders(), at.folded, strict=True):
+                F, each = self._factors(x, at, slopes=slopes, s=s)
+                total = total + part * (F - 1)
+                more += [(j, part * slope) for j, slope in each]
+        return total, more
 
     def _reading(self) -> list[int]:
         """Entries of x that reach the chain's parameters through an effect."""
@@ -145,16 +193,17 @@ class Model:
         )
 
     def _factors(
-        self, x: Float, at: Grid, *, slopes: bool
+        self, x: Float, at: Grid, *, slopes: bool, s: Complex | None = None
     ) -> tuple[Complex, list[tuple[int, Complex]]]:
+        """(n, q) product of the factors at s, by default at the grid's own, and its slopes."""
         total = np.ones((at.frequency.size, at.sensor.size), complex)
         parts = []
-        s = np.asarray(2j * np.pi * at.frequency, np.complex128)
+        s = np.asarray(2j * np.pi * at.frequency if s is None else s, np.complex128)
         first = self.n_nominal
         for effect, theta in zip(self.effects, self.parts(x), strict=True):
             if effect.factor is not None:
                 F, dF = effect.factor.value(s, theta)
-                on = self._entries(effect, at)
+                on = self.entries(effect, at)
                 total[:, on] *= F[:, None]
                 parts.append((first, on, F, dF, theta))
             first += len(effect.unknowns)
@@ -167,7 +216,8 @@ class Model:
                     out.append((first + j, slope))
         return total, out
 
-    def _entries(self, effect: Effect, at: Grid) -> Int:
+    def entries(self, effect: Effect, at: Grid) -> Int:
+        """Entries of the grid that an effect's factor is on."""
         assert effect.factor is not None
         if effect.factor.kind == "input":
             names = [a.name for a in self.rig.actuator]

@@ -9,25 +9,23 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import fields, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from samii_rig.diagnose.effect import Effect, Unknown
+from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.judge import Judgement
-from samii_rig.diagnose.measured import Measured, binned
-from samii_rig.diagnose.nonlinear_laws import CUBIC, EXCESS, FRICTION, GAP
+from samii_rig.diagnose.nonlinear_apart import Apart
+from samii_rig.diagnose.nonlinear_confirm import seen
+from samii_rig.diagnose.nonlinear_driven import drives
+from samii_rig.diagnose.nonlinear_forces import forces
 from samii_rig.diagnose.nonlinear_levels import LevelGrid, level_grid
-from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
+from samii_rig.diagnose.nonlinear_model import LevelModel
+from samii_rig.diagnose.nonlinear_screen import Bins, Promise
 from samii_rig.diagnose.refit import Problem, refit
-from samii_rig.diagnose.scales import spread
-from samii_rig.diagnose.search import LATER, WORTH, Explanation, Search
-from samii_rig.errors import SamiiRigError
-from samii_rig.model.tmm import Chain
-from samii_rig.rig.schema import ANGLE_SOURCES, SOURCES, Rig, TorsionalSpring
-from samii_rig.types import Float, FrequencyResponse, Recording
+from samii_rig.diagnose.search import MIXED, NEAR, WORTH, Explanation, Search
+from samii_rig.types import FrequencyResponse, Recording
 
 NAMES = (
     "coulomb_friction",
@@ -37,170 +35,30 @@ NAMES = (
     "flow_saturation",
     "output_saturation",
 )
-BINS = 100  # of each level
-# Fields of `Measured` that are not of its lines.
-WHOLE = ("levels", "periodic", "sensor", "actuator", "outputs", "inside", "rate_hz")
-KEPT = 6  # linear explanations that are held against the levels
-BASES = 2  # of these to which a nonlinear force is added
-STARTS = 5
-PROMISING = 0.3  # of what is needed to be as good as the best, gained in the screen, at least
-RANGE = (1e-4, 30.0)  # of a strength over the one that doubles or halves the motion at its place
-WIDTHS = (1e-4, 2.0)  # of a gap or limit over the largest amplitude that meets it
+KEPT = 4  # linear explanations that are held against the levels
+PROMISING = 0.25  # of what the first gains in the screen, at least
+TRIED = 4  # forces that are refitted beside each base
+ALARM, BETWEEN = 14.0, 8.0  # of chi-square, and of that between levels, that a force must gain
+SHARE, MORE = 0.3, 3.0  # of what it should gain between levels, that it does
+STRONG = 150.0  # of chi-square: a force that gains more is computed anew where it was found
+AGAIN, MOVED = 2, 0.01  # times at most; change of its logarithm that is small
+GROWN = 3  # linear effects that are refitted beside a force
 ONE_LEVEL = (
     "all runs have one amplitude: friction, deadband, backlash, hardening and saturation cannot "
     "be told from linear physics; runs at half and at twice the amplitude would"
 )
 
 
-def forces(rig: Rig, problem: Problem) -> Iterator[Effect]:
-    """Every nonlinear force that the table knows on this rig; ranges are those of the data."""
-    order = [e.name for e in rig.element]
-    kinds = {e.name: e for e in rig.element}
-    for e in rig.element:
-        if isinstance(e, TorsionalSpring):
-            at = order.index(e.name)
-            near: list[tuple[str, ...]] = [
-                (order[i], e.name) if i < at else (e.name, order[i])
-                for i in (at - 1, at + 1)
-                if 0 <= i < len(order) and isinstance(kinds[order[i]], ANGLE_SOURCES)
-            ]
-            for across in ((e.name,), *near):
-                yield from _joint(rig, problem, across, e.name)
-    actuator = rig.actuator[int(problem.at.actuator[0])]
-    source = next(
-        (e for e in rig.element if isinstance(e, SOURCES) and e.input == actuator.name), None
-    )
-    if source is None:
-        return
-    alias = actuator.name
-    largest = _largest(problem)
-    if isinstance(source, ANGLE_SOURCES):
-        across = (source.name,)
-        yield _force(
-            "coulomb_friction", source.name, alias, Quasi("drive", across, FRICTION),
-            _log("T_c", actuator.unit, 1e-4 * largest, 2 * largest),
-        )  # fmt: skip
-        flow = Quasi("flow", across, None)
-        scale = _motion(rig, problem, flow, reading=1)
-        if scale is not None:
-            top = float(np.max(scale[0]))
-            yield _force(
-                "flow_saturation", source.name, alias, flow,
-                _log("T_s", "N m", top, 1e4 * top),
-            )  # fmt: skip
-    at_source = (source.name,)
-    yield _force(
-        "valve_deadband", source.name, alias, Quasi("command", at_source, GAP),
-        _log("width", actuator.unit, WIDTHS[0] * largest, WIDTHS[1] * largest),
-    )  # fmt: skip
-    yield _force(
-        "output_saturation", source.name, alias, Quasi("command", at_source, EXCESS),
-        _log("limit", actuator.unit, 0.02 * largest, largest),
-    )  # fmt: skip
-
-
-def _joint(rig: Rig, problem: Problem, across: tuple[str, ...], spring: str) -> Iterator[Effect]:
-    """Forces between both sides of a joint: of its spring alone, or of spring and source."""
-    friction = Quasi("joint", across, FRICTION)
-    alone = len(across) == 1
-    other = next((n for n in across if n != spring), "")
-    speed = _motion(rig, problem, friction)
-    if speed is None:
-        return
-    A, y1 = speed
-    torque = float(np.median(np.pi / 4 * A / y1))
-    low, high = (x * torque for x in RANGE)
-    yield _force("coulomb_friction", spring, other, friction, _log("T_c", "N m", low, high))
-    if not alone:
-        return
-    cubic = Quasi("joint", across, CUBIC)
-    turned = _motion(rig, problem, cubic)
-    assert turned is not None
-    A, y1 = turned
-    k3 = 4 / 3 / float(np.median(y1)) / float(np.max(A)) ** 2
-    yield _force(
-        "cubic_stiffness", spring, "", cubic,
-        _log("k3", "N m/rad^3", RANGE[0] * k3, RANGE[1] * k3),
-    )  # fmt: skip
-    top = float(np.max(A))
-    yield _force(
-        "backlash", spring, "", Quasi("joint", across, GAP, 1.0, (spring, "k")),
-        _log("width", "rad", WIDTHS[0] * top, WIDTHS[1] * top),
-    )  # fmt: skip
-
-
-def _log(symbol: str, unit: str, low: float, high: float) -> Unknown:
-    return Unknown(symbol, unit, low, high, spread(low, high, STARTS))
-
-
-def _force(physics: str, site: str, alias: str, quasi: Quasi, unknown: Unknown) -> Effect:
-    return Effect(
-        physics=physics,
-        site=site,
-        unknowns=(unknown,),
-        quasi=quasi,
-        aliases=((physics, alias),) if alias else (),
-        variant=f"{quasi.kind} {' '.join(quasi.across)}",
-    )
-
-
-def _largest(problem: Problem) -> float:
-    """Largest amplitude of the input at any level."""
-    at = problem.at
-    assert isinstance(at, LevelGrid)
-    sine = np.sqrt(2 * at.driven.max(axis=1))
-    return float(np.max(np.where(at.random, 3 * np.sqrt(at.driven.sum(axis=1)), sine)))
-
-
-def _motion(
-    rig: Rig, problem: Problem, quasi: Quasi, reading: int = 0
-) -> tuple[Float, Float] | None:
-    """Amplitude of what drives a force at every line, and how much a unit force moves it; None
-    where nothing moves, or the force cannot act."""
-    at = problem.at
-    assert isinstance(at, LevelGrid)
-    assert at.power is not None
-    try:
-        G = Chain(quasi.widened(rig)).response(at.frequency)
-    except SamiiRigError:
-        return None
-    n = len(rig.sensor) + reading
-    rate = np.ones(at.frequency.size)
-    if quasi.law is not None and quasi.law.of_speed:
-        rate = 2 * np.pi * at.frequency
-    A = np.abs(rate * G[:, n, int(at.actuator[0])]) * np.sqrt(2 * at.power)
-    y1 = np.abs(rate * G[:, n, -1])
-    on = A > 0
-    if not on.any() or not np.all(y1 > 0) or not np.all(np.isfinite(y1)):
-        return None
-    return A[on], y1[on]
-
-
-def apart(lines: Measured, search: Search, bins: int = BINS) -> Measured:
-    """The lines in bins of one level each, about the best explanation."""
-    best = search.ranked()[0].fitted
-    parts = []
-    for k in np.unique(lines.level):
-        own = lines.take(lines.level == k)
-        shape = best.model.response(best.x, search.grid.at(own.frequency, own.level))
-        parts.append(binned(own, shape, bins))
-    order = np.argsort(np.concatenate([p.frequency for p in parts]), kind="stable")
-
-    joined: dict[str, Any] = {
-        f.name: np.concatenate([getattr(p, f.name) for p in parts])[order]
-        for f in fields(lines)
-        if f.name not in WHOLE
-    }
-    inside = (sum(p.inside[0] for p in parts), sum(p.inside[1] for p in parts))
-    return replace(lines, inside=inside, **joined)
-
-
-def compete(search: Search, responses: Sequence[FrequencyResponse]) -> Effect | None:
+def compete(
+    search: Search, responses: Sequence[FrequencyResponse], runs: Sequence[Recording] = ()
+) -> Effect | None:
     """Let the nonlinear rows compete with what the linear search found.
 
     Where one wins, `search` goes on with the levels apart and with it; where none does, it is
     left as it was. Nothing is done with fewer than two levels, nor where it is not known how
-    strongly each drove each frequency. Returns the winner.
+    strongly each drove each frequency. runs : recordings of the inputs, under which promising
+    forces are computed in time; without them their describing functions must do. Returns the
+    winner.
     """
     lines = search.lines
     if np.unique(lines.level).size < 2:
@@ -209,47 +67,135 @@ def compete(search: Search, responses: Sequence[FrequencyResponse]) -> Effect | 
     if grid is None:
         return None
     before = (search.problem, search.grid, search.table, search.found, search.temperature)
-    kept = list(search.ranked()[:KEPT])
+    ranked = search.ranked()
+    kept = [e for e in ranked[:KEPT] if e.weight > ranked[0].weight - NEAR]
     kept += [e for e in (search.nominal,) if e not in kept]
-    search.problem = Problem.of(apart(lines, search), grid)
-    search.grid = grid
-    table = list(forces(search.rig, search.problem))
-    _use(search, [*before[2], *table])
-    search.found = {}
-    for e in kept:
-        search._keep(e.effects, refit(e.fitted.model, search.problem, e.fitted.x, far=False))
-    bases = {e.key: e for e in (search.nominal, *search.ranked()[: BASES - 1])}
-    whole = search.table
-    search.table = table
-    for base in bases.values():
-        _grow(search, base)
-    search.temper()
-    forced = _force_in(search.ranked()[0])
-    if forced is not None:
-        # Linear effects that the search took to mend the force are no longer needed, others may be.
-        search.prune()
-        if not search._enough(search.ranked()[0]):
-            search.table = whole
-            search.grow(search.ranked()[0], LATER)
-            search.temper()
-            search.prune()
-        forced = _force_in(search.ranked()[0])
-    search.table = whole
+    bins = Bins.of(lines, ranked[0].fitted, search.grid)
+    problem = Problem.of(bins.combined(), grid)
+    levels = Apart(
+        search, bins, grid, problem, list(forces(search.rig, problem)),
+        drives(search.rig, lines, responses, runs),
+    )  # fmt: skip
+    search.problem, search.grid = problem, grid
+    _use(search, [*before[2], *levels.forces])
+    bases = list({e.key: e for e in (ranked[0], search.nominal)}.values())
+    promised = [(base, levels.promises(base)) for base in bases]
+    forced: Effect | None = None
+    if any(_heard(p) for _, found in promised for p in found):
+        search.found = {}
+        for e in kept:
+            search._keep(e.effects, refit(e.fitted.model, search.problem, e.fitted.x, far=False))
+        _force(search, promised)
+        search.temper()
+        forced = _settled(levels, before[2])
+    search.table = before[2]
     if forced is None:
-        search.problem, search.grid, table_, search.found, search.temperature = before
-        _use(search, table_)
+        search.problem, search.grid, table, search.found, search.temperature = before
+        _use(search, table)
     return forced
 
 
-def _grow(search: Search, base: Explanation) -> None:
-    """Refit `base` with each nonlinear force that may come near the best explanation."""
-    best = min(e.fitted.cost for e in search.found.values())
-    needed = max(WORTH, PROMISING * (base.fitted.cost - best))
-    for drop, effect, starts in search.screen(base)[:LATER]:
-        if drop < needed:
+def _heard(promise: Promise) -> bool:
+    """Whether levels differ as the force would make them, and not much more."""
+    low, high = max(BETWEEN, SHARE * promise.due), BETWEEN + MORE * promise.due
+    return promise.gain > ALARM and low < promise.contrast < high
+
+
+def _force(search: Search, promised: Sequence[tuple[Explanation, list[Promise]]]) -> None:
+    """Refit each base with the force that promises most beside it, and with others that may come
+    as near."""
+    for base, promise in [(base, p) for base, found in promised for p in _worth(found)]:
+        effects = (*base.effects, promise.effect)
+        ends = [search._refit(effects, base, [math.log(p)]) for p in promise.starts]
+        done = [end for end in ends if end is not None]
+        if done:
+            search._keep(effects, min(done, key=lambda end: end.cost))
+
+
+def _worth(found: Sequence[Promise]) -> list[Promise]:
+    """Those that may be the best: of each physics the first, then others."""
+    heard = [p for p in found if _heard(p) and p.gain > PROMISING * found[0].gain]
+    first = {p.effect.physics: p for p in reversed(heard)}
+    ordered = sorted(heard, key=lambda p: (p is not first[p.effect.physics], -p.gain))
+    return ordered[:TRIED]
+
+
+def _settled(levels: Apart, table: Sequence[Effect]) -> Effect | None:
+    """The force of the best explanation, if it has one, once linear effects that only mimicked it
+    are gone and those beside it are found."""
+    search = levels.search
+    if _force_in(search.ranked()[0]) is None:
+        return None
+    gain = search.nominal.fitted.cost - search.ranked()[0].fitted.cost
+    for _ in range(AGAIN if gain > STRONG else 0):
+        if _again(levels) < MOVED:
             break
+    levels.inside(search.ranked()[0])
+    search.temper()
+    search.prune()
+    best = search.ranked()[0]
+    forced = next((e for e in search.ranked() if _force_in(e) and len(e.effects) == 1), best)
+    for base in {e.key: e for e in (best, forced)}.values():
+        if _force_in(base) is not None:
+            _beside(search, base, table)
+    search.temper()
+    search.prune()
+    levels.inside(search.ranked()[0])
+    search.temper()
+    return _force_in(search.ranked()[0])
+
+
+def _again(levels: Apart) -> float:
+    """Compute the force of the best explanation where it was found, and refit what has it and may
+    still compete; by how much the logarithm of its strength moved."""
+    search = levels.search
+    best = search.ranked()[0]
+    model = best.fitted.model
+    if not isinstance(model, LevelModel):
+        return 0.0
+    p = model.strength(best.fitted.x)[0]
+    if not levels.compute(model, best.fitted.x, p):
+        return 0.0
+    for e in list(search.found.values()):
+        force = _force_in(e)
+        if force is None or force.quasi != model.quasi:
+            continue
+        end = search._refit(e.effects, e) if e.weight > best.weight - NEAR else None
+        del search.found[e.key]
+        if end is not None:
+            search._keep(e.effects, end)
+    after = search.found.get(best.key)
+    if after is None:
+        search.found[best.key] = best
+        return 0.0
+    search.temper()
+    return abs(math.log(model.strength(after.fitted.x)[0] / p))
+
+
+def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:
+    """Refit an explanation with a force and each of the most promising linear effects.
+
+    They are screened on what is left of the measurements without what the force adds.
+    """
+    model, x, whole, every = base.fitted.model, base.fitted.x, search.problem, search.table
+    assert isinstance(model, LevelModel)
+    linear = tuple(e for e in base.effects if e.quasi is None)
+    plain = search._model(linear)
+    if plain is None or len(base.effects) >= MIXED + 1:
+        return
+    known = np.delete(x, model.unknown)
+    added = model.response(x, whole.at) - plain.response(known, whole.at)
+    search.problem = replace(whole, data=replace(whole.data, H=whole.data.H - added))
+    search.table = table
+    rest = refit(plain, search.problem, known, far=False, steps=2)
+    screened = search.screen(Explanation(linear, rest, 0.0))
+    search.problem, search.table = whole, every
+    for drop, effect, starts in screened[:GROWN]:
         effects = (*base.effects, effect)
-        ends = [search._refit(effects, base, np.log(s).tolist(), best) for s in starts]
+        mixed = len(effects) > MIXED and len({e.physics for e in effects}) > MIXED
+        if drop < WORTH or mixed or frozenset(e.key for e in effects) in search.found:
+            continue
+        ends = [search._refit(effects, base, np.log(start).tolist()) for start in starts]
         done = [end for end in ends if end is not None]
         if done:
             search._keep(effects, min(done, key=lambda end: end.cost))
@@ -292,30 +238,33 @@ def settle(
     search: Search,
     responses: Sequence[FrequencyResponse],
     runs: Sequence[Recording],
-) -> tuple[Judgement, list[str]]:
-    """The verdict with the levels, and what is to be said of them.
-
-    A nonlinear force that was not confirmed in time on recorded inputs is not named.
-    """
+) -> tuple[bool, list[str]]:
+    """Whether a nonlinear force of the answer was confirmed in time on recorded inputs, and what
+    is to be said of the levels."""
     if np.unique(search.lines.level).size < 2:
-        return judged, [] if judged.verdict == "no_mismatch" else [ONE_LEVEL]
+        return False, [] if judged.verdict == "no_mismatch" else [ONE_LEVEL]
     best = judged.best
-    if _force_in(best) is None or judged.verdict not in ("named", "ambiguous"):
-        return judged, []
+    if _force_in(best) is None or judged.verdict == "no_mismatch":
+        return False, []
     said = [level_dependence(best, search), *distorted(responses)]
+    effects = frozenset(e.key for e in best.effects if e.quasi is None)
+    linear = max(
+        (e for e in search.found.values() if _force_in(e) is None),
+        key=lambda e: (e.key == effects, e.weight),
+    )
+    at = search.grid
+    assert isinstance(at, LevelGrid)
+    found = seen(linear.fitted, best.fitted, at, search.lines, responses, runs)
+    if found is not None:
+        return found.holds, [*said, found.told()]
     from samii_rig.diagnose.nonlinear_time import confirm, pieces
 
     recorded = pieces(runs)
     if not recorded:
-        said.append("not confirmed in time: no recorded input was given for it")
-        return replace(judged, verdict="ambiguous"), said
-
-    effects = frozenset(e.key for e in best.effects if e.quasi is None)
-    linear = search.found.get(effects, search.nominal)
+        return False, [*said, "not confirmed in time: no recorded input was given for it"]
     f = search.lines.frequency
-    found = confirm(linear.fitted, best.fitted, recorded, (float(f[0]), float(f[-1])))
-    said.append(found.told())
-    return (judged if found.holds else replace(judged, verdict="ambiguous")), said
+    ends = confirm(linear.fitted, best.fitted, recorded, (float(f[0]), float(f[-1])))
+    return ends.holds, [*said, ends.told()]
 
 
 def distorted(responses: Sequence[FrequencyResponse]) -> list[str]:

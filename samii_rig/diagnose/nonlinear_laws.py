@@ -15,7 +15,10 @@ from scipy.special import erf
 
 from samii_rig.types import Complex, Float
 
-PHASES = 64  # instants of a period over which the flow's fundamental is summed
+PHASES = 32  # instants of a period over which the flow's fundamental is summed
+
+
+Strength = float | Float
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,19 +29,19 @@ class Law:
     of_speed : whether y is the speed of what is read, not its place.
     """
 
-    sine: Callable[[Float, float], Float]
-    gauss: Callable[[Float, float], Float]
+    sine: Callable[[Float, Strength], Float]
+    gauss: Callable[[Float, Strength], Float]
     force: Callable[[Float, float], Float]
     of_speed: bool = False
 
 
-def clipped(A: Float, limit: float) -> Float:
+def clipped(A: Float, limit: Strength) -> Float:
     """N of clip(y, -limit, limit): 1 below the limit."""
     r = np.minimum(limit / np.maximum(A, 1e-300), 1.0)
     return np.asarray(2 / np.pi * (np.arcsin(r) + r * np.sqrt(1 - r**2)))
 
 
-def clipped_gauss(sigma: Float, limit: float) -> Float:
+def clipped_gauss(sigma: Float, limit: Strength) -> Float:
     """The same for a Gaussian y: the chance that it is below the limit."""
     return np.asarray(erf(limit / (np.sqrt(2) * np.maximum(sigma, 1e-300))))
 
@@ -68,13 +71,27 @@ EXCESS = Law(
 )
 
 
-def starved(flow: Complex, M: Complex, T_s: float) -> Complex:
+def starved(flow: Complex, M: Complex, T_s: Strength) -> Complex:
     """Fundamental of q sqrt(1 + sign(q) M/T_s) - q: an orifice whose supply holds a torque T_s.
 
-    flow, M : (n,) phasors; M is the chain's moment, which pushes against a positive flow when
-    negative.
+    flow : (n,), M : (..., n) phasors, T_s : (..., 1); M is the chain's moment, which pushes
+    against a positive flow when negative.
     """
     turn = np.exp(2j * np.pi * np.arange(PHASES) / PHASES)
-    q, m = np.real(flow[:, None] * turn), np.real(M[:, None] * turn)
-    gone = q * (np.sqrt(np.maximum(1 + np.sign(q) * m / T_s, 0.0)) - 1)
-    return np.asarray(2 * np.mean(gone * turn.conj(), axis=1))
+    q, m = np.real(flow[..., None] * turn), np.real(M[..., None] * turn)
+    held = np.asarray(T_s)[..., None]
+    gone = q * (np.sqrt(np.maximum(1 + np.sign(q) * m / held, 0.0)) - 1)
+    return np.asarray(2 * (gone @ turn.conj()) / PHASES)
+
+
+def starved_gauss(flow: Complex, M: Complex, power: Float, T_s: Strength) -> Complex:
+    """The same for lines that act at once, of a supply that is far from its limit: the best
+    linear approximation of |q| M/(2 T_s), for q and M that are Gaussian together.
+
+    flow : (n,), M : (..., n) per unit command of mean square `power` (n,).
+    """
+    sd = np.sqrt(np.sum(np.abs(flow) ** 2 * power))
+    both = np.sum(np.real(flow * M.conj()) * power, axis=-1, keepdims=True)
+    if not sd > 0:
+        return np.zeros_like(M)
+    return np.asarray(np.sqrt(2 / np.pi) / (2 * np.asarray(T_s)) * (sd * M + both / sd * flow))

@@ -6,8 +6,8 @@ act at once, so that what counts is the standard deviation of them all.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from samii_rig.diagnose.measured import PERIODIC, Measured
 from samii_rig.diagnose.model import STEP, Grid
-from samii_rig.diagnose.nonlinear_laws import Law, starved
+from samii_rig.diagnose.nonlinear_laws import Law, Strength, starved, starved_gauss
 from samii_rig.model.sampled import hold_response, sensor_response
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse, Int
@@ -23,9 +23,27 @@ from samii_rig.types import Complex, Float, FrequencyResponse, Int
 if TYPE_CHECKING:
     from samii_rig.diagnose.nonlinear_model import Quasi
 
-SWEEPS, SETTLED = 40, 1e-9  # of the amplitude, at most; change of x at which they end
-FLOW_SWEEPS = 8
+SWEEPS, SETTLED = 60, 1e-9  # of the amplitude, at most; change of x at which they end
+STEEPEST = 0.7  # slope of a sweep that is believed where the next one is guessed from two
+FLOW_SWEEPS, FLOW_SETTLED = 10, 1e-4
 LEAST = 1e-3  # of the motion without the force: friction that holds is a very stiff damper
+
+
+@dataclass(frozen=True, slots=True)
+class Extra:
+    """What a force adds to the response beyond its describing function, computed in time.
+
+    part : (n_level, n, q) at all lines of a grid, or (n, q) at some. p : the strength that it was
+    computed at. top : the largest value of what it is driven by, where that is the input.
+    """
+
+    part: Complex
+    p: float
+    top: float = 0.0
+
+    def at(self, level: Int, i: Int) -> Extra:
+        """At lines i of these levels."""
+        return replace(self, part=self.part[level, i])
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +53,8 @@ class LevelGrid(Grid):
     hold, filter : (n,), (n, q) the parts of `factor`. driven : (n_level, n) mean square of the
     input; random : (n_level,) whether all lines were driven at once. level, power : (n,) of the
     lines themselves, in a grid that `at` made; power of all lines of a random level adds up to
-    that of its input.
+    that of its input. extra : of some forces, what the response with their describing
+    function lacks.
     """
 
     hold: Complex
@@ -44,6 +63,15 @@ class LevelGrid(Grid):
     random: NDArray[np.bool_]
     level: Int | None = None
     power: Float | None = None
+    extra: Mapping[Quasi, Extra] = field(default_factory=dict)
+
+    def together(self) -> Iterator[Int]:
+        """The lines of each random level."""
+        assert self.level is not None
+        for k in np.flatnonzero(self.random):
+            mine = np.flatnonzero(self.level == k)
+            if mine.size:
+                yield mine
 
     def at(self, frequency: Float, level: Int | None = None) -> LevelGrid:
         """The same on lines of these levels."""
@@ -58,8 +86,10 @@ class LevelGrid(Grid):
                     which = np.searchsorted(edges, self.frequency)
                     power[mine] = np.bincount(which, self.driven[k], mine.size)
         return LevelGrid(
-            frequency, self.factor[i], self.aliases[i], self.sensor, self.actuator,
-            self.hold[i], self.filter[i], self.driven, self.random, level, power,
+            frequency, self.factor[i], self.aliases[i], self.folded[:, i], self.rate_hz,
+            self.sensor, self.actuator, self.hold[i], self.filter[i], self.driven, self.random,
+            level, power,
+            {} if level is None else {key: e.at(level, i) for key, e in self.extra.items()},
         )  # fmt: skip
 
 
@@ -97,7 +127,7 @@ def level_grid(
         driven[k] = np.max(rms, axis=0) ** 2
     spec = rig.actuator[int(at.actuator[0])]
     return LevelGrid(
-        at.frequency, at.factor, at.aliases, at.sensor, at.actuator,
+        at.frequency, at.factor, at.aliases, at.folded, at.rate_hz, at.sensor, at.actuator,
         hold_response(at.frequency, rig.rate_hz, spec.delay),
         sensor_response(rig.sensor, at.frequency)[:, at.sensor],
         driven, random,
@@ -114,20 +144,19 @@ class Loop:
     at: LevelGrid
 
     def amplitude(self, reading: Complex) -> Float:
-        """(n,) amplitude of a sine; of a line of a multisine the standard deviation of all."""
+        """(..., n) amplitude of a sine; of a line of a multisine the standard deviation of all."""
         assert self.at.power is not None
-        return np.asarray(np.sqrt(self.added(np.abs(reading) ** 2 * self.at.power)))
+        power = np.abs(reading) ** 2 * self.at.power
+        return np.asarray(np.sqrt(self.added(power, axis=-1)))
 
-    def added(self, power: Float) -> Float:
-        """(n, ...) twice a sine's mean square; a random level's lines all added up."""
-        assert self.at.level is not None
-        out = 2 * power
-        for k in np.flatnonzero(self.at.random):
-            mine = self.at.level == k
-            out[mine] = power[mine].sum(axis=0)
-        return out
+    def added(self, power: Float, axis: int = 0) -> Float:
+        """Twice a sine's mean square; a random level's lines, along `axis`, all added up."""
+        out = np.moveaxis(2 * power, axis, -1)
+        for mine in self.at.together():
+            out[..., mine] = out[..., mine].sum(axis=-1, keepdims=True) / 2
+        return np.moveaxis(out, -1, axis)
 
-    def gain(self, law: Law, A: Float, p: float) -> Float:
+    def gain(self, law: Law, A: Float, p: Strength) -> Float:
         """(n,) N of each line's kind of excitation."""
         assert self.at.level is not None
         random = self.at.random[self.at.level]
@@ -140,21 +169,33 @@ class Loop:
         rate = self.s if law.of_speed else np.ones_like(self.s)
         return rate * self.l0[:, 0], rate * self.l1[:, 0]
 
-    def force(self, quasi: Quasi, p: float, scale: float = 1.0) -> tuple[Complex, Float]:
-        """(n,) e per unit command, and x."""
+    def force(self, quasi: Quasi, p: Strength, scale: float = 1.0) -> tuple[Complex, Float]:
+        """(n,) e per unit command, and x; (m, n) for strengths p (m, 1)."""
         if quasi.law is None:
             return self._flow(p), np.zeros(0)
-        l0, l1 = self.parts(quasi.law)
+        law = quasi.law
+        l0, l1 = self.parts(law)
         least = LEAST * self.amplitude(l0)
-        x = np.zeros(self.s.size)
-        for _ in range(SWEEPS):
+
+        def swept(x: Float) -> Float:
             A = np.maximum(self.amplitude(l0 / (1 - x * l1)), least)
-            new = 0.5 * (x + quasi.sign * scale * self.gain(quasi.law, A, p))
-            moved = np.max(np.abs(new - x) / np.maximum(np.abs(new), 1e-300))
-            x = new
-            if moved < SETTLED:
+            return quasi.sign * scale * self.gain(law, A, p)
+
+        x = np.zeros(np.broadcast_shapes(np.shape(p), self.s.shape))
+        new = swept(x)
+        slope = np.zeros_like(x)
+        for _ in range(SWEEPS):
+            # Wegstein's method: the fixed point of the line through the last two sweeps.
+            ahead = x + (new - x) / (1 - slope)
+            moved = ahead - x
+            still = np.abs(moved) <= SETTLED * np.abs(ahead)
+            if np.all(still):
                 break
-        return np.asarray(x * l0 / (1 - x * l1)), x
+            there = swept(ahead)
+            change = np.divide(there - new, moved, out=np.zeros_like(x), where=~still)
+            slope = np.minimum(change, STEEPEST)
+            x, new = ahead, there
+        return np.asarray(new * l0 / (1 - new * l1)), new
 
     def slopes(
         self, quasi: Quasi, p: float, scale: float, x: Float, changes: tuple[Complex, Complex]
@@ -190,12 +231,21 @@ class Loop:
         by_scale = through(zero.astype(complex), x[:, None])[:, 0]
         return by_chain, by_p, by_scale
 
-    def _flow(self, T_s: float) -> Complex:
+    def _flow(self, T_s: Strength) -> Complex:
         assert self.at.power is not None
         a = np.sqrt(2 * self.at.power)
         size = np.where(a > 0, a, 1.0)
-        q, e = self.s * self.l0[:, 0], np.zeros_like(self.s)
-        for _ in range(FLOW_SWEEPS):
+        q = self.s * self.l0[:, 0]
+        e = np.zeros(np.broadcast_shapes(np.shape(T_s), q.shape), complex)
+        for i in range(FLOW_SWEEPS):
             M = self.l0[:, 1] + self.l1[:, 1] * e
-            e = 0.5 * (e + starved(q * a, M * a, T_s) / size)
+            new = starved(q * a, M * a, T_s) / size
+            for mine in self.at.together():
+                power = self.at.power[mine]
+                new[..., mine] = starved_gauss(q[mine], M[..., mine], power, T_s)
+            # The first sweep is the answer of a weak force; a strong one needs damping.
+            moved = np.abs(new - e)
+            e = new if i == 0 else 0.5 * (e + new)
+            if np.all(moved < FLOW_SETTLED * np.abs(new) + 1e-300):
+                break
         return e

@@ -20,10 +20,10 @@ import numpy as np
 from samii_rig.diagnose import insert
 from samii_rig.diagnose.effect import Effect, Key
 from samii_rig.diagnose.model import STEP, Grid, Model
-from samii_rig.diagnose.nonlinear_laws import Law
+from samii_rig.diagnose.nonlinear_laws import EXCESS, Law, Strength
 from samii_rig.diagnose.nonlinear_levels import LevelGrid, Loop
 from samii_rig.errors import InputError
-from samii_rig.model.tmm import Chain
+from samii_rig.model.sampled import sensor_response
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     ActuatorSpec,
@@ -36,6 +36,7 @@ from samii_rig.rig.schema import (
 )
 from samii_rig.types import Complex, Float
 
+CAP = 1.5  # power of its height, that what a limit cuts off a sine grows with
 FAST = 1e6  # rad/s: an injected flow has no lag
 EXTRA = f"{insert.PREFIX}force"  # the input and the sensor that the chain has more
 
@@ -59,6 +60,11 @@ class Quasi:
     law: Law | None
     sign: float = -1.0
     scale: Key | None = None
+
+    @property
+    def power(self) -> int:
+        """Of the strength, that a weak force grows with."""
+        return -1 if self.law is None else 1
 
     @property
     def own_input(self) -> bool:
@@ -116,7 +122,7 @@ class LevelModel(Model):
         self._which, effect = forces[0]
         assert effect.quasi is not None
         self.quasi = effect.quasi
-        self.chain = Chain(self.quasi.widened(self.built))
+        self.chain = self.chain_of(self.quasi.widened(self.built))
         first = self.n_nominal + sum(len(e.unknowns) for e in self.effects[: self._which])
         self.unknown = first
 
@@ -124,22 +130,76 @@ class LevelModel(Model):
         """(n, q) at the grid's lines."""
         if not isinstance(at, LevelGrid) or at.power is None:
             return super().response(x, at)
-        G = self.chain.with_values(self.values(x)).response(at.frequency)
+        G, loop, r = self.looped(x, at)
         F, _ = self._factors(x, at, slopes=False)
-        loop, r = self._loop(G, at)
-        t, _ = loop.force(self.quasi, *self._strength(x))
+        p, scale = self.strength(x)
+        t, _ = loop.force(self.quasi, p, scale)
         y = G[:, at.sensor, at.actuator] * at.factor + r * t[:, None] * at.filter
-        return np.asarray(y * F + at.aliases)
+        aliases, _ = self._aliases(x, at, slopes=False)
+        return np.asarray(y * F + aliases + self._more(at, p)[0])
+
+    def several(self, x: Float, at: LevelGrid, strengths: Float) -> Complex:
+        """(m, n, q) what the force adds to the response, at strengths (m,) instead of that in x."""
+        _, loop, r = self.looped(x, at)
+        F, _ = self._factors(x, at, slopes=False)
+        t, _ = loop.force(self.quasi, strengths[:, None], self.strength(x)[1])
+        by_force = r * at.filter * F
+        return np.asarray(t[:, :, None] * by_force + self._more(at, strengths[:, None, None])[0])
+
+    def looped(self, x: Float, at: LevelGrid) -> tuple[Complex, Loop, Complex]:
+        """(n, ...) response of the chain, the force's loop, and outputs per unit force (n, q)."""
+        f, which = np.unique(at.frequency, return_inverse=True)
+        G = self.chain.with_values(self.values(x)).response(f)[which]
+        return G, *self._loop(G, at)
+
+    def scaled(self, at: LevelGrid, p: Float, times: Float) -> Float:
+        """The strengths (m,) at which a weak force is about so many times as strong."""
+        extra = at.extra.get(self.quasi)
+        if self.quasi.law is EXCESS:
+            if extra is None:
+                return p
+            cut = np.maximum(extra.top - p, 0.0) * np.clip(times, 0.02, 8.0) ** (1 / CAP)
+            return np.asarray(extra.top - cut)
+        return np.asarray(p * np.clip(times, 0.4, 2.5) ** (1 / self.quasi.power))
+
+    def per_force(self, x: Float, at: Grid) -> Complex:
+        """(n, q) the sampled outputs per unit of the force."""
+        G = self.chain.with_values(self.values(x)).response(at.frequency)
+        act = int(at.actuator[0])
+        own = len(self.rig.actuator) if self.quasi.own_input else act
+        filters = sensor_response(self.rig.sensor, at.frequency)[:, at.sensor]
+        return np.asarray(G[:, at.sensor, own] * filters * self._factors(x, at, slopes=False)[0])
+
+    def factors(self, x: Float, at: LevelGrid) -> Complex:
+        """(n, q) of the effects on channels."""
+        return self._factors(x, at, slopes=False)[0]
+
+    def _more(self, at: LevelGrid, p: Strength) -> tuple[Complex | float, Float | float]:
+        """What the force adds beyond its describing function, where it is known; and how fast
+        that grows, d log / d log p."""
+        extra = at.extra.get(self.quasi)
+        if extra is None:
+            return 0.0, 0.0
+        if self.quasi.law is EXCESS:
+            # A cap of height a is cut off a sine over a time like sqrt(a).
+            left = np.maximum(extra.top - p, 1e-6 * extra.top)
+            grown = (left / (extra.top - extra.p)) ** CAP
+            return np.asarray(extra.part * grown), np.asarray(-CAP * p / left)
+        power = self.quasi.power
+        return np.asarray(extra.part * (p / extra.p) ** power), float(power)
 
     def gradient(self, x: Float, at: Grid) -> tuple[Complex, Complex]:
         """The same, and its derivatives (n, q, n_x)."""
         if not isinstance(at, LevelGrid) or at.power is None:
             return super().gradient(x, at)
         values = self.values(x)
-        G, dG = self.chain.with_values(values).gradient(at.frequency, tuple(values))
+        f, which = np.unique(at.frequency, return_inverse=True)
+        G, dG = self.chain.with_values(values).gradient(f, tuple(values))
+        G, dG = G[which], dG[which]
         loop, r = self._loop(G, at)
-        p, scale = self._strength(x)
+        p, scale = self.strength(x)
         t, found = loop.force(self.quasi, p, scale)
+        more, growth = self._more(at, p)
         map_ = self._map(x, values)
         on = np.flatnonzero(np.any(map_, axis=0))
         moved, dr = self._loop(dG @ map_[:, on], at)
@@ -167,7 +227,11 @@ class LevelModel(Model):
         dy[:, :, on] += dr * t[:, None, None] * filtered
         for j, dlog in slopes:
             dy[:, :, j] += own * dlog
-        return np.asarray(own * F + at.aliases), dy
+        dy[:, :, self.unknown] += growth * more
+        aliases, folded = self._aliases(x, at, slopes=True)
+        for j, slope in folded:
+            dy[:, :, j] += slope
+        return np.asarray(own * F + aliases + more), dy
 
     def _map(self, x: Float, values: dict[Key, float]) -> Float:
         """(key, n_x) derivatives of the chain's parameters."""
@@ -179,7 +243,7 @@ class LevelModel(Model):
             out[:, j] = [(there[k] - values[k]) / STEP for k in values]
         return out
 
-    def _strength(self, x: Float) -> tuple[float, float]:
+    def strength(self, x: Float) -> tuple[float, float]:
         """The force's unknown, and what multiplies it."""
         p = float(np.exp(x[self.unknown]))
         if self.quasi.scale is None:

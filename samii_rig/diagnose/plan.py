@@ -38,6 +38,8 @@ LIKELY = 0.05  # probability from which another class is to be told apart
 def next_experiment(search: Search, judged: Judgement) -> tuple[str, str]:
     """(why, experiment) in words; both empty where nothing is to be told apart."""
     rivals = _rivals(judged)
+    if not rivals and judged.verdict != "no_mismatch" and (alone := _alone(search)):
+        return alone
     if judged.verdict == "unknown" and not rivals:
         return (
             "no explanation passes: what is missing may depend on amplitude",
@@ -57,6 +59,20 @@ def next_experiment(search: Search, judged: Judgement) -> tuple[str, str]:
     if best[1] < TELLING:
         return what, "none tried would tell them: they are the same thing to every sensor here"
     return f"{what}; predicted {best[1]:.0f} noise units apart", best[0]
+
+
+def _alone(search: Search) -> tuple[str, str] | None:
+    """Where one sensor is all there is: what it cannot know, and what would tell."""
+    outputs = set(search.problem.data.outputs)
+    links = [e.name for e in search.rig.element if isinstance(e, RigidLink) and e.L.value > 0]
+    if len(outputs) > 1 or not links:
+        return None
+    (only,) = outputs
+    return (
+        f"{only} alone does not show which part moves: what gives in the base or in a joint before "
+        "the actuator is told from what gives behind it by the shape of one curve",
+        f"brace the rig behind {links[0]}, which takes the base out of {only}, and compare",
+    )
 
 
 def _rivals(judged: Judgement) -> tuple[Explanation, Explanation] | None:
@@ -181,7 +197,8 @@ def _elsewhere(e: Explanation, change: Change, f: Float) -> tuple[Complex, Compl
     n_s, n_a = len(rig.sensor), len(rig.actuator)
     sensor, actuator = (x.ravel() for x in np.meshgrid(range(n_s), range(n_a), indexing="ij"))
     factor = sensor_response(rig.sensor, f)[:, sensor] * hold[:, actuator]
-    at = Grid(f, factor, np.zeros_like(factor), sensor, actuator)
+    none = np.zeros_like(factor)
+    at = Grid(f, factor, none, none[None][:0], rig.rate_hz, sensor, actuator)
     return there.gradient(e.fitted.x, at)
 
 

@@ -24,7 +24,8 @@ LONGEST = 1.2  # a step of an effect's logarithm at most
 FIRST, LEAST = 10.0, 1e-2  # damping: of chi-square, for a step of the largest allowed size
 CORRECTIONS = 4  # of a step that left the valley
 SETTLED = 0.02  # of chi-square, improvement of a step at which a refit ends
-HOPELESS = 0.02  # of the way to a chi-square that matters, gained by a step
+HOPELESS = 0.05  # of the way to a chi-square that matters, gained by a step
+PATIENT = 3  # steps before that is asked
 SPAN = math.sqrt(12.0)  # of a uniform distribution in its standard deviations
 
 
@@ -119,6 +120,11 @@ def refit(
 
     give_up : chi-square that matters; a search that hardly comes nearer to it ends.
     """
+    if model.n == 0:  # a rig file without tolerances: nothing to fit
+        fixed = np.zeros(0)
+        chi2 = _cost(model, problem, fixed, model.response(fixed, problem.at))
+        rows = problem.residual(problem.data.H).size
+        return Fitted(model, fixed, chi2, 0.0, np.zeros((rows, 0)), np.zeros((0, 0)))
     x = np.clip(start, model.lower, model.upper)
     scaled = problem.expected
     h, dh = model.gradient(x, problem.at)
@@ -134,7 +140,7 @@ def refit(
             break
         x, cost = x_new, new
         h, dh = model.gradient(x, problem.at)
-        if gain < SETTLED + 1e-9 * cost or (step >= 5 and gain < HOPELESS * (cost - give_up)):
+        if gain < SETTLED + 1e-9 * cost or (step >= PATIENT and gain < HOPELESS * (cost - give_up)):
             break
     J = problem.whiten(dh)
     penalty = _penalty(model, x)

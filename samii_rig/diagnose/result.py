@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from samii_rig.rig.schema import Rig
@@ -101,6 +101,8 @@ class Diagnosis:
     train, held_out : chi-square per degree of freedom of the refitted nominal model and with
         the causes, each on the lines fitted and on those shown.
     rig : the nominal rig with the causes; traces : the best places, law-free.
+    evidence : what the probability of the answer rests on (`stated.Evidence`), and the causes of
+        the most probable explanation, whether they are told or not.
     """
 
     verdict: Verdict
@@ -120,6 +122,7 @@ class Diagnosis:
     outside: float
     rig: Rig | None
     traces: tuple[Trace, ...]
+    evidence: dict[str, Any] = field(default_factory=dict)
     model: str = ""
 
     def plain(self) -> dict[str, Any]:

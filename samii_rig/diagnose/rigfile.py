@@ -14,7 +14,8 @@ from samii_rig.rig.schema import Parameter, Rig
 def explained(fitted: Fitted) -> Rig:
     """The rig with the effects of a fit in it and the uncertain parameters refitted.
 
-    What was identified says so and has the standard deviation found as its tolerance.
+    What was identified says so and has the standard deviation found as its tolerance. A rig file
+    has no nonlinear force: the rig is that without it, and its description says which it was.
     """
     model, x = fitted.model, fitted.x
     sd = np.sqrt(np.diag(fitted.covariance()))
@@ -31,6 +32,11 @@ def explained(fitted: Fitted) -> Rig:
     )
     for effect, theta in zip(model.effects, model.parts(x), strict=True):
         rig = effect.write(rig, theta)
+        if effect.quasi is not None:
+            symbol, unit = effect.unknowns[0].symbol, effect.unknowns[0].unit
+            found = f"{effect.physics.replace('_', ' ')} at {effect.site}"
+            told = f"Found beside this linear rig: {found}, {symbol} = {theta[0]:.4g} {unit}."
+            rig = rig.model_copy(update={"description": f"{rig.description} {told}".strip()})
     return rig
 
 

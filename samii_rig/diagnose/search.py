@@ -19,7 +19,8 @@ from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.measured import Measured, binned
 from samii_rig.diagnose.model import Grid, Model
 from samii_rig.diagnose.nonlinear_model import model_of
-from samii_rig.diagnose.refit import Fitted, Problem, refit
+from samii_rig.diagnose.ranking import moved, ranking
+from samii_rig.diagnose.refit import STEPS, Fitted, Problem, refit
 from samii_rig.diagnose.screen import Screen, Start
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig
@@ -34,11 +35,19 @@ NEAR = 25.0  # of the logarithm of evidence: explanations further below the best
 WORTH = 8.0  # of chi-square, gain in the screen below which a candidate is not refitted
 FIVE = 5.0  # standard deviations of chi-square beyond which what is left is more than noise
 ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and bins over which it is looked for
+EXACT = 2e-4  # of the mismatch: what beams, sensors and integrators are modelled to
 ENOUGH = 1.15  # chi-square over its mean below which growth looks at one explanation only
 SATURATED = "torsional_compliance"  # joints that give: what is missing in many places at once
 MOST_SATURATED = 12  # of these places
 WEAK = (4, 5, 6)  # tenths of the range at which they start
 BEAM = 2  # explanations that are grown further
+HOPELESS = 20.0  # times the best chi-square, above which an explanation is let go
+ANYHOW = 2  # of the most promising in another's place are refitted whatever the screen says
+SHARE = 0.3  # of the best candidate's gain: one that promises less is not refitted
+GROSS = 8.0  # chi-square over its mean above which candidates race before they are refitted
+AHEAD, FINALISTS = 5, 5  # steps of that race, and how many go on
+
+Candidate = tuple[float, tuple[Effect, ...], list[Float]]  # chi-square hoped for, and starts
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +79,7 @@ class Search:
     found: dict[frozenset[str], Explanation] = field(default_factory=dict)
     problem: Problem = field(init=False)
     temperature: float = 1.0
+    _gross: float = 0.0  # chi-square that the nominal model leaves
     _rows: Counter[str] = field(init=False)
     _total: dict[str, float] = field(init=False)
     _models: dict[tuple[str, ...], Model | None] = field(default_factory=dict)
@@ -80,7 +90,8 @@ class Search:
         model = Model(self.rig)
         at = self.grid.at(self.lines.frequency)
         x = np.zeros(model.n)
-        self.problem = Problem.of(binned(self.lines, model.response(x, at)), self.grid)
+        shape = model.response(x, at)
+        self.problem = Problem.of(binned(self.lines, shape, misfit=math.inf), self.grid)
         nominal = refit(model, self.problem, x)
         self._rebin(nominal)
         self._keep((), refit(model, self.problem, nominal.x))
@@ -95,8 +106,12 @@ class Search:
         return sorted(self.found.values(), key=lambda e: -e.weight)
 
     def weigh(self, effects: Iterable[Effect], fitted: Fitted) -> float:
-        """Logarithm of evidence times prior."""
-        return fitted.evidence(self.temperature) + self.log_prior(effects)
+        """Logarithm of evidence times prior, less what effects beside the first must be worth
+        where the mismatch is gross: they may not live on what models are not exact to."""
+        effects = tuple(effects)
+        inexact = EXACT**2 * self._gross / self.temperature
+        beside = 0.5 * inexact * max(len(effects) - 1, 0)
+        return fitted.evidence(self.temperature) + self.log_prior(effects) - beside
 
     def temper(self) -> None:
         """Take the temperature of the explanation that fits best, and weigh all anew.
@@ -138,7 +153,7 @@ class Search:
         self.grow(self.nominal, FIRST)
         self.temper()
         for turn in range(MOST - 1):
-            before = self.ranked()[0]
+            before = self._nearest() if turn == 0 else self.ranked()[0]
             if not before.effects:
                 break
             self._renew(before)
@@ -151,7 +166,7 @@ class Search:
             if self.ranked()[0].key == before.key:
                 break
         best = self.ranked()[0]
-        if len(best.effects) > 1:
+        if best.effects:
             self.swap(best)
             self.temper()
             self.prune()
@@ -169,40 +184,72 @@ class Search:
         """Refit `base` with each of the most promising further effects."""
         if len(base.effects) >= MOST:
             return
-        kinds = {e.physics for e in base.effects}
-        screened = self.screen(base)
-        best = max((e.fitted.cost for e in self.found.values()), default=math.inf)
-        for drop, effect, starts in screened[:most]:
-            if drop < WORTH:
-                break
+        tried: list[Candidate] = []
+        for drop, effect, starts in self.screen(base)[:most]:
             effects = (*base.effects, effect)
-            if len(effects) > MIXED and kinds != {effect.physics}:
+            model = self._model(effects)
+            known_ = frozenset(e.key for e in effects) in self.found
+            if drop < WORTH or known_ or self._mixed(effects) or not model:
                 continue
-            if frozenset(e.key for e in effects) in self.found:
+            known = _moved(base, model)
+            whole = [np.append(known, np.log(start)) for start in starts]
+            tried.append((base.fitted.cost - drop, effects, whole))
+        if base.fitted.cost > GROSS * self.problem.expected:
+            tried = self._ahead([*tried, *self._switches(base)])
+        best = min((e.fitted.cost for e in self.found.values()), default=math.inf)
+        reached = base.fitted.cost
+        for predicted, effects, starts_ in tried:
+            if base.fitted.cost - predicted < SHARE * (base.fitted.cost - reached):
                 continue
-            ends = []
-            for start in starts:
-                end = self._refit(effects, base, np.log(start).tolist(), best)
-                if end is not None:
-                    ends.append(end)
-            if ends:
-                end = min(ends, key=lambda end: end.cost)
+            end: Fitted | None = None
+            for x in starts_:
+                new = self._from(effects, x, best)
+                if new is not None and (end is None or new.cost < end.cost):
+                    end = new
+                if end is not None and end.cost < predicted + WORTH:
+                    break
+            if end is not None:
                 self._keep(effects, end)
+                reached = min(reached, end.cost)
                 best = min(best, end.cost + 2 * NEAR)
+
+    def _switches(self, base: Explanation) -> list[Candidate]:
+        """Effects that are there or not, from the nominal parameters as the rig file has them:
+        where a gross mismatch has bent these, no step along them shows what such an effect does."""
+        out: list[Candidate] = []
+        for effect in self.table:
+            effects = (*base.effects, effect)
+            model = None if effect.unknowns or self._mixed(effects) else self._model(effects)
+            if model is not None and frozenset(e.key for e in effects) not in self.found:
+                x = _moved(base, model)
+                x[: model.n_nominal] = 0.0
+                out.append((-math.inf, effects, [x]))
+        return out
+
+    @staticmethod
+    def _mixed(effects: Sequence[Effect]) -> bool:
+        """Whether these are too many of different physics."""
+        return len(effects) > MIXED and len({e.physics for e in effects}) > 1
+
+    def _ahead(self, tried: Sequence[Candidate]) -> list[Candidate]:
+        """Those that a few steps of a refit bring farthest, from where these ended.
+
+        Far from the noise the nominal parameters stand where they mend what is missing, and
+        what a screen about them says of a cure does not rank it.
+        """
+        ends = []
+        for _, effects, starts in tried:
+            for x in starts:
+                end = self._from(effects, x, steps=AHEAD)
+                if end is not None:
+                    ends.append((end.cost, effects, [end.x]))
+        return sorted(ends, key=lambda end: end[0])[:FINALISTS]
 
     def screen(self, base: Explanation) -> list[tuple[float, Effect, list[Start]]]:
         """How far chi-square should fall with each further effect, and one or two starts for its
         refit; the largest first."""
         look = Screen.of(self.problem, base.fitted)
-        names = {e.key for e in base.effects}
-        out = []
-        for effect in self.table:
-            model = None if effect.key in names else self._model((*base.effects, effect))
-            found = look.look(model, _moved(base, model), effect) if model else None
-            if found is not None:
-                out.append((found[0], effect, found[1]))
-        out.sort(key=lambda item: -item[0])
-        return out
+        return ranking(look, self.table, base.effects, self._model)
 
     def saturate(self, physics: str) -> None:
         """Every place of one physics at once, taken away again one by one while that is better.
@@ -224,12 +271,19 @@ class Search:
         end = min(ends, key=lambda end: end.cost)
         whole = Explanation(effects, end, self.weigh(effects, end))
         while whole.effects:
-            less = [self.without(whole, i) for i in range(len(whole.effects))]
+            least = self._least(whole)
+            less = [self.without(whole, i) for i in least[:2]]
             best = max((e for e in less if e is not None), key=lambda e: e.weight, default=None)
             if best is None or best.weight < whole.weight:
                 break
             whole = best
         self._keep(whole.effects, whole.fitted)
+
+    def _least(self, whole: Explanation) -> list[int]:
+        """Its effects, first the one without which chi-square should rise least."""
+        bare = [self.bare(whole, i) for i in range(len(whole.effects))]
+        left = [Screen.of(self.problem, e.fitted).left() if e else math.inf for e in bare]
+        return [int(i) for i in np.argsort(left)]
 
     def prune(self) -> None:
         """Try the best explanation without each of its effects, until none can go."""
@@ -259,11 +313,50 @@ class Search:
         return self.found[key]
 
     def swap(self, whole: Explanation) -> None:
-        """Every effect of `whole` taken out, and every other tried in its place."""
+        """Every effect of `whole` taken out, and every other tried in its place, about where
+        `whole` left the rest."""
+        enough = whole.fitted.cost + 4 * NEAR * self.temperature
         for i in range(len(whole.effects)):
-            base = self.without(whole, i)
-            if base is not None:
-                self.grow(base, LATER)
+            base = self.bare(whole, i)
+            if base is None:
+                continue
+            screened = self.screen(base)
+            for rank, (drop, effect, starts) in enumerate(screened[: LATER + 1]):
+                effects = (*base.effects, effect)
+                done = frozenset(e.key for e in effects) in self.found or self._mixed(effects)
+                if done or (rank >= ANYHOW and base.fitted.cost - drop > enough):
+                    continue
+                end = self._refit(effects, base, np.log(starts[0]).tolist(), enough)
+                if end is not None:
+                    self._keep(effects, end)
+
+    def bare(self, whole: Explanation, i: int) -> Explanation | None:
+        """`whole` less its effect i, not refitted."""
+        effects = whole.effects[:i] + whole.effects[i + 1 :]
+        less = self._model(effects)
+        old = whole.fitted.model
+        if less is None or less.keys != old.keys:
+            return None
+        first = old.n_nominal + sum(len(e.unknowns) for e in whole.effects[:i])
+        own = range(first, first + len(whole.effects[i].unknowns))
+        x = np.delete(whole.fitted.x, list(own))
+        h, dh = less.gradient(x, self.problem.at)
+        J, r = self.problem.whiten(dh), self.problem.residual(h)
+        fitted = Fitted(less, x, float(r @ r), whole.fitted.penalty, J, J.T @ J)
+        return Explanation(effects, fitted, 0.0)
+
+    def _nearest(self) -> Explanation:
+        """The most probable explanation; where even that leaves much, the one nearest to the lines
+        themselves: bins about a gross mismatch hide how well another would do."""
+        ranked = self.ranked()
+        if self._enough(ranked[0]):
+            return ranked[0]
+        at = self.grid.at(self.lines.frequency, self.lines.level)
+
+        def left(e: Explanation) -> float:
+            return float(np.sum(self.lines.chi_square(e.fitted.model.response(e.fitted.x, at))))
+
+        return min(ranked[:FINALISTS], key=left)
 
     def _beam(self) -> list[Explanation]:
         ranked = self.ranked()
@@ -278,7 +371,11 @@ class Search:
 
     def _renew(self, best: Explanation) -> None:
         """Bins anew about the best explanation, and what may still compete refitted on them."""
-        keep = [e for e in self.ranked()[:FIRST] if e.weight > best.weight - 4 * NEAR]
+        keep = [
+            e
+            for e in self.ranked()[:FIRST]
+            if e.weight > best.weight - 4 * NEAR and e.fitted.cost < HOPELESS * best.fitted.cost
+        ]
         nominal = self.nominal
         self._rebin(best.fitted)
         self.found.clear()
@@ -290,7 +387,8 @@ class Search:
     def _rebin(self, fitted: Fitted) -> None:
         at = self.grid.at(self.lines.frequency)
         shape = fitted.model.response(fitted.x, at)
-        self.problem = Problem.of(binned(self.lines, shape), self.grid)
+        misfit = fitted.cost / self.problem.expected
+        self.problem = Problem.of(binned(self.lines, shape, misfit=misfit), self.grid)
 
     def _model(self, effects: tuple[Effect, ...]) -> Model | None:
         """The model with these effects; None if the rig does not allow them together."""
@@ -313,13 +411,26 @@ class Search:
         model = self._model(effects)
         if model is None:
             return None
-        start = np.append(_moved(base, model), more)
+        return self._from(effects, np.append(_moved(base, model), more), give_up)
+
+    def _from(
+        self,
+        effects: tuple[Effect, ...],
+        start: Float,
+        give_up: float = math.inf,
+        steps: int = STEPS,
+    ) -> Fitted | None:
+        """From a vector of the model with these effects, which the rig allows together."""
+        model = self._model(effects)
+        assert model is not None
         try:
-            return refit(model, self.problem, start, give_up=give_up)
+            return refit(model, self.problem, start, give_up=give_up, steps=steps)
         except (SamiiRigError, np.linalg.LinAlgError):
             return None
 
     def _keep(self, effects: tuple[Effect, ...], fitted: Fitted) -> None:
+        if not effects:
+            self._gross = fitted.chi2
         made = Explanation(effects, fitted, self.weigh(effects, fitted))
         old = self.found.get(made.key)
         if old is None or made.weight > old.weight:
@@ -327,9 +438,4 @@ class Search:
 
 
 def _moved(base: Explanation, model: Model) -> Float:
-    """x of `base` for a model of more effects: some nominal parameters may be gone or back."""
-    old, x = base.fitted.model, base.fitted.x
-    if model.keys == old.keys:
-        return x
-    held = dict(zip(old.keys, x[: old.n_nominal].tolist(), strict=True))
-    return np.array([held.get(k, 0.0) for k in model.keys] + x[old.n_nominal :].tolist())
+    return moved(base.fitted.model, base.fitted.x, model)

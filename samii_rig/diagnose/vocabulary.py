@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Any, Literal
 
 import numpy as np
 
 from samii_rig.diagnose import bodies, channels, insert
-from samii_rig.diagnose.effect import Effect, Key, Unknown, Values
+from samii_rig.diagnose.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.scales import PAIRS, REACH, Places, middle, places, spread
 from samii_rig.model.tmm import State
 from samii_rig.rig.elements import quantities
@@ -23,7 +24,6 @@ from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     GravityStiffness,
     LumpedMass,
-    OilColumn,
     RelativeAngle,
     Rig,
     TorsionalGroundSpring,
@@ -31,12 +31,13 @@ from samii_rig.rig.schema import (
     TranslationalGroundSpring,
     TranslationalSpring,
 )
-from samii_rig.types import Float
+from samii_rig.types import Complex, Float
 
-Law = Literal["spring", "softness", "damper", "slip", "mass"]
+Law = Literal["spring", "softness", "column", "damper", "slip", "mass"]
 LOSS = (1e-4, 10.0)  # damping force over spring force in mid band
 LOSS_STARTS = (0.05,)
 JOINTS = (TorsionalSpring, TranslationalSpring, *ANGLE_SOURCES)
+VOLUME = "m^3/Pa"  # of C_h
 DISPLACEMENT = 1.475e-5  # m^3/rad, of a vane motor of a joint; C_h is stated for this one
 
 
@@ -45,10 +46,12 @@ class Point:
     """A row: physics at a port.
 
     jump, by : the state that jumps and the one that drives it.
-    law : what x(s) is: softness 1/(k + c s), slip 1/(c s), spring k + c s, damper c s, mass
-        m s^2. strong, loss : symbols of its parameters, loss "" where there is none.
+    law : what x(s) is: softness 1/(k + c s), column the same with k = D^2/C_h, slip 1/(c s),
+        spring k + c s, damper c s, mass m s^2. strong, loss : symbols of its parameters, loss ""
+        where there is none.
     kind : the element that it adds to the rig file.
-    at_source : whether it belongs to a source only.
+    at_source : whether it belongs to a source only. either_sign : whether the strong one may
+        be negative (a pendulum upside down).
     """
 
     physics: str
@@ -59,6 +62,7 @@ class Point:
     loss: str
     kind: type[Any]
     at_source: bool = False
+    either_sign: bool = False
 
     @property
     def units(self) -> dict[str, str]:
@@ -73,11 +77,11 @@ POINTS: tuple[Point, ...] = (
     Point("added_inertia", "M", "theta", "mass", "I", "", LumpedMass),
     Point("ground_spring", "M", "theta", "spring", "k", "c", TorsionalGroundSpring),
     Point("ground_spring", "V", "w", "spring", "k", "c", TranslationalGroundSpring),
-    Point("gravity_stiffness", "M", "theta", "spring", "k", "", GravityStiffness),
+    Point("gravity_stiffness", "M", "theta", "spring", "k", "", GravityStiffness, either_sign=True),
     Point("viscous_damping", "M", "theta", "damper", "c", "", TorsionalGroundSpring),
     Point("viscous_damping", "V", "w", "damper", "c", "", TranslationalGroundSpring),
     Point("velocity_feedback", "theta", "M", "slip", "c", "", TorsionalSpring, True),
-    Point("hydraulic_compressibility", "theta", "M", "softness", "C_h", "", OilColumn, True),
+    Point("hydraulic_compressibility", "theta", "M", "column", "C_h", "c", TorsionalSpring, True),
 )
 
 REPORTED = {"velocity_feedback": {"c": "g_v"}, "added_inertia": {"I": "J"}}
@@ -106,7 +110,7 @@ def _scale(row: Point, where: Places, port: int) -> float:
     x = where.strength(PAIRS.index((row.jump, row.by)), port)
     w = middle(where)
     match row.law:
-        case "softness":
+        case "softness" | "column":
             return 1 / x
         case "slip":
             return 1 / (x * w)
@@ -130,32 +134,38 @@ def _point(rig: Rig, where: Places, row: Point, port: int) -> Iterator[Effect]:
     low, high = (scale * x for x in REACH)
     if row.law in ("spring", "damper", "mass"):
         low, high = scale / REACH[1], scale / REACH[0]
-    if row.strong == "C_h":  # C_h/D^2 is the compliance
+    if row.law == "column":  # C_h/D^2 is the compliance
         low, high = DISPLACEMENT**2 / high, DISPLACEMENT**2 / low
     w = middle(where)
-    unknowns = [Unknown(row.strong, row.units[row.strong], low, high, spread(low, high, 10))]
+    unit = VOLUME if row.law == "column" else row.units[row.strong]
+    unknowns = [Unknown(row.strong, unit, low, high, spread(low, high, 11))]
     if row.loss:
         unknowns.append(Unknown(row.loss, row.units[row.loss], *LOSS, LOSS_STARTS))
     unknowns[0] = _renamed(row, unknowns[0])
     after = names[0] if port > 0 else None
-    for seen, tail in _readings(rig, row, names, port):
+    signs = (1.0, -1.0) if row.either_sign else (1.0,)
+    for (seen, tail), sign in product(_readings(rig, row, names, port), signs):
         name = f"{insert.PREFIX}{_TAGS[row.physics]}{port}{tail}"
 
         def build(r: Rig, name: str = name, seen: tuple[str, ...] = seen) -> Rig:
             made = insert.element_of(row.kind, name, row.units)
             return insert.inserted(r, after, made, seen)
 
-        def values(x: Float, _: Values, name: str = name) -> dict[Key, float]:
+        def values(x: Float, _: Values, name: str = name, sign: float = sign) -> dict[Key, float]:
             out = dict.fromkeys(((name, s) for s in row.units), 0.0)
-            if "D" in row.units:
-                out[name, "D"] = DISPLACEMENT
-            out[name, row.strong] = float(x[0])
+            strong = DISPLACEMENT**2 / float(x[0]) if row.law == "column" else sign * float(x[0])
+            out[name, "k" if row.law == "column" else row.strong] = strong
             if row.loss:
-                out[name, row.loss] = float(x[0] * x[1] / w)
+                out[name, row.loss] = strong * float(x[1]) / w
             return out
 
-        def report(x: Float) -> Float:
-            return np.array([x[0], x[0] * x[1] / w]) if row.loss else x
+        def report(x: Float, sign: float = sign) -> Float:
+            strong = DISPLACEMENT**2 / x[0] if row.law == "column" else x[0]
+            return np.array([x[0], strong * x[1] / w]) if row.loss else sign * x
+
+        def x_of(s: Complex, x: Float, sign: float = sign) -> Complex:
+            strong = DISPLACEMENT**2 / x[:, 0] if row.law == "column" else sign * x[:, 0]
+            return _x(row, s, strong, strong * x[:, 1] / w if row.loss else 0.0 * strong)
 
         site, others = _site(rig, row, names)
         yield Effect(
@@ -164,10 +174,29 @@ def _point(rig: Rig, where: Places, row: Point, port: int) -> Iterator[Effect]:
             unknowns=tuple(unknowns),
             build=build,
             parameters=values,
+            jump=Jump(f"{row.jump} by {row.by} at port {port}{tail}", x_of, (row.jump, row.by)),
             aliases=tuple((row.physics, o) for o in others),
             report=report,
-            variant=name,
+            weight=1 / len(signs),
+            variant=name if sign > 0 else f"{name} negative",
         )
+
+
+def _x(row: Point, s: Complex, strong: Float, loss: Float) -> Complex:
+    """x(s), (m, n), of the row's element."""
+    value, more = strong[:, None], s * loss[:, None]
+    match row.law:
+        case "softness" | "column":
+            return np.asarray(1 / (value + more))
+        case "slip":
+            return np.asarray(1 / (value * s))
+        case "spring":
+            return np.asarray(value + more)
+        case "damper":
+            return np.asarray(value * s)
+        case "mass":
+            return np.asarray(value * s**2)
+    raise ValueError(row.law)
 
 
 _TAGS = {
@@ -256,8 +285,16 @@ def _oscillators(rig: Rig, where: Places) -> Iterator[Effect]:
             parameters=values,
             aliases=tuple(("attached_oscillator", o) for o in others),
             report=_oscillating,
+            jump=Jump(f"V by w at port {port}w", _hanging, ("V", "w")),
             variant=name,
         )
+
+
+def _hanging(s: Complex, x: Float) -> Complex:
+    """Force over motion of a mass on a spring, (m, n)."""
+    m, w, zeta = (x[:, i : i + 1] for i in range(3))
+    held = w**2 + 2 * zeta * w * s
+    return np.asarray(m * s**2 * held / (s**2 + held))
 
 
 def _oscillating(x: Float) -> Float:

@@ -20,20 +20,25 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import import_module, metadata
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from samii_rig.diagnose.stated import Evidence
 from samii_rig.errors import InputError, SamiiRigError
+from samii_rig.prove.calibrate import row
 from samii_rig.prove.trial import Answer, Hidden, Trial, Truth
 from samii_rig.record.export import replacing
 from samii_rig.record.reader import read_notes, read_recording
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
+
+if TYPE_CHECKING:
+    from samii_rig.prove.size import Sized
 
 GROUP = "samii_rig.plants"
 KINDS = ("nothing", "one", "two", "outside", "joints")
@@ -127,26 +132,27 @@ def _one(campaign: Campaign, kind: str, seed: int) -> None:
     said = _Reader.of(campaign.out / "truth").diagnose(folder)
     if "error" in said:
         raise SamiiRigError(said["error"])
-    _write(campaign.out / "sizes" / answer.name, {"size": _size(folder, truth)})
+    _write(campaign.out / "sizes" / answer.name, asdict(_sized(folder, truth, said)))
     _write(answer, said)
     if not campaign.keep:
         for log in folder.glob("*.mcap"):
             log.unlink()
 
 
-def _size(folder: Path, truth: Path) -> float:
+def _sized(folder: Path, truth: Path, said: Mapping[str, Any]) -> Sized:
     """Sigma that the best simpler explanation leaves; the drawn one where nothing was recorded
     to compute it from."""
-    from samii_rig.prove.size import size_of
+    from samii_rig.prove.size import Sized, size_of
 
     told = json.loads(truth.read_text("utf-8"))
     arrays = truth.with_suffix(".npz")
     if not arrays.exists():
-        return float(told["size"])
+        return Sized(float(told["size"]))
     log = min(folder.glob("*.mcap"))
     rig = parse(Rig, read_recording(log).rig_toml, str(log))
+    causes = Answer.of(said).causes
     with np.load(arrays) as held:
-        return size_of(told, held, rig)
+        return size_of(told, held, rig, causes[0].names if causes else ())
 
 
 def _write(path: Path, data: Mapping[str, Any]) -> None:
@@ -209,13 +215,20 @@ class _Reader:
 
 def results(out: Path) -> list[Trial]:
     """Every trial that has an answer, in the order of kind and seed."""
-    trials = []
+    trials = [Trial(truth, Answer.of(said)) for truth, said in _answers(out)]
+    return sorted(trials, key=lambda t: (KINDS.index(t.truth.kind), t.truth.seed))
+
+
+def evidence(out: Path) -> list[tuple[Evidence, bool]]:
+    """Of every trial in which an effect was found: its evidence, and whether it was right."""
+    return [found for truth, said in _answers(out) if (found := row(truth, said)) is not None]
+
+
+def _answers(out: Path) -> Iterator[tuple[Truth, dict[str, Any]]]:
     for answer in sorted((out / "answers").glob("*.json")):
         truth = json.loads((out / "truth" / answer.name).read_text("utf-8"))
-        said = json.loads(answer.read_text("utf-8"))
         effects = tuple(Hidden(e["physics"], e["site"], e["parameters"]) for e in truth["effects"])
-        sized = out / "sizes" / answer.name
-        size = json.loads(sized.read_text("utf-8"))["size"] if sized.exists() else truth["size"]
-        hidden = Truth(truth["kind"], truth["seed"], effects, size)
-        trials.append(Trial(hidden, Answer.of(said)))
-    return sorted(trials, key=lambda t: (KINDS.index(t.truth.kind), t.truth.seed))
+        file = out / "sizes" / answer.name
+        sized = json.loads(file.read_text("utf-8")) if file.exists() else {"size": truth["size"]}
+        hidden = Truth(truth["kind"], truth["seed"], effects, **sized)
+        yield hidden, json.loads(answer.read_text("utf-8"))

@@ -57,7 +57,7 @@ def acceptable(trial: Trial) -> bool:
 
 
 def _row(s: Score) -> dict[str, str]:
-    share = not s.what.startswith(("AUROC", "expected", "parameter", "gap"))
+    share = not s.what.startswith(("AUROC", "expected", "parameter", "gap", "names in", "sites in"))
     goal = _goal(s, share)
     word = {None: "", True: "met", False: "missed"}[s.met]
     mark = {None: "note", True: "good", False: "bad"}[s.met]

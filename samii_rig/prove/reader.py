@@ -29,7 +29,8 @@ def hide(folder: Path) -> None:
 
 
 def diagnose_folder(folder: Path) -> dict[str, Any]:
-    """The diagnosis of all recordings in a folder, by the rig file that they carry."""
+    """The diagnosis of all recordings in a folder, by the rig file that they carry, and the
+    evidence that its probability rests on."""
     from samii_rig.diagnose.diagnose import diagnose
     from samii_rig.errors import InputError
     from samii_rig.record.reader import read_recording
@@ -42,7 +43,8 @@ def diagnose_folder(folder: Path) -> dict[str, Any]:
         raise InputError(str(folder), "", "no recording", "a folder with .mcap files")
     recordings = [read_recording(log) for log in logs]
     rig = parse(Rig, recordings[0].rig_toml, str(logs[0]))
-    return diagnose(estimate(recordings), rig, runs=recordings).plain()
+    found = diagnose(estimate(recordings), rig, runs=recordings)
+    return {**found.plain(), "evidence": found.evidence}
 
 
 def main() -> None:

@@ -112,12 +112,23 @@ def auroc(positive: Sequence[float], negative: Sequence[float]) -> float:
     return float(np.mean((a > b) + 0.5 * (a == b)))
 
 
+def ratio(pairs: Sequence[tuple[int, int]]) -> float:
+    """Sum of the first over that of the second; NaN without any."""
+    return sum(a for a, _ in pairs) / sum(b for _, b in pairs) if pairs else math.nan
+
+
 def stated(trial: Trial) -> list[Stated]:
     """Every cause named; one is right when it is one of the effects, up to its class."""
     if not trial.answer.speaks:
         return []
     good = {id(cause) for _, cause in trial.matches()}
     return [(cause.probability, id(cause) in good) for cause in trial.answer.causes]
+
+
+def confidently_wrong(trial: Trial) -> bool:
+    """Whether it states a cause with more than `SURE` that is none. An effect that was not found
+    beside one that was is missed, not wrong."""
+    return any(p > SURE and not good for p, good in stated(trial))
 
 
 def reliability(rows: Sequence[Sequence[Stated]]) -> list[tuple[float, float, int]]:
@@ -185,10 +196,28 @@ def scores(trials: Sequence[Trial]) -> list[Score]:
         out.append(
             frequency(f"name right up to its class, {text}", [t.right for t in big], at_least(name))
         )
+    counted = [t for t in above(one, 10.0) if t.truth.said]
+    out.append(
+        bootstrap(
+            "names in a class over those an oracle would give, from 10 sigma",
+            [(t.truth.said, t.truth.names) for t in counted],
+            ratio,
+            at_most(1.2),
+        )
+    )
+    counted = [t for t in above(one, 10.0) if t.truth.sites and t.answer.sites]
+    out.append(
+        bootstrap(
+            "sites in the 90 % set over those an oracle would give, from 10 sigma",
+            [(len(t.answer.site_set()), t.truth.sites) for t in counted],
+            ratio,
+            at_most(1.2),
+        )
+    )
     out.append(
         frequency(
             "confidently wrong",
-            [t.confidence > SURE and not t.right for t in trials],
+            [confidently_wrong(t) for t in trials],
             at_most(0.02),
         )
     )
@@ -215,6 +244,8 @@ def scores(trials: Sequence[Trial]) -> list[Score]:
     out.append(
         frequency("two effects: both found", [t.right for t in above(two, 10.0)], at_least(0.80))
     )
+    joints = [t for t in trials if t.truth.kind == "joints"]
+    out.append(frequency("every joint gives: all found", [t.right for t in joints], at_least(0.95)))
     out.append(
         bootstrap(
             "expected calibration error",
@@ -263,7 +294,7 @@ def _short(trials: Sequence[Trial]) -> list[Score]:
         frequency("detected", [t.answer.verdict != "no_mismatch" for t in trials]),
         frequency("place right", [t.place_right for t in trials]),
         frequency("name right", [t.right for t in trials]),
-        frequency("confidently wrong", [t.confidence > SURE and not t.right for t in trials]),
+        frequency("confidently wrong", [confidently_wrong(t) for t in trials]),
     ]
 
 

@@ -41,12 +41,17 @@ class Truth:
 
     kind : `nothing`, `one`, `two`, `outside`, or `joints` (every joint gives).
     size : sigma that are left when the nearest smaller explanation has been refitted.
+    names, sites : how many these data cannot tell from the effect; said : names in the answer's
+        class, structural twins as one. 0 where they were not counted.
     """
 
     kind: str
     seed: int
     effects: tuple[Hidden, ...]
     size: float = 0.0
+    names: int = 0
+    sites: int = 0
+    said: int = 0
 
 
 @dataclass(frozen=True, slots=True)

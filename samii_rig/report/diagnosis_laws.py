@@ -38,6 +38,10 @@ def _softness(s: Complex, p: Numbers) -> Complex:
     return 1 / _spring(s, p)
 
 
+def _oil(s: Complex, p: Numbers) -> Complex:
+    return 1 / (DISPLACEMENT**2 / p["C_h"] + p.get("c", 0.0) * s)
+
+
 def _oscillator(s: Complex, p: Numbers) -> Complex:
     inertia, spring = p["m"] * s**2, _spring(s, p)
     return inertia * spring / (inertia + spring)
@@ -47,9 +51,7 @@ JUMPS: dict[str, tuple[tuple[Jump, Law], ...]] = {
     "torsional_compliance": ((TURN, _softness),),
     "translational_compliance": ((SHEAR, _softness),),
     "velocity_feedback": ((TURN, lambda s, p: 1 / (p["g_v"] * s)),),
-    "hydraulic_compressibility": (
-        (TURN, lambda s, p: np.full(s.shape, p["C_h"] / DISPLACEMENT**2, complex)),
-    ),
+    "hydraulic_compressibility": ((TURN, _oil),),
     "added_mass": ((FORCE, lambda s, p: p["m"] * s**2),),
     "attached_oscillator": ((FORCE, _oscillator),),
     "added_inertia": ((TORQUE, lambda s, p: p["J"] * s**2),),

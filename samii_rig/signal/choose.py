@@ -63,6 +63,14 @@ def drop_foreign(group: Group) -> None:
             f"{foreign[min(foreign)].message}; a third repeat would tell which is wrong, or "
             "estimate each by itself"
         )
+    rest = [i for i in range(len(pieces)) if i not in foreign]
+    knocked = checks.knocks(
+        [pieces[i].z for i in rest],
+        [names[i] for i in rest],
+        group.selection.names,
+        group.rate_hz,
+    )
+    foreign |= {rest[i]: finding for i, finding in knocked.items()}
     group.findings += foreign.values()
     group.pieces = [
         replace(p, follows=p.follows and i - 1 not in foreign)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -41,45 +42,36 @@ def gather(
         raise EstimateError("no recording was given; nothing to estimate")
     groups: list[tuple[Group, Waveform]] = []
     lost: list[Finding] = []
-    selection: Selection | None = None
-    for recording in recordings:
-        ends: dict[int, int] = {}  # of the last piece of each group, in this recording
-        own = select(recording, input, outputs)
-        if selection is None:
-            selection = own
-        elif selection.names != own.names:
+    looked = _look(recordings, input, outputs, reference, gaps, lost)
+    if outputs is None:
+        looked = _spared(looked, reference, gaps)
+    ends: dict[tuple[int, int], int] = {}  # of the last piece of each group in each recording
+    for seen in looked:
+        recording, segment, cut, own = seen.recording, seen.segment, seen.cut, seen.selection
+        if not seen.usable:
+            lost += seen.found
+            continue
+        r, through, remark = reference_of(cut, own, reference)
+        group = _group_for(groups, segment, cut, own, Waveform.of(cut, segment, r))
+        group.through = through
+        if remark and remark not in group.findings:
+            group.findings.append(remark)
+        group.findings += seen.found
+        name = f"{recording.source}, {segment.name}" if recording.source else segment.name
+        z = cut.values[:, [cut.column(n) for n in own.names]]
+        kept, breaks = _whole_rows(cut, seen.names)
+        measured = np.ptp(z[kept][:, 1:]) > 0
+        if measured and any(np.array_equal(p.z, z[kept]) for p in group.pieces):
             raise EstimateError(
-                f"{recording.source or 'recording'} has the channels {', '.join(own.names)}, the "
-                f"first one {', '.join(selection.names)}; name input and outputs, or estimate apart"
+                f"{name} holds the very samples of another repeat: the same file twice, or a "
+                "simulation with the same seed; leave one out"
             )
-        for segment in segments_of(recording):
-            if segment.kind == "transient":
-                continue
-            cut = recording.cut(segment)
-            found, usable, names = _examine(cut, segment, own, reference, gaps)
-            if not usable:
-                lost += found
-                continue
-            r, through, remark = reference_of(cut, own, reference)
-            group = _group_for(groups, segment, cut, own, Waveform.of(cut, segment, r))
-            group.through = through
-            if remark and remark not in group.findings:
-                group.findings.append(remark)
-            group.findings += found
-            name = f"{recording.source}, {segment.name}" if recording.source else segment.name
-            z = cut.values[:, [cut.column(n) for n in own.names]]
-            kept, breaks = _whole_rows(cut, names)
-            measured = np.ptp(z[kept][:, 1:]) > 0
-            if measured and any(np.array_equal(p.z, z[kept]) for p in group.pieces):
-                raise EstimateError(
-                    f"{name} holds the very samples of another repeat: the same file twice, or a "
-                    "simulation with the same seed; leave one out"
-                )
-            follows = ends.get(id(group)) == segment.start and not breaks
-            ends[id(group)] = segment.stop
-            group.pieces.append(Piece(name, r[kept], z[kept], breaks, follows))
-            if recording.source and recording.source not in group.sources:
-                group.sources.append(recording.source)
+        place = id(group), id(recording)
+        follows = ends.get(place) == segment.start and not breaks
+        ends[place] = segment.stop
+        group.pieces.append(Piece(name, r[kept], z[kept], breaks, follows))
+        if recording.source and recording.source not in group.sources:
+            group.sources.append(recording.source)
     if not groups and not lost:
         raise EstimateError("steps and other transients only: no response can be estimated")
     if not groups:
@@ -90,10 +82,92 @@ def gather(
     return [group for group, _ in groups]
 
 
+@dataclass(frozen=True, slots=True)
+class _Looked:
+    """A segment, what was found in it and whether it is used. names : columns that it needs.
+    spoilt : outputs that alone are why it is not used."""
+
+    recording: Recording
+    segment: Segment
+    cut: Recording
+    selection: Selection
+    names: list[str]
+    found: list[Finding]
+    usable: bool
+    spoilt: frozenset[str]
+
+
+def _look(
+    recordings: Sequence[Recording],
+    input: str | None,
+    outputs: Sequence[str] | None,
+    reference: str | None,
+    gaps: Gaps,
+    lost: list[Finding],
+) -> list[_Looked]:
+    """All segments of recordings whose input moves; `lost` is told of the others."""
+    out: list[_Looked] = []
+    selection: Selection | None = None
+    still: list[EstimateError] = []
+    for recording in recordings:
+        try:
+            own = select(recording, input, outputs)
+        except EstimateError as error:
+            still.append(error)
+            continue
+        if selection is None:
+            selection = own
+        elif selection.names != own.names:
+            raise EstimateError(
+                f"{recording.source or 'recording'} has the channels {', '.join(own.names)}, the "
+                f"first one {', '.join(selection.names)}; name input and outputs, or estimate apart"
+            )
+        for segment in segments_of(recording):
+            if segment.kind != "transient":
+                cut = recording.cut(segment)
+                out.append(_examine(recording, segment, cut, own, reference, gaps))
+    if selection is None:
+        raise still[0]
+    lost += [Finding("stuck", "error", f"{error}; left out") for error in still]
+    return out
+
+
+def _spared(looked: list[_Looked], reference: str | None, gaps: Gaps) -> list[_Looked]:
+    """The same, but where no segment of a level can be used for the sake of some outputs, these
+    are left out and not the level."""
+    levels: dict[tuple[str, str, str], list[_Looked]] = {}
+    for seen in looked:
+        s = seen.segment
+        levels.setdefault((s.kind, f"{s.level:g}", s.unit), []).append(seen)
+    out: dict[int, _Looked] = {}
+    for members in levels.values():
+        bad = frozenset().union(*(m.spoilt for m in members))
+        keep = tuple(c for c in members[0].selection.outputs if c.name not in bad)
+        if any(m.usable or not m.spoilt for m in members) or not keep:
+            continue
+        for m in members:
+            fewer = Selection(m.selection.input, keep)
+            again = _examine(m.recording, m.segment, m.cut, fewer, reference, gaps)
+            why = [f for f in m.found if f.channel in bad]
+            out[id(m)] = replace(again, found=[*why, *again.found])
+        segment, names = members[0].segment, ", ".join(sorted(bad))
+        level = f"at {segment.level:g} {segment.unit}" if np.isfinite(segment.level) else "here"
+        first = out[id(members[0])]
+        kind = first.found[0].kind
+        text = f"{names} left out {level}: no run there in which it is sound"
+        first.found.insert(0, Finding(kind, "error", text, channel=names))
+    return [out.get(id(m), m) for m in looked]
+
+
 def _examine(
-    cut: Recording, segment: Segment, selection: Selection, reference: str | None, gaps: Gaps
-) -> tuple[list[Finding], bool, list[str]]:
-    """Findings about a segment, whether it is used, and the channels that it needs."""
+    recording: Recording,
+    segment: Segment,
+    cut: Recording,
+    selection: Selection,
+    reference: str | None,
+    gaps: Gaps,
+) -> _Looked:
+    """What is wrong with a segment, and whether it is used."""
     names = list(dict.fromkeys([*selection.names, *cut.names("reference")]))
     if reference is not None and reference in {c.name for c in cut.channels}:
         names = list(dict.fromkeys([*selection.names, reference]))
@@ -108,16 +182,23 @@ def _examine(
             f"{broken[0].message}; gaps='exclude' leaves the segment out, "
             "gaps='model' treats what follows a gap as a new transient"
         )
+    outputs = {c.name for c in selection.outputs}
+
+    def looked(usable: bool, spoilt: set[str]) -> _Looked:
+        alone = frozenset(spoilt) if spoilt <= outputs else frozenset()
+        return _Looked(recording, segment, cut, selection, names, found, usable, alone)
+
     kept, _ = _whole_rows(cut, names)
     short = np.count_nonzero(kept) < LEAST_SAMPLES
     if broken and (gaps == "exclude" or broken[0].kind == "timing" or short):
-        return found, False, names
+        timed = any(f.kind == "timing" for f in broken)
+        return looked(False, set() if timed else {channel for _, _, channel in breaks})
     stand = checks.stuck(cut, segment, selection)
     frozen = [f for f in stand if f.severity == "error" and "never changes" not in f.message]
     clipped = checks.clipping(cut, segment, selection)
     found += stand + clipped
-    spoilt = bool(frozen) or any(f.kind == "clipping" for f in clipped)
-    return found, not spoilt, names
+    spoilt = {f.channel for f in (*frozen, *clipped) if f.severity == "error"}
+    return looked(not spoilt, spoilt)
 
 
 def _whole_rows(cut: Recording, names: Sequence[str]) -> tuple[NDArray[np.bool_], tuple[int, ...]]:
@@ -137,7 +218,12 @@ def _group_for(
     shape: Waveform,
 ) -> Group:
     for group, known in groups:
-        same = (group.kind, group.unit, group.rate_hz) == (segment.kind, segment.unit, cut.rate_hz)
+        same = (group.kind, group.unit, group.rate_hz, group.selection.names) == (
+            segment.kind,
+            segment.unit,
+            cut.rate_hz,
+            selection.names,
+        )
         level = bool(np.isclose(group.level, segment.level, rtol=1e-6, equal_nan=True))
         if same and level and known.same(shape):
             return group

@@ -76,7 +76,8 @@ class Group:
 
 
 def select(recording: Recording, input: str | None, outputs: Sequence[str] | None) -> Selection:
-    """The input channel and the outputs; InputError when they are not there or not clear."""
+    """The input channel and the outputs; InputError when they are not there or not clear,
+    EstimateError when no input moves."""
     where = recording.source or "recording"
     by_name = {c.name: c for c in recording.channels}
     if input is None:
@@ -84,6 +85,8 @@ def select(recording: Recording, input: str | None, outputs: Sequence[str] | Non
         moving = [
             n for n in commands if np.nanmax(np.abs(_column(recording, n)), initial=0.0) > 0.0
         ]
+        if commands and not moving:
+            raise EstimateError(f"{where}: the input {', '.join(commands)} never moves")
         if len(moving) != 1:
             found = list(moving or commands)
             raise InputError(where, "input", found, "the name of the one input to estimate from")

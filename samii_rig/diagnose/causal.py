@@ -1,0 +1,96 @@
+"""A beam whose loss factor is causal: its stiffness rises with frequency, as it must.
+
+A stiffness EI (1 + j eta) with both numbers constant would answer before it is asked. The
+nearest law that does not has a modulus that grows by 2 eta/pi for every factor e of frequency
+(`samii_rig.model.damping`), so that a chain whose beam is missing its loss is also out of tune.
+The chain is evaluated at the stiffness of a few nodes, and in between by the two next to each
+frequency: exact to second order in what the stiffness changes from one node to the next, which
+is small against the width of any mode that such a beam has.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from samii_rig.model.tmm import Chain
+from samii_rig.types import Complex, Float, Int
+
+SPACING = 0.6  # of the logarithm of frequency, between nodes
+RISE = 2 / math.pi  # of the logarithm of stiffness by that of frequency, over eta
+STIFFNESS = ("EI", "GA")
+
+Key = tuple[str, str]
+
+
+class CausalChain:
+    """As `Chain`, with the stiffness of `beams` as in the file at `middle_hz`."""
+
+    def __init__(self, chain: Chain, beams: tuple[str, ...], middle_hz: float) -> None:
+        self._chain, self._beams, self._middle = chain, beams, middle_hz
+        self.parameters = chain.parameters
+        self._at = {key: i for i, key in enumerate(chain.parameters)}
+
+    def with_values(self, values: Mapping[Key, float]) -> CausalChain:
+        """As of `Chain`."""
+        return CausalChain(self._chain.with_values(values), self._beams, self._middle)
+
+    def response(self, frequency_hz: Float) -> Complex:
+        """As of `Chain`."""
+        out: Complex | None = None
+        for _, chain, on, weight in self._nodes(frequency_hz):
+            H = chain.response(frequency_hz[on])
+            if out is None:
+                out = np.zeros((frequency_hz.size, *H.shape[1:]), complex)
+            out[on] += weight[:, None, None] * H
+        assert out is not None
+        return out
+
+    def gradient(self, frequency_hz: Float, wrt: Sequence[Key]) -> tuple[Complex, Complex]:
+        """As of `Chain`."""
+        keys = list(wrt)
+        given = self._chain.values()
+        stiff = [(b, s) for b in self._beams for s in STIFFNESS if (b, s) in self._at]
+        every = (*keys, *(k for k in stiff if k not in keys))
+        out: tuple[Complex, Complex] | None = None
+        for log, chain, on, weight in self._nodes(frequency_hz):
+            H, dH = chain.gradient(frequency_hz[on], every)
+            for b, s in stiff:
+                i = every.index((b, s))
+                ratio = math.exp(RISE * given[self._at[b, "eta"]] * log)
+                slope = dH[:, :, :, i] * ratio
+                dH[:, :, :, i] = slope
+                if (b, "eta") in keys:
+                    dH[:, :, :, keys.index((b, "eta"))] += (
+                        slope * given[self._at[b, s]] * RISE * log
+                    )
+            if out is None:
+                n = frequency_hz.size
+                shape = dH.shape[1:3]
+                out = np.zeros((n, *shape), complex), np.zeros((n, *shape, len(keys)), complex)
+            out[0][on] += weight[:, None, None] * H
+            out[1][on] += weight[:, None, None, None] * dH[:, :, :, : len(keys)]
+        assert out is not None
+        return out
+
+    def _nodes(self, f: Float) -> Iterator[tuple[float, Chain, Int, Float]]:
+        """Of each node ln(f/middle), the chain, the frequencies it counts at and how much."""
+        log = np.log(f / self._middle)
+        low, high = float(np.min(log)), float(np.max(log))
+        nodes = np.linspace(low, high, max(2, math.ceil((high - low) / SPACING) + 1))
+        step = max(nodes[1] - nodes[0], 1e-12)
+        values = self._chain.values()
+        for node in nodes:
+            weight = 1 - np.abs(log - node) / step
+            on = np.flatnonzero(weight > 0)
+            if on.size == 0:
+                continue
+            changed = {
+                (b, s): values[self._at[b, s]] * math.exp(RISE * values[self._at[b, "eta"]] * node)
+                for b in self._beams
+                for s in STIFFNESS
+                if (b, s) in self._at
+            }
+            yield float(node), self._chain.with_values(changed), on, weight[on]

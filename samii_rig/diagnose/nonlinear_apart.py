@@ -1,0 +1,125 @@
+"""A search whose levels are apart, and what each nonlinear force promises in it.
+
+All forces are screened by their describing functions, those that come near are computed in time
+under the inputs that were recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.nonlinear_driven import Drives, driven, top_of
+from samii_rig.diagnose.nonlinear_laws import EXCESS
+from samii_rig.diagnose.nonlinear_levels import Extra, LevelGrid
+from samii_rig.diagnose.nonlinear_model import LevelModel
+from samii_rig.diagnose.nonlinear_screen import Bins, Levels, Promise
+from samii_rig.diagnose.refit import Problem
+from samii_rig.diagnose.search import Explanation, Search
+from samii_rig.types import Float
+
+# Forces that describing functions may miss altogether, as their amplitude is not the sweep's.
+BLIND = ("output_saturation", "flow_saturation")
+CUTS = (0.003, 0.012, 0.05, 0.2, 0.5)  # off the largest command, limits that are tried first
+NEARER = (2.0, 1.4, 1.2)  # factors on that, that are tried then
+HINT = 5.0  # of chi-square, gained in the screen: less is not looked at any closer
+CLOSER = 6  # forces that are
+
+
+@dataclass
+class Apart:
+    """A search with its levels apart. grid, problem : with what of forces was computed in time.
+
+    given : one period of the input of each level that was recorded.
+    """
+
+    search: Search
+    bins: Bins
+    grid: LevelGrid
+    problem: Problem
+    forces: list[Effect]
+    given: Drives
+
+    def promises(self, base: Explanation) -> list[Promise]:
+        """What each force would gain beside a linear explanation, the largest gain first."""
+        look = Levels.of(self.problem, base.fitted)
+        found: list[Promise] = []
+        for effect in self.forces:
+            model = self.search._model((*base.effects, effect))
+            if isinstance(model, LevelModel):
+                promise = look.promise(effect, model)
+                found += [promise] if promise is not None else []
+        found.sort(key=lambda p: -p.gain)
+        blind = [p for p in found[CLOSER:] if p.effect.physics in BLIND]
+        closer = [
+            p for p in (*found[:CLOSER], *blind) if p.gain > HINT or p.effect.physics in BLIND
+        ]
+        return sorted((self._closer(base, look, p) for p in closer), key=lambda p: -p.gain)
+
+    def _closer(self, base: Explanation, look: Levels, promise: Promise) -> Promise:
+        """The same with the force in time, under the inputs that were recorded."""
+        effect = promise.effect
+        model = self.search._model((*base.effects, effect))
+        assert isinstance(model, LevelModel)
+        tried: dict[float, Promise] = {}
+
+        def at(p: float) -> float:
+            """Chi-square gained there; a limit below zero is none."""
+            if p <= 0:
+                return -math.inf
+            if p not in tried and self.compute(model, np.append(base.fitted.x, math.log(p)), p):
+                one = replace(effect, unknowns=(replace(effect.unknowns[0], starts=(p,)),))
+                found = replace(look, problem=self.problem).promise(one, model)
+                if found is not None:
+                    tried[p] = replace(found, effect=effect)
+            return tried[p].gain if p in tried else -math.inf
+
+        if model.quasi.law is not EXCESS:
+            at(promise.starts[0])
+        elif self.given:
+            top = top_of(model, self.given)
+            cut = CUTS[0] * top
+            for x in CUTS[1:]:
+                # What is cut off too much is worse than nothing.
+                if at(top - x * top) < min(at(top - cut), 0.0):
+                    break
+                cut = max((cut, x * top), key=lambda x: at(top - x))
+            for nearer in NEARER if at(top - cut) > HINT else ():
+                cut = max((cut, cut / nearer, cut * nearer), key=lambda x: at(top - x))
+        if not tried:
+            return promise
+        best = max(tried.values(), key=lambda p: p.gain)
+        # Where it came nearest it is computed once more, and kept.
+        p = best.starts[0]
+        self.compute(model, np.append(base.fitted.x, math.log(p)), p)
+        return best
+
+    def compute(self, model: LevelModel, x: Float, p: float) -> bool:
+        """Put what a force is in time, beyond its describing function, into grid and problem."""
+        if not self.given:
+            return False
+        extra = driven(model, x, self.grid, self.given, p)
+        if extra is None:
+            return False
+        top = top_of(model, self.given)
+        quasi = model.quasi
+        self.grid = replace(self.grid, extra={**self.grid.extra, quasi: Extra(extra, p, top)})
+        self.problem = self.bins.better(self.problem, quasi, Extra(extra, p, top))
+        self.search.problem, self.search.grid = self.problem, self.grid
+        return True
+
+    def inside(self, best: Explanation) -> None:
+        """Take what bins lose about the best explanation: a force in time is no smooth curve, and
+        is taken out of their lines first."""
+        model, lines = best.fitted.model, self.bins.lines
+        if not isinstance(model, LevelModel) or not self.given:
+            return
+        at = self.grid.at(lines.frequency, lines.level)
+        linear = model.response(best.fitted.x, replace(at, power=None))
+        added = model.response(best.fitted.x, at) - linear
+        inside = self.bins.combined(lines.H - added).inside
+        self.problem = replace(self.problem, data=replace(self.problem.data, inside=inside))
+        self.search.problem = self.problem

@@ -1,0 +1,62 @@
+"""Weights of `diagnose.stated` from trials whose truth is known.
+
+Logistic regression of whether all that the most probable explanation names is concealed there, up
+to its class, on its evidence; every weight is held by a normal prior, so that few trials do not
+make it certain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import optimize, special
+
+from samii_rig.diagnose.stated import Evidence
+from samii_rig.errors import InputError
+from samii_rig.prove.trial import Answer, Trial, Truth
+from samii_rig.record.export import replacing
+
+WIDE = 4.0  # standard deviation of a weight before the trials
+FEWEST = 40  # trials below which a regression says nothing
+
+
+def row(truth: Truth, answer: Mapping[str, Any]) -> tuple[Evidence, bool] | None:
+    """Evidence of the most probable explanation, and whether every cause in it is right; None where
+    it was that nothing is missing."""
+    told = answer["evidence"]
+    if not told["causes"]:
+        return None
+    said = replace(Answer.of({**answer, "causes": told["causes"]}), verdict="named")
+    known = {f.name: told[f.name] for f in fields(Evidence)}
+    return Evidence(**known), len(Trial(truth, said).matches()) == len(said.causes)
+
+
+def fit(rows: Sequence[tuple[Evidence, bool]]) -> dict[str, float]:
+    """The weights.
+
+    Raises InputError for fewer than `FEWEST` rows.
+    """
+    if len(rows) < FEWEST:
+        raise InputError("--calibrate", "trials", len(rows), f"at least {FEWEST} that find effects")
+    names = list(rows[0][0].features())
+    X = np.array([list(e.features().values()) for e, _ in rows])
+    y = np.array([2.0 * right - 1 for _, right in rows])
+
+    def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
+        score = y * (X @ w)
+        gradient = -(X.T @ (y * special.expit(-score))) + w / WIDE**2
+        return float(-np.sum(special.log_expit(score)) + 0.5 * w @ w / WIDE**2), gradient
+
+    found = optimize.minimize(loss, np.zeros(len(names)), jac=True, method="BFGS")
+    return dict(zip(names, found.x.tolist(), strict=True))
+
+
+def write(path: Path, weights: Mapping[str, float], trials: str) -> None:
+    """The file that `diagnose.stated` reads; `trials` says where the weights come from."""
+    lines = [f"# {trials}", "[weights]", *(f"{k} = {v:.4g}" for k, v in weights.items())]
+    with replacing(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")

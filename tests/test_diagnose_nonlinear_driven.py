@@ -1,0 +1,143 @@
+"""Forces under the inputs that were recorded: the same as an integration in time, and confirmed."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from identify_kit import noiseless, samii
+
+from samii_rig.diagnose.effect import Effect, Unknown
+from samii_rig.diagnose.measured import measured
+from samii_rig.diagnose.model import Model, grid
+from samii_rig.diagnose.nonlinear_confirm import seen
+from samii_rig.diagnose.nonlinear_driven import drives, forced
+from samii_rig.diagnose.nonlinear_laws import CUBIC, EXCESS, FRICTION, GAP
+from samii_rig.diagnose.nonlinear_levels import level_grid
+from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
+from samii_rig.diagnose.nonlinear_screen import Bins, Levels
+from samii_rig.diagnose.nonlinear_time import simulate
+from samii_rig.diagnose.refit import Problem, refit
+from samii_rig.types import Channel, Recording, Segment
+
+N = 6000  # samples of a period
+CASES = [
+    (Quasi("joint", ("joint_2",), FRICTION), 0.5),
+    (Quasi("joint", ("joint_1",), CUBIC), 1e6),
+    (Quasi("joint", ("joint_2",), GAP, 1.0, ("joint_2", "k")), 1e-6),
+    (Quasi("command", ("joint_2_source",), GAP), 0.01),
+    (Quasi("command", ("joint_2_source",), EXCESS), 0.95),
+    (Quasi("flow", ("joint_2_source",), None), 5e4),
+]
+
+
+def sweep(level):
+    """A sweep from 1 to 30 Hz and back, which repeats itself without a step."""
+    t = np.arange(N) / N
+    f = 15.5 - 14.5 * np.cos(2 * np.pi * t)
+    return level * np.sin(2 * np.pi * np.cumsum(f) / samii().rate_hz)
+
+
+@cache
+def campaign():
+    """Lines and grid of two levels, without a force."""
+    f = np.arange(12, 361) * samii().rate_hz / N
+    responses = [
+        replace(
+            noiseless(samii(), f),
+            level=level,
+            method="settled (drawn)",
+            input_rms=np.full((f.size, 1), level / np.sqrt(2)),
+        )
+        for level in (0.5, 1.0)
+    ]
+    lines = measured(responses, samii())
+    at = grid(samii(), lines.frequency, lines.sensor, lines.actuator)
+    return responses, lines, level_grid(samii(), at, lines, responses)
+
+
+def model_of(quasi, p):
+    effect = Effect("x", "y", (Unknown("p", "1", p / 100, 100 * p, (p / 2, p)),), quasi=quasi)
+    model = LevelModel(samii(), [effect])
+    return effect, model, np.append(np.zeros(model.n - 1), np.log(p))
+
+
+def recorded(quasi, p):
+    """Two periods at each level, integrated from rest, without noise."""
+    runs = []
+    names = [s.name for s in samii().sensor]
+    for level in (0.5, 1.0):
+        v = np.tile(sweep(level), 3)
+        y = simulate(samii(), v, quasi, p)
+        channels = (Channel("v_2", "V", "command"),
+                    *(Channel(n, samii().units()[n], "sensor") for n in names))  # fmt: skip
+        segments = tuple(
+            Segment(f"s{i}", "burst", i * N, (i + 1) * N, level, "V", i) for i in range(3)
+        )
+        runs.append(
+            Recording(
+                channels, samii().rate_hz, np.arange(3 * N) * 2_000_000, np.arange(3 * N),
+                np.column_stack([v, y]), np.zeros((3 * N, 1 + len(names)), np.uint8), segments,
+            )
+        )  # fmt: skip
+    return runs
+
+
+@pytest.mark.parametrize(("quasi", "p"), CASES)
+def test_a_force_in_time_is_that_of_an_integration(quasi, p):
+    _, model, x = model_of(quasi, p)
+    at = campaign()[2]
+    (one,) = forced(model, x, at, {1: sweep(1.0)}, p)
+    v = np.tile(sweep(1.0), 3)
+    force = simulate(samii(), v, quasi, p, inner=16) - simulate(
+        samii(), v, quasi, 1e9 if quasi.law in (None, EXCESS) else 0.0, inner=16
+    )
+    want = np.fft.rfft(force[2 * N :], axis=0)[one.bins]
+    on = (one.frequency > 1) & (one.frequency < 30)
+    there = grid(samii(), one.frequency[on], at.sensor, at.actuator)
+    got = model.per_force(x, there) * one.E[on][:, None]
+    apart = np.linalg.norm(got - want[on], axis=0) / np.linalg.norm(want[on], axis=0)
+    assert np.max(apart) < 0.15
+
+
+def test_a_period_is_found_from_the_lines_and_the_mean_of_it_taken():
+    responses, lines, _ = campaign()
+    given = drives(samii(), lines, responses, recorded(*CASES[0]))
+    assert sorted(given) == [0, 1]
+    assert np.allclose(given[1], sweep(1.0))
+    assert drives(samii(), lines, responses, []) == {}
+
+
+def test_recordings_with_a_force_confirm_it_and_others_do_not():
+    quasi, p = CASES[0]
+    responses, lines, at = campaign()
+    held = Problem.of(lines, at)
+    _, model, x = model_of(quasi, p)
+    there = refit(model, held, x, steps=0)
+    plain = refit(Model(samii()), held, x[:-1], steps=0)
+    true = seen(plain, there, at, lines, responses, recorded(quasi, p))
+    none = seen(plain, there, at, lines, responses, recorded(quasi, 1e-9))
+    assert true.holds
+    assert true.share == pytest.approx(1.0, abs=0.1)
+    assert not none.holds
+    assert none.fall < 0
+    assert "of the force" in true.told()
+    assert seen(plain, there, at, lines, responses, []) is None
+
+
+def test_levels_against_each_other_tell_a_force_but_nothing_linear():
+    quasi, p = CASES[0]
+    effect, model, x = model_of(quasi, p)
+    _, lines, at = campaign()
+    plain = refit(Model(samii()), Problem.of(lines, at), x[:-1], steps=0)
+    h = model.response(x, at.at(lines.frequency, lines.level))
+    late = lines.H * np.exp(-2e-4j * 2 * np.pi * lines.frequency)[:, None]
+
+    def promised(H):
+        problem = Problem.of(Bins.of(replace(lines, H=H), plain, at).combined(), at)
+        return Levels.of(problem, plain).promise(effect, model)
+
+    there, not_there = promised(h), promised(late)
+    assert there.contrast == pytest.approx(there.due, rel=0.05)
+    assert there.starts[0] == pytest.approx(p, rel=0.1)
+    assert not_there.contrast < 0.05 * max(not_there.due, not_there.gain, 1.0)
