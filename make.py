@@ -64,8 +64,7 @@ def check(arguments: list[str]) -> None:
     call(BIN / "mypy")
     call(BIN / "lint-imports")
     workers = str(min(os.cpu_count() or 1, 4))
-    spread = ("-n", workers, "--dist", "loadgroup")
-    call(BIN / "pytest", "-q", *spread, "--durations=10", *arguments)
+    call(BIN / "pytest", "-q", "-n", workers, "--durations=10", *arguments)
 
 
 COMMANDS = {"demo": demo, "check": check}

@@ -1,26 +1,40 @@
 """Fixtures that more than one test file needs."""
 
 import os
+import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-# What runs a device or a service in real time, on ports whose names the system gives out again.
-KITS = {"wire_kit", "can_kit", "faults_kit", "serve_kit"}
-# Whose fixtures take so long that both halves of the tests must not make them anew.
-TOGETHER = {"test_mode_scan", "test_modal", "test_control", "test_papers"}
+# What runs a device in real time, on ports whose names the system gives out again.
+KITS = {"wire_kit", "can_kit", "faults_kit"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of real time run one after another: side by side they would be late for each other,
-    and one could open the port that another has just pulled. So do those of one costly fixture."""
+    """Of three tries in real time one must hold: a loaded machine is late by itself."""
     for item in items:
         here = vars(item.getparent(pytest.Module).obj)  # type: ignore[union-attr]
         if KITS & {getattr(thing, "__module__", "") for thing in here.values()}:
-            item.add_marker(pytest.mark.xdist_group("real time"))
-        elif item.path.stem in TOGETHER:
-            item.add_marker(pytest.mark.xdist_group(item.path.stem))
+            item.add_marker("real_time")
+            item.add_marker(pytest.mark.flaky(reruns=2, reruns_delay=0.5))
+
+
+@pytest.fixture(autouse=True)
+def one_at_a_time(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Tests of real time run one after another: side by side they would be late for each other,
+    and one could open the port that another has just pulled."""
+    if request.node.get_closest_marker("real_time") is None or sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    run = os.environ.get("PYTEST_XDIST_TESTRUNUID", str(os.getpid()))
+    with (Path(tempfile.gettempdir()) / f"samii_rig_tests_{run}.lock").open("w") as turn:
+        fcntl.flock(turn, fcntl.LOCK_EX)
+        yield
 
 
 @pytest.fixture(scope="session")
