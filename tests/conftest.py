@@ -11,15 +11,18 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 # What runs a device in real time, on ports whose names the system gives out again.
 KITS = {"wire_kit", "can_kit", "faults_kit"}
+TRIES_MORE = 4
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of three tries in real time one must hold: a loaded machine is late by itself."""
+    """Of some tries in real time one must hold: a loaded machine is late by itself."""
     for item in items:
         here = vars(item.getparent(pytest.Module).obj)  # type: ignore[union-attr]
-        if KITS & {getattr(thing, "__module__", "") for thing in here.values()}:
+        used = {getattr(thing, "__module__", "") for thing in here.values()}
+        if KITS & used:
             item.add_marker("real_time")
-            item.add_marker(pytest.mark.flaky(reruns=2, reruns_delay=0.5))
+        if (KITS | {"serve_kit"}) & used:
+            item.add_marker(pytest.mark.flaky(reruns=TRIES_MORE, reruns_delay=0.5))
 
 
 @pytest.fixture(autouse=True)
