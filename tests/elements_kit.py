@@ -14,6 +14,7 @@ from samii_rig.rig.schema import (
     ForceSource,
     GravityStiffness,
     HydraulicLine,
+    LumpedLine,
     LumpedMass,
     OilColumn,
     Rig,
@@ -31,7 +32,8 @@ KINDS: dict[str, Any] = {
     for c in (
         Beam, TimoshenkoBeam, RigidLink, LumpedMass, TorsionalSpring, TranslationalSpring,
         TorsionalGroundSpring, TranslationalGroundSpring, GravityStiffness, OilColumn,
-        HydraulicLine, AngularVelocitySource, AngularVelocitySource2, TorqueSource, ForceSource,
+        HydraulicLine, LumpedLine, AngularVelocitySource, AngularVelocitySource2, TorqueSource,
+        ForceSource,
     )
 }  # fmt: skip
 GAIN = {"torque_source": "N m/V", "force_source": "N/V"}

@@ -14,7 +14,7 @@ KINDS = {
         *elements.SOURCES, *elements.BEAMS, elements.RigidLink, elements.LumpedMass,
         elements.TorsionalSpring, elements.TranslationalSpring, elements.TorsionalGroundSpring,
         elements.TranslationalGroundSpring, elements.GravityStiffness, elements.OilColumn,
-        elements.HydraulicLine, elements.Branch,
+        elements.HydraulicLine, elements.LumpedLine, elements.Branch,
     )
 }  # fmt: skip
 GAIN = {"torque_source": "N m/V", "force_source": "N/V"}  # others: rad/(s V)

@@ -29,7 +29,7 @@ from sim.concealed.draw import edited
 from sim.concealed.effects import OUTSIDE, ROWS, physics, places
 from sim.concealed.modes import poles_of
 from sim.concealed.parts import Description, Law, described
-from sim.concealed.scales import DISPLACEMENT, RIGID, Concealed
+from sim.concealed.scales import DISPLACEMENT, RIGID, Concealed, Dose
 
 S = 2j * np.pi * FREQUENCY
 CLOSE = 5e-4  # relative, at every line of every sensor
@@ -39,7 +39,7 @@ Values = dict[str, float]
 def put(name: str, site: str, x: float, seed: int = 0) -> tuple[Description, Concealed]:
     plant = described(SAMII)
     module = linear if hasattr(linear, name) else nonlinear
-    return plant, getattr(module, name)(plant, site, x, np.random.default_rng(seed))
+    return plant, getattr(module, name)(plant, site, Dose(x, np.random.default_rng(seed)))
 
 
 def alike(plant: Description, model: Complex, tolerance: float = CLOSE) -> None:
@@ -157,7 +157,7 @@ def test_oil_line_makes_the_source_second_order() -> None:
     plant.parts[-1].values.update(m=1e-6, I=1e-8)
     plant.push = "link_2"
     plant.sensors = plant.sensors[:1]
-    effect = linear.oil(plant, "joint_2_source", 1.0, np.random.default_rng(seed))
+    effect = linear.oil(plant, "joint_2_source", Dose(1.0, np.random.default_rng(seed)))
     omega, zeta = effect.parameters["omega"], effect.parameters["zeta"]
     d = plant.drive
     line = omega**2 / (S**2 + 2 * zeta * omega * S + omega**2)

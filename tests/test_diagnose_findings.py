@@ -9,46 +9,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from identify_kit import noiseless, samii
+from sweep_kit import swept
 
-from experiments.swept_sine import SweptSine
 from samii_rig.diagnose import findings, wiring
 from samii_rig.diagnose.diagnose import diagnose, table
 from samii_rig.errors import EstimateError, InputError, SamiiRigError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.rig.load import load_rig
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Quality, Recording, Segment
-from sim.rig import open_rig
+from samii_rig.types import Quality
 
 LEVELS = (0.3, 0.5)
 RIVALS = ("torsional_compliance", "velocity_feedback", "sensor_delay", "sensor_gain")
 RATE = 500
 
 
-def sweeps(level, seed, rig=None):
+def sweeps(level, seed):
     """Four sweeps at one level, each from rest to rest."""
-    rig = rig or samii()
-    plan = SweptSine(
-        experiment="swept_sine", name="short", actuator="v_2", unit="V", sweep="logarithmic",
-        start_hz=0.8, stop_hz=35.0, duration=8.0, ramp=0.5, lead_in=1.0, ring_down=25.0,
-        amplitudes=(level,), repeats=4,
-    ).plan(rig)  # fmt: skip
-    device = open_rig(rig, {"seed": seed, "disturbance_rms": 0.01})
-    device.actuator.configure(DeviceLoop(plan.centring_sensor, plan.kp, 10.0, 1e9, 1e9))
-    u = np.concatenate([s.u for s in plan.segments])
-    device.actuator.write(CommandBlock(0, u, np.zeros_like(u)))
-    device.clock.sleep(len(u) / rig.rate_hz)
-    b = device.sensor.read()
-    ends = np.cumsum([len(s.u) for s in plan.segments])
-    segments = tuple(
-        Segment(f"sweep {i + 1}", s.kind, int(end) - len(s.u), int(end), s.level, s.unit, i)
-        for i, (s, end) in enumerate(zip(plan.segments, ends, strict=True))
-    )
-    return Recording(
-        b.channels, rig.rate_hz, b.time, b.sequence, b.values, b.quality, segments,
-        rig_toml=load_rig("samii")[1], source=f"run at {level:g} V",
-    )  # fmt: skip
+    rig, text = load_rig("samii")
+    return swept(rig, level, repeats=4, duration=8.0, ring_down=25.0, seed=seed, rig_toml=text)
 
 
 @pytest.fixture(scope="module")

@@ -87,7 +87,7 @@ def recorded(quasi, p):
 def test_a_force_in_time_is_that_of_an_integration(quasi, p):
     _, model, x = model_of(quasi, p)
     at = campaign()[2]
-    (one,) = forced(model, x, at, {1: sweep(1.0)}, p)
+    (one,) = forced(model, x, {1: sweep(1.0)}, p)
     v = np.tile(sweep(1.0), 3)
     force = simulate(samii(), v, quasi, p, inner=16) - simulate(
         samii(), v, quasi, 1e9 if quasi.law in (None, EXCESS) else 0.0, inner=16

@@ -3,44 +3,24 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from identify_kit import STIFFNESSES, samii
+from sweep_kit import swept
 from typer.testing import CliRunner
 
-from experiments.swept_sine import SweptSine
 from samii_rig.cli.app import app
 from samii_rig.identify.actuator import choice, compare_variants, with_encoder
 from samii_rig.identify.velocity_feedback import in_series
 from samii_rig.record.store import write_recording
 from samii_rig.rig.load import load_rig
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Recording, Segment
-from sim.rig import open_rig
 
 SOURCE = "joint_2_source"
 
 
 def recorded(rig, level):
-    """Three sweeps on the simulated rig, with sensor noise and a disturbance of 10 mV."""
-    plan = SweptSine(
-        experiment="swept_sine", name="short", actuator="v_2", unit="V", sweep="logarithmic",
-        start_hz=0.8, stop_hz=35.0, duration=15.0, ramp=0.5, lead_in=1.0, ring_down=11.0,
-        amplitudes=(level,), repeats=3,
-    ).plan(rig)  # fmt: skip
-    device = open_rig(rig, {"seed": 1, "disturbance_rms": 0.01})
-    device.actuator.configure(DeviceLoop(plan.centring_sensor, plan.kp, 10.0, 1e9, 1e9))
-    u = np.concatenate([s.u for s in plan.segments])
-    device.actuator.write(CommandBlock(0, u, np.zeros_like(u)))
-    device.clock.sleep(len(u) / rig.rate_hz)
-    b = device.sensor.read()
-    ends = np.cumsum([len(s.u) for s in plan.segments])
-    segments = tuple(
-        Segment(s.name, s.kind, int(end) - len(s.u), int(end), s.level, s.unit, s.repeat)
-        for s, end in zip(plan.segments, ends, strict=True)
-    )
-    return Recording(b.channels, rig.rate_hz, b.time, b.sequence, b.values, b.quality, segments)
+    """Three sweeps, each from rest to rest."""
+    return swept(rig, level, repeats=3, duration=15.0, ring_down=11.0)
 
 
 @pytest.mark.parametrize("outputs", [None, ("theta_2",)])

@@ -17,6 +17,7 @@ import pytest
 from samii_rig.errors import InputError
 from samii_rig.prove import campaign
 from samii_rig.rig.load import load_rig
+from samii_rig.workers import workers
 
 
 def test_kinds_are_spread_over_the_campaign() -> None:
@@ -59,7 +60,7 @@ def test_a_scheduler_that_does_not_answer_costs_one_line() -> None:
     pytest.importorskip("distributed")
     with (
         pytest.raises(InputError, match="--scheduler"),
-        campaign.workers(None, "tcp://127.0.0.1:9"),
+        workers(scheduler="tcp://127.0.0.1:9"),
     ):
         pass
 

@@ -37,6 +37,16 @@ def test_abstaining_on_an_effect_is_a_miss_but_may_know_the_place() -> None:
     assert trial("nothing", NOTHING).right
 
 
+def test_a_site_has_as_many_names_as_the_effect_has_structural_twins() -> None:
+    silent = {**UNKNOWN, "sites": [{"site": "link_1", "probability": 0.7}]}
+    told = trial("one", silent, SPRING)
+    assert not told.place_right
+    assert not told.place_in_set
+    known = replace(told, truth=replace(told.truth, twins=("link_1",)))
+    assert known.place_right
+    assert known.place_in_set
+
+
 def test_two_effects_need_two_names_and_no_third() -> None:
     both = diagnosis("named", (*SPRING, 0.9), (*MASS, 0.8))
     assert trial("two", both, MASS, SPRING).right
@@ -48,6 +58,8 @@ def test_two_effects_need_two_names_and_no_third() -> None:
 def test_the_set_of_sites_holds_nine_tenths() -> None:
     data = diagnosis("named", ("a", "x", 0.6), ("b", "y", 0.35), ("c", "z", 0.05))
     assert Answer.of(data).site_set() == ("x", "y")
+    several = diagnosis("named", ("a", "x", 0.95), ("b", "y", 0.9), ("c", "z", 0.05))
+    assert Answer.of(several).site_set() == ("x", "y")
 
 
 @pytest.mark.parametrize(("hits", "n"), [(0, 300), (3, 300), (95, 100), (10, 10)])

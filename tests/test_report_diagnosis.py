@@ -14,9 +14,10 @@ from report_kit import Page, recorded
 
 from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.insert import DISPLACEMENT
 from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.result import Band, Cause, Diagnosis, Gap, Trace, Value
-from samii_rig.diagnose.vocabulary import DISPLACEMENT, hypotheses
+from samii_rig.diagnose.vocabulary import hypotheses
 from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.report import diagnosis_words as words
@@ -272,13 +273,13 @@ def test_rivals_stand_with_the_reason_why_they_lost(tmp_path):
 
 
 def test_what_has_no_name_is_shown_without_a_law(tmp_path):
-    found = made("unknown", outside=1.0, sites=(("a_1", 1.0),))
+    found = made("unknown", outside=1.0, sites=(("a_1", 0.1),))
     _, parsed = page_of(tmp_path, found, noiseless(samii(), F))
     assert "Something is missing that has no name here" in parsed.text
     assert "do not tell where" in parsed.text
     assert "if it is here" in parsed.text
     assert words.banner(found).causes == ()
-    held = made("unknown", outside=0.1, sites=(("a_1", 1.0),))
+    held = made("unknown", outside=1.0, sites=(("a_1", 0.9),))
     assert "most likely at a_1 (90 %)" in words.banner(held).text
 
 

@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 
+from samii_rig.diagnose import insert
 from samii_rig.diagnose.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.scales import PAIRS, REACH, Places, middle, spread
-from samii_rig.rig.schema import BEAMS, Rig, RigidLink, TorsionalSpring, TranslationalSpring
+from samii_rig.rig.schema import (
+    ANGLE_SOURCES,
+    BEAMS,
+    LINES,
+    Rig,
+    RigidLink,
+    TorsionalSpring,
+    TranslationalSpring,
+)
 from samii_rig.types import Float
+
+COMPLIANCES = (1e-4, 0.01, 1.0)  # of a line's oil over the chain's own, at which a search starts
 
 
 def effects(rig: Rig, where: Places) -> Iterator[Effect]:
     """All of them on this rig."""
     yield from _joint_dampers(rig, where)
+    yield from _lines(rig, where)
     yield from _links(rig, where)
     yield from _beams(rig, where)
 
@@ -46,6 +59,41 @@ def _joint_dampers(rig: Rig, where: Places) -> Iterator[Effect]:
             touches=(key,),
             jump=Jump(f"beside {e.name}", lambda s, x: np.asarray(s * x[:, :1])),
             variant="beside the spring",
+        )
+
+
+def _lines(rig: Rig, where: Places) -> Iterator[Effect]:
+    """Oil between valve and vane that has to be moved too: a resonance of its compliance, in the
+    flow that arrives and in what gives way to the load."""
+    low_w, high_w = (2 * math.pi * float(where.frequency[i]) for i in (0, -1))
+    have = {e.source for e in rig.element if isinstance(e, LINES)}
+    for e in rig.element:
+        if not isinstance(e, ANGLE_SOURCES) or e.name in have:
+            continue
+        port = next(i for i, n in enumerate(where.names) if n[-1] == e.name)
+        x = where.strength(PAIRS.index(("theta", "M")), port)
+        if not 0 < x < math.inf:
+            continue
+        name = f"{insert.PREFIX}line_{port}"
+        scale = insert.DISPLACEMENT**2 * x  # C_h/D^2 is the compliance
+        bounds = scale / REACH[1], scale / REACH[0]
+
+        def values(x: Float, _: Values, name: str = name) -> dict[Key, float]:
+            C_h, omega, zeta = (float(v) for v in x)
+            found = {"D": insert.DISPLACEMENT, "C_h": C_h, "omega": omega, "zeta": zeta}
+            return {(name, symbol): value for symbol, value in found.items()}
+
+        yield Effect(
+            physics="hydraulic_compressibility",
+            site=e.name,
+            unknowns=(
+                Unknown("C_h", insert.VOLUME, *bounds, tuple(scale * x for x in COMPLIANCES)),
+                Unknown("omega", "rad/s", low_w, 100 * high_w, spread(low_w, 30 * high_w, 6)),
+                Unknown("zeta", "1", 0.01, 3.0, (0.15,)),
+            ),
+            build=partial(insert.line, source=e.name, name=name),
+            parameters=values,
+            variant="line",
         )
 
 

@@ -29,13 +29,13 @@ class CausalChain:
     """As `Chain`, with the stiffness of `beams` as in the file at `middle_hz`."""
 
     def __init__(self, chain: Chain, beams: tuple[str, ...], middle_hz: float) -> None:
-        self._chain, self._beams, self._middle = chain, beams, middle_hz
+        self.plain, self._beams, self._middle = chain, beams, middle_hz
         self.parameters = chain.parameters
         self._at = {key: i for i, key in enumerate(chain.parameters)}
 
     def with_values(self, values: Mapping[Key, float]) -> CausalChain:
         """As of `Chain`."""
-        return CausalChain(self._chain.with_values(values), self._beams, self._middle)
+        return CausalChain(self.plain.with_values(values), self._beams, self._middle)
 
     def response(self, frequency_hz: Float) -> Complex:
         """As of `Chain`."""
@@ -51,7 +51,7 @@ class CausalChain:
     def gradient(self, frequency_hz: Float, wrt: Sequence[Key]) -> tuple[Complex, Complex]:
         """As of `Chain`."""
         keys = list(wrt)
-        given = self._chain.values()
+        given = self.plain.values()
         stiff = [(b, s) for b in self._beams for s in STIFFNESS if (b, s) in self._at]
         every = (*keys, *(k for k in stiff if k not in keys))
         out: tuple[Complex, Complex] | None = None
@@ -81,7 +81,7 @@ class CausalChain:
         low, high = float(np.min(log)), float(np.max(log))
         nodes = np.linspace(low, high, max(2, math.ceil((high - low) / SPACING) + 1))
         step = max(nodes[1] - nodes[0], 1e-12)
-        values = self._chain.values()
+        values = self.plain.values()
         for node in nodes:
             weight = 1 - np.abs(log - node) / step
             on = np.flatnonzero(weight > 0)
@@ -93,4 +93,4 @@ class CausalChain:
                 for s in STIFFNESS
                 if (b, s) in self._at
             }
-            yield float(node), self._chain.with_values(changed), on, weight[on]
+            yield float(node), self.plain.with_values(changed), on, weight[on]

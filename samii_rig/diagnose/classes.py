@@ -17,6 +17,7 @@ from samii_rig.rig.schema import Rig
 
 SAME = 3.0  # noise units below which two explanations are one
 RIVAL = 4.0  # of the logarithm of evidence, below the first, up to which a member is a name
+TRUSTED = 0.5  # of the logarithm of evidence between members
 AS_PROBABLE = 2.0  # of the logarithm of evidence: a member with less freedom goes first
 LEAST = 1e-3  # probability of an explanation that may begin a class of its own
 LOOKED_AT = 24  # explanations for which distances are computed
@@ -40,12 +41,25 @@ class Class:
         """The most probable member."""
         return self.members[0]
 
+    @property
+    def rivals(self) -> tuple[Explanation, ...]:
+        """Members beside the first that the data leave about as probable: one that is near, but
+        on the wrong side of the data or for more freedom than they call for, is no other name."""
+        return tuple(m for m in self.members[1:] if m.weight > self.first.weight - RIVAL)
+
+    def parts(self) -> list[tuple[Explanation, float]]:
+        """The first and its rivals, each with its part of the class's probability. Their
+        evidence counts half: it takes noise and tolerances for exactly what they are said to be."""
+        some = (self.first, *self.rivals)
+        p = np.exp(TRUSTED * (np.array([m.weight for m in some]) - self.first.weight))
+        return list(zip(some, (p / p.sum()).tolist(), strict=True))
+
     def equivalents(self, effect: Effect) -> list[tuple[str, str]]:
         """Other names for one effect of the first member: its aliases, and what takes its place
-        in members that differ in nothing else."""
+        in rivals that differ in nothing else."""
         mine = {e.key for e in self.first.effects}
         out = list(effect.aliases)
-        for other in self.members[1:]:
+        for other in self.rivals:
             new = [e for e in other.effects if e.key not in mine]
             kept = {e.key for e in other.effects} & mine
             if len(new) == 1 and kept == mine - {effect.key}:
@@ -64,8 +78,7 @@ class Class:
             kept = mine - {effect.key}
             others = {
                 e.name
-                for m in self.members[1:]
-                if m.weight > self.first.weight - RIVAL
+                for m in self.rivals
                 for e in m.effects
                 if e.key not in mine
                 and {x.key for x in m.effects} & mine == kept
@@ -84,6 +97,14 @@ def distance(a: Explanation, b: Explanation, problem: Problem) -> float:
     except (SamiiRigError, np.linalg.LinAlgError):
         return math.inf
     return math.sqrt(max(end.cost - a.fitted.penalty, 0.0))
+
+
+def apart(a: Explanation, b: Explanation, problem: Problem, unit: float = 1.0) -> float:
+    """`distance` in noise units of which each is `unit`; inf where b fits worse than a by more
+    than a class is wide, so that it cannot be near."""
+    if b.fitted.cost - a.fitted.cost > (unit * (SAME + 2.5)) ** 2:
+        return math.inf
+    return distance(a, b, problem) / unit
 
 
 def classes(
@@ -105,12 +126,8 @@ def classes(
             break
         members, far, total, rest = [first], [0.0], p, []
         for other, q in left[:LOOKED_AT]:
-            # One that fits worse by more than the class is wide cannot be as near.
-            worse = other.fitted.cost - first.fitted.cost
-            near = worse < temperature * (SAME + 2.5) ** 2 and bool(other.effects) == bool(
-                first.effects
-            )
-            d = distance(first, other, problem) / unit if near else math.inf
+            alike = bool(other.effects) == bool(first.effects)
+            d = apart(first, other, problem, unit) if alike else math.inf
             if d < SAME:
                 members.append(other)
                 far.append(d)

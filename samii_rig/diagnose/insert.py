@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, get_args
 
+from samii_rig.rig.elements import quantities
 from samii_rig.rig.schema import (
     AngularVelocitySource,
     AngularVelocitySource2,
     Branch,
     Element,
+    LumpedLine,
     LumpedMass,
     Parameter,
     RelativeAngle,
@@ -18,6 +20,8 @@ from samii_rig.rig.schema import (
 )
 
 PREFIX = "added_"  # of the names of what is put in
+DISPLACEMENT = 1.475e-5  # m^3/rad, of a vane motor of a joint; C_h is stated for this one
+VOLUME = "m^3/Pa"  # of C_h
 SOURCE = "not in the nominal rig file; identified from recordings"
 
 
@@ -44,6 +48,20 @@ def oscillator(name: str) -> Branch:
     )
     mass = LumpedMass(kind="lumped_mass", name=f"{name}_mass", m=parameter(1.0, "kg"))
     return Branch(kind="branch", name=name, element=(spring, mass))
+
+
+def line(rig: Rig, source: str, name: str) -> Rig:
+    """The rig with a line in one lump right behind a source, seen by all that sees the source."""
+    units = {symbol: q.unit for symbol, q in quantities(LumpedLine).items()}
+    values = {symbol: parameter(1.0, unit) for symbol, unit in units.items()}
+    made = LumpedLine(kind="lumped_line", name=name, source=source, **values)
+    order = [e.name for e in rig.element]
+    at = order.index(source) + 1
+    behind = order[at] if at < len(order) else None
+    seen = [s.name for s in rig.sensor if isinstance(s, RelativeAngle) and source in s.across]
+    sensors = tuple(_across(s, source, behind, name, seen) for s in rig.sensor)
+    elements = (*rig.element[:at], made, *rig.element[at:])
+    return rig.model_copy(update={"element": elements, "sensor": sensors})
 
 
 def inserted(rig: Rig, after: str | None, element: Element, seen_by: Sequence[str] = ()) -> Rig:

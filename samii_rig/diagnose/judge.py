@@ -10,14 +10,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from samii_rig.diagnose.between_runs import Changing, between_runs
 from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.classes import Class, classes
 from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.measured import Measured
+from samii_rig.diagnose.own_law import OwnLaw, own_law
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Band, Cause, Gap, Value, Verdict
 from samii_rig.diagnose.search import NEAR, Explanation, Search
-from samii_rig.diagnose.stated import TINY, Evidence, probability
+from samii_rig.diagnose.stated import PLACE, TINY, Evidence, probability
 from samii_rig.signal.statistics import octaves
 from samii_rig.types import Float
 
@@ -30,6 +32,8 @@ MOST_NAMES = 4  # of a class; more is no answer
 IN_DATA = 45.0  # of chi-square, that an effect must explain of the data to be called missing
 UNEXPLAINED = 3e-4  # chance that noise leaves as much as makes an empty answer "unknown"
 DRAWS = 400
+MUST_SHOW = 900.0  # of chi-square, that an effect explains of the data: 30 noise units
+NOTHING_SAID = "no_mismatch"
 SAID = ("named", "ambiguous")  # verdicts that come with causes
 SHOWN = 0.01  # probability of an alternative from which it is listed
 # What a factor between two units is: their names are told, not physics.
@@ -45,6 +49,7 @@ class Judgement:
 
     nothing : probability of nothing missing. right : that the chosen explanation is right, up to
         its class, by its evidence. inflation : factor on covariances for what it leaves.
+    beyond : what is in no table and explains the data better; the place is then its own.
     """
 
     verdict: Verdict
@@ -53,6 +58,7 @@ class Judgement:
     right: float
     evidence: Evidence
     inflation: float
+    beyond: Changing | OwnLaw | None = None
 
     @property
     def best(self) -> Explanation:
@@ -62,11 +68,20 @@ class Judgement:
     @property
     def shares(self) -> tuple[float, ...]:
         """Probability of each class; what is left to one is of what was not looked at."""
+        return self._shared(self.right)
+
+    def _shared(self, first: float) -> tuple[float, ...]:
+        """Of each class, where that of the first is known."""
         if not self.best.effects:
             return tuple(c.probability for c in self.classes)
         others = [c.probability for c in self.classes[1:]]
-        scale = min((1 - self.right) / sum(others), 1.0) if sum(others) > 0 else 0.0
-        return (self.right, *(scale * p for p in others))
+        scale = min((1 - first) / sum(others), 1.0) if sum(others) > 0 else 0.0
+        return (first, *(scale * p for p in others))
+
+    @property
+    def placed(self) -> tuple[float, ...]:
+        """As `shares`, that each class's sites are right, whatever the physics there."""
+        return self._shared(probability(self.evidence, PLACE))
 
     @property
     def outside(self) -> float:
@@ -91,14 +106,31 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
     nothing = sum(c.probability for c in grouped if not c.first.effects)
     ordered = tuple(_chosen_first(grouped, nothing))
     evidence = _evidence(search, ordered, ranked, decide)
+    said = _verdict(ordered[0], evidence, search, decide)
+    beyond = _beyond(search, ordered[0].first, evidence, decide) if said != NOTHING_SAID else None
     return Judgement(
-        verdict=_verdict(ordered[0], evidence, search, decide),
+        verdict="unknown" if beyond else said,
         classes=ordered,
         nothing=nothing,
         right=probability(evidence),
         evidence=evidence,
         inflation=search.temperature,
+        beyond=beyond,
     )
+
+
+def _beyond(
+    search: Search, best: Explanation, evidence: Evidence, decide: Measured | None
+) -> Changing | OwnLaw | None:
+    """What is in no table and explains the data better."""
+    if any(e.quasi is not None for e in best.effects):
+        return None
+    if decide is not None and evidence.held > threshold(decide, UNEXPLAINED):
+        absorbed = evidence.drop <= IN_DATA
+        base = search.nominal if absorbed else best
+        if (changing := between_runs(search, base.fitted, decide)) is not None:
+            return changing
+    return own_law(search, best)
 
 
 def _evidence(
@@ -178,8 +210,10 @@ def doubted(judged: Judgement, most: Verdict) -> Judgement:
 
 
 def shown(judged: Judgement, gap: Gap) -> Judgement:
-    """The same, but nothing is named that makes data worse which it was not fitted to."""
-    if judged.verdict in SAID and gap.value < 0:
+    """The same, but nothing is named that makes data worse which it was not fitted to: beyond what
+    chance does, or at all if it is so large that it must show."""
+    worse = gap.high < 0 or (gap.value < 0 and judged.evidence.drop > MUST_SHOW)
+    if judged.verdict in SAID and worse:
         return replace(judged, verdict="unknown")
     return judged
 
@@ -189,10 +223,12 @@ def _decided(search: Search, lines: Measured) -> list[Explanation]:
     likely each makes lines that were not fitted; the most probable first."""
     ranked = search.ranked()
     rivals = [e for e in ranked if e.weight > ranked[0].weight - NEAR or not e.effects]
+    gross = _predicted(search, lines, search.nominal.fitted)[0]
     heard = []
     for e in rivals:
         chi2, spread = _predicted(search, lines, e.fitted)
-        heard.append(replace(e, weight=e.weight - 0.5 * (chi2 / search.temperature + spread)))
+        lost = 0.5 * (chi2 / search.temperature + spread) + search.inexact(e.effects, gross)
+        heard.append(replace(e, weight=e.weight - lost))
     return sorted(heard, key=lambda e: -e.weight)
 
 
@@ -308,6 +344,8 @@ def told(judged: Judgement) -> list[str]:
             case _ if unit:
                 g = found["gain"]
                 out.append(f"{effect.site} is {g.value:.4g} times what it should be: {unit}")
+    if judged.beyond is not None:
+        out.append(judged.beyond.told())
     many = judged.classes[0].names()
     if many > MOST_NAMES:
         alike = [" and ".join(" at ".join(e.name) for e in m.effects)
@@ -317,13 +355,18 @@ def told(judged: Judgement) -> list[str]:
 
 
 def sites(judged: Judgement) -> list[tuple[str, float]]:
-    """Probability of each site over all explanations, the most probable first."""
+    """Probability of each site over all explanations and what they are not told apart from, the
+    most probable first. Sites of what was chosen are there however improbable."""
+    if judged.beyond is not None:
+        return [(s, p) for s, p in judged.beyond.sites if p >= SHOWN]
     total: dict[str, float] = defaultdict(float)
-    for c, share in zip(judged.classes, judged.shares, strict=True):
-        for site in {e.site for e in c.first.effects if e.physics not in NOT_PHYSICS}:
-            total[site] += share
+    for c, share in zip(judged.classes, judged.placed, strict=True):
+        for member, part in c.parts():
+            for site in {e.site for e in member.effects if e.physics not in NOT_PHYSICS}:
+                total[site] += share * part
+    chosen = {e.site for e in judged.best.effects}
     ranked = sorted(total.items(), key=lambda item: -item[1])
-    return [(s, min(p, 1.0)) for s, p in ranked if p >= SHOWN]
+    return [(s, min(p, 1.0)) for s, p in ranked if p >= SHOWN or s in chosen]
 
 
 def bands(search: Search, fitted: Fitted) -> tuple[Band, ...]:
@@ -364,6 +407,6 @@ def gap(search: Search, show: Measured, before: Fitted, after: Fitted) -> Gap:
     den = (chi_before - floor)[rows].sum(axis=1)
     # Where nothing is left to be closed, only the sign of the change says anything.
     value = (a - b) / (a - 1) if a > 1 else min(a - b, 0.0)
-    drawn = num / np.where(np.abs(den) > 0, den, np.inf)
+    drawn = num / np.where(np.abs(den) > 0, np.abs(den), np.inf)
     low, high = np.quantile(drawn, [0.05, 0.95])
     return Gap(float(value), float(low), float(high))

@@ -53,8 +53,15 @@ class Grid:
         return [np.asarray(2j * np.pi * x, np.complex128) for x in f]
 
 
-def grid(rig: Rig, frequency: Float, sensor: Int, actuator: Int) -> Grid:
-    """The grid of a rig at sorted frequencies, Hz."""
+def grid(
+    rig: Rig,
+    frequency: Float,
+    sensor: Int,
+    actuator: Int,
+    chain: Chain | None = None,
+) -> Grid:
+    """The grid of a rig at sorted frequencies, Hz. chain : whose aliases these are, if they are
+    not the rig's own."""
     f = np.unique(frequency)
 
     def around(f: Float) -> Complex:
@@ -63,7 +70,7 @@ def grid(rig: Rig, frequency: Float, sensor: Int, actuator: Int) -> Grid:
 
     few = np.geomspace(f[0], f[-1], min(ALIAS_POINTS, f.size))
     few[0], few[-1] = f[0], f[-1]
-    chain = Chain(rig)
+    chain = Chain(rig) if chain is None else chain
 
     def spread(few_: Complex) -> Complex:
         return np.stack([np.interp(f, few, r) for r in few_.T], axis=1)
@@ -136,6 +143,11 @@ class Model:
             all_values.update(change)
             moved.update(change)
         return moved
+
+    def plain(self, x: Float) -> Chain:
+        """The chain at x, a loss factor the same at all frequencies."""
+        chain = self.chain.with_values(self.values(x))
+        return chain.plain if isinstance(chain, CausalChain) else chain
 
     def response(self, x: Float, at: Grid) -> Complex:
         """(n, q) at the grid's frequencies."""

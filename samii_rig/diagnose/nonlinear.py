@@ -21,9 +21,9 @@ from samii_rig.diagnose.nonlinear_confirm import seen
 from samii_rig.diagnose.nonlinear_driven import drives
 from samii_rig.diagnose.nonlinear_forces import forces
 from samii_rig.diagnose.nonlinear_levels import LevelGrid, level_grid
-from samii_rig.diagnose.nonlinear_model import LevelModel
+from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.diagnose.nonlinear_screen import Bins, Promise
-from samii_rig.diagnose.refit import Problem, refit
+from samii_rig.diagnose.refit import Fitted, Problem, refit
 from samii_rig.diagnose.search import MIXED, NEAR, WORTH, Explanation, Search
 from samii_rig.types import FrequencyResponse, Recording
 
@@ -40,8 +40,10 @@ PROMISING = 0.25  # of what the first gains in the screen, at least
 TRIED = 4  # forces that are refitted beside each base
 ALARM, BETWEEN = 14.0, 8.0  # of chi-square, and of that between levels, that a force must gain
 SHARE, MORE = 0.3, 3.0  # of what it should gain between levels, that it does
-STRONG = 150.0  # of chi-square: a force that gains more is computed anew where it was found
-AGAIN, MOVED = 2, 0.01  # times at most; change of its logarithm that is small
+AGAIN, MOVED = 4, 0.5  # times that a force is computed anew at most; a move that is small
+RIVALS, REFITTED = 4, 8  # forces that are computed each time, and explanations refitted
+ON_LINES = 2  # times that they are computed anew on the lines themselves
+LAW = 0.01  # of a strength: what it was off by where it is hidden in strong forces
 GROWN = 3  # linear effects that are refitted beside a force
 ONE_LEVEL = (
     "all runs have one amplitude: friction, deadband, backlash, hardening and saturation cannot "
@@ -113,11 +115,14 @@ def _force(search: Search, promised: Sequence[tuple[Explanation, list[Promise]]]
 
 
 def _worth(found: Sequence[Promise]) -> list[Promise]:
-    """Those that may be the best: of each physics the first, then others."""
+    """Those that may be the best: of each physics the first, and the first's at other places,
+    for torques and angles of neighbouring joints go nearly together."""
     heard = [p for p in found if _heard(p) and p.gain > PROMISING * found[0].gain]
     first = {p.effect.physics: p for p in reversed(heard)}
-    ordered = sorted(heard, key=lambda p: (p is not first[p.effect.physics], -p.gain))
-    return ordered[:TRIED]
+    most = sorted(first.values(), key=lambda p: -p.gain)[:TRIED]
+    return (
+        most + [p for p in heard if p.effect.physics == most[0].effect.physics][1:] if most else []
+    )
 
 
 def _settled(levels: Apart, table: Sequence[Effect]) -> Effect | None:
@@ -126,50 +131,100 @@ def _settled(levels: Apart, table: Sequence[Effect]) -> Effect | None:
     search = levels.search
     if _force_in(search.ranked()[0]) is None:
         return None
-    gain = search.nominal.fitted.cost - search.ranked()[0].fitted.cost
-    for _ in range(AGAIN if gain > STRONG else 0):
-        if _again(levels) < MOVED:
-            break
-    levels.inside(search.ranked()[0])
-    search.temper()
-    search.prune()
+    _again(levels)
     best = search.ranked()[0]
     forced = next((e for e in search.ranked() if _force_in(e) and len(e.effects) == 1), best)
+    before = best.key
     for base in {e.key: e for e in (best, forced)}.values():
         if _force_in(base) is not None:
             _beside(search, base, table)
     search.temper()
     search.prune()
-    levels.inside(search.ranked()[0])
-    search.temper()
+    if search.ranked()[0].key != before:
+        _again(levels)
+    if _force_in(search.ranked()[0]) is not None:
+        _on_lines(levels)
+    for key, e in search.found.items():
+        search.found[key] = replace(e, fitted=_with_law_error(e.fitted))
     return _force_in(search.ranked()[0])
 
 
-def _again(levels: Apart) -> float:
-    """Compute the force of the best explanation where it was found, and refit what has it and may
-    still compete; by how much the logarithm of its strength moved."""
+def _with_law_error(fitted: Fitted) -> Fitted:
+    """The same, the strength of a force in the loop known no better than it is computed."""
+    model = fitted.model
+    if not isinstance(model, LevelModel) or model.quasi.kind == "command":
+        return fitted
+    both = fitted.covariance()
+    both[model.unknown, model.unknown] += LAW**2
+    prior = fitted.precision() - fitted.information
+    return replace(fitted, information=np.linalg.inv(both) - prior)
+
+
+def _again(levels: Apart) -> None:
+    """Compute the leading forces where they were found and refit all that may still compete,
+    until the best explanation stands still."""
     search = levels.search
-    best = search.ranked()[0]
-    model = best.fitted.model
-    if not isinstance(model, LevelModel):
-        return 0.0
-    p = model.strength(best.fitted.x)[0]
-    if not levels.compute(model, best.fitted.x, p):
-        return 0.0
-    for e in list(search.found.values()):
-        force = _force_in(e)
-        if force is None or force.quasi != model.quasi:
-            continue
-        end = search._refit(e.effects, e) if e.weight > best.weight - NEAR else None
-        del search.found[e.key]
+    for turn in range(AGAIN):
+        best = search.ranked()[0]
+        if not isinstance(best.fitted.model, LevelModel):
+            return
+        far = math.inf if turn == 0 else NEAR
+        rivals = _computed(levels)
+        levels.renew(best)
+        ranked = search.ranked()
+        bare = (e for e in ranked if len(e.effects) == 1 and _force_in(e) is not None)
+        # The force alone stays: other linear effects are tried beside it.
+        kept = [e for e in ranked if e.weight > best.weight - far][:REFITTED]
+        _only(search, [*kept, *rivals, search.nominal, *list(bare)[:1]])
+        search.temper()
+        search.prune()
+        after = search.ranked()[0]
+        if after.key == best.key and _moved(best, after) < MOVED:
+            return
+
+
+def _computed(levels: Apart) -> list[Explanation]:
+    """The best explanation with each of the leading forces, computed where it was found."""
+    search = levels.search
+    forced = [e for e in search.ranked() if isinstance(e.fitted.model, LevelModel)]
+    first: dict[Quasi, Explanation] = {}
+    for e in forced:
+        assert isinstance(e.fitted.model, LevelModel)
+        first.setdefault(e.fitted.model.quasi, e)
+    rivals = list(first.values())[:RIVALS]
+    for e in rivals:
+        model = e.fitted.model
+        assert isinstance(model, LevelModel)
+        levels.compute(model, e.fitted.x, model.strength(e.fitted.x)[0])
+    return rivals
+
+
+def _only(search: Search, some: Sequence[Explanation]) -> None:
+    """Refit some explanations, and forget all others."""
+    search.found = {}
+    for e in {e.key: e for e in some}.values():
+        end = search._refit(e.effects, e)
         if end is not None:
             search._keep(e.effects, end)
-    after = search.found.get(best.key)
-    if after is None:
-        search.found[best.key] = best
-        return 0.0
+
+
+def _on_lines(levels: Apart) -> None:
+    """Refit the leading explanations on the lines themselves: bins about one force lose what
+    another adds, as that is no smooth curve."""
+    search = levels.search
+    for _ in range(ON_LINES):
+        rivals = _computed(levels)
+        search.problem = Problem.of(search.lines, levels.grid)
+        ranked = search.ranked()
+        near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
+        _only(search, [*near[:RIVALS], *rivals, search.nominal])
     search.temper()
-    return abs(math.log(model.strength(after.fitted.x)[0] / p))
+
+
+def _moved(before: Explanation, after: Explanation) -> float:
+    """How far a refit went, in standard deviations of what the data say."""
+    d = after.fitted.x - before.fitted.x
+    return float(np.sqrt(d @ after.fitted.precision() @ d))
 
 
 def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:

@@ -26,7 +26,8 @@ BLIND = ("output_saturation", "flow_saturation")
 CUTS = (0.003, 0.012, 0.05, 0.2, 0.5)  # off the largest command, limits that are tried first
 NEARER = (2.0, 1.4, 1.2)  # factors on that, that are tried then
 HINT = 5.0  # of chi-square, gained in the screen: less is not looked at any closer
-CLOSER = 6  # forces that are
+KEPT = 6  # forces that are kept
+FINE = 150  # bins of each level about a force in time, which varies from line to line
 
 
 @dataclass
@@ -53,11 +54,18 @@ class Apart:
                 promise = look.promise(effect, model)
                 found += [promise] if promise is not None else []
         found.sort(key=lambda p: -p.gain)
-        blind = [p for p in found[CLOSER:] if p.effect.physics in BLIND]
-        closer = [
-            p for p in (*found[:CLOSER], *blind) if p.gain > HINT or p.effect.physics in BLIND
-        ]
-        return sorted((self._closer(base, look, p) for p in closer), key=lambda p: -p.gain)
+        kept = found[:KEPT] + [p for p in found[KEPT:] if p.effect.physics in BLIND]
+        closer = [self._closer(base, look, p) if self._inexact(p) else p for p in kept]
+        return sorted((p for p in closer if p.gain > HINT), key=lambda p: -p.gain)
+
+    @staticmethod
+    def _inexact(promise: Promise) -> bool:
+        """Whether it is worth while to compute a force in time before it is refitted."""
+        quasi = promise.effect.quasi
+        assert quasi is not None
+        by_command = quasi.kind == "command"
+        likely = promise.gain > HINT or quasi.law is EXCESS
+        return likely and (by_command or promise.effect.physics in BLIND)
 
     def _closer(self, base: Explanation, look: Levels, promise: Promise) -> Promise:
         """The same with the force in time, under the inputs that were recorded."""
@@ -111,15 +119,9 @@ class Apart:
         self.search.problem, self.search.grid = self.problem, self.grid
         return True
 
-    def inside(self, best: Explanation) -> None:
-        """Take what bins lose about the best explanation: a force in time is no smooth curve, and
-        is taken out of their lines first."""
-        model, lines = best.fitted.model, self.bins.lines
-        if not isinstance(model, LevelModel) or not self.given:
-            return
-        at = self.grid.at(lines.frequency, lines.level)
-        linear = model.response(best.fitted.x, replace(at, power=None))
-        added = model.response(best.fitted.x, at) - linear
-        inside = self.bins.combined(lines.H - added).inside
-        self.problem = replace(self.problem, data=replace(self.problem.data, inside=inside))
+    def renew(self, best: Explanation) -> None:
+        """Bins anew about an explanation with a force: as that is no smooth curve in time, only
+        bins about it lose nothing of it."""
+        self.bins = Bins.of(self.bins.lines, best.fitted, self.grid, FINE)
+        self.problem = Problem.of(self.bins.combined(), self.grid)
         self.search.problem = self.problem

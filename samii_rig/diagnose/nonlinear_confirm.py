@@ -69,7 +69,7 @@ def seen(
     names = (rig.actuator[int(lines.actuator[0])].name, *lines.outputs)
     kept = periods(rig, lines, responses, runs, names)
     given = {k: blocks[:, :, 0].mean(axis=0) for k, blocks in kept.items()}
-    found = forced(model, x, at, given, model.strength(x)[0])
+    found = forced(model, x, given, model.strength(x)[0])
     if not found:
         return None
     both = power = fall = 0.0

@@ -53,7 +53,7 @@ def forces(rig: Rig, problem: Problem) -> Iterator[Effect]:
             _log("T_c", actuator.unit, WIDTHS[0] * largest, WIDTHS[1] * largest),
         )  # fmt: skip
         flow = Quasi("flow", across, None)
-        scale = _motion(rig, problem, flow, reading=1)
+        scale = _motion(rig, problem, flow)
         if scale is not None:
             top = float(np.max(scale[0]))
             yield _force(
@@ -126,9 +126,7 @@ def _largest(problem: Problem) -> float:
     return float(np.max(np.where(at.random, 3 * np.sqrt(at.driven.sum(axis=1)), sine)))
 
 
-def _motion(
-    rig: Rig, problem: Problem, quasi: Quasi, reading: int = 0
-) -> tuple[Float, Float] | None:
+def _motion(rig: Rig, problem: Problem, quasi: Quasi) -> tuple[Float, Float] | None:
     """Amplitude of what drives a force at every line, and how much a unit force moves it; None
     where nothing moves, or the force cannot act."""
     at = problem.at
@@ -138,12 +136,12 @@ def _motion(
         G = Chain(quasi.widened(rig)).response(at.frequency)
     except SamiiRigError:
         return None
-    n = len(rig.sensor) + reading
+    n = len(rig.sensor)
     rate = np.ones(at.frequency.size)
     if quasi.law is not None and quasi.law.of_speed:
         rate = 2 * np.pi * at.frequency
     A = np.abs(rate * G[:, n, int(at.actuator[0])]) * np.sqrt(2 * at.power)
-    y1 = np.abs(rate * G[:, n, -1])
+    y1 = np.abs(rate * G[:, n, -1])  # the force's own input, or the only one
     on = A > 0
     if not on.any() or not np.all(y1 > 0) or not np.all(np.isfinite(y1)):
         return None

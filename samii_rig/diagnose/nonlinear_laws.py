@@ -74,8 +74,8 @@ EXCESS = Law(
 def starved(flow: Complex, M: Complex, T_s: Strength) -> Complex:
     """Fundamental of q sqrt(1 + sign(q) M/T_s) - q: an orifice whose supply holds a torque T_s.
 
-    flow : (n,), M : (..., n) phasors, T_s : (..., 1); M is the chain's moment, which pushes
-    against a positive flow when negative.
+    flow : (n,) that the valve is told to let through, M : (..., n) phasors, T_s : (..., 1); M is
+    the chain's moment, which pushes against a positive flow when negative.
     """
     turn = np.exp(2j * np.pi * np.arange(PHASES) / PHASES)
     q, m = np.real(flow[..., None] * turn), np.real(M[..., None] * turn)

@@ -235,10 +235,10 @@ class Loop:
         assert self.at.power is not None
         a = np.sqrt(2 * self.at.power)
         size = np.where(a > 0, a, 1.0)
-        q = self.s * self.l0[:, 0]
+        q = self.at.hold
         e = np.zeros(np.broadcast_shapes(np.shape(T_s), q.shape), complex)
         for i in range(FLOW_SWEEPS):
-            M = self.l0[:, 1] + self.l1[:, 1] * e
+            M = self.l0[:, 0] + self.l1[:, 0] * e
             new = starved(q * a, M * a, T_s) / size
             for mine in self.at.together():
                 power = self.at.power[mine]

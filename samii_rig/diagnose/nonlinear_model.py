@@ -27,7 +27,6 @@ from samii_rig.model.sampled import sensor_response
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     ActuatorSpec,
-    AngularVelocitySource,
     Moment,
     Parameter,
     RelativeAngle,
@@ -37,7 +36,6 @@ from samii_rig.rig.schema import (
 from samii_rig.types import Complex, Float
 
 CAP = 1.5  # power of its height, that what a limit cuts off a sine grows with
-FAST = 1e6  # rad/s: an injected flow has no lag
 EXTRA = f"{insert.PREFIX}force"  # the input and the sensor that the chain has more
 
 Kind = Literal["joint", "ground", "drive", "command", "flow"]
@@ -50,7 +48,8 @@ class Quasi:
     kind : `joint`, a torque between both sides of `across`, driven by the angle over it;
         `ground`, a torque against the ground behind the element, driven by its angle;
         `drive`, on the input of the source, driven by the source's own angle; `command`, on
-        the input, driven by the input; `flow`, of the source, driven by flow and torque.
+        the input, driven by the input; `flow`, on the input, driven by it and by the torque
+        behind the source.
     across : elements, base to tip; of a drive or flow the source.
     law : None for flow. sign : e = sign scale N reading. scale : a parameter that multiplies it.
     """
@@ -69,7 +68,7 @@ class Quasi:
     @property
     def own_input(self) -> bool:
         """Whether the force has an input of its own."""
-        return self.kind in ("joint", "ground", "flow")
+        return self.kind in ("joint", "ground")
 
     def widened(self, rig: Rig) -> Rig:
         """The rig with the force's input behind its own and its sensors behind its own."""
@@ -89,16 +88,7 @@ class Quasi:
                     AbsoluteAngle(kind="absolute_angle", name=EXTRA, after=last, unit="rad"),
                 )
             case "flow":
-                K = Parameter(value=1.0, unit="1", source="unit flow")
-                p = Parameter(value=FAST, unit="rad/s", source="no lag")
-                flow = AngularVelocitySource(
-                    kind="angular_velocity_source", name=f"{EXTRA}_flow", input=EXTRA, K=K, p=p
-                )
-                seen = [
-                    s.name for s in rig.sensor if isinstance(s, RelativeAngle) and last in s.across
-                ]
-                rig = insert.inserted(rig, last, flow, tuple(seen))
-                sensors += (Moment(kind="moment", name=f"{EXTRA}_M", after=last, unit="N m"),)
+                sensors = (Moment(kind="moment", name=EXTRA, after=last, unit="N m"),)
         update: dict[str, object] = {"sensor": (*rig.sensor, *sensors)}
         if self.own_input:
             spec = ActuatorSpec(name=EXTRA, unit="N m", low=-1.0, high=1.0)
@@ -205,7 +195,7 @@ class LevelModel(Model):
         moved, dr = self._loop(dG @ map_[:, on], at)
         dt = np.zeros((t.size, self.n), complex)
         if self.quasi.law is None:
-            # What the chain's own parameters do to the flow that is lost is of second order.
+            # What the chain's own parameters do to the lost flow is of second order.
             dt[:, self.unknown] = (loop.force(self.quasi, p * (1 + STEP))[0] - t) / STEP
         else:
             fixed = self.quasi.kind == "command"

@@ -45,12 +45,12 @@ class Bins:
     levels: tuple[tuple[Measured, Complex, Int], ...]
 
     @classmethod
-    def of(cls, lines: Measured, fitted: Fitted, at: Grid) -> Bins:
+    def of(cls, lines: Measured, fitted: Fitted, at: Grid, bins: int = BINS) -> Bins:
         """About a fit."""
         own = [lines.take(lines.level == k) for k in np.unique(lines.level)]
         shapes = [fitted.model.response(fitted.x, at.at(o.frequency, o.level)) for o in own]
         shapes = [np.where(s == 0, 1.0, s) for s in shapes]
-        few = [binned(o, s, BINS, MOST) for o, s in zip(own, shapes, strict=True)]
+        few = [binned(o, s, bins, MOST) for o, s in zip(own, shapes, strict=True)]
         # Edges half way between the bins of the level that shows most.
         f = max(few, key=lambda part: part.n).frequency
         edges = np.sqrt(f[1:] * f[:-1])

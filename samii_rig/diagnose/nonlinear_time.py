@@ -68,8 +68,8 @@ def _force(
     if code == LIMIT:
         return scale * (y - min(max(y, -p), p))
     if code == FLOW:
-        left = 1.0 + other / p if free >= 0.0 else 1.0 - other / p
-        return float(free * (np.sqrt(max(left, 0.0)) - 1.0))
+        left = 1.0 + other / p if y >= 0.0 else 1.0 - other / p
+        return float(y * (np.sqrt(max(left, 0.0)) - 1.0))
     return 0.0
 
 
@@ -113,13 +113,12 @@ def _run(
                 for k in range(n_pole):
                     total += (R[k, i, j] * z[k, j]).real
             y[step, i] = total
-        if code in (DRY, FLOW):
+        if code == DRY:
             for j in range(n_in):
                 given = u if j == 0 else 0.0
                 for k in range(n_pole):
-                    ahead = grow[k] * z[k, j] + push[k] * given if code == DRY else z[k, j]
-                    if code == DRY or j == 0:
-                        free += (R[k, at, j] * (poles[k] * ahead + given)).real
+                    ahead = grow[k] * z[k, j] + push[k] * given
+                    free += (R[k, at, j] * (poles[k] * ahead + given)).real
         if code != NONE:
             reads = u if command else y[step, at]
             other = y[step, n_out - 1]
@@ -172,7 +171,7 @@ def simulate(
     y = _run(
         poles, grow, push, np.ascontiguousarray(R), made.direct,
         np.ascontiguousarray(v, np.float64), late, inner, len(rig.sensor),
-        code, quasi is not None and quasi.kind == "command",
+        code, quasi is not None and quasi.kind in ("command", "flow"),
         strength, sign, 1 if quasi is not None and quasi.own_input else 0,
     )  # fmt: skip
     out = np.empty((v.size, len(rig.sensor)))

@@ -94,6 +94,11 @@ class Fitted:
         log_det = float(np.linalg.slogdet(A + np.eye(self.model.n))[1])
         return -0.5 * self.chi2 / temperature - 0.5 * self.penalty - 0.5 * log_det
 
+    def away(self, other: Fitted) -> float:
+        """How far another refit of the same model ended, in standard deviations of this one."""
+        d = other.x - self.x
+        return math.sqrt(max(float(d @ self.precision() @ d), 0.0))
+
     def covariance(self) -> Float:
         """(n_x, n_x) of the logarithms."""
         return np.asarray(np.linalg.inv(self.precision()))

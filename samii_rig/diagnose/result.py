@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+from samii_rig.display import card
 from samii_rig.rig.schema import Rig
-from samii_rig.types import Complex, Float
+from samii_rig.types import Complex, Float, FrequencyResponse
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from plotly.graph_objects import Figure
 
 Verdict = Literal["no_mismatch", "named", "ambiguous", "unknown"]
 
@@ -159,6 +165,39 @@ class Diagnosis:
         """Three lines for a person: what, how sure and how much better, what next."""
         return (self._what(), self._how_well(), self._next())
 
+    def plot(
+        self,
+        responses: Sequence[FrequencyResponse] = (),
+        rig: Rig | None = None,
+        output: str = "",
+        input: str = "",
+    ) -> Figure:
+        """With the responses and the rig that were diagnosed, one entry before and after; with
+        none, what is missing at the most probable place, free of any law."""
+        from samii_rig.report.notebook import before_after, place
+
+        return before_after(self, responses, rig, output, input) if rig else place(self)
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (
+                c.physics.replace("_", " "),
+                c.site,
+                f"{c.probability:.0%}",
+                ", ".join(
+                    f"{k} = {v.value:.4g} {v.unit} ({v.low:.4g} to {v.high:.4g})"
+                    for k, v in c.parameters.items()
+                ),
+                ", ".join(f"{p.replace('_', ' ')} at {s}" for p, s in c.equivalents),
+            )
+            for c in self.causes
+        ]
+        what, how_well, next_ = self.lines()
+        sites = ", ".join(f"{s} {p:.0%}" for s, p in self.sites[:4])
+        facts = {"found": what, "fit": how_well, "next": next_, "places": sites}
+        head = ("left out", "at", "probability", "parameters (90 %)", "not told apart from")
+        return card("Diagnosis", facts, head, rows)
+
     def _what(self) -> str:
         match self.verdict:
             case "no_mismatch":
@@ -186,7 +225,7 @@ class Diagnosis:
         )
 
     def _next(self) -> str:
-        parts = list(self.not_physics[:1])
+        parts = [f"{told[0].upper()}{told[1:].rstrip('.')}." for told in self.not_physics[:1]]
         if self.experiment:
             parts.append(f"Next: {self.experiment} ({self.why}).")
         return " ".join(parts) or "No further experiment is needed."

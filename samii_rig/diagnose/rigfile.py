@@ -28,7 +28,7 @@ def explained(fitted: Fitted) -> Rig:
         for key in effect.parameters(theta, {**model.nominal, **values}):
             spread[key] = min(width, 10.0)
     rig = model.built.model_copy(
-        update={"element": tuple(_valued(e, values, spread) for e in model.built.element)}
+        update={"element": tuple(valued(e, values, spread) for e in model.built.element)}
     )
     for effect, theta in zip(model.effects, model.parts(x), strict=True):
         rig = effect.write(rig, theta)
@@ -40,9 +40,10 @@ def explained(fitted: Fitted) -> Rig:
     return rig
 
 
-def _valued(
+def valued(
     element: Any, values: dict[tuple[str, str], float], spread: dict[tuple[str, str], float]
 ) -> Any:
+    """An element with other values of its parameters, and their tolerances."""
     update: dict[str, Any] = {}
     for symbol, p in iter(element):
         key = (element.name, symbol)
@@ -56,7 +57,7 @@ def _valued(
                 change["source"] = "identified from recordings; not in the nominal rig file"
             update[symbol] = p.model_copy(update=change)
     if getattr(element, "kind", "") == "branch":
-        update["element"] = tuple(_valued(e, values, spread) for e in element.element)
+        update["element"] = tuple(valued(e, values, spread) for e in element.element)
     return element.model_copy(update=update)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.measured import Measured, binned
-from samii_rig.diagnose.model import Grid, Model
+from samii_rig.diagnose.model import Grid, Model, grid
 from samii_rig.diagnose.nonlinear_model import model_of
 from samii_rig.diagnose.ranking import moved, ranking
 from samii_rig.diagnose.refit import STEPS, Fitted, Problem, refit
@@ -42,6 +42,8 @@ MOST_SATURATED = 12  # of these places
 WEAK = (4, 5, 6)  # tenths of the range at which they start
 BEAM = 2  # explanations that are grown further
 HOPELESS = 20.0  # times the best chi-square, above which an explanation is let go
+AGAIN, STILL = 4, 0.3  # times that bins are made anew at most, and a move that is none
+SWAPS = 2  # rounds of them, the second about what won the first
 ANYHOW = 2  # of the most promising in another's place are refitted whatever the screen says
 SHARE = 0.3  # of the best candidate's gain: one that promises less is not refitted
 GROSS = 8.0  # chi-square over its mean above which candidates race before they are refitted
@@ -109,9 +111,13 @@ class Search:
         """Logarithm of evidence times prior, less what effects beside the first must be worth
         where the mismatch is gross: they may not live on what models are not exact to."""
         effects = tuple(effects)
-        inexact = EXACT**2 * self._gross / self.temperature
-        beside = 0.5 * inexact * max(len(effects) - 1, 0)
+        beside = self.inexact(effects, self._gross)
         return fitted.evidence(self.temperature) + self.log_prior(effects) - beside
+
+    def inexact(self, effects: Sequence[Effect], gross: float) -> float:
+        """Logarithm of evidence that effects beside the first must be worth on lines where the
+        nominal model leaves `gross` of chi-square."""
+        return 0.5 * EXACT**2 * gross / self.temperature * max(len(effects) - 1, 0)
 
     def temper(self) -> None:
         """Take the temperature of the explanation that fits best, and weigh all anew.
@@ -156,7 +162,7 @@ class Search:
             before = self._nearest() if turn == 0 else self.ranked()[0]
             if not before.effects:
                 break
-            self._renew(before)
+            self.renew(before)
             if turn == 0 and not self._enough(self.ranked()[0]):
                 self.saturate(SATURATED)
             for base in self._beam():
@@ -165,11 +171,15 @@ class Search:
             self.prune()
             if self.ranked()[0].key == before.key:
                 break
-        best = self.ranked()[0]
-        if best.effects:
+        for _ in range(SWAPS):
+            best = self.ranked()[0]
+            if not best.effects:
+                break
             self.swap(best)
             self.temper()
             self.prune()
+            if self.ranked()[0].key == best.key:
+                break
         return self.ranked()
 
     def log_prior(self, effects: Iterable[Effect]) -> float:
@@ -316,7 +326,7 @@ class Search:
         """Every effect of `whole` taken out, and every other tried in its place, about where
         `whole` left the rest."""
         enough = whole.fitted.cost + 4 * NEAR * self.temperature
-        for i in range(len(whole.effects)):
+        for i, gone in enumerate(whole.effects):
             base = self.bare(whole, i)
             if base is None:
                 continue
@@ -324,7 +334,9 @@ class Search:
             for rank, (drop, effect, starts) in enumerate(screened[: LATER + 1]):
                 effects = (*base.effects, effect)
                 done = frozenset(e.key for e in effects) in self.found or self._mixed(effects)
-                if done or (rank >= ANYHOW and base.fitted.cost - drop > enough):
+                # At the place of what was taken out a simpler law may do what that did.
+                there = effect.jump and gone.jump and effect.jump.place == gone.jump.place
+                if done or (rank >= ANYHOW and not there and base.fitted.cost - drop > enough):
                     continue
                 end = self._refit(effects, base, np.log(starts[0]).tolist(), enough)
                 if end is not None:
@@ -363,28 +375,46 @@ class Search:
         best = ranked[0]
         size = len(best.effects)
         near = [e for e in ranked if len(e.effects) == size]
-        return near[:1] if self._enough(best) else near[:BEAM]
+        grown = near[:1] if self._enough(best) else near[:BEAM]
+        if size > MIXED:  # many places of one physics may stand for two of different physics
+            one = [e for e in ranked if len(e.effects) == 1]
+            grown += [e for e in one if e.weight > best.weight - 4 * NEAR][:1]
+        return grown
 
     def _enough(self, explanation: Explanation) -> bool:
         """Whether what an explanation leaves is near what noise would."""
         return explanation.fitted.chi2 < ENOUGH * self.problem.expected
 
-    def _renew(self, best: Explanation) -> None:
-        """Bins anew about the best explanation, and what may still compete refitted on them."""
+    def renew(self, best: Explanation) -> None:
+        """Bins anew about the best explanation until it stands still, for bins about a model that
+        is off lead to one that is; and what may still compete refitted on them."""
         keep = [
             e
             for e in self.ranked()[:FIRST]
             if e.weight > best.weight - 4 * NEAR and e.fitted.cost < HOPELESS * best.fitted.cost
         ]
         nominal = self.nominal
-        self._rebin(best.fitted)
+        for _ in range(AGAIN):
+            self._rebin(best.fitted)
+            end = self._refit(best.effects, best)
+            if end is None:
+                break
+            still = best.fitted.away(end) < STILL
+            best = replace(best, fitted=end)
+            if still:
+                break
         self.found.clear()
-        for e in {e.key: e for e in (*keep, nominal)}.values():
+        for e in {e.key: e for e in (*keep, best, nominal)}.values():
             end = self._refit(e.effects, e)
             if end is not None:
                 self._keep(e.effects, end)
 
     def _rebin(self, fitted: Fitted) -> None:
+        """Bins, and aliases, as of this model: those of a rigid joint are not those of one that
+        gives, by as little as a large effect leaves room for a small one."""
+        old = self.grid
+        chain = fitted.model.plain(fitted.x)
+        self.grid = grid(self.rig, old.frequency, old.sensor, old.actuator, chain)
         at = self.grid.at(self.lines.frequency)
         shape = fitted.model.response(fitted.x, at)
         misfit = fitted.cost / self.problem.expected

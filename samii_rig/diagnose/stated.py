@@ -17,6 +17,7 @@ from importlib import resources
 from typing import Any
 
 FILE = "calibration.toml"
+ANSWER, PLACE = "weights", "place"  # tables of it
 ODDS = 8.0  # of a logarithm: beyond, evidence says no more
 LEFT = 3.0  # the same of what is left, chi-square per degree of freedom
 TINY = 1e-300
@@ -72,14 +73,17 @@ class Evidence:
 
 
 @cache
-def weights() -> Mapping[str, float]:
-    """Of each feature, from `calibration.toml`."""
+def weights(of: str = ANSWER) -> Mapping[str, float]:
+    """Of each feature, from a table of `calibration.toml`; a file without a table for places says
+    of a place what it says of the answer."""
     text = resources.files("samii_rig.diagnose").joinpath(FILE).read_text("utf-8")
-    return {k: float(v) for k, v in tomllib.loads(text)["weights"].items()}
+    tables = tomllib.loads(text)
+    return {k: float(v) for k, v in tables.get(of, tables[ANSWER]).items()}
 
 
-def probability(evidence: Evidence) -> float:
-    """That the explanation is right, up to its class."""
-    w = weights()
+def probability(evidence: Evidence, of: str = ANSWER) -> float:
+    """That the explanation is right, up to its class; of `PLACE`, that one of its causes is where
+    something is missing, whatever it is called."""
+    w = weights(of)
     score = sum(w[k] * x for k, x in evidence.features().items())
     return 1 / (1 + math.exp(-min(max(score, -30.0), 30.0)))

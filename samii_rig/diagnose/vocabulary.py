@@ -17,6 +17,7 @@ import numpy as np
 
 from samii_rig.diagnose import bodies, channels, insert
 from samii_rig.diagnose.effect import Effect, Jump, Key, Unknown, Values
+from samii_rig.diagnose.insert import DISPLACEMENT, VOLUME
 from samii_rig.diagnose.scales import PAIRS, REACH, Places, middle, places, spread
 from samii_rig.model.tmm import State
 from samii_rig.rig.elements import quantities
@@ -36,9 +37,8 @@ from samii_rig.types import Complex, Float
 Law = Literal["spring", "softness", "column", "damper", "slip", "mass"]
 LOSS = (1e-4, 10.0)  # damping force over spring force in mid band
 LOSS_STARTS = (0.05,)
+MOST_DAMPED = 0.3  # damping ratio of an oscillator; with more it is a damper and does not resonate
 JOINTS = (TorsionalSpring, TranslationalSpring, *ANGLE_SOURCES)
-VOLUME = "m^3/Pa"  # of C_h
-DISPLACEMENT = 1.475e-5  # m^3/rad, of a vane motor of a joint; C_h is stated for this one
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,6 +256,7 @@ def _oscillators(rig: Rig, where: Places) -> Iterator[Effect]:
         if not 0 < x < math.inf:
             continue
         scale = x / w**2
+        masses = (1e-5 * scale, 3 * scale)
         name = f"{insert.PREFIX}oscillator_{port}"
         after = names[0] if port > 0 else None
 
@@ -275,11 +276,9 @@ def _oscillators(rig: Rig, where: Places) -> Iterator[Effect]:
             physics="attached_oscillator",
             site=site,
             unknowns=(
-                Unknown(
-                    "m", "kg", 1e-4 * scale, 30 * scale, (3e-4 * scale, 3e-3 * scale, 0.03 * scale)
-                ),
-                Unknown("k", "N/m", low_w / 2, 2 * high_w, spread(low_w, high_w, 48)),
-                Unknown("c", "N s/m", 1e-3, 1.0, (0.05,)),
+                Unknown("m", "kg", *masses, spread(*masses, 7)),
+                Unknown("k", "N/m", low_w, 2 * high_w, spread(low_w, high_w, 48)),
+                Unknown("c", "N s/m", 1e-3, MOST_DAMPED, (0.05,)),
             ),
             build=build,
             parameters=values,

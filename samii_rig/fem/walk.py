@@ -29,6 +29,7 @@ from samii_rig.rig.schema import (
     Element,
     ForceSource,
     GravityStiffness,
+    LumpedLine,
     LumpedMass,
     Moment,
     OilColumn,
@@ -122,6 +123,8 @@ class Walk:
                 # A volume D turns by pressure times C_h: compliance C_h/D^2.
                 if e.C_h.value > 0:
                     self._spring(self._joint(e.name), e.D.value**2 / e.C_h.value)
+            case LumpedLine():
+                self._line(e)
             case TranslationalSpring():
                 self.w = {**self.w, **self._new()}
                 self._spring(self._n - 1, e.k.value, e.c.value)
@@ -183,6 +186,14 @@ class Walk:
     def _spring(self, coordinate: int, k: float, c: float = 0.0) -> None:
         self._K.add([coordinate], k)
         self._C.add([coordinate], c)
+
+    def _line(self, e: LumpedLine) -> None:
+        """The oil gives way in a coordinate of its own; what the source lets in moves with what
+        it gives, and the line's inertance with both."""
+        k, omega = e.D.value**2 / e.C_h.value, e.omega.value
+        source, oil = self._joints[e.source], self._joint(e.name)
+        self._spring(oil, k, 2 * e.zeta.value * k / omega)
+        self._M.add([source, oil], np.full((2, 2), k / omega**2))
 
     def _source(
         self,

@@ -32,12 +32,12 @@ from samii_rig.model.registers import (
 from samii_rig.model.sensing import source_feed, terms
 from samii_rig.rig.schema import (
     BEAMS,
+    LINES,
     SOURCES,
     Acceleration,
     Beam,
     Branch,
     Element,
-    HydraulicLine,
     LumpedMass,
     Rig,
     RigidLink,
@@ -66,7 +66,7 @@ class CompiledChain:
     fixed, source_fixed : what is added to the parameters there: a beam's part is shorter
         than the beam by what lies before it.
     kinds : kind of each element, by name; sources : of each source.
-    lines : (n_source,) whether a line follows.
+    lines : (n_source,) kind of the line that follows, "" for none.
     points, waves, poles : the elements of kind JUMP or HINGE, of kind WAVES, and those whose
         law may have poles.
     at_end : (sensor, port, index into `parameters`) of an accelerometer at the very end of a
@@ -87,7 +87,7 @@ class CompiledChain:
     source_values: Float
     kinds: tuple[str, ...]
     sources: tuple[str, ...]
-    lines: tuple[bool, ...]
+    lines: tuple[str, ...]
     points: tuple[int, ...]
     waves: tuple[int, ...]
     poles: tuple[int, ...]
@@ -164,7 +164,7 @@ class _Parts:
         self.sources: list[str] = []
         self.source: list[tuple[int, int]] = []
         self.source_slots: list[list[int]] = []
-        self.lines: list[bool] = []
+        self.lines: list[str] = []
         self.branches: list[tuple[int, CompiledChain, int]] = []
         self.rigid: set[int] = set()
         self.rows = {JUMP: 0, WAVES: 0}
@@ -180,9 +180,9 @@ class _Parts:
         if isinstance(element, SOURCES):
             self._source(element, dict(zip(own, index, strict=True)))
             index = []
-        elif isinstance(element, HydraulicLine):
-            self.lines[-1] = True
-            self.source_slots[-1][LINE_AT:] = index
+        elif isinstance(element, LINES):
+            self.lines[-1] = element.kind
+            self.source_slots[-1][LINE_AT : LINE_AT + len(index)] = index
         elif isinstance(element, LumpedMass):
             index = [-1, -1, *index]  # a link of no length
         elif isinstance(element, Branch):
@@ -226,7 +226,7 @@ class _Parts:
         self.source.append((len(self.op), self.inputs.index(element.input)))
         self.source_slots.append(slots + [-1] * (SOURCE_WIDTH - len(slots)))
         self.sources.append(element.kind)
-        self.lines.append(False)
+        self.lines.append("")
 
 
 def compile_chain(rig: Rig, extra: Mapping[str, Sequence[float]] | None = None) -> CompiledChain:

@@ -9,7 +9,7 @@ import numpy as np
 
 from samii_rig.model import respond, timoshenko
 from samii_rig.model.chain import LINE_AT, SOURCE_WIDTH, WIDTH, CompiledChain
-from samii_rig.model.laws import POINTS, SOURCE_LAWS, line_filter, line_filter_relative
+from samii_rig.model.laws import LINE_FILTERS, POINTS, SOURCE_LAWS
 from samii_rig.model.registers import Factors
 from samii_rig.types import Complex, Float
 
@@ -42,11 +42,13 @@ def _drive(c: CompiledChain, s: Complex, slopes: bool) -> tuple[Complex, Complex
         drive[i] = law.value(s, p)
         d = law.relative(s, p) if slopes else np.zeros((0, s.size), complex)
         if line:
-            drive[i] *= line_filter(s, p[LINE_AT:])
+            passed, relative = LINE_FILTERS[line]
+            drive[i] *= passed(s, p[LINE_AT:])
             if slopes:
                 padded = np.zeros((SOURCE_WIDTH, s.size), complex)
                 padded[: d.shape[0]] = d
-                padded[LINE_AT:] = p[0] * line_filter_relative(s, p[LINE_AT:])
+                by_line = p[0] * relative(s, p[LINE_AT:])
+                padded[LINE_AT : LINE_AT + len(by_line)] = by_line
                 d = padded
         slopes_of.append(d)
     if len(slopes_of) == 1:

@@ -178,6 +178,57 @@ def line_filter_relative(s: Complex, p: Float) -> Complex:
     return np.asarray(-line.tanh()[0] / 2 * line.q_slopes())
 
 
+def _clear_lump(s: Complex, p: Float) -> Clearing:
+    """1 + 2 zeta s/omega + s^2/omega^2 of a `schema.LumpedLine`, p = (D, C_h, omega, zeta)."""
+    w, zeta = p[2:4]
+    return np.asarray(1 + 2 * zeta * s / w + (s / w) ** 2), 0.0
+
+
+def _lump(s: Complex, p: Float) -> Complex:
+    return np.asarray(p[1] / p[0] ** 2 * _inverse(np.asarray(_clear_lump(s, p)[0])))
+
+
+def _lump_slopes(s: Complex, p: Float) -> Complex:
+    x = _lump(s, p)
+    by_w, by_zeta = _of_lump(s, p)
+    N = _clear_lump(s, p)[0]
+    return np.stack([-2 * x / p[0], x / p[1], -x * by_w / N, -x * by_zeta / N])
+
+
+def _of_lump(s: Complex, p: Float) -> tuple[Complex, Complex]:
+    """Derivatives of 1 + 2 zeta s/omega + s^2/omega^2 by omega and zeta."""
+    w, zeta = p[2:4]
+    return -2 * s * (zeta / w**2 + s / w**3), 2 * s / w
+
+
+def _lump_filter(s: Complex, p: Float) -> Complex:
+    """(1 + 2 zeta s/omega)/(1 + 2 zeta s/omega + s^2/omega^2)."""
+    w, zeta = p[2:4]
+    return np.asarray((1 + 2 * zeta * s / w) * _inverse(np.asarray(_clear_lump(s, p)[0])))
+
+
+def _lump_filter_relative(s: Complex, p: Float) -> Complex:
+    """(4, n) derivatives of its logarithm by the line's parameters."""
+    w, zeta = p[2:4]
+    numerator, N = 1 + 2 * zeta * s / w, _clear_lump(s, p)[0]
+    by_w, by_zeta = _of_lump(s, p)
+    zero = np.zeros_like(s)
+    return np.stack(
+        [
+            zero,
+            zero,
+            -2 * zeta * s / w**2 / numerator - by_w / N,
+            2 * s / w / numerator - by_zeta / N,
+        ]
+    )
+
+
+# By kind of line: what arrives at its vane of the flow into it, and the derivatives of its log.
+LINE_FILTERS = {
+    "hydraulic_line": (line_filter, line_filter_relative),
+    "lumped_line": (_lump_filter, _lump_filter_relative),
+}
+
 # By kind of element, parameters in the order of its class.
 POINTS: dict[str, Law] = {
     "torsional_spring": Law(THETA_M, _compliance, _compliance_slopes, _clear_spring),
@@ -194,6 +245,7 @@ POINTS: dict[str, Law] = {
     "gravity_stiffness": Law(M_THETA, _constant, _constant_slopes),
     "oil_column": Law(THETA_M, _oil, _oil_slopes),
     "hydraulic_line": Law(THETA_M, _line, _line_slopes, _clear_line),
+    "lumped_line": Law(THETA_M, _lump, _lump_slopes, _clear_lump),
 }
 
 

@@ -24,6 +24,7 @@ from samii_rig.model.realise import LOSS_LOW, search_region, source_poles
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import (
     SOURCES,
+    LumpedLine,
     Rig,
     TorsionalSpring,
     TranslationalSpring,
@@ -199,7 +200,7 @@ def own_poles(rig: Rig, actuator: str) -> tuple[complex, ...]:
 
 
 def undamped(model: Rig | Chain) -> Chain:
-    """The chain with every c, eta, tau and line resistance 0.
+    """The chain with every c, eta, tau, resistance and damping ratio of a line 0.
 
     Raises InputError for a damper without a spring.
     """
@@ -210,5 +211,6 @@ def undamped(model: Rig | Chain) -> Chain:
                 chain.rig.name, f"{e.name}.k", e.k.value,
                 "more than 0: a damper alone has no undamped counterpart; poles() bears it",
             )  # fmt: skip
-    losses = {key: 0.0 for key in chain.parameters if key[1] in LOSSES}
+    lumps = [(e.name, "zeta") for e in chain.rig.element if isinstance(e, LumpedLine)]
+    losses = {key: 0.0 for key in chain.parameters if key[1] in LOSSES or key in lumps}
     return chain.with_values(losses) if losses else chain

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize, special
 
-from samii_rig.diagnose.stated import Evidence
+from samii_rig.diagnose.stated import ANSWER, PLACE, Evidence
 from samii_rig.errors import InputError
 from samii_rig.prove.trial import Answer, Trial, Truth
 from samii_rig.record.export import replacing
@@ -33,6 +33,16 @@ def row(truth: Truth, answer: Mapping[str, Any]) -> tuple[Evidence, bool] | None
     said = replace(Answer.of({**answer, "causes": told["causes"]}), verdict="named")
     known = {f.name: told[f.name] for f in fields(Evidence)}
     return Evidence(**known), len(Trial(truth, said).matches()) == len(said.causes)
+
+
+def places(truth: Truth, answer: Mapping[str, Any]) -> list[tuple[Evidence, bool]]:
+    """Evidence of the most probable explanation, once for each of its causes, and whether
+    something is concealed at that cause's site, or at one it is not told apart from."""
+    told = answer["evidence"]
+    known = Evidence(**{f.name: told[f.name] for f in fields(Evidence)})
+    causes = Answer.of({**answer, "causes": told["causes"]}).causes
+    hidden = {e.site for e in truth.effects}
+    return [(known, bool(hidden & {site for _, site in c.names})) for c in causes]
 
 
 def fit(rows: Sequence[tuple[Evidence, bool]]) -> dict[str, float]:
@@ -55,8 +65,16 @@ def fit(rows: Sequence[tuple[Evidence, bool]]) -> dict[str, float]:
     return dict(zip(names, found.x.tolist(), strict=True))
 
 
-def write(path: Path, weights: Mapping[str, float], trials: str) -> None:
-    """The file that `diagnose.stated` reads; `trials` says where the weights come from."""
-    lines = [f"# {trials}", "[weights]", *(f"{k} = {v:.4g}" for k, v in weights.items())]
+def write(
+    path: Path, weights: Mapping[str, float], trials: str, place: Mapping[str, float] | None = None
+) -> None:
+    """The file that `diagnose.stated` reads; `trials` says where the weights come from.
+
+    place : weights of what is said of places, from `places`; without them, those of the answer.
+    """
+    lines = [f"# {trials}"]
+    for table, found in ((ANSWER, weights), (PLACE, place or {})):
+        if found:
+            lines += [f"[{table}]", *(f"{k} = {v:.4g}" for k, v in found.items())]
     with replacing(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -14,15 +14,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from concurrent.futures import Executor, Future, as_completed
 from dataclasses import asdict, dataclass
-from importlib import import_module, metadata
-from multiprocessing import get_context
+from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -30,7 +28,7 @@ import numpy as np
 
 from samii_rig.diagnose.stated import Evidence
 from samii_rig.errors import InputError, SamiiRigError
-from samii_rig.prove.calibrate import row
+from samii_rig.prove.calibrate import places, row
 from samii_rig.prove.trial import Answer, Hidden, Trial, Truth
 from samii_rig.record.export import replacing
 from samii_rig.record.reader import read_notes, read_recording
@@ -99,28 +97,6 @@ def carry_out(
     return failures
 
 
-@contextmanager
-def workers(n: int | None, scheduler: str = "") -> Iterator[Executor]:
-    """An executor: `n` processes here (None: one a core), or a dask.distributed cluster."""
-    if scheduler:
-        try:
-            distributed: Any = import_module("distributed")
-        except ImportError as error:
-            expected = "dask.distributed to be installed (pip install samii-rig[cluster])"
-            raise InputError("samii-rig prove", "--scheduler", scheduler, expected) from error
-        try:
-            client = distributed.Client(scheduler, timeout="10s")
-        except (OSError, ValueError) as error:
-            expected = "the address of a dask scheduler that answers"
-            raise InputError("samii-rig prove", "--scheduler", scheduler, expected) from error
-        with client:
-            yield client.get_executor(pure=False)
-        return
-    # Fresh processes: a forked one would share the threads of numerical libraries.
-    with ProcessPoolExecutor(n or os.cpu_count(), mp_context=get_context("spawn")) as pool:
-        yield pool
-
-
 def _one(campaign: Campaign, kind: str, seed: int) -> None:
     """Make one trial, then have a process that sees no truth diagnose it."""
     folder = plant(campaign.plant)(kind, seed, campaign.out, campaign.rig_toml)
@@ -178,9 +154,10 @@ def _check_hash(folder: Path, truth: Path) -> None:
 
 
 class _Reader:
-    """The diagnosing process of this process; one serves many trials, as its imports take long."""
+    """The diagnosing process of this thread (a worker of a cluster may have several); one serves
+    many trials, as its imports take long."""
 
-    _running: ClassVar[dict[Path, _Reader]] = {}
+    _running: ClassVar[dict[tuple[Path, int], _Reader]] = {}
 
     def __init__(self, truths: Path) -> None:
         self._process = subprocess.Popen(
@@ -194,9 +171,10 @@ class _Reader:
     @classmethod
     def of(cls, truths: Path) -> _Reader:
         """The one that must not see `truths`; started when there is none or it has died."""
-        reader = cls._running.get(truths)
+        key = truths, threading.get_ident()
+        reader = cls._running.get(key)
         if reader is None or reader._process.poll() is not None:
-            reader = cls._running[truths] = cls(truths)
+            reader = cls._running[key] = cls(truths)
         return reader
 
     def diagnose(self, folder: Path) -> dict[str, Any]:
@@ -222,6 +200,11 @@ def results(out: Path) -> list[Trial]:
 def evidence(out: Path) -> list[tuple[Evidence, bool]]:
     """Of every trial in which an effect was found: its evidence, and whether it was right."""
     return [found for truth, said in _answers(out) if (found := row(truth, said)) is not None]
+
+
+def place_evidence(out: Path) -> list[tuple[Evidence, bool]]:
+    """The same of each cause's place."""
+    return [found for truth, said in _answers(out) for found in places(truth, said)]
 
 
 def _answers(out: Path) -> Iterator[tuple[Truth, dict[str, Any]]]:

@@ -31,19 +31,13 @@ def hide(folder: Path) -> None:
 def diagnose_folder(folder: Path) -> dict[str, Any]:
     """The diagnosis of all recordings in a folder, by the rig file that they carry, and the
     evidence that its probability rests on."""
-    from samii_rig.diagnose.diagnose import diagnose
+    from samii_rig.diagnose.batch import How, together
     from samii_rig.errors import InputError
-    from samii_rig.record.reader import read_recording
-    from samii_rig.rig.load import parse
-    from samii_rig.rig.schema import Rig
-    from samii_rig.signal.estimate import estimate
 
     logs = sorted(folder.glob("*.mcap"))
     if not logs:
         raise InputError(str(folder), "", "no recording", "a folder with .mcap files")
-    recordings = [read_recording(log) for log in logs]
-    rig = parse(Rig, recordings[0].rig_toml, str(logs[0]))
-    found = diagnose(estimate(recordings), rig, runs=recordings)
+    found = together(logs, How(gaps="refuse"))
     return {**found.plain(), "evidence": found.evidence}
 
 

@@ -262,10 +262,16 @@ def scores(trials: Sequence[Trial]) -> list[Score]:
     ]
     out.append(median("gap closed on data not used, from 30 sigma", gaps, at_least(0.9)))
     every = [
-        t.answer.gap_closed for t in trials if t.answer.speaks and t.answer.gap_closed is not None
+        t.answer.gap_closed
+        for t in above(trials, 30.0)
+        if t.answer.speaks and t.answer.gap_closed is not None
     ]
     out.append(
-        frequency("named though the gap did not close", [g < 0 for g in every], at_most(0.0))
+        frequency(
+            "named though the gap did not close, from 30 sigma",
+            [g < 0 for g in every],
+            at_most(0.0),
+        )
     )
     return out
 

@@ -10,18 +10,19 @@ refit goes far.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from samii_rig.diagnose.classes import SAME
+from samii_rig.diagnose.classes import SAME, apart
 from samii_rig.diagnose.diagnose import table
 from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.measured import Measured
 from samii_rig.diagnose.model import grid
 from samii_rig.diagnose.search import FIRST, Explanation, Search
+from samii_rig.prove.trial import Name
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 
@@ -34,14 +35,16 @@ class Sized:
     """How large a concealed effect is, and how many single effects these data cannot tell from it.
 
     size : sigma. names, sites : of the effects, structural twins as one, and of their places, that
-    stay nearer to the noise-free truth than `classes.SAME`; 0 where it is not one effect.
-    said : how many such names an answer gave.
+    come nearer than `classes.SAME` to the concealed effect as it fits the noise-free truth; 0
+    where it is not one effect, or none that has a linear model. said : the fewest effects of the
+    table that bear all names that an answer gave. twins : other sites of the concealed effect.
     """
 
     size: float
     names: int = 0
     sites: int = 0
     said: int = 0
+    twins: tuple[str, ...] = ()
 
 
 def size_of(
@@ -60,31 +63,53 @@ def size_of(
     at = grid(rig, lines.frequency, lines.sensor, lines.actuator)
     every = table(rig, float(lines.frequency[0]), float(lines.frequency[-1]))
     search = Search(rig, lines, at, _smaller(truth, every))
-    # Of the lines, not of the bins that a refit looks at.
-    here = at.at(lines.frequency, lines.level)
 
     def away(e: Explanation) -> float:
-        """Sigma by which an explanation misses the truth."""
+        """Sigma by which an explanation misses the truth: of the lines, not of the bins that a
+        refit looks at."""
+        here = search.grid.at(lines.frequency, lines.level)
         return math.sqrt(float(np.sum(lines.chi_square(e.fitted.model.response(e.fitted.x, here)))))
 
     if truth["kind"] == "one":
         size = away(search.nominal)
         if size < LEAST:
             return Sized(size)
-        search.grow(search.nominal, FIRST)
         hidden = {(e["physics"], e["site"]) for e in truth["effects"]}
-        near = [
-            e
-            for e in every
-            if (found := search.found.get(frozenset({e.key}))) is not None and away(found) < SAME
-        ]
-        near += [e for e in every if hidden & set(e.names) and e not in near]
-        names = {e.name for e in near}
-        told = {e.name for e in every if set(said) & set(e.names)}
-        return Sized(size, len(names), len({site for _, site in names}), len(told))
+        twins = {n for e in every if hidden & set(e.names) for n in e.names} - hidden
+        told = len(bearers(set(said), [set(e.names) for e in every]))
+        known = Sized(size, said=told, twins=tuple(sorted({site for _, site in twins})))
+        search.grow(search.nominal, FIRST)
+        single = [e for e in search.found.values() if e.effects]
+        mine = [e for e in single if hidden & set(e.effects[0].names)]
+        if not mine:
+            return replace(known, said=0)
+        # Held against the effect as the model has it, not against the truth: what model and
+        # plant differ by anyhow is in every candidate's distance to that.
+        search.renew(min(mine, key=lambda e: e.fitted.cost))
+        single = [e for e in search.found.values() if e.effects]
+        mine = [e for e in single if hidden & set(e.effects[0].names)]
+        own = min(mine, key=lambda e: e.fitted.cost)
+        near = [e.effects[0] for e in single if e is own or apart(own, e, search.problem) < SAME]
+        names = bearers({n for e in near for n in e.names}, [set(e.names) for e in near])
+        sites = {near[i].site for i in names}
+        return replace(known, names=len(names), sites=len(sites))
     if search.table:
         search.grow(search.nominal, FIRST)
+        search.renew(min(search.found.values(), key=lambda e: e.fitted.cost))
     return Sized(min(away(e) for e in search.found.values()))
+
+
+def bearers(names: Set[Name], effects: Sequence[Set[Name]]) -> list[int]:
+    """The fewest of `effects`, each given by all its names, that bear all of `names`: one that
+    stands between two elements is called by either (greedily, which so small a cover allows)."""
+    left, out = set(names), []
+    while left:
+        best = max(range(len(effects)), key=lambda i: len(left & effects[i]), default=None)
+        if best is None or not left & effects[best]:
+            break
+        out.append(best)
+        left -= effects[best]
+    return out
 
 
 def _smaller(truth: Mapping[str, Any], every: Sequence[Effect]) -> Sequence[Effect]:

@@ -42,7 +42,8 @@ class Truth:
     kind : `nothing`, `one`, `two`, `outside`, or `joints` (every joint gives).
     size : sigma that are left when the nearest smaller explanation has been refitted.
     names, sites : how many these data cannot tell from the effect; said : names in the answer's
-        class, structural twins as one. 0 where they were not counted.
+        class, structural twins as one. 0 where they were not counted. twins : other sites that a
+        single effect might as well be told to be at, by structure.
     """
 
     kind: str
@@ -52,6 +53,11 @@ class Truth:
     names: int = 0
     sites: int = 0
     said: int = 0
+    twins: Sequence[str] = ()
+
+    def places(self, effect: Hidden) -> frozenset[str]:
+        """All names of an effect's site."""
+        return frozenset((effect.site, *(self.twins if len(self.effects) == 1 else ())))
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,12 +94,14 @@ class Answer:
         return self.verdict in NAMED and bool(self.causes)
 
     def site_set(self) -> tuple[str, ...]:
-        """The likeliest sites that hold 90 % together."""
+        """The likeliest sites that hold 90 % together: of one where one thing is missing, of all
+        that is stated where several are, each at a site of its own."""
+        enough = ALL_BUT_TENTH * max(1.0, sum(p for _, p in self.sites))
         total, out = 0.0, []
         for site, probability in self.sites:
             out.append(site)
             total += probability
-            if total >= ALL_BUT_TENTH:
+            if total >= enough:
                 break
         return tuple(out)
 
@@ -130,9 +138,10 @@ class Trial:
     @property
     def place_right(self) -> bool:
         """Every effect has a cause of its own at its site, or at one declared equivalent."""
-        effects, causes, sites = self.truth.effects, self.answer.causes, self.answer.sites
+        effects, causes = self.truth.effects, self.answer.causes
         if not causes:  # an unknown may still know the place
-            return len(effects) == 1 and bool(sites) and sites[0][0] == effects[0].site
+            first = {site for site, _ in self.answer.sites[:1]}
+            return len(effects) == 1 and bool(first & self.truth.places(effects[0]))
         return len(_best(effects, causes, _same_place)) == len(effects)
 
     @property
@@ -142,7 +151,7 @@ class Trial:
         for cause in self.answer.causes:
             if cause.name[1] in inside:
                 inside |= {site for _, site in cause.names}
-        return all(e.site in inside for e in self.truth.effects)
+        return all(inside & self.truth.places(e) for e in self.truth.effects)
 
     @property
     def confidence(self) -> float:

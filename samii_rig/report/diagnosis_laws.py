@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from samii_rig.diagnose.insert import DISPLACEMENT
 from samii_rig.diagnose.result import Cause, Trace
-from samii_rig.diagnose.vocabulary import DISPLACEMENT
 from samii_rig.types import Complex, Float
 
 Numbers = Mapping[str, float]
@@ -72,8 +72,9 @@ FACTORS: dict[str, Law] = {
 
 
 def jump_of(cause: Cause) -> Jump | None:
-    """The jump that a cause makes; None where it is none, or is spread over a body."""
-    if "position" in cause.parameters:
+    """The jump that a cause makes; None where it is none, is spread over a body, or acts on the
+    input too, as a hydraulic line."""
+    if "position" in cause.parameters or "omega" in cause.parameters:
         return None
     rows = JUMPS.get(cause.physics, ())
     if len(rows) < 2:

@@ -50,6 +50,7 @@ WORDS = {
 _PREFIXES = {"N": ((1e9, "G"), (1e6, "M"), (1e3, "k")), "s": ((1.0, ""), (1e-3, "m"), (1e-6, "µ"))}
 _POWERS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 FAINT = 0.02  # probability of a site below which it is not marked
+LIKELY = 0.5  # probability of a site from which it is told as the place
 NEVER = 1e-4  # a probability below it is not written in digits
 
 
@@ -90,9 +91,8 @@ def answer(found: Diagnosis) -> tuple[Cause, ...]:
 
 
 def suspects(found: Diagnosis) -> dict[str, float]:
-    """Probability of each site, the most suspect first; what is not in the table has no site."""
-    seen = {site: p * (1 - found.outside) for site, p in found.sites}
-    return {site: p for site, p in seen.items() if p >= FAINT}
+    """Probability of each site, the most suspect first."""
+    return {site: p for site, p in found.sites if p >= FAINT}
 
 
 def named(cause: Cause) -> Named:
@@ -178,8 +178,8 @@ def _verdict(found: Diagnosis) -> tuple[Mark, str, str]:
             return "warning", f"Most likely left out of the model: {parts}", text
     places = suspects(found)
     where = "The data do not tell where it is."
-    if places:
-        site, p = next(iter(places.items()))
+    site, p = next(iter(places.items()), ("", 0.0))
+    if p >= LIKELY:
         where = f"It is most likely at {site} ({percent(p)})."
     text = f"No entry of the table of physics explains it. {where}"
     return "bad", "Something is missing that has no name here", text

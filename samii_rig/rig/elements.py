@@ -222,6 +222,23 @@ class HydraulicLine(ElementBase):
     R: Annotated[Parameter, _not_negative("Pa s/m^4")] = _zero("Pa s/m^4")
 
 
+class LumpedLine(ElementBase):
+    """A line between a valve and a vane in one lump: at the valve its oil gives way, C_h, against
+    a resistance R_h; towards the vane it has to be moved, inertance L_h.
+
+    It stands directly behind the angular velocity source that `source` names:
+    theta+ = theta- + ((2 zeta omega s + omega^2) (source) + omega^2 M C_h/D^2)/N,
+    N = s^2 + 2 zeta omega s + omega^2, omega^2 = 1/(L_h C_h), zeta = R_h/2 sqrt(C_h/L_h).
+    """
+
+    kind: Literal["lumped_line"]
+    source: Name
+    D: Annotated[Parameter, _positive("m^3/rad")]
+    C_h: Annotated[Parameter, _positive("m^3/Pa")]
+    omega: Annotated[Parameter, _positive("rad/s")]
+    zeta: Annotated[Parameter, _not_negative("1")]
+
+
 class AngularVelocitySource(ElementBase):
     """Angular velocity source with a first-order lag (paper 2, eq. 1):
     theta+ = theta- + K p v exp(-s tau)/(s (s + p)), v the input called `input`.
@@ -306,6 +323,7 @@ Source = AngularVelocitySource | AngularVelocitySource2 | TorqueSource | ForceSo
 SOURCES = (AngularVelocitySource, AngularVelocitySource2, TorqueSource, ForceSource)
 ANGLE_SOURCES = (AngularVelocitySource, AngularVelocitySource2)
 BEAMS = (Beam, TimoshenkoBeam)
+LINES = (HydraulicLine, LumpedLine)
 
 Element = Annotated[
     Beam
@@ -319,6 +337,7 @@ Element = Annotated[
     | GravityStiffness
     | OilColumn
     | HydraulicLine
+    | LumpedLine
     | Branch
     | AngularVelocitySource
     | AngularVelocitySource2

@@ -15,6 +15,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from samii_rig.rig.elements import (
     ANGLE_SOURCES,
     BEAMS,
+    LINES,
     SOURCES,
     AngularVelocitySource,
     AngularVelocitySource2,
@@ -26,6 +27,7 @@ from samii_rig.rig.elements import (
     ForceSource,
     GravityStiffness,
     HydraulicLine,
+    LumpedLine,
     LumpedMass,
     Name,
     NonNegative,
@@ -48,10 +50,12 @@ from samii_rig.rig.elements import (
 __all__ = [
     "ANGLE_SOURCES",
     "BEAMS",
+    "LINES",
     "SOURCES",
     "AbsoluteAngle",
     "Acceleration",
     "ActuatorSpec",
+    "Agreement",
     "AngularVelocitySource",
     "AngularVelocitySource2",
     "AntiAlias",
@@ -66,6 +70,7 @@ __all__ = [
     "GravityStiffness",
     "HydraulicLine",
     "Limit",
+    "LumpedLine",
     "LumpedMass",
     "Moment",
     "Monitor",
@@ -261,6 +266,22 @@ class Limit(Strict):
         return self
 
 
+class Agreement(Strict):
+    """Two channels that tell of one thing: if they part, one of them drifts, and no run goes on.
+
+    sensor : an angle, for instance the one that the centring reads. other : a sensor or monitor of
+        the same unit, such as a potentiometer; or the actuator whose angular velocity source turns
+        it. over : s over which the way of sensor and source is compared and then forgotten; given
+        with an actuator, and only then. max : by which they may part, in the sensor's unit.
+    """
+
+    sensor: Name
+    other: Name
+    max: Positive
+    over: Positive | None = None
+    reason: str = Field(min_length=1)
+
+
 class Device(Strict):
     """Which driver opens the rig (an entry point of `samii_rig.devices`) and its settings."""
 
@@ -401,6 +422,7 @@ class Rig(Strict):
     actuator: Annotated[tuple[ActuatorSpec, ...], Field(min_length=1)]
     monitor: tuple[Monitor, ...] = ()
     limit: tuple[Limit, ...] = ()
+    agreement: tuple[Agreement, ...] = ()
     centring: Centring | None = None
     feedback: tuple[Feedback, ...] = ()
     device: Device = Device()
@@ -421,7 +443,7 @@ class Rig(Strict):
         for before, e in zip((None, *self.element), self.element, strict=False):
             if isinstance(e, SOURCES):
                 _driven(e, inputs)
-            elif isinstance(e, HydraulicLine) and not (
+            elif isinstance(e, LINES) and not (
                 isinstance(before, ANGLE_SOURCES) and before.name == e.source
             ):
                 raise ValueError(
@@ -434,7 +456,7 @@ class Rig(Strict):
                 raise ValueError(
                     f"actuator {a.name}: drives no element; expected one with this input"
                 )
-        lines = {e.source: e.name for e in self.element if isinstance(e, HydraulicLine)}
+        lines = {e.source: e.name for e in self.element if isinstance(e, LINES)}
         for s in self.sensor:
             for name in places(s):
                 if name not in elements:
@@ -488,6 +510,17 @@ class Rig(Strict):
                 raise ValueError(
                     f"limit on {limit.channel}: min {limit.min:g}; expected none, as only a "
                     "monitor has one"
+                )
+        for pair in self.agreement:
+            one, other = pair.sensor, pair.other
+            where, known = f"agreement of {one} with {other}", [s.name for s in self.sensor]
+            if one not in known or other not in units or one == other:
+                raise ValueError(f"{where}: expected a sensor, one of {known}, and another channel")
+            if (pair.over is not None) != (other in inputs):
+                raise ValueError(f"{where}: expected over, s, with an actuator and only then")
+            if pair.over is None and units[one] != units[other]:
+                raise ValueError(
+                    f"{where}: units {units[one]!r} and {units[other]!r}; expected one"
                 )
         if self.centring and self.centring.sensor not in {s.name for s in self.sensor}:
             raise ValueError(

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.load import load_rig
-from sim.concealed.draw import KINDS, trial_id
+from sim.concealed.draw import DRAWN, Kind
 from sim.concealed.runs import Design
+from sim.concealed.stated import Stated
 from sim.concealed.trial import make
 
 
@@ -23,9 +24,18 @@ def main(arguments: list[str] | None = None) -> int:
     usual = Design()
     commands = parser.add_subparsers(dest="command", required=True)
     maker = commands.add_parser("make", help="make trials; those that are whole are not made again")
-    maker.add_argument("--seed", type=int, required=True, help="of the first trial")
+    maker.add_argument("--seed", type=int, default=0, help="of the first trial [default: 0]")
     maker.add_argument("--count", type=int, default=1, help="consecutive seeds [default: 1]")
-    maker.add_argument("--kind", choices=KINDS, required=True)
+    what = maker.add_mutually_exclusive_group(required=True)
+    what.add_argument("--kind", choices=DRAWN)
+    what.add_argument(
+        "--effect",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar="WORD",
+        help="PHYSICS SITE [SYMBOL=NUMBER ...]; several conceal them all",
+    )
     maker.add_argument("--out", type=Path, required=True, help="folder of recordings and truths")
     maker.add_argument("--rig", default="samii", help="rig file or name [default: samii]")
     maker.add_argument("--noise", type=float, default=usual.noise, help="multiple of the errors")
@@ -43,11 +53,13 @@ def main(arguments: list[str] | None = None) -> int:
     )
     try:
         _, text = load_rig(chosen.rig)
+        stated = tuple(Stated.of(words) for words in chosen.effect)
+        kind: Kind = chosen.kind or "stated"
         for seed in range(chosen.seed, chosen.seed + chosen.count):
             begin = time.monotonic()
-            folder = make(chosen.kind, seed, chosen.out, text, design)
+            folder = make(kind, seed, chosen.out, text, design, stated)
             took = time.monotonic() - begin
-            print(f"{chosen.kind} {seed} {trial_id(chosen.kind, seed)} {folder} {took:.1f} s")
+            print(f"{kind} {seed} {folder.name} {folder} {took:.1f} s")
     except SamiiRigError as error:
         print(error, file=sys.stderr)
         return error.exit_code

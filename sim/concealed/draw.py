@@ -6,6 +6,7 @@ import copy
 import hashlib
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -20,11 +21,13 @@ from sim.concealed.measure import Errors, draw_errors
 from sim.concealed.modes import Poles, poles_of
 from sim.concealed.parts import Description, described
 from sim.concealed.runs import Design
-from sim.concealed.scales import RIGID, RIGID_SOURCE, UNDAMPED_SOURCE, Concealed
+from sim.concealed.scales import RIGID, RIGID_SOURCE, UNDAMPED_SOURCE, Concealed, Dose
 from sim.concealed.size import Yardstick, response_change, yardstick
+from sim.concealed.stated import Stated, as_stated, row_of
 
-Kind = Literal["nothing", "one", "two", "outside", "joints"]
-KINDS: tuple[Kind, ...] = ("nothing", "one", "two", "outside", "joints")
+Kind = Literal["nothing", "one", "two", "outside", "joints", "stated"]
+KINDS: tuple[Kind, ...] = ("nothing", "one", "two", "outside", "joints", "stated")
+DRAWN = KINDS[:-1]
 SMALLEST, LARGEST = 1.0, 1000.0  # sigma aimed at
 LEAST_OF_TWO = 5.0  # of each of two, and of what lies outside
 INNOCENT = 0.3  # of the trials have a joint that is as rigid or undamped as the rig file says
@@ -59,22 +62,47 @@ class Drawn:
     believed: Poles | None
 
 
-def trial_id(kind: str, seed: int) -> str:
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """An effect before it is put in: what, where, and how much of it if that is stated."""
+
+    row: Row
+    site: str
+    stated: Stated | None = None
+
+    def put(self, plant: Description, x: float, seed: int) -> Concealed:
+        """Change a plant. x, seed : of what is not stated."""
+        rng = np.random.default_rng(seed)
+        if self.stated is None:
+            return self.row.put(plant, self.site, Dose(x, rng))
+        dose = Dose(x, rng, self.stated.parameters, self.stated.where)
+        effect = self.row.put(plant, self.site, dose)
+        as_stated(self.stated, effect)
+        return effect
+
+
+def trial_id(kind: str, seed: int, stated: Sequence[Stated] = ()) -> str:
     """Name of a trial's folders: says nothing of what is in it."""
-    return hashlib.sha256(f"concealed {kind} {seed}".encode()).hexdigest()[:12]
+    words = " ".join(["concealed", kind, str(seed), *map(repr, stated)])
+    return hashlib.sha256(words.encode()).hexdigest()[:12]
 
 
-def draw(kind: Kind, seed: int, rig_toml: str, design: Design) -> Drawn:
+def draw(
+    kind: Kind, seed: int, rig_toml: str, design: Design, stated: Sequence[Stated] = ()
+) -> Drawn:
     """The trial of this seed. Rows of the table follow each other with the seeds, places with
     each round through the rows, so that any range of seeds is spread evenly. `joints` conceals
-    that every joint of the rig file gives, each as the file says (the papers' own case)."""
+    that every joint of the rig file gives, each as the file says (the papers' own case). `stated`
+    conceals the effects given and nothing else; values of the rig, and noise, are drawn."""
     if kind not in KINDS:
         raise InputError("--kind", "", kind, f"one of {', '.join(KINDS)}")
+    if (kind == "stated") != bool(stated):
+        raise InputError("effects", "", list(stated), "at least one if, and only if, stated")
     rig = parse(Rig, rig_toml, "rig file")
     rng = np.random.default_rng([KINDS.index(kind), seed])
     base, values = draw_values(rig, rng)
-    chosen = _chosen(kind, seed, base, rng)
-    innocent = _innocent(base, {site for _, site in chosen}, rng)
+    chosen = [Chosen(row_of(base, s), s.site, s) for s in stated] or _chosen(kind, seed, base, rng)
+    innocent = {} if stated else _innocent(base, {c.site for c in chosen}, rng)
     rig_toml = edited(rig_toml, innocent)
     values.update({f"{name}.{symbol}": v for (name, symbol), (v, _) in innocent.items()})
     rig = parse(Rig, rig_toml, "rig file")
@@ -85,9 +113,10 @@ def draw(kind: Kind, seed: int, rig_toml: str, design: Design) -> Drawn:
     clean = poles_of(base)
     errors = draw_errors(rig, clean, design.noise, rng)
     multiples, sizes, sizings = [], [], []
-    for (row, site), s, target in zip(chosen, seeds, targets, strict=False):
-        sizing = _Sizing(rig, base, row, site, s, design, errors, clean)
-        x, sigma = (1.0, sizing.sigma(1.0)) if kind == "joints" else sizing.solve(target)
+    for one, s, target in zip(chosen, seeds, targets, strict=False):
+        sizing = _Sizing(rig, base, one, s, design, errors, clean)
+        as_given = kind in ("joints", "stated")
+        x, sigma = (1.0, sizing.sigma(1.0)) if as_given else sizing.solve(target)
         multiples.append(x)
         sizes.append(sigma)
         sizings.append(sizing)
@@ -113,15 +142,12 @@ def draw(kind: Kind, seed: int, rig_toml: str, design: Design) -> Drawn:
 
 
 def put(
-    base: Description, chosen: list[tuple[Row, str]], seeds: list[int], multiples: list[float]
+    base: Description, chosen: list[Chosen], seeds: list[int], multiples: list[float]
 ) -> tuple[Description, list[Concealed]]:
     """A copy of a plant with effects in it."""
     plant = copy.deepcopy(base)
-    effects = [
-        row.put(plant, site, x, np.random.default_rng(s))
-        for (row, site), s, x in zip(chosen, seeds, multiples, strict=False)
-    ]
-    return plant, effects
+    drawn = zip(chosen, seeds, multiples, strict=False)
+    return plant, [one.put(plant, x, s) for one, s, x in drawn]
 
 
 def believed(base: Description, effects: list[Concealed]) -> Description:
@@ -152,28 +178,26 @@ def draw_values(rig: Rig, rng: np.random.Generator) -> tuple[Description, dict[s
     return plant, values
 
 
-def _chosen(
-    kind: Kind, seed: int, plant: Description, rng: np.random.Generator
-) -> list[tuple[Row, str]]:
+def _chosen(kind: Kind, seed: int, plant: Description, rng: np.random.Generator) -> list[Chosen]:
     table = [row for row in (OUTSIDE if kind == "outside" else ROWS) if places(plant, row)]
 
-    def at(number: int) -> tuple[Row, str]:
+    def at(number: int) -> Chosen:
         row = table[number % len(table)]
         sites = places(plant, row)
-        return row, sites[(number // len(table)) % len(sites)]
+        return Chosen(row, sites[(number // len(table)) % len(sites)])
 
     if kind == "nothing":
         return []
     if kind == "joints":
         row = next(r for r in ROWS if r.physics == "torsional_compliance")
-        return [(row, p.name) for p in plant.parts if p.kind == "torsional_spring"]
+        return [Chosen(row, p.name) for p in plant.parts if p.kind == "torsional_spring"]
     first = at(seed)
     if kind != "two":
         return [first]
     while True:
         other = at(int(rng.integers(0, 60 * len(table))))
         # Two of one physics at one place are one; a joint can be edited only once.
-        if other[0].physics != first[0].physics and other[1] != first[1]:
+        if other.row.physics != first.row.physics and other.site != first.site:
             return [first, other]
 
 
@@ -203,14 +227,13 @@ class _Sizing:
         self,
         rig: Rig,
         base: Description,
-        row: Row,
-        site: str,
+        chosen: Chosen,
         seed: int,
         design: Design,
         errors: Errors,
         clean: Poles,
     ) -> None:
-        self.base, self.chosen, self.seed, self.row = base, [(row, site)], seed, row
+        self.base, self.chosen, self.seed, self.row = base, [chosen], seed, chosen.row
         _, effects = put(base, self.chosen, [seed], [1.0])
         nominal = believed(base, effects)
         self.believed = poles = poles_of(nominal) if effects[0].edits else clean

@@ -9,13 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
-
 from sim.concealed import linear, nonlinear
 from sim.concealed.parts import Description
-from sim.concealed.scales import Concealed
+from sim.concealed.scales import Concealed, Dose
 
-Put = Callable[[Description, str, float, np.random.Generator], Concealed]
+Put = Callable[[Description, str, Dose], Concealed]
 
 
 @dataclass(frozen=True, slots=True)

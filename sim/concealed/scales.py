@@ -1,11 +1,13 @@
-"""The units in which effects are sized on a rig, and what is noted of an effect."""
+"""The units in which effects are sized on a rig, how much of one is put in, what is noted of it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from samii_rig.errors import InputError
 from sim.concealed.parts import Description
 
 RIGID = 1e9  # N m/rad: what a rig file says of a joint that is believed to be rigid
@@ -36,6 +38,27 @@ class Scales:
         length = float(np.mean([v["L"] for v in links])) if links else 1.0
         k = float(np.exp(np.mean(np.log(springs)))) if springs else J * 400.0
         return cls(k, m, J, length)
+
+
+@dataclass(frozen=True, slots=True)
+class Dose:
+    """How much of an effect: parameters that are stated (SI), the others at `x` times the rig's own
+    scale or drawn. where : the variant, of an effect that has some; drawn if empty."""
+
+    x: float
+    rng: np.random.Generator
+    stated: Mapping[str, float] = field(default_factory=dict)
+    where: str = ""
+
+    def __call__(self, symbol: str, otherwise: float) -> float:
+        """The parameter as stated, or else as the scale or the draw has it."""
+        return self.stated.get(symbol, otherwise)
+
+    def choose(self, known: Iterable[str], otherwise: str) -> str:
+        """The variant as stated, or else as drawn. InputError for one that is not known."""
+        if self.where and self.where not in known:
+            raise InputError("effect", "where", self.where, f"one of {', '.join(known)}")
+        return self.where or otherwise
 
 
 @dataclass(slots=True)

@@ -15,6 +15,7 @@ import json
 import math
 import os
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -31,6 +32,7 @@ from sim.concealed.measure import ideally, loop_of, measured
 from sim.concealed.parts import Description
 from sim.concealed.runs import Design, Run, runs
 from sim.concealed.size import loop_gain, open_noise
+from sim.concealed.stated import Stated
 
 PARTIAL = ".partial"
 HEADROOM = 0.9  # of a converter's range that a run may use, else it is turned down
@@ -38,10 +40,18 @@ SETTLED = 3  # bursts after which a noise-free run repeats itself
 TURNED_DOWN = 0.8  # of the range that it uses then
 
 
-def make(kind: Kind, seed: int, out: Path, rig_toml: str, design: Design | None = None) -> Path:
-    """Make one trial, or find it made; returns the folder of its recordings."""
+def make(
+    kind: Kind,
+    seed: int,
+    out: Path,
+    rig_toml: str,
+    design: Design | None = None,
+    stated: Sequence[Stated] = (),
+) -> Path:
+    """Make one trial, or find it made; returns the folder of its recordings. stated : what it
+    conceals, of the kind of this name; the rig file says what is there besides."""
     design = design or Design()
-    name = trial_id(kind, seed)
+    name = trial_id(kind, seed, stated)
     folder, truths = out / "recordings" / name, out / "truth"
     if folder.is_dir():
         return folder
@@ -49,7 +59,7 @@ def make(kind: Kind, seed: int, out: Path, rig_toml: str, design: Design | None 
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
     truths.mkdir(parents=True, exist_ok=True)
-    drawn = draw(kind, seed, rig_toml, design)
+    drawn = draw(kind, seed, rig_toml, design, stated)
     rig = drawn.nominal
     tables = tabulate(drawn.poles, drawn.plant)
     units = (rig.actuator[0].unit, _centring_unit(rig))

@@ -1,0 +1,131 @@
+"""A law of its own: whether one part at one joint, in no table, does what several do together.
+
+Two compliances in a row, or one and an oscillator, can pass for a joint whose damping goes with a
+power of frequency. Such a part acts through one number as others do, x(s) = a (s/w)^b beside the
+joint's spring, so it is tried at every joint by the same screen (`moebius`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import optimize
+
+from samii_rig.diagnose.effect import Effect, Unknown
+from samii_rig.diagnose.model import Model
+from samii_rig.diagnose.moebius import place_of
+from samii_rig.diagnose.scales import spread
+from samii_rig.diagnose.screen import Screen
+from samii_rig.diagnose.search import Explanation, Search
+from samii_rig.errors import SamiiRigError
+from samii_rig.types import Complex, Float
+
+POWER = (0.05, 1.95)  # a spring has 0, a mass 2
+PRICE = 6.0  # of chi-square, what a further unknown is worth
+CLEAR = 10.0  # by which a law that is in no table must be better than what is
+UNKNOWNS = 2  # of that part
+TRIED = 2  # joints at which it is refitted
+ROUNDS, MORE_ROUNDS = 8, 40  # of their refits, and of the best
+SETTLED = 1e-4  # of chi-square, relative, gained by a round: less and it ends
+TOGETHER = 2  # effects from which their sum is doubted
+
+
+@dataclass(frozen=True, slots=True)
+class OwnLaw:
+    """A part at `site` whose x goes with (i w)^`power`; better by `gain` of chi-square."""
+
+    site: str
+    power: float
+    gain: float
+
+    @property
+    def sites(self) -> tuple[tuple[str, float], ...]:
+        """(site, probability) against the explanation that it is held against."""
+        return ((self.site, 1 / (1 + math.exp(-min(0.5 * self.gain, 30.0)))),)
+
+    def told(self) -> str:
+        """In words."""
+        return (
+            f"one part at {self.site} whose damping goes with the power {self.power:.2f} of "
+            "frequency explains as much: a law of its own, which is in no table"
+        )
+
+
+def own_law(search: Search, best: Explanation) -> OwnLaw | None:
+    """The part that does by itself what several effects of `best` do; None if none does."""
+    if len(best.effects) < TOGETHER or any(e.quasi is not None for e in best.effects):
+        return None
+    base = search.nominal.fitted
+    look = Screen.of(search.problem, base)
+    found = []
+    for effect in search.table:
+        part = _power(effect, search.problem.data.frequency)
+        model = search._model((effect,)) if part else None
+        if part is None or model is None or model.keys != base.model.keys:
+            continue
+        try:
+            place = place_of(model, base.x, effect, search.problem.at, look.response)
+        except SamiiRigError:
+            continue
+        if (end := look.through(place, part)) is not None:
+            found.append((end[0], part, model, np.append(base.x, np.log(end[1][0]))))
+    if not found:
+        return None
+    found = sorted(found, key=lambda f: -f[0])[:TRIED]
+    ends = [_refitted(search, part, model, y, ROUNDS) for _, part, model, y in found]
+    at = int(np.argmin([cost for cost, _ in ends]))
+    _, part, model, _ = found[at]
+    cost, y = _refitted(search, part, model, ends[at][1], MORE_ROUNDS)
+    more = sum(len(e.unknowns) for e in best.effects) - UNKNOWNS
+    gain = (best.fitted.cost - cost) / search.temperature + PRICE * more
+    return OwnLaw(part.site, float(np.exp(y[-1])), gain) if gain > CLEAR else None
+
+
+def _refitted(
+    search: Search, part: Effect, model: Model, start: Float, rounds: int
+) -> tuple[float, Float]:
+    """Chi-square with priors, and logarithms, of all nominal parameters and the part's unknowns.
+
+    model : with the effect that is at the part's place.
+    """
+    problem, nominal = search.problem, search.nominal.fitted.model
+    n = nominal.n
+    assert part.jump is not None
+    law = part.jump.x
+    s = np.asarray(2j * np.pi * problem.at.frequency, np.complex128)
+
+    def left(y: Float) -> Float:
+        a = nominal.response(y[:n], problem.at)
+        place = place_of(model, y[:n], model.effects[0], problem.at, a)
+        h = a + place.b * place.phi(law(s, np.exp(y[None, n:])))[0][:, None]
+        return np.concatenate([problem.residual(h), y[:n] / nominal.prior])
+
+    low = np.append(nominal.lower, [math.log(u.low) for u in part.unknowns])
+    high = np.append(nominal.upper, [math.log(u.high) for u in part.unknowns])
+    end = optimize.least_squares(
+        left,
+        np.clip(start, low + 1e-9, high - 1e-9),
+        bounds=(low, high),
+        x_scale=np.append(nominal.prior, np.ones(len(part.unknowns))),
+        ftol=SETTLED,
+        max_nfev=rounds,
+    )
+    return 2 * float(end.cost), np.asarray(end.x)
+
+
+def _power(effect: Effect, frequency: Float) -> Effect | None:
+    """The same part with a power of frequency for its law; None where it is no joint's."""
+    jump = effect.jump
+    if jump is None or jump.fixed:
+        return None
+    if effect.physics != "viscous_damping" or jump.states is not None:
+        return None
+    w = 2 * np.pi * float(np.sqrt(frequency[0] * frequency[-1]))
+
+    def x_of(s: Complex, x: Float) -> Complex:
+        return np.asarray(w * x[:, :1] * (s / w) ** x[:, 1:2])
+
+    power = Unknown("power", "", *POWER, spread(*POWER, 8))
+    return replace(effect, unknowns=(effect.unknowns[0], power), jump=replace(jump, x=x_of))
