@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from samii_rig.errors import DeviceError, InputError, RecordingError
 from samii_rig.record.reader import read_events, read_recording
 from samii_rig.rig.schema import Rig, Strict
+from samii_rig.rig.settings import checked, wrong
 from samii_rig.run.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.types import Recording, SampleBlock
 
@@ -136,17 +137,13 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
 
     InputError for a wrong setting or a recording that is not this rig's.
     """
-    try:
-        chosen = ReplaySettings.model_validate(settings)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(["device", "settings", *map(str, first["loc"])])
-        expected = "recording, a path, and pace, real or fast"
-        raise InputError(rig.name, field, first["input"], expected) from error
+    chosen = checked(
+        ReplaySettings, rig, settings, expected="recording, a path, and pace, real or fast"
+    )
     path = Path(chosen.recording)
     if not path.is_file():
         expected = "the path of a recording"
-        raise InputError(rig.name, "device.settings.recording", chosen.recording, expected)
+        raise wrong(rig, "recording", chosen.recording, expected)
     try:
         recording = read_recording(path)
         plans = [e for e in read_events(path) if e.name == "plan"]

@@ -6,10 +6,10 @@ import secrets
 from collections.abc import Mapping
 from typing import Annotated
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
-from samii_rig.errors import InputError
 from samii_rig.rig.schema import Name, NonNegative, Positive, Rig, Strict
+from samii_rig.rig.settings import checked, wrong
 
 
 class Hum(Strict):
@@ -59,20 +59,10 @@ class SimSettings(Strict):
 
 def read_settings(rig: Rig, overrides: Mapping[str, object]) -> SimSettings:
     """The rig file's [device.settings] with `overrides` on top; InputError names a wrong one."""
-    try:
-        settings = SimSettings.model_validate({**rig.device.settings, **overrides})
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(["device", "settings", *map(str, first["loc"])])
-        if first["type"] == "extra_forbidden":
-            known = ", ".join(SimSettings.model_fields)
-            raise InputError(rig.name, field, first["input"], f"one of {known}") from error
-        expected = first["msg"].removeprefix("Input should be ")
-        raise InputError(rig.name, field, first["input"], expected) from error
+    settings = checked(SimSettings, rig, {**rig.device.settings, **overrides})
     names = {s.name for s in rig.sensor}
     for setting in ("hum", "stuck", "nan"):
         for name in getattr(settings, setting):
             if name not in names:
-                where = f"device.settings.{setting}"
-                raise InputError(rig.name, where, name, f"one of {', '.join(sorted(names))}")
+                raise wrong(rig, setting, name, f"one of {', '.join(sorted(names))}")
     return settings

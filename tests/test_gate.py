@@ -55,6 +55,20 @@ class Bench:
         self.next = first + n
 
 
+def test_a_new_gate_has_no_fault():
+    assert Bench().gate.fault == ""
+
+
+def test_what_has_come_back_is_not_sent_any_more():
+    bench = Bench().running()
+    for _ in range(20):
+        bench.write(0.1)
+        bench.tick()
+    sent = bench.gate._sent
+    assert sent.first == bench.gate._latest.sequence + 1
+    assert len(sent.u) == bench.next - sent.first
+
+
 def test_a_run_goes_through_all_states_and_moves():
     bench = Bench()
     bench.tick()

@@ -1,11 +1,10 @@
 """The NI-DAQmx driver against a stand-in for nidaqmx: inputs on one clock, and no output."""
 
 import sys
-import time
-from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
+from ni_kit import installed
 from wire_kit import until
 
 from drivers.ni_daq import NiRig, open_rig
@@ -18,81 +17,13 @@ from samii_rig.types import Quality
 SETTINGS = {
     "board": "Dev1",
     "analogue": {"a_0": {"input": "ai3", "volts_per_unit": 0.1, "offset": 0.5}},
-    "encoder": {"theta_2": {"counter": "ctr1", "pulses_per_rev": 1000, "sign": -1, "offset": 0.25}},
+    "encoder": {"theta_2": {"counter": "ctr0", "pulses_per_rev": 1000, "sign": -1, "offset": 0.25}},
 }
-CONSTANTS = SimpleNamespace(
-    AcquisitionType=SimpleNamespace(CONTINUOUS="continuous"),
-    EncoderType=SimpleNamespace(X_4="x4"),
-    AngleUnits=SimpleNamespace(RADIANS="rad"),
-)
-
-
-class Ni:
-    """What a board does: every task's samples are taken on the analogue task's clock."""
-
-    def __init__(self):
-        self.tasks, self.calls, self.begun = [], [], 0.0
-        self.volts, self.angle, self.error = 0.5, 0.25, ""
-
-    def task(self):
-        if self.error:
-            raise RuntimeError(self.error)
-        made = SimpleNamespace(
-            channels=[],
-            given=0,
-            rate=0.0,
-            open=True,
-            timing=SimpleNamespace(cfg_samp_clk_timing=lambda *a, **k: self.clock(made, *a, **k)),
-            ai_channels=SimpleNamespace(
-                add_ai_voltage_chan=lambda name, **k: made.channels.append(("ai", name, k))
-            ),
-            ci_channels=SimpleNamespace(
-                add_ci_ang_encoder_chan=lambda name, **k: made.channels.append(("ci", name, k))
-            ),
-            start=lambda: self.start(made),
-            close=lambda: setattr(made, "open", False),
-            read=lambda n, timeout: self.read(made, n),
-        )
-        made.in_stream = Stream(self, made)
-        self.tasks.append(made)
-        return made
-
-    def clock(self, made, rate, source="", **more):
-        made.rate = rate
-        self.calls.append((made.channels[0][0], source, more["sample_mode"]))
-
-    def start(self, made):
-        self.calls.append(("start", made.channels[0][0]))
-        if made.channels[0][0] == "ai":
-            self.begun = time.monotonic()
-
-    def read(self, made, n):
-        if self.error:
-            raise RuntimeError(self.error)
-        made.given += n
-        value = self.volts if made.channels[0][0] == "ai" else self.angle
-        rows = [[value] * n for _ in made.channels]
-        return rows if len(rows) > 1 else rows[0]
-
-
-class Stream:
-    def __init__(self, ni, task):
-        self.ni, self.task = ni, task
-
-    @property
-    def avail_samp_per_chan(self):
-        taken = (time.monotonic() - self.ni.begun) * self.task.rate if self.ni.begun else 0
-        return int(taken) - self.task.given
 
 
 @pytest.fixture
 def ni(monkeypatch):
-    made = Ni()
-    module = ModuleType("nidaqmx")
-    module.Task = made.task
-    monkeypatch.setitem(sys.modules, "nidaqmx", module)
-    monkeypatch.setitem(sys.modules, "nidaqmx.constants", CONSTANTS)
-    return made
+    return installed(monkeypatch)
 
 
 @pytest.fixture(scope="module")
@@ -121,11 +52,11 @@ def taken(device, n=50):
 
 
 def test_encoders_and_inputs_are_taken_on_one_sample_clock(ni, device):
-    assert [t.channels[0][:2] for t in ni.tasks] == [("ai", "Dev1/ai3"), ("ci", "Dev1/ctr1")]
-    assert ("ci", "/Dev1/ai/SampleClock", "continuous") in ni.calls
+    assert [(t.kind, t.rows) for t in ni.tasks] == [("ai", ["Dev1/ai3"]), ("ci", ["Dev1/ctr0"])]
+    assert ("ci", "/Dev1/ai/SampleClock") in ni.calls
     # The clock begins when all others wait for it.
     assert ni.calls[-2:] == [("start", "ci"), ("start", "ai")]
-    ni.volts, ni.angle = 1.5, -0.75
+    ni.out, ni.volts, ni.theta = 0.0, 1.5, -0.75
     until(lambda: (device.sensor.read().values == [1.0, 10.0]).all(axis=1).any())
     when, sequence, values, quality = taken(device)
     np.testing.assert_allclose(values, np.tile([1.0, 10.0], (len(values), 1)))
@@ -146,7 +77,7 @@ def test_an_input_at_its_end_is_clipped_and_what_is_no_number_missing(ni, device
     until(lambda: (device.sensor.read().quality[:, 1] == Quality.CLIPPED).any())
     ni.volts = float("nan")
     until(lambda: (device.sensor.read().quality[:, 1] == Quality.MISSING).any())
-    ni.angle = 5.0
+    ni.out, ni.theta = 0.0, 5.0
     until(lambda: (device.sensor.read().quality[:, 0] == Quality.CLIPPED).any())
 
 
@@ -158,14 +89,15 @@ def test_no_gate_arms_it(device):
 
 def test_what_the_board_says_ends_it(ni, device):
     taken(device, 5)
+    ni.broken = {"ai", "ci"}
     ni.error = "-200279: The application is not able to keep up\nwith the hardware acquisition."
     with pytest.raises(DeviceError, match=r"Dev1: RuntimeError: -200279: .*up with the") as caught:
         until(lambda: device.sensor.read() is None, 5.0)
     assert "\n" not in str(caught.value)
-    ni.error = ""
 
 
 def test_a_board_that_is_not_there_is_one_line(ni, rig):
+    ni.broken = {"made"}
     ni.error = "-200220: Device identifier is invalid.\n\nDevice Specified: Dev1"
     with pytest.raises(DeviceError, match=r"Dev1: NI-DAQmx refuses: -200220: .* Device Spec"):
         open_rig(rig, SETTINGS)

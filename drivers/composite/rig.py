@@ -18,12 +18,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field
 
 from drivers.composite.sensor import MAIN, Clocks, CompositeSensor, Side
 from drivers.resampling import GAP, Track
 from samii_rig.errors import DeviceError, InputError, SamiiRigError
 from samii_rig.rig.schema import Device, Name, Positive, Rig, Strict
+from samii_rig.rig.settings import TABLE, checked, wrong
 from samii_rig.run.devices import open_device
 from samii_rig.run.protocols import OpenRig
 from samii_rig.run.timebase import ClockModel, Timed
@@ -166,26 +167,21 @@ def _open(rig: Rig, name: str, part: Part, parts: dict[str, Part]) -> OpenRig:
         raise InputError.saying("", "", text) from error
     if opened.metadata.get("clock") == "simulated":
         opened.close()
-        where = f"device.settings.{name}.driver"
-        raise InputError(rig.name, where, part.driver, "one in real time, not a model or replay")
+        where = f"{name}.driver"
+        raise wrong(rig, where, part.driver, "one in real time, not a model or replay")
     return opened
 
 
 def _read(rig: Rig, settings: Mapping[str, object]) -> dict[str, Part]:
     """The devices, the main one first."""
-    parts: dict[str, Part] = {}
-    for name, given in settings.items():
-        where = f"device.settings.{name}"
-        try:
-            parts[name] = Part.model_validate(given)
-        except ValidationError as error:
-            first = error.errors(include_url=False)[0]
-            field = ".".join([where, *map(str, first["loc"])])
-            expected = "a device: driver, sensors and its settings; see docs/composite.md"
-            raise InputError(rig.name, field, first["input"], expected) from error
+    expected = "a device: driver, sensors and its settings; see docs/composite.md"
+    parts = {
+        name: checked(Part, rig, given, table=f"{TABLE}.{name}", expected=expected)
+        for name, given in settings.items()
+    }
     if MAIN not in parts:
         expected = f"{MAIN} among them, the device that drives"
-        raise InputError(rig.name, "device.settings", sorted(parts), expected)
+        raise InputError(rig.name, TABLE, sorted(parts), expected)
     channels = [x.name for x in (*rig.sensor, *rig.monitor)]
     owner: dict[str, str] = {}
     least = min(x.stale_after for x in (*rig.sensor, *rig.monitor))
@@ -193,20 +189,20 @@ def _read(rig: Rig, settings: Mapping[str, object]) -> dict[str, Part]:
         # What waits for a gap to close is old when it comes: the node's own samples too.
         if part.gap > AGE_PART * least:
             expected = f"at most {AGE_PART * least:g}, half of the least stale_after"
-            raise InputError(rig.name, f"device.settings.{name}.gap", part.gap, expected)
-        where = f"device.settings.{name}.sensors"
+            raise wrong(rig, f"{name}.gap", part.gap, expected)
+        where = f"{name}.sensors"
         if (part.sensors is None) != (name == MAIN):
             expected = "left out" if name == MAIN else "the sensors that it measures"
-            raise InputError(rig.name, where, part.sensors, expected)
+            raise wrong(rig, where, part.sensors, expected)
         for sensor in part.sensors or ():
             if sensor not in channels:
-                raise InputError(rig.name, where, sensor, f"one of {', '.join(channels)}")
+                raise wrong(rig, where, sensor, f"one of {', '.join(channels)}")
             if sensor in owner:
-                raise InputError(rig.name, where, sensor, f"none that {owner[sensor]} measures")
+                raise wrong(rig, where, sensor, f"none that {owner[sensor]} measures")
             owner[sensor] = name
     centring = rig.centring.sensor if rig.centring else rig.sensor[0].name
     if centring in owner:
-        where = f"device.settings.{owner[centring]}.sensors"
+        where = f"{owner[centring]}.sensors"
         expected = f"no {centring}, on which {MAIN} closes its loop"
-        raise InputError(rig.name, where, centring, expected)
+        raise wrong(rig, where, centring, expected)
     return {MAIN: parts[MAIN], **parts}

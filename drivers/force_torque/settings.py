@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from drivers.force_torque.frames import AXES
-from samii_rig.errors import InputError
 from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Rig, Strict
+from samii_rig.rig.settings import checked, wrong
 
 UNITS = {"F": "N", "T": "N m"}  # of an axis, by its first letter
 Row = Annotated[tuple[Finite, ...], Field(min_length=6, max_length=6)]
@@ -50,36 +50,17 @@ class CanSettings(Strict):
 
 def read_settings(rig: Rig, given: Mapping[str, object]) -> CanSettings:
     """The settings, checked against the rig; InputError names the first wrong one."""
-    try:
-        s = CanSettings.model_validate(given)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(map(str, first["loc"]))
-        if first["type"] == "extra_forbidden":
-            known = ", ".join(CanSettings.model_fields)
-            raise _wrong(rig, field, first["input"], f"one of {known}") from error
-        if first["type"] == "missing":
-            where = f"device.settings.{field}"
-            raise InputError.saying(
-                rig.name, where, "is missing; see docs/force-torque.md"
-            ) from error
-        raise _wrong(
-            rig, field, first["input"], first["msg"].removeprefix("Input should be ")
-        ) from error
+    s = checked(CanSettings, rig, given, page="docs/force-torque.md")
     sensors = {x.name: x for x in (*rig.sensor, *rig.monitor)}
     for name, axis in s.axes.items():
         if name not in sensors:
-            raise _wrong(rig, "axes", name, f"one of {', '.join(sorted(sensors))}")
+            raise wrong(rig, "axes", name, f"one of {', '.join(sorted(sensors))}")
         unit = UNITS[axis.axis[0]]
         if sensors[name].unit != unit:
             expected = f"an axis in {sensors[name].unit}"
-            raise _wrong(rig, f"axes.{name}.axis", f"{axis.axis} in {unit}", expected)
+            raise wrong(rig, f"axes.{name}.axis", f"{axis.axis} in {unit}", expected)
     for name in sensors:
         if name not in s.axes:
             expected = f"{name} among them, with one of {', '.join(AXES)}"
-            raise _wrong(rig, "axes", sorted(s.axes), expected)
+            raise wrong(rig, "axes", sorted(s.axes), expected)
     return s
-
-
-def _wrong(rig: Rig, field: str, value: object, expected: str) -> InputError:
-    return InputError(rig.name, f"device.settings.{field}", value, expected)

@@ -14,13 +14,14 @@ from typing import Annotated
 
 import numpy as np
 import serial
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from drivers.ports import open_port
 from drivers.quadrature.wire import HALF, VERSION, WORD, Decoder, Sample, Told, request
 from drivers.sensing import NoOutput
-from samii_rig.errors import DeviceError, InputError
+from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Finite, Name, NonNegative, Rig, Strict
+from samii_rig.rig.settings import checked, wrong
 from samii_rig.run.clock import MonotonicClock
 from samii_rig.run.protocols import OpenRig
 from samii_rig.types import Channel, Int, Quality, SampleBlock
@@ -259,7 +260,7 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
         for name, c in chosen.counters.items():
             if c.index >= told.counters:
                 expected = f"below {told.counters}, what counter {told.serial} has"
-                raise _wrong(rig, f"counters.{name}.index", c.index, expected)
+                raise wrong(rig, f"counters.{name}.index", c.index, expected)
     except BaseException:
         device.close()
         raise
@@ -281,28 +282,11 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
 
 
 def _read(rig: Rig, given: Mapping[str, object]) -> CounterSettings:
-    try:
-        s = CounterSettings.model_validate(given)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field_name = ".".join(map(str, first["loc"]))
-        if first["type"] == "missing":
-            where = f"device.settings.{field_name}"
-            raise InputError.saying(
-                rig.name, where, "is missing; see docs/quadrature.md"
-            ) from error
-        expected = first["msg"].removeprefix("Input should be ")
-        if first["type"] == "extra_forbidden":
-            expected = f"one of {', '.join(CounterSettings.model_fields)}"
-        raise _wrong(rig, field_name, first["input"], expected) from error
+    s = checked(CounterSettings, rig, given, page="docs/quadrature.md")
     names = [x.name for x in (*rig.sensor, *rig.monitor)]
     if sorted(s.counters) != sorted(names):
-        raise _wrong(rig, "counters", sorted(s.counters), f"{', '.join(names)}, and no other")
+        raise wrong(rig, "counters", sorted(s.counters), f"{', '.join(names)}, and no other")
     for name, c in s.counters.items():
         if c.counts_per_unit == 0.0:
-            raise _wrong(rig, f"counters.{name}.counts_per_unit", 0.0, "another number than 0")
+            raise wrong(rig, f"counters.{name}.counts_per_unit", 0.0, "another number than 0")
     return s
-
-
-def _wrong(rig: Rig, field_name: str, value: object, expected: str) -> InputError:
-    return InputError(rig.name, f"device.settings.{field_name}", value, expected)

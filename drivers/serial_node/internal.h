@@ -15,7 +15,8 @@ enum {
     F_JUMP = 8,
     F_ANGLE = 16,
     F_EMERGENCY = 32,
-    F_NULL = 64
+    F_NULL = 64,
+    F_SUPPLY = 128
 };
 enum { HEADER = 8, CRC = 4, SAMPLES_HEAD = 14 };
 

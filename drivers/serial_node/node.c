@@ -39,6 +39,11 @@ static int64_t scaled(int32_t kp_q16, int64_t difference)
     return x >= 0 ? x / 0x10000 : -((-x + 0xFFFF) / 0x10000);
 }
 
+int node_supply(const node_t *node)
+{
+    return node_active(node);
+}
+
 static int64_t distance(int32_t a, int32_t b)
 {
     int64_t d = (int64_t)a - b;
@@ -144,6 +149,7 @@ int16_t node_sample(node_t *node, uint32_t clock_us, const int32_t *encoders,
         node_to_null(node, NODE_TRIPPED, reason);
     }
     if (node_active(node)) {
+        flags |= F_SUPPLY;
         const node_config *c = &node->config;
         int64_t most = node->max_output, step = node->max_step;
         int64_t wanted =

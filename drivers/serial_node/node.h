@@ -8,6 +8,7 @@
  *     for each byte block that came:  node_rx(&node, bytes, n);
  *     on each tick of the sample timer:
  *         dac(node_sample(&node, microseconds(), encoders, adcs, emergency_pin()));
+ *         supply_pin(node_supply(&node));
  *     whenever the port takes bytes:  n = node_tx(&node, buffer, sizeof buffer);
  *
  * C99, no allocation, no floating point. The functions are not reentrant: call them from one
@@ -85,6 +86,10 @@ void node_rx(node_t *node, const uint8_t *bytes, size_t n);
 /* One sample: returns the counts to put out now. clock_us is free running and wraps. */
 int16_t node_sample(node_t *node, uint32_t clock_us, const int32_t *encoders,
                     const int16_t *adcs, int emergency);
+
+/* Whether the supply line is on: the board sets it after each node_sample's counts are out, so that
+ * the valve is at null before its supply goes. Off at boot. */
+int node_supply(const node_t *node);
 
 /* Bytes to the host: fills at most room bytes, returns how many. */
 size_t node_tx(node_t *node, uint8_t *buffer, size_t room);

@@ -32,7 +32,7 @@ from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.clock import MonotonicClock
 from samii_rig.run.protocols import CommandBlock, DeviceEvent, DeviceLoop, OpenRig
-from samii_rig.types import Channel, Int, Quality, SampleBlock
+from samii_rig.types import Channel, Flags, Int, Quality, SampleBlock
 
 Q16 = 1 << 16
 MOST32 = HALF - 1
@@ -190,6 +190,8 @@ class SerialNode:
         )
         values = np.empty((len(raw), len(self.channels)))
         quality = np.zeros((len(raw), len(self.channels)), dtype=np.uint8)
+        if self._settings.supply:
+            self._check_supply(raw["flags"])
         out = self._settings.output_counts_per_unit
         values[:, 0], values[:, 2] = raw["u"] / out, raw["v"] / out
         x = self._angle
@@ -286,6 +288,15 @@ class SerialNode:
                 "and shield"
             )
 
+    def _check_supply(self, flags: Flags) -> None:
+        """The line is on while the output is live, and off at null."""
+        live, on = (flags & Flag.NULL) == 0, (flags & Flag.SUPPLY) != 0
+        if (live != on).any():
+            self._trouble = (
+                f"{self._link.name}: the node's supply line was not on while its output was live; "
+                "does its firmware have one (device.settings.supply)?"
+            )
+
     def _encoder(self, sensor: str) -> Input:
         if sensor not in self._settings.encoder:
             raise DeviceError(f"{self.name}: no encoder {sensor!r} to close the loop on")
@@ -353,6 +364,7 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
             "boot": str(hello.boot),
             "null_counts": str(hello.null),
             "device_settings": chosen.model_dump_json(),
+            **({"supply": "on only while the output is live"} if chosen.supply else {}),
             **({"tripped": TRIPPED} if hello.state is State.TRIPPED else {}),
         },
         node,

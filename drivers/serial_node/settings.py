@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from drivers.serial_node.wire import OVERHEAD, Hello
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Rig, Strict
+from samii_rig.rig.settings import checked, wrong
 from samii_rig.run.limits import MAX_AHEAD
 
 SYMBOL_BITS = 10  # a byte on an asynchronous line: start, 8 data, stop
@@ -34,6 +35,7 @@ class SerialSettings(Strict):
     encoder, adc : by sensor name; every sensor and monitor of the rig is in one of them.
     output_counts_per_unit : of the actuator. null : the converter's counts at which the valve
         stands still; the node holds it, this only has to be the same.
+    supply : the node's supply line switches pump or dump valve: on only while the output is live.
     max_jump : largest change of the centring sensor in one sample, in its unit; beyond it the
         node trips. Left out: the node's own.
     max_bad_frames : frames in one second that may be lost, damaged or doubled.
@@ -45,47 +47,31 @@ class SerialSettings(Strict):
     adc: dict[Name, Input] = Field(default_factory=dict)
     output_counts_per_unit: Finite
     null: Annotated[int, Field(ge=-32768, le=32767)] | None = None
+    supply: bool = False
     max_jump: Positive | None = None
     max_bad_frames: NonNegative = 5
 
 
 def read_settings(rig: Rig, given: Mapping[str, object]) -> SerialSettings:
     """The settings, checked against the rig; InputError names the first wrong one."""
-    try:
-        s = SerialSettings.model_validate(given)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = ".".join(map(str, first["loc"]))
-        if first["type"] == "extra_forbidden":
-            known = ", ".join(SerialSettings.model_fields)
-            raise _wrong(rig, field, first["input"], f"one of {known}") from error
-        if first["type"] == "missing":
-            where = f"device.settings.{field}"
-            raise InputError.saying(
-                rig.name, where, "is missing; see docs/serial-node.md"
-            ) from error
-        raise _wrong(
-            rig, field, first["input"], first["msg"].removeprefix("Input should be ")
-        ) from error
+    s = checked(SerialSettings, rig, given, page="docs/serial-node.md")
     if len(rig.actuator) != 1:
         raise InputError(rig.name, "actuator", len(rig.actuator), "one; the node has one output")
     names = {x.name: x for x in (*rig.sensor, *rig.monitor)}
     for table, inputs in (("encoder", s.encoder), ("adc", s.adc)):
         for name, x in inputs.items():
             if name not in names:
-                raise _wrong(rig, table, name, f"one of {', '.join(sorted(names))}")
+                raise wrong(rig, table, name, f"one of {', '.join(sorted(names))}")
             if x.counts_per_unit == 0.0:
-                raise _wrong(rig, f"{table}.{name}.counts_per_unit", 0.0, "another number than 0")
+                raise wrong(rig, f"{table}.{name}.counts_per_unit", 0.0, "another number than 0")
         seen = [x.index for x in inputs.values()]
         if len(set(seen)) < len(seen):
-            raise _wrong(rig, table, seen, "an index of its own for each")
+            raise wrong(rig, table, seen, "an index of its own for each")
     for name in names:
         if (name in s.encoder) == (name in s.adc):
-            raise _wrong(
-                rig, "encoder and adc", name, "this sensor in one of them, and in one only"
-            )
+            raise wrong(rig, "encoder and adc", name, "this sensor in one of them, and in one only")
     if s.output_counts_per_unit == 0.0:
-        raise _wrong(rig, "output_counts_per_unit", 0.0, "another number than 0")
+        raise wrong(rig, "output_counts_per_unit", 0.0, "another number than 0")
     return s
 
 
@@ -102,9 +88,9 @@ def check_node(rig: Rig, s: SerialSettings, hello: Hello) -> None:
         for name, x in inputs.items():
             if x.index >= n:
                 expected = f"below {n}, what {node} has"
-                raise _wrong(rig, f"{table}.{name}.index", x.index, expected)
+                raise wrong(rig, f"{table}.{name}.index", x.index, expected)
     if s.null is not None and s.null != hello.null:
-        raise _wrong(rig, "null", s.null, f"{hello.null}, the null that {node} holds")
+        raise wrong(rig, "null", s.null, f"{hello.null}, the null that {node} holds")
     ahead = round(MAX_AHEAD * rig.rate_hz)
     if ahead > hello.queue:
         most = hello.queue / MAX_AHEAD
@@ -112,8 +98,4 @@ def check_node(rig: Rig, s: SerialSettings, hello: Hello) -> None:
     sample = 9 + 4 * hello.n_encoder + 2 * hello.n_adc
     needed = SYMBOL_BITS * rate * (sample + (OVERHEAD + 4) / hello.batch)
     if needed > s.baud:
-        raise _wrong(rig, "baud", s.baud, f"at least {needed:.0f} for what {node} sends")
-
-
-def _wrong(rig: Rig, field: str, value: object, expected: str) -> InputError:
-    return InputError(rig.name, f"device.settings.{field}", value, expected)
+        raise wrong(rig, "baud", s.baud, f"at least {needed:.0f} for what {node} sends")

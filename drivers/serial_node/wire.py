@@ -87,6 +87,7 @@ class Flag(IntFlag):
     ANGLE = 16
     EMERGENCY = 32
     NULL = 64
+    SUPPLY = 128
 
 
 REASONS = (

@@ -1,12 +1,11 @@
-"""Frequency responses for other programs: CSV, NPZ, UFF 58, python-control.
+"""Frequency responses as files for other programs: CSV, NPZ, MATLAB, UFF 58.
 
 A file is written beside its place and renamed when whole, so that nothing half-written is
 ever found under its name. What each format can hold:
 
-- NPZ: all of it, as arrays without pickle.
+- NPZ, MAT: all of it, as arrays without pickle; as variables of MATLAB 5.
 - CSV: all of it but the findings, one row a frequency, units in the names of the columns.
 - UFF 58: H (function type 4), coherence (6); the format has no place for a covariance.
-- python-control FRD: H.
 """
 
 from __future__ import annotations
@@ -18,15 +17,12 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from samii_rig.errors import InputError
+from samii_rig.record.convert import arrays
 from samii_rig.types import Channel, Complex, Float, FrequencyResponse
-
-if TYPE_CHECKING:
-    import control
 
 # Codes of the universal file format, data set 58.
 _FRF, _COHERENCE = 4, 6
@@ -38,7 +34,7 @@ _EVEN = 1e-9
 
 
 def export_response(path: Path | str, response: FrequencyResponse) -> Path:
-    """Write `response` in the format that the suffix of `path` names: .csv, .npz, .uff.
+    """Write `response` in the format that the suffix of `path` names: .csv, .npz, .mat, .uff.
 
     Raises
     ------
@@ -48,6 +44,7 @@ def export_response(path: Path | str, response: FrequencyResponse) -> Path:
     writers: dict[str, Callable[[Path, FrequencyResponse], None]] = {
         ".csv": _write_csv,
         ".npz": _write_npz,
+        ".mat": _write_mat,
         ".uff": _write_uff,
         ".unv": _write_uff,
     }
@@ -84,18 +81,6 @@ def replacing(path: Path) -> Iterator[Path]:
         raise InputError(str(path), "", "a folder", "the path of a file") from error
     finally:
         part.unlink(missing_ok=True)
-
-
-def to_frd(response: FrequencyResponse) -> control.FrequencyResponseData:
-    """`response` as python-control's FRD: the same outputs and inputs, by name, rad/s."""
-    import control
-
-    return control.FrequencyResponseData(
-        np.moveaxis(response.H, 0, -1),
-        2 * np.pi * response.frequency,
-        inputs=[c.name for c in response.inputs],
-        outputs=[c.name for c in response.outputs],
-    )
 
 
 def table(response: FrequencyResponse) -> tuple[list[str], Float]:
@@ -152,30 +137,14 @@ def _write_csv(path: Path, response: FrequencyResponse) -> None:
 
 
 def _write_npz(path: Path, response: FrequencyResponse) -> None:
-    r = response
-    arrays: dict[str, Any] = {
-        "frequency_hz": r.frequency,
-        "H": r.H,
-        "covariance": r.covariance,
-        "dof": r.dof,
-        "coherence": r.coherence,
-        "input_rms": r.input_rms,
-        "inputs": np.array([c.name for c in r.inputs]),
-        "input_units": np.array([c.unit for c in r.inputs]),
-        "outputs": np.array([c.name for c in r.outputs]),
-        "output_units": np.array([c.unit for c in r.outputs]),
-        "level": np.array(r.level),
-        "level_unit": np.array(r.level_unit),
-        "rate_hz": np.array(r.rate_hz),
-        "n_averages": np.array(r.n_averages),
-        "method": np.array(r.method),
-        "why": np.array(r.why),
-        "sources": np.array(r.sources, dtype=np.str_),
-        "findings": np.array([f"{f.severity}: {f.message}" for f in r.findings], dtype=np.str_),
-    }
-    arrays |= {k: v for k, v in (("even", r.even), ("odd", r.odd)) if v is not None}
     with path.open("wb") as stream:
-        np.savez_compressed(stream, allow_pickle=False, **arrays)
+        np.savez_compressed(stream, allow_pickle=False, **arrays(response))
+
+
+def _write_mat(path: Path, response: FrequencyResponse) -> None:
+    from scipy.io import savemat
+
+    savemat(str(path), arrays(response), do_compression=True, oned_as="column")
 
 
 def _write_uff(path: Path, response: FrequencyResponse) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from samii_rig.errors import RecordingError
 from samii_rig.record import cdr
 from samii_rig.record.layout import MAX_CHANNELS, channel_from_json, channel_to_json
-from samii_rig.types import Finding, Float, FrequencyResponse
+from samii_rig.types import Complex, Finding, Float, FrequencyResponse
 
 SCHEMA = "samii_rig/msg/FrequencyResponse"
 
@@ -122,11 +122,16 @@ def decode(data: bytes) -> FrequencyResponse:
             )
         return value.reshape(shape)
 
+    def both(name: str, *shape: int) -> Complex:
+        value = np.empty(shape, dtype=complex)
+        value.real, value.imag = array(f"{name}_real", *shape), array(f"{name}_imag", *shape)
+        return value
+
     even, odd = array("even", n, n_out), array("odd", n, n_out)
     return FrequencyResponse(
         frequency=array("frequency", n),
-        H=array("h_real", n, n_out, n_in) + 1j * array("h_imag", n, n_out, n_in),
-        covariance=array("covariance_real", n, p, p) + 1j * array("covariance_imag", n, p, p),
+        H=both("h", n, n_out, n_in),
+        covariance=both("covariance", n, p, p),
         dof=array("dof", n),
         coherence=array("coherence", n, n_out),
         inputs=channels_in,

@@ -94,7 +94,8 @@ def _one_line(
         elif first["type"] == "missing" and i == last:
             field += f".{key}"
         # Otherwise the key is the tag of a union, which the file does not show.
-    field = field.lstrip(".")
+    # Names and keys are the file's: a line break in one must not make two lines of this.
+    field = "".join(c if c.isprintable() else "?" for c in field.lstrip("."))
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     match first["type"]:
         case "value_error":

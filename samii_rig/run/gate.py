@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from samii_rig.errors import GateError
+from samii_rig.run.agreement import Followed, apart
 from samii_rig.run.judgement import (
     Act,
     Arm,
@@ -86,6 +87,8 @@ class Gate:
             if math.isfinite(c.max_rate) or c.channel == limits.centring_sensor
         )
         self._places = Places.among(channels, limits.output.channel, limits.centring_sensor)
+        self._pairs = [(names.index(a.sensor), names.index(a.other)) for a in limits.agreements]
+        self._followed = [Followed() for _ in limits.agreements]
         self._sent = Sent()
         self._latest = Latest.nothing(len(self._columns))
         self._state = State.SAFE
@@ -114,7 +117,7 @@ class Gate:
             latest = observe(self._latest, block, self._columns, self._rates, now)
             if len(block):  # nothing new takes nothing back
                 strayed = stray(self._sent, block, self._places, self._limits.kp)
-                latest = replace(latest, stray=strayed)
+                latest = replace(latest, stray=strayed, apart=self._apart(block))
             self._latest = latest
             self._sent = self._sent.after(latest.sequence)
         self._ask(Check(), now)
@@ -144,6 +147,16 @@ class Gate:
         worst, name = max(used)
         return name, 1.0 - worst
 
+    def _apart(self, block: SampleBlock) -> tuple[float, ...]:
+        found = [
+            apart(a, columns, before, block)
+            for a, columns, before in zip(
+                self._limits.agreements, self._pairs, self._followed, strict=True
+            )
+        ]
+        self._followed = [followed for followed, _ in found]
+        return tuple(way for _, way in found)
+
     @contextmanager
     def _fault_on_error(self) -> Iterator[None]:
         """Whatever breaks in here, the device or we, the answer is zero and FAULT."""
@@ -165,6 +178,7 @@ class Gate:
             # Only a clear does this. Start afresh, so that arming needs new samples.
             beat = self._latest.heartbeat
             self._latest = replace(Latest.nothing(len(self._columns)), heartbeat=beat)
+            self._followed = [Followed() for _ in self._followed]
             self.fault = ""
         elif before is not State.FAULT and decision.state is State.FAULT:
             self.fault = decision.reason

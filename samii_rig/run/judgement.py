@@ -204,6 +204,10 @@ def violation(latest: Latest, limits: GateLimits, now: int) -> Decision | None:
         c, most = limits.output, limits.readback + limits.authority
         text = f"{c.channel} read back is {latest.stray:.4g} {c.unit} away from what was commanded"
         return _fault("readback", f"{text}; allowed {most:.3g}", latest.stray, most, c.unit)
+    for a, way in zip(limits.agreements, latest.apart, strict=False):
+        if way > a.max:
+            text = f"{a.sensor} and {a.other} are {way:.4g} {a.unit} apart: one of them drifts"
+            return _fault("apart", f"{text}; allowed {a.max:g} ({a.reason})", way, a.max, a.unit)
     silence = (now - latest.heartbeat) * 1e-9
     if silence > limits.heartbeat_age:
         return _fault(

@@ -32,6 +32,7 @@ class Latest:
     clipped : (n,) a converter at its end. limited : the device itself changed the output.
     stray : how far the output of the newest block was from what the device was told, see
         `readback.stray`.
+    apart : how far the two of each agreement parted in the newest block, see `agreement.apart`.
     disorder : samples came out of order, now or before.
     sequence, time : of the newest sample. offset : smallest host minus device time, as of
         `offset_at`, host time.
@@ -51,6 +52,7 @@ class Latest:
     clipped: tuple[bool, ...]
     limited: bool = False
     stray: float = 0.0
+    apart: tuple[float, ...] = ()
     disorder: bool = False
     sequence: int = -1
     time: int = NEVER

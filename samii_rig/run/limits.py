@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from samii_rig.errors import InputError
 from samii_rig.model.feedback import reach
+from samii_rig.rig import schema
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     AbsoluteAngle,
@@ -16,6 +17,7 @@ from samii_rig.rig.schema import (
     Rig,
     Sensor,
 )
+from samii_rig.run.agreement import Agreement
 from samii_rig.run.protocols import DeviceLoop
 
 # How long the read-back of an actuator without a deadman may be missing, s. Such an
@@ -112,6 +114,7 @@ class GateLimits:
     readback : how far v as read back may be from u + kp (theta_ref - theta) + feedback.
     turning : unit of the centring sensor per s and actuator unit where an angular velocity
         source turns it, with its sign; 0 where the travel does not follow from the output.
+    agreements : between sensors and what else is known of them.
     """
 
     rate_hz: float
@@ -124,6 +127,7 @@ class GateLimits:
     feedback: tuple[Addition, ...] = ()
     readback: float = math.inf
     turning: float = 0.0
+    agreements: tuple[Agreement, ...] = ()
 
     @property
     def authority(self) -> float:
@@ -166,7 +170,8 @@ def gate_limits(
     Several limits on one channel: the tightest of each number holds. The ends of the
     actuator's converter are a limit too.
 
-    InputError for a loop on a sensor that could stand still unseen, see `_refuse_blind`.
+    InputError for a loop on a sensor that could stand still unseen, see `_refuse_blind`, and for
+    an agreement with an output that turns the sensor at no known speed.
     """
     spec = find_actuator(rig, actuator, rig.name)
     output = _channel(
@@ -181,9 +186,13 @@ def gate_limits(
     feedback = tuple(
         Addition(f, reach(f, rig.rate_hz).slew) for f in rig.feedback if f.actuator == actuator
     )
+    agreements = tuple(
+        _agreement(rig, a) for a in rig.agreement if a.over is None or a.other == actuator
+    )
+    compared = {name for a in agreements for name in (a.sensor, a.other)}
     sensors = []
     for s in rig.sensor:
-        limited = any(True for _ in rig.limits_on(s.name))
+        limited = s.name in compared or any(True for _ in rig.limits_on(s.name))
         read = [a.loop.name for a in feedback if a.loop.sensor == s.name]
         if limited or read or (kp != 0.0 and s.name == sensor):
             reason = "the loop that centres the joint reads it"
@@ -196,7 +205,7 @@ def gate_limits(
     sensors += [
         _channel(rig, m.name, m.unit, math.inf, "", m.stale_after, 0.0)
         for m in rig.monitor
-        if any(True for _ in rig.limits_on(m.name))
+        if m.name in compared or any(True for _ in rig.limits_on(m.name))
     ]
     turning = sum(_angle_gain(rig, actuator, s) for s in rig.sensor if s.name == sensor)
     readback = max(READBACK_STEPS * spec.resolution, READBACK_PART * output.max)
@@ -210,7 +219,20 @@ def gate_limits(
         feedback=feedback,
         readback=readback,
         turning=turning,
+        agreements=agreements,
     )
+
+
+def _agreement(rig: Rig, a: schema.Agreement) -> Agreement:
+    unit = rig.units()[a.sensor]
+    if a.over is None:
+        return Agreement(a.sensor, a.other, unit, a.max, a.reason)
+    (sensor,) = (s for s in rig.sensor if s.name == a.sensor)
+    gain = _angle_gain(rig, a.other, sensor)
+    if gain == 0.0:
+        expected = f"an angle that {a.other} turns through an angular velocity source"
+        raise InputError(rig.name, "agreement.sensor", a.sensor, expected)
+    return Agreement(a.sensor, a.other, unit, a.max, a.reason, gain, a.over)
 
 
 def _stuck(rig: Rig, actuator: ActuatorSpec, sensor: Sensor, most: float) -> Stuck:

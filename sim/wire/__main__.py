@@ -38,11 +38,12 @@ def main() -> int:
     parser.add_argument("--script", type=Path, help="faults: a line SECONDS COMMAND each")
     parser.add_argument("--seed", type=int, default=0, help="of noise and faults")
     parser.add_argument("--ideal", action="store_true", help="no noise of the sensors")
+    parser.add_argument("--supply", action="store_true", help="the node switches the supply")
     chosen = parser.parse_args()
     try:
         script = read_script(chosen.script) if chosen.script else []
         settings = SimSettings(seed=chosen.seed, noise=not chosen.ideal)
-        rig = WireRig(load_rig(chosen.rig)[0], settings, chosen.link)
+        rig = WireRig(load_rig(chosen.rig)[0], settings, chosen.link, supply=chosen.supply)
     except SamiiRigError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code

@@ -50,7 +50,7 @@ class Node:
 
     sample : number of the next sample. state, rejected, host_seq : as the protocol has them.
     fed : sample at which the deadman was fed last. stray : counts by which the converter is
-    off what it was told, a defect that a test can have.
+    off what it was told, relay : whether the supply line works: defects that a test can have.
     """
 
     config: NodeConfig
@@ -67,6 +67,7 @@ class Node:
     fed: int = 0
     v: int = 0
     stray: int = 0
+    relay: bool = True
     theta_ref: int = 0
     encoders: tuple[int, ...] | None = None
     emergency: bool = False
@@ -228,6 +229,11 @@ class Node:
         """Whether the output follows the loop."""
         return self.state in (State.LIVE, State.DRY)
 
+    @property
+    def supply(self) -> bool:
+        """Whether the supply line is on."""
+        return self.live and self.relay
+
     def take(
         self, clock_us: int, encoders: tuple[int, ...], adcs: tuple[int, ...], emergency: bool
     ) -> int:
@@ -254,6 +260,7 @@ class Node:
             wanted = self._wanted(u, encoders)
             self.v = self._limited(wanted)
             flags |= Flag.LIMITED if self.v != wanted else 0
+            flags |= Flag.SUPPLY if self.supply else 0
         else:
             flags |= Flag.NULL | (0 if self.state == State.IDLE else Flag.LIMITED)
         self._report(clock_us, u, flags, encoders, adcs)

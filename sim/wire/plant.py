@@ -32,12 +32,14 @@ class Wiring:
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """The wiring of all sensors and of the output."""
+    """The wiring of all sensors and of the output. supply : the valve has one only while the node's
+    supply line is on."""
 
     encoder: dict[str, Wiring]
     adc: dict[str, Wiring]
     output_counts_per_unit: float
     null: int = NULL
+    supply: bool = False
 
     @property
     def names(self) -> set[str]:
@@ -58,7 +60,8 @@ class Board:
             for kind, wired in (("encoder", self.encoder), ("adc", self.adc))
         }
         out = self.output_counts_per_unit
-        return {"port": port, "output_counts_per_unit": out, "null": self.null, **tables}
+        more = {"supply": True} if self.supply else {}
+        return {"port": port, "output_counts_per_unit": out, "null": self.null, **tables, **more}
 
 
 def board(rig: Rig) -> Board:
@@ -71,7 +74,8 @@ def board(rig: Rig) -> Board:
                 for kind in ("encoder", "adc")
             )
             out = float(given["output_counts_per_unit"])
-            return Board(enc, adc, out, int(given.get("null", NULL)))
+            null, supply = int(given.get("null", NULL)), bool(given.get("supply", False))
+            return Board(enc, adc, out, null, supply)
         except (KeyError, TypeError, ValueError) as error:
             where = "device.settings"
             raise InputError.saying(rig.name, where, f"not a serial node's: {error}") from error

@@ -76,6 +76,7 @@ class Flag(IntFlag):
     ANGLE = 16
     EMERGENCY = 32
     NULL = 64
+    SUPPLY = 128
 
 
 @dataclass(frozen=True, slots=True)

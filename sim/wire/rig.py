@@ -14,6 +14,7 @@ Commands, one a line, on standard input or in a script (each with its time in s 
     offset NAME COUNTS   a sensor or monitor reads so much more from now on
     drift NAME COUNTS    it reads so much more every second
     freeze NAME 0|1      it repeats one value, or no longer
+    supply 0|1       the node's supply line is broken, or works again
     stray COUNTS     the converter holds so much more than the node puts out
     history          one line of JSON: what the output did
     quit
@@ -31,6 +32,7 @@ import sys
 import time
 import tty
 from collections import deque
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -51,8 +53,12 @@ READ = 4096  # bytes
 class WireRig:
     """Plant, node and port; `run` paces them."""
 
-    def __init__(self, rig: Rig, settings: SimSettings, link: Path | None) -> None:
+    def __init__(
+        self, rig: Rig, settings: SimSettings, link: Path | None, *, supply: bool = False
+    ) -> None:
         self.board: Board = board(self._wired(rig))
+        if supply:
+            self.board = replace(self.board, supply=True)
         self._link = link
         self._plant = Plant(rig, self.board, settings)
         n_encoder = 1 + max((w.index for w in self.board.encoder.values()), default=-1)
@@ -81,7 +87,7 @@ class WireRig:
         self._offset: dict[str, float] = {}
         self._drift: dict[str, float] = {}
         self._frozen: dict[str, int | None] = {}
-        self._stray = 0
+        self._stray, self._relay = 0, True
         self._taken = 0  # samples since boot
         self._told = 0  # sample at which a command was carried out last
         self._history: deque[tuple[int, int, int]] = deque(maxlen=KEPT)
@@ -164,10 +170,11 @@ class WireRig:
             adcs = tuple(RAILS[1] if i in self._rails else a for i, a in enumerate(adcs))
         clock = (self._clock + self._taken * self._config.period_ns // 1000) % WORD
         sample = self._node.sample
-        self._node.stray = self._stray
+        self._node.stray, self._node.relay = self._stray, self._relay
         dac = self._node.take(clock, encoders, adcs, self._emergency)
         self._taken += 1
-        self._plant.move(dac)
+        dumped = self.board.supply and not self._node.supply
+        self._plant.move(self._config.null if dumped else dac)
         self._history.append((sample, dac - self._config.null, time.monotonic_ns()))
 
     def _spoilt(
@@ -237,7 +244,7 @@ class WireRig:
                     if what == "rest":
                         self._emergency, self._jump, self._rails = False, 0, set()
                         self._offset, self._drift, self._frozen = {}, {}, {}
-                        self._stray = 0
+                        self._stray, self._relay = 0, True
                         self._plant.rest()
                         self._history.clear()
                 case ["clock", change]:
@@ -255,6 +262,8 @@ class WireRig:
                     self._frozen.pop(name, None)
                     if int(level):
                         self._frozen[name] = None
+                case ["supply", level]:
+                    self._relay = bool(int(level))
                 case ["stray", counts]:
                     self._stray = int(counts)
                 case ["history"]:

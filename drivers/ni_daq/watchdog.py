@@ -1,0 +1,62 @@
+"""The watchdog timer of the board: it puts the output to null when nobody resets it."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from typing import Any
+
+OFTEN = 5  # resets in its time, while the output rests
+
+
+class Watchdog:
+    """A running timer, from before any other task of the device, as NI asks.
+
+    While the output rests at null the timer is reset in here; from `feed` on, which the gate's own
+    calls come to, it is left to them. trouble : what ended the resets, "" if nothing did.
+    """
+
+    def __init__(self, ni: Any, device: str, channel: str, volts: float, seconds: float) -> None:
+        self._resting, self.trouble = True, ""
+        self._seconds = seconds
+        self._task = ni.system.watchdog.WatchdogTask(device, timeout=seconds)
+        try:
+            kind = ni.constants.WatchdogAOExpirState.VOLTAGE
+            state = ni.types.AOExpirationState(channel, volts, kind)
+            self._task.cfg_watchdog_ao_expir_states([state])
+            self._task.start()
+        except BaseException:
+            self._task.close()
+            raise
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="watchdog's resets", daemon=True)
+        self._thread.start()
+
+    def feed(self) -> None:
+        """Reset the timer for a live output; what NI-DAQmx says when it has expired."""
+        self._resting = False
+        self._task.reset_timer()
+
+    def rest(self, *, at_null: bool) -> None:
+        """The output was put to null, or should have been: then the timer is left to expire."""
+        self._resting = at_null
+        self._reset()
+
+    def close(self) -> None:
+        """End the timer; the output must be at null. May be called twice."""
+        if not self._ending.is_set():
+            self._ending.set()
+            self._thread.join()
+            with contextlib.suppress(Exception):
+                self._task.close()
+
+    def _run(self) -> None:
+        while not self.trouble and not self._ending.wait(self._seconds / OFTEN):
+            self._reset()
+
+    def _reset(self) -> None:
+        try:
+            if self._resting:
+                self._task.reset_timer()
+        except Exception as error:
+            self.trouble = f"watchdog: {' '.join(str(error).split())}"

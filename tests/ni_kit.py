@@ -1,0 +1,240 @@
+"""A stand-in for nidaqmx and a board behind it: sample clock, buffer, watchdog, in real time.
+
+Only what NI documents is there, with the names of the package; what a board refuses it refuses in
+NI's words. The output turns an encoder.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+
+TURN = 0.5  # rad/s that one volt at ao0 turns ctr0
+UNDERFLOW = "-200290: The generation has stopped to prevent the regeneration of old samples."
+EXPIRED = "-200678: Writing failed, because the watchdog timer expired."
+CONSTANTS = SimpleNamespace(
+    AcquisitionType=SimpleNamespace(CONTINUOUS="continuous"),
+    EncoderType=SimpleNamespace(X_4="x4"),
+    AngleUnits=SimpleNamespace(RADIANS="rad"),
+    RegenerationMode=SimpleNamespace(DONT_ALLOW_REGENERATION="once"),
+    TaskMode=SimpleNamespace(TASK_COMMIT="commit"),
+    WatchdogAOExpirState=SimpleNamespace(VOLTAGE="voltage"),
+)
+
+
+class Board:
+    """One sample clock. `out` is the voltage at the terminal, `volts` that at all inputs but the
+    read-back; `broken` says which task's calls fail: ai, ci, ao (what is played out), null (a
+    single value), made (that there is a task at all)."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self.rate, self.begun, self.k = 500.0, 0.0, 0
+        self.out, self.stray = 3.0, 0.0  # a board keeps its last voltage
+        self.volts, self.theta = 0.5, 0.0
+        self.seen: list[tuple[float, float]] = []  # at each sample: output before it, angle
+        self.player: Task | None = None
+        self.tasks: list[Task] = []
+        self.watchdog: Watchdog | None = None
+        self.broken: set[str] = set()
+        self.resets = 0
+        self.calls: list[tuple[str, str]] = []
+        self.error = "-50405: No transfer is in progress\nbecause the board is gone."
+
+    def advance(self) -> None:
+        """Up to now."""
+        now = time.monotonic()
+        w = self.watchdog
+        due = int((now - self.begun) * self.rate) if self.begun else 0
+        while self.k < due:
+            self._watch(self.begun + self.k / self.rate)
+            self.seen.append((self.out + self.stray, self.theta))
+            self.k += 1
+            if self.player is not None:
+                self.player.edge()
+            self.theta += TURN * self.out / self.rate
+        if w is not None:
+            self._watch(now)
+
+    def _watch(self, now: float) -> None:
+        w = self.watchdog
+        if w is not None and w.running and not w.expired and now - w.reset > w.timeout:
+            w.expired, self.out, self.player = True, w.volts, None
+
+    def check(self, kind: str) -> None:
+        self.advance()
+        if self.watchdog is not None and self.watchdog.expired:
+            raise RuntimeError(EXPIRED)
+        if kind in self.broken:
+            raise RuntimeError(self.error)
+
+
+class Task:
+    board: Board
+
+    def __init__(self) -> None:
+        self.board.check("made")
+        self.kind, self.open, self.rows, self.given = "", True, [], 0
+        self.buffer: list[float] = []
+        self.error, self.timed = "", False
+        chans = {
+            "ai": ("ai_channels", "add_ai_voltage_chan"),
+            "ci": ("ci_channels", "add_ci_ang_encoder_chan"),
+            "ao": ("ao_channels", "add_ao_voltage_chan"),
+        }
+        for kind, (group, add) in chans.items():
+            add_one = lambda name, kind=kind, **more: self.add(kind, name)  # noqa: E731
+            setattr(self, group, SimpleNamespace(**{add: add_one}))
+        self.timing = SimpleNamespace(cfg_samp_clk_timing=self.clock)
+        self.out_stream = OutStream()
+        self.in_stream = InStream(self)
+        self.board.tasks.append(self)
+
+    def add(self, kind: str, name: str) -> None:
+        self.kind = "null" if kind == "ao" else kind
+        self.rows.append(name)
+
+    def clock(self, rate, source="", sample_mode="", samps_per_chan=0) -> None:
+        assert sample_mode == "continuous"
+        assert rate == self.board.rate
+        assert (source == "") == (self.kind == "ai")
+        self.board.calls.append((self.kind, source))
+        self.timed = True
+        self.kind = "ao" if self.kind == "null" else self.kind
+
+    def control(self, mode: str) -> None:
+        assert mode == "commit"
+
+    def start(self) -> None:
+        b = self.board
+        with b.lock:
+            b.check(self.kind)
+            b.calls.append(("start", self.kind))
+            if self.kind == "ao":
+                assert self.out_stream.regen_mode == "once"
+                assert self.buffer
+                assert b.player is None, "two tasks play out"
+                b.player = self
+            elif self.kind == "ai":
+                b.begun = time.monotonic()
+
+    def edge(self) -> None:
+        """The sample clock, where this task plays out."""
+        if self.buffer:
+            self.board.out = self.buffer.pop(0)
+        else:
+            self.error, self.board.player = UNDERFLOW, None
+
+    def write(self, data, auto_start, timeout) -> None:
+        b = self.board
+        with b.lock:
+            b.check(self.kind)
+            if self.error:
+                raise RuntimeError(self.error)
+            if not self.timed:
+                assert auto_start
+                assert b.player is None, "the output is reserved by what plays out"
+                b.out = float(data)
+            else:
+                assert np.isfinite(data).all()
+                self.buffer += np.asarray(data).tolist()
+
+    def read(self, n: int, timeout: float):
+        b = self.board
+        with b.lock:
+            b.check(self.kind)
+            part = b.seen[self.given : self.given + n]
+            self.given += n
+            if self.kind == "ci":
+                return [theta for _, theta in part]
+            rows = [[v if "ao0" in name else b.volts for v, _ in part] for name in self.rows]
+            return rows if len(rows) > 1 else rows[0]
+
+    def close(self) -> None:
+        with self.board.lock:
+            self.board.advance()
+            self.open = False
+            if self.board.player is self:
+                self.board.player = None  # the terminal keeps its voltage
+
+
+class OutStream:
+    __slots__ = ("output_buf_size", "regen_mode")
+
+
+class InStream:
+    def __init__(self, task: Task) -> None:
+        self.task = task
+
+    @property
+    def total_samp_per_chan_acquired(self) -> int:
+        with self.task.board.lock:
+            self.task.board.check(self.task.kind)
+            return self.task.board.k
+
+    @property
+    def avail_samp_per_chan(self) -> int:
+        return self.total_samp_per_chan_acquired - self.task.given
+
+
+class Watchdog:
+    board: Board
+
+    def __init__(self, device_name: str, timeout: float) -> None:
+        self.name, self.timeout, self.volts = device_name, timeout, np.nan
+        self.running = self.expired = False
+        self.reset = 0.0
+        self.board.watchdog = self
+
+    def cfg_watchdog_ao_expir_states(self, states) -> None:
+        ((channel, self.volts, kind),) = states
+        assert channel.endswith("/ao0")
+        assert kind == "voltage"
+
+    def start(self) -> None:
+        assert not any(t.open for t in self.board.tasks), "-201477: tasks are reserved"
+        assert not np.isnan(self.volts)
+        self.running, self.reset = True, time.monotonic()
+
+    def reset_timer(self) -> None:
+        with self.board.lock:
+            self.board.advance()
+            if self.expired:
+                raise RuntimeError("-200644: The watchdog timer has expired.")
+            self.reset = time.monotonic()
+
+    def close(self) -> None:
+        with self.board.lock:
+            self.board.advance()
+            self.running = False
+            self.board.watchdog = None
+
+
+def installed(monkeypatch) -> Board:
+    """The package, in the place of the real one; what hangs on it."""
+    import sys
+
+    board = Board()
+
+    def reset_device() -> None:
+        board.resets += 1
+        board.out, board.watchdog = 0.0, None
+
+    modules = {name: ModuleType(f"nidaqmx.{name}") for name in ("types", "system")}
+    modules["constants"] = CONSTANTS
+    modules["system.watchdog"] = ModuleType("nidaqmx.system.watchdog")
+    modules["types"].AOExpirationState = lambda *fields: fields
+    modules["system"].Device = lambda name: SimpleNamespace(reset_device=reset_device)
+    modules["system"].watchdog = modules["system.watchdog"]
+    modules["system.watchdog"].WatchdogTask = type("W", (Watchdog,), {"board": board})
+    top = ModuleType("nidaqmx")
+    top.Task = type("T", (Task,), {"board": board})
+    for name in ("constants", "types", "system"):
+        setattr(top, name, modules[name])
+    monkeypatch.setitem(sys.modules, "nidaqmx", top)
+    for name, module in modules.items():
+        monkeypatch.setitem(sys.modules, f"nidaqmx.{name}", module)
+    return board
