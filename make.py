@@ -3,8 +3,9 @@
 
     python3 make.py demo     the main job on the simulated SAMII, from sweep to report
     python3 make.py check    every check: lint, types, import layers, tests
+    python3 make.py audit    the pinned packages against the known vulnerabilities of PyPI
 
-Both make a virtual environment in .venv on first use, with the versions that
+The first two make a virtual environment in .venv on first use, with the versions that
 constraints.txt pins. Anything after the command is handed on: to `samii-rig run` or to pytest.
 """
 
@@ -67,7 +68,17 @@ def check(arguments: list[str]) -> None:
     call(BIN / "pytest", "-q", "-n", workers, "--durations=10", *arguments)
 
 
-COMMANDS = {"demo": demo, "check": check}
+def audit(arguments: list[str]) -> None:
+    """Look every pinned package up; fails for a vulnerability, and for a package not looked up."""
+    place = VENV / "audit"
+    python = place / BIN.name / "python"
+    call(sys.executable, "-m", "venv", place)
+    call(python, "-m", "pip", "--quiet", "--disable-pip-version-check", "install", "pip-audit>=2.9")
+    pinned = ("--requirement", "constraints.txt", "--no-deps", "--disable-pip")
+    call(python, "-m", "pip_audit", "--strict", *pinned, *arguments)
+
+
+COMMANDS = {"demo": demo, "check": check, "audit": audit}
 
 if __name__ == "__main__":
     if sys.version_info < (3, 11):

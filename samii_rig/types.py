@@ -1,4 +1,5 @@
-"""The data that flows through the system, and nothing else.
+"""The data that flows through the system, and nothing else: pictures of it and other libraries'
+forms are made elsewhere, and imported when they are asked for.
 
 Axes are named here once and never change order. Values are in SI units unless the
 channel's `unit` says otherwise (an actuator's input may be counts).
@@ -6,12 +7,22 @@ channel's `unit` says otherwise (an actuator's input may be counts).
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from enum import IntFlag
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from samii_rig.display import card
+
+if TYPE_CHECKING:
+    import control
+    import xarray
+    from plotly.graph_objects import Figure
+
+    from samii_rig.rig.schema import Rig
 
 Float = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -170,6 +181,41 @@ class Recording:
             segments=(segment,),
         )
 
+    def to_numpy(self) -> dict[str, NDArray[Any]]:
+        """(n,) arrays by name: `time_s` from the first sample on, `sequence`, every channel."""
+        from samii_rig.record.convert import columns
+
+        return columns(self)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """A variable a channel over `time`, with units (`record.convert.samples`)."""
+        from samii_rig.record.convert import samples
+
+        return samples(self)
+
+    def plot(self) -> Figure:
+        """Every channel over time; one segment at a time, chosen above."""
+        from samii_rig.report.notebook import series
+
+        return series(self)
+
+    def _repr_html_(self) -> str:
+        missing = np.sum((self.quality & Quality.MISSING) != 0, axis=0)
+        rows = []
+        for i, c in enumerate(self.channels):
+            good = self.values[np.isfinite(self.values[:, i]), i]
+            ends = (f"{good.min():.4g}", f"{good.max():.4g}") if good.size else ("", "")
+            rows.append((c.name, c.unit, c.role, *ends, int(missing[i]) or ""))
+        levels = Counter(f"{s.kind} at {s.level:g} {s.unit}" for s in self.segments)
+        facts = {
+            "samples": f"{len(self):,} at {self.rate_hz:g} Hz, {len(self) / self.rate_hz:.4g} s",
+            "segments": ", ".join(f"{n} x {what}" for what, n in levels.items()),
+            "ended": f"{self.stop.status}: {self.stop.reason}",
+            "from": self.source,
+        }
+        head = ("channel", "unit", "role", "smallest", "largest", "missing")
+        return card("Recording", facts, head, rows)
+
 
 @dataclass(frozen=True, slots=True)
 class FrequencyResponse:
@@ -214,3 +260,53 @@ class FrequencyResponse:
     def variance(self) -> Float:
         """(n_freq, n_out, n_in) E|dH|^2, the diagonal of `covariance`."""
         return np.diagonal(self.covariance, axis1=1, axis2=2).real.reshape(self.H.shape)
+
+    def to_numpy(self) -> dict[str, NDArray[Any]]:
+        """All of it, words too, as arrays by name: those of the file that `.npz` exports."""
+        from samii_rig.record.convert import arrays
+
+        return arrays(self)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """H, its deviation and covariance by names of channels (`record.convert.lines`)."""
+        from samii_rig.record.convert import lines
+
+        return lines(self)
+
+    def to_control(self) -> control.FrequencyResponseData:
+        """H as python-control's FRD: outputs and inputs by name, rad/s."""
+        from samii_rig.record.convert import frd
+
+        return frd(self)
+
+    def plot(self, output: str = "", input: str = "", rig: Rig | None = None) -> Figure:
+        """Bode diagram of one entry with its 90 % bands, and the model of `rig` over it.
+
+        output, input : names of channels; by default the first.
+        """
+        from samii_rig.report.notebook import bode
+
+        return bode([self], output, input, rig)
+
+    def _repr_html_(self) -> str:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            relative = np.sqrt(self.variance()) / np.abs(self.H)
+        f = self.frequency
+        rows = [
+            (
+                f"{y.name}/{u.name}",
+                f"({y.unit})/({u.unit})",
+                f"{100 * np.nanmedian(relative[:, i, j]):.2g} %",
+                f"{np.nanmedian(self.coherence[:, i]):.4f}",
+            )
+            for i, y in enumerate(self.outputs)
+            for j, u in enumerate(self.inputs)
+        ]
+        facts = {
+            "lines": f"{len(f)}, {f[0]:.4g} to {f[-1]:.4g} Hz",
+            "level": f"{self.level:g} {self.level_unit}",
+            "method": f"{self.method}, {self.n_averages} averages. {self.why}",
+            "noticed": "; ".join(x.message for x in self.findings if x.severity != "note"),
+        }
+        head = ("entry", "unit", "standard deviation (median)", "coherence (median)")
+        return card("Frequency response", facts, head, rows)

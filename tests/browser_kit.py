@@ -64,12 +64,29 @@ class Browser:
 
     def value(self, expression: str) -> Any:
         """What JavaScript says."""
+        found = self._evaluated(expression)
+        assert "exceptionDetails" not in found, found["exceptionDetails"]
+        return found["result"].get("value")
+
+    def _evaluated(self, expression: str) -> dict[str, Any]:
         asked = {"expression": expression, "returnByValue": True, "awaitPromise": True}
-        return self.call("Runtime.evaluate", **asked)["result"].get("value")
+        return self.call("Runtime.evaluate", **asked)
+
+    def choose(self, id_: str, value: str) -> None:
+        """Change a select or an input, as a person does."""
+        self.value(
+            f"(e => {{ e.value = '{value}'; e.dispatchEvent(new Event('change')); }})"
+            f"(document.getElementById('{id_}'))"
+        )
+
+    def colours(self, scheme: str) -> None:
+        """`dark` or `light`."""
+        feature = {"name": "prefers-color-scheme", "value": scheme}
+        self.call("Emulation.setEmulatedMedia", features=[feature])
 
     def until(self, expression: str) -> None:
-        """Wait until it is true in the page."""
-        self._wait(lambda: self.value(expression), expression)
+        """Wait until it is true in the page; one that is just being loaded has not all parts."""
+        self._wait(lambda: self._evaluated(expression)["result"].get("value") is True, expression)
 
     def text(self, id_: str) -> str:
         return str(self.value(f"document.getElementById('{id_}')?.textContent ?? ''"))

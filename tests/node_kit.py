@@ -91,6 +91,10 @@ class CompiledNode:
         n = self._c.node_tx(self._node, out, ctypes.c_size_t(room))
         return out.raw[:n]
 
+    @property
+    def supply(self) -> bool:
+        return bool(self._c.node_supply(self._node))
+
     def take(
         self, clock_us: int, encoders: tuple[int, ...], adcs: tuple[int, ...], emergency: bool
     ) -> int:

@@ -283,7 +283,7 @@ def test_unknown_channels_and_methods_are_named(log: Path) -> None:
     assert "expected one of auto" in call("frf", log, "--method", "magic")[1]
     code, said = call("frf", log, "--export", "frf.docx")
     assert code == 2
-    assert ".csv, .npz or .uff" in said
+    assert ".csv, .npz, .mat or .uff" in said
 
 
 def test_an_existing_recording_is_never_overwritten(log: Path, sweep: Path) -> None:

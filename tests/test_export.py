@@ -9,7 +9,7 @@ import pyuff
 from report_kit import measured
 
 from samii_rig.errors import InputError
-from samii_rig.record.export import export_response, replacing, to_frd
+from samii_rig.record.export import export_response, replacing
 from samii_rig.report.page import write_report
 
 
@@ -66,7 +66,7 @@ def test_uff_is_read_by_pyuff(tmp_path, even):
 
 def test_python_control_evaluates_it():
     r = measured()
-    system = to_frd(r)
+    system = r.to_control()
     assert system.output_labels == ["theta_2", "a_0"]
     assert system.input_labels == ["v_2"]
     k = 123

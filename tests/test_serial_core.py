@@ -122,6 +122,7 @@ def compare(core, seed: int, steps: int) -> set[int]:
         clock = (clock + 2000) % 2**32
         inputs = clock, (encoder, -encoder // 2), adcs, rng.random() < 0.002
         assert node.take(*inputs) == c.take(*inputs)
+        assert node.supply == c.supply == node.live
         if rng.random() < 0.5:
             room = rng.choice([1, 50, 2048])
             assert node.transmit(room) == c.transmit(room)

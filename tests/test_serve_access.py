@@ -39,6 +39,8 @@ TABLE = {
     ("GET", "/api/experiments"): VIEWER,
     ("POST", "/api/dry-run"): VIEWER,
     ("GET", "/api/jobs/{id_}"): VIEWER,
+    ("GET", "/api/jobs/{id_}/responses"): VIEWER,
+    ("GET", "/api/jobs/{id_}/diagnosis"): VIEWER,
     ("GET", "/api/recordings"): VIEWER,
     ("GET", "/api/recordings/words"): VIEWER,
     ("GET", "/api/recordings/{id_}"): VIEWER,

@@ -1,17 +1,21 @@
-"""The page in a real browser: plan, start, watch, stop by Escape, a service that is killed.
+"""The page in a real browser: plan, start, watch, stop by Escape, a service that is killed; the
+responses and the diagnosis of a run that goes on; accessible to axe in dark and light.
 
 Skips where no Chromium is installed.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import pytest
 from browser_kit import Browser
 from index_kit import write_small
-from serve_kit import Service
+from serve_kit import Service, sweep
 
 from samii_rig.record.reader import read_recording
 
@@ -75,4 +79,50 @@ def test_an_afternoon_at_the_page(
         browser.value("document.querySelector('#list button').click()")
         browser.until("document.getElementById('one-about').textContent.includes('stopped')")
         browser.until("document.getElementById('one-notes').textContent.includes('stop asked by')")
+    assert browser.errors == []
+
+
+def violations(browser: Browser) -> list[Any]:
+    """What axe finds wrong with the page as it is now."""
+    axe = (resources.files("axe_core_python") / "axe.min.js").read_text("utf-8")
+    browser.value(f"{axe}; undefined")
+    found = browser.value("axe.run(document).then((found) => JSON.stringify(found.violations))")
+    return [(v["id"], v["help"], [n["html"][:120] for n in v["nodes"]]) for v in json.loads(found)]
+
+
+def test_a_run_tells_what_it_knows_while_it_goes_on(
+    browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SAMII_RIG_STATE", str(tmp_path / "state"))
+    write_small(tmp_path / "runs" / "old.mcap", operator="Ada")
+    with Service(tmp_path / "runs", "--pace", "4") as service:
+        browser.go(service.url)
+        browser.until("document.getElementById('link').textContent === 'live'")
+        for scheme in ("dark", "light"):
+            browser.colours(scheme)
+            assert violations(browser) == []
+        with service.lease() as lease:
+            service.start(lease, sweep(duration=8.0, repeats=60), diagnosis=True)
+            # Nothing is measured: all is hatched, and says so.
+            browser.until("document.getElementById('frf-about').textContent.includes('0 of 60')")
+            browser.until("/[1-9] repeats/.test(document.getElementById('frf-about').textContent)")
+            assert "of 60 segments whole" in browser.text("frf-about")
+            browser.until("document.getElementById('diagnosis-age').textContent.includes(' old')")
+            assert "Chance that nothing is missing" in browser.text("diagnosis-facts")
+            browser.until("document.getElementById('motion').ariaLabel.includes('times as large')")
+            # Everything that can be opened is open.
+            browser.choose("trigger", "single")
+            browser.click("cursors")
+            browser.until("document.getElementById('cursor-read').textContent.includes('Δt')")
+            browser.value("document.querySelector('#list button').click()")
+            browser.until("document.getElementById('one-about').textContent.includes('download')")
+            for scheme in ("dark", "light"):
+                browser.colours(scheme)
+                assert violations(browser) == []
+            browser.press("Escape")
+            browser.until("document.getElementById('now').textContent === 'No run.'")
+        # What was measured until then stays, as of a run that is over.
+        browser.until("document.getElementById('frf-about').textContent.startsWith('Last run')")
+        service.kill()
+        browser.until("document.getElementById('motion').ariaLabel.includes('not live')")
     assert browser.errors == []

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from samii_rig.plain import plain
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -16,11 +18,34 @@ if TYPE_CHECKING:
     from samii_rig.rig.schema import Rig
     from samii_rig.types import FrequencyResponse, Recording
 
+
+def rigs(incomplete: str) -> list[str]:
+    """Names of shipped rigs, for a shell that completes; where none fits it takes files."""
+    from samii_rig.rig.load import shipped
+
+    return [name for name in shipped() if name.startswith(incomplete)]
+
+
+def experiments(incomplete: str) -> list[str]:
+    """Names of shipped experiments, likewise."""
+    from samii_rig.run.experiments import shipped
+
+    return [name for name in shipped() if name.startswith(incomplete)]
+
+
 RigOption = Annotated[
-    str, typer.Option("--rig", help="Name of a shipped rig, or the path of a rig file.")
+    str,
+    typer.Option(
+        "--rig", help="Name of a shipped rig, or the path of a rig file.", autocompletion=rigs
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, for machines.")]
 Logs = Annotated[list[Path], typer.Argument(help="Recordings (.mcap).", show_default=False)]
+
+WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes; by default one a core.")]
+SchedulerOption = Annotated[
+    str, typer.Option(help="Address of a dask.distributed scheduler to run on instead.")
+]
 
 
 def check_target(
@@ -39,22 +64,8 @@ def check_target(
 
 def say_json(data: dict[str, Any]) -> None:
     """One JSON object on standard output; numbers that JSON has not become null."""
-    json.dump(_plain(data), sys.stdout, indent=2, allow_nan=False)
+    json.dump(plain(data), sys.stdout, indent=2, allow_nan=False)
     sys.stdout.write("\n")
-
-
-def _plain(value: Any) -> Any:
-    match value:
-        case dict():
-            return {str(k): _plain(v) for k, v in value.items()}
-        case list() | tuple():
-            return [_plain(v) for v in value]
-        case float():
-            return value if abs(value) < float("inf") else None
-        case str() | int() | None:
-            return value
-        case _:
-            return str(value)
 
 
 def rig_of(recordings: Sequence[Recording], option: str | None) -> tuple[Rig, str] | None:

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from samii_rig.cli.common import JsonOption, Logs, rig_of, say_json
+from samii_rig.cli.common import (
+    JsonOption,
+    Logs,
+    SchedulerOption,
+    WorkersOption,
+    rig_of,
+    say_json,
+)
 from samii_rig.cli.estimate import (
     BandOption,
     GapsOption,
@@ -18,7 +25,13 @@ from samii_rig.cli.estimate import (
 )
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from rich.console import Console
+
+    from samii_rig.diagnose.batch import How
     from samii_rig.diagnose.result import Diagnosis
+    from samii_rig.signal.gather import Gaps
 
 
 def diagnose(
@@ -34,6 +47,15 @@ def diagnose(
     output: OutputOption = None,
     gaps: GapsOption = "exclude",
     band: BandOption = None,
+    each: Annotated[
+        bool,
+        typer.Option(
+            "--each",
+            help="Diagnose every recording by itself, a folder's too; --out gets a .json for each.",
+        ),
+    ] = False,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = "",
     json: JsonOption = False,
 ) -> None:
     """Locate what differs between rig file and recordings, name it, model it, show the gain.
@@ -45,6 +67,25 @@ def diagnose(
     from dataclasses import replace
 
     from rich.console import Console
+
+    if each:
+        from samii_rig.diagnose.batch import How
+        from samii_rig.rig.load import load_rig
+        from samii_rig.workers import workers as at_work
+
+        how = How(
+            load_rig(rig)[1] if rig else "",
+            tuple(output) if output else None,
+            cast("Gaps", gaps),
+            band,
+        )
+        if out is not None:
+            _made(out)
+        with at_work(workers, scheduler) as executor:
+            said = _each(logs, how, out, executor, Console(highlight=False, stderr=json))
+        if json:
+            say_json({"recordings": said})
+        return
 
     from samii_rig.diagnose.diagnose import diagnose as found_by
     from samii_rig.errors import InputError
@@ -63,6 +104,7 @@ def diagnose(
             progress=lambda stage: status.update(f"{stage} ..."),
             runs=recordings,
         )
+    _keep(logs, {**found.plain(), "lines": list(found.lines())})
     page = None
     if out is not None:
         from samii_rig.report.diagnosis import write_diagnosis
@@ -87,6 +129,57 @@ def diagnose(
         console.print(f"page     {page}", soft_wrap=True)
 
 
+def _keep(logs: list[Path], found: dict[str, Any]) -> None:
+    """What was found, beside each recording, where `samii-rig recordings` finds it again."""
+    from samii_rig.errors import RecordingError
+    from samii_rig.index.remarks import set_diagnosis
+
+    for path in logs:
+        try:
+            set_diagnosis(path, found)
+        except RecordingError as error:
+            # A folder that only lets itself be read is no reason to diagnose nothing.
+            typer.echo(f"samii-rig: the diagnosis is not kept: {error}", err=True)
+
+
+def _made(folder: Path) -> None:
+    """Make the folder of --out; InputError where that is not possible."""
+    from samii_rig.errors import InputError
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("--out", "", str(folder), f"a folder to write to ({error})") from error
+
+
+def _each(
+    given: list[Path], how: How, out: Path | None, executor: Executor, console: Console
+) -> list[dict[str, Any]]:
+    """A line for every recording, and a file in `out`; one that has no diagnosis says why."""
+    import json
+
+    from samii_rig.diagnose.batch import each
+    from samii_rig.errors import InputError
+
+    logs = [log for p in given for log in (sorted(p.rglob("*.mcap")) if p.is_dir() else [p])]
+    if not logs:
+        raise InputError("LOGS", "", str(given[0]), "a folder with recordings (.mcap)")
+    stems = [log.stem for log in logs]
+    twice = [stem for stem in stems if stems.count(stem) > 1]
+    if out is not None and twice:
+        raise InputError("--out", "", twice[0], "recordings of different names")
+    said = []
+    for log, one in each(logs, executor, how):
+        said.append({"recording": str(log), **one})
+        if out is not None:
+            (out / f"{log.stem}.json").write_text(json.dumps(one, indent=2), encoding="utf-8")
+        if "error" not in one:
+            _keep([log], one)
+        what = f"no diagnosis: {one['error']}" if "error" in one else one["lines"][0]
+        console.print(f"{log}  {what}", soft_wrap=True, markup=False)
+    return said
+
+
 def _write(folder: Path, found: Diagnosis) -> str:
     """Write the new rig file, if there is one, and the contract; the rig file's path."""
     import json
@@ -95,8 +188,8 @@ def _write(folder: Path, found: Diagnosis) -> str:
     from samii_rig.diagnose.rigfile import toml
     from samii_rig.errors import InputError
 
+    _made(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         path = ""
         if found.rig is not None and found.causes:
             path = str(folder / "diagnosed.toml")

@@ -16,6 +16,7 @@ from samii_rig.cli.common import (
     model_curve,
     response_json,
     rig_of,
+    rigs,
     say_json,
 )
 from samii_rig.errors import EstimateError, InputError
@@ -31,7 +32,11 @@ ALL = (0.0, float("inf"))  # Hz: every line that was estimated
 
 RigOverride = Annotated[
     str | None,
-    typer.Option("--rig", help="Rig to lay over the data [default: the one they carry]"),
+    typer.Option(
+        "--rig",
+        help="Rig to lay over the data [default: the one they carry]",
+        autocompletion=rigs,
+    ),
 ]
 InputOption = Annotated[str | None, typer.Option("--input", help="Input channel.")]
 OutputOption = Annotated[
@@ -59,7 +64,7 @@ def frf(
     export: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Write a .csv, .npz or .uff file, one a level, replaced if it exists. "
+            help="Write a .csv, .npz, .mat or .uff file, one a level, replaced if it exists. "
             "May be repeated."
         ),
     ] = None,
@@ -82,7 +87,7 @@ def frf(
     from samii_rig.report.summary import summary
 
     for path in export or ():
-        check_target("--export", path, (".csv", ".npz", ".uff"), logs)
+        check_target("--export", path, (".csv", ".npz", ".mat", ".uff"), logs)
     if save:
         check_target("--save", save, (".mcap",), logs)
         if save.exists():

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from samii_rig.cli.common import JsonOption, RigOption, say_json
+from samii_rig.cli.common import JsonOption, RigOption, SchedulerOption, WorkersOption, say_json
 
 if TYPE_CHECKING:
     from samii_rig.prove.score import Score
@@ -32,12 +32,8 @@ def prove(
         int,
         typer.Option(help="Seed of the first trial of each kind. Thresholds were set below 1e6."),
     ] = 1_000_000,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes; by default one a core.")
-    ] = None,
-    scheduler: Annotated[
-        str, typer.Option(help="Address of a dask.distributed scheduler to run on instead.")
-    ] = "",
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = "",
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep the recordings (12 MB a trial).")
     ] = False,
@@ -62,6 +58,7 @@ def prove(
     from samii_rig.prove.page import write_page
     from samii_rig.prove.score import scores
     from samii_rig.rig.load import load_rig
+    from samii_rig.workers import workers as at_work
 
     console = Console(highlight=False)
     _, text = load_rig(rig)
@@ -76,7 +73,7 @@ def prove(
         TimeRemainingColumn(),
         console=console,
     )
-    with nullcontext() if json else bar, trials.workers(workers, scheduler) as executor:
+    with nullcontext() if json else bar, at_work(workers, scheduler) as executor:
         task = bar.add_task("trials", total=len(todo))
         failures = trials.carry_out(
             campaign, todo, executor, lambda n, _all: bar.update(task, completed=n)
@@ -104,7 +101,8 @@ def prove(
 
         rows = trials.evidence(campaign.out)
         origin = f"{len(rows)} trials with an effect found, of seeds from {seed}"
-        regression.write(calibrate, regression.fit(rows), origin)
+        place = regression.fit(trials.place_evidence(campaign.out))
+        regression.write(calibrate, regression.fit(rows), origin, place)
     if failures:
         raise typer.Exit(1)
 

@@ -17,6 +17,7 @@ from samii_rig.cli.common import (
     JsonOption,
     RigOption,
     comparisons,
+    experiments,
     model_curve,
     response_json,
     say_json,
@@ -41,7 +42,8 @@ def run(
         str,
         typer.Argument(
             help="Name of a shipped experiment (swept_sine, stepped_sine, multisine, torque_test, "
-            "mode_scan, step), or the path of its file."
+            "mode_scan, step), or the path of its file.",
+            autocompletion=experiments,
         ),
     ],
     rig: RigOption = "samii",

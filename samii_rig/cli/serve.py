@@ -38,6 +38,15 @@ def serve(
         float,
         typer.Option(help="Of a simulated rig: times real time; 0 for as fast as it can.", min=0.0),
     ] = 1.0,
+    foxglove: Annotated[
+        int | None,
+        typer.Option(
+            help="Port of this machine at which Foxglove sees runs live, without a token; 0 for "
+            "any [default: none]",
+            min=0,
+            max=65535,
+        ),
+    ] = None,
     new_token: Annotated[
         str | None,
         typer.Option("--new-token", help="Add a token for this person to --tokens, show it, end."),
@@ -86,5 +95,6 @@ def serve(
             tokens=known,
             names=tuple(name or ()),
             pace=pace,
+            foxglove=foxglove,
         )
     )

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from samii_rig.errors import InputError, RecordingError
+from samii_rig.plain import plain
 
 if sys.platform != "win32":
     import fcntl
@@ -126,7 +127,7 @@ def _change(recording: Path, change: Callable[[Remarks], Remarks]) -> Remarks:
     path = remarks_path(recording)
     with _alone(recording):
         new = change(read_remarks(recording))
-        data = {"format": FORMAT, **_plain(asdict(new))}
+        data = {"format": FORMAT, **plain(asdict(new))}
         handle, name = -1, ""
         try:
             handle, name = tempfile.mkstemp(dir=path.parent, prefix=".remarks-")
@@ -153,18 +154,3 @@ def _alone(recording: Path) -> Iterator[None]:
             yield
     except FileNotFoundError as error:
         raise RecordingError(f"{recording} is not there; expected a recording") from error
-
-
-def _plain(value: Any) -> Any:
-    """Data as JSON can say it: what is no number becomes null."""
-    match value:
-        case dict():
-            return {str(k): _plain(v) for k, v in value.items()}
-        case list() | tuple():
-            return [_plain(v) for v in value]
-        case float():
-            return value if abs(value) < float("inf") else None
-        case str() | int() | None:
-            return value
-        case _:
-            return str(value)

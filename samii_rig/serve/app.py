@@ -54,7 +54,10 @@ def application(rooms: Rooms) -> FastAPI:
             work.cancel()
             with suppress(asyncio.CancelledError):
                 await work
+            rooms.analysis.close()
             rooms.desk.close()
+            if rooms.foxglove is not None:
+                rooms.foxglove.close()
 
     app = FastAPI(
         title="samii-rig",
@@ -158,4 +161,6 @@ def serve(settings: Settings) -> None:
         timeout_graceful_shutdown=2,
     )
     print(f"{settings.rig.name}: {scheme}://{host}:{port}", flush=True)
+    if rooms.foxglove is not None:
+        print(f"Foxglove: ws://127.0.0.1:{rooms.foxglove.port}", flush=True)
     uvicorn.Server(config).run(sockets=[listening])

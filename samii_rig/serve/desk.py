@@ -20,6 +20,7 @@ from typing import Any
 
 from samii_rig import errors
 from samii_rig.errors import SamiiRigError
+from samii_rig.plain import plain
 
 WORKERS = 2
 WITHIN = 120.0  # s that a piece of work may take
@@ -74,7 +75,7 @@ def _begin() -> None:
 
 def _answered(work: Callable[..., dict[str, Any]], arguments: tuple[Any, ...]) -> dict[str, Any]:
     try:
-        return {"found": _plain(work(*arguments))}
+        return {"found": plain(work(*arguments))}
     except SamiiRigError as error:
         return {"raised": type(error).__name__, "line": str(error)}
     except MemoryError:
@@ -82,14 +83,30 @@ def _answered(work: Callable[..., dict[str, Any]], arguments: tuple[Any, ...]) -
 
 
 def rig(rig_toml: str) -> dict[str, Any]:
-    """The rig as data, and as a drawing."""
+    """The rig as data, as a drawing, and how it moves with its sensors (see `motion`)."""
+    import numpy as np
+
     from samii_rig.report.drawing import draw
     from samii_rig.rig.load import parse
     from samii_rig.rig.schema import Rig
+    from samii_rig.serve.motion import motion
 
     the_rig = parse(Rig, rig_toml, "rig file")
+    moves = motion(the_rig)
+    moving = None
+    if moves is not None:
+        kinds = {e.name: e.kind for e in the_rig.element}
+        moving = {
+            "x": moves.x.tolist(),
+            "element": list(moves.element),
+            "kind": [kinds[name] for name in moves.element],
+            "sensors": list(moves.sensors),
+            "accelerations": list(moves.accelerations),
+            "hz": moves.hz.tolist(),
+            "matrix": np.round(moves.matrix, 5).tolist(),
+        }
     found = the_rig.model_dump(mode="json", exclude={"device": {"settings"}})
-    return {"rig": found, "drawing": draw(the_rig), "text": rig_toml}
+    return {"rig": found, "drawing": draw(the_rig), "motion": moving, "text": rig_toml}
 
 
 def dry_run(rig_toml: str, name: str, text: str) -> dict[str, Any]:
@@ -212,16 +229,3 @@ def comparison(a: str, b: str) -> dict[str, Any]:
 
     first, second = (read_frequency_responses(Path(p)) for p in (a, b))
     return {"pairs": compared(first, second)}
-
-
-def _plain(value: Any) -> Any:
-    """What is no number as null, which JSON can say."""
-    match value:
-        case dict():
-            return {str(k): _plain(v) for k, v in value.items()}
-        case list() | tuple():
-            return [_plain(v) for v in value]
-        case float():
-            return value if math.isfinite(value) else None
-        case _:
-            return value

@@ -6,6 +6,7 @@ import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from samii_rig.errors import LimitError
@@ -13,6 +14,7 @@ from samii_rig.rig.load import MAX_BYTES
 from samii_rig.run.experiments import shipped
 from samii_rig.serve import desk
 from samii_rig.serve.access import COOKIE, STOP
+from samii_rig.serve.job import DIAGNOSIS, RESPONSES
 from samii_rig.serve.lease import EVERY, LASTS
 from samii_rig.serve.rooms import NotThereError, Rooms, operator, person
 from samii_rig.serve.viewers import MOST_VIEWERS
@@ -39,6 +41,7 @@ class Start(Asked):
     operator: Annotated[str, Field(max_length=80)] = ""
     diagnosis: bool = True
     seed: Annotated[int | None, Field(ge=0, le=2**53)] = None
+    stop_when_certain: bool = False
 
 
 class Word(Body):
@@ -107,6 +110,7 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
             asked.operator or who.name,
             diagnosis=asked.diagnosis,
             seed=asked.seed,
+            stop_when_certain=asked.stop_when_certain,
         )
         return {"jobs": [rooms.supervisor.plain(j) for j in jobs]}
 
@@ -117,6 +121,16 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
         if found is None:
             raise NotThereError(f"no job {id_[:40]!r}; expected the id of one")
         return found
+
+    @router.get("/jobs/{id_}/responses", response_class=FileResponse)
+    def responses(id_: str) -> FileResponse:
+        """The frequency responses of a run so far, with 90 % bands, and the model's."""
+        return _told(rooms, id_, RESPONSES)
+
+    @router.get("/jobs/{id_}/diagnosis", response_class=FileResponse)
+    def diagnosis(id_: str) -> FileResponse:
+        """The diagnosis of a run so far; `next_toml` is the experiment that it asks for."""
+        return _told(rooms, id_, DIAGNOSIS)
 
     @router.post(STOP.removeprefix("/api"))
     async def stop(request: Request) -> Answer:
@@ -145,6 +159,13 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
         rooms.drives(request)
         rooms.latch.clear(word.name, word.reason)
         return rooms.state()
+
+
+def _told(rooms: Rooms, id_: str, name: str) -> FileResponse:
+    path = rooms.supervisor.told(id_, name)
+    if path is None:
+        raise NotThereError(f"nothing is known yet of job {id_[:40]!r}")
+    return FileResponse(path, media_type="application/json")
 
 
 def _lease(router: APIRouter, rooms: Rooms) -> None:

@@ -24,7 +24,7 @@ from typing import Any, Literal
 from samii_rig.errors import GateError, RecordingError
 
 ID = re.compile(r"\d{8}T\d{12}-[0-9a-f]{6}")
-REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS = (
+REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, DIAGNOSIS = (
     "request.json",
     "state.json",
     "rig.toml",
@@ -32,6 +32,8 @@ REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS = (
     "lock",
     "log.txt",
     "stops.jsonl",
+    "responses.json",
+    "diagnosis.json",
 )
 
 MOST_STOPS = 20  # that are written down
@@ -45,7 +47,8 @@ OVER: tuple[Phase, ...] = ("done", "refused", "cancelled", "died")
 @dataclass(frozen=True, slots=True)
 class Request:
     """What was asked for. setup : which run of an experiment of several. recording : its name
-    below the folder. settings : of the device, over those of the rig file."""
+    below the folder. settings : of the device, over those of the rig file. stop_when_certain : end
+    once the diagnosis is (see `analysis`)."""
 
     experiment: str
     recording: str
@@ -54,13 +57,14 @@ class Request:
     instruction: str = ""
     diagnosis: bool = True
     duration_s: float = 0.0
+    stop_when_certain: bool = False
     settings: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class JobState:
     """How it stands. status, reason : of the stop record. error : why there is none.
-    live : path of the live data."""
+    live : path of the live data. early : why it ended before its plan did, in good order."""
 
     phase: Phase = "queued"
     pid: int = 0
@@ -70,6 +74,7 @@ class JobState:
     error: str = ""
     trouble: str = ""
     verdict: str = ""
+    early: str = ""
     time: str = ""
 
 
@@ -130,6 +135,12 @@ class Job:
         """Write how it stands, whole or not at all."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
         _put(self.folder / STATE, {**asdict(state), "time": now})
+
+    def tell(self, name: str, data: dict[str, Any]) -> None:
+        """Write what is known so far into the file `name`, whole or not at all."""
+        new = self.folder / f".{name}"
+        new.write_text(json.dumps(data, allow_nan=False), encoding="utf-8")
+        new.replace(self.folder / name)
 
     def alive(self) -> bool:
         """Whether somebody runs it now."""

@@ -28,10 +28,10 @@ MAGIC = b"SAMIILV1"
 SECONDS = 8.0  # of samples in the ring: what a viewer sees who comes late
 LEAST_ROWS = 1024
 PAGE = 16384  # bytes for the description and for the progress, each
-# Header: magic, channels, rows, rate; then counts of rows that are whole and that are begun, and
-# the service's sign of life in ns of the system's monotonic clock.
+# Header: magic, channels, rows, rate; then counts of rows that are whole and that are begun, the
+# service's sign of life in ns of the system's monotonic clock, and whether it knows enough.
 _HEAD = struct.Struct("<8sIId")
-_WHOLE, _BEGUN, _BEAT = 64, 72, 80
+_WHOLE, _BEGUN, _BEAT, _ENOUGH = 64, 72, 80, 88
 _DESCRIPTION, _PROGRESS, _RING = PAGE, 2 * PAGE, 3 * PAGE
 _COUNT = struct.Struct("<Q")
 _TEXT = struct.Struct("<QI")  # version (odd while it is written), length
@@ -124,6 +124,11 @@ class LiveWriter:
         """Seconds since the service's last sign of life."""
         return (time.monotonic_ns() - self._map.count(_BEAT)) * 1e-9
 
+    @property
+    def enough(self) -> bool:
+        """Whether the service asks for no more: the run may end where it next rests."""
+        return self._map.count(_ENOUGH) > 0
+
     def close(self) -> None:
         """Those who have it open keep it; nobody opens it any more."""
         self.path.unlink(missing_ok=True)
@@ -174,6 +179,10 @@ class LiveReader:
             with suppress(ValueError):
                 self._progress = json.loads(text)
         return self._progress
+
+    def enough(self) -> None:
+        """Ask for no more."""
+        self._map.put_count(_ENOUGH, 1)
 
     def beat(self) -> None:
         """Say that the service is there."""

@@ -17,7 +17,10 @@ from samii_rig.index.entry import Entry
 from samii_rig.index.store import Index
 from samii_rig.run.latch import Latch
 from samii_rig.serve.access import Person
+from samii_rig.serve.analysis import Analysis
 from samii_rig.serve.desk import Desk
+from samii_rig.serve.foxglove import Foxglove
+from samii_rig.serve.job import RESPONSES
 from samii_rig.serve.lease import Lease
 from samii_rig.serve.settings import Settings
 from samii_rig.serve.supervisor import Supervisor
@@ -48,10 +51,13 @@ class Rooms:
         self.index = Index(settings.folder)
         self.index.refresh(progress)
         self.supervisor = Supervisor(settings.rig, settings.rig_toml, self.index, settings.pace)
+        self.analysis = Analysis(settings.folder)
         self.lease = Lease()
         self.desk = Desk()
         self.viewers = Viewers()
         self.latch = Latch(settings.rig.name)
+        at = settings.foxglove
+        self.foxglove = None if at is None else Foxglove(at, settings.rig.name)
 
     async def work(self) -> None:
         """Look after run, lease and viewers until cancelled."""
@@ -72,13 +78,26 @@ class Rooms:
                 if now >= due["jobs"]:
                     due["jobs"] = now + LOOK_AFTER
                     self.supervisor.turn()
+                    self._analyse()
                 if now >= due["state"]:
                     due["state"] = now + STATE_PERIOD
                     state = self.state()
                 self.viewers.show(self.supervisor.reader(), state)
+                if self.foxglove is not None:
+                    job = self.supervisor.current
+                    self.foxglove.show(
+                        self.supervisor.reader(), job.folder / RESPONSES if job else None
+                    )
                 if now >= due["refresh"] and (refreshing is None or refreshing.done()):
                     due["refresh"] = now + REFRESH
                     refreshing = asyncio.create_task(asyncio.to_thread(self._refresh))
+
+    def _analyse(self) -> None:
+        """Look after what is known of the run; end it early where the order allows it."""
+        job, reader = self.supervisor.current, self.supervisor.reader()
+        self.analysis.turn(job)
+        if job is not None and job.request.stop_when_certain and self.analysis.certain and reader:
+            reader.enough()
 
     def _refresh(self) -> None:
         with _said("the index"):
@@ -90,6 +109,7 @@ class Rooms:
         fault = self.latch.fault if real else None
         return {
             **self.supervisor.state(),
+            "so_far": self.analysis.state() if self.supervisor.current else None,
             "rig": self.settings.rig.name,
             "real": real,
             "fault": asdict(fault) if fault else None,

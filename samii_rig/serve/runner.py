@@ -21,16 +21,15 @@ from typing import Any
 
 from samii_rig.errors import GateError, SamiiRigError
 from samii_rig.index.remarks import add_note, set_diagnosis
-from samii_rig.rig.load import parse
-from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import Outcome, carry_out
 from samii_rig.run.dryrun import predict
-from samii_rig.run.experiments import load_experiment
 from samii_rig.run.progress import Progress
 from samii_rig.run.protocols import Plan
-from samii_rig.run.setups import Setup, setups_of
-from samii_rig.serve.job import EXPERIMENT, RIG, Job, JobState
+from samii_rig.run.setups import Setup
+from samii_rig.serve.following import following
+from samii_rig.serve.job import DIAGNOSIS, Job, JobState
 from samii_rig.serve.live import LiveWriter, live_folder
+from samii_rig.serve.planned import planned
 from samii_rig.types import SampleBlock
 
 # s without a sign of the service after which it counts as gone: it gives one every half second.
@@ -47,13 +46,14 @@ class Runner:
         self.live: LiveWriter | None = None
         self.stop = Event()
         self.lost = False
+        self._enough_in = 0  # the segment in which the service asked for no more
 
     def go(self) -> None:
         """From the files of the job to the recording and its diagnosis."""
         live = live_folder() / f"{self.job.id}.live"
         self._set(phase="starting", pid=os.getpid(), live=str(live))
         try:
-            setup, text, plan = self._planned()
+            setup, text, plan = planned(self.job)
             outcome = self._carry_out(setup, text, plan, live)
             self._set(
                 phase="analysing",
@@ -62,7 +62,7 @@ class Runner:
                 trouble=outcome.trouble,
             )
             self._note()
-            verdict = self._diagnosed(setup, outcome)
+            verdict = self._diagnosed(setup, text, outcome)
             self._set(phase="done", verdict=verdict)
         except SamiiRigError as error:
             self._set(phase="refused", error=str(error))
@@ -77,13 +77,6 @@ class Runner:
     def _set(self, **changes: Any) -> None:
         self.state = replace(self.state, **changes)
         self.job.set(self.state)
-
-    def _planned(self) -> tuple[Setup, str, Plan]:
-        rig_toml = (self.job.folder / RIG).read_text(encoding="utf-8")
-        rig = parse(Rig, rig_toml, RIG)
-        experiment, text = load_experiment(str(self.job.folder / EXPERIMENT), rig)
-        setup = setups_of(experiment, rig, rig_toml)[self.request.setup]
-        return setup, text, experiment.plan(setup.rig)
 
     def _carry_out(self, setup: Setup, text: str, plan: Plan, live: Path) -> Outcome:
         predicted = predict(plan, setup.rig)
@@ -103,6 +96,7 @@ class Runner:
                 # JSON says neither "not a number" nor "infinite".
                 about = {"duration": plan.duration, "broadband": math.isinf(now.frequency)}
                 self.live.progress({**_numbers(asdict(now)), **about})
+                self._end_at_rest(now)
 
         def alive() -> bool:
             gone = self.live is not None and self.live.silence() > LOST_AFTER
@@ -126,25 +120,42 @@ class Runner:
             watch=watch,
         )
 
+    def _end_at_rest(self, now: Progress) -> None:
+        """Once the service asks for no more: end after the segment that goes on, at rest."""
+        assert self.live is not None
+        if self.live.enough and not self._enough_in:
+            self._enough_in = now.segment
+        # Its reference has come down by itself then, and nothing of the next has begun.
+        if 0 < self._enough_in < now.segment and math.isnan(now.frequency):
+            # Written down later: the loop waits for no disk.
+            early = f"its diagnosis was certain after segment {now.segment - 1}"
+            self.state = replace(self.state, early=early)
+            self.stop.set()
+
     def _note(self) -> None:
         """Who stopped it, beside the recording."""
-        said = [f"stop asked by {s['by']} at {s['time']}" for s in self.job.stops()]
+        said = [f"ended early: {self.state.early}"] if self.state.early else []
+        said += [f"stop asked by {s['by']} at {s['time']}" for s in self.job.stops()]
         if self.lost:
             said.append(f"stopped, as the service gave no sign for {LOST_AFTER:g} s")
         if said:
             add_note(self.path, "service", "; ".join(said)[:2000])
 
-    def _diagnosed(self, setup: Setup, outcome: Outcome) -> str:
+    def _diagnosed(self, setup: Setup, text: str, outcome: Outcome) -> str:
         """The verdict; "" where there is nothing to tell it from."""
         if not self.request.diagnosis or not outcome.responses:
             return ""
-        if outcome.stop.status != "completed" or outcome.interrupted:
+        whole = outcome.stop.status == "completed" or (self.state.early and not self.job.stops())
+        if not whole or outcome.interrupted:
             return ""
         from samii_rig.diagnose.diagnose import diagnose
+        from samii_rig.serve.analyst import said
 
         with suppress(SamiiRigError):
             found = diagnose(outcome.responses, setup.rig)
             set_diagnosis(self.path, {**found.plain(), "lines": list(found.lines())})
+            told = {"next_toml": following(found.experiment, text), "final": True}
+            self.job.tell(DIAGNOSIS, {**said(found), **told})
             return found.verdict
         return ""
 

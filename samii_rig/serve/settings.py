@@ -23,6 +23,7 @@ class Settings:
     tls : certificate and key, None without. tokens : None where everybody who reaches the service
     may drive: on this machine alone. names : under which it may be called, beside its host.
     pace : of a simulated rig, times real time; 0 for as fast as it can.
+    foxglove : port of this machine that shows runs to Foxglove, 0 for any; None for none.
     """
 
     rig: Rig
@@ -34,6 +35,7 @@ class Settings:
     tokens: Tokens | None = None
     names: tuple[str, ...] = ()
     pace: float = 1.0
+    foxglove: int | None = None
 
     def check(self) -> None:
         """InputError for what cannot work or would let strangers drive."""

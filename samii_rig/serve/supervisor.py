@@ -75,6 +75,7 @@ class Supervisor:
         *,
         diagnosis: bool,
         seed: int | None,
+        stop_when_certain: bool = False,
     ) -> list[Job]:
         """Queue the runs of an experiment, one job each; InputError if that cannot be,
         GateError while the queue is held.
@@ -105,6 +106,7 @@ class Supervisor:
                 instruction=run["instruction"],
                 diagnosis=diagnosis and len(predicted) == 1,
                 duration_s=run["duration_s"],
+                stop_when_certain=stop_when_certain,
                 settings={**settings, **with_seed},
             )
             made.append(Job.make(self._jobs, request, self._rig_toml, experiment_toml))
@@ -201,7 +203,8 @@ class Supervisor:
             reason = "its process ended without a word" if moved else "stopped before it moved"
             state = JobState(phase="died", live=state.live, status="failed", reason=reason)
             job.set(state)
-        if state.phase != "cancelled" and state.status != "completed":
+        asked = state.early and not job.stops()  # by the order itself
+        if state.phase != "cancelled" and state.status != "completed" and not asked:
             self.held = f"{recording}: {state.status or 'refused'}, {state.reason or state.error}"
         if state.live:
             Path(state.live).unlink(missing_ok=True)
@@ -231,6 +234,11 @@ class Supervisor:
         """A job by its id, among all that are kept; None if there is none."""
         job = Job(self._jobs / id_) if ID.fullmatch(id_) else None
         return self.plain(job) if job is not None and job.folder.is_dir() else None
+
+    def told(self, id_: str, name: str) -> Path | None:
+        """A file of what is known of a job so far; None if there is none."""
+        path = self._jobs / id_ / name
+        return path if ID.fullmatch(id_) and path.is_file() else None
 
     def plain(self, job: Job) -> dict[str, Any]:
         """A job as data."""

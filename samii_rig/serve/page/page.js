@@ -1,8 +1,12 @@
 import { Scope } from "/page/scope.js";
 import { plot } from "/page/curves.js";
+import { controls } from "/page/controls.js";
+import { Motion } from "/page/motion.js";
+import { SoFar } from "/page/sofar.js";
 
 const $ = (id) => document.getElementById(id);
-const scope = new Scope($("scope"));
+const scope = new Scope($("scope"), (text) => { $("scope-state").textContent = text; });
+const motion = new Motion($("motion"), scope, (text) => { $("motion").setAttribute("aria-label", text); });
 let lease = "", beating = 0, state = null, heard = 0, job = "", wanted = true;
 
 async function ask(method, path, body, headers = {}) {
@@ -34,6 +38,9 @@ function put(parent, tag, text, name = "") {
   return e;
 }
 
+Object.assign(window, { scope, motion }); // to measure what they cost
+const soFar = new SoFar($, ask, put);
+
 // The stop: no lease, no token, and Escape from anywhere.
 async function stop() {
   $("now").textContent = "Stop asked for …";
@@ -51,7 +58,11 @@ function listen() {
   socket.binaryType = "arraybuffer";
   socket.onmessage = (message) => {
     heard = performance.now();
-    if (typeof message.data === "string") show(JSON.parse(message.data)); else scope.take(message.data);
+    if (typeof message.data === "string") show(JSON.parse(message.data));
+    else {
+      const frame = scope.take(message.data);
+      if (frame) motion.take(frame, scope.channels);
+    }
   };
   socket.onclose = () => setTimeout(listen, 1000);
 }
@@ -67,7 +78,7 @@ setInterval(() => {
     $("facts").replaceChildren();
     $("bar").hidden = true;
     $("driver").textContent = "";
-  } else scope.why = state && !state.running && !scope.rows.length ? "No run" : "";
+  } else scope.why = state && !state.running && scope.empty ? "No run" : "";
   $("lost").textContent = scope.lost ? `${scope.lost} frames were skipped, as this viewer was slow` : "";
 }, 500);
 
@@ -78,7 +89,8 @@ function show(s) {
   document.title = `${s.running ? "▶ " : ""}${s.rig}`;
   $("driver").textContent = `${s.operator ? `${s.operator} drives` : "nobody drives"}, ${s.viewers} watching`;
   if (s.channels.length && JSON.stringify(s.channels) !== JSON.stringify(scope.channels)) channels(s.channels);
-  if (s.running && s.running.id !== job) { job = s.running.id; scope.clear(); }
+  if (s.running && s.running.id !== job) { job = s.running.id; scope.clear(); motion.clear(); }
+  motion.hz = s.running?.progress.frequency ?? null;
   const r = s.running, p = r ? r.progress : {};
   if (!r) $("now").textContent = s.fault ? "FAULT" : "No run.";
   else if (r.phase === "running" && p.segment) {
@@ -113,35 +125,18 @@ function show(s) {
   }
   const l = s.last;
   $("last").textContent = l ? `Last: ${l.experiment}, ${l.status || l.phase}. ${l.error || l.reason} ${l.verdict.replace("_", " ")}` : "";
+  soFar.show(s);
   if (before && l && (!before.last || before.last.id !== l.id)) find();
 }
 
-function channels(list) {
-  scope.channels = list; scope.clear();
-  const sensors = list.map((c, i) => [c, i]).filter(([c]) => c.role !== "reference").map(([, i]) => i);
-  scope.shown = sensors.slice(0, 4);
-  $("picks").replaceChildren();
-  for (let lane = 0; lane < Math.min(4, list.length); lane++) {
-    const label = put($("picks"), "label", `${lane + 1} `), select = put(label, "select", "");
-    list.forEach((c, i) => { put(select, "option", c.name).value = i; });
-    select.value = scope.shown[lane] ?? lane;
-    scope.shown[lane] = Number(select.value);
-    select.onchange = () => { scope.shown[lane] = Number(select.value); };
-  }
-}
-$("span").onchange = () => { scope.span = Number($("span").value); };
-$("pause").onclick = () => {
-  scope.paused = !scope.paused;
-  $("pause").setAttribute("aria-pressed", scope.paused);
-  $("pause").textContent = scope.paused ? "Go on" : "Pause";
-};
+const channels = controls($, put, scope);
 
 // Driving
 function driving(secret) {
   lease = secret;
   clearInterval(beating);
   $("take").textContent = lease ? "Hand over" : "Take control";
-  $("start").disabled = $("clear").disabled = !lease;
+  $("start").disabled = $("clear").disabled = $("next").disabled = !lease;
   if (!lease) return;
   beating = setInterval(async () => {
     try { await ask("POST", "/lease/beat"); } catch (error) { driving(""); alarm(error.message); }
@@ -160,10 +155,12 @@ $("plan").onclick = tried(async () => {
   $("planned").textContent = found.refused ? `Refused: ${found.refused}`
     : `${found.runs.length > 1 ? `${found.runs.length} runs, ` : ""}${clock(total)}; nearest to a limit: ${worst.channel} in ${worst.segment}, ${(100 * worst.margin).toFixed(0)} % left of ${worst.limit} ${worst.unit}`;
 });
+const order = (what) => ask("POST", "/runs", { ...what, operator: $("operator").value, stop_when_certain: $("early").checked });
+$("next").onclick = tried(async () => order({ experiment_toml: await soFar.next() }));
 $("start").onclick = tried(async () => {
   $("planned").textContent = "predicting …";
   try {
-    await ask("POST", "/runs", { experiment: $("experiment").value, operator: $("operator").value });
+    await order({ experiment: $("experiment").value });
   } finally { $("planned").textContent = ""; }
 });
 $("resume").onclick = tried(() => ask("POST", "/queue/resume"));
@@ -258,8 +255,9 @@ $("note").onsubmit = tried(async () => {
 });
 
 async function begin() {
-  const { drawing } = await ask("GET", "/rig");
+  const { drawing, motion: moves } = await ask("GET", "/rig");
   $("drawing").innerHTML = drawing;
+  motion.rig(moves);
   const { experiments } = await ask("GET", "/experiments");
   $("experiment").replaceChildren();
   for (const name of Object.keys(experiments)) put($("experiment"), "option", name);

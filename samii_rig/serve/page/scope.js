@@ -1,130 +1,223 @@
-// The live scope: the newest seconds of up to four channels. Missing samples are gaps, and a
-// connection that is lost covers the picture: what is old never looks as if it were live.
+// The live scope: up to four channels, free running or from a trigger, with two cursors. Missing
+// samples are gaps, and a connection that is lost covers the picture: what is old never looks live.
 
-const HEAD = 32; // bytes before a frame's values, see viewers.py
-const KEPT = 24; // s
+import { Samples } from "/page/samples.js";
+
 const EASE = 0.12; // of what is missing, a frame: blocks come four times a second
-
-function extremes(values, n, columns) {
-  const low = new Array(columns).fill(Infinity), high = new Array(columns).fill(-Infinity);
-  for (let i = 0; i < n; i++) {
-    for (let c = 0; c < columns; c++) {
-      const v = values[i * columns + c];
-      if (v < low[c]) low[c] = v;
-      if (v > high[c]) high[c] = v;
-    }
-  }
-  return { low, high };
-}
+const BEFORE = 0.25; // of the span, before the trigger
+const PATIENCE = 1.0; // s after which "auto" runs on without a trigger
+const LEFT = 76;
 
 export class Scope {
-  constructor(canvas) {
-    this.canvas = canvas;
-    this.channels = [];
-    this.shown = [];
-    this.span = 5;
-    this.paused = false;
-    this.live = false;
-    this.why = "";
+  constructor(canvas, said) {
+    Object.assign(this, { canvas, said, channels: [], shown: [], span: 5, paused: false, live: false, why: "" });
+    this.trigger = { mode: "off", lane: 0, level: 0, rising: true };
+    this.cursors = null; // two parts of the width, or none
+    this.samples = new Samples();
+    this.inks = {};
     this.clear();
-    const draw = () => { this.draw(); requestAnimationFrame(draw); };
+    setInterval(() => { this.inks = {}; }, 500); // dark and light may change
+    const draw = () => { if (canvas.isConnected) { this.draw(); requestAnimationFrame(draw); } };
     requestAnimationFrame(draw);
   }
 
-  clear() { this.rows = []; this.next = null; this.edge = null; this.lost = 0; }
+  ink = (name) => (this.inks[name] ??= getComputedStyle(document.documentElement).getPropertyValue(name).trim());
+
+  clear() { this.samples.clear(0, 0); this.edge = null; this.arm(); }
+
+  get empty() { return this.samples.end === null; }
+  get lost() { return this.samples.lost; }
+
+  // Look for a trigger from what is new on.
+  arm() { this.kept = null; this.at = null; this.looked = this.samples.end ?? 0; this.text = ""; }
 
   take(buffer) {
-    const view = new DataView(buffer);
-    if (view.getUint8(0) !== 1) return;
-    const columns = view.getUint16(2, true), n = view.getUint32(4, true);
-    const step = view.getUint32(8, true);
-    this.lost = view.getUint32(12, true);
-    const rate = view.getFloat64(16, true), first = Number(view.getBigInt64(24, true));
-    if (columns !== this.channels.length) return;
-    const values = new Float32Array(buffer, HEAD);
-    const samples = step === 1 ? n : (n / 2) * step;
-    if (this.next !== null && first < this.next) this.clear();
-    const t0 = first * (samples ? n / samples / rate : 0);
-    const gap = this.next !== null && first !== this.next;
-    this.rows.push({ t0, dt: 1 / rate, n, values, gap, ...extremes(values, n, columns) });
-    this.next = first + samples;
-    const end = t0 + n / rate;
-    while (this.rows.length && this.rows[0].t0 + this.rows[0].n * this.rows[0].dt < end - KEPT) {
-      this.rows.shift();
+    const frame = this.samples.take(buffer, this.channels.length);
+    if (frame) this.look();
+    return frame;
+  }
+
+  // The next crossing of the level whose window is whole; after it the next begins.
+  look() {
+    const { mode, lane, level, rising } = this.trigger, s = this.samples, column = this.shown[lane];
+    if (mode === "off" || column === undefined || (mode === "single" && this.kept) || this.paused) return;
+    const after = Math.ceil((1 - BEFORE) * this.span * s.rate), before = Math.floor(BEFORE * this.span * s.rate);
+    let r = Math.max(this.looked, s.begin + 1);
+    for (; r < s.end - after; r++) {
+      const a = s.value(column, r - 1), b = s.value(column, r);
+      if (rising ? a < level && b >= level : a > level && b <= level) {
+        // Between two samples, so that the picture does not jump by one.
+        this.at = (r - 1 + (level - a) / (b - a)) / s.rate;
+        this.kept = s.copy(r - before - 1, r + after);
+        r += after;
+        if (mode === "single") break;
+      }
     }
+    this.looked = r;
+  }
+
+  pause(on) {
+    this.paused = on;
+    const s = this.samples;
+    if (!on) { this.frozen = null; return; }
+    if (this.empty) return;
+    this.frozen = this.view();
+    if (this.frozen.rows === s) {
+      const { from } = this.frozen;
+      this.frozen.rows = s.copy(Math.floor(from * s.rate), Math.ceil((from + this.span) * s.rate));
+    }
+  }
+
+  // What is shown: rows, the time at the left edge, and the trigger's time if it is from one.
+  view() {
+    if (this.frozen) return this.frozen;
+    const s = this.samples, newest = (s.end ?? 0) / (s.rate || 1);
+    const { mode } = this.trigger;
+    const waits = mode !== "off" && !(mode === "auto" && newest - (this.at ?? -Infinity) > PATIENCE + this.span);
+    if (waits && this.kept) return { rows: this.kept, from: this.at - BEFORE * this.span, at: this.at };
+    if (waits && mode !== "auto") return { rows: null, from: 0, at: null };
+    return { rows: s, from: this.edge - this.span, at: null };
+  }
+
+  tell(view) {
+    const { mode } = this.trigger;
+    let text = "";
+    if (this.paused) text = "Paused";
+    else if (mode === "single" && this.kept) text = "Triggered once";
+    else if (mode === "normal" || mode === "single") text = view.rows ? "Triggered" : "Waiting for the trigger";
+    else if (mode === "auto") text = view.at === null ? "No trigger: runs free" : "Triggered";
+    if (text !== this.text) { this.text = text; this.said(text); }
   }
 
   draw() {
-    const c = this.canvas, ratio = window.devicePixelRatio || 1;
-    const w = c.clientWidth, h = c.clientHeight;
+    const c = this.canvas, ratio = window.devicePixelRatio || 1, w = c.clientWidth, h = c.clientHeight;
     if (c.width !== Math.round(w * ratio) || c.height !== Math.round(h * ratio)) {
       c.width = Math.round(w * ratio); c.height = Math.round(h * ratio);
-    } else if (this.paused) return;
-    const g = c.getContext("2d");
+    }
+    const g = c.getContext("2d"), s = this.samples, ink = this.ink;
     g.setTransform(ratio, 0, 0, ratio, 0, 0);
     g.clearRect(0, 0, w, h);
-    const style = getComputedStyle(document.documentElement);
-    const ink = (name) => style.getPropertyValue(name).trim();
-    const last = this.rows.at(-1);
-    const end = last ? last.t0 + last.n * last.dt : 0;
+    const end = s.end === null ? 0 : s.end / s.rate;
     if (this.edge === null || Math.abs(end - this.edge) > 2) this.edge = end;
-    if (!this.paused) this.edge += EASE * (end - this.edge);
-    const lanes = this.shown.length || 1, left = 76, tall = (h - 22) / lanes;
-    g.font = "13px system-ui, sans-serif"; g.lineJoin = "round";
-    this.shown.forEach((column, lane) => {
-      this.lane(g, column, lane, left, 4 + lane * tall, w - left - 8, tall - 8, ink);
-    });
+    this.edge += EASE * (end - this.edge);
+    const view = this.view(), lanes = this.shown.length || 1, tall = (h - 22) / lanes, width = w - LEFT - 8;
+    this.tell(view);
+    this.read = [];
+    g.font = "13px system-ui, sans-serif"; g.lineJoin = "bevel";
+    this.shown.forEach((column, lane) => this.lane(g, view, column, lane, 4 + lane * tall, width, tall - 8));
     g.fillStyle = ink("--muted"); g.textAlign = "left";
-    g.fillText(`−${this.span} s`, left, h - 4);
-    g.textAlign = "right"; g.fillText("now", w - 8, h - 4);
-    if (this.why) {
-      g.fillStyle = ink("--panel"); g.globalAlpha = 0.8; g.fillRect(left, 0, w, h - 20);
+    const zero = view.at === null || view.at === undefined ? view.from + this.span : view.at;
+    const told = (t) => (Math.abs(t) < 1e-9 ? (view.at === null ? "now" : "trigger") : `${t > 0 ? "+" : "−"}${Math.abs(t).toPrecision(3)} s`);
+    g.fillText(told(view.from - zero), LEFT, h - 4);
+    g.textAlign = "right"; g.fillText(this.frozen && view.at === null ? "paused" : told(view.from + this.span - zero), w - 8, h - 4);
+    if (this.cursors) this.marks(g, width, h);
+    const why = this.why || (!view.rows && this.live ? "Waiting for the trigger" : "");
+    if (why) {
+      g.fillStyle = ink("--panel"); g.globalAlpha = 0.8; g.fillRect(LEFT, 0, w, h - 20);
       g.globalAlpha = 1; g.fillStyle = ink(this.live ? "--muted" : "--bad");
       g.font = "600 18px system-ui, sans-serif"; g.textAlign = "center";
-      g.fillText(this.why, left + (w - left) / 2, h / 2);
+      g.fillText(why, LEFT + (w - LEFT) / 2, h / 2);
     }
   }
 
-  lane(g, column, lane, x, y, w, h, ink) {
-    const from = this.edge - this.span, columns = this.channels.length;
-    let low = Infinity, high = -Infinity;
-    for (const r of this.rows) {
-      if (r.t0 + r.n * r.dt < from) continue;
-      low = Math.min(low, r.low[column]);
-      high = Math.max(high, r.high[column]);
-    }
+  marks(g, width, h) {
+    g.setLineDash([2, 3]); g.lineWidth = 1.5; g.strokeStyle = g.fillStyle = this.ink("--ink"); g.textAlign = "left";
+    this.cursors.forEach((part, i) => {
+      const x = LEFT + part * width;
+      g.beginPath(); g.moveTo(x, 0); g.lineTo(x, h - 20); g.stroke();
+      g.fillText("AB"[i], x + 3, h - 26);
+    });
+    g.setLineDash([]);
+  }
+
+  lane(g, view, column, lane, y, w, h) {
+    const ink = this.ink, colour = ink(`--c${lane}`), channel = this.channels[column], x = LEFT;
     g.strokeStyle = ink("--line"); g.lineWidth = 1; g.strokeRect(x, y, w, h);
-    const channel = this.channels[column], colour = ink(`--c${lane}`);
     g.textAlign = "right"; g.fillStyle = colour;
     g.fillText(channel ? channel.name : "", x - 8, y + 14);
     g.fillStyle = ink("--muted");
     g.fillText(channel ? channel.unit.replace("^2", "²") : "", x - 8, y + 30);
+    const rows = view.rows;
+    if (!rows || rows.begin === null || !rows.columns[column]) return;
+    const values = rows.columns[column], size = rows.length, rate = rows.rate;
+    const first = Math.max(rows.begin, Math.ceil(view.from * rate));
+    const last = Math.min(rows.end, Math.floor((view.from + this.span) * rate) + 1);
+    const perPixel = (this.span * rate) / w, px = (r) => x + (w * (r / rate - view.from)) / this.span;
+    // More rows than pixels: the outline of each pixel's rows, which is what would be seen.
+    const bins = perPixel > 1 ? Math.ceil(w) + 1 : 0;
+    const lowest = new Float32Array(bins).fill(Infinity), highest = new Float32Array(bins).fill(-Infinity);
+    let low = Infinity, high = -Infinity;
+    for (let r = first; r < last; r++) {
+      const v = values[r % size];
+      if (v < low) low = v;
+      if (v > high) high = v;
+      if (bins) {
+        const b = ((r / rate - view.from) * w / this.span) | 0;
+        if (v < lowest[b]) lowest[b] = v;
+        if (v > highest[b]) highest[b] = v;
+      }
+    }
+    if (this.cursors) {
+      this.read[lane] = this.cursors.map((part) => {
+        const r = Math.round((view.from + part * this.span) * rate);
+        return r >= rows.begin && r < rows.end ? values[r % size] : NaN;
+      });
+    }
     if (!(high >= low)) return;
     if (high === low) { high += 1e-6 + Math.abs(high) * 0.01; low -= 1e-6 + Math.abs(low) * 0.01; }
     if (h > 64) {
       g.fillText(high.toPrecision(2), x - 8, y + 48);
       g.fillText(low.toPrecision(2), x - 8, y + h - 2);
     }
-    const px = (t) => x + (w * (t - from)) / this.span;
     const py = (v) => y + 3 + (h - 6) * (1 - (v - low) / (high - low));
     g.save(); g.beginPath(); g.rect(x, y, w, h); g.clip();
-    g.beginPath(); g.strokeStyle = colour; g.lineWidth = 1.5;
-    const gaps = [];
-    let pen = false;
-    for (const r of this.rows) {
-      if (r.t0 + r.n * r.dt < from) { pen = false; continue; }
-      if (r.gap) { pen = false; gaps.push(r.t0); }
-      for (let i = 0; i < r.n; i++) {
-        const v = r.values[i * columns + column];
+    const { mode, lane: on, level } = this.trigger;
+    if (mode !== "off" && on === lane) {
+      g.strokeStyle = ink("--warning"); g.setLineDash([6, 4]); g.beginPath();
+      g.moveTo(x, py(level)); g.lineTo(x + w, py(level));
+      if (view.at !== null && view.at !== undefined) { g.moveTo(px(view.at * rate), y); g.lineTo(px(view.at * rate), y + h); }
+      g.stroke(); g.setLineDash([]);
+    }
+    if (bins) {
+      // Columns of whole pixels, each down to where the next begins: much cheaper than a line.
+      g.fillStyle = colour;
+      let above = NaN, below = NaN;
+      for (let b = 0; b < bins; b++) {
+        let top = py(highest[b]), foot = py(lowest[b]);
+        if (lowest[b] > highest[b]) { above = below = NaN; continue; }
+        if (above > foot) foot = above;
+        if (below < top) top = below;
+        g.fillRect(x + b, top - 0.6, 1, foot - top + 1.2);
+        above = py(highest[b]); below = py(lowest[b]);
+      }
+    } else {
+      g.beginPath(); g.strokeStyle = colour; g.lineWidth = 1.5;
+      let pen = false;
+      for (let r = first; r < last; r++) {
+        const v = values[r % size];
         if (Number.isNaN(v)) { pen = false; continue; }
-        const at = px(r.t0 + i * r.dt);
-        if (pen) g.lineTo(at, py(v)); else g.moveTo(at, py(v));
+        if (pen) g.lineTo(px(r), py(v)); else g.moveTo(px(r), py(v));
         pen = true;
       }
+      g.stroke();
     }
-    g.stroke();
+    g.lineWidth = 1;
     g.strokeStyle = ink("--bad"); g.setLineDash([4, 4]);
-    for (const t of gaps) { g.beginPath(); g.moveTo(px(t), y); g.lineTo(px(t), y + h); g.stroke(); }
+    for (const r of rows.gaps) { g.beginPath(); g.moveTo(px(r), y); g.lineTo(px(r), y + h); g.stroke(); }
     g.restore();
+  }
+
+  // The cursors as text: their distance, and of each channel the difference.
+  measured() {
+    if (!this.cursors || !this.read) return "";
+    const [a, b] = this.cursors, dt = (b - a) * this.span;
+    const parts = [`Δt ${(dt * 1000).toPrecision(4)} ms${dt ? ` (${Math.abs(1 / dt).toPrecision(4)} Hz)` : ""}`];
+    this.shown.forEach((column, lane) => {
+      const pair = this.read[lane], c = this.channels[column];
+      if (!pair || !c) return;
+      const dv = pair[1] - pair[0];
+      parts.push(`Δ${c.name} ${Number.isFinite(dv) ? dv.toPrecision(4) : "–"} ${c.unit.replace("^2", "²")}`);
+    });
+    return parts.join(", ");
   }
 }

@@ -1,0 +1,306 @@
+"""Estimates and diagnoses a run while it goes on, in processes of its own.
+
+    python -m samii_rig.serve.analyst JOB_FOLDER RECORDINGS
+
+It reads the recording as far as it is on the disk, so that neither the loop nor the service ever
+waits for it, and writes two files of JSON into the job's folder, each whole or not at all. The
+diagnosis has a process beside, which takes as long as it takes. It ends with whoever started it:
+when its standard input is closed.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import resource
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from samii_rig.errors import RecordingError, SamiiRigError
+from samii_rig.model.sampled import sampled_response
+from samii_rig.record.reader import read_events, read_recording
+from samii_rig.record.writer import PARTIAL
+from samii_rig.rig.load import parse
+from samii_rig.rig.schema import Rig
+from samii_rig.run.protocols import Plan
+from samii_rig.serve.following import following
+from samii_rig.serve.job import DIAGNOSIS, RESPONSES, RIG, Job
+from samii_rig.serve.live import LiveReader
+from samii_rig.serve.planned import planned
+from samii_rig.serve.sofar import SoFar
+from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_width
+from samii_rig.types import Complex, Float, FrequencyResponse, Int
+
+if TYPE_CHECKING:
+    from samii_rig.diagnose.result import Diagnosis
+
+EVERY = 1.0  # s between looks
+MEMORY = 8 << 30  # bytes of address space
+NICE = 5  # steps behind the loop and the service
+POINTS = 200  # of a curve on a page
+BAND = 0.9
+DIGITS = 4
+SITES = 4  # that are told
+
+
+class Analyst:
+    """One run. recordings : the folder in which its recording lies."""
+
+    def __init__(self, job: Job, recordings: Path) -> None:
+        self.job = job
+        self._path = recordings / job.request.recording
+        self._setup, self._text, self._plan = planned(job)
+        self._so_far = SoFar(self._plan)
+        self._start: int | None = None
+        self._frequency = _grid(self._plan)
+        self._model = sampled_response(self._setup.rig, self._frequency)
+        self._diagnoser = Diagnoser(self._setup.rig_toml)
+        self._given: list[FrequencyResponse] = []
+        self._segment = -1
+
+    def go(self) -> None:
+        """Look every second until the run is over."""
+        self.job.tell(RESPONSES, self._responses(0.0))
+        while self.job.written.phase == "running":
+            begun = time.monotonic()
+            # It was just renamed, nothing is there yet, or it is too long for a look.
+            with suppress(RecordingError, MemoryError):
+                self.look()
+            self._diagnose()
+            took = time.monotonic() - begun
+            # Of a long recording each look takes its time: half a processor at most.
+            time.sleep(max(EVERY - took, took))
+
+    def look(self) -> None:
+        """Estimate what is new on the disk."""
+        segment = int(LiveReader(Path(self.job.written.live)).progress().get("segment", 0))
+        if segment == self._segment and not self._so_far.growing:
+            return
+        path = self._path.with_name(self._path.name + PARTIAL)
+        path = path if path.exists() else self._path
+        if self._start is None:
+            told = [e for e in read_events(path, partial=True) if e.name == "plan"]
+            self._start = int(told[0].payload["start"]) if told else None
+        if self._start is None:
+            return
+        begun = time.monotonic()
+        # What is said of it goes to people who need not know where it lies.
+        recording = replace(read_recording(path, partial=True), source=self._path.name)
+        if self._so_far.take(recording, self._start):
+            self.job.tell(RESPONSES, self._responses(time.monotonic() - begun))
+        # A segment that is over counts as looked at once it is on the disk.
+        self._segment = segment if self._so_far.done >= segment - 1 else -1
+
+    def _responses(self, took: float) -> dict[str, Any]:
+        low = min((s.band_hz[0] for s in self._plan.segments), default=0.0)
+        high = max((s.band_hz[1] for s in self._plan.segments), default=0.0)
+        return {
+            "low_hz": low,
+            "high_hz": high,
+            "done": self._so_far.done,
+            "of": len(self._plan.segments),
+            "took_s": took,
+            "trouble": self._so_far.trouble,
+            "model": _curves_of_model(self._setup.rig, self._plan, self._frequency, self._model),
+            "responses": [
+                {
+                    "level": r.level,
+                    "unit": r.level_unit,
+                    "method": r.method,
+                    "n": r.n_averages,
+                    "going_on": going_on,
+                    "low_hz": float(r.frequency[0]),
+                    "high_hz": float(r.frequency[-1]),
+                    **curves(r),
+                }
+                for r, going_on in self._so_far.responses()
+            ],
+        }
+
+    def _diagnose(self) -> None:
+        """Take what was found, and ask again if there is something new to ask."""
+        found = self._diagnoser.taken()
+        if found is not None:
+            next_toml = following(found.get("experiment", ""), self._text)
+            self.job.tell(DIAGNOSIS, {**found, "next_toml": next_toml})
+        known = self._so_far.responses()
+        sound = [r for r, going_on in known if not going_on and r.n_averages > 1]
+        asked_of = sound or [r for r, _ in known]
+        if not asked_of or not self._diagnoser.idle:
+            return
+        # A level's newer estimate is another object; kept, so that no other takes its place.
+        if [id(r) for r in asked_of] == [id(r) for r in self._given]:
+            return
+        self._given = asked_of
+        levels = {(s.kind, s.level) for s in self._plan.segments if s.kind != "transient"}
+        about = {
+            "time": time.time(),
+            "done": self._so_far.done,
+            "of": len(self._plan.segments),
+            "repeats": bool(sound),
+            "levels": len({r.level for r in sound}),
+            "of_levels": len(levels),
+            "low_hz": min(float(r.frequency[0]) for r in asked_of),
+            "high_hz": max(float(r.frequency[-1]) for r in asked_of),
+        }
+        self._diagnoser.ask(about, asked_of)
+
+
+class Diagnoser:
+    """Diagnoses in a process beside, one set of responses after the other."""
+
+    def __init__(self, rig_toml: str) -> None:
+        context = get_context("spawn")
+        self._line, theirs = context.Pipe()
+        process = context.Process(target=_diagnosing, args=(theirs, rig_toml), daemon=True)
+        process.start()
+        theirs.close()
+        self.idle = True
+
+    def ask(self, about: dict[str, Any], responses: Sequence[FrequencyResponse]) -> None:
+        """Begin; `about` comes back with what is found."""
+        self._line.send((about, responses))
+        self.idle = False
+
+    def taken(self) -> dict[str, Any] | None:
+        """What was found since, None if nothing was."""
+        if self.idle or not self._line.poll():
+            return None
+        self.idle = True
+        found: dict[str, Any] = self._line.recv()
+        return found
+
+
+def _diagnosing(line: Connection, rig_toml: str) -> None:
+    from samii_rig.diagnose.diagnose import diagnose
+
+    rig = parse(Rig, rig_toml, RIG)
+    # The one who asks is gone when nothing comes any more.
+    with suppress(EOFError, OSError):
+        while True:
+            about, responses = line.recv()
+            begun = time.monotonic()
+            try:
+                found = said(diagnose(responses, rig))
+            except SamiiRigError as error:
+                found = {"verdict": "", "trouble": str(error)}
+            line.send({**about, **found, "took_s": time.monotonic() - begun})
+
+
+def said(found: Diagnosis) -> dict[str, Any]:
+    """A diagnosis as a display shows it. nothing : chance that nothing is missing.
+
+    probability : of the answer, 0 where there is none.
+    """
+    plain = found.plain()
+    # Odds of the first explanation against all others that were looked at.
+    first = 1 / (1 + math.exp(-min(max(found.evidence["odds"], -700.0), 700.0)))
+    if not found.evidence["causes"]:
+        nothing = first
+    elif found.verdict == "no_mismatch":
+        nothing = 1 - first
+    else:
+        nothing = sum(p for causes, p in found.alternatives if not causes)
+    answer = nothing if found.verdict == "no_mismatch" else 0.0
+    if found.causes:
+        answer = min(c.probability for c in found.causes)
+    return {
+        "verdict": found.verdict,
+        "lines": list(found.lines()),
+        "nothing": float(nothing),
+        "probability": float(answer),
+        "causes": plain["causes"],
+        "sites": plain["sites"][:SITES],
+        "why": found.why,
+        "experiment": found.experiment,
+    }
+
+
+def curves(r: FrequencyResponse) -> dict[str, Any]:
+    """Gain and phase of each entry with their 90 % bands, few enough points for a page."""
+    inside = magnitude_interval(r, BAND)
+    angle, half = phase(r), phase_half_width(r, BAND)
+    at = _thinned(r.frequency)
+    entries = [
+        {
+            "output": y.name,
+            "input": u.name,
+            "unit": f"{y.unit}/{u.unit}",
+            "gain": _short(np.abs(r.H[at, i, j])),
+            "low": _short(inside.low[at, i, j]),
+            "high": _short(inside.high[at, i, j]),
+            "phase": _short(angle[at, i, j]),
+            "half": _short(half[at, i, j]),
+        }
+        for i, y in enumerate(r.outputs)
+        for j, u in enumerate(r.inputs)
+    ]
+    return {"frequency": _short(r.frequency[at]), "curves": entries}
+
+
+def _curves_of_model(rig: Rig, plan: Plan, f: Float, H: Complex) -> dict[str, Any]:
+    j = [a.name for a in rig.actuator].index(plan.actuator)
+    entries = [
+        {
+            "output": sensor.name,
+            "unit": f"{sensor.unit}/{rig.actuator[j].unit}",
+            "gain": _short(np.abs(H[:, i, j])),
+            "phase": _short(np.degrees(np.unwrap(np.angle(H[:, i, j])))),
+        }
+        for i, sensor in enumerate(rig.sensor)
+    ]
+    return {"frequency": _short(f), "input": plan.actuator, "curves": entries}
+
+
+def _grid(plan: Plan) -> Float:
+    """(n,) Hz, even on a logarithmic axis over all that the plan drives."""
+    bands = [s.band_hz for s in plan.segments] or [(0.1, 1.0)]
+    high = min(max(b[1] for b in bands), 0.49 * plan.rate_hz)
+    low = max(min(b[0] for b in bands), 1e-3 * high)
+    return np.geomspace(low, high, POINTS)
+
+
+def _thinned(f: Float) -> Int:
+    """Which lines are drawn: about even on a logarithmic axis."""
+    f = np.where(f > 0, f, np.nextafter(0.0, 1.0))
+    if f.size <= POINTS:
+        return np.arange(f.size)
+    bins = np.floor(POINTS * np.log(f / f[0]) / np.log(f[-1] / f[0]))
+    return np.unique(bins, return_index=True)[1]
+
+
+def _short(x: Float) -> list[float | None]:
+    """Few digits, and null for what is no number."""
+    return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in x.tolist()]
+
+
+def _ends_with_its_parent() -> None:
+    while os.read(0, 1):
+        pass
+    os._exit(0)
+
+
+def main() -> None:
+    """Entry point."""
+    threading.Thread(target=_ends_with_its_parent, daemon=True).start()
+    os.nice(NICE)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    try:
+        Analyst(Job(Path(sys.argv[1])), Path(sys.argv[2])).go()
+    except SamiiRigError as error:
+        print(f"samii-rig: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,116 @@
+// What is known of the run while it goes on: its frequency responses and its diagnosis.
+
+import { plotResponses } from "/page/frf.js";
+
+const part = (p) => (p > 0.9995 ? "over 99.9 %" : p < 0.0005 ? "under 0.1 %" : `${(100 * p).toFixed(1)} %`);
+const ago = (s) => (s < 90 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
+const hz = (f) => f.toPrecision(2);
+
+export class SoFar {
+  // $ : element by id. ask : the service. put : append an element.
+  constructor($, ask, put) {
+    Object.assign(this, { $, ask, put, data: null, seen: "", job: "", busy: false });
+    $("frf-level").onchange = $("frf-show").onchange = () => this.draw();
+    addEventListener("resize", () => this.draw());
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
+  }
+
+  async show(state) {
+    const { $ } = this;
+    const run = state.running, job = run ? run.id : state.last ? state.last.id : "";
+    if (job !== this.job) { this.job = job; this.seen = ""; this.data = null; this.final(run ? null : state.last); }
+    const told = run ? state.so_far : null;
+    if (told) this.diagnosis(told, run);
+    else if (!run && this.was) this.final(state.last);
+    this.was = run;
+    $("frf-age").textContent = told && told.responses !== "0" ? `Estimated ${ago(told.responses_age_s)} ago.` : "";
+    if (this.busy || !job || (told ? told.responses === this.seen : this.seen === "over")) return;
+    this.busy = true;
+    const seen = told ? told.responses : "over";
+    try {
+      if (seen !== "0") this.data = await this.ask("GET", `/jobs/${job}/responses`);
+      this.seen = seen;
+    } catch { this.seen = seen; } finally { this.busy = false; }
+    this.about(run);
+    this.draw();
+  }
+
+  about(run) {
+    const { $, data } = this;
+    $("frf-section").hidden = !data;
+    if (!data) return;
+    const was = $("frf-level").value;
+    $("frf-level").replaceChildren();
+    this.put($("frf-level"), "option", "newest").value = "";
+    data.responses.forEach((r, k) => { this.put($("frf-level"), "option", `${r.level} ${r.unit}`).value = k; });
+    if ([...$("frf-level").options].some((o) => o.value === was)) $("frf-level").value = was;
+    const said = data.responses.map((r) => `${r.level} ${r.unit}: ${hz(r.low_hz)} to ${hz(r.high_hz)} Hz, ${
+      r.going_on ? "goes on" : `${r.n} ${r.n > 1 ? "repeats" : "sweep"}`}`).join("; ");
+    const of = `${data.done} of ${data.of} segments whole`;
+    $("frf-about").textContent = `${run ? "" : "Last run. "}${of}. ${said || "Nothing measured yet"}.${
+      data.trouble ? ` The newest part: ${data.trouble}.` : ""}`;
+    $("frf").setAttribute("aria-label", `Frequency responses over the model. ${$("frf-about").textContent}`);
+  }
+
+  draw() {
+    const { $, data } = this;
+    if (!data || $("frf-section").hidden) return;
+    const chosen = $("frf-level").value === "" ? data.responses.length - 1 : Number($("frf-level").value);
+    plotResponses($("frf"), data, chosen, $("frf-show").value);
+  }
+
+  diagnosis({ diagnosis: d, failed }, run) {
+    const { $ } = this;
+    $("diagnosis-section").hidden = !run.diagnosis;
+    $("h-diagnosis").textContent = "Diagnosis so far";
+    const why = run.phase === "analysing" ? " The last one is being made." : failed ? " What makes it has ended; the log of the job says why." : "";
+    if (!d) { this.empty(`None yet.${why}`); return; }
+    this.say(d, d.repeats ? "" : "Preliminary, from one sweep: its noise is not known from repeats. ");
+    const end = d.certain ? `Certain: ${d.certain}. ` : "";
+    const stop = run.stop_when_certain ? (d.certain ? "The run ends after this segment." : "The run ends once it is certain.") : "";
+    $("diagnosis-age").textContent = `${ago(d.age_s)} old, made in ${d.took_s.toFixed(1)} s from ${d.done} of ${d.of} segments, ${
+      hz(d.low_hz)} to ${hz(d.high_hz)} Hz. ${end}${stop}${why}`;
+  }
+
+  // The diagnosis that is kept with the recording.
+  async final(last) {
+    const { $ } = this;
+    $("diagnosis-section").hidden = true;
+    if (!last || !last.verdict) return;
+    const d = await this.ask("GET", `/jobs/${last.id}/diagnosis`).catch(() => null);
+    if (!d || !d.final || this.job !== last.id) return;
+    $("diagnosis-section").hidden = false;
+    $("h-diagnosis").textContent = "Diagnosis of the last run";
+    this.say(d, "");
+    $("diagnosis-age").textContent = `Kept with ${last.recording}. ${last.early ? `The run ended early: ${last.early}.` : ""}`;
+  }
+
+  say(d, before) {
+    const { $, put } = this;
+    if (!d.verdict) { this.empty(`None: ${d.trouble}`); return; }
+    const open = !d.repeats && !d.final && d.verdict === "unknown";
+    $("diagnosis-what").textContent = before + (open ? "No answer yet." : d.lines[0]);
+    $("diagnosis-more").textContent = open ? "" : d.lines.slice(1).join(" ");
+    $("diagnosis-facts").replaceChildren();
+    const facts = { "Chance that nothing is missing": part(d.nothing) };
+    if (d.causes.length) facts["Chance of the answer"] = part(d.probability);
+    if (d.sites.length) facts.Sites = d.sites.map((s) => `${s.site} ${part(s.probability)}`).join(", ");
+    for (const [k, v] of Object.entries(facts)) {
+      const box = put($("diagnosis-facts"), "div", "");
+      put(box, "dt", k); put(box, "dd", v);
+    }
+    $("next").hidden = !d.next_toml;
+    $("next").textContent = `Queue the next experiment: ${d.experiment}`;
+  }
+
+  empty(text) {
+    const { $ } = this;
+    $("diagnosis-what").textContent = text;
+    $("diagnosis-more").textContent = $("diagnosis-age").textContent = "";
+    $("diagnosis-facts").replaceChildren();
+    $("next").hidden = true;
+  }
+
+  // The file of the next experiment, as the diagnosis asks for it.
+  async next() { return (await this.ask("GET", `/jobs/${this.job}/diagnosis`)).next_toml; }
+}

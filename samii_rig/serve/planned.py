@@ -1,0 +1,20 @@
+"""What a job's files ask for, as a plan."""
+
+from __future__ import annotations
+
+from samii_rig.rig.load import parse
+from samii_rig.rig.schema import Rig
+from samii_rig.run.experiments import load_experiment
+from samii_rig.run.protocols import Plan
+from samii_rig.run.setups import Setup, setups_of
+from samii_rig.serve.job import EXPERIMENT, RIG, Job
+
+
+def planned(job: Job) -> tuple[Setup, str, Plan]:
+    """The rig as the run needs it, the experiment's text and its plan; InputError if they are
+    wrong."""
+    rig_toml = (job.folder / RIG).read_text(encoding="utf-8")
+    rig = parse(Rig, rig_toml, RIG)
+    experiment, text = load_experiment(str(job.folder / EXPERIMENT), rig)
+    setup = setups_of(experiment, rig, rig_toml)[job.request.setup]
+    return setup, text, experiment.plan(setup.rig)
