@@ -65,7 +65,7 @@ def test_an_answer_is_held_against_the_truth_whether_it_was_told_or_not():
     cause = {"physics": "actuator_lag", "site": "v_2", "probability": 0.2, "parameters": {},
              "equivalent_to": [{"physics": "transport_delay", "site": "v_2"}]}  # fmt: skip
     said = {"verdict": "unknown", "causes": [], "sites": [], "fit": {},
-            "evidence": {**SURE.plain(), "causes": [cause]}}  # fmt: skip
+            "evidence": {**SURE.plain(), "beyond": False, "causes": [cause]}}  # fmt: skip
     held = row(Truth("one", 1, (Hidden("transport_delay", "v_2"),)), said)
     assert held == (SURE, True)
     assert row(Truth("one", 1, (Hidden("added_mass", "beam"),)), said) == (SURE, False)

@@ -120,6 +120,7 @@ def diagnose(
         traces=traces(search, judged) if judged.verdict != "no_mismatch" else (),
         evidence={
             **judged.evidence.plain(),
+            "beyond": judged.beyond is not None,
             "causes": [c.plain() for c in verdict.causes_of(judged.classes[0], judged)],
         },
     )

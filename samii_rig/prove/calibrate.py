@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize, special
 
+from samii_rig.diagnose.judge import IN_DATA
 from samii_rig.diagnose.stated import ANSWER, PLACE, Evidence
 from samii_rig.errors import InputError
 from samii_rig.prove.trial import Answer, Trial, Truth
@@ -26,19 +27,27 @@ FEWEST = 40  # trials below which a regression says nothing
 
 def row(truth: Truth, answer: Mapping[str, Any]) -> tuple[Evidence, bool] | None:
     """Evidence of the most probable explanation, and whether every cause in it is right; None where
-    it was that nothing is missing."""
+    it was that nothing is missing, or too little to be told, or where something beyond the table
+    was found instead."""
     told = answer["evidence"]
-    if not told["causes"]:
+    if not _asked(told) or not told["causes"]:
         return None
     said = replace(Answer.of({**answer, "causes": told["causes"]}), verdict="named")
     known = {f.name: told[f.name] for f in fields(Evidence)}
     return Evidence(**known), len(Trial(truth, said).matches()) == len(said.causes)
 
 
+def _asked(told: Mapping[str, Any]) -> bool:
+    """Whether the answer rests on the probability of its evidence."""
+    return bool(told["drop"] > IN_DATA and not told["beyond"])
+
+
 def places(truth: Truth, answer: Mapping[str, Any]) -> list[tuple[Evidence, bool]]:
     """Evidence of the most probable explanation, once for each of its causes, and whether
     something is concealed at that cause's site, or at one it is not told apart from."""
     told = answer["evidence"]
+    if not _asked(told):
+        return []
     known = Evidence(**{f.name: told[f.name] for f in fields(Evidence)})
     causes = Answer.of({**answer, "causes": told["causes"]}).causes
     hidden = {e.site for e in truth.effects}
