@@ -1,9 +1,20 @@
-"""What devices that only measure have in common."""
+"""What devices that measure have in common."""
 
 from __future__ import annotations
 
+from collections import deque
+
+import numpy as np
+
 from samii_rig.errors import DeviceError
 from samii_rig.run.protocols import CommandBlock, DeviceLoop
+from samii_rig.types import Int
+
+
+def taken(pairs: deque[tuple[int, int]]) -> Int:
+    """(n, 2) of what a sensor's `arrivals()` gives; `pairs` is empty then."""
+    found = np.array([pairs.popleft() for _ in range(len(pairs))], dtype=np.int64)
+    return found.reshape(-1, 2)
 
 
 class NoOutput:

@@ -5,16 +5,15 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
-import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import httpx
 import pytest
+from wait_kit import WITHIN, found
 from websockets.sync.client import ClientConnection, connect
 
-WITHIN = 90.0  # s
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 
 
@@ -22,15 +21,15 @@ class Browser:
     """One page of headless Chromium; the test skips where there is none."""
 
     def __init__(self, profile: Path) -> None:
-        found = next((path for name in NAMES if (path := shutil.which(name))), None)
-        if found is None:
+        program = next((path for name in NAMES if (path := shutil.which(name))), None)
+        if program is None:
             pytest.skip(f"no browser: none of {', '.join(NAMES)} is installed")
         flags = ["--headless", "--no-sandbox", "--disable-gpu", "--remote-debugging-port=0"]
         more = ["--remote-allow-origins=*", f"--user-data-dir={profile}", "about:blank"]
         quiet = subprocess.DEVNULL
-        self._process = subprocess.Popen([found, *flags, *more], stdout=quiet, stderr=quiet)
+        self._process = subprocess.Popen([program, *flags, *more], stdout=quiet, stderr=quiet)
         told = profile / "DevToolsActivePort"
-        self._wait(lambda: told.exists() and "\n" in told.read_text())
+        found(lambda: told.exists() and "\n" in told.read_text(), WITHIN)
         port = told.read_text().split("\n")[0]
         pages = httpx.get(f"http://127.0.0.1:{port}/json", timeout=WITHIN).json()
         url = next(p["webSocketDebuggerUrl"] for p in pages if p["type"] == "page")
@@ -64,9 +63,9 @@ class Browser:
 
     def value(self, expression: str) -> Any:
         """What JavaScript says."""
-        found = self._evaluated(expression)
-        assert "exceptionDetails" not in found, found["exceptionDetails"]
-        return found["result"].get("value")
+        said = self._evaluated(expression)
+        assert "exceptionDetails" not in said, said["exceptionDetails"]
+        return said["result"].get("value")
 
     def _evaluated(self, expression: str) -> dict[str, Any]:
         asked = {"expression": expression, "returnByValue": True, "awaitPromise": True}
@@ -86,7 +85,11 @@ class Browser:
 
     def until(self, expression: str) -> None:
         """Wait until it is true in the page; one that is just being loaded has not all parts."""
-        self._wait(lambda: self._evaluated(expression)["result"].get("value") is True, expression)
+
+        def true() -> bool:
+            return self._evaluated(expression)["result"].get("value") is True
+
+        found(true, WITHIN, said=expression)
 
     def text(self, id_: str) -> str:
         return str(self.value(f"document.getElementById('{id_}')?.textContent ?? ''"))
@@ -114,10 +117,3 @@ class Browser:
         self._socket.close()
         self._process.terminate()
         self._process.wait(WITHIN)
-
-    @staticmethod
-    def _wait(what: Any, said: str = "") -> None:
-        start = time.monotonic()
-        while not what():
-            assert time.monotonic() - start < WITHIN, f"it did not happen: {said}"
-            time.sleep(0.05)

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 # What runs a device in real time, on ports whose names the system gives out again.
 KITS = {"wire_kit", "can_kit", "faults_kit"}
-TRIES_MORE = 4
+TRIES_MORE, APART = 7, 2.0  # s; longer together than another program's burst of work
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -22,7 +22,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if KITS & used:
             item.add_marker("real_time")
         if (KITS | {"serve_kit"}) & used:
-            item.add_marker(pytest.mark.flaky(reruns=TRIES_MORE, reruns_delay=0.5))
+            item.add_marker(pytest.mark.flaky(reruns=TRIES_MORE, reruns_delay=APART))
 
 
 @pytest.fixture(autouse=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from experiments.multisine import Multisine
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
@@ -15,6 +16,23 @@ from samii_rig.run.experiments import load_experiment
 from samii_rig.run.protocols import Experiment
 from samii_rig.signal.statistics import imag_interval, real_interval
 from samii_rig.types import FrequencyResponse
+
+# Four periods of a quiet second.
+SHORT = Multisine(
+    experiment="multisine",
+    name="short",
+    actuator="v_2",
+    unit="V",
+    drive="output",
+    period=1.0,
+    low_hz=4.0,
+    high_hz=30.0,
+    realisations=1,
+    periods=4,
+    ramp=0.2,
+    amplitudes=(0.5,),
+    seed=1,
+)
 
 
 def shipped(rig_name: str, name: str, **changes: object) -> tuple[Rig, str, Experiment]:

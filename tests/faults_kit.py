@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import subprocess
 import sys
@@ -12,11 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from threading import Event
 
-import pytest
 from fault_host import Nowhere, plan_of
 from wire_kit import Wire
 
-from samii_rig.errors import SamiiRigError
 from samii_rig.run.ending import attempt
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.judgement import State
@@ -26,24 +23,6 @@ from samii_rig.run.protocols import Plan
 
 STATES = ("safe", "armed", "running")
 PATIENCE = 25  # samples in the deadman's 50 ms
-TRIES = 4  # of a test in real time; a loaded machine may be later than any bound allows
-
-
-def patient(test: Callable[..., None]) -> Callable[..., None]:
-    """A test in real time: of several tries one must hold, as a loaded machine is late."""
-
-    @functools.wraps(test)
-    def tried(*args: object, **kwargs: object) -> None:
-        for i in range(TRIES):
-            try:
-                test(*args, **kwargs)
-                return
-            except (AssertionError, SamiiRigError, pytest.fail.Exception):
-                if i == TRIES - 1:
-                    raise
-                time.sleep(0.2)
-
-    return tried
 
 
 class Held:

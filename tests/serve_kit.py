@@ -9,7 +9,6 @@ import ssl
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,6 +18,7 @@ from weakref import WeakKeyDictionary
 
 import httpx
 from fastapi import FastAPI
+from wait_kit import WITHIN, found
 
 from samii_rig.rig.load import load_rig
 from samii_rig.serve.access import Tokens
@@ -29,7 +29,6 @@ from samii_rig.serve.settings import Settings
 # The routes of a service are made once; each client has a guard of its own.
 _APPS: WeakKeyDictionary[Rooms, FastAPI] = WeakKeyDictionary()
 HOST = "127.0.0.1:8340"
-WITHIN = 90.0  # s for what takes a few on a machine with nothing else to do
 
 # Some seconds of a quiet sweep.
 SWEEP = """
@@ -159,16 +158,13 @@ class Service:
 
     def until(self, what: Any) -> Any:
         """Wait until it is true."""
-        start = time.monotonic()
-        while True:
-            try:
-                found = what()
-            except (httpx.TransportError, json.JSONDecodeError):
-                found = None
-            if found:
-                return found
-            assert time.monotonic() - start < WITHIN, "it did not happen"
-            time.sleep(0.05)
+
+        def asked() -> Any:
+            with suppress(httpx.TransportError, json.JSONDecodeError):
+                return what()
+            return None
+
+        return found(asked, WITHIN)
 
     def progressing(self) -> bool:
         """Samples come."""

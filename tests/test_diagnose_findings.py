@@ -13,6 +13,7 @@ from sweep_kit import swept
 
 from samii_rig.diagnose import findings, wiring
 from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.model import Model, grid
 from samii_rig.errors import EstimateError, InputError, SamiiRigError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.rig.load import load_rig
@@ -244,6 +245,23 @@ def test_a_rig_file_without_tolerances_is_diagnosed_and_told(rivals):
     found = diagnose([drawn()], without_tolerances(samii()), effects=rivals)
     assert found.verdict == "no_mismatch"
     assert any("gives no tolerance" in text for text in found.not_physics)
+
+
+def test_what_is_missing_in_a_rig_file_without_tolerances_is_found(rivals):
+    """With nothing to refit, on lines that are fitted and on lines that decide."""
+    soft = next(e for e in rivals if e.name == ("torsional_compliance", "joint_2_source"))
+    model = Model(samii(), [soft])
+    n = len(samii().sensor)
+    at = grid(samii(), LINES, np.arange(n), np.zeros(n, dtype=np.int64))
+    x = np.append(np.zeros(model.n_nominal), np.log([5e4, 0.05]))
+    H = model.response(x, at)[:, :, None]
+    runs = [
+        replace(redraw(drawn(), H, np.random.default_rng(seed), 10), method=method)
+        for seed, method in ((2, "burst (drawn)"), (3, "periodic (drawn)"))
+    ]
+    found = diagnose(runs, without_tolerances(samii()), effects=rivals)
+    assert found.verdict == "named"
+    assert ("torsional_compliance", "joint_2_source") in [(c.physics, c.site) for c in found.causes]
 
 
 def test_a_rig_of_one_sensor_without_tolerances_too():

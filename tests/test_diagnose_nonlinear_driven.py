@@ -25,6 +25,7 @@ CASES = [
     (Quasi("joint", ("joint_2",), FRICTION), 0.5),
     (Quasi("joint", ("joint_1",), CUBIC), 1e6),
     (Quasi("joint", ("joint_2",), GAP, 1.0, ("joint_2", "k")), 1e-6),
+    (Quasi("drive", ("joint_2_source",), FRICTION), 0.05),
     (Quasi("command", ("joint_2_source",), GAP), 0.01),
     (Quasi("command", ("joint_2_source",), EXCESS), 0.95),
     (Quasi("flow", ("joint_2_source",), None), 5e4),

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fault_host import plan_of
-from faults_kit import PATIENCE, STATES, Held, held, null_of, patient
+from faults_kit import PATIENCE, STATES, Held, held, null_of
 from wire_kit import Wire
 
 from samii_rig.errors import DeviceError, GateError
@@ -67,7 +67,6 @@ SEEN = table(
 
 
 @pytest.mark.parametrize(("state", "told", "said", "samples"), SEEN)
-@patient
 def test_a_fault_ends_at_null_and_is_latched(wire, state, told, said, samples):
     with held(wire, state) as host:
         wire.tell(told)
@@ -117,7 +116,6 @@ def _no_re_arm(wire: Wire, host: Held, before: dict) -> None:
         ("stall 0.5", "said nothing new"),
     ],
 )
-@patient
 def test_in_safe_a_fault_moves_nothing_and_arming_is_refused(wire, told, said):
     with held(wire, "safe") as host:
         wire.tell(told)
@@ -129,7 +127,6 @@ def test_in_safe_a_fault_moves_nothing_and_arming_is_refused(wire, told, said):
         assert wire.history()["state"] == "IDLE"
 
 
-@patient
 def test_in_safe_an_emergency_input_lets_nothing_arm(wire):
     with held(wire, "safe") as host:
         wire.tell("emergency 1")
@@ -144,7 +141,6 @@ def test_in_safe_an_emergency_input_lets_nothing_arm(wire):
 
 
 @pytest.mark.parametrize("state", STATES)
-@patient
 def test_a_cable_that_is_pulled_is_a_fault_and_its_return_arms_nothing(wire, state):
     plugged = True
     try:
@@ -185,7 +181,6 @@ LINES = [
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize(("fault", "counted"), LINES)
-@patient
 def test_a_line_worse_than_the_rig_allows_is_a_fault(wire, state, fault, counted):
     with held(wire, state) as host:
         wire.tell(f"line down {fault}")
@@ -202,7 +197,6 @@ def test_a_line_worse_than_the_rig_allows_is_a_fault(wire, state, fault, counted
 
 
 @pytest.mark.parametrize(("fault", "counted"), LINES)
-@patient
 def test_what_a_bad_line_does_is_counted_in_the_recording_and_makes_no_wrong_sample(
     wire, fault, counted
 ):
@@ -225,7 +219,6 @@ def test_what_a_bad_line_does_is_counted_in_the_recording_and_makes_no_wrong_sam
         assert host.job.missing == sequence[-1] - sequence[0] + 1 - len(sequence)
 
 
-@patient
 def test_frames_that_the_node_does_not_get_whole_are_counted_and_a_fault(wire):
     with held(wire, "running") as host:
         wire.tell("line up flip 5e-3")
@@ -239,7 +232,6 @@ def test_frames_that_the_node_does_not_get_whole_are_counted_and_a_fault(wire):
 # Clocks
 
 
-@patient
 def test_counters_that_wrap_and_a_wall_clock_that_jumps_have_no_effect(wire, monkeypatch):
     wire.tell(f"reboot {2**32 - 1500} {2**32 - 3_000_000}")
     host = Held(wire)
@@ -275,7 +267,6 @@ def command(host: Held, u: object, theta_ref: object = 0.0) -> CommandBlock:
     ],
     ids=["nan", "infinite", "volts", "slew", "set point"],
 )
-@patient
 def test_a_command_beyond_a_limit_never_reaches_the_wire(wire, u, theta_ref, said):
     with held(wire, "running") as host:
         last = wire.history()["most"]
@@ -286,7 +277,6 @@ def test_a_command_beyond_a_limit_never_reaches_the_wire(wire, u, theta_ref, sai
         assert h["most"] <= last + 20, "it came out"
 
 
-@patient
 def test_a_reference_that_would_turn_the_joint_too_far_is_refused_before_it_is_there(wire):
     wire.rest()
     plan = plan_of(wire.rig, 5.0)
@@ -308,7 +298,6 @@ def test_a_reference_that_would_turn_the_joint_too_far_is_refused_before_it_is_t
 
 
 @pytest.mark.parametrize("state", ["safe", "armed"])
-@patient
 def test_a_command_without_a_run_is_a_fault(wire, state):
     with held(wire, state) as host:
         with pytest.raises(GateError, match=f"write in state {state}"):
@@ -322,7 +311,6 @@ def test_a_command_without_a_run_is_a_fault(wire, state):
 
 
 @pytest.mark.parametrize("state", STATES)
-@patient
 def test_a_gate_that_hangs_while_samples_stream_leaves_null(wire, state):
     with held(wire, state) as host:
         time.sleep(0.3)

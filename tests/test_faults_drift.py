@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from faults_kit import PATIENCE, held, null_of, patient
+from faults_kit import PATIENCE, held, null_of
 from test_gate_agreement import ONE, SAMII, TWO
 from wire_kit import Wire
 
@@ -28,7 +28,6 @@ def case(request, tmp_path_factory) -> Iterator[tuple[Wire, str, int, int]]:
 
 
 @pytest.mark.parametrize("state", ["armed", "running"])
-@patient
 def test_an_encoder_that_drifts_ends_at_null_and_is_latched(case, state):
     wire, other, counts, samples = case
     with held(wire, state) as host:
@@ -45,7 +44,6 @@ def test_an_encoder_that_drifts_ends_at_null_and_is_latched(case, state):
             assert h["most"] == 0
 
 
-@patient
 def test_in_safe_no_gate_is_armed_on_it(case):
     wire, other, counts, _ = case
     with held(wire, "safe") as host:
@@ -57,7 +55,6 @@ def test_in_safe_no_gate_is_armed_on_it(case):
         assert wire.history()["state"] == "IDLE"
 
 
-@patient
 def test_a_joint_that_is_driven_agrees(case):
     with held(case[0], "running") as host:
         host.on(2.0)

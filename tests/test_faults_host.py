@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from faults_kit import PATIENCE, STATES, Hosts, null_of, patient
+from faults_kit import PATIENCE, STATES, Hosts, null_of
 from wire_kit import Wire
 
 from samii_rig.errors import DeviceError, GateError
@@ -64,7 +64,6 @@ def whole(path: Path) -> np.ndarray:
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("how", ["SIGKILL", "SIGSTOP"])
-@patient
 def test_a_host_that_is_killed_or_hangs_for_a_second_leaves_null(wire, hosts, tmp_path, how, state):
     path = fresh(wire, tmp_path)
     pid = hosts.start(wire, state, path)
@@ -137,7 +136,6 @@ def test_a_host_that_is_late_by_40_ms_changes_nothing(wire, hosts, tmp_path):
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("signals", ["SIGINT", "SIGTERM", "SIGHUP", "SIGINT SIGINT", "SIGINT x3"])
-@patient
 def test_a_signal_is_zero_first_then_a_whole_recording(wire, hosts, tmp_path, signals, state):
     path = fresh(wire, tmp_path)
     pid = hosts.start(wire, state, path)
@@ -163,7 +161,6 @@ def test_a_signal_is_zero_first_then_a_whole_recording(wire, hosts, tmp_path, si
 
 
 @pytest.mark.parametrize("state", STATES)
-@patient
 def test_a_second_program_is_refused_by_name_of_the_first(wire, hosts, tmp_path, state):
     path = fresh(wire, tmp_path)
     pid = hosts.start(wire, state, path)
@@ -175,7 +172,6 @@ def test_a_second_program_is_refused_by_name_of_the_first(wire, hosts, tmp_path,
     assert hosts.wait(pid) == 130
 
 
-@patient
 def test_an_emergency_input_stays_a_fault_with_the_host_dead(wire, hosts, tmp_path):
     path = fresh(wire, tmp_path)
     pid = hosts.start(wire, "running", path)
@@ -208,7 +204,6 @@ def driven(wire: Wire, path: Path, seconds: float):
 
 
 @pytest.mark.parametrize("error", [28, 5], ids=["full", "I/O error"])
-@patient
 def test_a_disk_that_refuses_is_a_controlled_stop_with_all_up_to_there(
     wire, hosts, tmp_path, monkeypatch, error
 ):
@@ -239,7 +234,6 @@ def test_a_disk_that_refuses_is_a_controlled_stop_with_all_up_to_there(
     assert (np.diff(sequence) == 1).all()
 
 
-@patient
 def test_a_disk_that_stalls_for_five_seconds_loses_no_sample(wire, hosts, tmp_path, monkeypatch):
     from samii_rig.record import appender
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from faults_kit import STATES, held, null_of, patient
+from faults_kit import STATES, held, null_of
 from wire_kit import Wire
 
 from samii_rig.run.judgement import State
@@ -33,7 +33,6 @@ def way(host, seconds: float) -> float:
 
 
 @pytest.mark.parametrize("state", ["armed", "running"])
-@patient
 def test_a_converter_that_puts_out_a_voltage_by_itself_moves_nothing_without_supply(wire, state):
     supplied = wire.settings.get("supply", False)
     with held(wire, state) as host:
@@ -50,7 +49,6 @@ def test_a_converter_that_puts_out_a_voltage_by_itself_moves_nothing_without_sup
         )
 
 
-@patient
 def test_it_is_off_until_a_reference_is_there(wire):
     supplied = wire.settings.get("supply", False)
     if not supplied:
@@ -61,7 +59,6 @@ def test_it_is_off_until_a_reference_is_there(wire):
 
 
 @pytest.mark.parametrize("state", STATES)
-@patient
 def test_a_supply_line_that_does_not_follow_is_a_fault_once_it_is_needed(wire, state):
     supplied = wire.settings.get("supply", False)
     with held(wire, state) as host:

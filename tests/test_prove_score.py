@@ -15,6 +15,7 @@ import pytest
 from prove_kit import MASS, NOTHING, SPRING, UNKNOWN, diagnosis, trial
 
 from samii_rig.prove.score import auroc, by_size, confusion, frequency, median, scores
+from samii_rig.prove.size import bearers
 from samii_rig.prove.trial import Answer, Trial
 
 
@@ -45,6 +46,16 @@ def test_a_site_has_as_many_names_as_the_effect_has_structural_twins() -> None:
     known = replace(told, truth=replace(told.truth, twins=("link_1",)))
     assert known.place_right
     assert known.place_in_set
+
+
+def test_names_count_as_the_fewest_effects_that_bear_them() -> None:
+    between = {("compliance", "clamp"), ("compliance", "beam")}
+    alone, other = {("compliance", "clamp")}, {("mass", "beam")}
+    effects = [alone, between, other]
+    assert bearers(between, effects) == [1]
+    assert bearers(between | other, effects) == [1, 2]
+    assert bearers({("lag", "v")}, effects) == []
+    assert bearers(between, []) == []
 
 
 def test_two_effects_need_two_names_and_no_third() -> None:

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from experiment_kit import SHORT
 
 from drivers.replay import open_rig
-from experiments.multisine import Multisine
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import load_rig
@@ -19,21 +19,6 @@ from samii_rig.run.protocols import Actuator, Clock, CommandBlock, DeviceLoop, S
 
 RIG = load_rig("samii")[0]
 LOOP = DeviceLoop("theta_2", 4.0, 5.0, 2000.0, 0.35)
-SHORT = Multisine(
-    experiment="multisine",
-    name="short",
-    actuator="v_2",
-    unit="V",
-    drive="output",
-    period=1.0,
-    low_hz=4.0,
-    high_hz=30.0,
-    realisations=1,
-    periods=4,
-    ramp=0.2,
-    amplitudes=(0.5,),
-    seed=1,
-)
 
 
 def done(rig, path, experiment=SHORT, **settings):

@@ -160,6 +160,26 @@ def test_a_diagnosis_that_is_killed_leaves_the_run_as_it_ended(tmp_path: Path) -
     assert "without a word" in found.held
 
 
+@pytest.mark.parametrize(
+    ("status", "stops", "held"),
+    [("stopped", False, False), ("stopped", True, True), ("tripped", False, True)],
+)
+def test_only_an_end_by_the_order_itself_lets_the_queue_go_on(
+    tmp_path: Path, status: str, stops: bool, held: bool
+) -> None:
+    """A limit may trip on the way to the rest at which a run ends early."""
+    job = Job.make(tmp_path / ".samii-rig" / "jobs", Request("short", "run.mcap"), "", "")
+    rig, text = load_rig("samii")
+    supervisor = Supervisor(rig, text, Index(tmp_path), 0.0)
+    supervisor.held = ""
+    job.set(JobState(phase="done", status=status, reason="why", early="its diagnosis was certain"))
+    if stops:
+        with job.held():
+            job.stop("somebody")
+    supervisor.turn()
+    assert bool(supervisor.held) is held
+
+
 def test_a_runner_that_is_killed_leaves_what_it_recorded(service: Service) -> None:
     with service.lease() as lease:
         id_ = service.start(lease, LONG)

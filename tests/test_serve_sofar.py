@@ -8,6 +8,8 @@ rest, with its diagnosis in the index.
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +19,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 from serve_kit import Service, sweep
+from wait_kit import WITHIN
 
 from samii_rig.cli import main
 from samii_rig.diagnose.diagnose import diagnose
@@ -294,6 +297,40 @@ def test_certain_is_the_same_answer_twice_in_a_row(
     analysis.turn(Job.make(tmp_path, Request("y", "y.mcap"), RIG_TOML, SWEEPS))
     assert analysis.certain == ""
     assert analysis.state()["diagnosis"] is None
+
+
+def test_the_last_word_of_the_runner_is_none_of_the_analyst(tmp_path: Path) -> None:
+    job = Job.make(tmp_path, Request("x", "x.mcap"), RIG_TOML, SWEEPS)
+    analysis = Analysis(tmp_path)
+    job.tell(DIAGNOSIS, {"verdict": "no_mismatch", "next_toml": "", "final": True})
+    analysis.turn(job)
+    assert analysis.state()["diagnosis"] is None
+    assert analysis.certain == ""
+
+
+def test_a_diagnosis_ends_with_who_asked_for_it() -> None:
+    """An analyst that is killed leaves no process behind, not even one in the midst of it."""
+    program = """
+import time
+from samii_rig.rig.load import load_rig
+from samii_rig.serve.analyst import Diagnoser
+
+class Long:
+    def __reduce__(self):
+        return time.sleep, (600,)
+
+kept = Diagnoser(load_rig("samii")[1])
+kept.ask({}, Long())
+print("asked", flush=True)
+time.sleep(600)
+"""
+    command = [sys.executable, "-c", program]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as analyst:
+        assert analyst.stdout is not None
+        assert analyst.stdout.readline() == "asked\n"
+        analyst.kill()
+        # Its end is read once nobody has it open any more.
+        analyst.communicate(timeout=WITHIN)
 
 
 def test_a_run_that_may_end_early_ends_at_rest(

@@ -1,5 +1,6 @@
 """Stated probabilities: evidence counts as it did on trials, and the regression finds how."""
 
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from samii_rig.diagnose.stated import Evidence, probability, weights
+from samii_rig.diagnose.stated import ANSWER, PLACE, Evidence, probability, weights
 from samii_rig.errors import InputError
-from samii_rig.prove.calibrate import FEWEST, fit, row, write
+from samii_rig.prove.calibrate import FEWEST, fit, places, row, write
 from samii_rig.prove.trial import Hidden, Truth
 
 SURE = Evidence(9.0, 1.0, 1.0, 1, False, False, 200.0, 400.0, 1, False, 1.0)
@@ -30,8 +31,9 @@ def test_a_probability_is_one_whatever_the_evidence(odds, left, held):
     assert 0 < probability(replace(SURE, odds=odds, left=left, held=held)) < 1
 
 
-def test_every_feature_has_its_weight():
-    assert set(weights()) == set(SURE.features())
+@pytest.mark.parametrize("of", [ANSWER, PLACE])
+def test_every_feature_has_its_weight(of):
+    assert set(weights(of)) == set(SURE.features())
 
 
 def drawn(n: int, rng: np.random.Generator) -> list[tuple[Evidence, bool]]:
@@ -73,8 +75,34 @@ def test_an_answer_is_held_against_the_truth_whether_it_was_told_or_not():
     assert row(Truth("nothing", 1, ()), said) is None
 
 
-def test_weights_are_written_as_they_are_read(tmp_path):
-    import tomllib
+def answered(*names, **told):
+    """An answer that names nothing aloud, whose evidence rests on these causes."""
+    causes = [
+        {"physics": p, "site": s, "probability": 0.2, "parameters": {}, "equivalent_to": []}
+        for p, s in names
+    ]
+    evidence = {**SURE.plain(), "beyond": False, "causes": causes, **told}
+    return {"verdict": "unknown", "causes": [], "sites": [], "fit": {}, "evidence": evidence}
 
-    write(tmp_path / "w.toml", {"one": 0.25, "odds": -3.0}, "from 2 trials")
-    assert tomllib.loads((tmp_path / "w.toml").read_text())["weights"] == {"one": 0.25, "odds": -3}
+
+def test_a_place_may_be_right_where_the_name_is_not_and_each_cause_counts():
+    truth = Truth("one", 1, (Hidden("added_mass", "beam"),))
+    said = answered(("added_inertia", "beam"), ("added_mass", "link_1"))
+    assert places(truth, said) == [(SURE, True), (SURE, False)]
+    assert row(truth, said) == (SURE, False)
+
+
+@pytest.mark.parametrize("told", [{"beyond": True}, {"drop": 10.0}])
+def test_answers_that_rest_on_something_else_calibrate_nothing(told):
+    truth = Truth("one", 1, (Hidden("added_mass", "beam"),))
+    said = answered(("added_mass", "beam"), **told)
+    assert places(truth, said) == []
+    assert row(truth, said) is None
+
+
+def test_weights_are_written_as_they_are_read(tmp_path):
+    file = tmp_path / "w.toml"
+    write(file, {"one": 0.25, "odds": -3.0}, "from 2 trials")
+    assert tomllib.loads(file.read_text()) == {ANSWER: {"one": 0.25, "odds": -3}}
+    write(file, {"one": 0.25}, "from 2 trials", {"one": 2.0})
+    assert tomllib.loads(file.read_text()) == {ANSWER: {"one": 0.25}, PLACE: {"one": 2.0}}

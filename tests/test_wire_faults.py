@@ -17,7 +17,7 @@ from samii_rig.rig.schema import Feedback
 from samii_rig.run.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.types import Quality
 from sim.settings import SimSettings
-from sim.wire.__main__ import read_script
+from sim.wire.program import read_script
 from sim.wire.rig import WireRig
 
 PATIENCE = 25  # samples in the deadman's 50 ms

@@ -8,6 +8,8 @@ import sys
 import time
 from pathlib import Path
 
+from wait_kit import found
+
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Device, Rig
 from samii_rig.run.devices import open_device
@@ -100,7 +102,5 @@ def slow_deadman(folder: Path) -> Path:
 def until(what, seconds: float = 2.0) -> float:
     """Wait until `what()` is true; the time that it took, s."""
     start = time.monotonic()
-    while not what():
-        assert time.monotonic() - start < seconds, "it did not happen"
-        time.sleep(0.002)
+    found(what, seconds, every=0.002)
     return time.monotonic() - start

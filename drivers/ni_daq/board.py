@@ -12,6 +12,7 @@ import numpy as np
 
 from drivers.ni_daq.output import AnalogueOutput
 from drivers.ni_daq.settings import NiSettings
+from drivers.sensing import taken
 from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Flags, Float, Int, Quality, SampleBlock
@@ -104,9 +105,7 @@ class Board:
 
     def arrivals(self) -> Int:
         """(n, 2) ns: board's and host's time of the samples given since the last call."""
-        pairs = np.array(self._arrivals, dtype=np.int64).reshape(-1, 2)
-        self._arrivals.clear()
-        return pairs
+        return taken(self._arrivals)
 
     def close(self) -> None:
         """End the reader; may be called twice."""

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from drivers.ports import open_port
 from drivers.quadrature.wire import HALF, VERSION, WORD, Decoder, Sample, Told, request
-from drivers.sensing import NoOutput
+from drivers.sensing import NoOutput, taken
 from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Finite, Name, NonNegative, Rig, Strict
 from samii_rig.rig.settings import checked, wrong
@@ -126,9 +126,7 @@ class Quadrature:
 
     def arrivals(self) -> Int:
         """(n, 2) ns: board's and host's time of the samples given since the last call."""
-        pairs = np.array(self._arrivals, dtype=np.int64).reshape(-1, 2)
-        self._arrivals.clear()
-        return pairs
+        return taken(self._arrivals)
 
     def close(self) -> None:
         """Stop reading and give the port back; may be called twice."""

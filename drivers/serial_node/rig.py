@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from drivers.sensing import taken
 from drivers.serial_node.link import KEPT, Link
 from drivers.serial_node.settings import Input, SerialSettings, check_node, read_settings
 from drivers.serial_node.wire import (
@@ -208,9 +209,7 @@ class SerialNode:
 
     def arrivals(self) -> Int:
         """(n, 2) ns: node's and host's time of the frames that `read` gave since the last call."""
-        pairs = np.array(self._arrivals, dtype=np.int64).reshape(-1, 2)
-        self._arrivals.clear()
-        return pairs
+        return taken(self._arrivals)
 
     def events(self) -> list[DeviceEvent]:
         """Changes of the node's state, and the counts of the line when they changed."""

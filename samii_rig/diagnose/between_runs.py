@@ -43,9 +43,9 @@ class Changing:
     def told(self) -> str:
         """In words."""
         each = ", ".join(
-            f"{100 * d:+.2g} % (+/- {100 * s:.1g}) in {'periodic runs' if again else 'bursts'} of "
-            f"{value:.3g} {unit}"
-            for (value, unit, again), d, s in zip(self.series, self.change, self.sd, strict=True)
+            f"{100 * d:+.2g} % (+/- {100 * s:.1g}) in "
+            f"{'periodic runs' if periodic else 'bursts'} of {value:.3g} {unit}"
+            for (value, unit, periodic), d, s in zip(self.series, self.change, self.sd, strict=True)
         )
         return (
             f"{self.sites[0][0]} changes from run to run; its stiffness, against its mean: {each}"
@@ -75,7 +75,7 @@ def between_runs(search: Search, base: Fitted, decide: Measured) -> Changing | N
     names = [base.model.keys[known[k][1]][0] for k in order]
     (_, change, cov), _ = known[int(order[0])]
     apart = np.eye(change.size) - 1 / change.size  # the mean is the rig file's own parameter
-    explained = min(1.0, gain / max(none[0] - expected, gain))
+    explained = gain / max(none[0] - expected, gain)
     return Changing(
         sites=tuple(zip(names, (explained * p / p.sum())[order].tolist(), strict=True)),
         series=tuple((*search.lines.levels[k], search.lines.periodic[k]) for k, _ in series),

@@ -87,7 +87,7 @@ def _lines(rig: Rig, where: Places) -> Iterator[Effect]:
             physics="hydraulic_compressibility",
             site=e.name,
             unknowns=(
-                Unknown("C_h", insert.VOLUME, *bounds, tuple(scale * x for x in COMPLIANCES)),
+                Unknown("C_h", insert.VOLUME, *bounds, tuple(scale * part for part in COMPLIANCES)),
                 Unknown("omega", "rad/s", low_w, 100 * high_w, spread(low_w, 30 * high_w, 6)),
                 Unknown("zeta", "1", 0.01, 3.0, (0.15,)),
             ),

@@ -33,7 +33,6 @@ IN_DATA = 45.0  # of chi-square, that an effect must explain of the data to be c
 UNEXPLAINED = 3e-4  # chance that noise leaves as much as makes an empty answer "unknown"
 DRAWS = 400
 MUST_SHOW = 900.0  # of chi-square, that an effect explains of the data: 30 noise units
-NOTHING_SAID = "no_mismatch"
 SAID = ("named", "ambiguous")  # verdicts that come with causes
 SHOWN = 0.01  # probability of an alternative from which it is listed
 # What a factor between two units is: their names are told, not physics.
@@ -107,7 +106,7 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
     ordered = tuple(_chosen_first(grouped, nothing))
     evidence = _evidence(search, ordered, ranked, decide)
     said = _verdict(ordered[0], evidence, search, decide)
-    beyond = _beyond(search, ordered[0].first, evidence, decide) if said != NOTHING_SAID else None
+    beyond = _beyond(search, ordered[0].first, evidence, decide) if said != "no_mismatch" else None
     return Judgement(
         verdict="unknown" if beyond else said,
         classes=ordered,

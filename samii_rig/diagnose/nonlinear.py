@@ -37,7 +37,7 @@ NAMES = (
 )
 KEPT = 4  # linear explanations that are held against the levels
 PROMISING = 0.25  # of what the first gains in the screen, at least
-TRIED = 4  # forces that are refitted beside each base
+TRIED = 4  # physics of which a force is refitted beside each base
 ALARM, BETWEEN = 14.0, 8.0  # of chi-square, and of that between levels, that a force must gain
 SHARE, MORE = 0.3, 3.0  # of what it should gain between levels, that it does
 AGAIN, MOVED = 4, 0.5  # times that a force is computed anew at most; a move that is small
@@ -179,7 +179,7 @@ def _again(levels: Apart) -> None:
         search.temper()
         search.prune()
         after = search.ranked()[0]
-        if after.key == best.key and _moved(best, after) < MOVED:
+        if after.key == best.key and after.fitted.away(best.fitted) < MOVED:
             return
 
 
@@ -219,12 +219,6 @@ def _on_lines(levels: Apart) -> None:
         near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
         _only(search, [*near[:RIVALS], *rivals, search.nominal])
     search.temper()
-
-
-def _moved(before: Explanation, after: Explanation) -> float:
-    """How far a refit went, in standard deviations of what the data say."""
-    d = after.fitted.x - before.fitted.x
-    return float(np.sqrt(d @ after.fitted.precision() @ d))
 
 
 def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:

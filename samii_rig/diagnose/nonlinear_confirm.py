@@ -61,8 +61,7 @@ def seen(
     responses: Sequence[FrequencyResponse],
     runs: Sequence[Recording],
 ) -> Seen | None:
-    """The force in the recordings of repeated inputs; None without any, or where it is too
-    strong to be computed so."""
+    """The force in the recordings of repeated inputs; None without any, or as `forced`."""
     model, x = with_force.model, with_force.x
     assert isinstance(model, LevelModel)
     rig = model.rig

@@ -96,7 +96,12 @@ def _lap(
 
 @dataclass(frozen=True, slots=True)
 class Inner:
-    """A rig's partial fractions between a command, a force and what drives it, at one step."""
+    """A rig's partial fractions from command and force to what drives the force, by exact steps.
+
+    The rig has one actuator. poles : (n_pole,) rad/s, of pairs one. grow, push : (n_pole,) what a
+    step makes of a state, and of an input held over it. R, D : (n_pole, n_in), (n_in,) as `_lap`.
+    late : steps of dead time. code : of the law. scale : e = scale times what the law says.
+    """
 
     poles: Complex
     grow: Complex

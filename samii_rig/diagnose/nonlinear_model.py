@@ -25,7 +25,6 @@ from samii_rig.diagnose.nonlinear_levels import LevelGrid, Loop
 from samii_rig.errors import InputError
 from samii_rig.model.sampled import sensor_response
 from samii_rig.rig.schema import (
-    AbsoluteAngle,
     ActuatorSpec,
     Moment,
     Parameter,
@@ -38,7 +37,7 @@ from samii_rig.types import Complex, Float
 CAP = 1.5  # power of its height, that what a limit cuts off a sine grows with
 EXTRA = f"{insert.PREFIX}force"  # the input and the sensor that the chain has more
 
-Kind = Literal["joint", "ground", "drive", "command", "flow"]
+Kind = Literal["joint", "drive", "command", "flow"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +45,6 @@ class Quasi:
     """A nonlinear force: where it is fed in, what drives it, and how.
 
     kind : `joint`, a torque between both sides of `across`, driven by the angle over it;
-        `ground`, a torque against the ground behind the element, driven by its angle;
         `drive`, on the input of the source, driven by the source's own angle; `command`, on
         the input, driven by the input; `flow`, on the input, driven by it and by the torque
         behind the source.
@@ -68,25 +66,20 @@ class Quasi:
     @property
     def own_input(self) -> bool:
         """Whether the force has an input of its own."""
-        return self.kind in ("joint", "ground")
+        return self.kind == "joint"
 
     def widened(self, rig: Rig) -> Rig:
         """The rig with the force's input behind its own and its sensors behind its own."""
         names = [e.name for e in rig.element]
         first, last = names.index(self.across[0]), self.across[-1]
         before = names[first - 1] if first > 0 else None
-        sensors: tuple[RelativeAngle | AbsoluteAngle | Moment, ...] = (
+        sensors: tuple[RelativeAngle | Moment, ...] = (
             RelativeAngle(kind="relative_angle", name=EXTRA, across=self.across, unit="rad"),
         )
         match self.kind:
             case "joint":
                 rig = insert.inserted(rig, last, _torque(1.0, "behind"))
                 rig = insert.inserted(rig, before, _torque(-1.0, "before"))
-            case "ground":
-                rig = insert.inserted(rig, last, _torque(1.0, "behind"))
-                sensors = (
-                    AbsoluteAngle(kind="absolute_angle", name=EXTRA, after=last, unit="rad"),
-                )
             case "flow":
                 sensors = (Moment(kind="moment", name=EXTRA, after=last, unit="N m"),)
         update: dict[str, object] = {"sensor": (*rig.sensor, *sensors)}

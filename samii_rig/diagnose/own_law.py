@@ -54,8 +54,9 @@ class OwnLaw:
 
 
 def own_law(search: Search, best: Explanation) -> OwnLaw | None:
-    """The part that does by itself what several effects of `best` do; None if none does."""
-    if len(best.effects) < TOGETHER or any(e.quasi is not None for e in best.effects):
+    """The part that does by itself what the effects of `best`, linear ones, do; None if none does
+    or if it is but one effect."""
+    if len(best.effects) < TOGETHER:
         return None
     base = search.nominal.fitted
     look = Screen.of(search.problem, base)

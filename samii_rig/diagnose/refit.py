@@ -54,7 +54,8 @@ class Problem:
 
     def whiten(self, dh: Complex) -> Float:
         """(2 n q, m) whitened derivatives."""
-        J = (self.root @ dh).reshape(-1, dh.shape[2])
+        n, q, m = dh.shape
+        J = (self.root @ dh).reshape(n * q, m)  # m = 0: a rig file without tolerances
         return np.concatenate([J.real, J.imag])
 
 

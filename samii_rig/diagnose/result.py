@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 Verdict = Literal["no_mismatch", "named", "ambiguous", "unknown"]
 
+LIKELY = 0.5  # probability of a site from which it is told as the place
+
 
 @dataclass(frozen=True, slots=True)
 class Value:
@@ -206,7 +208,8 @@ class Diagnosis:
                     f"freedom {self.chi2_per_dof:.3f}, threshold {self.threshold:.3f})."
                 )
             case "unknown":
-                place = f" It is most likely at {self.sites[0][0]}." if self.sites else ""
+                site, p = self.sites[0] if self.sites else ("", 0.0)
+                place = f" It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
                 return f"Something is missing that the table does not name for sure.{place}"
         named = " and ".join(_said(c) for c in self.causes)
         if self.verdict == "named":
@@ -219,8 +222,8 @@ class Diagnosis:
             return f"On lines kept apart the refitted model has {before:.3g} of the noise's power."
         sure = min(c.probability for c in self.causes)
         return (
-            f"Probability {sure:.0%}; on lines kept apart chi-square per degree of freedom falls "
-            f"from {before:.3g} to {after:.3g}, {self.gap.value:.0%} of the gap to the noise "
+            f"Probability {percent(sure)}; on lines kept apart chi-square per degree of freedom "
+            f"falls from {before:.3g} to {after:.3g}, {self.gap.value:.0%} of the gap to the noise "
             f"({self.gap.low:.0%} to {self.gap.high:.0%})."
         )
 
@@ -229,6 +232,17 @@ class Diagnosis:
         if self.experiment:
             parts.append(f"Next: {self.experiment} ({self.why}).")
         return " ".join(parts) or "No further experiment is needed."
+
+
+def percent(p: float) -> str:
+    """A probability: never 0 %% or 100 %%, which no data give."""
+    if p > 0.999:
+        return "over 99.9 %"
+    if p < 0.001:
+        return "under 0.1 %"
+    if p > 0.99 or p < 0.01:
+        return f"{100 * p:.1f} %"
+    return f"{100 * p:.0f} %"
 
 
 def _said(cause: Cause) -> str:

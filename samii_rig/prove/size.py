@@ -27,7 +27,6 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 
 LEAST = 10.0  # sigma from which it is asked what else might be meant
-ARRAYS = ("frequency", "linear", "level", "reference", "sensitivity", "open_noise")
 
 
 @dataclass(frozen=True, slots=True)

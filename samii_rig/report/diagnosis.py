@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from samii_rig.diagnose.result import Cause, Diagnosis, Trace
+from samii_rig.diagnose.result import Cause, Diagnosis, Trace, percent
 from samii_rig.errors import InputError
 from samii_rig.report import diagnosis_plots as figures
 from samii_rig.report import diagnosis_words as words
@@ -122,8 +122,7 @@ def _marked(found: Diagnosis, rig: Rig) -> dict[str, Suspect]:
     causes = words.answer(found)
     chosen = {c.site for c in causes}
     marked = {
-        site: Suspect(words.percent(p), p, site in chosen)
-        for site, p in words.suspects(found).items()
+        site: Suspect(percent(p), p, site in chosen) for site, p in words.suspects(found).items()
     }
     for cause in causes:
         port = _port(rig, cause.site)

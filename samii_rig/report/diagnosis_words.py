@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from samii_rig.diagnose.result import Band, Cause, Diagnosis, Trace, Value
+from samii_rig.diagnose.result import LIKELY, Band, Cause, Diagnosis, Trace, Value, percent
 from samii_rig.report.diagnosis_laws import Jump, jump_of
 from samii_rig.report.verdicts import Mark, without_folders
 
@@ -50,7 +50,6 @@ WORDS = {
 _PREFIXES = {"N": ((1e9, "G"), (1e6, "M"), (1e3, "k")), "s": ((1.0, ""), (1e-3, "m"), (1e-6, "µ"))}
 _POWERS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 FAINT = 0.02  # probability of a site below which it is not marked
-LIKELY = 0.5  # probability of a site from which it is told as the place
 NEVER = 1e-4  # a probability below it is not written in digits
 
 
@@ -120,17 +119,6 @@ def said(physics: str) -> str:
 def listed(parts: Sequence[str]) -> str:
     """`a, b and c`."""
     return f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else "".join(parts)
-
-
-def percent(p: float) -> str:
-    """A probability: never 0 %% or 100 %%, which no data give."""
-    if p > 0.999:
-        return "over 99.9 %"
-    if p < 0.001:
-        return "under 0.1 %"
-    if p > 0.99 or p < 0.01:
-        return f"{100 * p:.1f} %"
-    return f"{100 * p:.0f} %"
 
 
 def share(value: float, half: float) -> str:

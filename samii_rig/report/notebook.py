@@ -85,8 +85,8 @@ def before_after(
     is from the measurement in units of its noise."""
     i, j = _entry(responses, output, input)
     before = curve(refitted_nominal(rig, responses, None), "refitted nominal model", responses)
-    causes = found.causes and found.rig
-    after = curve(found.rig, "with the causes", responses) if causes and found.rig else None
+    named = found.rig if found.causes else None
+    after = curve(named, "with the causes", responses) if named else None
     curves = [plots.Curves.of(r) for r in responses]
     return figure(diagnosis_plots.before_after(curves, i, j, before, after))
 

@@ -89,15 +89,17 @@ class Analysis:
         }
 
     def _newer(self, name: str) -> dict[str, Any] | None:
-        """What a file of the analyst says, if it says something new."""
+        """What a file of the analyst says, if it says something new; the runner's last word, of the
+        whole run, is not the analyst's."""
         assert self._job is not None
         path = self._job.folder / name
         with suppress(OSError, ValueError):
             written = path.stat().st_mtime_ns
             if written != self._read.get(name, (0, {}))[0]:
                 found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-                self._read[name] = (written, found)
-                return found
+                if not found.get("final"):
+                    self._read[name] = (written, found)
+                    return found
         return None
 
 

@@ -19,7 +19,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -130,7 +130,8 @@ class Analyst:
     def _diagnose(self) -> None:
         """Take what was found, and ask again if there is something new to ask."""
         found = self._diagnoser.taken()
-        if found is not None:
+        # After the run the runner has the last word.
+        if found is not None and self.job.written.phase == "running":
             next_toml = following(found.get("experiment", ""), self._text)
             self.job.tell(DIAGNOSIS, {**found, "next_toml": next_toml})
         known = self._so_far.responses()
@@ -184,6 +185,7 @@ class Diagnoser:
 def _diagnosing(line: Connection, rig_toml: str) -> None:
     from samii_rig.diagnose.diagnose import diagnose
 
+    threading.Thread(target=_ends_with_the_analyst, daemon=True).start()
     rig = parse(Rig, rig_toml, RIG)
     # The one who asks is gone when nothing comes any more.
     with suppress(EOFError, OSError):
@@ -195,6 +197,14 @@ def _diagnosing(line: Connection, rig_toml: str) -> None:
             except SamiiRigError as error:
                 found = {"verdict": "", "trouble": str(error)}
             line.send({**about, **found, "took_s": time.monotonic() - begun})
+
+
+def _ends_with_the_analyst() -> None:
+    """A diagnosis that nobody waits for any more takes no processor from the next run."""
+    analyst = parent_process()
+    assert analyst is not None
+    analyst.join()
+    os._exit(0)
 
 
 def said(found: Diagnosis) -> dict[str, Any]:

@@ -6,7 +6,6 @@ import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Request, Response, WebSocket, WebSocketDisconnect
-from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from samii_rig.errors import LimitError
@@ -122,13 +121,13 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
             raise NotThereError(f"no job {id_[:40]!r}; expected the id of one")
         return found
 
-    @router.get("/jobs/{id_}/responses", response_class=FileResponse)
-    def responses(id_: str) -> FileResponse:
+    @router.get("/jobs/{id_}/responses")
+    def responses(id_: str) -> Response:
         """The frequency responses of a run so far, with 90 % bands, and the model's."""
         return _told(rooms, id_, RESPONSES)
 
-    @router.get("/jobs/{id_}/diagnosis", response_class=FileResponse)
-    def diagnosis(id_: str) -> FileResponse:
+    @router.get("/jobs/{id_}/diagnosis")
+    def diagnosis(id_: str) -> Response:
         """The diagnosis of a run so far; `next_toml` is the experiment that it asks for."""
         return _told(rooms, id_, DIAGNOSIS)
 
@@ -161,11 +160,12 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
         return rooms.state()
 
 
-def _told(rooms: Rooms, id_: str, name: str) -> FileResponse:
+def _told(rooms: Rooms, id_: str, name: str) -> Response:
     path = rooms.supervisor.told(id_, name)
     if path is None:
         raise NotThereError(f"nothing is known yet of job {id_[:40]!r}")
-    return FileResponse(path, media_type="application/json")
+    # Read at once: a file that is replaced while it is sent would have another length than told.
+    return Response(path.read_bytes(), media_type="application/json")
 
 
 def _lease(router: APIRouter, rooms: Rooms) -> None:

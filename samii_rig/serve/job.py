@@ -185,6 +185,10 @@ class Job:
             file.write(json.dumps({"time": now, "by": by}) + "\n")
         return True
 
+    def early(self, state: JobState) -> bool:
+        """Whether it ended by its own order, and by nothing else that came on the way there."""
+        return bool(state.early) and state.status == "stopped" and not self.stops()
+
     def stops(self) -> list[dict[str, str]]:
         """Who asked for a stop, and when."""
         try:

@@ -145,7 +145,7 @@ class Runner:
         """The verdict; "" where there is nothing to tell it from."""
         if not self.request.diagnosis or not outcome.responses:
             return ""
-        whole = outcome.stop.status == "completed" or (self.state.early and not self.job.stops())
+        whole = outcome.stop.status == "completed" or self.job.early(self.state)
         if not whole or outcome.interrupted:
             return ""
         from samii_rig.diagnose.diagnose import diagnose

@@ -203,8 +203,7 @@ class Supervisor:
             reason = "its process ended without a word" if moved else "stopped before it moved"
             state = JobState(phase="died", live=state.live, status="failed", reason=reason)
             job.set(state)
-        asked = state.early and not job.stops()  # by the order itself
-        if state.phase != "cancelled" and state.status != "completed" and not asked:
+        if state.phase != "cancelled" and state.status != "completed" and not job.early(state):
             self.held = f"{recording}: {state.status or 'refused'}, {state.reason or state.error}"
         if state.live:
             Path(state.live).unlink(missing_ok=True)

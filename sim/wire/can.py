@@ -21,21 +21,19 @@ sim/wire/rig.py, and
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
 
-from samii_rig.errors import InputError, SamiiRigError
-from samii_rig.rig.load import load_rig
+from samii_rig.errors import InputError
 from samii_rig.rig.schema import Device, Moment, Rig
 from samii_rig.types import Float
 from sim.settings import SimSettings
-from sim.wire.__main__ import read_script
 from sim.wire.can_adapter import Adapter
 from sim.wire.can_sensor import Sensor
+from sim.wire.program import options, run
 from sim.wire.rig import WireRig
 
 BASE = 0x20  # the sensor's base identifier
@@ -87,7 +85,7 @@ class CanWireRig(WireRig):
 
     def close(self) -> None:
         """Both ports vanish."""
-        self.unplug()
+        super().close()
         self.adapter.unplug()
 
     def obey(self, line: str) -> bool:
@@ -178,34 +176,17 @@ def _axes(rig: Rig) -> dict[str, tuple[str, int]]:
 
 def main() -> int:
     """Run until standard input ends, `quit` or Ctrl-C."""
-    parser = argparse.ArgumentParser(prog="python -m sim.wire.can", description=__doc__)
-    parser.add_argument("--rig", required=True, help="path of a rig file with moment sensors")
-    parser.add_argument("--link", type=Path, help="a symbolic link that leads to the node's port")
+    parser = options("sim.wire.can", __doc__, "path of a rig file with moment sensors")
     parser.add_argument("--can-link", type=Path, help="one that leads to the adapter's port")
-    parser.add_argument("--script", type=Path, help="faults: a line SECONDS COMMAND each")
-    parser.add_argument("--seed", type=int, default=0, help="of noise and faults")
-    parser.add_argument("--ideal", action="store_true", help="no noise of the sensors")
     parser.add_argument("--drift", type=float, default=0.0, help="ppm by which the node is slow")
     chosen = parser.parse_args()
-    try:
-        script = read_script(chosen.script) if chosen.script else []
-        settings = SimSettings(seed=chosen.seed, noise=not chosen.ideal)
-        rig = CanWireRig(load_rig(chosen.rig)[0], settings, chosen.link, chosen.can_link)
-    except SamiiRigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
-    rig.pace = 1.0 + chosen.drift * 1e-6
-    rig.say(rig.hello())
-    try:
-        rig.run(script)
-    except SamiiRigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        pass
-    finally:
-        rig.close()
-    return 0
+
+    def make(rig: Rig, settings: SimSettings) -> CanWireRig:
+        made = CanWireRig(rig, settings, chosen.link, chosen.can_link)
+        made.pace = 1.0 + chosen.drift * 1e-6
+        return made
+
+    return run(chosen, make)
 
 
 if __name__ == "__main__":

@@ -118,6 +118,10 @@ class WireRig:
         if self._link is not None:
             self._link.unlink(missing_ok=True)
 
+    def close(self) -> None:
+        """The port vanishes for good."""
+        self.unplug()
+
     # Time
 
     def run(self, script: list[tuple[float, str]]) -> None:
