@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import struct
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 from report_kit import measured
-from serve_kit import WITHIN, Service, sweep
+from serve_kit import Service, sweep
+from wait_kit import WITHIN, found
 
 pytest.importorskip("foxglove")
 
@@ -95,10 +95,7 @@ def test_every_sample_arrives_by_name_in_order_and_in_time(
         channel = advertised(ws, "/samples")
         assert channel["metadata"] == {"unit.u": "V", "unit.theta_2": "rad"}
         subscribe(ws, channel)
-        until = time.monotonic() + WITHIN
-        while not server._samples.has_sinks():
-            assert time.monotonic() < until
-            time.sleep(0.01)
+        found(server._samples.has_sinks, WITHIN)
         for first in (0, 20, 40):
             writer.samples(block(first, 20))
             server.show(reader, None)
@@ -125,10 +122,7 @@ def test_frequency_responses_come_as_curves_by_output(
         channel = advertised(ws, BODE)
         assert channel["encoding"] == "json"
         subscribe(ws, channel)
-        until = time.monotonic() + WITHIN
-        while not server._bode.has_sinks():
-            assert time.monotonic() < until
-            time.sleep(0.01)
+        found(server._bode.has_sinks, WITHIN)
         server.show(None, file)
         (one,) = json.loads(received(ws)[1])["responses"]
         gain = np.interp(one["frequency"], r.frequency, np.abs(r.H[:, 1, 0]))

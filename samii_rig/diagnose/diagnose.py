@@ -85,6 +85,9 @@ def diagnose(
     judged = verdict.shown(verdict.confirmed(judged) if holds else judged, gap)
     if clean.doubt:
         judged = verdict.doubted(judged, clean.doubt.most)
+    if len(set(whole.outputs)) == 1 and len(best.effects) > 1:
+        # Trials of four channels say nothing of how often one curve tells several places apart.
+        judged = verdict.doubted(judged, "ambiguous")
     shown = verdict.causes_of(judged.classes[0], judged) if judged.verdict in verdict.SAID else ()
     told = list(clean.told)
     if judged.verdict != "no_mismatch" or best.effects:

@@ -67,7 +67,10 @@ class Judgement:
     @property
     def shares(self) -> tuple[float, ...]:
         """Probability of each class; what is left to one is of what was not looked at."""
-        return self._shared(self.right)
+        shares = self._shared(self.right)
+        if self.beyond is None:
+            return shares
+        return tuple((1 - max(p for _, p in self.beyond.sites)) * share for share in shares)
 
     def _shared(self, first: float) -> tuple[float, ...]:
         """Of each class, where that of the first is known."""

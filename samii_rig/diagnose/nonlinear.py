@@ -296,11 +296,9 @@ def settle(
     if _force_in(best) is None or judged.verdict == "no_mismatch":
         return False, []
     said = [level_dependence(best, search), *distorted(responses)]
-    effects = frozenset(e.key for e in best.effects if e.quasi is None)
-    linear = max(
-        (e for e in search.found.values() if _force_in(e) is None),
-        key=lambda e: (e.key == effects, e.weight),
-    )
+    # Held against the same without the force, not against a model that lacks the rest too.
+    force = next(i for i, e in enumerate(best.effects) if e.quasi is not None)
+    linear = search.without(best, force) or search.nominal
     at = search.grid
     assert isinstance(at, LevelGrid)
     found = seen(linear.fitted, best.fitted, at, search.lines, responses, runs)

@@ -75,10 +75,13 @@ def own_law(search: Search, best: Explanation) -> OwnLaw | None:
     if not found:
         return None
     found = sorted(found, key=lambda f: -f[0])[:TRIED]
-    ends = [_refitted(search, part, model, y, ROUNDS) for _, part, model, y in found]
-    at = int(np.argmin([cost for cost, _ in ends]))
-    _, part, model, _ = found[at]
-    cost, y = _refitted(search, part, model, ends[at][1], MORE_ROUNDS)
+    try:
+        ends = [_refitted(search, part, model, y, ROUNDS) for _, part, model, y in found]
+        at = int(np.argmin([cost for cost, _ in ends]))
+        _, part, model, _ = found[at]
+        cost, y = _refitted(search, part, model, ends[at][1], MORE_ROUNDS)
+    except (SamiiRigError, ValueError):  # on the way the rig's values become ones that no rig has
+        return None
     more = sum(len(e.unknowns) for e in best.effects) - UNKNOWNS
     gain = (best.fitted.cost - cost) / search.temperature + PRICE * more
     return OwnLaw(part.site, float(np.exp(y[-1])), gain) if gain > CLEAR else None

@@ -106,11 +106,12 @@ class Diagnosis:
 
     chi2_per_dof, threshold : of the refitted nominal model, and what noise would reach in
         three of a thousand cases.
-    train, held_out : chi-square per degree of freedom of the refitted nominal model and with
+    nominal, with_causes : chi-square per degree of freedom of the refitted nominal model and with
         the causes, each on the lines fitted and on those shown.
     rig : the nominal rig with the causes; traces : the best places, law-free.
-    evidence : what the probability of the answer rests on (`stated.Evidence`), and the causes of
-        the most probable explanation, whether they are told or not.
+    evidence : what the probability of the answer rests on (`stated.Evidence`), whether something
+        `beyond` the table was found instead, and the causes of the most probable explanation,
+        whether they are told or not.
     """
 
     verdict: Verdict
