@@ -225,10 +225,11 @@ def _decided(search: Search, lines: Measured) -> list[Explanation]:
     likely each makes lines that were not fitted; the most probable first."""
     ranked = search.ranked()
     rivals = [e for e in ranked if e.weight > ranked[0].weight - NEAR or not e.effects]
-    gross = _predicted(search, lines, search.nominal.fitted)[0]
+    predicted = {e.key: _predicted(search, lines, e.fitted) for e in rivals}
+    gross, _ = predicted[search.nominal.key]
     heard = []
     for e in rivals:
-        chi2, spread = _predicted(search, lines, e.fitted)
+        chi2, spread = predicted[e.key]
         lost = 0.5 * (chi2 / search.temperature + spread) + search.inexact(e.effects, gross)
         heard.append(replace(e, weight=e.weight - lost))
     return sorted(heard, key=lambda e: -e.weight)

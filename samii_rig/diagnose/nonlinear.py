@@ -119,10 +119,9 @@ def _worth(found: Sequence[Promise]) -> list[Promise]:
     for torques and angles of neighbouring joints go nearly together."""
     heard = [p for p in found if _heard(p) and p.gain > PROMISING * found[0].gain]
     first = {p.effect.physics: p for p in reversed(heard)}
-    most = sorted(first.values(), key=lambda p: -p.gain)[:TRIED]
-    return (
-        most + [p for p in heard if p.effect.physics == most[0].effect.physics][1:] if most else []
-    )
+    # `found` has the largest gain first, and so have these.
+    elsewhere = [p for p in heard[1:] if p.effect.physics == heard[0].effect.physics]
+    return sorted(first.values(), key=lambda p: -p.gain)[:TRIED] + elsewhere
 
 
 def _settled(levels: Apart, table: Sequence[Effect]) -> Effect | None:
@@ -186,17 +185,14 @@ def _again(levels: Apart) -> None:
 def _computed(levels: Apart) -> list[Explanation]:
     """The best explanation with each of the leading forces, computed where it was found."""
     search = levels.search
-    forced = [e for e in search.ranked() if isinstance(e.fitted.model, LevelModel)]
-    first: dict[Quasi, Explanation] = {}
-    for e in forced:
-        assert isinstance(e.fitted.model, LevelModel)
-        first.setdefault(e.fitted.model.quasi, e)
+    first: dict[Quasi, tuple[Explanation, LevelModel]] = {}
+    for e in search.ranked():
+        if isinstance(model := e.fitted.model, LevelModel):
+            first.setdefault(model.quasi, (e, model))
     rivals = list(first.values())[:RIVALS]
-    for e in rivals:
-        model = e.fitted.model
-        assert isinstance(model, LevelModel)
+    for e, model in rivals:
         levels.compute(model, e.fitted.x, model.strength(e.fitted.x)[0])
-    return rivals
+    return [e for e, _ in rivals]
 
 
 def _only(search: Search, some: Sequence[Explanation]) -> None:
