@@ -1,43 +1,64 @@
 """The service under viewers and kills.
 
-    python benchmarks/bench_serve.py [--viewers 20] [--slow 5] [--stops 15] [--kills 20]
+    python benchmarks/bench_serve.py [--viewers 20] [--slow 5] [--stops 15] [--pairs 3] [--kills 20]
 
-Viewers: a simulated rig in real time, so many viewers of whom some never read. Prints how long a
+Stops: a simulated rig in real time, so many viewers of whom some never read. Prints how long a
 stop takes from the request to its answer and to zero volts, how long a plain request takes, what
 the viewers got and lost, and that no sample is missing in the recordings. When the output was zero
 is read from the recording; the device's clock is laid against this machine's by the promptest
 block that a viewer got, so that what is printed is too long by that block's own delay.
 
+Pairs: the simulated serial node in real time, a run without viewers and one with them by turns;
+prints how late the loop's sleeps ended in either, and that no sample is missing.
+
 Kills: one run after another, the service killed at a moment drawn anew in each and started again;
 prints what of the recordings and the index is not as it should be.
 
-Page: what a picture of the page costs in Chromium with four channels of 1 kHz, and how far apart
+Page: how long until it can be used, just after the service was started and later; what a picture
+costs in Chromium with four channels of 1 kHz, and how far apart
 its pictures are, beside those of an empty page on the same machine.
+
+So far: what an estimate and a diagnosis of a run that goes on cost, in s of a processor, on the
+shipped swept sine as far as each of its segments, and as the page would ask.
+
+--autogroup N gives the service and its runs that nice level among the programs of a loaded machine
+(/proc/PID/autogroup of Linux; below 0 wants root).
 """
 
 import argparse
 import math
+import os
 import random
-import statistics
 import struct
 import sys
 import tempfile
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from websockets.sync.client import connect
 
-from samii_rig.record.reader import read_recording
+from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.record.reader import read_events, read_recording
 from samii_rig.record.verify import verify
 from samii_rig.rig.load import load_rig
+from samii_rig.run.campaign import carry_out
+from samii_rig.run.dryrun import predict
+from samii_rig.run.experiments import load_experiment
+from samii_rig.run.priority import PRIORITY
+from samii_rig.serve.sofar import SoFar
+from samii_rig.types import Recording
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 from browser_kit import Browser  # found by the line above
+from device_kit import TIMED, installed
 from serve_kit import Service, sweep
+from wire_kit import Wire
 
 HEAD = struct.Struct("<BBHIIIdq")  # see samii_rig/serve/viewers.py
 
@@ -51,18 +72,54 @@ class Viewer(threading.Thread):
     def __init__(self, url: str, slow: bool) -> None:
         super().__init__(daemon=True)
         self.url, self.slow, self.frames, self.lost, self.apart = url, slow, 0, 0, math.inf
+        self.leave = threading.Event()
 
     def run(self) -> None:
         with suppress(Exception), connect(self.url, max_size=None, ping_interval=None) as socket:
-            while True:
-                if self.slow:
-                    time.sleep(3600)
+            if self.slow:
+                self.leave.wait()
+                socket.socket.shutdown(2)
+            while not self.leave.is_set():
                 frame = socket.recv()
                 if isinstance(frame, bytes):
                     now = time.monotonic()
                     _, _, _, rows, _, self.lost, rate, first = HEAD.unpack_from(frame)
                     self.frames += 1
                     self.apart = min(self.apart, now - (first + rows - 1) / rate)
+
+
+def prefer(level: int | None, pid: int | str = "self") -> None:
+    """Give the session of this process the level among others; a run has a session of its own."""
+    if level is not None and Path("/proc/self/autogroup").exists():
+        Path(f"/proc/{pid}/autogroup").write_text(str(level))
+
+
+def started(service: Service, lease: dict, text: str, level: int | None) -> str:
+    id_ = service.start(lease, text)
+    for children in Path(f"/proc/{service.process.pid}/task").glob("*/children"):
+        for pid in children.read_text().split():
+            prefer(level, pid)
+    service.until(service.progressing)
+    return id_
+
+
+@contextmanager
+def watching(service: Service, count: int, slow: int):
+    """So many viewers, of whom some never read, until the end."""
+    url = service.url.replace("http", "ws") + "/api/live"
+    with ExitStack() as kept:
+        all_ = [Viewer(url, i < slow) for i in range(count)]
+        for v in all_:
+            kept.callback(v.leave.set)
+            v.start()
+        service.until(lambda: service.state()["viewers"] == count)
+        yield all_
+    service.until(lambda: service.state()["viewers"] == 0)
+
+
+def told(what: str, ms: Sequence[float], unit: str = "ms") -> None:
+    p50, p99 = np.percentile(ms, [50, 99])
+    print(f"{what}: p50 {p50:.1f}, p99 {p99:.1f}, worst {max(ms):.1f} {unit} of {len(ms):,}")
 
 
 def ended(service: Service, id_: str) -> dict:
@@ -73,53 +130,79 @@ def ended(service: Service, id_: str) -> dict:
     return service.until(over)
 
 
-def viewers(arguments: argparse.Namespace) -> None:
-    with tempfile.TemporaryDirectory() as folder, Service(Path(folder), "--pace", "1") as service:
-        url = service.url.replace("http", "ws") + "/api/live"
-        all_ = [Viewer(url, i < arguments.slow) for i in range(arguments.viewers)]
-        for v in all_:
-            v.start()
-        service.until(lambda: service.state()["viewers"] == len(all_))
-        stops, zeros, plain, missing = [], [], [], 0
-        with service.lease() as lease:
-            for _ in range(arguments.stops):
-                id_ = service.start(lease, sweep(duration=60.0))
-                for v in all_:
-                    v.apart = math.inf
-                service.until(service.progressing)
-                for _ in range(50):
-                    start = time.perf_counter()
-                    service.http.get("/page/page.css")
-                    plain.append(1e3 * (time.perf_counter() - start))
-                    time.sleep(0.04)
-                start = time.monotonic()
-                service.http.post("/api/stop")
-                stops.append(1e3 * (time.monotonic() - start))
+def stops(arguments: argparse.Namespace) -> None:
+    took, zeros, plain, missing = [], [], [], 0
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Service(Path(folder), "--pace", "1") as service,
+        watching(service, arguments.viewers, arguments.slow) as all_,
+        service.lease() as lease,
+    ):
+        for _ in range(arguments.stops):
+            for v in all_:
+                v.apart = math.inf
+            id_ = started(service, lease, sweep(duration=60.0), arguments.autogroup)
+            for _ in range(10):
+                start = time.perf_counter()
+                service.http.get("/page/page.css")
+                plain.append(1e3 * (time.perf_counter() - start))
+                time.sleep(random.uniform(0.02, 0.06))
+            start = time.monotonic()
+            service.http.post("/api/stop")
+            took.append(1e3 * (time.monotonic() - start))
+            job = ended(service, id_)
+            recording = read_recording(Path(folder) / job["recording"])
+            missing += recording.stop.missing_samples
+            v = recording.values[:, recording.column("v_2")]
+            zero = recording.sequence[np.flatnonzero(v)[-1] + 1] / recording.rate_hz
+            zeros.append(1e3 * (zero + min(v.apart for v in all_) - start))
+    print(f"{len(all_)} viewers, {arguments.slow} of them never read")
+    told("stop, request to answer", took)
+    told("stop, request to zero volts", zeros)
+    told("a small file", plain)
+    reading = [v for v in all_ if not v.slow]
+    print(
+        f"frames got {min(v.frames for v in reading)} to {max(v.frames for v in reading)}, "
+        f"lost {sum(v.lost for v in reading)}; samples missing in the recordings: {missing}"
+    )
+
+
+def pairs(arguments: argparse.Namespace) -> None:
+    wire = Wire()
+    with tempfile.TemporaryDirectory() as name, ExitStack() as kept:
+        kept.callback(wire.close)
+        folder, late = Path(name), Path(name) / "late.npy"
+        os.environ["PYTHONPATH"] = installed(folder / "package", "timed_node", TIMED)
+        # The simulated node stands for a device, which no load of this machine holds up.
+        with suppress(OSError):
+            os.sched_setscheduler(wire.process.pid, os.SCHED_RR, os.sched_param(PRIORITY + 1))
+        rig = wire.rig_file(folder)
+        text = rig.read_text().replace('driver = "serial_node"', 'driver = "timed_node"')
+        rig.write_text(text.replace("[device.settings]", f'[device.settings]\nlate = "{late}"', 1))
+        service = kept.enter_context(Service(folder / "runs", "--rig", str(rig)))
+        found: dict[int, list[np.ndarray]] = {0: [], arguments.viewers: []}
+        missing, ticks = dict.fromkeys(found, 0), dict.fromkeys(found, 0)
+        for i in range(2 * arguments.pairs):
+            # By turns which of them is first.
+            count = arguments.viewers if i % 4 in (1, 2) else 0
+            with watching(service, count, min(count, arguments.slow)), service.lease() as lease:
+                id_ = started(service, lease, sweep(duration=20.0, repeats=1), arguments.autogroup)
                 job = ended(service, id_)
-                recording = read_recording(Path(folder) / job["recording"])
-                missing += recording.stop.missing_samples
-                v = recording.values[:, recording.column("v_2")]
-                zero = recording.sequence[np.flatnonzero(v)[-1] + 1] / recording.rate_hz
-                apart = min(v.apart for v in all_)
-                zeros.append(1e3 * (zero + apart - start))
-        plain.sort()
-        print(f"{len(all_)} viewers, {arguments.slow} of them never read")
+                wire.rest()
+                if job["status"] != "completed":
+                    print(f"{count} viewers: {job['status']}, {job['reason']}")
+                    why = {"name": "bench", "reason": "the machine was late"}
+                    service.http.post("/api/clear-fault", headers=lease, json=why)
+                    continue
+            stop = read_recording(folder / "runs" / job["recording"]).stop
+            missing[count] += stop.missing_samples
+            ticks[count] += stop.late_ticks
+            found[count].append(np.load(late))
+    for count, runs in ((c, r) for c, r in found.items() if r):
+        told(f"{count} viewers, a sleep of the loop ends late by", np.concatenate(runs))
         print(
-            f"stop, request to answer: median {statistics.median(stops):.0f} ms, "
-            f"worst of {len(stops)} {max(stops):.0f} ms"
-        )
-        print(
-            f"stop, request to zero volts: median {statistics.median(zeros):.0f} ms, "
-            f"worst of {len(zeros)} {max(zeros):.0f} ms"
-        )
-        print(
-            f"a small file: median {statistics.median(plain):.0f} ms, "
-            f"p99 {plain[int(0.99 * len(plain))]:.0f} ms"
-        )
-        reading = [v for v in all_ if not v.slow]
-        print(
-            f"frames got {min(v.frames for v in reading)} to {max(v.frames for v in reading)}, "
-            f"lost {sum(v.lost for v in reading)}; samples missing in the recordings: {missing}"
+            f"  worst of each run: {', '.join(f'{r.max():.1f}' for r in runs)} ms; "
+            f"late ticks {ticks[count]}, samples missing {missing[count]}"
         )
 
 
@@ -169,6 +252,9 @@ new Promise((done) => {
 """
 
 
+READY = "performance.getEntriesByName('interactive')"
+
+
 def page() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -176,6 +262,16 @@ def page() -> None:
         rig.write_text(load_rig("samii")[1].replace("rate_hz = 500.0", "rate_hz = 1000.0"))
         options = ("--pace", "1", "--rig", str(rig))
         with Browser(folder / "browser") as browser:
+            first, later = [], []
+            for i in range(5):
+                with Service(folder / f"empty_{i}") as service:
+                    for n in range(5):
+                        browser.go(service.url)
+                        browser.until(f"{READY}.length === 1")
+                        (first if n == 0 else later).append(browser.value(f"{READY}[0].startTime"))
+            told("page can be used, just after the start of the service", first)
+            told("page can be used, later", later)
+            browser.go("about:blank")
             empty, _ = browser.value(PICTURES)
             with Service(folder / "runs", *options) as service, service.lease() as lease:
                 browser.go(service.url)
@@ -195,20 +291,77 @@ def page() -> None:
                 service.http.post("/api/stop")
 
 
+def so_far() -> None:
+    rig, rig_toml = load_rig("samii")
+    experiment, text = load_experiment("swept_sine", rig)
+    plan = experiment.plan(rig)
+    with tempfile.TemporaryDirectory() as name:
+        path = Path(name) / "run.mcap"
+        carry_out(rig, rig_toml, text, plan, predict(plan, rig), path, settings={"seed": 1})
+        start = next(int(e.payload["start"]) for e in read_events(path) if e.name == "plan")
+        begun = time.process_time()
+        recording = read_recording(path)
+        reading = time.process_time() - begun
+    known, going_on, whole, found = SoFar(plan), [], [], []
+    before = start
+    for s, planned in zip(recording.segments, plan.segments, strict=True):
+        ends = [before + round(part * len(planned.u)) for part in (0.3, 0.6, 0.9)]
+        before += len(planned.u)
+        for stop, times in ((e, going_on) for e in ends if known.growing):
+            begun = time.process_time()
+            if known.take(until(recording, stop), start):
+                times.append(time.process_time() - begun)
+        begun = time.process_time()
+        known.take(until(recording, s.stop), start)
+        whole.append(time.process_time() - begun)
+        asked = known.sound or [r for r, _ in known.responses()]
+        begun = time.process_time()
+        diagnose(asked, rig)
+        found.append(time.process_time() - begun)
+    print(f"reading {len(recording):,} samples {reading:.2f} s")
+    for what, took in (
+        ("estimate of a sweep that goes on", going_on),
+        ("estimate of what is whole", whole),
+        ("diagnosis, nothing missing (the first compiles)", found),
+    ):
+        print(f"{what}: {min(took):.2f} to {max(took):.2f} s, median {np.median(took):.2f}")
+
+
+def until(recording: Recording, stop: int) -> Recording:
+    """As it is on the disk when its newest sample is `stop` - 1."""
+    n = int(np.searchsorted(recording.sequence, stop))
+    return replace(
+        recording,
+        sequence=recording.sequence[:n],
+        time=recording.time[:n],
+        values=recording.values[:n],
+        quality=recording.quality[:n],
+        segments=tuple(s for s in recording.segments if s.stop <= stop),
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--viewers", type=int, default=20)
     parser.add_argument("--slow", type=int, default=5)
     parser.add_argument("--stops", type=int, default=15)
+    parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--so-far", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument("--autogroup", type=int, metavar="N")
     parser.add_argument("--page", action=argparse.BooleanOptionalAction, default=True)
     arguments = parser.parse_args()
+    prefer(arguments.autogroup)
     if arguments.stops:
-        viewers(arguments)
+        stops(arguments)
+    if arguments.pairs:
+        pairs(arguments)
     if arguments.kills:
         kills(arguments)
     if arguments.page:
         page()
+    if arguments.so_far:
+        so_far()
 
 
 if __name__ == "__main__":

@@ -3,71 +3,108 @@
     python benchmarks/endurance.py load --rate 1000 --seconds 600     # both cores busy
     python benchmarks/endurance.py faults --seconds 3600 --seed 1     # a fault in every run
 
-`load` reports lateness of the ticks (p50, p99, p99.9, worst), lost samples and CPU. `faults` checks
-after each run that the output is at null, that the recording verifies or recovers, and that
-memory, threads and open files do not grow. Exit code 1 if anything does not hold.
+`load` reports lateness of the ticks and latency of the samples (p50, p99, p99.9, worst), what was
+lost, and CPU. Latency is the time from a sample's instant to its arrival at the gate, beyond that
+of the promptest one. `faults` checks after each run that the output is at null, that it was so
+within the deadman's time of its last feed, that no reference was beyond the plan's, that a fault is
+latched, and that the recording verifies or recovers; and that memory, threads and open files do
+not grow. Exit code 1 if anything does not hold.
 """
 
 import argparse
+import errno
 import gc
 import multiprocessing
 import os
 import random
 import resource
+import signal
 import sys
 import tempfile
 import threading
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from fault_host import plan_of
+from fault_host import VOLTS, plan_of
+from faults_kit import PATIENCE, Hosts
 from wire_kit import Wire
 
 from samii_rig.errors import SamiiRigError
+from samii_rig.record.appender import Appender
 from samii_rig.record.reader import read_recording
 from samii_rig.record.recover import recover
+from samii_rig.record.verify import verify
 from samii_rig.rig.load import load_rig
+from samii_rig.rig.schema import Rig
 from samii_rig.run import campaign
-from samii_rig.run.dryrun import predict
+from samii_rig.run.campaign import Outcome
+from samii_rig.run.dryrun import DryRun, predict
 from samii_rig.run.latch import Latch
+from samii_rig.run.protocols import OpenRig, Plan
+from samii_rig.types import Float, Int, SampleBlock
 
 WARM = 5  # runs until memory counts
 GROWTH = 64 << 20  # bytes that memory may grow by after that
-FAULTS = (
-    "",
+TELL = 300.0  # s between lines that say how it goes
+STEP = 1e-3  # V, more than a step of the node's converter
+LINE = ("loss", "flip", "duplicate", "reorder")
+STRAY = "stray 500"  # the converter by itself, which can be seen and not ended
+LATCHED = ("tripped", "failed")
+DISK, KILLED = "disk full", "program killed"
+ADD_CHUNK = Appender.add_chunk
+# What ends every run in which it begins, and what may end one.
+ENDING = (
     "emergency 1",
     "jump 5000",
     "rail 0 1",
     "offset a_2 26400",
     "drift a_0 2e5",
-    "freeze theta_2 1",
-    "freeze a_0 1",
     "stall 0.3",
-    "stray 500",
+    STRAY,
     "reboot",
     "clock -3000000",
+    "unplug",
+    DISK,
+)
+FAULTS = (
+    "",
+    *ENDING,
+    KILLED,
+    "freeze theta_2 1",
+    "freeze a_0 1",
     "line down flip 2e-3",
     "line down loss 2e-3",
     "line down duplicate 0.5",
+    "line up loss 0.02",
     "line up reorder 0.5",
-    "unplug",
 )
 
 
 class Timed:
-    """A clock that notes how late each sleep ends."""
+    """A device that notes how late each sleep of its clock ends, s, and how long after its instant
+    each sample is given, ns plus something that is the same for all."""
 
-    def __init__(self, clock: object) -> None:
-        self.clock, self.late = clock, []
-        self.now = clock.now
+    def __init__(self, device: OpenRig) -> None:
+        self.late: list[float] = []
+        self.ages: list[Int] = []
+        self._sleep, self._read = device.clock.sleep, device.sensor.read
+        object.__setattr__(device, "clock", self)
+        device.sensor.read = self.read
+        self.now = time.monotonic_ns
 
     def sleep(self, seconds: float) -> None:
         due = time.monotonic() + max(0.0, seconds)
-        self.clock.sleep(seconds)
+        self._sleep(seconds)
         self.late.append(time.monotonic() - due)
+
+    def read(self) -> SampleBlock:
+        block = self._read()
+        self.ages.append(time.monotonic_ns() - block.time)
+        return block
 
 
 def burn() -> None:
@@ -75,19 +112,17 @@ def burn() -> None:
         sum(i * i for i in range(10_000))
 
 
-def carried_out(wire: Wire, plan, predicted, path: Path, clocks: list) -> object:
-    """A run whose clock is timed."""
-    opens = campaign.open_device
+def timed_run(wire: Wire, plan: Plan, predicted: DryRun, path: Path) -> tuple[Outcome, Timed]:
+    opens, made = campaign.open_device, []
 
-    def timed(rig, settings):
+    def opening(rig: Rig, settings: dict[str, object]) -> OpenRig:
         device = opens(rig, settings)
-        clocks.append(Timed(device.clock))
-        object.__setattr__(device, "clock", clocks[-1])
+        made.append(Timed(device))
         return device
 
-    campaign.open_device = timed
+    campaign.open_device = opening
     try:
-        return campaign.carry_out(wire.rig, "", "", plan, predicted, path)
+        return campaign.carry_out(wire.rig, "", "", plan, predicted, path), made[0]
     finally:
         campaign.open_device = opens
 
@@ -97,6 +132,14 @@ def wired(rate: float, folder: Path, seed: int) -> Wire:
     path = folder / "rig.toml"
     path.write_text(text)
     return Wire("--seed", str(seed), rig=str(path))
+
+
+def told(what: str, ms: Float) -> None:
+    p = np.percentile(ms, [50, 99, 99.9])
+    print(
+        f"{what} {p[0]:.2f} ms p50, {p[1]:.2f} p99, {p[2]:.2f} p99.9, {ms.max():.2f} at worst, "
+        f"of {len(ms)}"
+    )
 
 
 def load(chosen: argparse.Namespace, folder: Path) -> int:
@@ -109,25 +152,26 @@ def load(chosen: argparse.Namespace, folder: Path) -> int:
     ]
     for b in burners:
         b.start()
-    clocks: list[Timed] = []
+    wire.rest()
     before, start = resource.getrusage(resource.RUSAGE_SELF), time.monotonic()
-    outcome = carried_out(wire, plan, predicted, folder / "load.mcap", clocks)
+    outcome, timed = timed_run(wire, plan, predicted, folder / "load.mcap")
     took, after = time.monotonic() - start, resource.getrusage(resource.RUSAGE_SELF)
     for b in burners:
-        b.terminate()
+        b.kill()
+        b.join()
+    node = wire.history()["late"]
     wire.close()
-    late = 1e3 * np.array(clocks[0].late)
+    # What came first had waited while the recording was opened.
+    age = np.concatenate([a for a in timed.ages if len(a)][1:])
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    p = np.percentile(late, [50, 99, 99.9])
     print(
         f"{chosen.rate:g} Hz, {took:.0f} s, {outcome.stop.status}: {outcome.stop.reason}; "
         f"{len(outcome.recording)} samples, {outcome.stop.missing_samples} lost, "
         f"{outcome.stop.late_ticks} ticks over 10 ms late"
     )
-    print(
-        f"{len(late)} sleeps, late by {p[0]:.2f} ms p50, {p[1]:.2f} p99, {p[2]:.2f} p99.9, "
-        f"{late.max():.1f} at worst; CPU {cpu / took:.0%} of a core, estimate included"
-    )
+    told("ticks late by", 1e3 * np.array(timed.late))
+    told("samples' latency", 1e-6 * (age - age.min()))
+    print(f"CPU {cpu / took:.0%} of a core, estimate included; node late by {node * 1e-6:.1f} ms")
     return 0 if outcome.stop.status == "completed" and not outcome.stop.missing_samples else 1
 
 
@@ -142,65 +186,149 @@ def state() -> tuple[int, int, int]:
     )
 
 
-def faults(chosen: argparse.Namespace, folder: Path) -> int:
-    wire = wired(500.0, folder, chosen.seed)
-    rng, wrong, ends = random.Random(chosen.seed), [], {}
-    plan = plan_of(wire.rig, 3.0)
-    predicted = predict(plan, wire.rig)
-    latch = Latch(wire.rig.name, wire.rig.device.driver)
-    began, runs, first = time.monotonic(), 0, None
-    while time.monotonic() - began < chosen.seconds:
-        wire.rest()
-        wire.tell(
-            *(
-                f"line {w} {f} 0"
-                for w in ("up", "down")
-                for f in ("loss", "flip", "duplicate", "reorder")
-            )
-        )
-        if latch.fault:
-            latch.clear("endurance", "the next run")
-        fault, path = rng.choice(FAULTS), folder / f"{runs}.mcap"
-        timer = threading.Timer(rng.uniform(0.2, 2.5), wire.tell, [fault] if fault else [])
-        timer.start()
-        try:
-            status = carried_out(wire, plan, predicted, path, []).stop.status
-        except SamiiRigError as error:
-            status = type(error).__name__
-        timer.join()
-        ends[status] = ends.get(status, 0) + 1
+class Endured:
+    """The rig under one fault after the other; `wrong` is what did not hold, in words."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self.folder, self.rng = folder, random.Random(seed)
+        self.wire, self.hosts = wired(500.0, folder, seed), Hosts()
+        self.plan = plan_of(self.wire.rig, 3.0)
+        self.predicted = predict(self.plan, self.wire.rig)
+        self.latch = Latch(self.wire.rig.name, self.wire.rig.device.driver)
+        self.wrong: list[str] = []
+        self.ends: Counter[tuple[str, str]] = Counter()
+        self.samples = 0
+
+    def one(self, n: int) -> None:
+        """A run with a fault from a random moment on, while it runs; of five one at any moment."""
+        self.wire.rest()
+        self.wire.tell(*(f"line {way} {what} 0" for way in ("up", "down") for what in LINE))
+        if self.latch.fault:
+            self.latch.clear("endurance", "the next run")
+        fault, path = self.rng.choice(FAULTS), self.folder / f"{n}.mcap"
+        # At first the output is still at rest: it begins 0.1 s ahead.
+        running, delay = self.rng.random() < 0.8, self.rng.uniform(0.2, 2.0)
+        boot = self.wire.history()["boot"]
+        status = self._host(fault, delay, path) if fault == KILLED else ""
+        status = status or self._run(fault, delay, path, running=running)
+        self.ends[fault, status] += 1
+        if running and status == "completed" and fault in ENDING:
+            self.wrong.append(f"run {n}: {fault} ended nothing")
+        # What was refused before it was armed has nothing to latch.
+        if (running or status == "tripped") and status in LATCHED and not self.latch.fault:
+            self.wrong.append(f"run {n}, {fault}: {status}, and nothing is latched")
         if fault == "unplug":
-            wire.rig.device.settings["port"] = wire.plug()
-        partial = path.with_name(f"{path.name}.partial")
+            self.wire.rig.device.settings["port"] = self.wire.plug()
         time.sleep(0.1)
-        h = wire.history()
-        if h["v"] != (500 if fault == "stray 500" else 0) or h["state"] in ("LIVE", "DRY"):
-            wrong.append(f"run {runs}, {fault}: output {h}")
+        h = self.wire.history()
+        stray = fault == STRAY
+        if h["v"] != (500 if stray else 0) or h["state"] in ("LIVE", "DRY"):
+            self.wrong.append(f"run {n}, {fault}: output {h}")
+        if not stray and h["boot"] == boot and h["live"] - h["fed"] >= PATIENCE:
+            self.wrong.append(f"run {n}, {fault}: the output outlived its gate: {h}")
+        if status in ("GateError", "DeviceError") and not running:
+            return  # refused before there was a recording
         try:
-            if partial.exists():
-                recover(partial, path)
-            sequence = read_recording(path).sequence
-            if (np.diff(sequence) < 1).any():
-                wrong.append(f"run {runs}, {fault}: samples out of order")
+            self._check(path)
+        except (SamiiRigError, AssertionError) as error:
+            self.wrong.append(f"run {n}, {fault}: {error}")
+
+    def close(self) -> None:
+        self.hosts.close()
+        self.wire.close()
+
+    def _run(self, fault: str, delay: float, path: Path, *, running: bool) -> str:
+        """How it ended; a fault of the disk is in this process, others in the rig's."""
+        chunks = iter(range(6 if fault == DISK else 1 << 30))
+
+        def add_chunk(appender: Appender, pieces: object) -> None:
+            if next(chunks, None) is None:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            ADD_CHUNK(appender, pieces)
+
+        timer = threading.Timer(delay, self._inject, [fault])
+        began = threading.Event()
+
+        def progress(_: object) -> None:
+            if running and not began.is_set():
+                began.set()
+                timer.start()
+
+        if not running:
+            timer.start()
+        Appender.add_chunk = add_chunk
+        try:
+            outcome = campaign.carry_out(
+                self.wire.rig, "", "", self.plan, self.predicted, path, progress=progress
+            )
+            return outcome.stop.status
         except SamiiRigError as error:
-            wrong.append(f"run {runs}, {fault}: {error}")
-        path.unlink(missing_ok=True)
+            return type(error).__name__
+        finally:
+            Appender.add_chunk = ADD_CHUNK
+            timer.cancel()
+            if timer.ident is not None:
+                timer.join()
+
+    def _inject(self, fault: str) -> None:
+        if fault not in ("", DISK):
+            self.wire.tell(fault)
+
+    def _host(self, fault: str, delay: float, path: Path) -> str:
+        """A program that is killed while it runs."""
+        try:
+            pid = self.hosts.start(self.wire, "running", path)
+        except AssertionError as ended:  # by this machine's own lateness
+            return f"ended before it was killed: {ended}"
+        time.sleep(1.0 + delay)  # there is something on the disk after a second
+        os.kill(pid, signal.SIGKILL)
+        return f"{fault}: {self.hosts.wait(pid)}"
+
+    def _check(self, path: Path) -> None:
+        partial = path.with_name(f"{path.name}.partial")
+        if partial.exists():
+            path = path.with_stem("recovered")
+            recover(partial, path)
+        found = verify(path)
+        assert found.status == "whole", found.problems
+        recording = read_recording(path)
+        assert (np.diff(recording.sequence) >= 1).all(), "samples out of order"
+        u = np.abs(recording.values[:, 0]).max(initial=0.0)
+        assert u <= VOLTS + STEP, f"a reference of {u} V that nobody sent"
+        self.samples += len(recording)
+        path.unlink()
         partial.unlink(missing_ok=True)
+
+
+def faults(chosen: argparse.Namespace, folder: Path) -> int:
+    endured = Endured(folder, chosen.seed)
+    began, runs, first, tell = time.monotonic(), 0, None, 0.0
+    while (since := time.monotonic() - began) < chosen.seconds:
+        endured.one(runs)
         runs += 1
         if runs == WARM:
             first = state()
-    wire.close()
-    print(f"{runs} runs: {ends}")
-    if first:
-        last = state()
-        print(
-            f"memory {first[0] >> 20} -> {last[0] >> 20} MB, threads {first[1]} -> {last[1]}, "
-            f"files {first[2]} -> {last[2]}"
-        )
-        if last[0] - first[0] > GROWTH or last[1] > first[1] or last[2] > first[2]:
-            wrong.append("memory, threads or open files grew")
-    print(*wrong, sep="\n")
-    return 1 if wrong else 0
+        if since >= tell:
+            tell += TELL
+            print(
+                f"{since:.0f} s, {runs} runs, {grown(state())}",
+                *endured.wrong,
+                sep="\n",
+                flush=True,
+            )
+    last = state()
+    endured.close()
+    for (fault, status), n in sorted(endured.ends.items()):
+        print(f"{n:5d}  {fault or 'no fault'}: {status}")
+    print(f"{runs} runs, {endured.samples} samples; {grown(first or last)} -> {grown(last)}")
+    if first and (last[0] - first[0] > GROWTH or last[1] > first[1] or last[2] > first[2]):
+        endured.wrong.append("memory, threads or open files grew")
+    print(*endured.wrong, sep="\n")
+    return 1 if endured.wrong else 0
+
+
+def grown(s: tuple[int, int, int]) -> str:
+    return f"{s[0] >> 20} MB, {s[1]} threads, {s[2]} files"
 
 
 def main() -> int:

@@ -1,6 +1,6 @@
 """Mutation testing of the safety gate: how many small defects its tests notice.
 
-    python benchmarks/gate_mutants.py [--only judgement] [--after LINE] [--list]
+    python benchmarks/gate_mutants.py [--only judgement] [--after LINE] [--sample N] [--list]
 
 Each mutant changes one operator, constant, condition, state or act, or leaves a statement out, in
 gate.py, judgement.py, latest.py, readback.py or agreement.py, and runs the gate's tests until the
@@ -11,35 +11,35 @@ import argparse
 import ast
 import copy
 import importlib
-import importlib.abc
-import importlib.util
+import inspect
+import math
 import os
+import random
+import resource
 import signal
 import sys
 import time
-from collections.abc import Iterator
+import types
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+
+import hypothesis
+import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 MODULES = ("judgement", "gate", "latest", "readback", "agreement")
-TESTS = ("judgement", "readback", "agreement", "", "limits", "stuck")
-FIRST = {"gate": "", "readback": "readback", "agreement": "agreement"}
+TESTS = ("judgement", "reference", "readback", "agreement", "", "limits", "stuck")
 WANTED = 0.98
-TIMEOUT = 120  # s; a mutant that hangs is noticed
-# Everything that the tests need and that is not mutated, loaded once.
-PRELOAD = (
-    "numpy",
-    "scipy.signal",
-    "scipy.fft",
-    "hypothesis.stateful",
-    "pytest",
-    "samii_rig.rig.load",
-    "samii_rig.model.loops",
-    "samii_rig.model.tmm",
-    "samii_rig.record.reader",
-    "samii_rig.record.writer",
-    "samii_rig.signal.estimate",
-)
+FIRST = {  # "" is tests/test_gate.py
+    "judgement": ("judgement", "reference"),
+    "gate": ("",),
+    "latest": ("judgement",),
+    "readback": ("readback",),
+    "agreement": ("agreement",),
+}
+SLOW = 0.1  # s of CPU; tests beyond come last
+HANGS, WAITS = 90, 1800  # s of CPU and of time; a mutant that hangs is noticed
 COMPARE = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -71,6 +71,7 @@ MEMBERS = {
     "WRITE": "NOTHING",
     "ZERO": "NOTHING",
 }
+Mutant = tuple[str, str, Callable[[], ast.Module]]  # module, place, maker of the tree
 
 
 def bodies(tree: ast.Module) -> Iterator[ast.AST]:
@@ -99,8 +100,9 @@ def inside(node: ast.AST) -> Iterator[ast.AST]:
                 yield from inside(one)
 
 
-def changes(node: ast.AST) -> Iterator[tuple[str, object]]:
-    """What can be changed in place: a description and the attribute values to set."""
+def changes(node: ast.AST) -> Iterator[tuple[str, dict[str, object] | None]]:
+    """What can be changed in place: a description and the attribute values to set, None to leave
+    the statement out."""
     match node:
         case ast.Compare(ops=[op]) if type(op) in COMPARE:
             yield (
@@ -139,98 +141,167 @@ def changes(node: ast.AST) -> Iterator[tuple[str, object]]:
             yield "raise left out", None
 
 
-def mutants(source: str) -> Iterator[tuple[int, str, ast.Module]]:
-    """Line, description and tree of each."""
+def mutants(source: str) -> Iterator[tuple[int, str, Callable[[], ast.Module]]]:
+    """Line, description and maker of each."""
     tree = ast.parse(source)
     for number, node in enumerate(bodies(tree)):
         for what, values in changes(node):
-            changed = copy.deepcopy(tree)
-            target = next(n for i, n in enumerate(bodies(changed)) if i == number)
-            if values is None:
-                for parent in ast.walk(changed):
-                    for body in (getattr(parent, "body", []), getattr(parent, "orelse", [])):
-                        if isinstance(body, list) and target in body:
-                            body[body.index(target)] = ast.Pass()
-            else:
-                for name, value in values.items():
-                    setattr(target, name, value)
-            yield node.lineno, what, ast.fix_missing_locations(changed)
+            yield node.lineno, what, partial(mutant, tree, number, values)
 
 
-class Changed(importlib.abc.MetaPathFinder, importlib.abc.Loader):
-    """Loads one module from a changed tree."""
+def mutant(tree: ast.Module, number: int, values: dict[str, object] | None) -> ast.Module:
+    """A copy of the tree with one node changed, or left out."""
+    changed = copy.deepcopy(tree)
+    target = next(n for i, n in enumerate(bodies(changed)) if i == number)
+    if values is None:
+        for parent in ast.walk(changed):
+            for body in (getattr(parent, "body", []), getattr(parent, "orelse", [])):
+                if isinstance(body, list) and target in body:
+                    body[body.index(target)] = ast.Pass()
+    else:
+        for name, value in values.items():
+            setattr(target, name, value)
+    return ast.fix_missing_locations(changed)
 
-    def __init__(self, name: str, tree: ast.Module, path: Path) -> None:
-        self.name, self.tree, self.path = name, tree, path
 
-    def find_spec(self, fullname, path, target=None):
-        if fullname == self.name:
-            return importlib.util.spec_from_loader(fullname, self, origin=str(self.path))
-        return None
-
-    def exec_module(self, module) -> None:
-        exec(compile(self.tree, str(self.path), "exec"), module.__dict__)
+def codes(code: types.CodeType) -> Iterator[types.CodeType]:
+    """The code of a module's functions, whatever they stand in."""
+    for constant in code.co_consts:
+        if isinstance(constant, types.CodeType):
+            yield constant
+            yield from codes(constant)
 
 
-def survives(name: str, tree: ast.Module, path: Path) -> bool:
+def functions(module: types.ModuleType) -> Iterator[types.FunctionType]:
+    """A module's functions and methods, as they were before they were decorated."""
+    own = [x for x in vars(module).values() if getattr(x, "__module__", "") == module.__name__]
+    for thing in own:
+        for one in vars(thing).values() if isinstance(thing, type) else [thing]:
+            bare = one.fget if isinstance(one, property) else getattr(one, "__func__", one)
+            if isinstance(bare, types.FunctionType):
+                yield inspect.unwrap(bare)
+
+
+def change(module: types.ModuleType, tree: ast.Module) -> None:
+    """Put the changed code into the functions that everybody already holds."""
+    found = {c.co_qualname: c for c in codes(compile(tree, str(module.__file__), "exec"))}
+    for function in functions(module):
+        if function.__code__.co_qualname in found:
+            function.__code__ = found[function.__code__.co_qualname]
+
+
+def file(test: str) -> Path:
+    return ROOT / "tests" / f"test_gate{'_' * bool(test)}{test}.py"
+
+
+def passes(session: pytest.Session, item: pytest.Item) -> bool:
+    session.config.hook.pytest_runtest_protocol(item=item, nextitem=None)
+    return not session.testsfailed
+
+
+def survives(
+    module: types.ModuleType, tree: ast.Module, session: pytest.Session, items: list[pytest.Item]
+) -> bool:
     """Whether the gate's tests pass with this module; in a process of its own."""
     child = os.fork()
     if child == 0:
-        signal.alarm(TIMEOUT)
+        # On a loaded machine only the processor's time tells a mutant that hangs.
+        resource.setrlimit(resource.RLIMIT_CPU, (HANGS, HANGS))
+        signal.alarm(WAITS)
         silent = os.open(os.devnull, os.O_WRONLY)
         os.dup2(silent, 1)
         os.dup2(silent, 2)
-        import pytest
-
-        sys.meta_path.insert(0, Changed(name, tree, path))
-        # Most fall to the first file alone, which is soon collected.
-        own = FIRST.get(name.rpartition(".")[2], TESTS[0])
-        files = {t: str(ROOT / "tests" / f"test_gate{'_' * bool(t)}{t}.py") for t in TESTS}
-        first = files.pop(own)
-        options = ["-x", "-q", "-p", "no:cacheprovider", "--rootdir", str(ROOT)]
-        # Loaded before pytest could rewrite its assertions: that is what saves the time.
-        options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
-        os._exit(int(pytest.main([*options, first]) or pytest.main([*options, *files.values()])))
+        change(module, tree)
+        os._exit(0 if all(passes(session, item) for item in items) else 1)
     _, status = os.waitpid(child, 0)
     return status == 0
+
+
+class Mutation:
+    """A plugin that runs the collected tests once as they are and then for each mutant."""
+
+    def __init__(self, chosen: list[Mutant]) -> None:
+        self.chosen, self.alive, self.done = chosen, 0, 0
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        took = {}
+        for item in session.items:
+            start = time.process_time()
+            if not passes(session, item):
+                pytest.exit(f"{item.nodeid} fails as it is: no mutant can be judged", 1)
+            took[item] = time.process_time() - start
+        orders: dict[str, list[pytest.Item]] = {}
+        for name, place, make in self.chosen:
+            module = importlib.import_module(f"samii_rig.run.{name}")
+            if name not in orders:
+                own = {file(test) for test in FIRST[name]}
+                # Most mutants fall to a fast test of their own files.
+                orders[name] = sorted(
+                    took, key=lambda i: (took[i] > SLOW, i.path not in own, took[i])
+                )
+                if not survives(module, ast.parse(source(name)), session, orders[name]):
+                    pytest.exit(
+                        f"{name}.py as it is fails in this order: no mutant can be judged", 1
+                    )
+            self.done += 1
+            if survives(module, make(), session, orders[name]):
+                self.alive += 1
+                print(f"\nSURVIVED {place}", flush=True)
+            if self.done % 25 == 0:
+                print(f"\n{self.done - self.alive} of {self.done} killed", flush=True)
+        return True
+
+
+def source(name: str) -> str:
+    return (ROOT / "samii_rig" / "run" / f"{name}.py").read_text()
+
+
+def every(name: str, after: int) -> Iterator[Mutant]:
+    """The mutants of a module, each with a word for where and what it is."""
+    lines = source(name).splitlines()
+    for line, what, make in mutants(source(name)):
+        if line > after:
+            yield name, f"{name}.py:{line} {what}: {lines[line - 1].strip()}", make
+
+
+def wilson(k: int, n: int) -> tuple[float, float]:
+    """The 95 % interval of a share of which k of n drawn at random are."""
+    z = 1.96
+    centre, half = k + z * z / 2, z * math.sqrt(k * (n - k) / n + z * z / 4)
+    return (centre - half) / (n + z * z), (centre + half) / (n + z * z)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", choices=MODULES)
     parser.add_argument("--after", type=int, default=0, help="line of the module to go on after")
+    parser.add_argument("--sample", type=int, help="take so many of them, drawn at random")
+    parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--list", action="store_true", help="say the mutants and end")
-    chosen = parser.parse_args()
+    asked = parser.parse_args()
     os.chdir(ROOT)
-    sys.path.insert(0, str(ROOT / "tests"))
-    for name in PRELOAD:
-        importlib.import_module(name)
-    start, total, alive = time.monotonic(), 0, []
-    for module in (chosen.only,) if chosen.only else MODULES:
-        path = ROOT / "samii_rig" / "run" / f"{module}.py"
-        source = path.read_text()
-        lines = source.splitlines()
-        if not survives(f"samii_rig.run.{module}", ast.parse(source), path):
-            sys.exit(f"{module}.py as it is fails its tests: no mutant can be judged")
-        for line, what, tree in mutants(source):
-            if line <= chosen.after:
-                continue
-            total += 1
-            place = f"{module}.py:{line} {what}: {lines[line - 1].strip()}"
-            if chosen.list:
-                print(place)
-            elif survives(f"samii_rig.run.{module}", tree, path):
-                alive.append(place)
-                print(f"SURVIVED {place}", flush=True)
-            elif total % 50 == 0:
-                print(f"{total} done", flush=True)
-    if chosen.list:
-        print(total)
+    chosen = [m for n in MODULES if asked.only in (None, n) for m in every(n, asked.after)]
+    if asked.sample:
+        chosen = random.Random(asked.seed).sample(chosen, min(asked.sample, len(chosen)))
+    if asked.list:
+        print(*(place for _, place, _ in chosen), sep="\n")
         return 0
-    killed = total - len(alive)
+    os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+    # The same examples for every mutant; a failure is enough, the smallest one is not looked for.
+    phases = (hypothesis.Phase.explicit, hypothesis.Phase.generate)
+    hypothesis.settings.register_profile(
+        "mutants", derandomize=True, database=None, phases=phases, deadline=None
+    )
+    hypothesis.settings.load_profile("mutants")
+    mutation, start = Mutation(chosen), time.monotonic()
+    files = [str(file(test)) for test in TESTS]
+    if pytest.main(["-q", "-s", "-p", "no:cacheprovider", *files], plugins=[mutation]):
+        return 2
+    killed, n = mutation.done - mutation.alive, mutation.done
+    share, (low, high) = killed / n, wilson(killed, n)
     took = time.monotonic() - start
-    print(f"{killed} of {total} killed, {killed / total:.1%}, in {took:.0f} s")
-    return 0 if killed >= WANTED * total else 1
+    print(f"{killed} of {n} killed, {share:.1%} ({low:.1%} to {high:.1%} of all), in {took:.0f} s")
+    return 0 if share >= WANTED else 1
 
 
 if __name__ == "__main__":

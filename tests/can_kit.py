@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 from wire_kit import Wire, until
@@ -53,22 +51,15 @@ def moment_rig(folder: Path, deadman: float = 0.05) -> Path:
 class CanWire(Wire):
     """`python -m sim.wire.can`, and the composite rig whose drivers lead to it."""
 
+    program, driver = "sim.wire.can", "composite"
+
     def __init__(self, *options: str, rig: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "sim.wire.can", "--rig", rig, *options],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        plain = load_rig(rig)[0]
-        self.settings = self._answer()["settings"]
-        device = Device(driver="composite", settings=self.settings)
-        self.rig: Rig = plain.model_copy(update={"device": device})
+        super().__init__(*options, rig=rig)
         names = self.settings["ft"]["sensors"]
-        own = tuple(s for s in plain.sensor if s.name in names)
+        own = tuple(s for s in self.rig.sensor if s.name in names)
         ft = {k: v for k, v in self.settings["ft"].items() if k not in ("driver", "sensors")}
         alone = Device(driver="force_torque", settings=ft)
-        self.sensor_rig: Rig = plain.model_copy(update={"sensor": own, "device": alone})
+        self.sensor_rig: Rig = self.rig.model_copy(update={"sensor": own, "device": alone})
 
     def rest(self) -> None:
         """Rig, node, adapter and sensor as new."""

@@ -7,10 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 # What runs a device in real time, on ports whose names the system gives out again.
 KITS = {"wire_kit", "can_kit", "faults_kit"}
+# How long an example takes is the machine's affair.
+settings.register_profile("patient", deadline=None)
+settings.load_profile("patient")
 TRIES_MORE, APART = 7, 2.0  # s; longer together than another program's burst of work
 
 

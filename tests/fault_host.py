@@ -1,7 +1,8 @@
 """Hosts that can be killed: a process that has loaded everything and forks one for each line.
 
 In comes JSON: {"rig", "state", "path"}; out goes "pid N", and from the host itself "ready N" once
-it is in that state. {"wait": N} is answered by "exit N CODE" (minus the signal if one ended it).
+it is in that state and "ended N CODE" when it is over. {"wait": N} is answered by "exit N CODE"
+(minus the signal if one ended it).
 """
 
 from __future__ import annotations
@@ -107,6 +108,8 @@ def main() -> None:
                 code = driven(rig, Path(asked["path"]), predicted)
             else:
                 code = rest(rig, asked["state"])
+            # One that ended before it was ready must not be waited for.
+            say(f"ended {os.getpid()} {code}")
         except BaseException as error:
             code = getattr(error, "exit_code", 1)
             say(f"error {os.getpid()} {error!r}")

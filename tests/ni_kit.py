@@ -13,6 +13,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 
 TURN = 0.5  # rad/s that one volt at ao0 turns ctr0
+HOLD = 0.1  # s after the last edge at port0/line0 that the interlock stays closed
 UNDERFLOW = "-200290: The generation has stopped to prevent the regeneration of old samples."
 EXPIRED = "-200678: Writing failed, because the watchdog timer expired."
 CONSTANTS = SimpleNamespace(
@@ -28,7 +29,7 @@ CONSTANTS = SimpleNamespace(
 class Board:
     """One sample clock. `out` is the voltage at the terminal, `volts` that at all inputs but the
     read-back; `broken` says which task's calls fail: ai, ci, ao (what is played out), null (a
-    single value), made (that there is a task at all)."""
+    single value), do (the line), made (that there is a task at all)."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
@@ -41,6 +42,7 @@ class Board:
         self.watchdog: Watchdog | None = None
         self.broken: set[str] = set()
         self.resets = 0
+        self.level, self.edge = False, -np.inf  # of the line, and when it was last, s
         self.calls: list[tuple[str, str]] = []
         self.error = "-50405: No transfer is in progress\nbecause the board is gone."
 
@@ -58,6 +60,11 @@ class Board:
             self.theta += TURN * self.out / self.rate
         if w is not None:
             self._watch(now)
+
+    @property
+    def closed(self) -> bool:
+        """Whether the interlock lets the valve have its power."""
+        return time.monotonic() - self.edge < HOLD
 
     def _watch(self, now: float) -> None:
         w = self.watchdog
@@ -84,6 +91,7 @@ class Task:
             "ai": ("ai_channels", "add_ai_voltage_chan"),
             "ci": ("ci_channels", "add_ci_ang_encoder_chan"),
             "ao": ("ao_channels", "add_ao_voltage_chan"),
+            "do": ("do_channels", "add_do_chan"),
         }
         for kind, (group, add) in chans.items():
             add_one = lambda name, kind=kind, **more: self.add(kind, name)  # noqa: E731
@@ -134,7 +142,12 @@ class Task:
             b.check(self.kind)
             if self.error:
                 raise RuntimeError(self.error)
-            if not self.timed:
+            if self.kind == "do":
+                assert auto_start
+                assert self.rows == ["Dev1/port0/line0"]
+                if data is not b.level:
+                    b.level, b.edge = data, time.monotonic()
+            elif not self.timed:
                 assert auto_start
                 assert b.player is None, "the output is reserved by what plays out"
                 b.out = float(data)

@@ -126,6 +126,18 @@ def test_every_value_is_of_its_samples_own_time_to_what_is_stated(opened):
     assert not device.sensor.events()
 
 
+def test_what_is_stated_of_a_clock_is_the_worst_of_the_run(opened):
+    device, made = opened
+    taken(device, 0.1)
+    before = json.loads(device.metadata["timing"])["a_2"][1]
+    made["host"].timing = 10.0 * before
+    taken(device, 0.1)
+    made["host"].timing = before
+    taken(device, 0.1)
+    clock, after = json.loads(device.metadata["timing"])["a_2"]
+    assert (clock, after) == ("host", pytest.approx(10.0 * before, rel=0.2))
+
+
 def test_one_device_that_falls_silent_says_so_once_and_the_others_go_on(opened):
     device, made = opened
     taken(device, 0.05)

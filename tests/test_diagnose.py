@@ -164,6 +164,15 @@ def test_what_decides_and_what_shows_took_no_part_in_the_fit():
     assert usable([single]) == [single]
 
 
+def test_few_lines_leave_one_to_show_on():
+    f = np.array([2.0, 5.0, 9.0, 14.0])
+    fit, decide, show = measured([concealing(f=f)], samii()).splits()
+    assert (fit.n, decide, show.n) == (3, None, 1)
+    one = replace(concealing(f=f[1:2]), method="periodic")
+    fit, decide, show = measured([concealing(f=f), one], samii()).splits()
+    assert (fit.n, decide, show.n) == (4, None, 1)
+
+
 def test_lines_of_few_cycles_a_record_are_left_to_the_drift():
     f = np.arange(1, 400) * 0.05
     lines = measured([replace(concealing(f=f), method="settled")], samii())

@@ -9,16 +9,25 @@ import pytest
 from identify_kit import noiseless, samii
 from test_diagnose import ALL, FEW, LINES, concealing, effect
 
+from samii_rig.diagnose.between_runs import between_runs
 from samii_rig.diagnose.classes import RIVAL, Class
 from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.judge import Judgement, judge, shown
 from samii_rig.diagnose.measured import measured
 from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.moebius import place_of
 from samii_rig.diagnose.own_law import own_law
-from samii_rig.diagnose.search import Search
+from samii_rig.diagnose.result import Gap
+from samii_rig.diagnose.search import Explanation, Search
+from samii_rig.diagnose.stated import Evidence, probability
 from samii_rig.identify.bootstrap import redraw
 
+COMPLIANCE = "torsional_compliance"
 POWER = 0.5
+STRONG = Evidence(
+    odds=8.0, left=1.0, held=1.0, effects=1, forced=False, confirmed=False, gain=50.0,
+    drop=1e4, names=3, pair=False, closed=1.0,
+)  # fmt: skip
 TABLE = [
     e
     for e in ALL
@@ -85,6 +94,23 @@ def test_damping_with_a_power_of_frequency_is_a_law_of_its_own():
     assert law is not None
     assert law.site == "joint_1"
     assert law.power == pytest.approx(POWER, abs=0.1)
+    one = (e for e in search.ranked() if [x.physics for x in e.effects] == [COMPLIANCE])
+    assert own_law(search, next(one)) is not None
+
+
+def test_an_effect_that_only_spares_the_tolerances_is_not_told_beside_another():
+    spring, damper = effect("torsional_compliance", "beam"), effect("viscous_damping", "joint_2")
+    lines = measured([concealing((spring, [1e6, 0.05]))], samii())
+    at = grid(samii(), lines.frequency, lines.sensor, lines.actuator)
+    search = Search(samii(), lines, at, [spring, damper])
+    search.grow(search.nominal, 2)
+    both = (spring, damper)
+    search.grow(search.found[frozenset({spring.key})], 2)
+    end = search._refit(both, search.found[frozenset({spring.key})], [0.0])
+    assert end is not None
+    # However much more likely its nominal parameters: the data do not show the damper.
+    search.found[frozenset(e.key for e in both)] = Explanation(both, end, 1e3)
+    assert judge(search).best.effects == (spring,)
 
 
 def test_two_compliances_are_two():
@@ -110,3 +136,38 @@ def test_a_name_is_one_that_the_data_leave_as_probable(behind, told):
     assert len(parts) == told
     assert sum(p for _, p in parts) == pytest.approx(1)
     assert (brace.name in both.equivalents(pendulum)) == (told == 2)
+
+
+def test_a_joint_without_a_tolerance_may_change_between_runs_too():
+    def known(e):
+        return e.model_copy(update={"k": e.k.model_copy(update={"tolerance": 0.0})})
+
+    rig = samii()
+    rig = rig.model_copy(
+        update={"element": tuple(known(e) if e.name == "joint_1" else e for e in rig.element)}
+    )
+    lines = measured([concealing()], rig)
+    at = grid(rig, lines.frequency, lines.sensor, lines.actuator)
+    other = measured([concealing(rig=softened("joint_1", -0.06), seed=2)], rig)
+    search = Search(rig, lines, at, [])
+    changing = between_runs(search, search.nominal.fitted, other)
+    assert changing is not None
+    assert changing.sites[0][0] == "joint_1"
+
+
+def test_a_probability_is_never_more_than_the_evidence_leaves_it():
+    assert probability(STRONG) > 0.9
+    assert probability(replace(STRONG, odds=0.5)) < 1 / (1 + np.exp(-0.5)) + 1e-9
+
+
+def test_what_lies_where_two_models_are_alike_need_not_show():
+    judged = Judgement("named", (), 0.0, 0.95, STRONG, 1.0)
+    worse = Gap(-0.05, -0.7, 0.4)
+    assert shown(judged, worse, due=1.0).verdict == "named"
+    assert shown(judged, worse, due=100.0).verdict == "unknown"
+
+
+def test_a_damper_may_be_as_weak_as_the_data_can_see():
+    damper = effect("viscous_damping", "joint_1", "beside")
+    k = next(e.k.value for e in samii().element if e.name == "joint_1")
+    assert damper.unknowns[0].low * 2 * np.pi * LINES[-1] / k < 1e-5

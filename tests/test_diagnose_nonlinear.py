@@ -89,7 +89,7 @@ def linear_rivals():
 
 @pytest.mark.parametrize("law", [FRICTION, CUBIC, GAP, EXCESS])
 @given(A=st.floats(0.1, 10.0), p=st.floats(0.1, 5.0))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_a_describing_function_is_the_fundamental_of_the_force(law, A, p):
     turn = (np.arange(20000) + 0.5) / 20000 * 2 * np.pi
     y = A * np.cos(turn)
@@ -99,7 +99,7 @@ def test_a_describing_function_is_the_fundamental_of_the_force(law, A, p):
 
 @pytest.mark.parametrize("law", [FRICTION, CUBIC, GAP, EXCESS])
 @given(sigma=st.floats(0.2, 3.0), p=st.floats(0.2, 3.0))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 def test_for_a_gaussian_motion_it_is_the_best_linear_gain(law, sigma, p):
     y = np.linspace(-8, 8, 20001) * sigma
     weight = np.exp(-0.5 * (y / sigma) ** 2)

@@ -11,9 +11,10 @@ from samii_rig.diagnose.effect import Effect, Unknown
 from samii_rig.diagnose.measured import measured
 from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.nonlinear_confirm import seen
-from samii_rig.diagnose.nonlinear_driven import drives, forced
+from samii_rig.diagnose.nonlinear_consistent import self_consistent
+from samii_rig.diagnose.nonlinear_driven import driven, drives, forced
 from samii_rig.diagnose.nonlinear_laws import CUBIC, EXCESS, FRICTION, GAP
-from samii_rig.diagnose.nonlinear_levels import level_grid
+from samii_rig.diagnose.nonlinear_levels import Extra, level_grid
 from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.diagnose.nonlinear_screen import Bins, Levels
 from samii_rig.diagnose.nonlinear_time import simulate
@@ -88,7 +89,7 @@ def recorded(quasi, p):
 def test_a_force_in_time_is_that_of_an_integration(quasi, p):
     _, model, x = model_of(quasi, p)
     at = campaign()[2]
-    (one,) = forced(model, x, {1: sweep(1.0)}, p)
+    (one,) = forced(model, x, {1: sweep(1.0)[None]}, p)
     v = np.tile(sweep(1.0), 3)
     force = simulate(samii(), v, quasi, p, inner=16) - simulate(
         samii(), v, quasi, 1e9 if quasi.law in (None, EXCESS) else 0.0, inner=16
@@ -101,10 +102,24 @@ def test_a_force_in_time_is_that_of_an_integration(quasi, p):
     assert np.max(apart) < 0.15
 
 
-def test_a_period_is_found_from_the_lines_and_the_mean_of_it_taken():
+def test_what_a_gap_takes_is_of_each_command_as_it_was_converted():
+    quasi, p = CASES[4]
+    _, model, x = model_of(quasi, p)
+    step = 2 * p
+    off = step * np.array([[0.0], [1 / 3], [2 / 3]])
+    commands = step * np.round((sweep(1.0) + off) / step)
+    (all_,) = forced(model, x, {1: commands}, p)
+    each = [forced(model, x, {1: one[None]}, p)[0].E for one in commands]
+    (mean,) = forced(model, x, {1: commands.mean(axis=0)[None]}, p)
+    assert np.allclose(all_.E, np.mean(each, axis=0))
+    assert np.linalg.norm(mean.E - all_.E) > 0.02 * np.linalg.norm(all_.E)
+
+
+def test_periods_are_found_from_the_lines_the_first_left_out():
     responses, lines, _ = campaign()
     given = drives(samii(), lines, responses, recorded(*CASES[0]))
     assert sorted(given) == [0, 1]
+    assert given[1].shape == (2, N)
     assert np.allclose(given[1], sweep(1.0))
     assert drives(samii(), lines, responses, []) == {}
 
@@ -124,6 +139,42 @@ def test_recordings_with_a_force_confirm_it_and_others_do_not():
     assert none.fall < 0
     assert "of the force" in true.told()
     assert seen(plain, there, at, lines, responses, []) is None
+
+
+def test_force_and_parameters_end_where_both_agree_with_the_data():
+    quasi, p = CASES[1]
+    _, model, truth = model_of(quasi, p)
+    _, lines, at = campaign()
+    given = {0: sweep(0.5)[None], 1: sweep(1.0)[None]}
+    turns = []
+
+    def problem(model, x, data=lines):
+        now = model.strength(x)[0]
+        turns.append(now)
+        extra = Extra(driven(model, x, at, given, now), now)
+        return Problem.of(data, replace(at, extra={quasi: extra}))
+
+    held = problem(model, truth)
+    measured_ = replace(lines, H=model.response(truth, held.at))
+    start = truth.copy()
+    start[model.unknown] += 0.3
+    bent = refit(model, Problem.of(measured_, at), start, far=False)
+    turns.clear()
+    end = self_consistent(bent, lambda m, x: problem(m, x, measured_))
+    assert np.exp(bent.x[model.unknown]) != pytest.approx(p, rel=0.02)
+    assert np.exp(end.x[model.unknown]) == pytest.approx(p, rel=0.01)
+    assert end.cost < 0.1
+    assert len(turns) <= 13
+
+
+def test_levels_that_differ_are_told_without_a_model():
+    quasi, p = CASES[0]
+    _, model, x = model_of(quasi, p)
+    _, lines, at = campaign()
+    other = replace(lines, H=model.response(x, at.at(lines.frequency, lines.level)))
+    assert lines.differing() < 1e-6
+    assert other.differing() > 0.5
+    assert np.isnan(lines.take(lines.level == 0).differing())
 
 
 def test_levels_against_each_other_tell_a_force_but_nothing_linear():

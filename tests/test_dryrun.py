@@ -110,7 +110,7 @@ def test_without_centring_the_drift_adds_up_over_the_segments():
     np.testing.assert_allclose(np.diff(theta), each, rtol=1e-3)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(level=st.floats(0.01, 30.0))
 def test_the_level_that_is_named_passes_and_a_little_more_does_not(level):
     predicted = predict(plan_for(FAKE, [level, level / 2], duration=2.0), FAKE)
@@ -146,7 +146,7 @@ def test_what_the_dry_run_lets_through_the_gate_does_not_trip():
     assert stop.status == "tripped"
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(kp=st.floats(10.0, 8000.0))
 def test_a_loop_is_refused_exactly_when_its_poles_leave_the_unit_circle(kp):
     """theta'' = -p theta' + K p v, held for a sample, v = -kp theta."""

@@ -5,6 +5,7 @@ On the wire, with the real program's loop and recorder in a process of its own.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -20,8 +21,10 @@ from samii_rig.errors import DeviceError, GateError
 from samii_rig.record.reader import read_events, read_recording
 from samii_rig.record.recover import recover
 from samii_rig.run.latch import Latch
+from samii_rig.run.priority import PRIORITY
 
-LATE_TRIES = 8
+LATE_TRIES = 12
+FAIR_TRIES = 3  # that fail make the test fail
 
 
 @pytest.fixture(scope="module")
@@ -104,20 +107,39 @@ def test_a_host_that_is_killed_or_hangs_for_a_second_leaves_null(wire, hosts, tm
         assert len(sequence) > 200
 
 
+def stopped(pid: int, seconds: float) -> float:
+    """Stop a process for so long; how long it was, s."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY + 2))
+    try:
+        os.kill(pid, signal.SIGSTOP)
+        begun = time.monotonic()
+        time.sleep(seconds)
+        os.kill(pid, signal.SIGCONT)
+        return time.monotonic() - begun
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def test_a_host_that_is_late_by_40_ms_changes_nothing(wire, hosts, tmp_path):
-    """Of several one must go through: a loaded machine adds its own lateness to the 40 ms."""
+    """A try is fair if it was 40 ms and no more, and the node itself was in time. Of fair ones one
+    must go through: the machine may let the host wait on after it was woken."""
+    fair = 0
     for _ in range(LATE_TRIES):
         path = fresh(wire, tmp_path)
         pid = hosts.start(wire, "running", path)
         time.sleep(0.3)
-        os.kill(pid, signal.SIGSTOP)
-        time.sleep(0.04)
-        os.kill(pid, signal.SIGCONT)
+        took = stopped(pid, 0.04)
         time.sleep(0.2)
-        if wire.history()["state"] == "LIVE":
+        h = wire.history()
+        if h["state"] == "LIVE":
             os.kill(pid, signal.SIGINT)
         if hosts.wait(pid) == 130:
             break
+        fair += took < 0.041 and h["late"] < 2_000_000
+        assert fair < FAIR_TRIES, read_recording(path).stop
+    else:
+        pytest.skip(f"this machine was late by itself in {LATE_TRIES - fair} of {LATE_TRIES} tries")
     whole(path)
     recording = read_recording(path)
     assert recording.stop.status == "stopped", recording.stop

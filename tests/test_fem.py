@@ -161,7 +161,7 @@ positive = st.floats(0.5, 2.0)
 ends = st.sampled_from(["clamped", "pinned", "free"])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     base=ends, tip=ends, numbers=st.tuples(*[positive] * 8), loss=st.floats(0, 0.05),
     order=st.permutations(["spring", "beam", "source", "link", "last"]),

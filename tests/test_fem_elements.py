@@ -128,7 +128,7 @@ def test_an_element_answers_in_both_models_alike(name: str) -> None:
     agree(Chain(rig).response(F), Fem(rig, elements=mesh(name)).response(F), 5e-4)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     st.lists(
         st.sampled_from([n for n in MIDDLE if not n.startswith("timo")]), min_size=1, max_size=5
@@ -213,7 +213,7 @@ def test_a_reduction_with_all_modes_is_the_whole_model(name: str) -> None:
     agree(whole.response(F), fem.response(F), 1e-6)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.floats(1e-3, 1e3), st.floats(1e-3, 1.0), st.floats(0.0, 1e-2))
 def test_a_thick_beams_element_is_exact_in_statics_and_keeps_its_mass(
     phi: float, h: float, J: float

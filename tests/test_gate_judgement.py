@@ -22,14 +22,12 @@ from samii_rig.run.judgement import (
     State,
     Stop,
     Write,
-    command_violation,
     decide,
     violation,
 )
 from samii_rig.run.latest import NEVER, Latest, observe
 from samii_rig.run.limits import gate_limits
 from samii_rig.run.protocols import CommandBlock
-from samii_rig.run.readback import Sent, travel
 from samii_rig.types import Quality, SampleBlock
 
 LIMITS = gate_limits(fake_rig(), "v", 4.0, "theta")
@@ -59,8 +57,13 @@ def command(u, theta_ref=None, first=100):
     return CommandBlock(first, u, ref)
 
 
-NOTHING = Sent()
 FINE = seen([[0.0, 0.0], [0.0, 0.0]])
+
+
+def with_feedback():
+    values = {"name": "f", "sensor": "theta", "actuator": "v", "gain": 1.0, "unit": "V/(rad)"}
+    loop = Feedback(**values, poles=(-5.0,), max=0.5)
+    return gate_limits(fake_rig().model_copy(update={"feedback": (loop,)}), "v", 4.0, "theta")
 
 
 def verdict(latest, now=None):
@@ -72,6 +75,17 @@ def verdict(latest, now=None):
 
 def test_samples_at_rest_are_fine():
     assert verdict(FINE) is None
+    assert seen([[0.0, 0.0], [0.0, 0.0]]).rate == (0.0, 0.0)
+
+
+def test_time_that_stands_still_counts_as_a_nanosecond():
+    def rate(values, latest):
+        b = block(values, first=2)
+        b = replace(b, time=np.full(len(values), FINE.time))
+        return observe(latest, b, COLUMNS, RATES, NOW).rate[1]
+
+    assert rate([[0, 1e-9]], FINE) == pytest.approx(1.0)
+    assert rate([[0, 1e-9], [0, 3e-9]], FINE) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize(
@@ -82,6 +96,7 @@ def test_samples_at_rest_are_fine():
         ([[5.01, 0], [5.01, 0]], "limit", 5.01),
         ([[0, 0], [4.1, 0]], "rate", 2050.0),
         ([[4.1, 0], [0, 0]], "rate", 2050.0),
+        ([[0, 0], [0, 0], [4.1, 0]], "rate", 2050.0),
     ],
 )
 def test_a_number_over_its_limit_trips_and_is_named(values, what, number):
@@ -130,6 +145,7 @@ def test_a_missing_value_is_waited_for_but_not_for_ever():
     latest = seen([[0.0, math.nan]], latest=seen([[0, 0.2]]), first=1, quality=lost)
     assert verdict(latest) is None
     assert latest.peak[1] == 0.2  # the value before it stands
+    assert latest.rate[1] == 0.0
     assert verdict(seen([[0.0, math.nan]], latest=latest, first=40, quality=lost)).what == "stale"
 
 
@@ -187,16 +203,29 @@ def test_samples_that_go_back_trip_for_good(first):
 
 
 @pytest.mark.parametrize("what", ["time", "sequence"])
-def test_order_inside_a_block_is_checked(what):
-    b = block([[0, 0]] * 3)
+@pytest.mark.parametrize("n", [2, 3])
+def test_order_inside_a_block_is_checked(what, n):
+    b = block([[0, 0]] * n)
     wrong = getattr(b, what).copy()
-    wrong[1] = wrong[2]
+    wrong[-2] = wrong[-1]
     latest = observe(Latest.nothing(2), replace(b, **{what: wrong}), COLUMNS, RATES, NOW)
+    assert verdict(latest, NOW).what == "order"
+
+
+@pytest.mark.parametrize("what", ["time", "sequence"])
+@pytest.mark.parametrize("back", [0, 1])
+def test_order_is_checked_over_the_border_of_two_blocks(what, back):
+    b = block([[0, 0]], first=2)
+    wrong = getattr(b, what).copy()
+    wrong[0] = getattr(FINE, what) - back
+    latest = observe(FINE, replace(b, **{what: wrong}), COLUMNS, RATES, NOW)
     assert verdict(latest, NOW).what == "order"
 
 
 def test_a_converter_at_its_end_is_blind_and_trips():
     assert verdict(seen([[0, 0.1]], quality=[[0, Quality.CLIPPED]])).what == "clipped"
+    flags = [[0, 0], [0, Quality.CLIPPED], [0, 0]]
+    assert verdict(seen([[0, 0.1]] * 3, quality=flags)).what == "clipped"
 
 
 def test_an_output_that_the_device_changed_trips_once_commands_are_under_way():
@@ -205,11 +234,32 @@ def test_an_output_that_the_device_changed_trips_once_commands_are_under_way():
     running = replace(FINE, first=10)
     assert verdict(seen([[0, 0]], latest=running, first=9, quality=limited)) is None
     assert verdict(seen([[0, 0]], latest=running, first=10, quality=limited)).what == "device"
+    begun = replace(Latest.nothing(2), first=0)
+    assert seen([[0, 0]], latest=begun, quality=limited).limited
+
+
+@pytest.mark.parametrize("flags", [[0, Quality.MISSING], [Quality.STALE, 0], [0, Quality.LIMITED]])
+def test_another_flag_or_another_channels_is_no_output_that_the_device_changed(flags):
+    running = replace(FINE, first=2)
+    assert not seen([[0, 0], [0, 0]], latest=running, first=2, quality=[flags, flags]).limited
 
 
 def test_a_flag_on_one_sample_does_not_hide_the_next_value():
     latest = seen([[0, 0], [0, 0.4]], quality=[[0, Quality.MISSING], [0, 0]])
     assert verdict(latest).what == "limit"
+
+
+def test_the_newest_good_value_of_each_channel_is_kept():
+    flags = [[Quality.MISSING, 0], [0, Quality.MISSING], [Quality.MISSING, Quality.MISSING]]
+    latest = seen([[0.1, 0.01], [0.2, 0.02], [0.3, 0.03]], quality=flags)
+    assert (latest.last, latest.good) == ((0.2, 0.01), (2_000_000, 0))
+    later = seen([[0.4, 0.04]], latest=latest, first=3, quality=flags[2:])
+    assert (later.last, later.good) == (latest.last, latest.good)
+
+
+def test_a_rate_that_nothing_limits_is_not_taken():
+    b = block([[0, 0], [1, 1]])
+    assert observe(Latest.nothing(2), b, COLUMNS, (1,), 0).rate == (0.0, 500.0)
 
 
 def test_the_heartbeat_counts_only_where_a_client_is_needed():
@@ -220,137 +270,6 @@ def test_the_heartbeat_counts_only_where_a_client_is_needed():
     late = seen([[0, 0]], latest=beat, first=251)
     assert violation(beat, needed, FINE.time) is None
     assert violation(late, needed, late.time).what == "heartbeat"
-
-
-# What a reference says
-
-
-# A joint that may turn as far as it likes: what is left are the limits on the output.
-ROOMY = replace(LIMITS, sensors=(replace(LIMITS.sensors[0], max=9.0),))
-
-
-def wrong(block, latest=FINE, limits=ROOMY, sent=NOTHING):
-    return command_violation(block, latest, limits, sent)
-
-
-def test_a_small_reference_passes():
-    assert wrong(command([0.0, 1.0, 2.0])) is None
-    assert wrong(command([0.0, 0.0], [0.1, 0.2])) is None
-
-
-def test_the_bound_adds_the_loops_own_share():
-    moved = seen([[0, -0.3], [0, -0.3]])
-    assert wrong(command([2.0, 3.7]), moved) is None
-    d = wrong(command([2.0, 3.9]), moved)
-    assert (d.what, d.number) == ("limit", pytest.approx(3.9 + 4 * 0.3))
-    d = wrong(command([0.0, 0.0, 0.0], [0.5, 1.0, 1.3]))
-    assert (d.what, d.number) == ("limit", pytest.approx(5.2))
-
-
-def test_a_reference_at_its_limits_passes():
-    assert wrong(command([2.0, 4.0, 5.0])) is None
-    assert wrong(command([4.0])) is None
-
-
-@pytest.mark.parametrize("u", [[4.1], [0.0, 4.1], [0.0, 2.0, -2.1]])
-def test_a_step_is_refused_over_the_border_and_inside(u):
-    assert wrong(command(u)).what == "rate"
-
-
-def test_the_slew_counts_from_the_last_sample_sent():
-    sent = replace(FINE, u=3.0, theta_ref=0.2)
-    assert wrong(command([4.0], [0.2]), sent) is None
-    assert wrong(command([-1.1], [0.2]), sent).what == "rate"
-    assert wrong(command([1.0], [-0.4]), sent).what == "rate"
-
-
-def test_a_turning_joint_uses_up_slew():
-    turning = seen([[0, 0], [0, 0.3]])  # 150 rad/s, 600 V/s through kp
-    assert wrong(command([2.9]), FINE) is None
-    assert wrong(command([2.9]), turning).what == "rate"
-
-
-@pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_reference_that_is_not_a_number_is_refused(value):
-    assert wrong(command([value])).what == "not a number"
-    assert wrong(command([0.0], [value])).what == "not a number"
-
-
-def test_a_reference_of_wrong_shape_is_refused():
-    assert wrong(CommandBlock(100, np.zeros(0), np.zeros(0))).what == "shape"
-    assert wrong(CommandBlock(100, np.zeros(2), np.zeros(3))).what == "shape"
-    assert wrong(CommandBlock(100, np.zeros((2, 2)), np.zeros(2))).what == "shape"
-
-
-def test_a_set_point_beyond_the_sensors_limit_is_refused():
-    assert wrong(command([0.0], [0.35]), limits=LIMITS) is None
-    for angle in (0.351, -0.351):
-        d = wrong(command([0.0, 0.0], [0.0, angle]), limits=LIMITS)
-        assert (d.what, d.number, d.limit, d.unit) == ("set point", 0.351, 0.35, "rad")
-        assert "theta's limit of 0.35 rad (the frame)" in d.reason
-
-
-def turned(u, theta_ref, angle, kp, rate=0.001):
-    """Sample by sample what `travel` has in closed form."""
-    furthest = 0.0
-    for a, b in zip(u, theta_ref, strict=True):
-        angle += rate * (a + kp * (b - angle))
-        furthest = max(furthest, abs(angle))
-    return furthest
-
-
-@given(
-    u=st.lists(st.floats(-5, 5), min_size=1, max_size=120),
-    ref=st.floats(-0.3, 0.3),
-    angle=st.floats(-0.3, 0.3),
-    kp=st.floats(0, 10),
-    cut=st.integers(0, 119),
-)
-def test_the_travel_of_a_reference_is_that_of_the_source_alone(u, ref, angle, kp, cut):
-    refs = np.full(len(u), ref)
-    cut = min(cut, len(u) - 1)
-    sent = Sent(0, np.array(u[:cut]), refs[:cut])
-    got = travel(sent, CommandBlock(cut, np.array(u[cut:]), refs[cut:]), angle, 0.001, kp)
-    assert got == pytest.approx(turned(u, refs, angle, kp), rel=1e-9, abs=1e-12)
-
-
-def test_a_reference_that_would_turn_the_joint_too_far_is_refused():
-    """K = 0.5 rad/(s V) at 500 Hz: 1 mrad a sample and volt; 0.42 rad are 1.2 of the limit."""
-    far = seen([[0, 0.34], [0, 0.34]])
-    assert wrong(command([3.4] * 23), far, replace(LIMITS, kp=0.0)) is None
-    d = wrong(command([3.4] * 24), far, replace(LIMITS, kp=0.0))
-    assert (d.what, d.unit) == ("travel", "rad")
-    assert (d.number, d.limit) == (pytest.approx(0.4216), pytest.approx(0.42))
-    assert "would turn theta to 0.4216 rad; allowed 0.42 rad (the frame)" in d.reason
-    under_way = Sent(90, np.full(10, 3.4), np.zeros(10))
-    d = wrong(command([3.4] * 15), replace(far, u=3.4), replace(LIMITS, kp=0.0), under_way)
-    assert d.what == "travel"
-    back = seen([[0, -0.34], [0, -0.34]])
-    assert wrong(command([-3.4] * 25), back, replace(LIMITS, kp=0.0)).what == "travel"
-    assert wrong(command([3.4] * 24), back, replace(LIMITS, kp=0.0)) is None
-    unknown = replace(LIMITS, kp=0.0, turning=0.0)
-    assert wrong(command([3.4] * 100, first=2), far, unknown) is None
-
-
-def test_the_centring_holds_a_joint_that_the_source_alone_would_turn_too_far():
-    far = seen([[0, 0.34], [0, 0.34]])
-    assert wrong(command([2.0] * 60, first=2), far, replace(LIMITS, kp=0.0)).what == "travel"
-    assert wrong(command([2.0] * 60, first=2), far, LIMITS) is None
-
-
-def test_a_reference_must_continue_and_must_not_be_late():
-    sent = replace(FINE, next=100)
-    assert wrong(command([0.0], first=100), sent) is None
-    assert wrong(command([0.0], first=101), sent).what == "order"
-    assert wrong(command([0.0], first=99), sent).what == "order"
-    assert wrong(command([0.0], first=1)).what == "late"
-    assert wrong(command([0.0], first=2)) is None
-
-
-def test_a_reference_must_not_reach_far_ahead_of_the_samples():
-    # The newest sample is number 1; a quarter of a second is 125 samples.
-    assert wrong(command([0.0] * 25, first=102)) is None
-    assert wrong(command([0.0] * 26, first=102)).what == "ahead"
 
 
 # States
@@ -493,10 +412,7 @@ def test_an_age_and_a_silence_that_are_just_allowed_do_not_trip():
 
 
 def test_what_a_feedback_may_add_is_no_stray_output():
-    rig = fake_rig()
-    values = {"name": "f", "sensor": "theta", "actuator": "v", "gain": 1.0, "unit": "V/(rad)"}
-    loop = Feedback(**values, poles=(-5.0,), max=0.5)
-    limits = gate_limits(rig.model_copy(update={"feedback": (loop,)}), "v", 4.0, "theta")
+    limits = with_feedback()
     assert violation(replace(FINE, stray=0.54), limits, FINE.time) is None
     d = violation(replace(FINE, stray=0.56), limits, FINE.time)
     assert (d.what, d.limit) == ("readback", pytest.approx(0.55))

@@ -8,9 +8,7 @@ import sys
 from gate_machine import GateAndLoop
 from hypothesis import settings
 
-GateAndLoop.TestCase.settings = settings(
-    max_examples=120, stateful_step_count=25, deadline=None, derandomize=True
-)
+GateAndLoop.TestCase.settings = settings(max_examples=120, stateful_step_count=25, derandomize=True)
 TestGateAndLoop = GateAndLoop.TestCase
 
 GATE = ("gate", "judgement", "latest", "readback")

@@ -88,7 +88,7 @@ def test_an_output_that_the_device_changes_while_armed_is_a_fault():
         bench.gate.observe(bench.device.read(), bench.device.now())
     assert bench.gate.state is State.ARMED, "these may have been under way"
     with pytest.raises(GateError, match="the device itself changed v"):
-        bench.tick()
+        bench.tick(0.002)
 
 
 @pytest.mark.parametrize("flag", [Quality.MISSING, Quality.STALE, Quality.CLIPPED, Quality.LIMITED])
@@ -106,6 +106,8 @@ def test_an_angle_that_is_not_known_judges_an_open_loop_only():
     assert stray(SENT, block([[9.0, 0.0]]), blind, KP) == 0.0
     assert stray(SENT, block([[1.5, 0.0]]), blind, 0.0) == pytest.approx(0.5)
     assert stray(SENT, block([[1.5, 7.0]]), PLAIN, 0.0) == pytest.approx(0.5)
+    assert stray(SENT, block([[1.5, math.nan]]), PLAIN, 0.0) == pytest.approx(0.5)
+    assert stray(SENT, block([[0.7, 0.3]]), PLAIN, 1.0) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_reference_that_was_lost_on_its_way_is_no_difference_but_another_one_is():

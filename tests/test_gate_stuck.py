@@ -62,6 +62,14 @@ def test_travel_is_the_integral_of_the_output_since_the_last_change(chunk):
     assert latest.effort[1] == pytest.approx(0.4 * 0.3)
 
 
+def test_an_output_that_was_not_told_moves_nothing():
+    v, flags = np.full(101, -0.3), np.zeros((101, 2), np.uint8)
+    v[50], flags[50, 0] = math.nan, Quality.MISSING
+    latest = after(v, np.full(101, 0.02), chunk=101, quality=flags)
+    assert latest.travel[1] == pytest.approx(-0.3 * 99 / RATE)
+    assert latest.effort[1] == pytest.approx(0.3 * 99 / RATE)
+
+
 @pytest.mark.parametrize(
     ("v", "seconds", "what"),
     [
@@ -78,6 +86,33 @@ def test_travel_is_the_integral_of_the_output_since_the_last_change(chunk):
 def test_an_angle_that_does_not_follow_is_stuck(v, seconds, what):
     n = round(seconds * RATE) + 1
     assert verdict(ANGLE, after(np.full(n, v), np.full(n, 0.02))) == what
+
+
+def test_the_time_counts_from_the_last_change():
+    """0.3 s at 0.6 V move it by 30 mrad in the last 0.1 s."""
+    theta = np.r_[np.full(100, 0.01), np.full(51, 0.02)]
+    assert verdict(ANGLE, after(np.full(151, 0.6), theta)) == ""
+
+
+def found(rule: Stuck, held: float, travel: float = 0.0, effort: float = 0.0):
+    """What a value says that has not changed for so long."""
+    fresh = replace(after([0.0], [0.0]), time=round(held * 1e9), good=(round(held * 1e9),) * 2)
+    latest = replace(fresh, offset=0, travel=(0.0, travel), effort=(0.0, effort))
+    return violation(latest, limits(rule), latest.time)
+
+
+def test_a_number_at_its_bound_is_not_beyond_it():
+    rule = replace(ANGLE, travel=0.125, at_once=0.5)
+    assert found(rule, 0.1, travel=1.0) is None
+    d = found(rule, 0.1, travel=1.5)
+    assert (d.what, d.number, d.limit, d.unit) == ("stuck", 0.75, 0.5, "rad")
+    assert found(rule, 0.3, travel=0.25) is None
+    d = found(rule, 0.25, travel=0.5)
+    assert (d.what, d.number, d.limit) == ("stuck", 0.25, 0.125)
+    noisy = Stuck(noise_after=1.0, effort=0.5)
+    assert found(noisy, 1.0, effort=0.5) is None
+    d = found(noisy, 1.0, effort=0.6)
+    assert (d.what, d.number, d.limit, d.unit) == ("stuck", 1.0, 1.0, "s")
 
 
 def test_an_output_that_goes_to_and_fro_moves_an_angle_nowhere():

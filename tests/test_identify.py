@@ -52,7 +52,7 @@ def test_all_four_stiffnesses_of_table_2_within_a_fraction_of_two_percent():
     assert found.reached == 2
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.lists(st.floats(0.7, 1.3), min_size=8, max_size=8))
 def test_any_start_within_30_percent_leads_to_the_same_optimum(factors):
     names = (*STIFFNESSES, *DAMPERS)

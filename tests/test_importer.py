@@ -255,9 +255,7 @@ LINES = st.lists(
 ).map("\n".join)
 # Single bytes that end scipy's MATLAB reader by a segmentation fault: (place, value).
 FATAL = [(176, 128), (353, 60)]
-FUZZ = settings(
-    max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+FUZZ = settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @FUZZ

@@ -223,9 +223,7 @@ def test_a_question_mends_a_broken_index_too(index: Index, damage) -> None:
     assert index.search(Query()) == expected
 
 
-@settings(
-    max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_whatever_bytes_change_the_answer_is_right(index: Index, data: st.DataObject) -> None:
     expected = index.search(Query())

@@ -16,7 +16,7 @@ from samii_rig.record.reader import read_recording
 from samii_rig.run import campaign
 from samii_rig.run.campaign import Outcome, carry_out
 from samii_rig.run.dryrun import predict
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.protocols import CommandBlock, Plan, PlannedSegment
 from samii_rig.signal.excitation import swept_sine
 from samii_rig.types import Channel
 
@@ -142,3 +142,22 @@ def test_a_place_that_cannot_hold_the_recording_costs_one_line(
     assert words in str(result.exception)
     assert "\n" not in str(result.exception)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_what_the_device_learns_meanwhile_is_in_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = FakeDevice()
+    opened = device.open()
+    opened.metadata["timing"] = "before"
+    monkeypatch.setattr(campaign, "open_device", lambda rig, settings: opened)
+    works = device.write
+
+    def write(block: CommandBlock) -> None:
+        opened.metadata["timing"] = "after"
+        works(block)
+
+    monkeypatch.setattr(device, "write", write)
+    notes = go(tmp_path / "run.mcap").recording.metadata
+    assert notes["device_timing"] == "after"
+    assert notes["experiment"] == "sweep"

@@ -45,7 +45,7 @@ def steepest(u, theta_ref) -> float:
 # The reference, sample by sample
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(
     frequencies=st.lists(st.sampled_from(FREQUENCIES), min_size=1, max_size=2, unique=True),
     drive=st.sampled_from(["output", "reference"]),
@@ -102,7 +102,7 @@ class Fast(FakeDevice):
         self.noise = lambda: sd * rng.standard_normal()
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     sd=st.floats(1e-6, 3e-2),
     seed=st.integers(0, 1000),

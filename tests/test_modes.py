@@ -35,7 +35,7 @@ def product(omega):
     return D
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(st.floats(0.2, 150.0), max_size=9))
 def test_every_root_is_found_once_and_those_below_are_counted(omega: list[float]) -> None:
     apart = [x for i, x in enumerate(omega) if all(abs(x - y) > 1e-5 * x for y in omega[:i])]
@@ -77,7 +77,7 @@ def test_a_damped_function_is_refused() -> None:
         axis_zeros(D, 1.0, 100.0)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(chains(), st.floats(1.0, 30.0), st.floats(1.5, 30.0))
 def test_the_count_is_that_of_wittrick_and_williams(rig, low: float, factor: float) -> None:
     high = low * factor

@@ -16,7 +16,12 @@ from samii_rig.run.limits import gate_limits
 from samii_rig.run.protocols import CommandBlock, DeviceLoop
 
 DEADMAN = 0.2  # s; a loaded machine may feed late
-INTERLOCK = {"name": "pressure switch K3", "reason": "drops when its square wave stops"}
+INTERLOCK = {
+    "name": "pressure switch K3",
+    "line": "port0/line0",
+    "reason": "drops when its square wave stops",
+}
+LOCKED = {"channel": "ao0", "interlock": INTERLOCK}
 SETTINGS = {
     "board": "Dev1",
     "analogue": {"a_0": {"input": "ai3", "volts_per_unit": 0.1, "offset": 0.5}},
@@ -110,12 +115,12 @@ class TestNiOutput(DeviceContract):
 
 def test_opening_brings_a_board_that_held_a_voltage_to_null(board):
     assert board.out == 3.0
-    with_interlock = {**SETTINGS, "output": {"channel": "ao0", "interlock": INTERLOCK}}
-    device = open_rig(RIG, with_interlock)
+    device = open_rig(RIG, {**SETTINGS, "output": LOCKED})
     assert board.out == 0.0
-    assert device.metadata["interlock"].startswith("pressure switch K3: ")
+    assert device.metadata["interlock"].startswith("pressure switch K3 at port0/line0: ")
     device.close()
     assert not board.resets
+    assert not any(t.open for t in board.tasks)
 
 
 def test_the_watchdog_ends_the_output_of_a_program_that_hangs(board, device, monkeypatch):
@@ -173,6 +178,57 @@ def test_a_board_that_does_not_take_null_is_left_to_its_watchdog(board, device):
     assert board.watchdog.expired
     with pytest.raises(DeviceError, match="Dev1: "):
         until(lambda: device.sensor.read() is None)
+
+
+@pytest.fixture
+def locked(board):
+    opened = open_rig(RIG, {**SETTINGS, "output": LOCKED})
+    yield opened
+    opened.close()
+
+
+def test_an_interlock_is_closed_only_while_the_output_is_fed(board, locked):
+    time.sleep(0.05)
+    assert not board.closed
+    live(board, locked)
+    assert board.closed
+    locked.actuator.zero()
+    assert board.out == 0.0
+    until(lambda: not board.closed)
+
+
+def test_a_board_that_does_not_take_null_opens_its_interlock(board, locked):
+    driven = live(board, locked)
+    board.broken = {"ao", "null"}
+    locked.actuator.zero()
+    assert board.out == 1.0
+    with pytest.raises(DeviceError, match="could not be set to null: -50405"):
+        driven.until(lambda: False)
+    until(lambda: not board.closed, 1.0)
+    with pytest.raises(DeviceError, match="could not be set to null: -50405"):
+        locked.actuator.configure(LOOP)
+    assert not board.closed
+
+
+def test_a_program_that_hangs_opens_its_interlock(board, locked, monkeypatch):
+    live(board, locked)
+    monkeypatch.setattr(locked.actuator, "look", lambda angle: None)
+    until(lambda: not board.closed, 1.0)
+    assert board.out == 1.0, "nobody but the interlock"
+
+
+def test_a_line_that_is_not_to_be_had_ends_at_null(board, locked):
+    driven = live(board, locked)
+    board.broken = {"do"}
+    with pytest.raises(DeviceError, match="the output has ended: -50405"):
+        driven.until(lambda: False)
+    assert board.out == 0.0
+    until(lambda: not board.closed, 1.0)
+    locked.close()
+    with pytest.raises(DeviceError, match="NI-DAQmx refuses: -50405"):
+        open_rig(RIG, with_output(interlock=INTERLOCK))
+    assert not any(t.open for t in board.tasks)
+    assert board.watchdog is None
 
 
 def test_inputs_that_end_take_the_output_with_them(board, device):
@@ -273,7 +329,8 @@ def test_a_loop_is_refused_and_leaves_it_at_null(board, device):
     [
         ({"volts_per_unit": 0.0}, "output.volts_per_unit is 0.0"),
         ({"null": 10.0}, r"output.null is 10.0; expected between low, -10, and high, 10"),
-        ({"interlock": {"name": "K3"}}, "output.interlock.reason: is missing"),
+        ({"interlock": {**INTERLOCK, "line": ""}}, "output.interlock.line is ''"),
+        ({"interlock": {"name": "K3", "reason": "fast"}}, "output.interlock.line: is missing"),
         ({"interlock": {**INTERLOCK, "reason": ""}}, "output.interlock.reason is ''"),
     ],
 )

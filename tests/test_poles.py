@@ -65,7 +65,7 @@ zero = st.builds(complex, st.floats(-99.0, 1.0), imag)
 
 
 @given(st.lists(zero, max_size=8))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_every_zero_of_a_known_function_is_found_and_no_other(zeros):
     far = [z for i, z in enumerate(zeros) if all(abs(z - y) > 0.01 for y in zeros[:i])]
     found = find_poles(product(far), REGION)

@@ -95,7 +95,7 @@ def seen(rig, chain):
     st.integers(1, 6),
     st.floats(40.0, 300.0),
 )
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 def test_a_rational_chain_is_realised_exactly(k, c, p, order, corner):
     rig = spring_arm(k, c, p, antialias={"order": order, "corner_hz": corner}, highpass_hz=0.1)
     made = realise(rig)
@@ -158,7 +158,7 @@ def test_no_hole_without_viscous_beams():
 
 
 @given(st.floats(1e-4, 0.1), st.floats(0.02, 1.0), st.floats(50.0, 2000.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_relaxations_hold_the_loss_factor_over_the_band(eta, low, high):
     beam = fit_loss(eta, 0.0, low, high)
     f = np.geomspace(low, high, 77)

@@ -81,7 +81,7 @@ def test_a_run_comes_back_as_it_was(tmp_path: Path, compression: str) -> None:
     assert not list(tmp_path.glob("*.partial"))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     sizes=st.lists(st.integers(0, 4000), min_size=1, max_size=4),
     columns=st.integers(1, 9),

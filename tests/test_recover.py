@@ -17,6 +17,7 @@ from record_kit import (
     RATE,
     RIG,
     SEGMENT,
+    STOP,
     block,
     blocks,
     joined,
@@ -244,3 +245,19 @@ def assert_continuous(path: Path) -> None:
         start += rows
         if start >= len(recording):
             break
+
+
+def test_what_was_noted_later_stands_in_place_of_what_was_before(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    writer = RunWriter(path, CHANNELS, RATE, metadata={"seed": "7", "clock": "1 ms"})
+    writer.write(block(0, 10))
+    writer.flush()
+    writer.note({"clock": "2 ms"})
+    writer.flush()
+    cut = tmp_path / "cut.mcap"
+    recover(writer.partial_path, cut)
+    writer.close(STOP)
+    assert read_recording(path).metadata == {"seed": "7", "clock": "2 ms"}
+    assert verify(path).status == "whole"
+    notes = read_recording(cut).metadata
+    assert (notes["seed"], notes["clock"]) == ("7", "2 ms")

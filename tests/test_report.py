@@ -188,7 +188,7 @@ def test_peaks_are_the_modes_and_noise_has_none():
     assert peaks(flat, 0) == ()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=400), st.integers(1, 60))
 def test_thinning_keeps_every_extreme(values, pixels):
     y = np.array(values)

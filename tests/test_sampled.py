@@ -97,7 +97,7 @@ def test_an_accelerometer_on_the_source_reads_the_side_before_the_jump():
 
 
 @given(st.floats(0.0, 3 * T))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_a_delay_does_the_same_at_the_output_and_at_the_sensor(delay):
     late_output = sampled_response(arm([angle()], delay), F)
     late_sensor = sampled_response(arm([angle(delay=delay)]), F)
@@ -105,7 +105,7 @@ def test_a_delay_does_the_same_at_the_output_and_at_the_sensor(delay):
 
 
 @given(st.floats(1e-5, 3 * T))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_a_delay_lags(delay):
     prompt = sampled_response(arm([angle()]), F[:3])[:, 0, 0]
     late = sampled_response(arm([angle(delay=delay)]), F[:3])[:, 0, 0]
@@ -121,7 +121,6 @@ def test_a_whole_period_of_delay_is_one_sample():
 
 
 @given(st.integers(1, 8), st.floats(20.0, 2000.0), st.floats(0.0, 3.0))
-@settings(deadline=None)
 def test_a_sensor_filter_is_the_sum_of_its_residues(order, corner, highpass):
     sensor = AbsoluteAngle.model_validate(
         angle(antialias={"order": order, "corner_hz": corner}, highpass_hz=highpass)

@@ -42,7 +42,7 @@ def test_a_node_says_what_it_is():
     assert (said.firmware, said.serial) == ("simulated 1", "SIM-0001")
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(st.binary(max_size=700), max_size=5), st.booleans())
 def test_bytes_that_mean_nothing_do_nothing(parts, greeted):
     d = Decoder()
@@ -51,7 +51,7 @@ def test_bytes_that_mean_nothing_do_nothing(parts, greeted):
     assert [m for part in parts for m in d.feed(part)] == []
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.binary(min_size=1, max_size=200), st.lists(st.integers(0, 400), max_size=6))
 def test_where_the_bytes_are_cut_does_not_matter(body, cuts):
     data = hello() + raw(1, Type.EVENT, 7, 1, struct.pack("<IBB", 5, 1, 1)) + body + b"\0" + hello()

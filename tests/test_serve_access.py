@@ -46,6 +46,7 @@ TABLE = {
     ("GET", "/api/recordings/{id_}"): VIEWER,
     ("GET", "/api/recordings/{id_}/file"): VIEWER,
     ("GET", "/api/recordings/{id_}/signals"): VIEWER,
+    ("GET", "/api/recordings/{id_}/frames"): VIEWER,
     ("GET", "/api/recordings/{id_}/frf"): VIEWER,
     ("GET", "/api/compare"): VIEWER,
     ("POST", "/api/runs"): OPERATOR,

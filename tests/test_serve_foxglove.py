@@ -6,16 +6,19 @@ an MCAP viewer's ROS 2 decoder, which knows nothing of ours.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from report_kit import measured
-from serve_kit import Service, sweep
+from serve_kit import Service, settings, sweep
 from wait_kit import WITHIN, found
 
 pytest.importorskip("foxglove")
@@ -25,9 +28,11 @@ from mcap_ros2.decoder import DecoderFactory
 from websockets.sync.client import ClientConnection, connect
 
 from samii_rig.errors import InputError
+from samii_rig.serve.access import Tokens
 from samii_rig.serve.analyst import curves
 from samii_rig.serve.foxglove import BODE, Foxglove
 from samii_rig.serve.live import LiveReader, LiveWriter
+from samii_rig.serve.rooms import Rooms
 from samii_rig.types import Channel, SampleBlock
 
 CHANNELS = (Channel("u", "V", "reference"), Channel("Theta_2", "rad"))
@@ -139,6 +144,42 @@ def test_a_port_that_is_taken_costs_one_line(
 ) -> None:
     with pytest.raises(InputError, match="a free port"):
         Foxglove(shown[0].port, "another")
+
+
+def test_a_failing_foxglove_takes_nothing_down(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rooms = Rooms(settings(tmp_path, foxglove=0))
+    broken = rooms.foxglove
+    assert broken is not None
+    viewer = rooms.viewers.add()
+
+    async def work() -> None:
+        with (
+            patch.object(broken, "show", side_effect=RuntimeError("a display that breaks")),
+            patch.object(rooms, "_refresh") as refreshed,
+            suppress(TimeoutError),
+        ):
+            await asyncio.wait_for(rooms.work(), 1.0)
+        # What comes after it is done as ever.
+        assert refreshed.called
+
+    asyncio.run(work())
+    assert json.loads(asyncio.run(viewer.next()))["rig"] == "SAMII"
+    assert rooms.foxglove is None
+    with pytest.raises(OSError, match="refused"):
+        client(broken.port)
+    (said,) = [r for r in caplog.records if r.name == "samii_rig.serve"]
+    assert "Foxglove failed and is off" in said.message
+
+
+def test_where_others_show_a_token_an_open_port_is_asked_for_by_name(tmp_path: Path) -> None:
+    kept = Tokens(tmp_path / "tokens.json")
+    kept.add("Ada", "operator")
+    with pytest.raises(InputError, match="--foxglove is 0; expected --foxglove-open"):
+        settings(tmp_path, kept, foxglove=0).check()
+    settings(tmp_path, kept, foxglove=0, foxglove_open=True).check()
+    settings(tmp_path, foxglove=0).check()
 
 
 def test_a_run_of_the_service_is_seen(tmp_path: Path) -> None:

@@ -87,9 +87,7 @@ def fits(schema: dict[str, Any], parts: dict[str, Any]) -> st.SearchStrategy[Any
     )
 
 
-@settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_no_request_makes_the_service_fail(
     rooms: Rooms, api: dict[str, Any], data: st.DataObject
@@ -133,7 +131,7 @@ def _ask(
     return asyncio.run(ask())
 
 
-@settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=100, suppress_health_check=list(HealthCheck))
 @given(
     headers=st.lists(
         st.tuples(

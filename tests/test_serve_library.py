@@ -15,13 +15,15 @@ import httpx
 import numpy as np
 import pytest
 from index_kit import write_small
-from record_kit import CHANNELS, RATE, blocks, response, write_run
+from record_kit import CHANNELS, RATE, STOP, block, blocks, response, write_run
 from serve_kit import client, settings
 
 from samii_rig.index.remarks import read_remarks
 from samii_rig.record.reader import read_frequency_responses, read_recording
+from samii_rig.record.writer import RunWriter
 from samii_rig.serve import upload
 from samii_rig.serve.rooms import Rooms
+from samii_rig.serve.viewers import HEAD
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +74,43 @@ def test_signals_have_the_outline_of_the_samples(rooms: Rooms) -> None:
     wrong = ask(rooms, "GET", f"/api/recordings/{id_}/signals", params={"channel": "nope"})
     assert wrong.status_code == 422
     assert "expected" in wrong.json()["error"]
+
+
+@pytest.mark.parametrize(("rate", "step"), [(500.0, 1), (5000.0, 5)])
+def test_frames_hold_every_sample_or_its_outline_and_end_at_gaps(
+    rooms: Rooms, rate: float, step: int
+) -> None:
+    name = f"gap_{rate:g}.mcap"
+    path = rooms.index.folder / name
+    with RunWriter(path, CHANNELS, rate) as writer:
+        for start in (1000, 1100, 1230, 1330):
+            writer.write(block(start, 100))
+        writer.close(STOP)
+    rooms.index.refresh()
+    recording, place = read_recording(path), f"/api/recordings/{id_of(rooms, name)}/frames"
+    # In one answer, and in two that were asked one after the other.
+    for spans in ([(0.0, 10.0)], [(0.0, 205 / rate), (205 / rate, 10.0)]):
+        data = b"".join(
+            ask(rooms, "GET", place, params={"start": a, "length": b}).content for a, b in spans
+        )
+        at, numbers, rows_of = 0, [], []
+        while at < len(data):
+            _, _, columns, rows, said, _, hz, first = HEAD.unpack_from(data, at)
+            assert (said, hz) == (step, rate if step == 1 else 2 * rate / step)
+            values = np.frombuffer(data, "<f4", rows * columns, at + HEAD.size)
+            rows_of.append(values.reshape(rows, columns))
+            at += HEAD.size + values.nbytes
+            numbers.append(first + np.arange(rows * step // (2 if step > 1 else 1)))
+        shown = np.concatenate(numbers)
+        np.testing.assert_array_equal(shown, recording.sequence - 1000)
+        bins = recording.values.reshape(-1, step, recording.values.shape[1])
+        outline = (
+            np.stack([np.fmin.reduce(bins, axis=1), np.fmax.reduce(bins, axis=1)], axis=1)
+            if step > 1
+            else bins
+        )
+        outline = outline.reshape(-1, recording.values.shape[1])
+        np.testing.assert_array_equal(np.concatenate(rows_of), outline.astype("<f4"))
 
 
 def test_frequency_responses_are_those_of_the_file(rooms: Rooms) -> None:

@@ -38,7 +38,7 @@ def block(first: int, rows: int) -> SampleBlock:
     return SampleBlock(CHANNELS, sequence * 1000, sequence, values, quality)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.lists(st.tuples(st.integers(0, 700), st.booleans()), max_size=12))
 def test_what_is_read_was_written_and_the_rest_is_said_to_be_lost(
     steps: list[tuple[int, bool]],

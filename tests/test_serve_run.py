@@ -20,6 +20,7 @@ from samii_rig.index.store import Index
 from samii_rig.record.reader import read_recording
 from samii_rig.record.verify import verify
 from samii_rig.rig.load import load_rig
+from samii_rig.run.experiments import shipped
 from samii_rig.serve.job import Job, JobState, Request
 from samii_rig.serve.supervisor import Supervisor
 
@@ -103,6 +104,15 @@ def test_a_lab_s_afternoon(service: Service) -> None:
     assert service.http.get(f"/api/recordings/{entry['id']}/file").content == path.read_bytes()
 
 
+def test_a_service_that_is_told_to_end_leaves_nothing_behind(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with Service(tmp_path) as ending:
+        assert ending.http.get("/api/rig").status_code == 200
+    assert ending.process.returncode == 0
+    assert capfd.readouterr().err == ""
+
+
 def test_a_stop_while_it_starts_keeps_anything_from_moving(service: Service) -> None:
     with service.lease() as lease:
         id_ = service.start(lease, LONG)
@@ -132,6 +142,23 @@ def test_a_plan_beyond_a_limit_is_refused_with_the_amplitude_that_is_not(service
         planned = service.http.post("/api/dry-run", json={"experiment_toml": hard}).json()
         assert planned["refused"] == answer.json()["error"]
         assert planned["runs"][0]["margins"][0]["margin"] < 0.0
+
+
+def test_an_early_end_wants_a_diagnosis_that_can_become_certain(service: Service) -> None:
+    scan, *places = shipped()["mode_scan"].read_text().split("[[place]]")
+    two_runs = "[[place]]".join([scan.replace("repeats = 3", "repeats = 1"), *places[:2]])
+    with service.lease() as lease:
+        for order, said in (
+            ({"experiment_toml": sweep(), "diagnosis": False}, "without one nothing"),
+            ({"experiment_toml": two_runs}, "diagnosed together"),
+        ):
+            asked = {**order, "stop_when_certain": True}
+            answer = service.http.post("/api/runs", headers=lease, json=asked)
+            assert answer.status_code == 422
+            assert "order: stop_when_certain is True; expected false" in answer.json()["error"]
+            assert said in answer.json()["error"]
+        assert service.state()["queue"] == []
+        assert service.state()["running"] is None
 
 
 def test_an_operator_who_goes_silent_stops_the_run(service: Service) -> None:

@@ -48,7 +48,6 @@ def test_no_request_of_the_description_makes_the_service_fail(api: Any) -> None:
             max_examples=EXAMPLES,
             derandomize=True,
             database=None,
-            deadline=None,
             suppress_health_check=list(HealthCheck),
         )
         @given(case=operation.as_strategy())

@@ -11,6 +11,7 @@ import json
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from samii_rig.run.protocols import Plan
 from samii_rig.serve.analysis import Analysis
 from samii_rig.serve.analyst import curves, said
 from samii_rig.serve.following import following
-from samii_rig.serve.job import DIAGNOSIS, Job, Request
+from samii_rig.serve.job import DIAGNOSIS, RESPONSES, SO_FAR, Job, Request
 from samii_rig.serve.sofar import SoFar
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
@@ -139,6 +140,24 @@ def test_at_the_end_it_says_what_the_estimate_of_the_whole_says(
         assert (r.level, r.method, r.n_averages) == (found.level, found.method, found.n_averages)
         np.testing.assert_array_equal(r.H, found.H)
         np.testing.assert_array_equal(r.covariance, found.covariance)
+
+
+def test_a_level_counts_once_whatever_is_driven_at_it(
+    swept: tuple[Plan, Recording, int],
+) -> None:
+    plan, recording, start = swept
+    (*_, last) = plan.segments
+    for more, levels in (
+        ((), (2, 2)),
+        ((replace(last, kind="periodic"),), (2, 2)),
+        ((replace(last, level=0.08),), (2, 3)),
+        ((replace(last, unit="rad"),), (2, 3)),
+        ((replace(last, level=0.08, kind="transient"),), (2, 2)),
+    ):
+        so_far = SoFar(replace(plan, segments=(*plan.segments, *more)))
+        assert so_far.levels == (0, levels[1])
+        so_far.take(recording, start)
+        assert so_far.levels == levels
 
 
 def test_of_a_multisine_whole_periods_count(tmp_path: Path) -> None:
@@ -286,7 +305,7 @@ def test_certain_is_the_same_answer_twice_in_a_row(
     analysis = Analysis(tmp_path)
     analysis.turn(job)
     for i, found in enumerate(told):
-        job.tell(DIAGNOSIS, {"time": time.time(), "next_toml": "", "number": i, **found})
+        job.tell(SO_FAR, {"time": time.time(), "next_toml": "", "number": i, **found})
         analysis.turn(job)
         analysis.turn(job)  # looked at twice is not told twice
     assert analysis.certain == certain
@@ -306,6 +325,23 @@ def test_the_last_word_of_the_runner_is_none_of_the_analyst(tmp_path: Path) -> N
     analysis.turn(job)
     assert analysis.state()["diagnosis"] is None
     assert analysis.certain == ""
+
+
+def test_what_two_tell_of_a_job_at_once_is_whole(tmp_path: Path) -> None:
+    job = Job.make(tmp_path, Request("x", "x.mcap"), RIG_TOML, SWEEPS)
+
+    def tell(by: int) -> None:
+        for n in range(200):
+            job.tell(RESPONSES, {"by": by, "long": [n] * 500})
+
+    with ThreadPoolExecutor(2) as pool:
+        told = [pool.submit(tell, by) for by in range(2)]
+        while not all(t.done() for t in told):
+            if (job.folder / RESPONSES).exists():
+                assert len(json.loads((job.folder / RESPONSES).read_text())["long"]) == 500
+        for t in told:
+            t.result()
+    assert not [f for f in job.folder.iterdir() if f.name.startswith("tmp")]
 
 
 def test_a_diagnosis_ends_with_who_asked_for_it() -> None:

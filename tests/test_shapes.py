@@ -71,7 +71,7 @@ def stiffness(rig: Rig, a: ModeShape, b: ModeShape) -> float:
     return float(total)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(chains())
 def test_modes_are_orthogonal_by_mass_and_by_stiffness(rig: Rig) -> None:
     modes = first_modes(rig, 4)
@@ -82,7 +82,7 @@ def test_modes_are_orthogonal_by_mass_and_by_stiffness(rig: Rig) -> None:
     np.testing.assert_allclose(k / np.outer(omega, omega), np.eye(len(modes)), atol=1e-6)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(chains(), st.floats(-0.2, 0.2))
 def test_rayleighs_quotient_is_least_at_the_first_mode(rig: Rig, share: float) -> None:
     first, second = first_modes(rig, 2)
@@ -95,7 +95,7 @@ def test_rayleighs_quotient_is_least_at_the_first_mode(rig: Rig, share: float) -
     assert k / m == pytest.approx(expected, rel=1e-6)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(chains(damped=True), st.floats(0.3, 60.0), st.integers(0, 7), st.integers(0, 7))
 def test_what_a_force_does_elsewhere_it_suffers_from_there(
     rig: Rig, f: float, a: int, b: int

@@ -243,7 +243,7 @@ def test_a_mode_shape_does_not_depend_on_where_the_beam_is_looked_at() -> None:
 positive = st.floats(0.1, 10.0)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     s=st.complex_numbers(min_magnitude=0.1, max_magnitude=20.0, allow_nan=False),
     a=positive, b=positive, c=positive, d=positive,
@@ -262,7 +262,7 @@ def test_every_element_keeps_the_symplectic_product(
         assert np.abs(T.T @ elements.J @ T - elements.J).max() < 1e-12 * max(size, 1.0)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     numbers=st.lists(st.floats(0.2, 5.0), min_size=8, max_size=8),
     f=st.floats(0.05, 3.0),

@@ -12,7 +12,7 @@ from samii_rig.rig.schema import Rig
 positive = st.floats(0.1, 10.0)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(
     s=st.complex_numbers(min_magnitude=0.1, max_magnitude=10.0, allow_nan=False),
     a=positive,

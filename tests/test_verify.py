@@ -145,7 +145,7 @@ def _craft(path: Path, raws: list[bytes], metadata: dict[str, str] | None = None
         appender.finish()
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_nothing_but_a_recording_error_comes_of_hostile_chunks(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
@@ -160,7 +160,7 @@ def test_nothing_but_a_recording_error_comes_of_hostile_chunks(
     read_all(path)
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(data=st.data())
 def test_nothing_but_a_recording_error_comes_of_mutations(
     tmp_path_factory: pytest.TempPathFactory, whole: bytes, data: st.DataObject
@@ -197,7 +197,7 @@ JSONISH = st.recursive(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(item=JSONISH, rate=st.sampled_from(["500.0", "nan", "-1", "x", "1e999"]))
 def test_any_description_of_the_channels_is_read_or_refused(
     tmp_path_factory: pytest.TempPathFactory, item: object, rate: str

@@ -66,7 +66,7 @@ def test_the_response_vanishes_at_each_zero_and_nowhere_else(name: str) -> None:
             assert np.sum(np.angle(H[1:] / H[:-1])) == pytest.approx(2 * np.pi, abs=1e-6)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=6)
 @given(chains(damped=True))
 def test_an_encoder_at_a_perfect_source_has_no_zero(rig: Rig) -> None:
     """theta/v is K p/(s (s + p)): every zero of the numerator is a pole as well."""

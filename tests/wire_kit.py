@@ -19,19 +19,20 @@ STARTED_WITHIN = 60.0  # s, with cold caches
 
 
 class Wire:
-    """`python -m sim.wire`, and the rig whose driver leads to it."""
+    """`python -m sim.wire`, or another `program` like it, and the rig whose driver leads to it."""
+
+    program, driver = "sim.wire", "serial_node"
 
     def __init__(self, *options: str, rig: str = "samii") -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "sim.wire", "--rig", rig, *options],
+            [sys.executable, "-m", self.program, "--rig", rig, *options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
         )
-        plain = load_rig(rig)[0]
         self.settings = self._answer()["settings"]
-        device = Device(driver="serial_node", settings=self.settings)
-        self.rig: Rig = plain.model_copy(update={"device": device})
+        device = Device(driver=self.driver, settings=self.settings)
+        self.rig: Rig = load_rig(rig)[0].model_copy(update={"device": device})
 
     def open(self, **settings: object) -> OpenRig:
         return open_device(self.rig, settings)

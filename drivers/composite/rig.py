@@ -28,10 +28,10 @@ from samii_rig.rig.settings import TABLE, checked, wrong
 from samii_rig.run.devices import open_device
 from samii_rig.run.protocols import OpenRig
 from samii_rig.run.timebase import ClockModel, Timed
-from samii_rig.signal.skew import KEY, Skew, to_text
 
 AGE_PART = 0.5  # of the age at which a channel is stale, that waiting may take
 SETTLE = 3.0  # s within which the clocks must be known
+LISTEN = 1.0  # s to listen in any case; the first tenths know the clocks half as well
 
 
 class Part(Strict):
@@ -103,35 +103,35 @@ def _together(rig: Rig, parts: dict[str, Part], opened: dict[str, OpenRig]) -> C
         for name, part in opened.items()
         if name != MAIN
     ]
-    both = CompositeSensor(main, model, sides)
+    metadata = {
+        "device": "composite",
+        "clock": "device",
+        **{f"{n}_{k}": v for n, part in opened.items() for k, v in part.metadata.items()},
+    }
+    both = CompositeSensor(main, model, sides, metadata)
     _settle(both, sides, main)
-    skews = {c.name: Skew(s.name, s.clocks.sigma) for s in sides for c in s.track.channels}
     return CompositeRig(
         main.actuator,
         both,
         main.clock,
         " with ".join(part.description for part in opened.values()),
-        {
-            "device": "composite",
-            "clock": "device",
-            # The prefix is added where the metadata goes into the recording.
-            KEY.removeprefix("device_"): to_text(skews),
-            **{f"{n}_{k}": v for n, part in opened.items() for k, v in part.metadata.items()},
-        },
+        metadata,
         opened,
     )
 
 
 def _settle(both: CompositeSensor, sides: list[Side], main: OpenRig) -> None:
     """Listen until the clocks are known; what was measured by then is nobody's."""
-    until = time.monotonic() + SETTLE
-    while not (ready := all(s.clocks.ready for s in sides)) and time.monotonic() < until:
+    begun = time.monotonic()
+    ready = False
+    while (since := time.monotonic() - begun) < LISTEN or (not ready and since < SETTLE):
         time.sleep(0.005)
         main.sensor.read()
         both.listen()
         for side in sides:
             side.opened.sensor.read()
             side.clocks.listen()
+        ready = all(s.clocks.ready for s in sides)
     if not ready:
         slow = ", ".join(s.name for s in sides if not s.clocks.ready)
         raise DeviceError(
@@ -142,6 +142,7 @@ def _settle(both: CompositeSensor, sides: list[Side], main: OpenRig) -> None:
     for side in sides:
         side.opened.sensor.read()
         side.track.heard = now
+    both.state()
 
 
 def _open(rig: Rig, name: str, part: Part, parts: dict[str, Part]) -> OpenRig:

@@ -11,6 +11,7 @@ from drivers.resampling import Track
 from samii_rig.errors import DeviceError, SamiiRigError
 from samii_rig.run.protocols import DeviceEvent, OpenRig, Reports
 from samii_rig.run.timebase import ClockFit, ClockModel, Timed
+from samii_rig.signal.skew import KEY, Skew, to_text
 from samii_rig.types import Float, Int, SampleBlock
 
 MAIN = "main"
@@ -62,13 +63,18 @@ class Clocks:
 
 @dataclass(slots=True)
 class Side:
-    """A device that only measures. age : s without a sample after which the run ends."""
+    """A device that only measures.
+
+    age : s without a sample after which the run ends. sigma : s, the largest of its clock since
+        the device is open.
+    """
 
     name: str
     opened: OpenRig
     clocks: Clocks
     track: Track
     age: float
+    sigma: float = 0.0
     trouble: str = ""
     told: bool = False
 
@@ -97,10 +103,20 @@ class Side:
 
 
 class CompositeSensor:
-    """The samples of all devices as those of the main one."""
+    """The samples of all devices as those of the main one.
 
-    def __init__(self, main: OpenRig, model: ClockModel | None, sides: list[Side]) -> None:
+    metadata : of the rig; what is stated of the clocks in it is kept up to date.
+    """
+
+    def __init__(
+        self,
+        main: OpenRig,
+        model: ClockModel | None,
+        sides: list[Side],
+        metadata: dict[str, str],
+    ) -> None:
         self._main, self._model, self._sides = main, model, sides
+        self._metadata = metadata
         self.channels = main.sensor.channels + tuple(c for s in sides for c in s.track.channels)
         self._held: list[tuple[int, SampleBlock]] = []
         self._told = -TELL
@@ -112,6 +128,7 @@ class CompositeSensor:
         for side in self._sides:
             side.take(now)
             side.check(now)
+        self.state()
         block = self._main.sensor.read()
         self.listen()
         if len(block):
@@ -130,6 +147,16 @@ class CompositeSensor:
                 break
             self._held.pop(0)
         return _joined(out) if out else self._whole(_rows(block, 0, 0))
+
+    def state(self) -> None:
+        """How well the clocks are known, at the worst moment so far, into the metadata."""
+        now = [side.clocks.sigma for side in self._sides]
+        if any(sigma > side.sigma for side, sigma in zip(self._sides, now, strict=True)):
+            for side, sigma in zip(self._sides, now, strict=True):
+                side.sigma = max(side.sigma, sigma)
+            skews = {c.name: Skew(s.name, s.sigma) for s in self._sides for c in s.track.channels}
+            # The prefix is added where the metadata goes into the recording.
+            self._metadata[KEY.removeprefix("device_")] = to_text(skews)
 
     def listen(self) -> None:
         """Take the main device's pairs of times."""

@@ -2,7 +2,8 @@
 
 There is no loop in a board, so there is none here: v = u. Three things end the output, each by
 itself: the gate's zero(), a look every 2 ms at deadman, angle and the play-out (with this program
-alive), and the board's watchdog or an interlock (with it dead or hung).
+alive), and the board's watchdog or an interlock (with it dead or hung, or a null that the board
+does not take).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from drivers.ni_daq.settings import NiSettings, Output
-from drivers.ni_daq.watchdog import Watchdog
+from drivers.ni_daq.watchdog import SquareWave, Watchdog
 from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import ActuatorSpec
 from samii_rig.run.protocols import CommandBlock, DeviceLoop
@@ -57,6 +58,7 @@ class AnalogueOutput:
         self._told: dict[int, tuple[float, float, bool]] = {}
         self.acquired: Callable[[], int] = lambda: 0
         self.watchdog: Watchdog | None = None
+        self._wave: SquareWave | None = None
         if o.watchdog:
             # An expired one of an earlier program would refuse everything.
             ni.system.Device(o.watchdog).reset_device()
@@ -65,6 +67,12 @@ class AnalogueOutput:
             raise DeviceError(self.trouble)
         if o.watchdog and spec.deadman is not None:
             self.watchdog = Watchdog(ni, o.watchdog, settings.at(o.channel), o.null, spec.deadman)
+        if o.interlock:
+            try:
+                self._wave = SquareWave(ni, settings.at(o.interlock.line))
+            except BaseException:
+                self.close()
+                raise
 
     @property
     def trouble(self) -> str:
@@ -87,6 +95,8 @@ class AnalogueOutput:
             if self._live:
                 raise DeviceError(f"{self.name}: the output is live")
             self._rest(dead=False)
+            if self._not_null:
+                raise DeviceError(self._not_null)
             try:
                 self._start()
             except Exception as error:
@@ -111,6 +121,8 @@ class AnalogueOutput:
             try:
                 if self.watchdog is not None:
                     self.watchdog.feed()
+                if self._wave is not None:
+                    self._wave.edge()
                 self._live, self._fed = True, time.monotonic()
                 self._fill(block.first)
                 self._play(u[late:], ref[late:])
@@ -119,7 +131,8 @@ class AnalogueOutput:
                 raise DeviceError(f"{self._s.board}: the output has ended: {error}") from error
 
     def zero(self) -> None:
-        """Output at null, nothing queued. What the board does not take, its watchdog ends."""
+        """Output at null, nothing queued. What the board does not take, its watchdog or the
+        interlock ends."""
         taken = self._lock.acquire(timeout=TAKEN)
         try:
             self._rest(dead=False)
@@ -132,6 +145,8 @@ class AnalogueOutput:
         self.zero()
         if self.watchdog is not None and not self._not_null:
             self.watchdog.close()
+        if self._wave is not None:
+            self._wave.close()
 
     # For the reader of the inputs
 
@@ -237,7 +252,8 @@ class AnalogueOutput:
             self._told = {n: row for n, row in self._told.items() if n < taken}
 
     def _null(self) -> None:
-        """One sample of null, on demand; unless it is taken the watchdog is left to expire."""
+        """One sample of null, on demand; unless it is taken the watchdog is left to expire. The
+        interlock opens in any case."""
         o, task = self._o, None
         try:
             task = self._ni.Task()
@@ -258,9 +274,12 @@ class AnalogueOutput:
 
 def describe(o: Output, deadman: float | None) -> dict[str, str]:
     """What ends the output when this program is dead, for the recording."""
+    lock, told = o.interlock, {}
     if o.watchdog:
-        return {"watchdog": f"{o.watchdog}, {deadman:g} s"}
-    return {"interlock": f"{o.interlock.name}: {o.interlock.reason}"} if o.interlock else {}
+        told["watchdog"] = f"{o.watchdog}, {deadman:g} s"
+    if lock:
+        told["interlock"] = f"{lock.name} at {lock.line}: {lock.reason}"
+    return told
 
 
 def _closed(task: Any) -> None:

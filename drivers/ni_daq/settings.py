@@ -32,10 +32,12 @@ class Encoder(Strict):
 
 
 class Interlock(Strict):
-    """What takes the valve's power away within the actuator's `deadman` when this program dies,
-    and why that is known: the word of the person who writes it."""
+    """What takes the valve's power away within the actuator's `deadman` of the last edge at a
+    digital output such as port0/line0, and why that is known: the word of the person who writes
+    it."""
 
     name: str = Field(min_length=1)
+    line: str = Field(min_length=1)
     reason: str = Field(min_length=1)
 
 
@@ -74,8 +76,9 @@ class NiSettings(Strict):
     latency: Positive = 0.005
 
     def at(self, channel: str) -> str:
-        """The whole name of a channel."""
-        return channel if "/" in channel else f"{self.board}/{channel}"
+        """The whole name of a channel, or of a line such as port0/line0."""
+        own = channel.startswith("port") or "/" not in channel
+        return f"{self.board}/{channel}" if own else channel
 
     def rate(self, rig: Rig) -> float:
         """Samples per second."""

@@ -1,4 +1,5 @@
-"""The watchdog timer of the board: it puts the output to null when nobody resets it."""
+"""What ends the output when this program does not: the board's watchdog timer, or a square wave
+that keeps an interlock closed."""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import threading
 from typing import Any
 
 OFTEN = 5  # resets in its time, while the output rests
+WAIT = 0.02  # s that an edge may wait to be written
 
 
 class Watchdog:
@@ -60,3 +62,28 @@ class Watchdog:
                 self._task.reset_timer()
         except Exception as error:
             self.trouble = f"watchdog: {' '.join(str(error).split())}"
+
+
+class SquareWave:
+    """A digital output whose edges keep an interlock closed. Each is made by a call of the gate's,
+    so that whatever keeps those away opens it."""
+
+    def __init__(self, ni: Any, line: str) -> None:
+        self._level = False
+        self._task = ni.Task()
+        try:
+            self._task.do_channels.add_do_chan(line)
+            self._task.write(self._level, auto_start=True, timeout=WAIT)
+        except BaseException:
+            self._task.close()
+            raise
+
+    def edge(self) -> None:
+        """What NI-DAQmx says when it refuses one."""
+        self._level = not self._level
+        self._task.write(self._level, auto_start=True, timeout=WAIT)
+
+    def close(self) -> None:
+        """May be called twice."""
+        with contextlib.suppress(Exception):
+            self._task.close()

@@ -12,17 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.sensing import taken
+from drivers.serial_node.continuity import Continuity
 from drivers.serial_node.link import KEPT, Link
 from drivers.serial_node.settings import Input, SerialSettings, check_node, read_settings
 from drivers.serial_node.wire import (
     HALF,
     MAX_STREAM,
-    WORD,
     Code,
     Event,
     Flag,
     Hello,
-    Samples,
     State,
     Type,
     configure_body,
@@ -38,9 +37,6 @@ from samii_rig.types import Channel, Flags, Int, Quality, SampleBlock
 Q16 = 1 << 16
 MOST32 = HALF - 1
 RAILS = (-(1 << 15), (1 << 15) - 1)  # where an ADC is out of its range
-# How far the node's clock may be from its own sample count before one of them was reset.
-CLOCK_SLACK = 2.0  # samples
-CLOCK_DRIFT = 0.01  # of the time between two frames
 TELL_EVERY = 0.25  # s between two events that count the line's faults
 TRIPPED = "the node had tripped while no program was there"
 REFUSALS = {
@@ -79,14 +75,8 @@ class SerialNode:
                 ("adc", "<i2", (hello.n_adc,)),
             ]
         )
-        self._sample = -1  # of the newest frame's first, counted on past 32 bits
-        self._clock = 0  # us, its time, likewise
-        self._state = hello.state
-        self._rejected: int | None = None
-        self._bad = 0
-        self._trouble = ""
-        self._history: deque[tuple[float, int]] = deque([(time.monotonic(), 0)])
-        self._told: dict[str, int] = {}
+        self._line = Continuity(link, hello.period_ns, settings.max_bad_frames)
+        self._told: dict[str, str | int | float] = {}
         self._tell_at = 0.0
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=KEPT)
         # The way back is at most the whole round.
@@ -166,15 +156,14 @@ class SerialNode:
     def read(self) -> SampleBlock:
         """All samples since the last call. DeviceError, after the last one that came, when the
         port is gone, the node has rebooted or its clock jumped, or too many frames are bad."""
-        if self._trouble:
-            raise DeviceError(self._trouble)
+        if self._line.trouble:
+            raise DeviceError(self._line.trouble)
         trouble = self._link.trouble
         came = [self._link.samples.popleft() for _ in range(len(self._link.samples))]
         frames = [frame for _, frame in came]
         if not frames and trouble:
             raise DeviceError(trouble)
-        self._count_bad(frames)
-        starts = self._unwrapped(frames)
+        starts = self._line.take(frames)
         frames = frames[: len(starts)]
         raw = np.frombuffer(b"".join(f.data for f in frames), dtype=self._layout)
         period = self._hello.period_ns
@@ -214,84 +203,28 @@ class SerialNode:
     def events(self) -> list[DeviceEvent]:
         """Changes of the node's state, and the counts of the line when they changed."""
         node = [self._link.events.popleft() for _ in range(len(self._link.events))]
-        told = [DeviceEvent(self._time_of(e), "node", _change(e)) for e in node]
-        bad = self._bad_counts()
-        if bad != self._told and (time.monotonic() >= self._tell_at or self._trouble):
+        told = [DeviceEvent(self._line.time_of(e), "node", _change(e)) for e in node]
+        bad = self._line.bad()
+        if bad != self._told and (time.monotonic() >= self._tell_at or self._line.trouble):
             self._told, self._tell_at = bad, time.monotonic() + TELL_EVERY
-            told.append(DeviceEvent(self._clock * 1000, "line", dict(bad)))
+            told.append(DeviceEvent(self._line.clock, "line", bad))
         return told
-
-    def _time_of(self, event: Event) -> int:
-        """ns on the node's clock; the newest sample's before there is any."""
-        ahead = (event.sample - self._sample + HALF) % WORD - HALF
-        return max(0, self._clock * 1000 + ahead * self._hello.period_ns)
 
     @property
     def counts(self) -> dict[str, str]:
         """How the line did so far, as text."""
-        bad = {name: str(n) for name, n in self._bad_counts().items()}
+        bad = {name: str(n) for name, n in self._line.bad().items()}
         return {
             "frames": str(self._link.decoder.frames),
             **bad,
             "node_last_reason": self._link.last_reason(),
         }
 
-    def _bad_counts(self) -> dict[str, int]:
-        d = self._link.decoder
-        return {
-            "frames_lost": d.lost,
-            "frames_corrupt": d.corrupt,
-            "frames_stale": d.stale,
-            "frames_refused_by_node": self._bad,
-            "streams_refused_by_node": self._link.refused,
-        }
-
-    def _unwrapped(self, frames: list[Samples]) -> list[tuple[int, int]]:
-        """Sample number and clock (us) of each frame, without their wraps at 2^32, up to where
-        the clock jumps against the count."""
-        starts: list[tuple[int, int]] = []
-        period = self._hello.period_ns / 1000
-        for f in frames:
-            if self._sample < 0:
-                self._sample, self._clock = f.first, f.clock_us
-            else:
-                ahead = (f.first - self._sample) % WORD
-                expected = self._clock + round(ahead * period)
-                off = (f.clock_us - expected + HALF) % WORD - HALF
-                if not 0 < ahead < HALF or abs(off) > period * (CLOCK_SLACK + CLOCK_DRIFT * ahead):
-                    self._trouble = (
-                        f"{self._link.name}: the node's clock jumped by {off * 1e-6:.3g} s against "
-                        f"its count of samples, at sample {f.first}"
-                    )
-                    break
-                self._sample, self._clock = self._sample + ahead, expected + off
-            starts.append((self._sample, self._clock))
-        return starts
-
-    def _count_bad(self, frames: list[Samples]) -> None:
-        """Notice when a second had more bad frames, of both ways, than are allowed."""
-        for f in frames:
-            before = f.rejected if self._rejected is None else self._rejected
-            self._bad += (f.rejected - before) % (1 << 16)
-            self._rejected = f.rejected
-        d, now = self._link.decoder, time.monotonic()
-        total = d.lost + d.stale + self._bad
-        self._history.append((now, total))
-        while self._history[0][0] < now - 1.0:
-            self._history.popleft()
-        bad = total - self._history[0][1]
-        if bad > self._settings.max_bad_frames:
-            self._trouble = (
-                f"{self._link.name}: {bad} frames lost or damaged within a second; allowed "
-                f"{self._settings.max_bad_frames:g} (device.settings.max_bad_frames); check cable "
-                "and shield"
-            )
-
     def _check_supply(self, flags: Flags) -> None:
         """The line is on while the output is live, and off at null."""
         live, on = (flags & Flag.NULL) == 0, (flags & Flag.SUPPLY) != 0
         if (live != on).any():
-            self._trouble = (
+            self._line.trouble = (
                 f"{self._link.name}: the node's supply line was not on while its output was live; "
                 "does its firmware have one (device.settings.supply)?"
             )

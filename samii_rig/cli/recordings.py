@@ -8,27 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from samii_rig.cli.common import JsonOption, say_json
+from samii_rig.index.query import Query, each_by_name
 
 if TYPE_CHECKING:
     from samii_rig.index.entry import Entry
 
 
+@each_by_name(lambda _, said: typer.Option(help=said))
 def recordings(
     folder: Annotated[Path, typer.Argument(help="Folder of recordings.")] = Path("runs"),
-    rig: Annotated[str, typer.Option(help="Name of the rig, as its file says.")] = "",
-    experiment: Annotated[str, typer.Option(help="Name of the experiment.")] = "",
-    operator: Annotated[str, typer.Option(help="Who stood at the rig.")] = "",
-    since: Annotated[str, typer.Option(help="First day or time, such as 2026-11-01.")] = "",
-    until: Annotated[str, typer.Option(help="Last day or time.")] = "",
-    status: Annotated[
-        str, typer.Option(help="completed, stopped, tripped, failed, unfinished or unreadable.")
-    ] = "",
-    verdict: Annotated[
-        str, typer.Option(help="Of the diagnosis: no_mismatch, named, ambiguous or unknown.")
-    ] = "",
-    tag: Annotated[str, typer.Option(help="A tag.")] = "",
-    text: Annotated[str, typer.Option(help="Words in name, tags, notes, reason.")] = "",
-    limit: Annotated[int, typer.Option(help="How many are shown.")] = 50,
+    *,
+    query: Query,
     json: JsonOption = False,
 ) -> None:
     """Find recordings in a folder, newest first.
@@ -42,21 +32,8 @@ def recordings(
 
     from rich.console import Console
 
-    from samii_rig.index.query import Query
     from samii_rig.index.store import Index
 
-    query = Query(
-        rig=rig,
-        experiment=experiment,
-        operator=operator,
-        status=status,
-        verdict=verdict,
-        tag=tag,
-        since=since,
-        until=until,
-        text=text,
-        limit=limit,
-    )
     query.where()  # a wrong time is said before a large folder is read
     query.page()
     index = Index(folder)

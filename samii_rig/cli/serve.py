@@ -47,6 +47,13 @@ def serve(
             max=65535,
         ),
     ] = None,
+    foxglove_open: Annotated[
+        bool,
+        typer.Option(
+            "--foxglove-open",
+            help="With --tokens: who reaches the port of --foxglove may look without one.",
+        ),
+    ] = False,
     new_token: Annotated[
         str | None,
         typer.Option("--new-token", help="Add a token for this person to --tokens, show it, end."),
@@ -96,5 +103,6 @@ def serve(
             names=tuple(name or ()),
             pace=pace,
             foxglove=foxglove,
+            foxglove_open=foxglove_open,
         )
     )

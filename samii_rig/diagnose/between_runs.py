@@ -7,19 +7,23 @@ in common; the one that explains most of what is left is the place.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from samii_rig.diagnose.measured import Measured, binned
+from samii_rig.diagnose.model import Model
+from samii_rig.diagnose.ranking import moved
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.search import Search
 from samii_rig.errors import SamiiRigError
+from samii_rig.rig.schema import Parameter, parameters
 from samii_rig.types import Float
 
 STIFFNESS = "k"  # symbol of the parameters that may change
 WIDTH = 0.5  # of the logarithm of a stiffness, before the data, from one series to the next
 LARGEST = 3.0  # of that logarithm
+KNOWN = 1e-4  # relative, of a stiffness for which the rig file has no tolerance
 BINS = 100  # of each series
 ROUNDS = 4  # of Gauss and Newton
 MOSTLY = 0.5  # of what one stiffness for all leaves over the noise, that must be explained
@@ -55,6 +59,7 @@ class Changing:
 def between_runs(search: Search, base: Fitted, decide: Measured) -> Changing | None:
     """The joint whose stiffness changes between the series of runs that were fitted and those that
     `decide`; None where that is not most of what `base` leaves."""
+    base = _every_joint(search, base)
     series = _series(search, base, decide)
     joints = [i for i, (_, symbol) in enumerate(base.model.keys) if symbol == STIFFNESS]
     if len(series) < 2 or not joints:
@@ -82,6 +87,24 @@ def between_runs(search: Search, base: Fitted, decide: Measured) -> Changing | N
         change=np.expm1(apart @ change),
         sd=np.sqrt(np.diag(apart @ cov @ apart)),
     )
+
+
+def _every_joint(search: Search, base: Fitted) -> Fitted:
+    """The same with every stiffness among the model's parameters, also one without a tolerance: it
+    is known, but need not stay."""
+
+    def loose(p: Parameter) -> Parameter:
+        known = p.tolerance > 0 or p.value == 0
+        return p if known else p.model_copy(update={"tolerance": KNOWN})
+
+    elements = tuple(
+        e.model_copy(update={STIFFNESS: loose(parameters(e)[STIFFNESS])})
+        if STIFFNESS in parameters(e)
+        else e
+        for e in search.rig.element
+    )
+    model = Model(search.rig.model_copy(update={"element": elements}), base.model.effects)
+    return replace(base, model=model, x=moved(base.model, base.x, model))
 
 
 def _series(search: Search, base: Fitted, decide: Measured) -> list[tuple[int, Problem]]:

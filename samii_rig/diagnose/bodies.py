@@ -23,6 +23,7 @@ from samii_rig.rig.schema import (
 from samii_rig.types import Float
 
 COMPLIANCES = (1e-4, 0.01, 1.0)  # of a line's oil over the chain's own, at which a search starts
+DAMPED = (1e-7, 1e3)  # loss angle of a joint's spring with a damper, from invisible to gross
 
 
 def effects(rig: Rig, where: Places) -> Iterator[Effect]:
@@ -50,11 +51,11 @@ def _joint_dampers(rig: Rig, where: Places) -> Iterator[Effect]:
         def values(x: Float, nominal: Values, key: Key = key) -> dict[Key, float]:
             return {key: nominal[key] + float(x[0])}
 
-        bounds = 1e-4 * scale, 1e3 * scale
+        bounds = DAMPED[0] * scale, DAMPED[1] * scale
         yield Effect(
             physics="viscous_damping",
             site=e.name,
-            unknowns=(Unknown("c", e.c.unit, *bounds, spread(*bounds, 8)),),
+            unknowns=(Unknown("c", e.c.unit, *bounds, spread(*bounds, 11)),),
             parameters=values,
             touches=(key,),
             jump=Jump(f"beside {e.name}", lambda s, x: np.asarray(s * x[:, :1])),

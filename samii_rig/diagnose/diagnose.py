@@ -27,6 +27,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
 
 ALTERNATIVES = 6
+DIFFER = 1.5  # chi-square per degree of freedom of levels against each other
 TWIN_POINTS = 40
 
 Progress = Callable[[str], None]
@@ -73,16 +74,20 @@ def diagnose(
     first = search.ratio(nominal)
     bands = verdict.bands(search, nominal)
     progress("what is missing")
-    search.run()
+    # Linear effects bend towards what no linear rig does: a force comes first where levels differ.
+    gross = seen.differing() > DIFFER
+    search.run(briefly=gross)
     progress("amplitude levels")
-    compete(search, sound, runs)
+    if compete(search, sound, runs) is None and gross:
+        search.run()
     progress("what cannot be told apart")
     judged = verdict.judge(search, decide)
     nominal = search.nominal.fitted
     best = judged.best
     gap = verdict.gap(search, show, nominal, best.fitted)
+    due = verdict.due_there(search, show, nominal, best.fitted)
     holds, said = settle(judged, search, sound, runs)
-    judged = verdict.shown(verdict.confirmed(judged) if holds else judged, gap)
+    judged = verdict.shown(verdict.confirmed(judged) if holds else judged, gap, due)
     if clean.doubt:
         judged = verdict.doubted(judged, clean.doubt.most)
     if len(set(whole.outputs)) == 1 and len(best.effects) > 1:

@@ -101,7 +101,9 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
 
     decide : lines that took no part in the fit, on which the best explanation must hold too.
     """
-    ranked = _decided(search, decide) if decide is not None else search.ranked()
+    thin = _thin(search)
+    kept = [e for e in search.ranked() if e.key not in thin]
+    ranked = _decided(search, decide, kept) if decide is not None else kept
     weights = np.array([e.weight for e in ranked])
     p = np.exp(weights - np.max(weights))
     grouped = classes(ranked, (p / p.sum()).tolist(), search.problem, search.temperature)
@@ -211,19 +213,38 @@ def doubted(judged: Judgement, most: Verdict) -> Judgement:
     return replace(judged, verdict=most) if judged.verdict in SAID else judged
 
 
-def shown(judged: Judgement, gap: Gap) -> Judgement:
+def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
     """The same, but nothing is named that makes data worse which it was not fitted to: beyond what
-    chance does, or at all if it is so large that it must show."""
-    worse = gap.high < 0 or (gap.value < 0 and judged.evidence.drop > MUST_SHOW)
+    chance does, or at all if it is so large that it must show, there too. due : of `due_there`."""
+    must = judged.evidence.drop > MUST_SHOW and due > IN_DATA
+    worse = gap.high < 0 or (gap.value < 0 and must)
     if judged.verdict in SAID and worse:
         return replace(judged, verdict="unknown")
     return judged
 
 
-def _decided(search: Search, lines: Measured) -> list[Explanation]:
-    """The explanations that may still compete, and that nothing is missing, weighed anew by how
-    likely each makes lines that were not fitted; the most probable first."""
+def _thin(search: Search) -> set[frozenset[str]]:
+    """Explanations of linear effects of which one, beside the others, is not in the data: it spares
+    the nominal parameters values that their tolerances make unlikely, and no more."""
     ranked = search.ranked()
+    near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
+    out = set()
+    while near:
+        e = near.pop()
+        if len(e.effects) < 2 or e.key in out or any(x.quasi is not None for x in e.effects):
+            continue
+        for i in range(len(e.effects)):
+            less = search.without(e, i)
+            gained = less.fitted.chi2 - e.fitted.chi2 if less is not None else math.inf
+            if less is not None and gained < IN_DATA * search.temperature:
+                out.add(e.key)
+                near.append(less)
+    return out
+
+
+def _decided(search: Search, lines: Measured, ranked: list[Explanation]) -> list[Explanation]:
+    """Those of `ranked` that may still compete, and that nothing is missing, weighed anew by how
+    likely each makes lines that were not fitted; the most probable first."""
     rivals = [e for e in ranked if e.weight > ranked[0].weight - NEAR or not e.effects]
     predicted = {e.key: _predicted(search, lines, e.fitted) for e in rivals}
     gross, _ = predicted[search.nominal.key]
@@ -413,3 +434,11 @@ def gap(search: Search, show: Measured, before: Fitted, after: Fitted) -> Gap:
     drawn = num / np.where(np.abs(den) > 0, np.abs(den), np.inf)
     low, high = np.quantile(drawn, [0.05, 0.95])
     return Gap(float(value), float(low), float(high))
+
+
+def due_there(search: Search, show: Measured, before: Fitted, after: Fitted) -> float:
+    """Chi-square that `after`, if true, should explain of other lines: they may lie where the two
+    are alike."""
+    at = search.grid.at(show.frequency, show.level)
+    predicted = replace(show, H=after.model.response(after.x, at))
+    return float(np.sum(predicted.chi_square(before.model.response(before.x, at))))

@@ -7,6 +7,7 @@ ratio of truth to model is smooth; where it is not, the bin is split (`binned`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -78,6 +79,21 @@ class Measured:
             np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.conj().swapaxes(1, 2)
         )
 
+    def differing(self) -> float:
+        """Chi-square per degree of freedom of the levels against each other, line by line; nan
+        where no line was measured at two of them."""
+        f, which = np.unique(self.frequency, return_inverse=True)
+        A = np.zeros((f.size, *self.W.shape[1:]), complex)
+        b = np.zeros((f.size, self.W.shape[1]), complex)
+        np.add.at(A, which, self.W)
+        np.add.at(b, which, np.einsum("nij,nj->ni", self.W, self.H))
+        common = np.einsum("gij,gj->gi", np.linalg.pinv(A, rcond=1e-12, hermitian=True), b)
+        times = np.bincount(which)[which]
+        several = times > 1
+        mean = float(np.sum((self.expected * (1 - 1 / times))[several]))
+        left = float(np.sum(self.chi_square(common[which])[several]))
+        return left / mean if mean > 0 else math.nan
+
     def take(self, mask: NDArray[np.bool_]) -> Measured:
         """Some of the lines."""
         return replace(
@@ -95,8 +111,8 @@ class Measured:
 
         Transients (bursts) are fitted. Of a periodic excitation the middle level shows and the
         others decide whether what was fitted holds; of less than three levels, lines in turn.
-        Where there is but one kind of excitation, one line in five of it shows, and nothing but
-        the fit decides.
+        Where there is but one kind of excitation, one line in five of it shows, at least one,
+        and nothing but the fit decides.
         """
         turn = np.zeros(self.n, dtype=np.int64)
         for level in np.unique(self.level):
@@ -106,13 +122,14 @@ class Measured:
         if repeats.any() and not repeats.all():
             own = sorted(np.unique(self.level[repeats]), key=lambda k: self.levels[k][0])
             middle = own[len(own) // 2]
-            decides = self.level != middle if len(own) > 2 else turn % 2 == 0
-            return (
-                self.take(~repeats),
-                self.take(repeats & decides),
-                self.take(repeats & ~decides),
-            )
+            decides = repeats & (self.level != middle if len(own) > 2 else turn % 2 == 0)
+            shown = repeats & ~decides
+            if shown.any():
+                return self.take(~repeats), self.take(decides), self.take(shown)
+            return self.take(~repeats), None, self.take(repeats)
         shown = turn % TURN == SHOW
+        if not shown.any():  # a few frequencies, one by one
+            shown = np.arange(self.n) == self.n // 2
         return self.take(~shown), None, self.take(shown)
 
     def chi_square(self, h: Complex) -> Float:

@@ -18,12 +18,13 @@ from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.nonlinear_apart import Apart
 from samii_rig.diagnose.nonlinear_confirm import seen
+from samii_rig.diagnose.nonlinear_consistent import self_consistent
 from samii_rig.diagnose.nonlinear_driven import drives
 from samii_rig.diagnose.nonlinear_forces import forces
 from samii_rig.diagnose.nonlinear_levels import LevelGrid, level_grid
 from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.diagnose.nonlinear_screen import Bins, Promise
-from samii_rig.diagnose.refit import Fitted, Problem, refit
+from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.search import MIXED, NEAR, WORTH, Explanation, Search
 from samii_rig.types import FrequencyResponse, Recording
 
@@ -41,8 +42,8 @@ TRIED = 4  # physics of which a force is refitted beside each base
 ALARM, BETWEEN = 14.0, 8.0  # of chi-square, and of that between levels, that a force must gain
 SHARE, MORE = 0.3, 3.0  # of what it should gain between levels, that it does
 AGAIN, MOVED = 4, 0.5  # times that a force is computed anew at most; a move that is small
+REACH = 0.5  # of what the best explanation gains, that a rival may lose and still be computed
 RIVALS, REFITTED = 4, 8  # forces that are computed each time, and explanations refitted
-ON_LINES = 2  # times that they are computed anew on the lines themselves
 LAW = 0.01  # of a strength: what it was off by where it is hidden in strong forces
 GROWN = 3  # linear effects that are refitted beside a force
 ONE_LEVEL = (
@@ -86,7 +87,8 @@ def compete(
     if any(_heard(p) for _, found in promised for p in found):
         search.found = {}
         for e in kept:
-            search._keep(e.effects, refit(e.fitted.model, search.problem, e.fitted.x, far=False))
+            if (end := search._refit(e.effects, e, far=False)) is not None:
+                search._keep(e.effects, end)
         _force(search, promised)
         search.temper()
         forced = _settled(levels, before[2])
@@ -168,7 +170,7 @@ def _again(levels: Apart) -> None:
         if not isinstance(best.fitted.model, LevelModel):
             return
         far = math.inf if turn == 0 else NEAR
-        rivals = _computed(levels)
+        rivals = _computed(levels, math.inf if turn == 0 else REACH)
         levels.renew(best)
         ranked = search.ranked()
         bare = (e for e in ranked if len(e.effects) == 1 and _force_in(e) is not None)
@@ -182,12 +184,15 @@ def _again(levels: Apart) -> None:
             return
 
 
-def _computed(levels: Apart) -> list[Explanation]:
-    """The best explanation with each of the leading forces, computed where it was found."""
+def _computed(levels: Apart, reach: float) -> list[Explanation]:
+    """The best explanation with each of the leading forces, computed where it was found; of those
+    that lose less than `reach` of what the best gains."""
     search = levels.search
+    ranked = search.ranked()
+    least = ranked[0].weight - reach * max(ranked[0].weight - search.nominal.weight, NEAR)
     first: dict[Quasi, tuple[Explanation, LevelModel]] = {}
-    for e in search.ranked():
-        if isinstance(model := e.fitted.model, LevelModel):
+    for e in ranked:
+        if isinstance(model := e.fitted.model, LevelModel) and e.weight >= least:
             first.setdefault(model.quasi, (e, model))
     rivals = list(first.values())[:RIVALS]
     for e, model in rivals:
@@ -208,13 +213,20 @@ def _on_lines(levels: Apart) -> None:
     """Refit the leading explanations on the lines themselves: bins about one force lose what
     another adds, as that is no smooth curve."""
     search = levels.search
-    for _ in range(ON_LINES):
-        rivals = _computed(levels)
-        search.problem = Problem.of(search.lines, levels.grid)
-        ranked = search.ranked()
-        near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
-        _only(search, [*near[:RIVALS], *rivals, search.nominal])
+    ranked = search.ranked()
+    rivals = _computed(levels, REACH)
+    bare = next((e for e in ranked if len(e.effects) == 1 and _force_in(e) is not None), ranked[0])
+    leading = {e.key: e for e in (bare, ranked[0])}
+    ends = {key: self_consistent(e.fitted, levels.on_lines) for key, e in leading.items()}
+    near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
+    search.problem = Problem.of(search.lines, levels.grid)
+    _only(search, [*near[:RIVALS], *rivals, search.nominal])
+    for key, e in leading.items():
+        search._keep(e.effects, ends[key])
     search.temper()
+    best = search.ranked()[0].fitted
+    if isinstance(best.model, LevelModel):
+        search.problem = levels.on_lines(best.model, best.x)
 
 
 def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:
@@ -232,8 +244,8 @@ def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:
     added = model.response(x, whole.at) - plain.response(known, whole.at)
     search.problem = replace(whole, data=replace(whole.data, H=whole.data.H - added))
     search.table = table
-    rest = refit(plain, search.problem, known, far=False, steps=2)
-    screened = search.screen(Explanation(linear, rest, 0.0))
+    rest = search._from(linear, known, steps=2, far=False)
+    screened = search.screen(Explanation(linear, rest, 0.0)) if rest is not None else []
     search.problem, search.table = whole, every
     for drop, effect, starts in screened[:GROWN]:
         effects = (*base.effects, effect)

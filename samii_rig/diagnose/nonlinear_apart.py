@@ -89,12 +89,7 @@ class Apart:
             at(promise.starts[0])
         elif self.given:
             top = top_of(model, self.given)
-            cut = CUTS[0] * top
-            for x in CUTS[1:]:
-                # What is cut off too much is worse than nothing.
-                if at(top - x * top) < min(at(top - cut), 0.0):
-                    break
-                cut = max((cut, x * top), key=lambda x: at(top - x))
+            cut = max((x * top for x in CUTS), key=lambda x: at(top - x))
             for nearer in NEARER if at(top - cut) > HINT else ():
                 cut = max((cut, cut / nearer, cut * nearer), key=lambda x: at(top - x))
         if not tried:
@@ -118,6 +113,11 @@ class Apart:
         self.problem = self.bins.better(self.problem, quasi, Extra(extra, p, top))
         self.search.problem, self.search.grid = self.problem, self.grid
         return True
+
+    def on_lines(self, model: LevelModel, x: Float) -> Problem:
+        """The lines themselves, with the model's force computed in time at x."""
+        self.compute(model, x, model.strength(x)[0])
+        return Problem.of(self.search.lines, self.grid)
 
     def renew(self, best: Explanation) -> None:
         """Bins anew about an explanation with a force: as that is no smooth curve in time, only

@@ -67,7 +67,7 @@ def seen(
     rig = model.rig
     names = (rig.actuator[int(lines.actuator[0])].name, *lines.outputs)
     kept = periods(rig, lines, responses, runs, names)
-    given = {k: blocks[:, :, 0].mean(axis=0) for k, blocks in kept.items()}
+    given = {k: blocks[:, :, 0] for k, blocks in kept.items()}
     found = forced(model, x, given, model.strength(x)[0])
     if not found:
         return None

@@ -31,11 +31,11 @@ Drives = Mapping[int, Float]
 def drives(
     rig: Rig, lines: Measured, responses: Sequence[FrequencyResponse], runs: Sequence[Recording]
 ) -> Drives:
-    """(n,) one period of the command of each level whose input repeats itself, by its index in
-    `lines.levels`; the mean of its periods but for the first."""
+    """(n_period, n) the command of each level whose input repeats itself, by its index in
+    `lines.levels`; its periods but for the first."""
     name = rig.actuator[int(lines.actuator[0])].name
     found = periods(rig, lines, responses, runs, (name,))
-    return {k: blocks[:, :, 0].mean(axis=0) for k, blocks in found.items()}
+    return {k: blocks[:, :, 0] for k, blocks in found.items()}
 
 
 def periods(
@@ -113,14 +113,17 @@ def forced(model: LevelModel, x: Float, given: Drives, p: float) -> list[Driven]
         except SamiiRigError:
             return None
     out = []
-    for k, v in given.items():
+    for k, blocks in given.items():
+        v = blocks.mean(axis=0)
         bins = np.arange(1, v.size // 2, dtype=np.int64)
         f = np.asarray(bins * rate / v.size)
         if inner is not None:
             E = inner.lines(v, bins, p)
         else:
             assert quasi.law is not None
-            e = quasi.sign * model.strength(x)[1] * quasi.law.force(v, p)
+            # A converter's steps differ from period to period, and so does what a gap of a few
+            # of them takes away.
+            e = quasi.sign * model.strength(x)[1] * quasi.law.force(blocks, p).mean(axis=0)
             E = np.fft.rfft(e)[bins] * hold_response(f, rate, model.rig.actuator[0].delay)
         out.append(Driven(k, bins, f, np.fft.rfft(v)[bins], E))
     return out

@@ -1,8 +1,9 @@
 """A law of its own: whether one part at one joint, in no table, does what several do together.
 
-Two compliances in a row, or one and an oscillator, can pass for a joint whose damping goes with a
-power of frequency. Such a part acts through one number as others do, x(s) = a (s/w)^b beside the
-joint's spring, so it is tried at every joint by the same screen (`moebius`).
+Two compliances in a row, one and an oscillator, or one that is all loss can pass for a joint whose
+damping goes with a power of frequency. Such a part acts through one number as others do,
+x(s) = a (s/w)^b beside the joint's spring, so it is tried at every joint by the same screen
+(`moebius`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from scipy import optimize
 from samii_rig.diagnose.effect import Effect, Unknown
 from samii_rig.diagnose.model import Model
 from samii_rig.diagnose.moebius import place_of
+from samii_rig.diagnose.ranking import moved
+from samii_rig.diagnose.refit import Fitted
 from samii_rig.diagnose.scales import spread
 from samii_rig.diagnose.screen import Screen
 from samii_rig.diagnose.search import Explanation, Search
@@ -29,7 +32,6 @@ UNKNOWNS = 2  # of that part
 TRIED = 2  # joints at which it is refitted
 ROUNDS, MORE_ROUNDS = 8, 40  # of their refits, and of the best
 SETTLED = 1e-4  # of chi-square, relative, gained by a round: less and it ends
-TOGETHER = 2  # effects from which their sum is doubted
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +57,11 @@ class OwnLaw:
 
 def own_law(search: Search, best: Explanation) -> OwnLaw | None:
     """The part that does by itself what the effects of `best`, linear ones, do; None if none does
-    or if it is but one effect."""
-    if len(best.effects) < TOGETHER:
+    or if they have fewer unknowns than it."""
+    more = sum(len(e.unknowns) for e in best.effects) - UNKNOWNS
+    if more < 0:
         return None
-    base = search.nominal.fitted
+    base = _around(search, best)
     look = Screen.of(search.problem, base)
     found = []
     for effect in search.table:
@@ -82,9 +85,17 @@ def own_law(search: Search, best: Explanation) -> OwnLaw | None:
         cost, y = _refitted(search, part, model, ends[at][1], MORE_ROUNDS)
     except (SamiiRigError, ValueError):  # on the way the rig's values become ones that no rig has
         return None
-    more = sum(len(e.unknowns) for e in best.effects) - UNKNOWNS
     gain = (best.fitted.cost - cost) / search.temperature + PRICE * more
     return OwnLaw(part.site, float(np.exp(y[-1])), gain) if gain > CLEAR else None
+
+
+def _around(search: Search, best: Explanation) -> Fitted:
+    """The nominal model where `best` left it: its own optimum is bent by what is missing."""
+    problem, model = search.problem, search.nominal.fitted.model
+    x = moved(best.fitted.model, best.fitted.x[: best.fitted.model.n_nominal], model)
+    h, dh = model.gradient(x, problem.at)
+    J, r = problem.whiten(dh), problem.residual(h)
+    return Fitted(model, x, float(r @ r), best.fitted.penalty, J, J.T @ J)
 
 
 def _refitted(

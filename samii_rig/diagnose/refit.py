@@ -234,9 +234,9 @@ def _logarithm(
 ) -> tuple[Float, Complex, Complex, float]:
     """A few steps on log(model/measurement); kept only if chi-square fell too."""
     d = problem.data.H
-    variance = 2 / np.maximum(np.diagonal(problem.data.W, axis1=1, axis2=2).real, 1e-300)
-    size = np.where(np.abs(d) > 0, np.abs(d), 1e-300)
-    weight = 1 / np.sqrt(LOG_FLOOR**2 + variance / size**2)
+    precision = np.diagonal(problem.data.W, axis1=1, axis2=2).real * np.abs(d) ** 2
+    # An entry that was not measured has none, and no weight.
+    weight = np.sqrt(precision / (LOG_FLOOR**2 * precision + 2))
     n = model.n_nominal
     best = (x, h, dh, cost)
     damping, current = 1e-2, math.inf

@@ -41,6 +41,7 @@ SECOND = 0.6  # of the best try's gain: less is no start of its own
 
 Start = tuple[float, ...]
 Found = tuple[float, list[Start]]
+Tried = tuple[float, Start, Float]  # chi-square, where, and what is left
 
 
 @dataclass(frozen=True)
@@ -181,6 +182,8 @@ class Screen:
                 gain = max(gain, self.base.cost - cost + more)
                 tried += moved
         tried.sort(key=lambda t: t[0])
+        if len(effect.unknowns) > 1:
+            tried.insert(0, self._descended(model, known, effect, tried[0]))
         starts = [tried[0][1]]
         other = next((t[1] for t in tried[1:OTHERS] if _apart(t[1], starts[0])), None)
         if other is not None:
@@ -193,7 +196,7 @@ class Screen:
     def _left(self, whole: Float) -> Float:
         return np.asarray(whole - self.directions @ (self.directions.T @ whole))
 
-    def _cost(self, model: Model, known: Float, start: Start) -> tuple[float, Start, Float] | None:
+    def _cost(self, model: Model, known: Float, start: Start) -> Tried | None:
         """Chi-square with the effect at `start`, and what is left."""
         try:
             h = model.response(np.append(known, np.log(start)), self.problem.at)
@@ -205,9 +208,37 @@ class Screen:
         left = self._left(np.concatenate([r, self.tail]))
         return float(left @ left), start, left
 
+    def _descended(self, model: Model, known: Float, effect: Effect, best: Tried) -> Tried:
+        """The best try after a few damped Gauss-Newton steps in all of the effect's unknowns."""
+        first = model.n - len(effect.unknowns)
+        low, high = np.log([(u.low, u.high) for u in effect.unknowns]).T
+        damping = 1e-2
+        for _ in range(ROUNDS):
+            cost, start, left = best
+            y = np.log(start)
+            try:
+                _, dh = model.gradient(np.append(known, y), self.problem.at)
+            except SamiiRigError:
+                break
+            slopes = self.problem.whiten(dh[:, :, first:])
+            J = self._left(np.concatenate([slopes, np.zeros((self.tail.size, y.size))]))
+            A = J.T @ J
+            A[np.diag_indices(y.size)] += damping * np.diag(A) + 1e-9 * np.max(np.diag(A)) + 1e-30
+            if not np.all(np.isfinite(A)):
+                break
+            step = np.clip(-np.linalg.solve(A, J.T @ left), -LONGEST, LONGEST)
+            new = self._cost(model, known, tuple(np.exp(np.clip(y + step, low, high)).tolist()))
+            if new is None or new[0] >= cost:
+                damping *= 30
+                continue
+            best, damping = new, damping * 0.1
+            if cost - new[0] < SETTLED:
+                break
+        return best
+
     def _stepped(
         self, model: Model, known: Float, effect: Effect, start: Start, left: Float
-    ) -> tuple[list[tuple[float, Start, Float]], float]:
+    ) -> tuple[list[Tried], float]:
         """Tries one step along the strength's derivative, and by how much it should help."""
         try:
             _, dh = model.gradient(np.append(known, np.log(start)), self.problem.at)

@@ -154,10 +154,13 @@ class Search:
         taken = float(np.trace(np.linalg.solve(fitted.precision(), fitted.information)))
         return (fitted.chi2 + found) / max(self.problem.expected + mean - taken, 1.0)
 
-    def run(self) -> list[Explanation]:
-        """Grow, swap, prune; all explanations, the most probable first."""
+    def run(self, *, briefly: bool = False) -> list[Explanation]:
+        """Grow, swap, prune; all explanations, the most probable first. briefly : single effects
+        alone."""
         self.grow(self.nominal, FIRST)
         self.temper()
+        if briefly:
+            return self.ranked()
         for turn in range(MOST - 1):
             before = self._nearest() if turn == 0 else self.ranked()[0]
             if not before.effects:
@@ -436,12 +439,14 @@ class Search:
         base: Explanation,
         more: Sequence[float] = (),
         give_up: float = math.inf,
+        *,
+        far: bool = True,
     ) -> Fitted | None:
         """From where `base` ended, and `more` logarithms of further unknowns."""
         model = self._model(effects)
         if model is None:
             return None
-        return self._from(effects, np.append(_moved(base, model), more), give_up)
+        return self._from(effects, np.append(_moved(base, model), more), give_up, far=far)
 
     def _from(
         self,
@@ -449,12 +454,15 @@ class Search:
         start: Float,
         give_up: float = math.inf,
         steps: int = STEPS,
+        *,
+        far: bool = True,
     ) -> Fitted | None:
-        """From a vector of the model with these effects, which the rig allows together."""
+        """From a vector of the model with these effects, which the rig allows together; None where
+        that is no rig, or no step can be computed."""
         model = self._model(effects)
         assert model is not None
         try:
-            return refit(model, self.problem, start, give_up=give_up, steps=steps)
+            return refit(model, self.problem, start, far=far, give_up=give_up, steps=steps)
         except (SamiiRigError, np.linalg.LinAlgError):
             return None
 

@@ -3,7 +3,8 @@
 The evidence of an explanation among those that were looked at says nothing of those that were not,
 nor of what the models of noise and force lack. How often an answer with such evidence is right was
 counted on concealed trials; a logistic regression on it (`prove.calibrate`) gives the probability
-that is stated. Its weights are data, in `calibration.toml`, with the trials that they come from.
+that is stated, but never more than the evidence leaves it among those that were looked at. The
+weights are data, in `calibration.toml`, with the trials that they come from.
 """
 
 from __future__ import annotations
@@ -85,5 +86,9 @@ def probability(evidence: Evidence, of: str = ANSWER) -> float:
     """That the explanation is right, up to its class; of `PLACE`, that one of its causes is where
     something is missing, whatever it is called."""
     w = weights(of)
-    score = sum(w[k] * x for k, x in evidence.features().items())
+    known = _logistic(sum(w[k] * x for k, x in evidence.features().items()))
+    return min(known, _logistic(evidence.odds)) if of == ANSWER else known
+
+
+def _logistic(score: float) -> float:
     return 1 / (1 + math.exp(-min(max(score, -30.0), 30.0)))

@@ -100,7 +100,7 @@ def _read(file: Path, entry: Entry) -> Entry:
         tail = read_tail(data)
         contents = read_contents(data, tail.summary_start, strict=True)
     run = check_format(contents)
-    notes = contents.one_map(layout.NOTES) or {}
+    notes = contents.notes()
     stop = contents.one_map(layout.STOP)
     channels: tuple[str, ...] = ()
     if contents.channel_id(layout.SAMPLES) is not None:

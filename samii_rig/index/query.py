@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
 from datetime import UTC, datetime
+from functools import wraps
+from inspect import Parameter, signature
+from typing import Annotated, Any
 
 from samii_rig.errors import InputError
 
 MOST = 1000  # entries in one answer
 _DAY = re.compile(r"\d{4}-\d\d-\d\d")
+
+
+def _asked(said: str, default: Any = "") -> Any:
+    """A field, with what it is in the words of a help."""
+    return field(default=default, metadata={"help": said})
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,17 +31,17 @@ class Query:
     text : words that all stand somewhere in name, rig, experiment, operator, reason, tags, notes.
     """
 
-    rig: str = ""
-    experiment: str = ""
-    operator: str = ""
-    status: str = ""
-    verdict: str = ""
-    tag: str = ""
-    since: str = ""
-    until: str = ""
-    text: str = ""
-    limit: int = 100
-    offset: int = 0
+    rig: str = _asked("Name of the rig, as its file says.")
+    experiment: str = _asked("Name of the experiment.")
+    operator: str = _asked("Who stood at the rig.")
+    status: str = _asked("completed, stopped, tripped, failed, unfinished or unreadable.")
+    verdict: str = _asked("Of the diagnosis: no_mismatch, named, ambiguous or unknown.")
+    tag: str = _asked("A tag.")
+    since: str = _asked("First day or time, such as 2026-11-01.")
+    until: str = _asked("Last day or time.")
+    text: str = _asked("Words in name, tags, notes, reason.")
+    limit: int = _asked("How many are shown.", 100)
+    offset: int = _asked("How many of the newest are passed over.", 0)
 
     def where(self) -> tuple[str, list[str]]:
         """The condition and its values; InputError for a time that is none."""
@@ -63,6 +72,38 @@ class Query:
         if not 0 <= self.offset < 2**31:
             raise InputError("search", "offset", self.offset, "0 or more")
         return self.limit, self.offset
+
+
+def each_by_name(metadata: Callable[[str, str], Any]) -> Callable[[Callable[..., Any]], Any]:
+    """Decorates a function of a `query` into one of its fields, each by its own name: for what
+    makes options of a signature, as typer and FastAPI do.
+
+    metadata : of a field's annotation, from its name and its help.
+    """
+    asked = [
+        Parameter(
+            f.name,
+            Parameter.KEYWORD_ONLY,
+            default=f.default,
+            annotation=Annotated[type(f.default), metadata(f.name, f.metadata["help"])],
+        )
+        for f in fields(Query)
+    ]
+
+    def decorated(function: Callable[..., Any]) -> Any:
+        @wraps(function)
+        def taken(*others: Any, **given: Any) -> Any:
+            query = Query(**{p.name: given.pop(p.name) for p in asked})
+            return function(*others, query=query, **given)
+
+        own = signature(function, eval_str=True).parameters.values()
+        all_ = [*(p for p in own if p.name != "query"), *asked]
+        all_.sort(key=lambda p: p.kind)
+        taken.__signature__ = signature(function).replace(parameters=all_)  # type: ignore[attr-defined]
+        taken.__annotations__ = {p.name: p.annotation for p in all_}
+        return taken
+
+    return decorated
 
 
 def moment(field: str, text: str, *, end: bool = False) -> str:

@@ -78,16 +78,14 @@ def size_of(
         told = len(bearers(set(said), [set(e.names) for e in every]))
         known = Sized(size, said=told, twins=tuple(sorted({site for _, site in twins})))
         search.grow(search.nominal, FIRST)
-        single = [e for e in search.found.values() if e.effects]
-        mine = [e for e in single if hidden & set(e.effects[0].names)]
-        if not mine:
+        if (own := _own(search, hidden)) is not None:
+            # Held against the effect as the model has it, not against the truth: what model and
+            # plant differ by anyhow is in every candidate's distance to that.
+            search.renew(own)
+            own = _own(search, hidden)
+        if own is None:
             return replace(known, said=0)
-        # Held against the effect as the model has it, not against the truth: what model and
-        # plant differ by anyhow is in every candidate's distance to that.
-        search.renew(min(mine, key=lambda e: e.fitted.cost))
         single = [e for e in search.found.values() if e.effects]
-        mine = [e for e in single if hidden & set(e.effects[0].names)]
-        own = min(mine, key=lambda e: e.fitted.cost)
         near = [e.effects[0] for e in single if e is own or apart(own, e, search.problem) < SAME]
         names = bearers({n for e in near for n in e.names}, [set(e.names) for e in near])
         sites = {near[i].site for i in names}
@@ -96,6 +94,12 @@ def size_of(
         search.grow(search.nominal, FIRST)
         search.renew(min(search.found.values(), key=lambda e: e.fitted.cost))
     return Sized(min(away(e) for e in search.found.values()))
+
+
+def _own(search: Search, hidden: Set[Name]) -> Explanation | None:
+    """The concealed effect as the model fits it best; None where no refit of it ended."""
+    mine = [e for e in search.found.values() if e.effects and hidden & set(e.effects[0].names)]
+    return min(mine, key=lambda e: e.fitted.cost, default=None)
 
 
 def bearers(names: Set[Name], effects: Sequence[Set[Name]]) -> list[int]:

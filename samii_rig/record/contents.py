@@ -71,6 +71,10 @@ class Contents:
         """All metadata records of this name that are ours, checked."""
         return [layout.unsealed(m, f"metadata {n}") for n, m in self.metadata if n == name]
 
+    def notes(self) -> dict[str, str]:
+        """The run's notes; what was noted later stands instead of what was before."""
+        return {key: text for found in self.maps(layout.NOTES) for key, text in found.items()}
+
     def one_map(self, name: str) -> dict[str, str] | None:
         """The one metadata record of this name, None if there is none."""
         found = self.maps(name)

@@ -68,7 +68,7 @@ def read_recording(path: Path, *, partial: bool = False) -> Recording:
             segments=tuple(layout.segment_from_map(m) for m in contents.maps(layout.SEGMENT)),
             rig_toml=_text(data, contents, layout.RIG_FILE),
             experiment_toml=_text(data, contents, layout.EXPERIMENT_FILE),
-            metadata=contents.one_map(layout.NOTES) or {},
+            metadata=contents.notes(),
             stop=stop_record,
             source=str(path),
         )
@@ -89,7 +89,7 @@ def read_events(path: Path, *, partial: bool = False) -> list[Event]:
 def read_notes(path: Path, *, partial: bool = False) -> dict[str, str]:
     """The metadata of a recording (seed, versions, operator, hashes of sources, ...)."""
     with _contents(path, partial=partial) as (_, contents):
-        return contents.one_map(layout.NOTES) or {}
+        return contents.notes()
 
 
 @contextmanager

@@ -89,7 +89,7 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
             good.append(chunk)
         except RecordingError as error:
             problems.append(str(error))
-    notes = next(iter(_maps(contents, layout.NOTES, problems)), {})
+    notes = {k: v for m in _maps(contents, layout.NOTES, problems) for k, v in m.items()}
     segments = [layout.segment_from_map(item) for item in _maps(contents, layout.SEGMENT, problems)]
     stops = [layout.stop_from_map(item) for item in _maps(contents, layout.STOP, problems)]
     notes["recovered_from"] = path.name

@@ -80,7 +80,7 @@ def _verify(path: Path, data: memoryview) -> Verdict:
             problems.append("it is not a recording of samii-rig, or its first metadata are lost")
         else:
             check_format(contents)
-        contents.one_map(layout.NOTES)
+        contents.notes()
         contents.maps(layout.RESPONSE)
         for item in contents.maps(layout.SEGMENT):
             layout.segment_from_map(item)

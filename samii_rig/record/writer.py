@@ -176,6 +176,11 @@ class RunWriter:
         data = events.encode(events.Event(time_ns, name, payload or {}))
         self._put_message(self._events_id, time_ns, data)
 
+    def note(self, metadata: dict[str, str]) -> None:
+        """Metadata that were not known, or were others, when the file was made."""
+        data = layout.sealed(metadata)
+        self._put(lambda appender: appender.add_metadata(layout.NOTES, data))
+
     def segment(self, segment: Segment) -> None:
         """Log that `segment` was done."""
         data = layout.sealed(layout.segment_to_map(segment))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import platform
 import sys
@@ -80,6 +81,9 @@ def carry_out(
     predicted.refuse()
     latch = Latch(rig.name, rig.device.driver)
     latch.refuse()
+    # Before any device waits: the samples of a run before are garbage in cycles, which by itself
+    # may stay for a hundred runs.
+    gc.collect()
     device = open_device(rig, settings or {})
     real = device.metadata.get("clock") != "simulated"
     cleared = latch.cleared if real else None
@@ -130,6 +134,10 @@ def carry_out(
                 interrupts.ending = True
                 writer.close(StopRecord("failed", _line(error)))
                 raise
+            # What the device has learnt meanwhile, as how well its clocks are known.
+            told = {f"device_{key}": value for key, value in device.metadata.items()}
+            if news := dict(told.items() - notes.items()):
+                writer.note(news)
             trouble = _estimate_into(writer, interrupts)
             writer.close(ended)
     finally:

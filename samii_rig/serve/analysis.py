@@ -16,7 +16,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from samii_rig.serve.job import DIAGNOSIS, LOG, RESPONSES, Job
+from samii_rig.serve.job import LOG, RESPONSES, SO_FAR, Job
 
 CERTAIN = 0.95
 IN_A_ROW = 2
@@ -48,7 +48,7 @@ class Analysis:
                     stdout=log,
                     stderr=log,
                 )
-        new = self._newer(DIAGNOSIS)
+        new = self._newer(SO_FAR)
         if new is not None:
             self._answers.append(_answer(new))
 
@@ -71,7 +71,7 @@ class Analysis:
     def state(self) -> dict[str, Any]:
         """What is told to everybody who looks: a word that changes with the responses and their
         age in s, the diagnosis with its own, and whether the analyst is gone."""
-        diagnosis = dict(self._read.get(DIAGNOSIS, (0, {}))[1])
+        diagnosis = dict(self._read.get(SO_FAR, (0, {}))[1])
         if diagnosis:
             diagnosis["age_s"] = round(time.time() - diagnosis["time"], 1)
             diagnosis["certain"] = self.certain
@@ -89,17 +89,15 @@ class Analysis:
         }
 
     def _newer(self, name: str) -> dict[str, Any] | None:
-        """What a file of the analyst says, if it says something new; the runner's last word, of the
-        whole run, is not the analyst's."""
+        """What a file of the analyst says, if it says something new."""
         assert self._job is not None
         path = self._job.folder / name
         with suppress(OSError, ValueError):
             written = path.stat().st_mtime_ns
             if written != self._read.get(name, (0, {}))[0]:
                 found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-                if not found.get("final"):
-                    self._read[name] = (written, found)
-                    return found
+                self._read[name] = (written, found)
+                return found
         return None
 
 

@@ -34,7 +34,7 @@ from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.run.protocols import Plan
 from samii_rig.serve.following import following
-from samii_rig.serve.job import DIAGNOSIS, RESPONSES, RIG, Job
+from samii_rig.serve.job import RESPONSES, RIG, SO_FAR, Job
 from samii_rig.serve.live import LiveReader
 from samii_rig.serve.planned import planned
 from samii_rig.serve.sofar import SoFar
@@ -130,27 +130,25 @@ class Analyst:
     def _diagnose(self) -> None:
         """Take what was found, and ask again if there is something new to ask."""
         found = self._diagnoser.taken()
-        # After the run the runner has the last word.
-        if found is not None and self.job.written.phase == "running":
+        if found is not None:
             next_toml = following(found.get("experiment", ""), self._text)
-            self.job.tell(DIAGNOSIS, {**found, "next_toml": next_toml})
-        known = self._so_far.responses()
-        sound = [r for r, going_on in known if not going_on and r.n_averages > 1]
-        asked_of = sound or [r for r, _ in known]
+            self.job.tell(SO_FAR, {**found, "next_toml": next_toml})
+        sound = self._so_far.sound
+        asked_of = sound or [r for r, _ in self._so_far.responses()]
         if not asked_of or not self._diagnoser.idle:
             return
         # A level's newer estimate is another object; kept, so that no other takes its place.
         if [id(r) for r in asked_of] == [id(r) for r in self._given]:
             return
         self._given = asked_of
-        levels = {(s.kind, s.level) for s in self._plan.segments if s.kind != "transient"}
+        levels, of_levels = self._so_far.levels
         about = {
             "time": time.time(),
             "done": self._so_far.done,
             "of": len(self._plan.segments),
             "repeats": bool(sound),
-            "levels": len({r.level for r in sound}),
-            "of_levels": len(levels),
+            "levels": levels,
+            "of_levels": of_levels,
             "low_hz": min(float(r.frequency[0]) for r in asked_of),
             "high_hz": max(float(r.frequency[-1]) for r in asked_of),
         }

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import signal
 import sys
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from importlib import resources
 from typing import Any
 
@@ -47,13 +48,13 @@ def application(rooms: Rooms) -> FastAPI:
 
     @asynccontextmanager
     async def life(app: FastAPI) -> AsyncIterator[None]:
-        work = asyncio.create_task(rooms.work())
+        tasks = [asyncio.create_task(w) for w in (rooms.work(), rooms.ready())]
         try:
             yield
         finally:
-            work.cancel()
-            with suppress(asyncio.CancelledError):
-                await work
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
             rooms.analysis.close()
             rooms.desk.close()
             if rooms.foxglove is not None:
@@ -163,4 +164,6 @@ def serve(settings: Settings) -> None:
     print(f"{settings.rig.name}: {scheme}://{host}:{port}", flush=True)
     if rooms.foxglove is not None:
         print(f"Foxglove: ws://127.0.0.1:{rooms.foxglove.port}", flush=True)
+    # Once it has ended in good order uvicorn raises the signal again, which would end us without.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     uvicorn.Server(config).run(sockets=[listening])

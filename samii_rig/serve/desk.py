@@ -11,9 +11,11 @@ import asyncio
 import math
 import resource
 import tempfile
+from base64 import b64encode
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ WORKERS = 2
 WITHIN = 120.0  # s that a piece of work may take
 MEMORY = 8 << 30  # bytes of address space of one of them
 MOST_POINTS = 4000  # of one curve in one answer
+MOST_VALUES = 8_000_000  # of samples in one answer: ten channels at 1 kHz for 13 minutes
 
 
 class Desk:
@@ -212,6 +215,36 @@ def signals(path: str, names: list[str], start: float, stop: float, pixels: int)
             for s in recording.segments
         ],
     }
+
+
+def frames(path: str, start: float, length: float) -> dict[str, Any]:
+    """Samples as frames of the live data, one after the other, in base64; the first sample of the
+    recording is number 0, and each stretch between gaps has frames of its own.
+
+    start, length : s by the sample numbers.
+    """
+    import numpy as np
+
+    from samii_rig.errors import InputError
+    from samii_rig.record.reader import read_recording
+    from samii_rig.serve.viewers import decimated, frame, step_of
+
+    recording = read_recording(Path(path))
+    rate, step = recording.rate_hz, step_of(recording.rate_hz)
+    number = recording.sequence - (recording.sequence[0] if len(recording) else 0)
+    # Whole steps, so that one answer goes on where the last one ended.
+    low, high = (math.floor(t * rate / step) * step for t in (start, start + length))
+    begin, end = np.searchsorted(number, [low, high])
+    if (end - begin) * recording.values.shape[1] > MOST_VALUES:
+        raise InputError("frames", "length", length, f"at most {MOST_VALUES:,} values in it")
+    data = []
+    cuts = begin + 1 + np.flatnonzero(np.diff(number[begin:end]) != 1)
+    for first, last in pairwise([begin, *cuts, end]):
+        rows = (last - first) // step * step
+        if rows:
+            values = decimated(recording.values[first : first + rows], step)
+            data.append(frame(values, step, rate, int(number[first])))
+    return {"frames": b64encode(b"".join(data)).decode()}
 
 
 def responses(path: str) -> dict[str, Any]:

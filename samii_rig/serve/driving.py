@@ -13,7 +13,7 @@ from samii_rig.rig.load import MAX_BYTES
 from samii_rig.run.experiments import shipped
 from samii_rig.serve import desk
 from samii_rig.serve.access import COOKIE, STOP
-from samii_rig.serve.job import DIAGNOSIS, RESPONSES
+from samii_rig.serve.job import DIAGNOSIS, RESPONSES, SO_FAR
 from samii_rig.serve.lease import EVERY, LASTS
 from samii_rig.serve.rooms import NotThereError, Rooms, operator, person
 from samii_rig.serve.viewers import MOST_VIEWERS
@@ -64,7 +64,7 @@ def _describe(router: APIRouter, rooms: Rooms) -> None:
     @router.get("/rig")
     async def rig() -> Answer:
         """The rig file as data, as text and as a drawing."""
-        return await rooms.desk.do(desk.rig, rooms.settings.rig_toml)
+        return await rooms.drawn()
 
     @router.get("/state")
     async def state(request: Request) -> Answer:
@@ -129,7 +129,7 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
     @router.get("/jobs/{id_}/diagnosis")
     def diagnosis(id_: str) -> Response:
         """The diagnosis of a run so far; `next_toml` is the experiment that it asks for."""
-        return _told(rooms, id_, DIAGNOSIS)
+        return _told(rooms, id_, DIAGNOSIS, SO_FAR)
 
     @router.post(STOP.removeprefix("/api"))
     async def stop(request: Request) -> Answer:
@@ -160,8 +160,9 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
         return rooms.state()
 
 
-def _told(rooms: Rooms, id_: str, name: str) -> Response:
-    path = rooms.supervisor.told(id_, name)
+def _told(rooms: Rooms, id_: str, *names: str) -> Response:
+    """The first of these files that there is."""
+    path = next((p for name in names if (p := rooms.supervisor.told(id_, name))), None)
     if path is None:
         raise NotThereError(f"nothing is known yet of job {id_[:40]!r}")
     # Read at once: a file that is replaced while it is sent would have another length than told.

@@ -30,7 +30,7 @@ def following(words: str, experiment_toml: str) -> str:
         changes |= {k: float(found[1]) for k in STARTS if k in before}
     elif re.search(r"at half .*twice the .*amplitude", words) and levels:
         changes["amplitudes"] = [0.5 * min(levels), 2.0 * max(levels)]
-    elif "repeat each run three times" in words and "repeats" in before:
+    elif "repeat each run three times" in words and before.get("repeats", 3) < 3:
         changes["repeats"] = 3
     if not changes or all(before.get(k) == v for k, v in changes.items()):
         return ""

@@ -24,7 +24,7 @@ from typing import Any, Literal
 from samii_rig.errors import GateError, RecordingError
 
 ID = re.compile(r"\d{8}T\d{12}-[0-9a-f]{6}")
-REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, DIAGNOSIS = (
+REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS = (
     "request.json",
     "state.json",
     "rig.toml",
@@ -33,7 +33,8 @@ REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, DIAGNOSIS = (
     "log.txt",
     "stops.jsonl",
     "responses.json",
-    "diagnosis.json",
+    "diagnosis_so_far.json",  # the analyst's
+    "diagnosis.json",  # the runner's last word, of the whole run
 )
 
 MOST_STOPS = 20  # that are written down
@@ -97,7 +98,7 @@ class Job:
             job = cls(folder)
             job.set(JobState())
             # Last: a folder without it is not a job.
-            _put(folder / REQUEST, asdict(request))
+            _put(folder / REQUEST, asdict(request), durable=True)
         except OSError as error:
             raise RecordingError(f"{folder} cannot be written: {error.strerror}") from error
         return job
@@ -134,13 +135,11 @@ class Job:
     def set(self, state: JobState) -> None:
         """Write how it stands, whole or not at all."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        _put(self.folder / STATE, {**asdict(state), "time": now})
+        _put(self.folder / STATE, {**asdict(state), "time": now}, durable=True)
 
     def tell(self, name: str, data: dict[str, Any]) -> None:
         """Write what is known so far into the file `name`, whole or not at all."""
-        new = self.folder / f".{name}"
-        new.write_text(json.dumps(data, allow_nan=False), encoding="utf-8")
-        new.replace(self.folder / name)
+        _put(self.folder / name, data, durable=False)
 
     def alive(self) -> bool:
         """Whether somebody runs it now."""
@@ -198,12 +197,15 @@ class Job:
         return [json.loads(line) for line in lines]
 
 
-def _put(path: Path, data: dict[str, Any]) -> None:
+def _put(path: Path, data: dict[str, Any], *, durable: bool) -> None:
+    """Whole or not at all, whoever else writes it; `durable` if it is to outlive a power cut."""
+    text = json.dumps(data, allow_nan=False)
     handle, name = tempfile.mkstemp(dir=path.parent)
     with os.fdopen(handle, "w", encoding="utf-8") as file:
-        json.dump(data, file)
-        file.flush()
-        os.fsync(file.fileno())
+        file.write(text)
+        if durable:
+            file.flush()
+            os.fsync(file.fileno())
     Path(name).replace(path)
 
 

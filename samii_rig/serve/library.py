@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import os
 import secrets
+from base64 import b64decode
 from datetime import UTC, datetime
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse
 from pydantic import Field
 from starlette.requests import ClientDisconnect
 
 from samii_rig.errors import RecordingError
-from samii_rig.index.query import MOST
+from samii_rig.index.query import MOST, each_by_name
 from samii_rig.index.query import Query as Asked
 from samii_rig.index.remarks import add_note, read_remarks, set_tags
 from samii_rig.index.store import PRIVATE
@@ -22,6 +23,7 @@ from samii_rig.serve.driving import Answer, Body
 from samii_rig.serve.rooms import Rooms, operator
 
 Short = Annotated[str, Query(max_length=200)]
+BOUNDS = {"limit": {"ge": 1, "le": MOST}, "offset": {"ge": 0, "lt": 2**31}}
 MEDIA = "application/octet-stream"
 
 
@@ -46,36 +48,16 @@ def routes(rooms: Rooms) -> APIRouter:
     return router
 
 
+def _bounded(name: str, said: str) -> Any:
+    return Query(description=said, **BOUNDS.get(name, {"max_length": 200}))  # type: ignore[arg-type]
+
+
 def _search(router: APIRouter, rooms: Rooms) -> None:
     @router.get("/recordings")
-    def recordings(
-        rig: Short = "",
-        experiment: Short = "",
-        operator: Short = "",
-        status: Short = "",
-        verdict: Short = "",
-        tag: Short = "",
-        since: Short = "",
-        until: Short = "",
-        text: Short = "",
-        limit: Annotated[int, Query(ge=1, le=MOST)] = 100,
-        offset: Annotated[int, Query(ge=0, lt=2**31)] = 0,
-    ) -> Answer:
+    @each_by_name(_bounded)
+    def recordings(*, query: Asked) -> Answer:
         """Recordings that fit, newest first."""
-        asked = Asked(
-            rig=rig,
-            experiment=experiment,
-            operator=operator,
-            status=status,
-            verdict=verdict,
-            tag=tag,
-            since=since,
-            until=until,
-            text=text,
-            limit=limit,
-            offset=offset,
-        )
-        found = rooms.index.search(asked)
+        found = rooms.index.search(query)
         return {"total": found.total, "recordings": list(found.entries)}
 
     @router.get("/recordings/words")
@@ -119,6 +101,17 @@ def _look(router: APIRouter, rooms: Rooms) -> None:
         """Channels as curves of a few points with the outline of the whole; times in s."""
         _, path = rooms.entry(id_)
         return await rooms.desk.do(desk.signals, str(path), channel or [], start, stop, pixels)
+
+    @router.get("/recordings/{id_}/frames", response_class=Response)
+    async def frames(
+        id_: str,
+        start: Annotated[float, Query(ge=0, le=1e6)] = 0.0,
+        length: Annotated[float, Query(gt=0, le=1e4)] = 10.0,
+    ) -> Response:
+        """Samples as frames of the live data (see `viewers`), one after the other; times in s."""
+        _, path = rooms.entry(id_)
+        found = await rooms.desk.do(desk.frames, str(path), start, length)
+        return Response(b64decode(found["frames"]), media_type=MEDIA)
 
     @router.get("/recordings/{id_}/frf")
     async def frf(id_: str) -> Answer:

@@ -16,6 +16,7 @@ from samii_rig.errors import GateError, InputError, SamiiRigError
 from samii_rig.index.entry import Entry
 from samii_rig.index.store import Index
 from samii_rig.run.latch import Latch
+from samii_rig.serve import desk
 from samii_rig.serve.access import Person
 from samii_rig.serve.analysis import Analysis
 from samii_rig.serve.desk import Desk
@@ -56,7 +57,9 @@ class Rooms:
         self.desk = Desk()
         self.viewers = Viewers()
         self.latch = Latch(settings.rig.name)
+        self._drawn: asyncio.Task[dict[str, Any]] | None = None
         at = settings.foxglove
+        # Last: nothing of ours fails after its port is open.
         self.foxglove = None if at is None else Foxglove(at, settings.rig.name)
 
     async def work(self) -> None:
@@ -83,11 +86,7 @@ class Rooms:
                     due["state"] = now + STATE_PERIOD
                     state = self.state()
                 self.viewers.show(self.supervisor.reader(), state)
-                if self.foxglove is not None:
-                    job = self.supervisor.current
-                    self.foxglove.show(
-                        self.supervisor.reader(), job.folder / RESPONSES if job else None
-                    )
+                self._foxglove()
                 if now >= due["refresh"] and (refreshing is None or refreshing.done()):
                     due["refresh"] = now + REFRESH
                     refreshing = asyncio.create_task(asyncio.to_thread(self._refresh))
@@ -98,6 +97,33 @@ class Rooms:
         self.analysis.turn(job)
         if job is not None and job.request.stop_when_certain and self.analysis.certain and reader:
             reader.enough()
+
+    async def drawn(self) -> dict[str, Any]:
+        """The rig as `desk.rig` gives it. It does not change and takes seconds: all who ask wait
+        for the same."""
+        found = self._drawn
+        if found is None or (found.done() and (found.cancelled() or found.exception())):
+            work = self.desk.do(desk.rig, self.settings.rig_toml)
+            self._drawn = found = asyncio.create_task(work)
+        return await asyncio.shield(found)
+
+    async def ready(self) -> None:
+        """Have what the first page asks for."""
+        with _said("the drawing"):
+            await self.drawn()
+
+    def _foxglove(self) -> None:
+        """Show Foxglove what is new. It is a display: one that fails is taken away."""
+        if self.foxglove is None:
+            return
+        job = self.supervisor.current
+        try:
+            self.foxglove.show(self.supervisor.reader(), job.folder / RESPONSES if job else None)
+        except Exception:
+            log.exception("Foxglove failed and is off until the service is started again")
+            failed, self.foxglove = self.foxglove, None
+            with contextlib.suppress(Exception):
+                failed.close()
 
     def _refresh(self) -> None:
         with _said("the index"):

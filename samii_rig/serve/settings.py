@@ -23,7 +23,8 @@ class Settings:
     tls : certificate and key, None without. tokens : None where everybody who reaches the service
     may drive: on this machine alone. names : under which it may be called, beside its host.
     pace : of a simulated rig, times real time; 0 for as fast as it can.
-    foxglove : port of this machine that shows runs to Foxglove, 0 for any; None for none.
+    foxglove : port of this machine that shows runs to Foxglove, 0 for any; None for none. Its
+    protocol has no token: where others must show one, `foxglove_open` says that this is meant.
     """
 
     rig: Rig
@@ -36,6 +37,7 @@ class Settings:
     names: tuple[str, ...] = ()
     pace: float = 1.0
     foxglove: int | None = None
+    foxglove_open: bool = False
 
     def check(self) -> None:
         """InputError for what cannot work or would let strangers drive."""
@@ -47,6 +49,9 @@ class Settings:
         if (not is_local(self.host) or self.names) and not (self.tokens and self.tokens.known):
             expected = "a file with at least one token, as others than this machine can reach it"
             raise InputError(WHERE, "--tokens", None, expected)
+        if self.foxglove is not None and self.tokens is not None and not self.foxglove_open:
+            expected = "--foxglove-open beside --tokens, as Foxglove can show no token"
+            raise InputError(WHERE, "--foxglove", self.foxglove, expected)
         if self.tls is not None:
             try:
                 ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(*self.tls)

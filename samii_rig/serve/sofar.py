@@ -85,6 +85,18 @@ class SoFar:
         """All that is known, in the order of the plan, and whether each still goes on."""
         return [(r, part.going_on) for part, found in self._known.values() for r in found]
 
+    @property
+    def sound(self) -> list[FrequencyResponse]:
+        """Those of levels of which repeats are whole, so that their noise is known from them."""
+        return [r for r, going_on in self.responses() if not going_on and r.n_averages > 1]
+
+    @property
+    def levels(self) -> tuple[int, int]:
+        """Of how many levels there is a sound response, and how many the plan has. A level counts
+        once, whatever is driven at it."""
+        planned = {(s.level, s.unit) for s in self._plan.segments if s.kind != "transient"}
+        return len({(r.level, r.level_unit) for r in self.sound} & planned), len(planned)
+
     def _parts(self, recording: Recording, start: int) -> Iterator[Part]:
         newest = int(recording.sequence[-1]) + 1 if len(recording) else start
         # A segment may be written down before the last of its samples is on the disk.

@@ -91,6 +91,12 @@ class Supervisor:
         if len(predicted) > 1 and not simulated:
             expected = "one run; between several a person changes the rig: use samii-rig run"
             raise InputError("experiment", "", f"{name}, {len(predicted)} runs", expected)
+        if stop_when_certain and not diagnosis:
+            expected = "false, or diagnosis: without one nothing becomes certain"
+            raise InputError("order", "stop_when_certain", True, expected)
+        if stop_when_certain and len(predicted) > 1:
+            expected = "false: the runs of an experiment of several are diagnosed together, later"
+            raise InputError("order", "stop_when_certain", True, expected)
         settings: dict[str, Any] = {"pace": self._pace} if simulated and self._pace > 0 else {}
         slug = re.sub(r"[^a-z0-9]+", "_", f"{self._rig.name}_{name}".lower()).strip("_")
         stem = f"{datetime.now():%Y-%m-%dT%H-%M-%S}_{slug}"

@@ -99,7 +99,7 @@ class Viewers:
             self._row = reader.whole if reader else 0
             return
         new = reader.since(self._row)
-        step = max(1, -(-round(reader.rate_hz) // round(MOST_RATE)))
+        step = step_of(reader.rate_hz)
         rows = len(new.sequence) // step * step
         self._row += new.lost + rows
         if rows:
@@ -107,6 +107,11 @@ class Viewers:
             data = frame(values, step, reader.rate_hz, int(new.sequence[0]))
             for viewer in self._all:
                 viewer.give(data)
+
+
+def step_of(rate_hz: float) -> int:
+    """Samples that a pair of rows stands for, 1 for rows that are samples."""
+    return max(1, -(-round(rate_hz) // round(MOST_RATE)))
 
 
 def decimated(values: Float, step: int) -> Float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from pathlib import Path
 from samii_rig.errors import InputError, SamiiRigError
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
-from samii_rig.run.priority import prioritised
+from samii_rig.run.priority import PRIORITY, prioritised
 from sim.settings import SimSettings
 from sim.wire.rig import WireRig
 
@@ -48,8 +49,10 @@ def run(chosen: Namespace, make: Callable[[Rig, SimSettings], WireRig]) -> int:
         settings = SimSettings(seed=chosen.seed, noise=not chosen.ideal)
         rig = make(load_rig(chosen.rig)[0], settings)
         rig.say(rig.hello())
-        # A board's clock waits for no other program.
-        with prioritised():
+        # A board's clock waits for no other program, nor for the host's.
+        with prioritised() as granted:
+            if granted:
+                os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY + 1))
             rig.run(script)
     except SamiiRigError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -75,6 +75,7 @@ class WireRig:
         self._node = Node(self._config, 1)
         self.pace = 1.0  # of real time in one second of the node's clock
         self._due = 0  # ns, host's time at which the newest sample was due
+        self._late = 0  # ns by which the latest sample was late
         self._clock = 0  # us at the node's boot
         up, down = np.random.SeedSequence(settings.seed).spawn(2)
         self._lines = {
@@ -150,6 +151,7 @@ class WireRig:
                         return
             while time.monotonic_ns() >= start + n * period:
                 self._due = start + n * period
+                self._late = max(self._late, time.monotonic_ns() - self._due)
                 n += 1
                 self._step()
             while waiting and (time.monotonic_ns() - start) * 1e-9 >= waiting[0][0]:
@@ -251,6 +253,7 @@ class WireRig:
                         self._stray, self._relay = 0, True
                         self._plant.rest()
                         self._history.clear()
+                        self._late = 0
                 case ["clock", change]:
                     self._clock += int(change)
                 case ["emergency", level]:
@@ -287,7 +290,8 @@ class WireRig:
     def history(self) -> dict[str, object]:
         """What the output did. fed : sample at which a stream was accepted last; told : the next
         one when a command came last; live : the last sample with another output than null, and its
-        time on the system's monotonic clock; most : the largest output kept."""
+        time on the system's monotonic clock; most : the largest output kept; late : ns by which
+        this process was late at most."""
         node, live = self._node, [h for h in self._history if h[1] != 0]
         last = live[-1] if live else (-1, 0, 0)
         return {
@@ -300,6 +304,7 @@ class WireRig:
             "most": max((abs(h[1]) for h in self._history), default=0),
             "live": last[0],
             "live_ns": last[2],
+            "late": self._late,
             "v": self._history[-1][1] if self._history else 0,
         }
 

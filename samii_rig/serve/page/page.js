@@ -3,6 +3,7 @@ import { plot } from "/page/curves.js";
 import { controls } from "/page/controls.js";
 import { Motion } from "/page/motion.js";
 import { SoFar } from "/page/sofar.js";
+import { Replay } from "/page/replay.js";
 
 const $ = (id) => document.getElementById(id);
 const scope = new Scope($("scope"), (text) => { $("scope-state").textContent = text; });
@@ -38,7 +39,7 @@ function put(parent, tag, text, name = "") {
   return e;
 }
 
-Object.assign(window, { scope, motion }); // to measure what they cost
+Object.assign(window, { scope, motion }); // to measure what they cost and show
 const soFar = new SoFar($, ask, put);
 
 // The stop: no lease, no token, and Escape from anywhere.
@@ -52,17 +53,47 @@ async function stop() {
 $("stop").addEventListener("click", stop);
 document.addEventListener("keydown", (e) => { if (e.key === "Escape") { e.preventDefault(); stop(); } });
 
-// Live data
+// Live data, or a recording in their place
+function take(data) {
+  const frame = scope.take(data);
+  if (frame && (!replay.on || replay.about.moves)) motion.take(frame, scope.channels);
+}
+const replay = new Replay({
+  fetched: async (id, start, length) => {
+    const answer = await fetch(`/api/recordings/${id}/frames?start=${start}&length=${length}`);
+    if (!answer.ok) throw new Error((await answer.json()).error);
+    return answer.arrayBuffer();
+  },
+  show: take,
+  began: ({ channels: list }) => {
+    $("replay-row").hidden = false;
+    motion.hz = null;
+    if (JSON.stringify(list) !== JSON.stringify(scope.channels)) channels(list);
+    scope.clear(); motion.clear();
+  },
+  ended: () => { $("replay-row").hidden = true; scope.clear(); motion.clear(); },
+  said: (text, part) => {
+    if (part === undefined) { alarm(text); return; }
+    $("replay-state").textContent = text;
+    $("replay-place").setAttribute("aria-valuetext", text);
+    if (document.activeElement !== $("replay-place")) $("replay-place").value = 1000 * part;
+  },
+});
+$("replay-end").onclick = () => replay.stop();
+$("replay-speed").onchange = () => { replay.speed = Number($("replay-speed").value); };
+$("replay-place").onchange = () => replay.seek((replay.about.duration * $("replay-place").value) / 1000);
+$("replay-pause").onclick = () => {
+  replay.paused = !replay.paused;
+  $("replay-pause").setAttribute("aria-pressed", replay.paused);
+  $("replay-pause").textContent = replay.paused ? "Go on" : "Hold";
+};
 function listen() {
   const socket = new WebSocket(`${location.protocol.replace("http", "ws")}//${location.host}/api/live`);
   socket.binaryType = "arraybuffer";
   socket.onmessage = (message) => {
     heard = performance.now();
     if (typeof message.data === "string") show(JSON.parse(message.data));
-    else {
-      const frame = scope.take(message.data);
-      if (frame) motion.take(frame, scope.channels);
-    }
+    else if (!replay.on) take(message.data);
   };
   socket.onclose = () => setTimeout(listen, 1000);
 }
@@ -78,7 +109,7 @@ setInterval(() => {
     $("facts").replaceChildren();
     $("bar").hidden = true;
     $("driver").textContent = "";
-  } else scope.why = state && !state.running && scope.empty ? "No run" : "";
+  } else scope.why = state && !replay.on && !state.running && scope.empty ? "No run" : "";
   $("lost").textContent = scope.lost ? `${scope.lost} frames were skipped, as this viewer was slow` : "";
 }, 500);
 
@@ -88,9 +119,12 @@ function show(s) {
   $("rig-name").textContent = s.rig;
   document.title = `${s.running ? "▶ " : ""}${s.rig}`;
   $("driver").textContent = `${s.operator ? `${s.operator} drives` : "nobody drives"}, ${s.viewers} watching`;
-  if (s.channels.length && JSON.stringify(s.channels) !== JSON.stringify(scope.channels)) channels(s.channels);
-  if (s.running && s.running.id !== job) { job = s.running.id; scope.clear(); motion.clear(); }
-  motion.hz = s.running?.progress.frequency ?? null;
+  // A run that begins is more than a replay.
+  if (s.running && s.running.id !== job) { job = s.running.id; replay.stop(); scope.clear(); motion.clear(); }
+  if (!replay.on) {
+    if (s.channels.length && JSON.stringify(s.channels) !== JSON.stringify(scope.channels)) channels(s.channels);
+    motion.hz = s.running?.progress.frequency ?? null;
+  }
   const r = s.running, p = r ? r.progress : {};
   if (!r) $("now").textContent = s.fault ? "FAULT" : "No run.";
   else if (r.phase === "running" && p.segment) {
@@ -193,6 +227,7 @@ $("search").onsubmit = tried(find);
 let looked = "", listed = [];
 async function look(id) {
   looked = id;
+  $("replay").disabled = true; // of what was looked at before
   const { recording: e, remarks } = await ask("GET", `/recordings/${id}`);
   $("one").hidden = false;
   offer(id);
@@ -207,6 +242,13 @@ async function look(id) {
   const signals = await ask("GET", `/recordings/${id}/signals?pixels=700`);
   const time = $("one-time"), bode = $("one-frf");
   time.style.height = `${40 + 70 * signals.curves.length}px`;
+  $("replay").onclick = () => {
+    if (replay.paused) $("replay-pause").click();
+    const list = signals.curves.map(({ name, unit, role }) => ({ name, unit, role }));
+    replay.start({ id, name: e.path, duration: signals.duration_s, channels: list, moves: e.rig === state?.rig });
+    $("h-scope").scrollIntoView({ block: "start" });
+  };
+  $("replay").disabled = false;
   plot(time, signals.curves.map((c) => ({ name: c.name, unit: c.unit, x: c.time, y: c.values })));
   const { responses } = e.responses ? await ask("GET", `/recordings/${id}/frf`) : { responses: [] };
   bode.hidden = !responses.length;
@@ -255,16 +297,20 @@ $("note").onsubmit = tried(async () => {
 });
 
 async function begin() {
-  const { drawing, motion: moves } = await ask("GET", "/rig");
-  $("drawing").innerHTML = drawing;
-  motion.rig(moves);
+  // First: it says who may not look.
   const { experiments } = await ask("GET", "/experiments");
   $("experiment").replaceChildren();
   for (const name of Object.keys(experiments)) put($("experiment"), "option", name);
   if ("swept_sine" in experiments) $("experiment").value = "swept_sine";
+  if (wanted) { wanted = false; listen(); }
+  const drawn = ask("GET", "/rig").then(({ drawing, motion: moves }) => {
+    $("drawing").innerHTML = drawing;
+    motion.rig(moves);
+  });
   const words = await ask("GET", "/recordings/words");
   for (const name of words.experiment) put($("by-experiment"), "option", name).value = name;
   await find();
-  if (wanted) { wanted = false; listen(); }
+  performance.mark("interactive");
+  await drawn;
 }
 tried(begin)();

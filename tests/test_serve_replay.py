@@ -1,0 +1,106 @@
+"""Recordings through the page's scope, in a real browser: every sample, at any speed, never as if
+it were live. Skips where no Chromium is installed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from browser_kit import Browser
+from record_kit import block, write_run
+from replay_kit import opened, replayed
+from serve_kit import Service, sweep
+
+from samii_rig.record.importer import import_file
+from samii_rig.record.maps import load_map
+from samii_rig.record.reader import read_recording
+from samii_rig.record.store import write_recording
+
+GAPPED = "gapped.mcap"
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with Browser(tmp_path_factory.mktemp("browser")) as opened_:
+        yield opened_
+
+
+@pytest.fixture
+def service(tmp_path: Path, browser: Browser) -> Iterator[Service]:
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    # 36 s with 40 samples lost in the midst.
+    write_run(
+        runs / GAPPED, [block(n, 500) for n in (*range(0, 9000, 500), *range(9040, 18040, 500))]
+    )
+    with Service(runs, "--pace", "4") as started:
+        browser.go(started.url)
+        browser.until("document.getElementById('link').textContent === 'live'")
+        yield started
+        assert browser.errors == []
+
+
+def test_every_sample_is_shown_and_a_gap_is_one(service: Service, browser: Browser) -> None:
+    opened(browser, GAPPED)
+    assert replayed(browser, service.folder / GAPPED) == 18_000
+    assert browser.value("scope.samples.gaps") == [9040]
+    assert browser.value("scope.samples.value(0, 9039) === scope.samples.value(0, 9039)") is False
+
+    # Another speed, from another place: a person's time passes.
+    browser.choose("replay-speed", "10")
+    browser.choose("replay-place", "250")
+    browser.until("scope.samples.end > 6000")
+    assert 4500 <= browser.value("scope.samples.begin") < 4600
+    browser.click("replay-pause")
+    browser.until("document.getElementById('replay-state').textContent.includes('held')")
+    held = browser.value("scope.samples.end")
+    assert held < 18_040
+    assert browser.value(
+        f"new Promise((done) => setTimeout(() => done(scope.samples.end === {held}), 300))"
+    )
+
+    browser.click("replay-end")
+    assert browser.value("document.getElementById('replay-row').hidden")
+    browser.until("scope.why === 'No run'")
+
+
+def test_a_run_that_begins_ends_a_replay(service: Service, browser: Browser) -> None:
+    opened(browser, GAPPED)
+    browser.choose("replay-speed", "0.1")
+    browser.click("replay")
+    with service.lease() as lease:
+        service.start(lease, sweep(duration=60.0))
+        browser.until("document.getElementById('replay-row').hidden")
+        browser.until("scope.channels.some((c) => c.name === 'theta_2') && !scope.empty")
+        # While it goes on, an old one can be looked at; the stop is as near as ever.
+        browser.click("replay")
+        browser.until("scope.channels.every((c) => c.name !== 'theta_2') && !scope.empty")
+        assert browser.text("now").startswith("short: ")
+        browser.press("Escape")
+        browser.until("document.getElementById('now').textContent === 'No run.'")
+
+
+@pytest.mark.parametrize(
+    ("name", "layout"),
+    [
+        ("2009-07-07_full-robot_swept_sine_amp-50_test_1.txt", "sflr"),
+        ("2009-08-03_motor-only_ol_step_response_amp-50_test_1.txt", "sflr_motor_open"),
+    ],
+)
+def test_a_real_recording_is_replayed(
+    service: Service, browser: Browser, recordings: Path, name: str, layout: str
+) -> None:
+    """All of them: `python benchmarks/replay_page.py`."""
+    path = service.folder / f"{Path(name).stem}.mcap"
+    the_map, text = load_map(layout)
+    write_recording(path, import_file(recordings / name, the_map, text))
+    browser.until(
+        "(document.querySelector('#search button').click(), "
+        "document.querySelectorAll('#list tr').length === 2)"
+    )
+    opened(browser, path.name)
+    assert replayed(browser, path) == len(read_recording(path)) >= 500
+    # The rig that is drawn is another one: it does not move with it.
+    assert browser.value("motion.y.length") == 0
