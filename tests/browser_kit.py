@@ -83,13 +83,13 @@ class Browser:
         feature = {"name": "prefers-color-scheme", "value": scheme}
         self.call("Emulation.setEmulatedMedia", features=[feature])
 
-    def until(self, expression: str) -> None:
+    def until(self, expression: str, within: float = WITHIN) -> None:
         """Wait until it is true in the page; one that is just being loaded has not all parts."""
 
         def true() -> bool:
             return self._evaluated(expression)["result"].get("value") is True
 
-        found(true, WITHIN, said=expression)
+        found(true, within, said=expression)
 
     def text(self, id_: str) -> str:
         return str(self.value(f"document.getElementById('{id_}')?.textContent ?? ''"))
