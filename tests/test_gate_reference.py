@@ -80,6 +80,7 @@ def test_the_slew_inside_a_block_counts_the_set_point_too():
     assert wrong(command([0.0, 0.0], [-0.6, 0.6])).what == "rate"
     assert wrong(command([0.0, 1.0], [-0.4, 0.3])) is None
     assert wrong(command([0.0, 1.0], [-0.4, 0.4])).what == "rate"
+    assert wrong(command([0.0, 0.0, 0.0], [-0.6, 0.0, 0.6])) is None
 
 
 def test_a_turning_joint_uses_up_slew():
