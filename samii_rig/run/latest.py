@@ -124,8 +124,7 @@ def observe(
         rate[i] = _steepest(latest.last[i], latest.good[i], values[seen[i], i], time[seen[i]])
     since, travel, effort = _standstill(latest, values, time, seen)
     order = time[0] > latest.time and sequence[0] > latest.sequence
-    if n > 1:
-        order = order and (time[1:] > time[:-1]).all() and (sequence[1:] > sequence[:-1]).all()
+    order = order and (time[1:] > time[:-1]).all() and (sequence[1:] > sequence[:-1]).all()
     drifted = latest.offset + round(CLOCK_DRIFT * (now - latest.offset_at))
     return replace(
         latest,
