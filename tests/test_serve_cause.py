@@ -18,6 +18,7 @@ from serve_kit import Service, sweep
 
 from samii_rig.rig.load import load_rig
 
+pytestmark = pytest.mark.slow
 LEVEL = "[0.2]"
 ANALYSED = 400.0  # s: a cause takes ten seconds of a processor that other tests load
 # Each request of the page shows its lease, with which the test may ask too.
