@@ -8,7 +8,8 @@ lost, and CPU. Latency is the time from a sample's instant to its arrival at the
 of the promptest one. `faults` checks after each run that the output is at null, that it was so
 within the deadman's time of its last feed, that no reference was beyond the plan's, that a fault is
 latched, and that the recording verifies or recovers; and that memory, threads and open files do
-not grow. Exit code 1 if anything does not hold.
+not grow. A run that was refused before its recording was opened has none and is listed with the
+reason. Exit code 1 if anything does not hold.
 """
 
 import argparse
@@ -38,6 +39,7 @@ from samii_rig.record.appender import Appender
 from samii_rig.record.reader import read_recording
 from samii_rig.record.recover import recover
 from samii_rig.record.verify import verify
+from samii_rig.record.writer import PARTIAL, RunWriter
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.run import campaign
@@ -187,7 +189,8 @@ def state() -> tuple[int, int, int]:
 
 
 class Endured:
-    """The rig under one fault after the other; `wrong` is what did not hold, in words."""
+    """The rig under one fault after the other; `wrong` is what did not hold, `refused` which runs
+    ended before their recording was opened, in words."""
 
     def __init__(self, folder: Path, seed: int) -> None:
         self.folder, self.rng = folder, random.Random(seed)
@@ -196,6 +199,8 @@ class Endured:
         self.predicted = predict(self.plan, self.wire.rig)
         self.latch = Latch(self.wire.rig.name, self.wire.rig.device.driver)
         self.wrong: list[str] = []
+        self.refused: list[str] = []
+        self.opened = False  # the recording of the run at hand
         self.ends: Counter[tuple[str, str]] = Counter()
         self.samples = 0
 
@@ -208,9 +213,12 @@ class Endured:
         fault, path = self.rng.choice(FAULTS), self.folder / f"{n}.mcap"
         # At first the output is still at rest: it begins 0.1 s ahead.
         running, delay = self.rng.random() < 0.8, self.rng.uniform(0.2, 2.0)
-        boot = self.wire.history()["boot"]
-        status = self._host(fault, delay, path) if fault == KILLED else ""
-        status = status or self._run(fault, delay, path, running=running)
+        boot, self.opened = self.wire.history()["boot"], False
+        status, reason = (
+            self._host(fault, delay, path)
+            if fault == KILLED
+            else self._run(fault, delay, path, running=running)
+        )
         self.ends[fault, status] += 1
         if running and status == "completed" and fault in ENDING:
             self.wrong.append(f"run {n}: {fault} ended nothing")
@@ -227,8 +235,9 @@ class Endured:
             self.wrong.append(f"run {n}, {fault}: output {h}")
         if not stray and h["boot"] == boot and h["live"] - h["fed"] >= PATIENCE:
             self.wrong.append(f"run {n}, {fault}: the output outlived its gate: {h}")
-        if status in ("GateError", "DeviceError") and not running:
-            return  # refused before there was a recording
+        if not self.opened:
+            self.refused.append(f"run {n}, {fault}: {reason}")
+            return
         try:
             self._check(path)
         except (SamiiRigError, AssertionError) as error:
@@ -238,14 +247,19 @@ class Endured:
         self.hosts.close()
         self.wire.close()
 
-    def _run(self, fault: str, delay: float, path: Path, *, running: bool) -> str:
-        """How it ended; a fault of the disk is in this process, others in the rig's."""
+    def _run(self, fault: str, delay: float, path: Path, *, running: bool) -> tuple[str, str]:
+        """How it ended and why; a fault of the disk is in this process, others in the rig's."""
         chunks = iter(range(6 if fault == DISK else 1 << 30))
 
         def add_chunk(appender: Appender, pieces: object) -> None:
             if next(chunks, None) is None:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             ADD_CHUNK(appender, pieces)
+
+        def opening(*given: object, **named: object) -> RunWriter:
+            writer = RunWriter(*given, **named)
+            self.opened = True
+            return writer
 
         timer = threading.Timer(delay, self._inject, [fault])
         began = threading.Event()
@@ -257,16 +271,16 @@ class Endured:
 
         if not running:
             timer.start()
-        Appender.add_chunk = add_chunk
+        Appender.add_chunk, campaign.RunWriter = add_chunk, opening
         try:
             outcome = campaign.carry_out(
                 self.wire.rig, "", "", self.plan, self.predicted, path, progress=progress
             )
-            return outcome.stop.status
+            return outcome.stop.status, outcome.stop.reason
         except SamiiRigError as error:
-            return type(error).__name__
+            return type(error).__name__, str(error)
         finally:
-            Appender.add_chunk = ADD_CHUNK
+            Appender.add_chunk, campaign.RunWriter = ADD_CHUNK, RunWriter
             timer.cancel()
             if timer.ident is not None:
                 timer.join()
@@ -275,18 +289,22 @@ class Endured:
         if fault not in ("", DISK):
             self.wire.tell(fault)
 
-    def _host(self, fault: str, delay: float, path: Path) -> str:
-        """A program that is killed while it runs."""
+    def _host(self, fault: str, delay: float, path: Path) -> tuple[str, str]:
+        """A program that is killed while it runs: how it ended and why."""
         try:
             pid = self.hosts.start(self.wire, "running", path)
         except AssertionError as ended:  # by this machine's own lateness
-            return f"ended before it was killed: {ended}"
+            # An error may have come before there was a recording.
+            made = path.exists() or partial_of(path).exists()
+            self.opened = made or not str(ended).startswith("error")
+            return "ended before it was killed", str(ended)
+        self.opened = True
         time.sleep(1.0 + delay)  # there is something on the disk after a second
         os.kill(pid, signal.SIGKILL)
-        return f"{fault}: {self.hosts.wait(pid)}"
+        return f"{fault}: {self.hosts.wait(pid)}", ""
 
     def _check(self, path: Path) -> None:
-        partial = path.with_name(f"{path.name}.partial")
+        partial = partial_of(path)
         if partial.exists():
             path = path.with_stem("recovered")
             recover(partial, path)
@@ -299,6 +317,10 @@ class Endured:
         self.samples += len(recording)
         path.unlink()
         partial.unlink(missing_ok=True)
+
+
+def partial_of(path: Path) -> Path:
+    return path.with_name(path.name + PARTIAL)
 
 
 def faults(chosen: argparse.Namespace, folder: Path) -> int:
@@ -314,6 +336,7 @@ def faults(chosen: argparse.Namespace, folder: Path) -> int:
             print(
                 f"{since:.0f} s, {runs} runs, {grown(state())}",
                 *endured.wrong,
+                *endured.refused,
                 sep="\n",
                 flush=True,
             )
@@ -324,6 +347,7 @@ def faults(chosen: argparse.Namespace, folder: Path) -> int:
     print(f"{runs} runs, {endured.samples} samples; {grown(first or last)} -> {grown(last)}")
     if first and (last[0] - first[0] > GROWTH or last[1] > first[1] or last[2] > first[2]):
         endured.wrong.append("memory, threads or open files grew")
+    print(f"{len(endured.refused)} refused before they began", *endured.refused, sep="\n")
     print(*endured.wrong, sep="\n")
     return 1 if endured.wrong else 0
 
