@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 import ast
+import copy
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +19,17 @@ from scipy.linalg import eigh
 import sim.concealed
 from samii_rig.errors import InputError
 from samii_rig.model.sampled import sampled_response
+from samii_rig.rig.elements import parameters
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
-from sim.concealed.assemble import assemble
+from sim.concealed.assemble import PHASE, assemble
 from sim.concealed.modes import poles_of
 from sim.concealed.parts import Description, Drive, Part, described
+from sim.concealed.size import STEP, tangent
+
+TOLERATED = [
+    (e.name, symbol) for e in SAMII.element for symbol, p in parameters(e).items() if p.tolerance
+]
 
 
 def structure(*parts: Part, base: str = "clamped") -> Description:
@@ -89,6 +96,27 @@ def test_nothing_hidden_it_answers_as_the_transfer_matrices_do(name: str) -> Non
     rig, _ = load_rig(name)
     H = poles_of(described(rig)).sampled(FREQUENCY)
     assert np.abs(H / sampled_response(rig, FREQUENCY)[:, :, 0] - 1).max() < 2e-4
+
+
+def test_slope_of_the_response_holds_where_a_step_of_it_would_divide_the_beam_anew() -> None:
+    plant = described(SAMII)
+    beam = plant.part("beam").values
+    phase = (beam["mu"] * (np.pi * plant.rate_hz) ** 2 / beam["EI"]) ** 0.25 * beam["L"]
+    beam["mu"] *= (24 * PHASE / phase) ** 4 * (1 - STEP / 2)
+    up, down = (_with_mu(plant, beam["mu"] * (1 + step)) for step in (STEP, -STEP))
+    at, above = (len(assemble(p).inside["beam"]) for p in (plant, up))
+    assert (at, above) == (24, 25)
+    _, slopes = tangent(plant, SAMII, FREQUENCY)
+    slope = slopes[TOLERATED.index(("beam", "mu"))]
+    H, less = (poles_of(p).sampled(FREQUENCY) for p in (plant, down))
+    wrong = np.abs((H - less) / STEP - slope).max(axis=0)
+    assert (wrong < 0.01 * np.abs(slope).max(axis=0)).all()
+
+
+def _with_mu(plant: Description, mu: float) -> Description:
+    other = copy.deepcopy(plant)
+    other.part("beam").values["mu"] = mu
+    return other
 
 
 def test_recorded_samples_of_the_closed_loop_show_the_model_of_the_sampled_rig() -> None:

@@ -107,8 +107,9 @@ def consistent_mass(h: float) -> Float:
 class Assembly:
     """Carries the rows from base to tip and gathers the matrices."""
 
-    def __init__(self, base: str, highest_hz: float) -> None:
+    def __init__(self, base: str, highest_hz: float, like: Structure | None) -> None:
         self.n = 0
+        self.like = like
         self.highest = 2 * math.pi * highest_hz
         self.M, self.C, self.K = (np.zeros((MOST, MOST)) for _ in range(3))
         self.w, self.theta = np.zeros(MOST), np.zeros(MOST)
@@ -192,8 +193,7 @@ class Assembly:
 
     def _beam(self, part: Part) -> None:
         v = part.values
-        wave = (v["mu"] * self.highest**2 / v["EI"]) ** 0.25
-        count = max(LEAST_ELEMENTS, math.ceil(wave * v["L"] / PHASE))
+        count = len(self.like.inside[part.name]) if self.like else self._elements(v)
         h = v["L"] / count
         stiffness, mass = v["EI"] * bending(h), v["mu"] * consistent_mass(h)
         tau = v.get("tau", 0.0)
@@ -214,6 +214,10 @@ class Assembly:
         self.inside[part.name] = found
         self.relaxations += [Relaxation(b, k, rate) for b in bent for k, rate in part.ladder]
 
+    def _elements(self, v: dict[str, float]) -> int:
+        wave: float = (v["mu"] * self.highest**2 / v["EI"]) ** 0.25
+        return max(LEAST_ELEMENTS, math.ceil(wave * v["L"] / PHASE))
+
     @staticmethod
     def _curvatures(rows: Float, h: float, EI: float) -> list[Float]:
         """Rows whose squares sum to the bending energy: mean and linear part of the curvature."""
@@ -222,9 +226,10 @@ class Assembly:
         return [mean, linear]
 
 
-def assemble(plant: Description) -> Structure:
-    """The matrices of a description."""
-    work = Assembly(plant.base, plant.rate_hz / 2)
+def assemble(plant: Description, like: Structure | None = None) -> Structure:
+    """The matrices of a description. like : of the same parts; beams are divided as there, so that
+    the matrices of both can be compared."""
+    work = Assembly(plant.base, plant.rate_hz / 2, like)
     starts: dict[str, tuple[Float, Float]] = {}
     ends: dict[str, tuple[Float, Float]] = {}
     for part in plant.parts:

@@ -18,6 +18,7 @@ from samii_rig.rig.elements import parameters
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.excitation import schedule_factor
 from samii_rig.types import Complex, Float
+from sim.concealed.assemble import assemble
 from sim.concealed.measure import Errors
 from sim.concealed.modes import Poles, filter_response, state_space
 from sim.concealed.parts import Description, Law
@@ -35,7 +36,8 @@ def tangent(plant: Description, rig: Rig, f: Float) -> tuple[Float, Complex]:
     From (s - A) x = B u and y = C x + D u, with its adjoint; hold, filters and delays as factors.
     """
     s = np.asarray(2j * np.pi * f, np.complex128)
-    system = state_space(plant)
+    structure = assemble(plant)
+    system = state_space(plant, structure)
     inverse = np.linalg.inv(s[:, None, None] * np.eye(system.A.shape[0]) - system.A)
     m = len(plant.sensors)
     x = inverse @ system.B[:, 0]
@@ -53,7 +55,7 @@ def tangent(plant: Description, rig: Rig, f: Float) -> tuple[Float, Complex]:
                 setattr(other.drive, symbol, getattr(other.drive, symbol) * (1 + STEP))
             else:
                 other.part(element.name).values[symbol] *= 1 + STEP
-            near = state_space(other)
+            near = state_space(other, assemble(other, structure))
             dx = x @ (near.A - system.A).T + (near.B - system.B)[:, 0]
             change = np.einsum("foj,fj->fo", y, dx) + x @ (near.C - system.C)[:m].T
             change += (near.D - system.D)[:m, 0]
