@@ -1,7 +1,7 @@
 """A cluster found by its address says what this machine says.
 
-Plan: a concealed trial of a campaign and a folder of recordings, each on two workers of a cluster
-and here; every digit is the same, and what cannot be diagnosed says why.
+Plan: a concealed trial of a campaign, a folder of recordings and a parameter study, each on two
+workers of a cluster and here; every digit is the same, and what cannot be diagnosed says why.
 """
 
 from __future__ import annotations
@@ -93,6 +93,18 @@ def test_a_folder_is_diagnosed_on_a_cluster_as_it_is_here(tmp_path: Path, schedu
     assert "cut_off.mcap" in there["cut_off.mcap"]["error"]
     assert json.loads((out / "2.json").read_text())["verdict"] == "no_mismatch"
     assert read_remarks(runs / "2.mcap").diagnosis["verdict"] == "no_mismatch"
+
+
+def test_a_parameter_study_on_a_cluster_writes_what_it_writes_here(
+    tmp_path: Path, scheduler: str
+) -> None:
+    here, there = tmp_path / "here.csv", tmp_path / "there.csv"
+    # More points than one piece of work has, some of them impossible.
+    grid = ["--vary", "joint_1.k=6800:27200:5:log", "--vary", "joint_2.c=-20:160:4"]
+    call("study", *grid, "--out", there, "--scheduler", scheduler, "--json")
+    call("study", *grid, "--out", here, "--workers", 1, "--json")
+    assert len(there.read_text().splitlines()) == 2 + 5 * 4
+    assert here.read_bytes() == there.read_bytes()
 
 
 def test_processes_here_have_one_thread_each(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ from samii_rig.cli import (
     record,
     recordings,
     serve,
+    study,
 )
 
 app = typer.Typer(
@@ -55,6 +56,7 @@ app.command("frf")(estimate.frf)
 app.command("report")(estimate.report)
 app.command("identify")(identify.identify)
 app.command("diagnose")(diagnose.diagnose)
+app.command("study")(study.study)
 app.command("control")(control.control)
 app.command("papers")(papers.papers)
 app.command("prove")(prove.prove)
