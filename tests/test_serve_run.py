@@ -8,13 +8,16 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 from serve_kit import Service, sweep
+from wait_kit import WITHIN
 
 from samii_rig.index.store import Index
 from samii_rig.record.reader import read_recording
@@ -109,6 +112,29 @@ def test_a_service_that_is_told_to_end_leaves_nothing_behind(
 ) -> None:
     with Service(tmp_path) as ending:
         assert ending.http.get("/api/rig").status_code == 200
+    assert ending.process.returncode == 0
+    assert capfd.readouterr().err == ""
+
+
+def test_a_service_ends_without_a_word_whatever_is_asked_of_it(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """An upload that stalls, a download and live data that nobody reads, and a rig to be drawn."""
+    with (tmp_path / "large.mcap").open("wb") as file:
+        file.truncate(64 << 20)
+    with ExitStack() as stack, Service(tmp_path) as ending:
+        (entry,) = ending.http.get("/api/recordings").json()["recordings"]
+        for head in (
+            "POST /api/recordings HTTP/1.1\r\ncontent-length: 1000",
+            f"GET /api/recordings/{entry['id']}/file HTTP/1.1",
+            "GET /api/live HTTP/1.1\r\nconnection: upgrade\r\nupgrade: websocket\r\n"
+            "sec-websocket-version: 13\r\nsec-websocket-key: MDAwMDAwMDAwMDAwMDAwMA==",
+            "GET /api/rig HTTP/1.1",
+        ):
+            address = ("127.0.0.1", int(ending.port))
+            asking = stack.enter_context(socket.create_connection(address, WITHIN))
+            asking.sendall(f"{head}\r\nhost: 127.0.0.1:{ending.port}\r\n\r\n".encode())
+        assert ending.http.get("/api/state").status_code == 200  # what came before is being done
     assert ending.process.returncode == 0
     assert capfd.readouterr().err == ""
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 import signal
+import socket
 import sys
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from importlib import resources
 from typing import Any
 
@@ -20,13 +21,16 @@ from starlette.exceptions import HTTPException
 import samii_rig
 from samii_rig.errors import SamiiRigError
 from samii_rig.serve import driving, library
-from samii_rig.serve.access import App, Guard
+from samii_rig.serve.access import App, Guard, Receive, Scope, Send
 from samii_rig.serve.rooms import STATUS, NotThereError, Rooms
 from samii_rig.serve.settings import Settings, is_local
 
 MAX_HEADER = 32 << 10  # bytes of a request's head
 MAX_MESSAGE = 4 << 10  # bytes of a WebSocket message to us; none is expected
 PING = 10.0  # s; a viewer that does not answer for that long is let go
+GRACE = 2.0  # s that what is asked has to be answered once the service shall end
+ABORTED = 0.1  # s after which a request knows that its connection is gone
+LAST = 10  # s; a thread that still works then is left
 MANY = 500  # recordings whose reading takes seconds, and is told
 # Nothing from elsewhere, nothing that is not a file of ours, in nobody's frame.
 POLICY = (
@@ -134,6 +138,34 @@ def _reading(done: int, of: int) -> None:
         print(f"index: {done:,} of {of:,} recordings", file=sys.stderr, flush=True)
 
 
+class _Server(uvicorn.Server):
+    """Cuts off what is asked when `GRACE` is over: uvicorn would tell of each as of a defect."""
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Stop listening, wait for what is asked, end."""
+        cutting = asyncio.create_task(self._cut_off())
+        await super().shutdown(sockets)
+        cutting.cancel()
+
+    async def _cut_off(self) -> None:
+        await asyncio.sleep(GRACE)
+        for connection in list(self.server_state.connections):
+            connection.transport.abort()
+        await asyncio.sleep(ABORTED)
+        for task in list(self.server_state.tasks):
+            task.cancel()
+
+
+def _cancellable(app: App) -> App:
+    """The same; a request that is cancelled, as only the end of the service does, is over."""
+
+    async def served(scope: Scope, receive: Receive, send: Send) -> None:
+        with suppress(asyncio.CancelledError):
+            await app(scope, receive, send)
+
+    return served
+
+
 def serve(settings: Settings) -> None:
     """Check, listen, serve until a signal; InputError for what cannot be."""
     settings.check()
@@ -144,7 +176,7 @@ def serve(settings: Settings) -> None:
     scheme = "https" if settings.tls else "http"
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format="%(name)s: %(message)s")
     config = uvicorn.Config(
-        guarded(rooms, port),
+        _cancellable(guarded(rooms, port)),
         http="h11",
         ws="websockets-sansio",
         loop="asyncio",
@@ -159,11 +191,11 @@ def serve(settings: Settings) -> None:
         ws_ping_interval=PING,
         ws_ping_timeout=PING,
         ws_per_message_deflate=False,
-        timeout_graceful_shutdown=2,
+        timeout_graceful_shutdown=LAST,
     )
     print(f"{settings.rig.name}: {scheme}://{host}:{port}", flush=True)
     if rooms.foxglove is not None:
         print(f"Foxglove: ws://127.0.0.1:{rooms.foxglove.port}", flush=True)
     # Once it has ended in good order uvicorn raises the signal again, which would end us without.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    uvicorn.Server(config).run(sockets=[listening])
+    _Server(config).run(sockets=[listening])
