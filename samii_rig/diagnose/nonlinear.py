@@ -220,7 +220,8 @@ def _on_lines(levels: Apart) -> None:
     ends = {key: self_consistent(e.fitted, levels.on_lines) for key, e in leading.items()}
     near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
     search.problem = Problem.of(search.lines, levels.grid)
-    _only(search, [*near[:RIVALS], *rivals, search.nominal])
+    others = [*near[:RIVALS], *rivals, search.nominal]
+    _only(search, [e for e in others if e.key not in leading])
     for key, e in leading.items():
         search._keep(e.effects, ends[key])
     search.temper()

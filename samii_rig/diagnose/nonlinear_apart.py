@@ -7,12 +7,12 @@ under the inputs that were recorded.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.nonlinear_driven import Drives, driven, top_of
+from samii_rig.diagnose.nonlinear_driven import Drives, Known, driven, top_of
 from samii_rig.diagnose.nonlinear_laws import EXCESS
 from samii_rig.diagnose.nonlinear_levels import Extra, LevelGrid
 from samii_rig.diagnose.nonlinear_model import LevelModel
@@ -43,6 +43,7 @@ class Apart:
     problem: Problem
     forces: list[Effect]
     given: Drives
+    known: Known = field(default_factory=dict)
 
     def promises(self, base: Explanation) -> list[Promise]:
         """What each force would gain beside a linear explanation, the largest gain first."""
@@ -104,7 +105,7 @@ class Apart:
         """Put what a force is in time, beyond its describing function, into grid and problem."""
         if not self.given:
             return False
-        extra = driven(model, x, self.grid, self.given, p)
+        extra = driven(model, x, self.grid, self.given, p, self.known)
         if extra is None:
             return False
         top = top_of(model, self.given)

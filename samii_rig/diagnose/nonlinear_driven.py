@@ -15,7 +15,7 @@ import numpy as np
 from samii_rig.diagnose.measured import PERIODIC, Measured
 from samii_rig.diagnose.nonlinear_inner import Inner
 from samii_rig.diagnose.nonlinear_levels import LevelGrid
-from samii_rig.diagnose.nonlinear_model import LevelModel
+from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.errors import SamiiRigError
 from samii_rig.model.sampled import hold_response
 from samii_rig.rig.schema import Rig
@@ -26,6 +26,7 @@ WHOLE = 0.02  # of a line: how near a whole number of cycles is
 FAINT = 1e-4  # of the strongest line of the input: below, a ratio to it says nothing
 
 Drives = Mapping[int, Float]
+Known = dict[Quasi, Complex]  # poles of the chain with a force, where it was computed last
 
 
 def drives(
@@ -103,13 +104,20 @@ class Driven:
     E: Complex
 
 
-def forced(model: LevelModel, x: Float, given: Drives, p: float) -> list[Driven] | None:
-    """The force p under each input; None where the rig has no partial fractions."""
+def forced(
+    model: LevelModel, x: Float, given: Drives, p: float, known: Known | None = None
+) -> list[Driven] | None:
+    """The force p under each input; None where the rig has no partial fractions.
+
+    known : poles from which they are looked for, and where they are left.
+    """
+    known = {} if known is None else known
     rate, quasi = model.rig.rate_hz, model.quasi
     inner: Inner | None = None
     if quasi.kind != "command":
         try:
-            inner = Inner.of(model, x)
+            inner = Inner.of(model, x, known.get(quasi))
+            known[quasi] = inner.structure
         except SamiiRigError:
             return None
     out = []
@@ -129,10 +137,17 @@ def forced(model: LevelModel, x: Float, given: Drives, p: float) -> list[Driven]
     return out
 
 
-def driven(model: LevelModel, x: Float, grid: LevelGrid, given: Drives, p: float) -> Complex | None:
+def driven(
+    model: LevelModel,
+    x: Float,
+    grid: LevelGrid,
+    given: Drives,
+    p: float,
+    known: Known | None = None,
+) -> Complex | None:
     """(n_level, n, q) what the force p adds to the response over its describing function, at
     all lines of the grid; 0 at levels without a drive. None as `forced`."""
-    found = forced(model, x, given, p)
+    found = forced(model, x, given, p, known)
     if found is None:
         return None
     out = np.zeros((*grid.driven.shape, grid.sensor.size), complex)

@@ -26,14 +26,14 @@ DRY, CUBE, PLAY, FLOW = range(4)
 _CODES: tuple[tuple[Law | None, int], ...] = ((FRICTION, DRY), (CUBIC, CUBE), (GAP, PLAY))
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
 def _lap(
-    z: Complex,
-    poles: Complex,
-    grow: Complex,
-    push: Complex,
-    R: Complex,
-    D: Float,
+    w: Float,
+    grow: Float,
+    by_v: Float,
+    by_e: Float,
+    direct: float,
+    g: float,
     v: Float,
     late: int,
     inner: int,
@@ -41,36 +41,26 @@ def _lap(
     p: float,
     scale: float,
 ) -> Float:
-    """(n inner,) the force over one period of the command v (n,), from the states z (n_pole,
-    n_in), which are left as they are then.
+    """(n inner,) the force over one period of the command v (n,), from the states w, which are
+    left as they are then.
 
-    R : (n_pole, n_in), pairs counted twice, and D : (n_in,) of what drives the force; the last
-    input is the force's.
+    w, grow, by_v, by_e : (2, n_pole) real and imaginary parts. What drives the force is the sum
+    of all real parts, and direct and g per unit of command and of force.
     """
-    n_pole, n_in = R.shape
-    own = n_in - 1
-    # Reading at the end of a step, of a state and per unit force over it.
-    W = np.zeros((n_pole, n_in), dtype=np.complex128)
-    g = 0.0 if code == DRY else D[own]
-    for k in range(n_pole):
-        for j in range(n_in):
-            W[k, j] = R[k, j] * (poles[k] if code == DRY else 1.0)
-        g += (W[k, own] * push[k]).real
-        if code == DRY:
-            g += R[k, own].real
+    n_pole = w.shape[1]
+    wr, wi, gr, gi = w[0], w[1], grow[0], grow[1]
+    vr, vi, er, ei = by_v[0], by_v[1], by_e[0], by_e[1]
     e = np.zeros(v.size * inner)
-    before = 0.0
+    before, f = 0.0, 0.0
     for step in range(e.size):
         u = v[(step - late) // inner]
-        y = 0.0 if code == DRY else D[0] * u
+        y = 0.0
         for k in range(n_pole):
-            z[k, 0] = grow[k] * z[k, 0] + push[k] * u
-            y += (W[k, 0] * z[k, 0]).real
-            if code == DRY:
-                y += R[k, 0].real * u
-            if own == 1:
-                z[k, 1] = grow[k] * z[k, 1]
-                y += (W[k, 1] * z[k, 1]).real
+            real, imag = wr[k] + er[k] * f, wi[k] + ei[k] * f
+            wr[k] = gr[k] * real - gi[k] * imag + vr[k] * u
+            wi[k] = gr[k] * imag + gi[k] * real + vi[k] * u
+            y += wr[k]
+        y += direct * u
         f = 0.0
         if code == DRY:
             f = min(max(-y / g, -p), p)
@@ -88,9 +78,10 @@ def _lap(
             against = 1.0 + moment / p if u >= 0.0 else 1.0 - moment / p
             f = u * (np.sqrt(max(against, 0.0)) - 1.0)
         e[step] = f
-        for k in range(n_pole):
-            z[k, own] += push[k] * f
         before = y + g * f
+    for k in range(n_pole):
+        wr[k] += er[k] * f
+        wi[k] += ei[k] * f
     return e
 
 
@@ -98,30 +89,36 @@ def _lap(
 class Inner:
     """A rig's partial fractions from command and force to what drives the force, by exact steps.
 
-    The rig has one actuator. poles : (n_pole,) rad/s, of pairs one. grow, push : (n_pole,) what a
-    step makes of a state, and of an input held over it. R, D : (n_pole, n_in), (n_in,) as `_lap`.
+    The rig has one actuator. grow, by_v, by_e : (2, n_pole) what a step makes of a state, and of
+    command and force held over it, real and imaginary parts. direct, g : as `_lap` has them.
     late : steps of dead time. code : of the law. scale : e = scale times what the law says.
+    structure : the chain's own poles.
     """
 
-    poles: Complex
-    grow: Complex
-    push: Complex
-    R: Complex
-    D: Float
+    grow: Float
+    by_v: Float
+    by_e: Float
+    direct: float
+    g: float
     late: int
     code: int
     scale: float
     rate_hz: float
+    structure: Complex
 
     @classmethod
-    def of(cls, model: LevelModel, x: Float) -> Inner:
-        """Of a force that the motion drives. Raises InputError as `realise` does."""
+    def of(cls, model: LevelModel, x: Float, near: Complex | None = None) -> Inner:
+        """Of a force that the motion drives. near : as `realise` has it.
+
+        Raises InputError as that does.
+        """
         quasi, values = model.quasi, model.values(x)
         rig = model.built.model_copy(
             update={"element": tuple(valued(e, values, {}) for e in model.built.element)}
         )
         wide = quasi.widened(rig)
-        made = realise(wide.model_copy(update={"sensor": wide.sensor[len(rig.sensor) :]}))
+        own = wide.model_copy(update={"sensor": wide.sensor[len(rig.sensor) :]})
+        made = realise(own, near=near)
         h = 1 / (rig.rate_hz * INNER)
         grow = np.exp(made.poles * h)
         still = np.abs(made.poles) * h < 1e-12
@@ -130,19 +127,25 @@ class Inner:
         late = round((rig.actuator[0].delay + float(made.late[0])) / h)
         code = next((c for law, c in _CODES if law is quasi.law), FLOW)
         scale = quasi.sign * model.strength(x)[1]
-        R = np.ascontiguousarray(made.residues[:, 0] * pairs)
+        R = made.residues[:, 0] * pairs
+        D = made.direct[0]
+        if code == DRY:  # driven by the speed, and at once by what changes it
+            D = R.sum(axis=0).real
+            R = R * made.poles[:, None]
+        both = push[:, None] * R
+        g = float(D[-1] + both[:, -1].real.sum())
         return cls(
-            made.poles, grow, push, R, made.direct[0], late, code, scale, rig.rate_hz
+            _parts(grow), _parts(both[:, 0]), _parts(both[:, -1]), float(D[0]), g, late, code,
+            scale, rig.rate_hz, made.structure.poles,
         )  # fmt: skip
 
     def force(self, v: Float, p: float) -> Float:
         """(n INNER,) the force p in the second period of a command v (n,)."""
-        z = np.zeros((self.poles.size, self.R.shape[1]), complex)
-        e = v
+        w, e = np.zeros_like(self.grow), v
         for _ in range(2):
             e = _lap(
-                z, self.poles, self.grow, self.push, self.R, self.D, np.ascontiguousarray(v),
-                self.late, INNER, self.code, p, self.scale,
+                w, self.grow, self.by_v, self.by_e, self.direct, self.g,
+                np.ascontiguousarray(v), self.late, INNER, self.code, p, self.scale,
             )  # fmt: skip
         return np.asarray(e)
 
@@ -151,3 +154,8 @@ class Inner:
         f = np.asarray(bins * self.rate_hz / v.size)
         held = hold_response(f, self.rate_hz * INNER)
         return np.asarray(np.fft.rfft(self.force(v, p))[bins] / INNER * held)
+
+
+def _parts(x: Complex) -> Float:
+    """(2, n) real and imaginary parts."""
+    return np.stack([x.real, x.imag])

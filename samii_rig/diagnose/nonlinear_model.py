@@ -178,14 +178,16 @@ class LevelModel(Model):
         values = self.values(x)
         f, which = np.unique(at.frequency, return_inverse=True)
         G, dG = self.chain.with_values(values).gradient(f, tuple(values))
+        map_ = self._map(x, values)
+        on = np.flatnonzero(np.any(map_, axis=0))
+        # One product of two matrices, before the levels repeat its rows.
+        dG = (dG.reshape(-1, len(values)) @ map_[:, on]).reshape(*G.shape, on.size)
         G, dG = G[which], dG[which]
         loop, r = self._loop(G, at)
         p, scale = self.strength(x)
         t, found = loop.force(self.quasi, p, scale)
         more, growth = self._more(at, p)
-        map_ = self._map(x, values)
-        on = np.flatnonzero(np.any(map_, axis=0))
-        moved, dr = self._loop(dG @ map_[:, on], at)
+        moved, dr = self._loop(dG, at)
         dt = np.zeros((t.size, self.n), complex)
         if self.quasi.law is None:
             # What the chain's own parameters do to the lost flow is of second order.
@@ -205,9 +207,9 @@ class LevelModel(Model):
         F, slopes = self._factors(x, at, slopes=True)
         own = G[:, at.sensor, at.actuator] * at.factor + r * t[:, None] * at.filter
         filtered = (at.filter * F)[:, :, None]
-        dy = (dG[:, at.sensor, at.actuator] @ map_) * (at.factor * F)[:, :, None]
-        dy = dy + r[:, :, None] * dt[:, None, :] * filtered
+        dy = r[:, :, None] * dt[:, None, :] * filtered
         dy[:, :, on] += dr * t[:, None, None] * filtered
+        dy[:, :, on] += dG[:, at.sensor, at.actuator] * (at.factor * F)[:, :, None]
         for j, dlog in slopes:
             dy[:, :, j] += own * dlog
         dy[:, :, self.unknown] += growth * more

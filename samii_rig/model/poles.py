@@ -37,6 +37,8 @@ MAX_HALVINGS = 28  # a side halved this often passes through a zero
 CUTS = (0.5, 0.47, 0.54, 0.41, 0.61, 0.35)  # where to cut a box if the middle meets a zero
 CLUSTER = 1e-5  # rad/s, zeros closer than this are one with a multiplicity
 MULLER_STEPS = 60
+NEWTON_STEPS = 12
+WIDTH, SETTLED = 1e-7, 1e-10  # of a place: of the difference for a step, and of a step that is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,9 +112,11 @@ class _Box:
         return self.left <= s.real <= self.right and self.low <= s.imag <= self.high
 
 
-def find_poles(D: Characteristic, region: Region) -> PoleSet:
+def find_poles(D: Characteristic, region: Region, near: Complex | None = None) -> PoleSet:
     """All zeros of D in the region; D must be real on the real axis and analytic in it.
 
+    near : (n,) places, Im >= 0, that zeros may be close to: a short way to them where it leads
+    to all that were counted.
     Edges that run through a zero are moved outwards by a little; the region returned is the
     one searched. SamiiRigError if a count and what was found do not agree.
     """
@@ -130,12 +134,13 @@ def find_poles(D: Characteristic, region: Region) -> PoleSet:
             break
     else:
         raise SamiiRigError("pole search: every contour tried runs through a pole")
+    polished = np.zeros(0, complex) if near is None else _newton(D, near)
     found: list[tuple[complex, int]] = []
     total = 0
     for box, n in zip(boxes, counts, strict=True):
         assert n is not None
         total += n if box.symmetric else 2 * n
-        found += _isolate(D, box, n)
+        found += _known(polished, box, n) or _isolate(D, box, n)
     found.sort(key=lambda item: (abs(item[0]), item[0].imag))
     poles = np.array([p for p, _ in found], dtype=complex)
     multiplicity = np.array([m for _, m in found], dtype=np.int64)
@@ -212,7 +217,9 @@ def phase_along(
     return None
 
 
-def _log_derivative(D: Characteristic, s: Complex, h: float) -> tuple[Complex, Complex, Float]:
+def _log_derivative(
+    D: Characteristic, s: Complex, h: float | Float
+) -> tuple[Complex, Complex, Float]:
     """D'/D by a central difference of width h, and D as mantissa and scale."""
     mantissa, log_scale = D(np.concatenate([s, s + h, s - h]))
     n = s.size
@@ -220,6 +227,31 @@ def _log_derivative(D: Characteristic, s: Complex, h: float) -> tuple[Complex, C
     up = mantissa[n : 2 * n] / here * np.exp(np.clip(log_scale[n : 2 * n] - log_scale[:n], -9, 9))
     down = mantissa[2 * n :] / here * np.exp(np.clip(log_scale[2 * n :] - log_scale[:n], -9, 9))
     return (up - down) / (2 * h), mantissa[:n], log_scale[:n]
+
+
+def _newton(D: Characteristic, s: Complex) -> Complex:
+    """(m,) zeros of D, all apart, that Newton's steps from s lead to; those that settle."""
+    real = s.imag == 0
+    settled = np.zeros(s.size, dtype=bool)
+    for _ in range(NEWTON_STEPS):
+        size = np.maximum(np.abs(s), 1.0)
+        slope, mantissa, _ = _log_derivative(D, s, WIDTH * size)
+        step = np.where(mantissa == 0, 0.0, 1 / np.where(slope == 0, 1 / size, slope))
+        step *= np.minimum(1.0, size / np.maximum(np.abs(step), size))
+        s = s - np.where(real, step.real, step)
+        settled = np.abs(step) <= SETTLED * size
+    out: list[complex] = []
+    for root in s[settled].tolist():
+        if all(abs(root - x) > CLUSTER for x in out):
+            out.append(root)
+    return np.array(out, dtype=complex)
+
+
+def _known(polished: Complex, box: _Box, n: int) -> list[tuple[complex, int]]:
+    """The n zeros in a box, if these are all there and simple; else nothing."""
+    inside = [x for x in polished.tolist() if box.holds(x) and x.imag >= 0]
+    held = sum(2 if box.symmetric and x.imag > 0 else 1 for x in inside)
+    return [(x, 1) for x in inside] if held == n else []
 
 
 def _isolate(D: Characteristic, box: _Box, n: int) -> list[tuple[complex, int]]:

@@ -110,10 +110,11 @@ class Realisation:
         return A, B, C, self.direct
 
 
-def realise(rig: Rig, band_hz: float | None = None) -> Realisation:
+def realise(rig: Rig, band_hz: float | None = None, near: Complex | None = None) -> Realisation:
     """The chain of `rig` as partial fractions, all poles up to `band_hz` kept.
 
     band_hz : edge of the searched region, default 4 times the sample rate.
+    near : poles of nearly the same chain, from which these are found in less time.
     A beam's constant loss factor is replaced by relaxations (`samii_rig.model.damping`) fitted
     from LOSS_LOW times the rate to half the rate. InputError if the chain is unstable or has
     a pole of higher order.
@@ -122,7 +123,8 @@ def realise(rig: Rig, band_hz: float | None = None) -> Realisation:
     beams = relaxed_beams(rig, LOSS_LOW * rig.rate_hz, 0.5 * rig.rate_hz)
     chain = CausalChain(rig, beams) if beams else Chain(rig)
     band = BAND_OVER_RATE * rig.rate_hz if band_hz is None else band_hz
-    found = find_poles(lambda s: chain.characteristic(s, clear=True), search_region(rig, band))
+    region = search_region(rig, band)
+    found = find_poles(lambda s: chain.characteristic(s, clear=True), region, near)
     if found.poles.size and found.poles.real.max() > 1e-6 * found.region.top:
         worst = found.poles[found.poles.real.argmax()]
         raise InputError(rig.name, "element", f"pole at {worst:.4g} rad/s", "a stable chain")
