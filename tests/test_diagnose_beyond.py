@@ -12,13 +12,14 @@ from test_diagnose import ALL, FEW, LINES, concealing, effect
 from samii_rig.diagnose.between_runs import between_runs
 from samii_rig.diagnose.classes import RIVAL, Class
 from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.explanations import Explanation
 from samii_rig.diagnose.judge import Judgement, judge, shown
 from samii_rig.diagnose.measured import measured
 from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.moebius import place_of
 from samii_rig.diagnose.own_law import own_law
 from samii_rig.diagnose.result import Gap
-from samii_rig.diagnose.search import Explanation, Search
+from samii_rig.diagnose.search import Search
 from samii_rig.diagnose.stated import Evidence, probability
 from samii_rig.identify.bootstrap import redraw
 
@@ -106,7 +107,7 @@ def test_an_effect_that_only_spares_the_tolerances_is_not_told_beside_another():
     search.grow(search.nominal, 2)
     both = (spring, damper)
     search.grow(search.found[frozenset({spring.key})], 2)
-    end = search._refit(both, search.found[frozenset({spring.key})], [0.0])
+    end = search.refitted(both, search.found[frozenset({spring.key})], [0.0])
     assert end is not None
     # However much more likely its nominal parameters: the data do not show the damper.
     search.found[frozenset(e.key for e in both)] = Explanation(both, end, 1e3)

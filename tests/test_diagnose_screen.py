@@ -91,7 +91,7 @@ def test_a_screen_finds_the_strength_that_a_refit_finds():
     at = grid(samii(), here.frequency, here.sensor, here.actuator)
     search = Search(samii(), here, at, [brace])
     ((drop, found, starts),) = search.screen(search.nominal)
-    end = search._refit((found,), search.nominal, np.log(starts[0]).tolist())
+    end = search.refitted((found,), search.nominal, np.log(starts[0]).tolist())
     assert drop == pytest.approx(search.nominal.fitted.cost - end.cost, rel=0.05)
     assert starts[0][0] == pytest.approx(np.exp(end.x[-1]), rel=0.05)
 
@@ -157,8 +157,8 @@ def test_a_cause_is_shown_at_its_own_place_about_the_rig_with_the_other_one():
     here = measured([concealing((spring, [1e6, 0.1]), (late, [2e-3]))], samii())
     at = grid(samii(), here.frequency, here.sensor, here.actuator)
     search = Search(samii(), here, at, [spring, late])
-    end = search._refit((spring, late), search.nominal, np.log([1e6, 0.1, 2e-3]).tolist())
-    search._keep((spring, late), end)
+    end = search.refitted((spring, late), search.nominal, np.log([1e6, 0.1, 2e-3]).tolist())
+    search.keep((spring, late), end)
     judged = judge(search)
     assert {e.key for e in judged.best.effects} == {spring.key, late.key}
     first = traces(search, judged)[0]

@@ -127,10 +127,10 @@ def test_the_rate_is_taken_over_the_border_of_two_blocks():
 
 
 def test_a_rate_is_over_the_interval_that_it_changed_in():
-    before = seen([[0, 0]], first=1000)
-    assert seen([[0, 1]], latest=before, first=1001).rate[1] == pytest.approx(500.0)
-    inside = seen([[0, 0], [0, 0], [0, 1]], latest=before, first=1001)
-    assert inside.rate[1] == pytest.approx(500.0)
+    before = seen([[0, 2]], first=1000)
+    assert seen([[0, 3]], latest=before, first=1001).rate[1] == pytest.approx(500.0)
+    inside = seen([[0, 3], [0, 4], [0, 6]], latest=before, first=1001)
+    assert inside.rate[1] == pytest.approx(1000.0)
 
 
 def test_the_rate_over_a_gap_uses_the_time_that_passed():

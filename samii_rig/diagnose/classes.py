@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.explanations import Explanation
 from samii_rig.diagnose.model import Model
 from samii_rig.diagnose.refit import Problem, refit
-from samii_rig.diagnose.search import Explanation
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig
 

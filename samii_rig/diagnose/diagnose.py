@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from samii_rig.diagnose import findings
+from samii_rig.diagnose import answer, findings
 from samii_rig.diagnose import judge as verdict
 from samii_rig.diagnose.classes import without_twins
 from samii_rig.diagnose.effect import Effect
@@ -72,7 +72,7 @@ def diagnose(
     search = Search(rig, seen, at, clean.competing(effects))
     nominal = search.nominal.fitted
     first = search.ratio(nominal)
-    bands = verdict.bands(search, nominal)
+    bands = answer.bands(search, nominal)
     progress("what is missing")
     # Linear effects bend towards what no linear rig does: a force comes first where levels differ.
     gross = seen.differing() > DIFFER
@@ -84,8 +84,8 @@ def diagnose(
     judged = verdict.judge(search, decide)
     nominal = search.nominal.fitted
     best = judged.best
-    gap = verdict.gap(search, show, nominal, best.fitted)
-    due = verdict.due_there(search, show, nominal, best.fitted)
+    gap = answer.gap(search, show, nominal, best.fitted)
+    due = answer.due_there(search, show, nominal, best.fitted)
     holds, said = settle(judged, search, sound, runs)
     judged = verdict.shown(verdict.confirmed(judged) if holds else judged, gap, due)
     if clean.doubt:
@@ -93,27 +93,27 @@ def diagnose(
     if len(set(whole.outputs)) == 1 and len(best.effects) > 1:
         # Trials of four channels say nothing of how often one curve tells several places apart.
         judged = verdict.doubted(judged, "ambiguous")
-    shown = verdict.causes_of(judged.classes[0], judged) if judged.verdict in verdict.SAID else ()
+    shown = answer.causes_of(judged.classes[0], judged) if judged.verdict in verdict.SAID else ()
     told = list(clean.told)
     if judged.verdict != "no_mismatch" or best.effects:
-        told += verdict.told(judged)
+        told += answer.told(judged)
     told += (*said, *clean.lacks)
     why, experiment = next_levels(judged) or next_experiment(search, judged)
     if clean.doubt and judged.verdict != "no_mismatch":
         why, experiment = clean.doubt.why, clean.doubt.experiment
     ranked = list(zip(judged.classes, judged.shares, strict=True))[len(shown) > 0 :]
     alternatives = tuple(
-        (verdict.causes_of(c, judged, share), share)
+        (answer.causes_of(c, judged, share), share)
         for c, share in ranked[:ALTERNATIVES]
-        if share >= verdict.SHOWN and judged.verdict != "no_mismatch"
+        if share >= answer.SHOWN and judged.verdict != "no_mismatch"
     )
-    fits = [(search.ratio(f), verdict.per_dof(search, show, f)[0]) for f in (nominal, best.fitted)]
+    fits = [(search.ratio(f), answer.per_dof(search, show, f)[0]) for f in (nominal, best.fitted)]
     return Diagnosis(
         verdict=judged.verdict,
         chi2_per_dof=first,
         threshold=verdict.threshold(seen),
         bands=bands,
-        sites=tuple(verdict.sites(judged)) if judged.verdict != "no_mismatch" else (),
+        sites=tuple(answer.sites(judged)) if judged.verdict != "no_mismatch" else (),
         causes=shown,
         alternatives=alternatives,
         nominal=fits[0],
@@ -129,6 +129,6 @@ def diagnose(
         evidence={
             **judged.evidence.plain(),
             "beyond": judged.beyond is not None,
-            "causes": [c.plain() for c in verdict.causes_of(judged.classes[0], judged)],
+            "causes": [c.plain() for c in answer.causes_of(judged.classes[0], judged)],
         },
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -13,15 +12,13 @@ from scipy import stats
 from samii_rig.diagnose.between_runs import Changing, between_runs
 from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.classes import Class, classes
-from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.explanations import NEAR, Explanation
 from samii_rig.diagnose.measured import Measured
 from samii_rig.diagnose.own_law import OwnLaw, own_law
 from samii_rig.diagnose.refit import Fitted, Problem
-from samii_rig.diagnose.result import Band, Cause, Gap, Value, Verdict
-from samii_rig.diagnose.search import NEAR, Explanation, Search
+from samii_rig.diagnose.result import Gap, Verdict
+from samii_rig.diagnose.search import Search
 from samii_rig.diagnose.stated import PLACE, TINY, Evidence, probability
-from samii_rig.signal.statistics import octaves
-from samii_rig.types import Float
 
 FALSE_ALARM = 0.003  # of the chi-square test of the nominal model alone
 NOTHING = 0.2  # probability of nothing missing below which it is called missing
@@ -31,14 +28,8 @@ MOSTLY = 0.5  # of the mismatch; one cause that explains it is told whatever els
 MOST_NAMES = 4  # of a class; more is no answer
 IN_DATA = 45.0  # of chi-square, that an effect must explain of the data to be called missing
 UNEXPLAINED = 3e-4  # chance that noise leaves as much as makes an empty answer "unknown"
-DRAWS = 400
 MUST_SHOW = 900.0  # of chi-square, that an effect explains of the data: 30 noise units
 SAID = ("named", "ambiguous")  # verdicts that come with causes
-SHOWN = 0.01  # probability of an alternative from which it is listed
-# What a factor between two units is: their names are told, not physics.
-UNITS = {57.29578: "degrees for radians", 9.80665: "g for m/s^2", 1000.0: "milli for one",
-         6.283185: "hertz for rad/s"}  # fmt: skip
-UNIT_WITHIN = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +206,10 @@ def doubted(judged: Judgement, most: Verdict) -> Judgement:
 
 def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
     """The same, but nothing is named that makes data worse which it was not fitted to: beyond what
-    chance does, or at all if it is so large that it must show, there too. due : of `due_there`."""
+    chance does, or at all if it is so large that it must show, there too.
+
+    due : of `answer.due_there`.
+    """
     must = judged.evidence.drop > MUST_SHOW and due > IN_DATA
     worse = gap.high < 0 or (gap.value < 0 and must)
     if judged.verdict in SAID and worse:
@@ -279,166 +273,3 @@ def _chosen_first(grouped: Sequence[Class], nothing: float) -> list[Class]:
     """Nothing missing last, unless that is the answer."""
     alarmed = nothing < NOTHING
     return sorted(grouped, key=lambda c: (bool(c.first.effects) != alarmed, -c.probability))
-
-
-def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> tuple[Cause, ...]:
-    """The physics of a class's first member. Each has its own marginal probability, or that of
-    the whole class where it is given."""
-    first = chosen.first
-    values = _values(first, judged.inflation)
-    out = []
-    for effect, found in zip(first.effects, values, strict=True):
-        if effect.physics in NOT_PHYSICS or unit_of(effect, found):
-            continue
-        same = {effect.name, *chosen.equivalents(effect)}
-        p = share
-        if p is None:
-            p = sum(
-                q
-                for c, q in zip(judged.classes, judged.shares, strict=True)
-                if any(n in same for e in c.first.effects for n in e.names)
-            )
-        equivalents = tuple(n for n in chosen.equivalents(effect))
-        out.append(Cause(effect.physics, effect.site, min(p, 1.0), equivalents, found))
-    return tuple(out)
-
-
-def unit_of(effect: Effect, found: dict[str, Value]) -> str:
-    """What unit a sensor's gain would be a confusion of, "" for none."""
-    if effect.physics != "sensor_gain":
-        return ""
-    for factor, name in UNITS.items():
-        for value in (factor, 1 / factor):
-            if abs(found["gain"].value / value - 1) < UNIT_WITHIN:
-                return name
-    return ""
-
-
-def _values(explanation: Explanation, inflation: float) -> list[dict[str, Value]]:
-    """Parameters of every effect with 90 % intervals, from draws of the logarithms."""
-    fitted = explanation.fitted
-    model, x = fitted.model, fitted.x
-    cov = fitted.covariance()[model.n_nominal :, model.n_nominal :] * inflation
-    rng = np.random.default_rng(0)
-    centre = x[model.n_nominal :]
-    draws = rng.multivariate_normal(centre, cov, DRAWS, method="eigh") if centre.size else None
-    out, at = [], 0
-    for effect, theta in zip(model.effects, model.parts(x), strict=True):
-        n = len(effect.unknowns)
-        reported = effect.report(theta)
-        found: dict[str, Value] = {}
-        if draws is not None and n:
-            low = np.log([u.low for u in effect.unknowns])
-            high = np.log([u.high for u in effect.unknowns])
-            drawn = np.exp(np.clip(draws[:, at : at + n], low, high))
-            every = np.array([effect.report(row) for row in drawn])
-            ends = np.quantile(every, [0.05, 0.95], axis=0)
-            found = {
-                u.symbol: Value(float(reported[i]), u.unit, float(ends[0, i]), float(ends[1, i]))
-                for i, u in enumerate(effect.unknowns)
-            }
-        at += n
-        out.append(found)
-    return out
-
-
-def told(judged: Judgement) -> list[str]:
-    """Findings of the chosen explanation that are not physics, in words."""
-    out = []
-    best = judged.best
-    for effect, found in zip(best.effects, _values(best, judged.inflation), strict=True):
-        unit = unit_of(effect, found)
-        match effect.physics:
-            case "channel_swap":
-                out.append(f"{effect.site} and {effect.aliases[0][1]} are swapped")
-            case "sign_error":
-                out.append(f"{effect.site} has the wrong sign")
-            case "time_offset":
-                t = found["tau"]
-                out.append(
-                    f"{effect.site} is {1e3 * t.value:.4g} ms ({1e3 * t.low:.4g} to "
-                    f"{1e3 * t.high:.4g}) ahead of the other channels: stamped or read too early"
-                )
-            case "common_gain":
-                g = found["gain"]
-                out.append(
-                    f"all channels share a gain of {g.value:.4g} ({g.low:.4g} to {g.high:.4g}): "
-                    "a scale of the input, not a shape that physics would have"
-                )
-            case _ if unit:
-                g = found["gain"]
-                out.append(f"{effect.site} is {g.value:.4g} times what it should be: {unit}")
-    if judged.beyond is not None:
-        out.append(judged.beyond.told())
-    many = judged.classes[0].names()
-    if many > MOST_NAMES:
-        alike = [" and ".join(" at ".join(e.name) for e in m.effects)
-                 for m in judged.classes[0].members[:MOST_NAMES]]  # fmt: skip
-        out.append(f"{many} names fit these data alike, among them {'; '.join(alike)}")
-    return out
-
-
-def sites(judged: Judgement) -> list[tuple[str, float]]:
-    """Probability of each site over all explanations and what they are not told apart from, the
-    most probable first. Sites of what was chosen are there however improbable."""
-    if judged.beyond is not None:
-        return [(s, p) for s, p in judged.beyond.sites if p >= SHOWN]
-    total: dict[str, float] = defaultdict(float)
-    for c, share in zip(judged.classes, judged.placed, strict=True):
-        for member, part in c.parts():
-            for site in {e.site for e in member.effects if e.physics not in NOT_PHYSICS}:
-                total[site] += share * part
-    chosen = {e.site for e in judged.best.effects}
-    ranked = sorted(total.items(), key=lambda item: -item[1])
-    return [(s, min(p, 1.0)) for s, p in ranked if p >= SHOWN or s in chosen]
-
-
-def bands(search: Search, fitted: Fitted) -> tuple[Band, ...]:
-    """Chi-square per degree of freedom of each channel in each octave."""
-    data = search.problem.data
-    e = np.abs(fitted.model.response(fitted.x, search.problem.at) - data.H) ** 2
-    variance = np.diagonal(np.linalg.pinv(data.W), axis1=1, axis2=2).real
-    q = data.H.shape[1]
-    mean = (data.expected / q)[:, None]
-    unit = np.divide(e, variance, out=np.zeros_like(e), where=variance > 0) / mean
-    out = []
-    for low, high in octaves(data.frequency):
-        inside = (data.frequency >= low) & (data.frequency < high)
-        if inside.any():
-            top = min(high, float(data.frequency[-1]))
-            out += [
-                Band(name, low, top, float(np.mean(unit[inside, k])))
-                for k, name in enumerate(data.outputs)
-            ]
-    return tuple(out)
-
-
-def per_dof(search: Search, lines: Measured, fitted: Fitted) -> tuple[float, Float]:
-    """Chi-square per degree of freedom on other lines, and of each line its share."""
-    h = fitted.model.response(fitted.x, search.grid.at(lines.frequency, lines.level))
-    chi = lines.chi_square(h)
-    return float(np.sum(chi) / np.sum(lines.expected)), chi
-
-
-def gap(search: Search, show: Measured, before: Fitted, after: Fitted) -> Gap:
-    """How far the way from the refitted nominal model to the noise was gone, on `show`."""
-    a, chi_before = per_dof(search, show, before)
-    b, chi_after = per_dof(search, show, after)
-    rng = np.random.default_rng(1)
-    rows = rng.integers(0, show.n, (DRAWS, show.n))
-    floor = show.expected
-    num = (chi_before - chi_after)[rows].sum(axis=1)
-    den = (chi_before - floor)[rows].sum(axis=1)
-    # Where nothing is left to be closed, only the sign of the change says anything.
-    value = (a - b) / (a - 1) if a > 1 else min(a - b, 0.0)
-    drawn = num / np.where(np.abs(den) > 0, np.abs(den), np.inf)
-    low, high = np.quantile(drawn, [0.05, 0.95])
-    return Gap(float(value), float(low), float(high))
-
-
-def due_there(search: Search, show: Measured, before: Fitted, after: Fitted) -> float:
-    """Chi-square that `after`, if true, should explain of other lines: they may lie where the two
-    are alike."""
-    at = search.grid.at(show.frequency, show.level)
-    predicted = replace(show, H=after.model.response(after.x, at))
-    return float(np.sum(predicted.chi_square(before.model.response(before.x, at))))

@@ -16,12 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.explanations import Explanation
 from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.model import Model
 from samii_rig.diagnose.moebius import Place, place_of
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Trace
-from samii_rig.diagnose.search import Explanation, Search
+from samii_rig.diagnose.search import Search
 from samii_rig.types import Complex, Float
 
 ROUNDS = 4  # of nominal parameters and x in turn

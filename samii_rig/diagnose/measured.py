@@ -83,10 +83,8 @@ class Measured:
         """Chi-square per degree of freedom of the levels against each other, line by line; nan
         where no line was measured at two of them."""
         f, which = np.unique(self.frequency, return_inverse=True)
-        A = np.zeros((f.size, *self.W.shape[1:]), complex)
-        b = np.zeros((f.size, self.W.shape[1]), complex)
-        np.add.at(A, which, self.W)
-        np.add.at(b, which, np.einsum("nij,nj->ni", self.W, self.H))
+        A = summed(self.W, which, f.size)
+        b = summed(np.einsum("nij,nj->ni", self.W, self.H), which, f.size)
         common = np.einsum("gij,gj->gi", np.linalg.pinv(A, rcond=1e-12, hermitian=True), b)
         times = np.bincount(which)[which]
         several = times > 1
@@ -136,6 +134,13 @@ class Measured:
         """(n,) e^H W e of a prediction (n, q)."""
         e = h - self.H
         return np.asarray(np.einsum("ni,nij,nj->n", e.conj(), self.W, e).real)
+
+
+def summed(values: Complex, which: Int, n: int) -> Complex:
+    """(n, ...) sums of `values` over the lines of each of n groups. which : of each line."""
+    out = np.zeros((n, *values.shape[1:]), complex)
+    np.add.at(out, which, values)
+    return out
 
 
 def usable(responses: Sequence[FrequencyResponse]) -> list[FrequencyResponse]:

@@ -8,13 +8,13 @@ here with the best linear explanations on the very same lines, by the same evide
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.explanations import NEAR, Explanation
 from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.nonlinear_apart import Apart
 from samii_rig.diagnose.nonlinear_confirm import seen
@@ -25,7 +25,7 @@ from samii_rig.diagnose.nonlinear_levels import LevelGrid, level_grid
 from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.diagnose.nonlinear_screen import Bins, Promise
 from samii_rig.diagnose.refit import Fitted, Problem
-from samii_rig.diagnose.search import MIXED, NEAR, WORTH, Explanation, Search
+from samii_rig.diagnose.search import MIXED, WORTH, Search
 from samii_rig.types import FrequencyResponse, Recording
 
 NAMES = (
@@ -80,22 +80,22 @@ def compete(
         drives(search.rig, lines, responses, runs),
     )  # fmt: skip
     search.problem, search.grid = problem, grid
-    _use(search, [*before[2], *levels.forces])
+    search.use([*before[2], *levels.forces])
     bases = list({e.key: e for e in (ranked[0], search.nominal)}.values())
     promised = [(base, levels.promises(base)) for base in bases]
     forced: Effect | None = None
     if any(_heard(p) for _, found in promised for p in found):
         search.found = {}
         for e in kept:
-            if (end := search._refit(e.effects, e, far=False)) is not None:
-                search._keep(e.effects, end)
+            if (end := search.refitted(e.effects, e, far=False)) is not None:
+                search.keep(e.effects, end)
         _force(search, promised)
         search.temper()
         forced = _settled(levels, before[2])
     search.table = before[2]
     if forced is None:
         search.problem, search.grid, table, search.found, search.temperature = before
-        _use(search, table)
+        search.use(table)
     return forced
 
 
@@ -110,10 +110,10 @@ def _force(search: Search, promised: Sequence[tuple[Explanation, list[Promise]]]
     as near."""
     for base, promise in [(base, p) for base, found in promised for p in _worth(found)]:
         effects = (*base.effects, promise.effect)
-        ends = [search._refit(effects, base, [math.log(p)]) for p in promise.starts]
+        ends = [search.refitted(effects, base, [math.log(p)]) for p in promise.starts]
         done = [end for end in ends if end is not None]
         if done:
-            search._keep(effects, min(done, key=lambda end: end.cost))
+            search.keep(effects, min(done, key=lambda end: end.cost))
 
 
 def _worth(found: Sequence[Promise]) -> list[Promise]:
@@ -204,9 +204,9 @@ def _only(search: Search, some: Sequence[Explanation]) -> None:
     """Refit some explanations, and forget all others."""
     search.found = {}
     for e in {e.key: e for e in some}.values():
-        end = search._refit(e.effects, e)
+        end = search.refitted(e.effects, e)
         if end is not None:
-            search._keep(e.effects, end)
+            search.keep(e.effects, end)
 
 
 def _on_lines(levels: Apart) -> None:
@@ -223,7 +223,7 @@ def _on_lines(levels: Apart) -> None:
     others = [*near[:RIVALS], *rivals, search.nominal]
     _only(search, [e for e in others if e.key not in leading])
     for key, e in leading.items():
-        search._keep(e.effects, ends[key])
+        search.keep(e.effects, ends[key])
     search.temper()
     best = search.ranked()[0].fitted
     if isinstance(best.model, LevelModel):
@@ -238,14 +238,14 @@ def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:
     model, x, whole, every = base.fitted.model, base.fitted.x, search.problem, search.table
     assert isinstance(model, LevelModel)
     linear = tuple(e for e in base.effects if e.quasi is None)
-    plain = search._model(linear)
+    plain = search.model(linear)
     if plain is None or len(base.effects) >= MIXED + 1:
         return
     known = np.delete(x, model.unknown)
     added = model.response(x, whole.at) - plain.response(known, whole.at)
     search.problem = replace(whole, data=replace(whole.data, H=whole.data.H - added))
     search.table = table
-    rest = search._from(linear, known, steps=2, far=False)
+    rest = search.refitted_from(linear, known, steps=2, far=False)
     screened = search.screen(Explanation(linear, rest, 0.0)) if rest is not None else []
     search.problem, search.table = whole, every
     for drop, effect, starts in screened[:GROWN]:
@@ -253,21 +253,14 @@ def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:
         mixed = len(effects) > MIXED and len({e.physics for e in effects}) > MIXED
         if drop < WORTH or mixed or frozenset(e.key for e in effects) in search.found:
             continue
-        ends = [search._refit(effects, base, np.log(start).tolist()) for start in starts]
+        ends = [search.refitted(effects, base, np.log(start).tolist()) for start in starts]
         done = [end for end in ends if end is not None]
         if done:
-            search._keep(effects, min(done, key=lambda end: end.cost))
+            search.keep(effects, min(done, key=lambda end: end.cost))
 
 
 def _force_in(explanation: Explanation) -> Effect | None:
     return next((e for e in explanation.effects if e.quasi is not None), None)
-
-
-def _use(search: Search, table: Sequence[Effect]) -> None:
-    """Give the search another table, with its prior even over the rows of that."""
-    search.table = table
-    search._rows = Counter(e.physics for e in table)
-    search._total = {p: sum(e.weight for e in table if e.physics == p) for p in search._rows}
 
 
 def level_dependence(explanation: Explanation, search: Search) -> str:

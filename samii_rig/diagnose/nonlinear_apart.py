@@ -12,13 +12,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.explanations import Explanation
 from samii_rig.diagnose.nonlinear_driven import Drives, Known, driven, top_of
 from samii_rig.diagnose.nonlinear_laws import EXCESS
 from samii_rig.diagnose.nonlinear_levels import Extra, LevelGrid
 from samii_rig.diagnose.nonlinear_model import LevelModel
 from samii_rig.diagnose.nonlinear_screen import Bins, Levels, Promise
 from samii_rig.diagnose.refit import Problem
-from samii_rig.diagnose.search import Explanation, Search
+from samii_rig.diagnose.search import Search
+from samii_rig.errors import SamiiRigError
 from samii_rig.types import Float
 
 # Forces that describing functions may miss altogether, as their amplitude is not the sweep's.
@@ -50,7 +52,7 @@ class Apart:
         look = Levels.of(self.problem, base.fitted)
         found: list[Promise] = []
         for effect in self.forces:
-            model = self.search._model((*base.effects, effect))
+            model = self.search.model((*base.effects, effect))
             if isinstance(model, LevelModel):
                 promise = look.promise(effect, model)
                 found += [promise] if promise is not None else []
@@ -71,7 +73,7 @@ class Apart:
     def _closer(self, base: Explanation, look: Levels, promise: Promise) -> Promise:
         """The same with the force in time, under the inputs that were recorded."""
         effect = promise.effect
-        model = self.search._model((*base.effects, effect))
+        model = self.search.model((*base.effects, effect))
         assert isinstance(model, LevelModel)
         tried: dict[float, Promise] = {}
 
@@ -116,8 +118,12 @@ class Apart:
         return True
 
     def on_lines(self, model: LevelModel, x: Float) -> Problem:
-        """The lines themselves, with the model's force computed in time at x."""
-        self.compute(model, x, model.strength(x)[0])
+        """The lines themselves, with the model's force computed in time at x.
+
+        Raises SamiiRigError where the rig has no partial fractions there.
+        """
+        if self.given and not self.compute(model, x, model.strength(x)[0]):
+            raise SamiiRigError("no partial fractions")
         return Problem.of(self.search.lines, self.grid)
 
     def renew(self, best: Explanation) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.measured import Measured, binned, combined
+from samii_rig.diagnose.measured import Measured, binned, combined, summed
 from samii_rig.diagnose.model import Grid
 from samii_rig.diagnose.nonlinear_levels import Extra, LevelGrid
 from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
@@ -129,8 +129,7 @@ class Levels:
         residual = residual - Q @ (Q.T @ residual)
         groups = _same_bin(problem.data)
         columns = np.asarray(problem.root * h[:, None, :], np.complex128)
-        A = np.zeros((int(groups.max()) + 1, *columns.shape[1:]), complex)
-        np.add.at(A, groups, columns.conj().swapaxes(1, 2) @ columns)
+        A = summed(columns.conj().swapaxes(1, 2) @ columns, groups, int(groups.max()) + 1)
         inverse = np.asarray(np.linalg.pinv(A, rcond=1e-12, hermitian=True), np.complex128)
         return cls(problem, base, residual, Q, groups, columns, inverse)
 
@@ -199,8 +198,7 @@ class Levels:
     def _common(self, d: Complex) -> Complex:
         """(m, n_group, q) the part of d along a response common to all levels."""
         part = np.einsum("nji,mnj->mni", self.columns.conj(), d)
-        out = np.zeros((*self.inverse.shape[:2], len(d)), complex)
-        np.add.at(out, self.groups, np.moveaxis(part, 0, -1))
+        out = summed(np.moveaxis(part, 0, -1), self.groups, len(self.inverse))
         return np.asarray(np.moveaxis(out, -1, 0))
 
 

@@ -15,13 +15,14 @@ import numpy as np
 from scipy import optimize
 
 from samii_rig.diagnose.effect import Effect, Unknown
+from samii_rig.diagnose.explanations import Explanation
 from samii_rig.diagnose.model import Model
 from samii_rig.diagnose.moebius import place_of
 from samii_rig.diagnose.ranking import moved
 from samii_rig.diagnose.refit import Fitted
 from samii_rig.diagnose.scales import spread
 from samii_rig.diagnose.screen import Screen
-from samii_rig.diagnose.search import Explanation, Search
+from samii_rig.diagnose.search import Search
 from samii_rig.errors import SamiiRigError
 from samii_rig.types import Complex, Float
 
@@ -66,7 +67,7 @@ def own_law(search: Search, best: Explanation) -> OwnLaw | None:
     found = []
     for effect in search.table:
         part = _power(effect, search.problem.data.frequency)
-        model = search._model((effect,)) if part else None
+        model = search.model((effect,)) if part else None
         if part is None or model is None or model.keys != base.model.keys:
             continue
         try:

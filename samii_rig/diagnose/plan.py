@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from samii_rig.diagnose import insert
+from samii_rig.diagnose.explanations import Explanation
 from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.model import Grid, Model
 from samii_rig.diagnose.refit import Problem
-from samii_rig.diagnose.search import Explanation, Search
+from samii_rig.diagnose.search import Search
 from samii_rig.errors import SamiiRigError
 from samii_rig.model.sampled import hold_response, sensor_response
 from samii_rig.rig.schema import (

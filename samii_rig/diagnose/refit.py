@@ -173,7 +173,7 @@ def _step(
     A[np.arange(n), np.arange(n)] += 1 / model.prior[:n] ** 2
     downhill[:n] += x[:n] / model.prior[:n] ** 2
     for _ in range(7):
-        new = _move(model, x, A, downhill, damping)
+        new = move(model, x, A, downhill, damping)
         if new is None:
             damping = max(damping * 5, LEAST)
             continue
@@ -189,7 +189,7 @@ def _step(
             # Back into the curved valley along which the step went, by the same derivatives.
             g = J.T @ problem.residual(h)
             g[:n] += new[:n] / model.prior[:n] ** 2
-            back = _move(model, new, A, g, damping)
+            back = move(model, new, A, g, damping)
             if back is None:
                 break
             try:
@@ -207,8 +207,11 @@ def _step(
     return x, None, cost, damping
 
 
-def _move(model: Model, x: Float, A: Float, g: Float, damping: float) -> Float | None:
-    """x after a damped step within the bounds; unknowns held at a bound do not take part."""
+def move(model: Model, x: Float, A: Float, g: Float, damping: float) -> Float | None:
+    """x after a damped step within the bounds; unknowns held at a bound do not take part.
+
+    A, g : half of the cost's second and first derivatives. None where there is no step.
+    """
     scale = np.sqrt(np.maximum(np.diag(A), 1e-12 * np.max(np.diag(A)) + 1e-30))
     held = ((x <= model.lower) & (g > 0)) | ((x >= model.upper) & (g < 0))
     on = np.flatnonzero(~held)
@@ -253,7 +256,7 @@ def _logarithm(
         A, g = J.T @ J, J.T @ r
         A[np.arange(n), np.arange(n)] += 1 / model.prior[:n] ** 2
         g[:n] += y[:n] / model.prior[:n] ** 2
-        new = _move(model, y, A, g, damping)
+        new = move(model, y, A, g, damping)
         if new is None:
             break
         try:

@@ -19,9 +19,10 @@ import numpy as np
 from samii_rig.diagnose.classes import SAME, apart
 from samii_rig.diagnose.diagnose import table
 from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.explanations import Explanation
 from samii_rig.diagnose.measured import Measured
 from samii_rig.diagnose.model import grid
-from samii_rig.diagnose.search import FIRST, Explanation, Search
+from samii_rig.diagnose.search import FIRST, Search
 from samii_rig.prove.trial import Name
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
