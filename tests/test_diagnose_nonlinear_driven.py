@@ -163,8 +163,8 @@ def test_force_and_parameters_end_where_both_agree_with_the_data():
     end = self_consistent(bent, lambda m, x: problem(m, x, measured_))
     assert np.exp(bent.x[model.unknown]) != pytest.approx(p, rel=0.02)
     assert np.exp(end.x[model.unknown]) == pytest.approx(p, rel=0.01)
-    assert end.cost < 0.1
-    assert len(turns) <= 13
+    assert end.cost < 0.3
+    assert len(turns) < 4 * model.n
 
 
 def test_levels_that_differ_are_told_without_a_model():

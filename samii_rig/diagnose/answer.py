@@ -132,7 +132,9 @@ def sites(judged: Judgement) -> list[tuple[str, float]]:
     total: dict[str, float] = defaultdict(float)
     for c, share in zip(judged.classes, judged.placed, strict=True):
         for member, part in c.parts():
-            for site in dict.fromkeys(e.site for e in member.effects if e.physics not in NOT_PHYSICS):
+            for site in dict.fromkeys(
+                e.site for e in member.effects if e.physics not in NOT_PHYSICS
+            ):
                 total[site] += share * part
     chosen = {e.site for e in judged.best.effects}
     ranked = sorted(total.items(), key=lambda item: -item[1])

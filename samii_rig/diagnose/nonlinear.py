@@ -26,6 +26,7 @@ from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.diagnose.nonlinear_screen import Bins, Promise
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.search import MIXED, WORTH, Search
+from samii_rig.errors import SamiiRigError
 from samii_rig.types import FrequencyResponse, Recording
 
 NAMES = (
@@ -144,7 +145,7 @@ def _settled(levels: Apart, table: Sequence[Effect]) -> Effect | None:
     if search.ranked()[0].key != before:
         _again(levels)
     if _force_in(search.ranked()[0]) is not None:
-        _on_lines(levels)
+        _on_lines(levels, table)
     for key, e in search.found.items():
         search.found[key] = replace(e, fitted=_with_law_error(e.fitted))
     return _force_in(search.ranked()[0])
@@ -209,25 +210,44 @@ def _only(search: Search, some: Sequence[Explanation]) -> None:
             search.keep(e.effects, end)
 
 
-def _on_lines(levels: Apart) -> None:
+def _on_lines(levels: Apart, table: Sequence[Effect]) -> None:
     """Refit the leading explanations on the lines themselves: bins about one force lose what
     another adds, as that is no smooth curve."""
     search = levels.search
     ranked = search.ranked()
-    rivals = _computed(levels, REACH)
     bare = next((e for e in ranked if len(e.effects) == 1 and _force_in(e) is not None), ranked[0])
-    leading = {e.key: e for e in (bare, ranked[0])}
-    ends = {key: self_consistent(e.fitted, levels.on_lines) for key, e in leading.items()}
+    try:
+        end = self_consistent(bare.fitted, levels.on_lines)
+    except SamiiRigError:  # no partial fractions where the refit ended
+        return
+    _use_force_of(levels, end)
+    alone = replace(bare, fitted=end)
+    if search.leftover(end) > 1:
+        # What else is missing was looked for beside a force that was not right yet.
+        levels.renew(alone)
+        _only(search, [*ranked[:REFITTED], alone, search.nominal])
+        _beside(search, search.found.get(bare.key, alone), table)
+        search.temper()
+        ranked = search.ranked()
+    rivals = _computed(levels, REACH)
     near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
-    search.problem = Problem.of(search.lines, levels.grid)
-    others = [*near[:RIVALS], *rivals, search.nominal]
-    _only(search, [e for e in others if e.key not in leading])
-    for key, e in leading.items():
-        search.keep(e.effects, ends[key])
+    _use_force_of(levels, end)
+    _only(search, [e for e in (*near[:RIVALS], *rivals, search.nominal) if e.key != bare.key])
+    search.keep(bare.effects, end)
     search.temper()
-    best = search.ranked()[0].fitted
-    if isinstance(best.model, LevelModel):
-        search.problem = levels.on_lines(best.model, best.x)
+    best = search.ranked()[0]
+    if _force_in(best) is not None and best.key != bare.key:
+        # Not the better of both: the force was that of another explanation.
+        del search.found[best.key]
+        search.keep(best.effects, self_consistent(best.fitted, levels.on_lines))
+        search.temper()
+    _use_force_of(levels, search.ranked()[0].fitted)
+
+
+def _use_force_of(levels: Apart, fitted: Fitted) -> None:
+    """The problem on the lines, with the force where this fit has it."""
+    if isinstance(fitted.model, LevelModel):
+        levels.search.problem = levels.on_lines(fitted.model, fitted.x)
 
 
 def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:

@@ -1,8 +1,10 @@
-"""A force in the loop and the parameters about it, until both stand still.
+"""A force in the loop and the parameters about it, fitted to each other.
 
 A refit knows how a force's describing function moves with the parameters, not how its part in
-time does; computing that anew where a refit ended, and refitting again, creeps along valleys that
-the data hardly see. What such turns left of the data says where they lead.
+time does. Where both are strong, computing that anew where a refit ended, and refitting again,
+creeps along valleys that the data hardly see, or runs away from them. So the slopes learn from
+each step what it really changed (Broyden), and where that leads no further they are differences
+of the force in time itself.
 """
 
 from __future__ import annotations
@@ -12,57 +14,84 @@ from collections.abc import Callable
 import numpy as np
 
 from samii_rig.diagnose.nonlinear_model import LevelModel
-from samii_rig.diagnose.refit import Fitted, Problem, refit
+from samii_rig.diagnose.refit import FIRST, LEAST, Fitted, Problem, move
+from samii_rig.errors import SamiiRigError
 from samii_rig.types import Float
 
-TURNS = 12  # at most
-STILL = 0.5  # standard deviations that a turn moves the parameters, at its end
-PLAIN = 3  # turns between leaps: they lead back into the valley
-GAIN = 0.5  # of the cost, that a leap must promise
-FIRM = 1e-4  # of the largest, singular values of differences that a leap rests on
+STEPS = 40  # at most
+TRIES, SHORTER = 5, 20.0  # of a step, and how much more each is damped
+DIFFERENCE = 1e-3  # of a tolerance, or of a logarithm without one, for slopes
+SETTLED = 0.3  # of chi-square, gained by a step: less and it leads no further
+
+Computed = Callable[[LevelModel, Float], Problem]
 
 
-def self_consistent(fitted: Fitted, computed: Callable[[LevelModel, Float], Problem]) -> Fitted:
-    """Where turns of computing the force and refitting end, from where `fitted` is.
+def self_consistent(fitted: Fitted, computed: Computed) -> Fitted:
+    """The least squares that `fitted` leads to.
 
-    computed : the problem with the force as it is in time at a vector of the model. Of the
-    vectors that were tried, that with the least cost is where the last refit begins.
+    computed : the problem with the force as it is in time at a vector of the model.
     """
     model, x = fitted.model, fitted.x
     assert isinstance(model, LevelModel)
-    tried: list[tuple[Float, Float]] = []  # vector, whitened residuals with those of the priors
-    best, least = x, np.inf
-    for turn in range(TURNS):
-        problem = computed(model, x)
-        left = _left(model, problem, x)
-        if (cost := float(left @ left)) < least:
-            best, least = x, cost
-        tried.append((x, left))
-        end = refit(model, problem, x, far=False)
-        step = end.x - x
-        x = end.x
-        if float(step @ end.precision() @ step) < STILL**2:
+    problem = computed(model, x)
+    r = _left(model, x, problem)
+    n, m = model.n_nominal, r.size - model.n_nominal  # of the priors, and of the data
+    J = np.zeros((r.size, model.n))
+    J[:m] = problem.whiten(model.gradient(x, problem.at)[1])
+    J[m:, :n] = np.diag(1 / model.prior[:n])
+    scale = np.minimum(model.prior, 1.0)  # inf of an unknown
+    # What a command drives does not move with the parameters.
+    command = model.quasi.kind == "command"
+    damping, exact = FIRST, False
+    for _ in range(STEPS):
+        before = float(r @ r)
+        new, there, damping = _step(model, x, J, r, computed, damping)
+        d, change = new - x, there - r
+        x, r = new, there
+        if before - float(r @ r) > SETTLED:
+            by = d / scale**2
+            J += np.outer(change - J @ d, by) / (d @ by)
+            exact = False
+        elif exact or command:
             break
-        if turn % PLAIN == PLAIN - 1:
-            x = _leap(model, tried[-PLAIN:], x)
-    return refit(model, computed(model, best), best, far=False)
+        else:
+            J, exact, damping = _slopes(model, x, r, computed, scale), True, LEAST
+    chi2, penalty = float(r[:m] @ r[:m]), float(r[m:] @ r[m:])
+    return Fitted(model, x, chi2, penalty, J[:m], J[:m].T @ J[:m])
 
 
-def _left(model: LevelModel, problem: Problem, x: Float) -> Float:
+def _step(
+    model: LevelModel, x: Float, J: Float, r: Float, computed: Computed, damping: float
+) -> tuple[Float, Float, float]:
+    """A damped step that lowers the cost, what is left there, and the next damping; the same x and
+    r where none was found."""
+    A, g = J.T @ J, J.T @ r
+    for _ in range(TRIES):
+        new = move(model, x, A, g, damping)
+        try:
+            there = r if new is None else _left(model, new, computed(model, new))
+        except SamiiRigError:
+            there = r
+        if new is not None and float(there @ there) < float(r @ r):
+            return new, there, max(damping * 0.3, LEAST)
+        damping *= SHORTER
+    return x, r, damping
+
+
+def _left(model: LevelModel, x: Float, problem: Problem) -> Float:
+    """Whitened residuals with those of the priors."""
     n = model.n_nominal
-    return np.concatenate(
-        [problem.residual(model.response(x, problem.at)), x[:n] / model.prior[:n]]
-    )
+    data = problem.residual(model.response(x, problem.at))
+    return np.concatenate([data, x[:n] / model.prior[:n]])
 
 
-def _leap(model: LevelModel, tried: list[tuple[Float, Float]], x: Float) -> Float:
-    """To the least squares on the plane through the vectors that were tried; x where that
-    promises nothing."""
-    base, left = tried[-1]
-    by = np.stack([r - left for _, r in tried[:-1]], axis=1)
-    times = np.linalg.lstsq(by, -left, rcond=FIRM)[0]
-    there = left + by @ times
-    if float(left @ left - there @ there) < GAIN:
-        return x
-    along = np.stack([v - base for v, _ in tried[:-1]], axis=1)
-    return np.asarray(np.clip(base + along @ times, model.lower, model.upper))
+def _slopes(model: LevelModel, x: Float, r: Float, computed: Computed, scale: Float) -> Float:
+    """(r.size, n_x) by differences, towards the inside of the bounds."""
+    J = np.empty((r.size, model.n))
+    for j in range(model.n):
+        step = DIFFERENCE * float(scale[j])
+        step = -step if x[j] + step > model.upper[j] else step
+        ahead = x.copy()
+        ahead[j] += step
+        J[:, j] = (_left(model, ahead, computed(model, ahead)) - r) / step
+    return J
