@@ -108,6 +108,25 @@ def test_a_report_and_figures_from_a_log(log: Path, tmp_path: Path) -> None:
     assert (tmp_path / "b.svg").read_text().startswith("<?xml")
 
 
+def test_a_figure_alone_leaves_the_page_of_the_run_as_it_is(log: Path, tmp_path: Path) -> None:
+    copy, page = tmp_path / "run.mcap", tmp_path / "run.html"
+    copy.write_bytes(log.read_bytes())
+    page.write_text("with its diagnosis")
+    code, said = call("report", copy, "--figure", tmp_path / "b.svg", "--json")
+    assert code == 0
+    assert json.loads(said)["written"] == [str(tmp_path / "b.svg")]
+    assert page.read_text() == "with its diagnosis"
+
+
+def test_what_is_no_recording_is_called_none(tmp_path: Path) -> None:
+    text = tmp_path / "README.md"
+    text.write_text("what a rig does\n" * 100)
+    for command in ("report", "frf", "diagnose"):
+        code, said = call(command, text)
+        assert code != 0
+        assert said == f"{text}: it does not begin as an MCAP file"
+
+
 def test_a_cut_recording_is_recovered(log: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap.partial"
     data = log.read_bytes()

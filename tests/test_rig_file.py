@@ -87,7 +87,8 @@ def test_samii_carries_table_ii_of_paper_1() -> None:
         ("max = 0.35", "max = 0.0", r"limit.*max is 0.0.*greater than 0"),
         ("low = -1.5", "low = 2.0", r"theta_2.*low 2, high 1.5; expected low below high"),
         ('sensor = "theta_2"', 'sensor = "theta_7"', r"centring.*'theta_7' does not exist"),
-        ("rate_hz", "rate", r"rate_hz: missing"),
+        ("rate_hz", "rate", r"rate: no such field; expected rate_hz"),
+        ('tip = "free"', "", r"tip: missing; expected one of"),
         ('tip = "free"', 'tip = "free"\ntop = 1', r"top: no such field"),
     ],
 )
@@ -162,7 +163,7 @@ def test_an_element_of_a_branch_is_named_by_its_place() -> None:
         (LINE, r"element line: source 'joint_2_source' is no angular velocity source right before"),
         (
             BRANCH.replace("[[element.element]]", "[[element.part]]"),
-            r"element\[hose\].element: missing",
+            r"element\[hose\].part: no such field; expected element",
         ),
         (
             BRANCH.replace('kind = "torsional', 'kind = "magic'),

@@ -33,9 +33,9 @@ from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
 from samii_rig.run.protocols import Plan
 from samii_rig.serve.analysis import Analysis
-from samii_rig.serve.analyst import curves, said
+from samii_rig.serve.analyst import Analyst, curves, said
 from samii_rig.serve.following import following
-from samii_rig.serve.job import DIAGNOSIS, RESPONSES, SO_FAR, Job, Request
+from samii_rig.serve.job import DIAGNOSIS, RESPONSES, SO_FAR, Job, JobState, Request
 from samii_rig.serve.sofar import SoFar
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
@@ -325,6 +325,20 @@ def test_the_last_word_of_the_runner_is_none_of_the_analyst(tmp_path: Path) -> N
     analysis.turn(job)
     assert analysis.state()["diagnosis"] is None
     assert analysis.certain == ""
+
+
+def test_a_run_that_ends_while_it_is_looked_at_is_looked_at_once_more(tmp_path: Path) -> None:
+    plan, _, _ = made(tmp_path, SWEEPS)
+    job = Job.make(tmp_path / "jobs", Request("swept_sine", "run.mcap"), RIG_TOML, SWEEPS)
+    job.set(JobState(phase="analysing"))
+    with patch("samii_rig.serve.analyst.Diagnoser"):
+        Analyst(job, tmp_path).go()
+    told = json.loads((job.folder / RESPONSES).read_text())
+    assert told["done"] == told["of"] == len(plan.segments)
+    assert [(r["level"], r["n"], r["going_on"]) for r in told["responses"]] == [
+        (0.02, 2, False),
+        (0.04, 2, False),
+    ]
 
 
 def test_what_two_tell_of_a_job_at_once_is_whole(tmp_path: Path) -> None:

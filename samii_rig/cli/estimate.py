@@ -126,13 +126,14 @@ def report(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="The page (.html), replaced if it exists [default: beside the first recording]"
+            help="The page (.html), replaced if it exists [default: beside the first recording; "
+            "none if there is a --figure]"
         ),
     ] = None,
     figure: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Also the Bode diagram as .png, .svg or .pdf, for a paper; replaced if it exists."
+            help="The Bode diagram as .png, .svg or .pdf, for a paper; replaced if it exists."
         ),
     ] = None,
     input_: InputOption = None,
@@ -153,24 +154,27 @@ def report(
     from samii_rig.report.page import write_report
     from samii_rig.report.summary import summary
 
-    page = out or logs[0].with_suffix(".html")
-    check_target("--out", page, (".html",), logs)
+    page = out or (None if figure else logs[0].with_suffix(".html"))
+    if page is not None:
+        check_target("--out", page, (".html",), logs)
     for path in figure or ():
         check_target("--figure", path, (".png", ".svg", ".pdf"), logs)
     recordings = read_all(logs)
     responses = estimated(recordings, input_, output, method, gaps, band)
     held = rig_of(recordings, rig)
     curve = model_curve(held[0], responses) if held else None
-    write_report(
-        page,
-        recordings,
-        responses,
-        rig=held[0] if held else None,
-        model=curve,
-        band_hz=band or ALL,
-        events=[event for path in logs for event in read_events(path)],
-    )
-    written = [page]
+    written = []
+    if page is not None:
+        write_report(
+            page,
+            recordings,
+            responses,
+            rig=held[0] if held else None,
+            model=curve,
+            band_hz=band or ALL,
+            events=[event for path in logs for event in read_events(path)],
+        )
+        written.append(page)
     for path in figure or ():
         written.append(save_figure(path, bode_figure(responses, curve)))
     if json:

@@ -229,10 +229,18 @@ class Diagnosis:
         )
 
     def _next(self) -> str:
-        parts = [f"{told[0].upper()}{told[1:].rstrip('.')}." for told in self.not_physics[:1]]
+        parts = [sentence(told) for told in self.not_physics[:1]]
         if self.experiment:
             parts.append(f"Next: {self.experiment} ({self.why}).")
         return " ".join(parts) or "No further experiment is needed."
+
+
+def sentence(text: str) -> str:
+    """With a capital and a full stop; the name of a channel stays as it is."""
+    text = text.strip()
+    if text[:1].islower() and " " in text and text.split()[0].isalpha():
+        text = text[0].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
 def percent(p: float) -> str:

@@ -83,14 +83,19 @@ class Contents:
         return found[0] if found else None
 
 
+def check_start(data: memoryview) -> None:
+    """RecordingError for a file that is no recording at all."""
+    if not scan.has_magic(data, 0):
+        raise RecordingError("it does not begin as an MCAP file")
+
+
 def read_contents(data: memoryview, stop: int, *, strict: bool) -> Contents:
     """Walk the data section, which ends before `stop`.
 
     strict : raise the first DamagedError; otherwise note it, look for the next whole chunk behind
         it and go on.
     """
-    if not scan.has_magic(data, 0):
-        raise RecordingError("it does not begin as an MCAP file")
+    check_start(data)
     contents = Contents()
     search = _ChunkSearch(data, stop)
     at = scan.MAGIC_SIZE
@@ -231,7 +236,9 @@ class Tail:
 
 
 def read_tail(data: memoryview) -> Tail:
-    """Footer and summary; DamagedError unless every byte of them is as it was written."""
+    """Footer and summary; DamagedError unless every byte of them is as it was written,
+    RecordingError as `check_start`."""
+    check_start(data)
     size = len(data)
     at = size - scan.MAGIC_SIZE - scan.FOOTER_SIZE
     if at < scan.MAGIC_SIZE or not scan.has_magic(data, size - scan.MAGIC_SIZE):

@@ -8,7 +8,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from samii_rig.diagnose.result import LIKELY, Band, Cause, Diagnosis, Trace, Value, percent
+from samii_rig.diagnose.result import (
+    LIKELY,
+    Band,
+    Cause,
+    Diagnosis,
+    Trace,
+    Value,
+    percent,
+    sentence,
+)
 from samii_rig.report.diagnosis_laws import Jump, jump_of
 from samii_rig.report.verdicts import Mark, without_folders
 
@@ -289,14 +298,7 @@ def _why(
 
 def findings(found: Diagnosis) -> list[str]:
     """What is wrong with the recordings, as sentences."""
-    return [_sentence(without_folders(text)) for text in found.not_physics]
-
-
-def _sentence(text: str) -> str:
-    text = text.strip()
-    if text[:1].islower() and " " in text and text.split()[0].isalpha():  # no channel's name
-        text = text[0].upper() + text[1:]
-    return text if text.endswith((".", "!", "?")) else f"{text}."
+    return [sentence(without_folders(text)) for text in found.not_physics]
 
 
 @dataclass(frozen=True, slots=True)

@@ -79,7 +79,9 @@ def load_named(
 def _one_line(
     model: type[BaseModel], error: ValidationError, data: dict[str, object], where: str
 ) -> InputError:
-    first = error.errors(include_url=False)[0]
+    found = error.errors(include_url=False)
+    # A name that is mistyped leaves the right one missing: the mistake is the former.
+    first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
     field = ""
     node: object = data
     last = len(first["loc"]) - 1
@@ -108,7 +110,11 @@ def _one_line(
             expected = f"one of {', '.join(words)}" if choice else "a value"
             return InputError.saying(where, field, f"missing; expected {expected}")
         case "extra_forbidden":
-            return InputError.saying(where, field, "no such field; expected a known name")
+            beside = first["loc"][:-1]
+            missing = (e["loc"] for e in found if e["type"] == "missing")
+            lacking = [str(loc[-1]) for loc in missing if loc[:-1] == beside]
+            expected = " or ".join(lacking) or "a known name"
+            return InputError.saying(where, field, f"no such field; expected {expected}")
         case "union_tag_not_found":
             return InputError.saying(where, field, "has no kind; expected one, as in the docs")
         case "union_tag_invalid":

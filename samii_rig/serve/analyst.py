@@ -80,12 +80,17 @@ class Analyst:
             took = time.monotonic() - begun
             # Of a long recording each look takes its time: half a processor at most.
             time.sleep(max(EVERY - took, took))
+        # It may have ended while a look was taken.
+        with suppress(RecordingError, MemoryError):
+            self.look(last=True)
 
-    def look(self) -> None:
-        """Estimate what is new on the disk."""
-        segment = int(LiveReader(Path(self.job.written.live)).progress().get("segment", 0))
-        if segment == self._segment and not self._so_far.growing:
-            return
+    def look(self, *, last: bool = False) -> None:
+        """Estimate what is new on the disk. last : all of it is there."""
+        segment = len(self._plan.segments)
+        if not last:
+            segment = int(LiveReader(Path(self.job.written.live)).progress().get("segment", 0))
+            if segment == self._segment and not self._so_far.growing:
+                return
         path = self._path.with_name(self._path.name + PARTIAL)
         path = path if path.exists() else self._path
         if self._start is None:
