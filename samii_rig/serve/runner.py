@@ -58,7 +58,7 @@ class Runner:
             self._set(
                 phase="analysing",
                 status=outcome.stop.status,
-                reason=outcome.stop.reason,
+                reason=self._reason(outcome),
                 trouble=outcome.trouble,
             )
             self._note()
@@ -131,6 +131,13 @@ class Runner:
             early = f"its diagnosis was certain after segment {now.segment - 1}"
             self.state = replace(self.state, early=early)
             self.stop.set()
+
+    def _reason(self, outcome: Outcome) -> str:
+        """Why it ended; who asked for it says more than the signal by which that came."""
+        stops = self.job.stops()
+        if outcome.stop.status == "stopped" and stops:
+            return f"stop asked by {stops[0]['by']}"
+        return outcome.stop.reason
 
     def _note(self) -> None:
         """Who stopped it, beside the recording."""

@@ -10,12 +10,13 @@ const scope = new Scope($("scope"), (text) => { $("scope-state").textContent = t
 const motion = new Motion($("motion"), scope, (text) => { $("motion").setAttribute("aria-label", text); });
 let lease = "", beating = 0, state = null, heard = 0, job = "", wanted = true;
 
+const GONE = "The service does not answer.";
 async function ask(method, path, body, headers = {}) {
   const answer = await fetch(`/api${path}`, {
     method,
     headers: { ...(lease ? { "X-Lease": lease } : {}), ...(body ? { "Content-Type": "application/json" } : {}), ...headers },
     body: body ? JSON.stringify(body) : undefined,
-  });
+  }).catch(() => { throw new Error(GONE); });
   const found = await answer.json().catch(() => ({}));
   if (answer.status === 401) { $("login").hidden = false; $("token").focus(); }
   if (!answer.ok) throw new Error(found.error || `${answer.status} ${answer.statusText}`);
@@ -95,6 +96,7 @@ function listen() {
     if (typeof message.data === "string") show(JSON.parse(message.data));
     else if (!replay.on) take(message.data);
   };
+  socket.onopen = () => { if ($("alarm").textContent === GONE) alarm(""); };
   socket.onclose = () => setTimeout(listen, 1000);
 }
 setInterval(() => {
@@ -158,7 +160,8 @@ function show(s) {
     }
   }
   const l = s.last;
-  $("last").textContent = l ? `Last: ${l.experiment}, ${l.status || l.phase}. ${l.error || l.reason} ${l.verdict.replace("_", " ")}` : "";
+  const told = l ? [l.status || l.phase, l.error || l.reason, l.verdict.replace("_", " ")].filter(Boolean) : [];
+  $("last").textContent = l ? `Last: ${l.experiment}: ${told.join("; ")}.` : "";
   soFar.show(s);
   if (before && l && (!before.last || before.last.id !== l.id)) find();
 }
@@ -171,6 +174,7 @@ function driving(secret) {
   clearInterval(beating);
   $("take").textContent = lease ? "Hand over" : "Take control";
   $("start").disabled = $("clear").disabled = $("next").disabled = !lease;
+  $("drives").hidden = Boolean(lease);
   if (!lease) return;
   beating = setInterval(async () => {
     try { await ask("POST", "/lease/beat"); } catch (error) { driving(""); alarm(error.message); }
