@@ -36,7 +36,7 @@ def setup(extra: str) -> None:
     stamps = {name: VENV / f"installed{name}" for name in ("", "[dev]")}
     if any(s.exists() and s.read_text() == state for n, s in stamps.items() if extra in n):
         return
-    print("setting up .venv (once; a minute or two) ...", flush=True)
+    print("setting up .venv (once; one to three minutes) ...", flush=True)
     if not (BIN / "python").exists() and not (BIN / "python.exe").exists():
         made = subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=False)
         if made.returncode:
