@@ -60,18 +60,10 @@ def size_of(
         of one cause of an answer.
     """
     lines = _lines(truth, arrays, rig)
-    at = grid(rig, lines.frequency, lines.sensor, lines.actuator)
     every = table(rig, float(lines.frequency[0]), float(lines.frequency[-1]))
-    search = Search(rig, lines, at, _smaller(truth, every))
-
-    def away(e: Explanation) -> float:
-        """Sigma by which an explanation misses the truth: of the lines, not of the bins that a
-        refit looks at."""
-        here = search.grid.at(lines.frequency, lines.level)
-        return math.sqrt(float(np.sum(lines.chi_square(e.fitted.model.response(e.fitted.x, here)))))
-
+    search = _search(rig, lines, _smaller(truth, every))
     if truth["kind"] == "one":
-        size = away(search.nominal)
+        size = _away(search, search.nominal)
         if size < LEAST:
             return Sized(size)
         hidden = {(e["physics"], e["site"]) for e in truth["effects"]}
@@ -94,7 +86,26 @@ def size_of(
     if search.table:
         search.grow(search.nominal, FIRST)
         search.renew(min(search.found.values(), key=lambda e: e.fitted.cost))
-    return Sized(min(away(e) for e in search.found.values()))
+    size = min(_away(search, e) for e in search.found.values())
+    if truth["kind"] == "two" and "settled" in arrays:
+        # The table that is refitted has no forces, so this is the force's. The other effect's is
+        # what it does to the plant without the force.
+        alone = {name: a for name, a in arrays.items() if name != "settled"}
+        rest = _search(rig, _lines(truth, alone, rig), [])
+        size = min(size, _away(rest, rest.nominal))
+    return Sized(size)
+
+
+def _search(rig: Rig, lines: Measured, effects: Sequence[Effect]) -> Search:
+    return Search(rig, lines, grid(rig, lines.frequency, lines.sensor, lines.actuator), effects)
+
+
+def _away(search: Search, e: Explanation) -> float:
+    """Sigma by which an explanation misses the truth: of the lines, not of the bins that a refit
+    looks at."""
+    lines = search.lines
+    here = search.grid.at(lines.frequency, lines.level)
+    return math.sqrt(float(np.sum(lines.chi_square(e.fitted.model.response(e.fitted.x, here)))))
 
 
 def _own(search: Search, hidden: Set[Name]) -> Explanation | None:
