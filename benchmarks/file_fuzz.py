@@ -1,7 +1,8 @@
-"""Damage TOML files or recordings, and see that the loaders give only their own errors.
+"""Damage TOML files, recordings or DBC files, and see that the loaders give only their own errors.
 
     python benchmarks/file_fuzz.py toml --inputs 100000 --seed 1
     python benchmarks/file_fuzz.py mcap --inputs 100000 --seed 1
+    python benchmarks/file_fuzz.py dbc --inputs 100000 --seed 1
 
 Ends with exit code 1 if an error escaped, an input took more than a second of CPU, or the memory
 grew by more than 200 MB.
@@ -15,7 +16,7 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from file_fuzz_kit import count, recordings, tables
+from file_fuzz_kit import buses, count, recordings, tables
 
 LONGEST = 1.0  # s of CPU
 GROWN = 200.0  # MB
@@ -23,13 +24,19 @@ GROWN = 200.0  # MB
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("toml", "mcap"))
+    parser.add_argument("what", choices=("toml", "mcap", "dbc"))
     parser.add_argument("--inputs", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
     chosen = parser.parse_args()
     rng, start = random.Random(chosen.seed), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        made = tables(rng) if chosen.what == "toml" else recordings(rng, Path(folder))
+        match chosen.what:
+            case "toml":
+                made = tables(rng)
+            case "mcap":
+                made = recordings(rng, Path(folder))
+            case _:
+                made = buses(rng, Path(folder))
         c = count(made, chosen.inputs)
     took = time.process_time() - start
     print(

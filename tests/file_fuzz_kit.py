@@ -1,7 +1,8 @@
-"""Damaged rig, experiment and map files, and damaged recordings, past the loaders."""
+"""Damaged rig, experiment and map files, recordings and DBC files, past the loaders."""
 
 from __future__ import annotations
 
+import contextlib
 import random
 import re
 import struct
@@ -17,6 +18,7 @@ from pathlib import Path
 
 from record_kit import blocks, write_run
 
+from drivers.force_torque.frames import NEEDED, Frames
 from samii_rig.errors import InputError, RecordingError
 from samii_rig.record import scan
 from samii_rig.record.maps import ImportMap
@@ -33,6 +35,37 @@ WORDS = (
     "{ value = 1 }", "{ value = nan, unit = 's', source = '' }", '"\\ud800"', "'''a\nb'''",
     "1e5000", "100000000000000000000000000000000", "[nan, nan]", "[[1, 2], [1, -2]]",
 )
+# fmt: on
+NUMBERS = (
+    "0",
+    "-1",
+    "8",
+    "64",
+    "512",
+    "65536",
+    "2147484160",
+    "4294967295",
+    "99999999999",
+    "-230000000",
+    "1e999",
+    "1e999999999",
+    "0.5",
+    "9" * 5000,
+)  # fmt: skip
+STATEMENTS = (
+    "SG_MUL_VAL_ 512 G0 G2 0-4000000000;",
+    'BA_DEF_ BO_ "x" INT 0 1e999999999;',
+    'BA_DEF_ "x" FLOAT 0 1;\nBA_DEF_DEF_ "x" 1e999999999;\nBA_ "x" BO_ 512 1e999999999;',
+    'CM_ BO_ 512 "BO_ 9 Gauges_0: 99999999 S";',
+    'EV_ x: 0 [0|1] "" 0 1 DUMMY_NODE_VECTOR0 a;',
+    "BO_TX_BU_ 512 : a,b,c;",
+    "BO_ 600 Other: 99999999 Sensor",
+    ' SG_ S m0M : 900000000|1@1+ (1,0) [0|0] "" Host',
+    ' SG_ S M : 0|1@1+ (1,0) [0|0] "" Host',
+    'VAL_ 520 ForceUnit 2 "N" 1e999999999 "x" ;',
+    "NS_ :\n CM_\n BA_\n VAL_\nBS_:",
+)
+# fmt: off
 LINES = ("[[element]]", "[element]", "[[sensor]]", "x = 1", "[a.b.c]", "a.b.c = 1", "=", "[[", '"')
 # fmt: on
 
@@ -158,6 +191,58 @@ def recordings(rng: random.Random, folder: Path) -> Iterator[Callable[[], object
                 lambda: read_frequency_responses(path),
             )
         )
+
+
+def buses(rng: random.Random, folder: Path) -> Iterator[Callable[[], object]]:
+    """The shipped DBC file with numbers, lines, statements and bytes changed. What is loaded must
+    read any data."""
+    path = folder / "fuzz.dbc"
+    text = resources.files("drivers.force_torque").joinpath("ati.dbc").read_text()
+
+    def load() -> None:
+        frames = Frames(0x20, str(path))
+        for fill in (b"\0", b"\x7f", b"\x80", b"\xff"):
+            data = {name: fill * frames.length(name) for name in NEEDED}
+            for name in NEEDED:
+                frames.values(name, data[name])
+            frames.gauges(data["Gauges_0"], data["Gauges_1"])
+            with contextlib.suppress(InputError):
+                frames.units(data["Units"])
+
+    while True:
+        lines = text.split("\n")
+        for _ in range(rng.choice((1, 1, 2, 4))):
+            _damage_bus(rng, lines)
+        b = bytearray("\n".join(lines).encode())
+        if rng.random() < 0.2:
+            _damage_bytes(rng, b)
+        path.write_bytes(b)
+        yield load
+
+
+def _damage_bus(rng: random.Random, lines: list[str]) -> None:
+    at = rng.randrange(len(lines))
+    line = lines[at]
+    numbers = list(re.finditer(r"-?\d+", line))
+    match rng.randrange(8):
+        case 0 | 1 if numbers:
+            found = rng.choice(numbers)
+            lines[at] = line[: found.start()] + rng.choice(NUMBERS) + line[found.end() :]
+        case 2 if numbers:
+            found = rng.choice(numbers)
+            lines[at] = line[: found.start()] + str(rng.randrange(70)) + line[found.end() :]
+        case 3:
+            lines.insert(at, rng.choice(STATEMENTS))
+        case 4:
+            lines.insert(rng.randrange(len(lines)), line)
+        case 5:
+            del lines[at]
+        case 6:
+            k = rng.randrange(len(line) + 1)
+            lines[at] = line[:k] + rng.choice('"\\;:|@/ \0\u20ac') + line[k:]
+        case _:
+            part = rng.choice(('\\"', '"', "(", "/", "a ", "CM_ ", "BO_ 1 A: 1 B ", "NS_ : ", "1"))
+            lines[at] = line + part * rng.choice((1, 2, 40, 5000))
 
 
 def _damage_bytes(rng: random.Random, b: bytearray) -> None:

@@ -3,7 +3,7 @@ benchmarks/file_fuzz.py."""
 
 import random
 
-from file_fuzz_kit import count, recordings, tables
+from file_fuzz_kit import buses, count, recordings, tables
 
 
 def test_no_damaged_rig_experiment_or_map_file_escapes():
@@ -18,3 +18,11 @@ def test_no_damaged_recording_escapes(tmp_path):
     assert not c.escaped
     assert c.loaded > 100
     assert c.refused > 100
+
+
+def test_no_damaged_dbc_file_escapes_or_takes_the_memory(tmp_path):
+    c = count(buses(random.Random(3), tmp_path), 300)
+    assert not c.escaped
+    assert c.loaded > 30
+    assert c.refused > 100
+    assert c.grown < 100.0

@@ -1,11 +1,13 @@
 """Wherever another sender's frame falls between the sensor's own, it never becomes a sample, and
 where the sensor's own are lost beside, nothing but whole pairs does."""
 
+import random
 from types import SimpleNamespace
 from unittest.mock import patch
 
 import can
 import numpy as np
+from can_fuzz_kit import sensor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -110,3 +112,31 @@ def test_frames_that_are_lost_are_counted_and_blamed_on_nobody(script):
     # The newest request has no reply yet.
     assert reader.counts.requests - len(reader.samples) - reader.counts.lost in (0, 1)
     assert TRUE != FALSE
+
+
+def test_a_foreign_second_frame_is_told_also_where_the_next_request_is_overdue():
+    clock = SimpleNamespace(now=0, monotonic=lambda: 0.0)
+    clock.monotonic_ns = lambda: clock.now
+    with patch("drivers.force_torque.reader.time", clock):
+        bus = Bus()
+        reader = Reader(bus, FRAMES, PERIOD)  # type: ignore[arg-type]
+        clock.now = 9 * PERIOD // 4
+        reader._due = PERIOD
+        reader._go_on(clock.now)
+        own, other = pair(SENSOR), pair(OTHER)
+        reader._take(own[0], clock.now)
+        reader._take(other[1], clock.now)
+        bus.asked = False
+        reader._go_on(clock.now)
+        assert not bus.asked
+        reader._take(own[1], clock.now)
+    assert "another sender" in reader.trouble
+    assert not reader.samples
+
+
+def test_no_damage_on_the_bus_becomes_a_sample_that_was_not_sent():
+    """A million frames: benchmarks/wire_fuzz.py."""
+    counted = sensor(random.Random(1), 20_000)
+    assert counted.wrong == 0
+    assert counted.accepted > 1_500
+    assert counted.damaged > 3_000

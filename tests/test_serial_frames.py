@@ -8,7 +8,7 @@ import pytest
 from cobs import cobs
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from wire_fuzz_kit import CONFIG, fuzz
+from wire_fuzz_kit import CONFIG, node
 
 from drivers.serial_node.wire import (
     Answer,
@@ -105,7 +105,7 @@ def test_a_whole_frame_of_a_wrong_length_is_corrupt(length):
 
 
 def test_no_wrong_sample_is_ever_accepted():
-    counted = fuzz(random.Random(1), 20_000)
+    counted = node(random.Random(1), 20_000)
     assert counted.wrong == 0
     assert counted.accepted > 5_000
     assert counted.damaged > 5_000

@@ -234,7 +234,7 @@ def _about(
     else:
         where, matrix = f"{rig.name}: device.settings.calibration", np.array(s.calibration)
     counts = np.repeat([per["PerForce"] / newton, per["PerTorque"] / newton_metre], 3)
-    if not (counts > 0).all():
+    if not ((counts > 0) & np.isfinite(counts)).all():
         raise InputError(f"sensor {serial}", "counts per unit", per, "numbers above 0")
     check_matrix(matrix, where)
     firmware = f"{version['Major']:g}.{version['Minor']:g}.{version['Build']:g}"

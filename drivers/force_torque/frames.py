@@ -7,14 +7,18 @@ by cantools; what the DBC does not hold, this driver does not know.
 from __future__ import annotations
 
 import logging
+import math
+import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import cantools.database
 import numpy as np
-from cantools.database.can import Message
+from cantools.database.can import Message, Signal
 from cantools.database.can.database import Database
 
 from samii_rig.errors import InputError
@@ -26,7 +30,18 @@ logging.getLogger("cantools").setLevel(logging.ERROR)
 AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 GAUGES = 6
 GAUGE_RAILS = (-32768, 32767)  # counts at which a gauge has saturated
-MOST_BYTES = 1 << 20  # of a DBC file; what is behind that is not read
+MOST_BYTES = 1 << 16  # of a DBC file; one of this sensor has some thousand
+# Strings, which stay, and what is neither message, name of a value nor type of a number: there the
+# parser counts to whatever number it meets (ranges of a multiplexer, 1e999999999 of an attribute).
+STRING = r'"(?:\\"|[^"])*+(?:"|\Z)'
+UNREAD = re.compile(
+    rf"{STRING}|//[^\n]*|\bNS_\s*:.*?(?=\b\w+\s*:)"
+    r"|\b(?:BA_(?:[A-Z]+_)*|CM_|EV_|ENVVAR_DATA_|SG_MUL_VAL_|BO_TX_BU_|SIG_GROUP_|VAL_TABLE_)\s"
+    rf'(?:{STRING}|[^";])*+(?:;|\Z)',
+    re.DOTALL,
+)
+# A length in bytes, or a first bit or a length in bits, beyond any frame's: it would allocate them.
+BEYOND = re.compile(r":\s*[-+]?0*[1-9]\d{3}|:\s*-|[|]\s*[-+]?0*[1-9]\d{3,}\s*@")
 OPERATIONS = 16  # identifiers of one sensor: the base and an operation in four bits
 # What each message must have; the status bits are whatever else Gauges_0 has.
 NEEDED: dict[str, tuple[str, ...]] = {
@@ -129,8 +144,8 @@ class Frames:
         factors = []
         for signal, table in (("ForceUnit", FORCE), ("TorqueUnit", TORQUE)):
             told = self._messages["Units"].get_signal_by_name(signal)
-            choices: Mapping[int, object] = told.choices or {}
-            name = str(choices.get(int(codes[signal]), f"code {codes[signal]:g}"))
+            choices: Mapping[Any, object] = told.choices or {}
+            name = str(choices.get(codes[signal], f"code {codes[signal]:g}"))
             if name not in table:
                 raise InputError(self.where, f"Units.{signal}", name, f"one of {', '.join(table)}")
             factors.append(table[name])
@@ -142,25 +157,35 @@ def _database(path: str) -> Database:
     try:
         if path:
             with Path(path).open("rb") as file:
-                data = file.read(MOST_BYTES)
+                data = file.read(MOST_BYTES + 1)
         else:
             data = resources.files(__package__).joinpath("ati.dbc").read_bytes()
     except OSError as error:
         expected = f"a DBC file that can be read ({error.strerror})"
         raise InputError("device.settings", "dbc", path, expected) from error
+    if len(data) > MOST_BYTES:
+        expected = f"a DBC file of at most {MOST_BYTES} bytes"
+        raise InputError("device.settings", "dbc", path, expected)
+    text = _read(data.decode("cp1252", "replace"))
+    if found := BEYOND.search(re.sub(STRING, '""', text)):
+        line = " ".join(found[0].split())[:40]
+        raise InputError.saying(path or "ati.dbc", "", f"is no DBC file: {line!r} is in no frame")
     try:
-        text = data.decode("cp1252", "replace")
         known = cantools.database.load_string(text, database_format="dbc")
     except Exception as error:
         # The parser meets what a stranger's file holds with errors of many kinds.
         line = " ".join(str(error).split())[:200]
         raise InputError.saying(path or "ati.dbc", "", f"is no DBC file: {line}") from error
     assert isinstance(known, Database)
-    names = [m.name for m in known.messages]
-    for name in names:
-        if names.count(name) > 1:
+    for name, n in Counter(m.name for m in known.messages).items():
+        if n > 1:
             raise InputError(path or "ati.dbc", "BO_", f"{name}, twice", "each message once")
     return known
+
+
+def _read(text: str) -> str:
+    """What the parser is to read of it."""
+    return UNREAD.sub(lambda m: m[0] if m[0].startswith('"') else " ", text)
 
 
 def _message(known: Database, where: str, name: str, signals: tuple[str, ...]) -> Message:
@@ -175,4 +200,23 @@ def _message(known: Database, where: str, name: str, signals: tuple[str, ...]) -
     if missing:
         there = [x.name for x in message.signals]
         raise InputError(where, f"{name}.SG_", there, f"{', '.join(missing)} among them")
+    for signal in message.signals:
+        if not (math.isfinite(signal.scale) and math.isfinite(signal.offset)):
+            said = "has a factor or offset that is no number"
+            raise InputError.saying(where, f"{name}.{signal.name}", said)
+        if name in SAMPLE and signal.name in signals and not _counts(signal):
+            said = "is not 16 bits with a sign and the factor 1, counts of a gauge"
+            raise InputError.saying(where, f"{name}.{signal.name}", said)
+    try:
+        message.decode(bytes(message.length), decode_choices=False)
+    except cantools.database.DecodeError as error:
+        raise InputError.saying(where, name, f"cannot be read: {error}") from error
     return message
+
+
+def _counts(signal: Signal) -> bool:
+    return (
+        (signal.length, signal.scale, signal.offset) == (16, 1, 0)
+        and signal.is_signed
+        and not signal.is_float
+    )

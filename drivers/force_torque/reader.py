@@ -23,6 +23,7 @@ TRIES = 3
 GIVE_UP = 20_000_000  # ns after which a request has no reply any more
 SYNC = "SerialNumber"  # what is asked after a lost reply: what comes before its answer is late
 HANG = 1.0  # s without a turn of the thread after which it hangs
+QUIET = 4  # of a period goes by after a reply before the next request
 KEPT = 65_536  # samples that wait for read()
 
 
@@ -172,12 +173,6 @@ class Reader:
         send(self._bus, self._frames.identifier(SAMPLE[0]))
 
     def _take(self, frame: can.Message, now: int) -> None:
-        if frame.is_error_frame:
-            self.trouble = (
-                f"{self.name}: the CAN controller reports an error (bus off, or nobody "
-                "acknowledges); check bit rate, termination and cable"
-            )
-            return
         if not self._frames.ours(frame.arbitration_id):
             self.counts.others += 1
             return
@@ -198,12 +193,14 @@ class Reader:
                 self.round_trips = (total + round_trip, n + 1)
             self.counts.replies += 1
             self._pending, self._first = False, None
+            self._listen(now)
             return
         if self._pending and self._first is None and self._fits(frame, SAMPLE[1]):
             # The first frame was lost, or this one is foreign: then the sensor's own come now,
             # unasked, and tell.
             self.counts.lost += 1
             self._pending = False
+            self._listen(now)
             return
         if self._syncs and self._fits(frame, SYNC):
             self._syncing = False
@@ -221,6 +218,10 @@ class Reader:
             "change its or device.settings.base_id"
         )
 
+    def _listen(self, now: int) -> None:
+        """No request before a frame too many had time to come, also where one is overdue."""
+        self._due = max(self._due, now + self._period // QUIET)
+
     def _drop(self) -> None:
         self._pending, self._first = False, None
 
@@ -229,12 +230,13 @@ class Reader:
             frame.arbitration_id == self._frames.identifier(name)
             and not frame.is_extended_id
             and not frame.is_remote_frame
+            and not frame.is_fd
             and len(frame.data) == self._frames.length(name)
         )
 
     def _receive(self, seconds: float) -> can.Message | None:
         try:
-            return self._bus.recv(seconds)
+            frame = self._bus.recv(seconds)
         except ValueError:
             # A line of the adapter that was damaged on its way.
             self.counts.corrupt += 1
@@ -242,6 +244,13 @@ class Reader:
         except Exception as error:
             # python-can lets through what the system, the port or a broken line gives.
             raise DeviceError(f"{self.name}: the bus is gone: {error}") from error
+        # Its identifier says what is wrong, and may be that of a reply.
+        if frame is not None and frame.is_error_frame:
+            raise DeviceError(
+                f"{self.name}: the CAN controller reports an error (bus off, or nobody "
+                "acknowledges); check bit rate, termination and cable"
+            )
+        return frame
 
     def _silent(self, message: str) -> str:
         identifier = self._frames.identifier(message)
