@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 from samii_rig.cli import main
 from samii_rig.cli.app import app
 from samii_rig.errors import SamiiRigError
+from samii_rig.index.remarks import read_remarks
 from samii_rig.record import scan
 from samii_rig.record.contents import read_contents
 from samii_rig.record.reader import read_frequency_responses, read_recording
@@ -116,6 +117,20 @@ def test_a_figure_alone_leaves_the_page_of_the_run_as_it_is(log: Path, tmp_path:
     assert code == 0
     assert json.loads(said)["written"] == [str(tmp_path / "b.svg")]
     assert page.read_text() == "with its diagnosis"
+
+
+def test_a_diagnosis_is_kept_with_a_recording_if_it_is_of_its_own_rig_file(
+    log: Path, tmp_path: Path
+) -> None:
+    copy, other = tmp_path / "run.mcap", tmp_path / "other.toml"
+    copy.write_bytes(log.read_bytes())
+    other.write_text(f"{load_rig('samii')[1]}\n# a guess\n")
+    code, said = call("diagnose", copy, "--rig", other)
+    assert code == 0
+    assert said.splitlines()[-1] == "not kept with the recordings: they carry another rig file"
+    assert not read_remarks(copy).diagnosis
+    assert call("diagnose", copy)[0] == 0
+    assert read_remarks(copy).diagnosis["verdict"]
 
 
 def test_what_is_no_recording_is_called_none(tmp_path: Path) -> None:

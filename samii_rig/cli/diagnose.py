@@ -104,7 +104,9 @@ def diagnose(
             progress=lambda stage: status.update(f"{stage} ..."),
             runs=recordings,
         )
-    _keep(logs, {**found.plain(), "lines": list(found.lines())})
+    own = all(r.rig_toml in ("", held[1]) for r in recordings)
+    if own:
+        _keep(logs, {**found.plain(), "lines": list(found.lines())})
     page = None
     if out is not None:
         from samii_rig.report.diagnosis import write_diagnosis
@@ -127,6 +129,8 @@ def diagnose(
         console.print(f"written  {found.model}", soft_wrap=True)
     if page:
         console.print(f"page     {page}", soft_wrap=True)
+    if not own:
+        console.print("not kept with the recordings: they carry another rig file", soft_wrap=True)
 
 
 def _keep(logs: list[Path], found: dict[str, Any]) -> None:
