@@ -213,7 +213,7 @@ def test_a_level_that_the_name_does_not_hold(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ('name = "lab"', 'nome = "lab"', "a known field name|missing"),
+        ('name = "lab"', 'nome = "lab"', "nome: no such field; expected name"),
         ('unit = "rad"', 'unit = "rad"\nscale = 0.0', "scale 0"),
         ("(?P<level>", "(?P<level", "no regular expression"),
         ("(?P<level>", "(?P<height>", r"no group \(\?P<level>"),

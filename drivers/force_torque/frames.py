@@ -164,8 +164,8 @@ def _database(path: str) -> Database:
         expected = f"a DBC file that can be read ({error.strerror})"
         raise InputError("device.settings", "dbc", path, expected) from error
     if len(data) > MOST_BYTES:
-        expected = f"a DBC file of at most {MOST_BYTES} bytes"
-        raise InputError("device.settings", "dbc", path, expected)
+        said = f"is too long; expected a DBC file of at most {MOST_BYTES} bytes"
+        raise InputError.saying(path, "", said)
     text = _read(data.decode("cp1252", "replace"))
     if found := BEYOND.search(re.sub(STRING, '""', text)):
         line = " ".join(found[0].split())[:40]

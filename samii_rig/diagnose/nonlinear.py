@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -237,17 +238,21 @@ def _on_lines(levels: Apart, table: Sequence[Effect]) -> None:
     search.temper()
     best = search.ranked()[0]
     if _force_in(best) is not None and best.key != bare.key:
-        # Not the better of both: the force was that of another explanation.
-        del search.found[best.key]
-        search.keep(best.effects, self_consistent(best.fitted, levels.on_lines))
-        search.temper()
+        with suppress(SamiiRigError):
+            again = self_consistent(best.fitted, levels.on_lines)
+            # Not the better of both: the force was that of another explanation.
+            del search.found[best.key]
+            search.keep(best.effects, again)
+            search.temper()
     _use_force_of(levels, search.ranked()[0].fitted)
 
 
 def _use_force_of(levels: Apart, fitted: Fitted) -> None:
-    """The problem on the lines, with the force where this fit has it."""
+    """The problem on the lines, with the force where this fit has it; as it was where the rig has
+    no partial fractions there."""
     if isinstance(fitted.model, LevelModel):
-        levels.search.problem = levels.on_lines(fitted.model, fitted.x)
+        with suppress(SamiiRigError):
+            levels.search.problem = levels.on_lines(fitted.model, fitted.x)
 
 
 def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:
