@@ -7,6 +7,7 @@ import numpy as np
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.load import load_rig
+from samii_rig.rig.schema import parameters
 from samii_rig.types import Channel, FrequencyResponse
 
 STIFFNESSES = ("clamp.k", "joint_1.k", "joint_2.k", "joint_3.k")
@@ -49,3 +50,13 @@ def drawn(rig, seed=0, *, n=200, band=(0.5, 40.0), outputs=None, truth=None, **n
     like = noiseless(rig, np.geomspace(*band, n), outputs, **noise)
     H = like.H if truth is None else noiseless(truth, like.frequency, outputs).H
     return redraw(like, H, np.random.default_rng(seed))
+
+
+def without_tolerances(rig, but=()):
+    """The rig with tolerances of these elements alone."""
+
+    def exact(e):
+        held = {s: p.model_copy(update={"tolerance": 0.0}) for s, p in parameters(e).items()}
+        return e if e.name in but else e.model_copy(update=held)
+
+    return rig.model_copy(update={"element": tuple(exact(e) for e in rig.element)})

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from identify_kit import noiseless, samii
+from identify_kit import noiseless, samii, without_tolerances
 from sweep_kit import swept
 
 from samii_rig.diagnose import findings, wiring
@@ -229,16 +229,6 @@ def drawn(seed=1, **changes):
     """A measurement of the rig itself."""
     exact = noiseless(samii(), LINES)
     return replace(redraw(exact, exact.H, np.random.default_rng(seed), 10), **changes)
-
-
-def without_tolerances(rig):
-    def exact(e):
-        known = {s: p for s, p in iter(e) if hasattr(p, "tolerance")}
-        return e.model_copy(
-            update={s: p.model_copy(update={"tolerance": 0.0}) for s, p in known.items()}
-        )
-
-    return rig.model_copy(update={"element": tuple(exact(e) for e in rig.element)})
 
 
 def test_a_rig_file_without_tolerances_is_diagnosed_and_told(rivals):

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from identify_kit import noiseless, samii
+from identify_kit import noiseless, samii, without_tolerances
 
 from samii_rig.diagnose.effect import Effect, Unknown
 from samii_rig.diagnose.measured import measured
@@ -19,7 +19,6 @@ from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.diagnose.nonlinear_screen import Bins, Levels
 from samii_rig.diagnose.nonlinear_time import simulate
 from samii_rig.diagnose.refit import Problem, refit
-from samii_rig.rig.schema import parameters
 from samii_rig.types import Channel, Recording, Segment
 
 N = 6000  # samples of a period
@@ -142,20 +141,10 @@ def test_recordings_with_a_force_confirm_it_and_others_do_not():
     assert seen(plain, there, at, lines, responses, []) is None
 
 
-def known_but_for(rig, *names):
-    """The rig with tolerances of these elements alone."""
-
-    def certain(e):
-        held = {s: v.model_copy(update={"tolerance": 0.0}) for s, v in parameters(e).items()}
-        return e if e.name in names else e.model_copy(update=held)
-
-    return rig.model_copy(update={"element": tuple(certain(e) for e in rig.element)})
-
-
 def test_force_and_parameters_end_where_both_agree_with_the_data():
     quasi, p = CASES[1]
     effect, _, _ = model_of(quasi, p)
-    model = LevelModel(known_but_for(samii(), "joint_1", "joint_2"), [effect])
+    model = LevelModel(without_tolerances(samii(), but=("joint_1", "joint_2")), [effect])
     truth = np.append(np.zeros(model.n - 1), np.log(p))
     _, lines, at = campaign()
     given = {0: sweep(0.5)[None], 1: sweep(1.0)[None]}
