@@ -23,9 +23,10 @@ from samii_rig.rig.elements import parameters
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
 from sim.concealed.assemble import PHASE, assemble
+from sim.concealed.draw import draw_values
 from sim.concealed.modes import poles_of
 from sim.concealed.parts import Description, Drive, Part, described
-from sim.concealed.size import STEP, tangent
+from sim.concealed.size import STEP, changed, tangent
 
 TOLERATED = [
     (e.name, symbol) for e in SAMII.element for symbol, p in parameters(e).items() if p.tolerance
@@ -111,6 +112,23 @@ def test_slope_of_the_response_holds_where_a_step_of_it_would_divide_the_beam_an
     H, less = (poles_of(p).sampled(FREQUENCY) for p in (plant, down))
     wrong = np.abs((H - less) / STEP - slope).max(axis=0)
     assert (wrong < 0.01 * np.abs(slope).max(axis=0)).all()
+
+
+@pytest.mark.parametrize(("name", "seed"), [("samii", 1), ("samii_braced", 2)])
+def test_slope_by_every_parameter_is_the_difference_of_the_responses(name: str, seed: int) -> None:
+    rig, _ = load_rig(name)
+    plant, _ = draw_values(rig, np.random.default_rng(seed))
+    H = np.abs(poles_of(plant).sampled(FREQUENCY)).max(axis=0)
+    keys = [(e.name, s) for e in rig.element for s, p in parameters(e).items() if p.tolerance]
+    step = 1e-4
+    assert ("beam", "L") in keys
+    for (element, symbol), slope in zip(keys, tangent(plant, rig, FREQUENCY)[1], strict=True):
+        near = [changed(plant, element, symbol, 1 + by) for by in (step, -step)]
+        up, down = (poles_of(other).sampled(FREQUENCY) for other in near)
+        wrong = np.abs((up - down) / (2 * step) - slope).max(axis=0)
+        # By a parameter that hardly acts, the difference shows the rounding of the poles.
+        allowed = 0.02 * np.abs(slope).max(axis=0) + 1e-3 * H
+        assert (wrong < allowed).all(), (element, symbol, wrong / allowed)
 
 
 def _with_mu(plant: Description, mu: float) -> Description:

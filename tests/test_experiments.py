@@ -14,7 +14,7 @@ from experiments.swept_sine import SweptSine
 from samii_rig.errors import InputError
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.run import experiments
-from samii_rig.run.experiments import load_experiment, shipped
+from samii_rig.run.experiments import fitting, load_experiment, shipped
 from samii_rig.run.protocols import Experiment
 
 RIG = fake_rig()
@@ -227,6 +227,16 @@ def test_every_shipped_file_is_found_and_loads():
     assert set(shipped()) >= {*kinds, "swept_sine_sflr", "swept_sine_samii_braced"}
     for name in shipped():
         load_experiment(name, RIG)
+
+
+def test_a_rig_is_offered_its_own_variants_and_no_other_s():
+    for rig in ("samii", "sflr", "samii_braced"):
+        loaded, _ = load_rig(rig)
+        offered = fitting(loaded)
+        assert not [name for name in offered if "sflr" in name or "samii" in name]
+        for name, file in offered.items():
+            assert file.read_text("utf-8") == load_experiment(name, loaded)[1]
+    assert fitting(load_rig("sflr")[0])["swept_sine"].name == "swept_sine_sflr.toml"
 
 
 def test_a_file_is_loaded_by_its_path(tmp_path):

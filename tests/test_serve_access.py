@@ -7,6 +7,7 @@ tokens, rates, sizes; what the service refuses to be started with.
 from __future__ import annotations
 
 import asyncio
+import os
 import socket
 import subprocess
 from collections.abc import Callable, Coroutine, Iterator
@@ -48,6 +49,7 @@ TABLE = {
     ("GET", "/api/recordings/{id_}/signals"): VIEWER,
     ("GET", "/api/recordings/{id_}/frames"): VIEWER,
     ("GET", "/api/recordings/{id_}/frf"): VIEWER,
+    ("GET", "/api/recordings/{id_}/report"): VIEWER,
     ("GET", "/api/compare"): VIEWER,
     ("POST", "/api/runs"): OPERATOR,
     ("DELETE", "/api/queue/{id_}"): OPERATOR,
@@ -307,8 +309,22 @@ def test_a_port_that_is_taken_is_one_clear_line(tmp_path: Path) -> None:
         other.bind(("127.0.0.1", 0))
         other.listen()
         asked = settings(tmp_path, port=other.getsockname()[1])
-        with pytest.raises(InputError, match="a free port"):
+        port = asked.port
+        with pytest.raises(InputError, match=f"--port is {port}; expected a free port of 127"):
             asked.bound()
+    with pytest.raises(InputError, match=r"--host is '192\.0\.2\.1'; expected an address"):
+        settings(tmp_path, host="192.0.2.1").bound()
+
+
+def test_a_folder_is_worked_on_by_one_service(tmp_path: Path) -> None:
+    first, second = settings(tmp_path), settings(tmp_path)
+    said = f"--folder .*; expected a folder that no other service works on.*process {os.getpid()} "
+    with first.alone():
+        for _ in range(2):
+            with pytest.raises(InputError, match=said), second.alone():
+                raise AssertionError("two at once")
+    with second.alone():
+        pass
 
 
 @pytest.mark.parametrize(

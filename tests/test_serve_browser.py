@@ -50,7 +50,14 @@ def test_an_afternoon_at_the_page(
         assert browser.value("document.querySelectorAll('#list img').length") == 0
         assert browser.value("document.getElementById('start').disabled")
 
-        browser.value("document.getElementById('experiment').value = 'step'")
+        browser.choose("experiment", "step")
+        assert "[0.2]" in browser.value("document.getElementById('text').value")
+        # An order of its own: what is wrong with it is said, what is right is run.
+        type_into(browser, "text", "'[0.2]', '[9.0]'")
+        browser.click("plan")
+        browser.until("document.getElementById('planned').textContent.includes('Refused')")
+        type_into(browser, "text", "'[9.0]', '[0.1]'")
+        assert not browser.value("document.getElementById('changed').hidden")
         browser.click("plan")
         browser.until("document.getElementById('planned').textContent.includes('nearest to a')")
         browser.click("take")
@@ -75,11 +82,25 @@ def test_an_afternoon_at_the_page(
         recording = read_recording(path)
         assert recording.stop.reason == "stopped by SIGTERM"
         assert recording.values[-1, recording.column("v_2")] == 0.0
+        assert "[0.1]" in recording.experiment_toml
+        browser.until("document.getElementById('scope-state').textContent.includes('is over')")
+        browser.until("document.getElementById('motion').ariaLabel.includes('no run')")
 
         browser.value("document.querySelector('#list button').click()")
         browser.until("document.getElementById('one-about').textContent.includes('stopped')")
         browser.until("document.getElementById('one-notes').textContent.includes('stop asked by')")
+        page = service.http.get(browser.value("document.getElementById('report').href"))
+        assert page.status_code == 200
+        assert path.name in page.text
     assert browser.errors == []
+
+
+def type_into(browser: Browser, id_: str, replaced: str) -> None:
+    """Change a text as a person does. replaced : what by what, as JavaScript."""
+    browser.value(
+        f"(e => {{ e.value = e.value.replace({replaced}); e.dispatchEvent(new Event('input')); }})"
+        f"(document.getElementById('{id_}'))"
+    )
 
 
 def violations(browser: Browser) -> list[Any]:
@@ -113,6 +134,7 @@ def test_a_run_tells_what_it_knows_while_it_goes_on(
             # Everything that can be opened is open.
             browser.choose("trigger", "single")
             browser.click("cursors")
+            browser.value("document.getElementById('change').open = true")
             browser.until("document.getElementById('cursor-read').textContent.includes('Δt')")
             browser.value("document.querySelector('#list button').click()")
             browser.until("document.getElementById('one-about').textContent.includes('download')")

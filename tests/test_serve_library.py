@@ -124,6 +124,17 @@ def test_frequency_responses_are_those_of_the_file(rooms: Rooms) -> None:
     np.testing.assert_array_equal(curve["sd"], np.sqrt(stored.variance())[:, 1, 0])
 
 
+def test_a_report_shows_the_recording_and_may_ask_for_nothing(rooms: Rooms) -> None:
+    id_ = id_of(rooms, "a.mcap")
+    answer = ask(rooms, "GET", f"/api/recordings/{id_}/report")
+    assert answer.status_code == 200, answer.text
+    assert "sandbox" in answer.headers["content-security-policy"]
+    assert "allow-same-origin" not in answer.headers["content-security-policy"]
+    assert "a.mcap" in answer.text
+    assert "Content-Security-Policy" in answer.text  # of the page's own, for its scripts
+    assert ask(rooms, "GET", "/api/recordings/nope/report").status_code == 404
+
+
 def test_a_recording_compared_with_its_like_does_not_differ(rooms: Rooms) -> None:
     ids = {"a": id_of(rooms, "a.mcap"), "b": id_of(rooms, "b.mcap")}
     pairs = ask(rooms, "GET", "/api/compare", params=ids).json()["pairs"]

@@ -117,6 +117,26 @@ def test_a_service_that_is_told_to_end_leaves_nothing_behind(
     assert capfd.readouterr().err == ""
 
 
+def test_a_service_that_ends_during_a_run_says_what_becomes_of_it(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with Service(tmp_path, "--pace", "2") as ending:
+        with ending.lease() as lease:
+            id_ = ending.start(lease, LONG)
+            ending.until(ending.progressing)
+        ending.process.terminate()
+        ending.process.wait(WITHIN)
+        job = Job(tmp_path / ".samii-rig" / "jobs" / id_)
+        line = capfd.readouterr().err
+        assert f"{job.request.recording} goes on without the service" in line
+        # What it says ends the run at zero output.
+        os.kill(int(line.rpartition("kill ")[2]), signal.SIGTERM)
+        ending.until(lambda: not job.alive())
+    recording = read_recording(tmp_path / job.request.recording)
+    assert recording.stop.status == "stopped"
+    assert recording.values[-1, recording.column("v_2")] == 0.0
+
+
 def test_a_service_ends_without_a_word_whatever_is_asked_of_it(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

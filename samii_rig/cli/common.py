@@ -79,29 +79,6 @@ def rig_of(recordings: Sequence[Recording], option: str | None) -> tuple[Rig, st
     return (parse(Rig, text, "the recording's rig file"), text) if text else None
 
 
-def model_curve(rig: Rig, responses: Sequence[FrequencyResponse]) -> ModelCurve | None:
-    """The rig's model, seen through its hold, filters and sampling, at the lines measured.
-
-    None when nothing was measured.
-    """
-    import numpy as np
-
-    from samii_rig.model.sampled import sampled_response
-    from samii_rig.report.compare import ModelCurve
-
-    if not responses:
-        return None
-    f = np.unique(np.concatenate([r.frequency for r in responses]))
-    f = f[(f > 0) & (f < rig.rate_hz / 2)]
-    return ModelCurve(
-        rig.name,
-        f,
-        sampled_response(rig, f),
-        tuple(s.name for s in rig.sensor),
-        tuple(a.name for a in rig.actuator),
-    )
-
-
 def comparisons(
     responses: Sequence[FrequencyResponse], curve: ModelCurve | None
 ) -> list[dict[str, Any]]:

@@ -89,19 +89,21 @@ def diagnose(
 
     from samii_rig.diagnose.diagnose import diagnose as found_by
     from samii_rig.errors import InputError
+    from samii_rig.report.summary import working
 
     recordings = read_all(logs)
     held = rig_of(recordings, rig)
     if held is None:
         raise InputError("--rig", "", None, "a rig: these recordings carry none")
-    console = Console(highlight=False, stderr=json)
-    with console.status("frequency responses ...") as status:
+    console, stderr = Console(highlight=False), Console(highlight=False, stderr=True)
+    with working(stderr, "diagnosis") as say:
+        say("frequency responses")
         responses = estimated(recordings, None, output, "auto", gaps, band)
         found = found_by(
             responses,
             held[0],
             band=band,
-            progress=lambda stage: status.update(f"{stage} ..."),
+            progress=say,
             runs=recordings,
         )
     own = all(r.rig_toml in ("", held[1]) for r in recordings)

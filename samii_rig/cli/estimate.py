@@ -13,7 +13,6 @@ from samii_rig.cli.common import (
     Logs,
     check_target,
     comparisons,
-    model_curve,
     response_json,
     rig_of,
     rigs,
@@ -84,6 +83,7 @@ def frf(
 
     from samii_rig.record.derived import save_frequency_responses
     from samii_rig.record.export import export_response
+    from samii_rig.report.compare import model_curve
     from samii_rig.report.summary import summary
 
     for path in export or ():
@@ -141,6 +141,12 @@ def report(
     method: MethodOption = "auto",
     gaps: GapsOption = "refuse",
     band: BandOption = None,
+    diagnosis: Annotated[
+        bool,
+        typer.Option(
+            "--diagnosis", help="Diagnose them first, and show what is found on the page."
+        ),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Write one self-contained HTML page about recordings: works offline, interactive.
@@ -150,9 +156,10 @@ def report(
     from rich.console import Console
 
     from samii_rig.record.reader import read_events
+    from samii_rig.report.compare import model_curve
     from samii_rig.report.figures import bode_figure, save_figure
     from samii_rig.report.page import write_report
-    from samii_rig.report.summary import summary
+    from samii_rig.report.summary import summary, working
 
     page = out or (None if figure else logs[0].with_suffix(".html"))
     if page is not None:
@@ -163,6 +170,14 @@ def report(
     responses = estimated(recordings, input_, output, method, gaps, band)
     held = rig_of(recordings, rig)
     curve = model_curve(held[0], responses) if held else None
+    found = None
+    if diagnosis:
+        from samii_rig.diagnose.diagnose import diagnose
+
+        if held is None:
+            raise InputError("--rig", "", None, "a rig: these recordings carry none")
+        with working(Console(stderr=True, highlight=False), "diagnosis") as say:
+            found = diagnose(responses, held[0], band=band, progress=say, runs=recordings)
     written = []
     if page is not None:
         write_report(
@@ -173,6 +188,7 @@ def report(
             model=curve,
             band_hz=band or ALL,
             events=[event for path in logs for event in read_events(path)],
+            diagnosis=found,
         )
         written.append(page)
     for path in figure or ():

@@ -59,6 +59,7 @@ def identify(
     from samii_rig.identify.maximum_likelihood import identify as maximum_likelihood
     from samii_rig.identify.parameters import uncertain
     from samii_rig.identify.table import method_table, summary_table
+    from samii_rig.report.summary import working
 
     if method not in ("likelihood", "1", "2"):
         raise InputError("--method", "", method, "likelihood, 1 or 2")
@@ -71,7 +72,7 @@ def identify(
     console = Console(highlight=False)
     if method != "likelihood":
         responses = estimated(recordings, None, None, "auto", gaps, band)
-        with console.status("identifying ..."):
+        with working(Console(stderr=True, highlight=False), "identifying"):
             by = methods.from_responses(
                 cast("methods.Method", method), responses, held[0], free or (), outputs=output,
                 band=band,
@@ -82,7 +83,7 @@ def identify(
             console.print(method_table(by))
         return
     responses = estimated(recordings, None, output, "auto", gaps, band)
-    with console.status("identifying ..."):
+    with working(Console(stderr=True, highlight=False), "identifying"):
         found = maximum_likelihood(
             responses, held[0], free or uncertain(held[0]), prior=not free, band=band
         )

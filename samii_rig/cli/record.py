@@ -18,7 +18,6 @@ from samii_rig.cli.common import (
     RigOption,
     comparisons,
     experiments,
-    model_curve,
     response_json,
     say_json,
 )
@@ -89,7 +88,7 @@ def run(
     from rich.console import Console
 
     from samii_rig.errors import EstimateError, InputError
-    from samii_rig.report.summary import show_dry_run
+    from samii_rig.report.summary import show_dry_run, working
     from samii_rig.rig.load import load_rig
     from samii_rig.run.dryrun import predict
     from samii_rig.run.experiments import load_experiment
@@ -105,7 +104,7 @@ def run(
         return
     setups = setups_of(the_experiment, the_rig, rig_text)
     plans = [the_experiment.plan(s.rig) for s in setups]
-    with nullcontext() if json else console.status("predicting the run ..."):
+    with working(console, "predicting the run", quiet=json):
         predicted = [predict(p, s.rig) for p, s in zip(plans, setups, strict=True)]
     if not json:
         # Of several runs the one that comes nearest to a limit.
@@ -245,6 +244,7 @@ def _carry_out(
 ) -> _Done:
     """One run with its page, and its summary on the console."""
     from samii_rig.index.remarks import set_diagnosis
+    from samii_rig.report.compare import model_curve
     from samii_rig.report.summary import LiveProgress, summary
     from samii_rig.run.campaign import carry_out
     from samii_rig.run.heartbeat import Pipe
@@ -302,17 +302,14 @@ def _diagnosed(setup: Setup, outcome: Outcome, console: Console, *, json: bool) 
     """What the rig file leaves out; None where the run has nothing to tell that from."""
     from samii_rig.diagnose.diagnose import diagnose
     from samii_rig.errors import EstimateError, InputError
+    from samii_rig.report.summary import working
 
     # Who stopped a run, or whose run tripped, wants to see that first.
     if not outcome.responses or outcome.stop.status != "completed" or outcome.interrupted:
         return None
     try:
-        with nullcontext() if json else console.status("diagnosis ...") as status:
-            return diagnose(
-                outcome.responses,
-                setup.rig,
-                progress=lambda stage: status.update(f"diagnosis: {stage} ...") if status else None,
-            )
+        with working(console, "diagnosis", quiet=json) as say:
+            return diagnose(outcome.responses, setup.rig, progress=say)
     except (EstimateError, InputError) as error:
         why = str(error)
     except KeyboardInterrupt:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samii_rig.errors import InputError
+from samii_rig.rig.schema import Rig
 from samii_rig.signal.statistics import CERTAIN, model_difference
 from samii_rig.types import Complex, Float, FrequencyResponse
 
@@ -63,6 +64,26 @@ class ModelCurve:
             for j, u in enumerate(response.inputs):
                 out[:, i, j] = self.at(response.frequency, y.name, u.name)
         return out
+
+
+def model_curve(rig: Rig, responses: Sequence[FrequencyResponse]) -> ModelCurve | None:
+    """The rig's model, seen through its hold, filters and sampling, at the lines measured.
+
+    None when nothing was measured.
+    """
+    from samii_rig.model.sampled import sampled_response  # loads the model and its compiler
+
+    if not responses:
+        return None
+    f = np.unique(np.concatenate([r.frequency for r in responses]))
+    f = f[(f > 0) & (f < rig.rate_hz / 2)]
+    return ModelCurve(
+        rig.name,
+        f,
+        sampled_response(rig, f),
+        tuple(s.name for s in rig.sensor),
+        tuple(a.name for a in rig.actuator),
+    )
 
 
 @dataclass(frozen=True, slots=True)

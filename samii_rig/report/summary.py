@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from types import TracebackType
 from typing import TYPE_CHECKING, Protocol, Self
 
@@ -131,6 +132,23 @@ class LiveProgress:
                 f"{progress.level:g} {progress.unit}, {duration(progress.time_left)} left",
                 highlight=False,
             )
+
+
+@contextmanager
+def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Callable[[str], None]]:
+    """Say what is being done; what is given says what comes next.
+
+    Without a terminal it is one line each, so that who reads a log later, or waits for a pipe,
+    sees that it goes on. quiet : say nothing.
+    """
+    if quiet:
+        yield lambda stage: None
+    elif console.is_terminal:
+        with console.status(f"{what} ...") as status:
+            yield lambda stage: status.update(f"{what}: {stage} ...")
+    else:
+        console.print(f"{what} ...", highlight=False)
+        yield lambda stage: console.print(f"{what}: {stage} ...", highlight=False)
 
 
 def summary(

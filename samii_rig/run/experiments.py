@@ -35,6 +35,22 @@ def shipped() -> dict[str, Traversable]:
     return found
 
 
+def fitting(rig: Rig) -> dict[str, Traversable]:
+    """Shipped experiments for this rig, by the name under which `load_experiment` finds them:
+    its own variants in place of the general ones, and no variant of another rig."""
+    files = shipped()
+    own = _slug(rig.name)
+    return {
+        name: files.get(f"{name}_{own}", file)
+        for name, file in files.items()
+        if not any(name.startswith(f"{other}_") for other in files)
+    }
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+
+
 def load_experiment(name: str, rig: Rig) -> tuple[Experiment, str]:
     """The experiment called `name` and the text of its file.
 
@@ -45,7 +61,7 @@ def load_experiment(name: str, rig: Rig) -> tuple[Experiment, str]:
     InputError if there is none, if its kind is not known, or if a field is wrong.
     """
     files = shipped()
-    own = re.sub(r"[^a-z0-9]+", "_", rig.name.lower()).strip("_")
+    own = _slug(rig.name)
     for candidate in (f"{name}_{own}", name):
         if candidate in files:
             return _load(files[candidate].read_text("utf-8"), f"{candidate}.toml")

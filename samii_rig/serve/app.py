@@ -20,8 +20,10 @@ from starlette.exceptions import HTTPException
 
 import samii_rig
 from samii_rig.errors import SamiiRigError
+from samii_rig.rig.schema import Rig
 from samii_rig.serve import driving, library
 from samii_rig.serve.access import App, Guard, Receive, Scope, Send
+from samii_rig.serve.job import LOST_AFTER, Job
 from samii_rig.serve.rooms import STATUS, NotThereError, Rooms
 from samii_rig.serve.settings import Settings, is_local
 
@@ -169,7 +171,11 @@ def _cancellable(app: App) -> App:
 def serve(settings: Settings) -> None:
     """Check, listen, serve until a signal; InputError for what cannot be."""
     settings.check()
-    listening = settings.bound()
+    with settings.alone():
+        _served(settings, settings.bound())
+
+
+def _served(settings: Settings, listening: socket.socket) -> None:
     port = listening.getsockname()[1]
     rooms = Rooms(settings, _reading)
     host = f"[{settings.host}]" if ":" in settings.host else settings.host
@@ -198,4 +204,20 @@ def serve(settings: Settings) -> None:
         print(f"Foxglove: ws://127.0.0.1:{rooms.foxglove.port}", flush=True)
     # Once it has ended in good order uvicorn raises the signal again, which would end us without.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    _Server(config).run(sockets=[listening])
+    try:
+        _Server(config).run(sockets=[listening])
+    finally:
+        if (job := rooms.supervisor.current) is not None:
+            _leaves(job, settings.rig)
+
+
+def _leaves(job: Job, rig: Rig) -> None:
+    """Say what becomes of the run that goes on."""
+    stops = rig.service.when_lost == "stop"
+    line = (
+        f"stops by the rig file, {LOST_AFTER:g} s after the service"
+        if stops
+        else f"goes on without the service; start it again to see it, or end it at zero output: "
+        f"kill {job.written.pid}"
+    )
+    print(f"{job.request.recording} {line}", file=sys.stderr, flush=True)

@@ -15,6 +15,7 @@ from base64 import b64encode
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
@@ -253,6 +254,41 @@ def responses(path: str) -> dict[str, Any]:
     from samii_rig.serve.words import response
 
     return {"responses": [response(r) for r in read_frequency_responses(Path(path))]}
+
+
+def report(path: str, diagnosed: bool) -> dict[str, Any]:
+    """The page about a recording, as `samii-rig report` writes it.
+
+    diagnosed : with the diagnosis, made again from the responses that the run logged.
+    """
+    from samii_rig.errors import InputError
+    from samii_rig.record.reader import read_events, read_frequency_responses, read_recording
+    from samii_rig.report.compare import model_curve
+    from samii_rig.report.page import write_report
+    from samii_rig.rig.load import parse
+    from samii_rig.rig.schema import Rig
+
+    recording = read_recording(Path(path))
+    responses = read_frequency_responses(Path(path))
+    the_rig = found = None
+    # Of another version, or imported: the measurement is shown all the same.
+    with suppress(InputError):
+        the_rig = parse(Rig, recording.rig_toml, "the recording's rig file")
+    if diagnosed and responses and the_rig is not None:
+        from samii_rig.diagnose.diagnose import diagnose
+
+        found = diagnose(responses, the_rig, runs=[recording])
+    with tempfile.TemporaryDirectory() as folder:
+        page = write_report(
+            Path(folder) / "report.html",
+            recording,
+            responses,
+            rig=the_rig,
+            model=model_curve(the_rig, responses) if the_rig else None,
+            events=read_events(Path(path)),
+            diagnosis=found,
+        )
+        return {"page": page.read_text(encoding="utf-8")}
 
 
 def comparison(a: str, b: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from samii_rig.errors import LimitError
 from samii_rig.rig.load import MAX_BYTES
-from samii_rig.run.experiments import shipped
+from samii_rig.run.experiments import fitting
 from samii_rig.serve import desk
 from samii_rig.serve.access import COOKIE, STOP
 from samii_rig.serve.job import DIAGNOSIS, RESPONSES, SO_FAR
@@ -74,8 +74,9 @@ def _describe(router: APIRouter, rooms: Rooms) -> None:
 
     @router.get("/experiments")
     async def experiments() -> Answer:
-        """The shipped experiments with the text of their files."""
-        found = {name: file.read_text("utf-8") for name, file in shipped().items()}
+        """The shipped experiments for this rig with the text of their files."""
+        files = fitting(rooms.settings.rig)
+        found = {name: file.read_text("utf-8") for name, file in files.items()}
         return {"experiments": found}
 
     @router.post("/dry-run")

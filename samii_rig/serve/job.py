@@ -37,6 +37,8 @@ REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS 
     "diagnosis.json",  # the runner's last word, of the whole run
 )
 
+# s without a sign of the service after which it counts as gone: it gives one every half second.
+LOST_AFTER = 5.0
 MOST_STOPS = 20  # that are written down
 
 Phase = Literal[

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
-from fastapi.responses import FileResponse
+from fastapi.responses import FileResponse, HTMLResponse
 from pydantic import Field
 from starlette.requests import ClientDisconnect
 
@@ -25,6 +25,14 @@ from samii_rig.serve.rooms import Rooms, operator
 Short = Annotated[str, Query(max_length=200)]
 BOUNDS = {"limit": {"ge": 1, "le": MOST}, "offset": {"ge": 0, "lt": 2**31}}
 MEDIA = "application/octet-stream"
+# What a recording says is shown in a page of its own that cannot ask us for anything; which
+# scripts it runs, the page itself says by their hashes.
+REPORT_HEADERS = {
+    "Content-Security-Policy": "sandbox allow-scripts allow-downloads; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
 
 
 class Tags(Body):
@@ -112,6 +120,13 @@ def _look(router: APIRouter, rooms: Rooms) -> None:
         _, path = rooms.entry(id_)
         found = await rooms.desk.do(desk.frames, str(path), start, length)
         return Response(b64decode(found["frames"]), media_type=MEDIA)
+
+    @router.get("/recordings/{id_}/report", response_class=HTMLResponse)
+    async def report(id_: str) -> HTMLResponse:
+        """The page about a recording, with the diagnosis if one is kept with it: some seconds."""
+        entry, path = rooms.entry(id_)
+        found = await rooms.desk.do(desk.report, str(path), bool(entry.verdict))
+        return HTMLResponse(found["page"], headers=REPORT_HEADERS)
 
     @router.get("/recordings/{id_}/frf")
     async def frf(id_: str) -> Answer:

@@ -138,6 +138,7 @@ class Rooms:
             "so_far": self.analysis.state() if self.supervisor.current else None,
             "rig": self.settings.rig.name,
             "real": real,
+            "pace": 1.0 if real else self.settings.pace,
             "fault": asdict(fault) if fault else None,
             "operator": self.lease.holder if self.lease.alive else "",
             "viewers": len(self.viewers),

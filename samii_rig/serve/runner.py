@@ -27,13 +27,10 @@ from samii_rig.run.progress import Progress
 from samii_rig.run.protocols import Plan
 from samii_rig.run.setups import Setup
 from samii_rig.serve.following import following
-from samii_rig.serve.job import DIAGNOSIS, Job, JobState
+from samii_rig.serve.job import DIAGNOSIS, LOST_AFTER, Job, JobState
 from samii_rig.serve.live import LiveWriter, live_folder
 from samii_rig.serve.planned import planned
 from samii_rig.types import SampleBlock
-
-# s without a sign of the service after which it counts as gone: it gives one every half second.
-LOST_AFTER = 5.0
 
 
 class Runner:

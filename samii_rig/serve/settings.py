@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import ipaddress
+import os
 import socket
 import ssl
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from samii_rig.errors import InputError
+from samii_rig.index.store import PRIVATE
 from samii_rig.rig.schema import Rig
 from samii_rig.serve.access import Tokens
 
 WHERE = "samii-rig serve"
+LOCK = "service.lock"
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +74,25 @@ class Settings:
             expected = f"a folder that can be written ({error.strerror})"
             raise InputError(WHERE, "--folder", str(self.folder), expected) from error
 
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """No other service works on this folder meanwhile; InputError if one does already.
+
+        Two would start each other's runs and stop them.
+        """
+        path = self.folder / PRIVATE / LOCK
+        path.parent.mkdir(exist_ok=True)
+        with path.open("a+", encoding="utf-8") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.seek(0)
+                expected = f"a folder that no other service works on ({file.read(80).strip()} does)"
+                raise InputError(WHERE, "--folder", str(self.folder), expected) from error
+            file.truncate(0)
+            print(f"process {os.getpid()}", file=file, flush=True)
+            yield
+
     def bound(self) -> socket.socket:
         """The socket that listens; InputError if the port is taken or the host is not ours."""
         family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
@@ -77,8 +103,12 @@ class Settings:
             listening.listen(128)
         except OSError as error:
             listening.close()
-            expected = f"a free port of this machine ({error.strerror})"
-            raise InputError(WHERE, "--port", f"{self.host}:{self.port}", expected) from error
+            ours = error.errno in (errno.EADDRINUSE, errno.EACCES)
+            if ours:
+                expected = f"a free port of {self.host} ({error.strerror})"
+                raise InputError(WHERE, "--port", self.port, expected) from error
+            expected = f"an address of this machine ({error.strerror})"
+            raise InputError(WHERE, "--host", self.host, expected) from error
         return listening
 
 

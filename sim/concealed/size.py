@@ -25,7 +25,11 @@ from sim.concealed.parts import Description, Law
 from sim.concealed.runs import SCHEDULE, Design, burst
 
 LINES = 150  # frequencies that stand for all estimated ones
-STEP = 1e-3  # relative step of the Jacobian
+# Relative step of the Jacobian, to both sides. The matrices' change acts on motions that are not
+# re-solved for it: nodes moved along a stiff beam of another length bend it by the step, and that
+# energy, the step squared times what one short element resists, is far more than the slope. It
+# cancels between both sides; the cubic rest wants a small step, rounding a larger one.
+STEP = 3e-5
 SWEEPS = 30  # fixed-point sweeps for an amplitude that depends on itself
 
 
@@ -50,18 +54,24 @@ def tangent(plant: Description, rig: Rig, f: Float) -> tuple[Float, Complex]:
         for symbol, parameter in parameters(element).items():
             if parameter.tolerance <= 0:
                 continue
-            other = copy.deepcopy(plant)
-            if element.name == plant.drive.element:
-                setattr(other.drive, symbol, getattr(other.drive, symbol) * (1 + STEP))
-            else:
-                other.part(element.name).values[symbol] *= 1 + STEP
-            near = state_space(other, assemble(other, structure))
-            dx = x @ (near.A - system.A).T + (near.B - system.B)[:, 0]
-            change = np.einsum("foj,fj->fo", y, dx) + x @ (near.C - system.C)[:m].T
-            change += (near.D - system.D)[:m, 0]
+            both = [changed(plant, element.name, symbol, 1 + by) for by in (STEP, -STEP)]
+            up, down = (state_space(other, assemble(other, structure)) for other in both)
+            dx = x @ (up.A - down.A).T + (up.B - down.B)[:, 0]
+            change = np.einsum("foj,fj->fo", y, dx) + x @ (up.C - down.C)[:m].T
+            change += (up.D - down.D)[:m, 0]
             tolerance.append(parameter.tolerance)
-            rows.append(change * chain / STEP)
+            rows.append(change * chain / (2 * STEP))
     return np.array(tolerance), np.array(rows)
+
+
+def changed(plant: Description, name: str, symbol: str, ratio: float) -> Description:
+    """A copy of a plant with one parameter of the rig file's element `name` times a ratio."""
+    other = copy.deepcopy(plant)
+    if name == plant.drive.element:
+        setattr(other.drive, symbol, getattr(other.drive, symbol) * ratio)
+    else:
+        other.part(name).values[symbol] *= ratio
+    return other
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ export class Motion {
 
   stale() {
     if (!this.scope.live) return "not live";
-    if (!this.y.length) return "no run";
+    if (this.over || !this.y.length) return "no run";
     const old = (performance.now() - this.arrived) / 1000;
     return old > STALE ? `stale: no sample for ${Math.round(old)} s` : "";
   }
@@ -114,7 +114,7 @@ export class Motion {
     g.globalAlpha = 1;
     const angles = there && !stale ? about.sensors.map((name, k) => (about.accelerations[k] ? "" : `${name} ${this.milli(there.y[k])}`)).filter(Boolean).join(", ") : "";
     const text = stale ? `Not moving: ${stale}.` : `${paused ? "Paused. " : ""}Displacements × ${this.factor}. ${angles}`;
-    g.font = "600 14px system-ui, sans-serif"; g.textAlign = "right"; g.fillStyle = ink(stale && this.y.length ? "--bad" : "--muted");
+    g.font = "600 14px system-ui, sans-serif"; g.textAlign = "right"; g.fillStyle = ink(stale && stale !== "no run" ? "--bad" : "--muted");
     g.fillText(text, w - 16, 18);
     // To who does not see it, when it changes and not at every frame.
     const plain = stale || paused ? text : `The rig moves, displacements drawn ${this.factor} times as large.`;

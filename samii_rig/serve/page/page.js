@@ -10,6 +10,13 @@ const scope = new Scope($("scope"), (text) => { $("scope-state").textContent = t
 const motion = new Motion($("motion"), scope, (text) => { $("motion").setAttribute("aria-label", text); });
 let lease = "", beating = 0, state = null, heard = 0, job = "", wanted = true;
 
+// The verdicts of a diagnosis, for who has not read its manual.
+const VERDICTS = {
+  no_mismatch: "nothing is missing", named: "cause named", ambiguous: "several causes fit", unknown: "mismatch, cause unknown",
+};
+const PHASES = {
+  starting: "starting; predicted once more, nothing moves yet", analysing: "over and at rest; estimated and diagnosed",
+};
 const GONE = "The service does not answer.";
 async function ask(method, path, body, headers = {}) {
   const answer = await fetch(`/api${path}`, {
@@ -29,10 +36,12 @@ const tried = (work) => async (event) => {
   try { alarm(""); await work(event); } catch (error) { alarm(error.message); }
 };
 function clock(s) {
-  if (!(s >= 0)) return "–";
+  if (!(s >= 0 && s < Infinity)) return "–";
   const m = Math.floor(s / 60);
   return m ? `${m} min ${String(Math.floor(s % 60)).padStart(2, "0")} s` : `${Math.ceil(s)} s`;
 }
+// What a plan takes, on the rig's clock: a simulated one may run faster.
+const planned = (s) => (state && state.pace !== 1 ? `${clock(s)} of the rig's time` : clock(s));
 function put(parent, tag, text, name = "") {
   const e = document.createElement(tag);
   e.textContent = text; if (name) e.className = name;
@@ -131,15 +140,15 @@ function show(s) {
   if (!r) $("now").textContent = s.fault ? "FAULT" : "No run.";
   else if (r.phase === "running" && p.segment) {
     $("now").textContent = `${r.experiment}: ${p.name}, segment ${p.segment} of ${p.n_segments}`;
-  } else $("now").textContent = `${r.experiment}: ${r.phase}`;
+  } else $("now").textContent = `${r.experiment}: ${PHASES[r.phase] ?? r.phase}`;
   $("bar").hidden = !p.segment;
   if (p.segment) $("bar").value = 1 - Math.max(0, p.time_left) / p.duration;
   const facts = p.segment ? {
-    "Run left": clock(p.time_left), "Queue left": clock(s.time_left_s),
+    "Run left": clock(p.time_left / s.pace), "Queue left": clock(s.time_left_s / s.pace),
     Level: `${p.level} ${p.unit}`, Frequency: p.broadband ? "whole band" : p.frequency ? `${p.frequency.toFixed(2)} Hz` : "at rest",
-    "Nearest limit": p.channel ? `${p.channel}, ${(100 * p.margin).toFixed(0)} % left` : "–",
-    "Worst so far": `${p.worst_channel}, ${(100 * p.worst_margin).toFixed(0)} % left`,
-    "Late ticks": p.late_ticks, "Missing samples": p.missing_samples,
+    "Nearest limit now": p.channel ? `${p.channel}, ${(100 * p.margin).toFixed(0)} % left` : "–",
+    "Nearest in this run": `${p.worst_channel}, ${(100 * p.worst_margin).toFixed(0)} % left`,
+    "Late samples": p.late_ticks, "Missing samples": p.missing_samples,
   } : {};
   $("facts").replaceChildren();
   for (const [k, v] of Object.entries(facts)) {
@@ -152,7 +161,7 @@ function show(s) {
   $("resume").hidden = !(s.held && s.queue.length && lease);
   $("queue").replaceChildren();
   for (const j of s.queue) {
-    const item = put($("queue"), "li", `${j.experiment}, ${clock(j.duration_s)} `);
+    const item = put($("queue"), "li", `${j.experiment}, ${planned(j.duration_s)} `);
     if (lease) {
       const b = put(item, "button", "Take out");
       b.type = "button";
@@ -160,8 +169,9 @@ function show(s) {
     }
   }
   const l = s.last;
-  const told = l ? [l.status || l.phase, l.error || l.reason, l.verdict.replace("_", " ")].filter(Boolean) : [];
+  const told = l ? [l.status || l.phase, l.error || l.reason, VERDICTS[l.verdict]].filter(Boolean) : [];
   $("last").textContent = l ? `Last: ${l.experiment}: ${told.join("; ")}.` : "";
+  scope.over = motion.over = !r && !replay.on;
   soFar.show(s);
   if (before && l && (!before.last || before.last.id !== l.id)) find();
 }
@@ -186,19 +196,28 @@ $("take").onclick = tried(async () => {
 addEventListener("pagehide", () => {
   if (lease && !(state && state.running)) fetch("/api/lease", { method: "DELETE", keepalive: true, headers: { "X-Lease": lease } });
 });
+// The experiment, or its file as it was changed
+let files = {};
+const chosen = () => ($("changed").hidden ? { experiment: $("experiment").value } : { experiment_toml: $("text").value });
+$("text").oninput = () => { $("changed").hidden = $("text").value === files[$("experiment").value]; };
+$("experiment").onchange = $("as-shipped").onclick = () => {
+  $("text").value = files[$("experiment").value];
+  $("changed").hidden = true;
+  $("planned").textContent = "";
+};
 $("plan").onclick = tried(async () => {
   $("planned").textContent = "predicting …";
-  const found = await ask("POST", "/dry-run", { experiment: $("experiment").value }).catch((e) => { $("planned").textContent = ""; throw e; });
+  const found = await ask("POST", "/dry-run", chosen()).catch((e) => { $("planned").textContent = ""; throw e; });
   const total = found.runs.reduce((sum, r) => sum + r.duration_s, 0), worst = found.runs[0].margins[0];
   $("planned").textContent = found.refused ? `Refused: ${found.refused}`
-    : `${found.runs.length > 1 ? `${found.runs.length} runs, ` : ""}${clock(total)}; nearest to a limit: ${worst.channel} in ${worst.segment}, ${(100 * worst.margin).toFixed(0)} % left of ${worst.limit} ${worst.unit}`;
+    : `${found.runs.length > 1 ? `${found.runs.length} runs, ` : ""}${planned(total)}; nearest to a limit: ${worst.channel} in ${worst.segment}, ${(100 * worst.margin).toFixed(0)} % left of ${worst.limit} ${worst.unit}`;
 });
 const order = (what) => ask("POST", "/runs", { ...what, operator: $("operator").value, stop_when_certain: $("early").checked });
 $("next").onclick = tried(async () => order({ experiment_toml: await soFar.next() }));
 $("start").onclick = tried(async () => {
   $("planned").textContent = "predicting …";
   try {
-    await order({ experiment: $("experiment").value });
+    await order(chosen());
   } finally { $("planned").textContent = ""; }
 });
 $("resume").onclick = tried(() => ask("POST", "/queue/resume"));
@@ -221,7 +240,7 @@ async function find() {
     const row = put($("list"), "tr", "");
     const written = state?.running && `${state.running.recording}.partial` === e.path;
     put(row, "td", e.started.slice(0, 16).replace("T", " "), "time");
-    for (const text of [e.experiment, e.operator, clock(e.duration_s), written ? "being written" : e.problem || e.status, e.verdict.replace("_", " "), e.tags.join(", ")]) put(row, "td", text);
+    for (const text of [e.experiment, e.operator, clock(e.duration_s), written ? "being written" : e.problem || e.status, VERDICTS[e.verdict] ?? "", e.tags.join(", ")]) put(row, "td", text);
     const cell = put(row, "td", ""), b = put(cell, "button", e.path);
     b.type = "button"; b.onclick = tried(() => look(e.id));
   }
@@ -237,6 +256,7 @@ async function look(id) {
   offer(id);
   $("h-one").textContent = e.path;
   $("one-about").textContent = `${e.rig}, ${e.experiment}, ${e.samples.toLocaleString()} samples at ${e.rate_hz} Hz; ${e.status}: ${e.reason} `;
+  $("report").href = `/api/recordings/${id}/report`;
   const link = put($("one-about"), "a", "download");
   link.href = `/api/recordings/${id}/file`;
   $("one-diagnosis").textContent = (remarks?.diagnosis.lines || []).join(" ");
@@ -306,6 +326,8 @@ async function begin() {
   $("experiment").replaceChildren();
   for (const name of Object.keys(experiments)) put($("experiment"), "option", name);
   if ("swept_sine" in experiments) $("experiment").value = "swept_sine";
+  files = experiments;
+  $("experiment").onchange();
   if (wanted) { wanted = false; listen(); }
   const drawn = ask("GET", "/rig").then(({ drawing, motion: moves }) => {
     $("drawing").innerHTML = drawing;

@@ -83,6 +83,7 @@ export class Scope {
     const { mode } = this.trigger;
     let text = "";
     if (this.paused) text = "Paused";
+    else if (this.over) text = this.empty ? "" : "The run is over: these are its last samples";
     else if (mode === "single" && this.kept) text = "Triggered once";
     else if (mode === "normal" || mode === "single") text = view.rows ? "Triggered" : "Waiting for the trigger";
     else if (mode === "auto") text = view.at === null ? "No trigger: runs free" : "Triggered";
@@ -104,10 +105,12 @@ export class Scope {
     this.tell(view);
     this.read = [];
     g.font = "13px system-ui, sans-serif"; g.lineJoin = "bevel";
+    g.globalAlpha = this.over ? 0.55 : 1; // what is over does not look live
     this.shown.forEach((column, lane) => this.lane(g, view, column, lane, 4 + lane * tall, width, tall - 8));
+    g.globalAlpha = 1;
     g.fillStyle = ink("--muted"); g.textAlign = "left";
     const zero = view.at === null || view.at === undefined ? view.from + this.span : view.at;
-    const told = (t) => (Math.abs(t) < 1e-9 ? (view.at === null ? "now" : "trigger") : `${t > 0 ? "+" : "−"}${Math.abs(t).toPrecision(3)} s`);
+    const told = (t) => (Math.abs(t) < 1e-9 ? (view.at === null ? (this.over ? "end" : "now") : "trigger") : `${t > 0 ? "+" : "−"}${Math.abs(t).toPrecision(3)} s`);
     g.fillText(told(view.from - zero), LEFT, h - 4);
     g.textAlign = "right"; g.fillText(this.frozen && view.at === null ? "paused" : told(view.from + this.span - zero), w - 8, h - 4);
     if (this.cursors) this.marks(g, width, h);

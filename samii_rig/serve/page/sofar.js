@@ -72,17 +72,18 @@ export class SoFar {
       hz(d.low_hz)} to ${hz(d.high_hz)} Hz. ${end}${stop}${why}`;
   }
 
-  // The diagnosis that is kept with the recording.
+  // The diagnosis that is kept with the recording; of a run that did not end, what was known until then.
   async final(last) {
     const { $ } = this;
     $("diagnosis-section").hidden = true;
-    if (!last || !last.verdict) return;
+    if (!last || !last.diagnosis) return;
     const d = await this.ask("GET", `/jobs/${last.id}/diagnosis`).catch(() => null);
-    if (!d || !d.final || this.job !== last.id) return;
+    if (!d || this.job !== last.id) return;
     $("diagnosis-section").hidden = false;
-    $("h-diagnosis").textContent = "Diagnosis of the last run";
-    this.say(d, "");
-    $("diagnosis-age").textContent = `Kept with ${last.recording}. ${last.early ? `The run ended early: ${last.early}.` : ""}`;
+    $("h-diagnosis").textContent = d.final ? "Diagnosis of the last run" : "Diagnosis until the last run ended";
+    this.say(d, d.final ? "" : "Preliminary, and not kept with the recording. ");
+    $("diagnosis-age").textContent = d.final ? `Kept with ${last.recording}. ${last.early ? `The run ended early: ${last.early}.` : ""}`
+      : `From ${d.done} of ${d.of} segments, ${hz(d.low_hz)} to ${hz(d.high_hz)} Hz.`;
   }
 
   say(d, before) {
