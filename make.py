@@ -65,7 +65,8 @@ def check(arguments: list[str]) -> None:
     call(BIN / "mypy")
     call(BIN / "lint-imports")
     workers = str(min(os.cpu_count() or 1, 4))
-    call(BIN / "pytest", "-q", "-n", workers, "--durations=10", *arguments)
+    spread = ["-n", workers, "--dist", "loadgroup", "--no-loadscope-reorder"]
+    call(BIN / "pytest", "-q", *spread, "--durations=10", *arguments)
 
 
 def audit(arguments: list[str]) -> None:

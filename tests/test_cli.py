@@ -133,6 +133,16 @@ def test_a_diagnosis_is_kept_with_a_recording_if_it_is_of_its_own_rig_file(
     assert read_remarks(copy).diagnosis["verdict"]
 
 
+def test_a_report_begins_with_the_diagnosis_if_it_is_asked_for(log: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    code, said = call("report", log, "--diagnosis", "--out", page)
+    assert code == 0
+    # Who reads a log sees that it goes on.
+    assert "diagnosis: what is missing ..." in said
+    text = page.read_text("utf-8")
+    assert text.index('id="diagnosis"') < text.index('id="bode"')
+
+
 def test_what_is_no_recording_is_called_none(tmp_path: Path) -> None:
     text = tmp_path / "README.md"
     text.write_text("what a rig does\n" * 100)

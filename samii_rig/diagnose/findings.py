@@ -116,7 +116,10 @@ def lacks(responses: Sequence[FrequencyResponse], rig: Rig) -> tuple[str, ...]:
     if not any(repeated(r) for r in responses):
         out.append(NO_REPEATS)
     elif max(r.n_averages for r in responses) < FEW_REPEATS:
-        out.append("there are two repeats: which of them is wrong, if one is, cannot be told")
+        out.append(
+            "only two repeats of a level could be used: were one of them wrong, it could not be "
+            "told which; one more would tell"
+        )
     if not any(p.tolerance > 0 for e in rig.element for p in parameters(e).values()):
         out.append(
             "the rig file gives no tolerance: every number in it is taken for exact, and one that "
