@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -24,8 +25,10 @@ import numpy as np
 
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.errors import SamiiRigError
-from samii_rig.prove.score import frequency
+from samii_rig.plain import plain
+from samii_rig.prove.score import confidently_wrong, frequency
 from samii_rig.prove.trial import Answer, Hidden, Trial, Truth
+from samii_rig.record.export import replacing
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.elements import parameters
 from samii_rig.rig.load import parse
@@ -133,23 +136,53 @@ CASES: dict[str, Callable[[Responses], Responses]] = {
 }
 
 
-def answer(folder: Path, case: str) -> tuple[str, str, Trial | None]:
-    """(case, kind, trial): one trial diagnosed in one case."""
-    told = json.loads((folder.parents[1] / "truth" / f"{folder.name}.json").read_text("utf-8"))
+def answered(folder: Path, cases: Sequence[str]) -> None:
+    """Diagnose one trial in those of `cases` that have no answer yet; each is kept in
+    OUT/needed/CASE/TRIAL.json as soon as it is there."""
     recordings = [read_recording(log) for log in sorted(folder.glob("*.mcap"))]
     rig = parse(Rig, recordings[0].rig_toml, str(folder))
-    if case == "half the bursts":
-        recordings = shorter(recordings)
-    if case == "without: nominal refit":
-        rig = certain(rig)
-    try:
-        found = diagnose(CASES[case](list(estimate(recordings))), rig, runs=recordings)
-    except SamiiRigError as error:
-        print(f"{folder.name} {case}: {error}", flush=True)
-        return case, told["kind"], None
+    whole: Responses = []
+    for case in cases:
+        kept = kept_at(folder, case)
+        if kept.exists():
+            continue
+        runs, own = recordings, rig
+        if case == "half the bursts":
+            runs = shorter(recordings)
+            responses = list(estimate(runs))
+        else:
+            whole = whole or list(estimate(recordings))
+            responses = CASES[case](whole)
+        if case == "without: nominal refit":
+            own = certain(rig)
+        try:
+            said = plain(diagnose(responses, own, runs=runs).plain())
+        except SamiiRigError as error:
+            said = {"failed": str(error)}
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        with replacing(kept) as part:
+            part.write_text(json.dumps(said), encoding="utf-8")
+
+
+def kept_at(folder: Path, case: str) -> Path:
+    """The file of an answer."""
+    return (
+        folder.parents[1]
+        / "needed"
+        / case.replace(": ", "_").replace(" ", "_")
+        / f"{folder.name}.json"
+    )
+
+
+def trial_of(folder: Path, case: str) -> Trial | None:
+    """The trial with its answer, None if the diagnosis said that it has nothing to go by."""
+    said = json.loads(kept_at(folder, case).read_text("utf-8"))
+    if "failed" in said:
+        print(f"{folder.name} {case}: {said['failed']}", flush=True)
+        return None
+    told = json.loads((folder.parents[1] / "truth" / f"{folder.name}.json").read_text("utf-8"))
     effects = tuple(Hidden(e["physics"], e["site"], e["parameters"]) for e in told["effects"])
-    truth = Truth(told["kind"], told["seed"], effects, told["size"])
-    return case, told["kind"], Trial(truth, Answer.of(found.plain()))
+    return Trial(Truth(told["kind"], told["seed"], effects, told["size"]), Answer.of(said))
 
 
 def main() -> None:
@@ -160,12 +193,15 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", default=list(CASES))
     chosen = parser.parse_args()
     folders = sorted(p for p in (chosen.out / "recordings").iterdir() if list(p.glob("*.mcap")))
-    todo = [(f, c) for f in folders for c in chosen.cases]
     with ProcessPoolExecutor(chosen.workers, mp_context=get_context("spawn")) as pool:
-        done = list(pool.map(answer, *zip(*todo, strict=True)))
-    print(f"{'':32} {'false alarms':>18} {'detected':>22} {'place':>22} {'name':>22}")
+        done = [pool.submit(answered, f, chosen.cases) for f in folders]
+        for n, one in enumerate(as_completed(done), 1):
+            one.result()
+            print(f"{n} of {len(folders)}", file=sys.stderr, flush=True)
+    head = ("false alarms", "detected", "place", "name", "confidently wrong")
+    print(f"{'':33}" + " ".join(f"{h:>20}" for h in head))
     for case in chosen.cases:
-        trials = [t for c, _, t in done if c == case and t is not None]
+        trials = [t for f in folders if (t := trial_of(f, case)) is not None]
         nothing = [t for t in trials if t.truth.kind == "nothing"]
         big = [t for t in trials if t.truth.kind == "one" and t.truth.size >= FROM]
         cells = [
@@ -173,10 +209,11 @@ def main() -> None:
             frequency("", [t.answer.verdict != "no_mismatch" for t in big]),
             frequency("", [t.place_right for t in big]),
             frequency("", [t.right for t in big]),
+            frequency("", [confidently_wrong(t) for t in trials]),
         ]
         text = [f"{c.value:4.0%} ({c.low:.0%} to {c.high:.0%})" for c in cells]
         print(
-            f"{case:32} " + " ".join(f"{t:>20}" for t in text) + f"  n = {len(nothing)}, {len(big)}"
+            f"{case:33}" + " ".join(f"{t:>20}" for t in text) + f"  n = {len(nothing)}, {len(big)}"
         )
 
 

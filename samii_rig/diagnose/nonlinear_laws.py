@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.special import erf
 
 from samii_rig.types import Complex, Float
@@ -77,11 +78,25 @@ def starved(flow: Complex, M: Complex, T_s: Strength) -> Complex:
     flow : (n,) that the valve is told to let through, M : (..., n) phasors, T_s : (..., 1); M is
     the chain's moment, which pushes against a positive flow when negative.
     """
-    turn = np.exp(2j * np.pi * np.arange(PHASES) / PHASES)
-    q, m = np.real(flow[..., None] * turn), np.real(M[..., None] * turn)
-    held = np.asarray(T_s)[..., None]
-    gone = q * (np.sqrt(np.maximum(1 + np.sign(q) * m / held, 0.0)) - 1)
-    return np.asarray(2 * (gone @ turn.conj()) / PHASES)
+    shape = np.broadcast_shapes(flow.shape, M.shape, np.shape(T_s))
+    rows = [np.broadcast_to(x, shape).reshape(-1, shape[-1]) for x in (flow, M, np.asarray(T_s))]
+    return np.asarray(_starved(*rows)).reshape(shape)
+
+
+@njit(cache=True)
+def _starved(flow: Complex, M: Complex, T_s: Float) -> Complex:
+    """(m, n) each. Both halves of a period give the same, so that one is enough."""
+    out = np.zeros(flow.shape, np.complex128)
+    half = PHASES // 2
+    for k in range(half):
+        turn = np.exp(1j * np.pi * k / half)
+        back = 2 / half * np.conj(turn)
+        for i in range(flow.shape[0]):
+            for j in range(flow.shape[1]):
+                q, m = (flow[i, j] * turn).real, (M[i, j] * turn).real
+                held = 1 + np.sign(q) * m / T_s[i, j]
+                out[i, j] += q * (np.sqrt(max(held, 0.0)) - 1) * back
+    return out
 
 
 def starved_gauss(flow: Complex, M: Complex, power: Float, T_s: Strength) -> Complex:
