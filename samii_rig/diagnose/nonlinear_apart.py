@@ -45,7 +45,7 @@ class Apart:
     problem: Problem
     forces: list[Effect]
     given: Drives
-    known: Known = field(default_factory=dict)
+    known: Known = field(default_factory=list)
 
     def promises(self, base: Explanation) -> list[Promise]:
         """What each force would gain beside a linear explanation, the largest gain first."""

@@ -15,7 +15,7 @@ import numpy as np
 from samii_rig.diagnose.measured import PERIODIC, Measured
 from samii_rig.diagnose.nonlinear_inner import Inner
 from samii_rig.diagnose.nonlinear_levels import LevelGrid
-from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
+from samii_rig.diagnose.nonlinear_model import LevelModel
 from samii_rig.errors import SamiiRigError
 from samii_rig.model.sampled import hold_response
 from samii_rig.rig.schema import Rig
@@ -26,7 +26,7 @@ WHOLE = 0.02  # of a line: how near a whole number of cycles is
 FAINT = 1e-4  # of the strongest line of the input: below, a ratio to it says nothing
 
 Drives = Mapping[int, Float]
-Known = dict[Quasi, Complex]  # poles of the chain with a force, where it was computed last
+Known = list[Complex]  # poles of the chain where a force was computed last, of one at most
 
 
 def drives(
@@ -109,15 +109,16 @@ def forced(
 ) -> list[Driven] | None:
     """The force p under each input; None where the rig has no partial fractions.
 
-    known : poles from which they are looked for, and where they are left.
+    known : poles from which they are looked for, and where they are left. They are the chain's own,
+        whatever the force.
     """
-    known = {} if known is None else known
+    known = [] if known is None else known
     rate, quasi = model.rig.rate_hz, model.quasi
     inner: Inner | None = None
     if quasi.kind != "command":
         try:
-            inner = Inner.of(model, x, known.get(quasi))
-            known[quasi] = inner.structure
+            inner = Inner.of(model, x, known[0] if known else None)
+            known[:] = [inner.structure]
         except SamiiRigError:
             return None
     out = []
