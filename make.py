@@ -65,8 +65,7 @@ def check(arguments: list[str]) -> None:
     call(BIN / "mypy")
     call(BIN / "lint-imports")
     workers = str(min(os.cpu_count() or 1, 4))
-    spread = ["-n", workers, "--dist", "loadgroup", "--no-loadscope-reorder"]
-    call(BIN / "pytest", "-q", *spread, "--durations=10", *arguments)
+    call(BIN / "pytest", "-q", "-n", workers, "--durations=10", *arguments)
 
 
 def audit(arguments: list[str]) -> None:

@@ -19,25 +19,14 @@ TRIES_MORE, APART = 7, 2.0  # s; longer together than another program's burst of
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of some tries in real time one must hold: a loaded machine is late by itself.
-
-    On several workers, tests of real time are all of one worker, and begun first: two workers would
-    wait for each other by turns. Of the others, each file is of one.
-    """
+    """Of some tries in real time one must hold: a loaded machine is late by itself."""
     for item in items:
-        module = item.getparent(pytest.Module)
-        assert module is not None
-        used = {getattr(thing, "__module__", "") for thing in vars(module.obj).values()}
+        here = vars(item.getparent(pytest.Module).obj)  # type: ignore[union-attr]
+        used = {getattr(thing, "__module__", "") for thing in here.values()}
         if KITS & used:
             item.add_marker("real_time")
         if (KITS | {"serve_kit"}) & used:
             item.add_marker(pytest.mark.flaky(reruns=TRIES_MORE, reruns_delay=APART))
-        group = "real_time" if KITS & used else module.name
-        item.add_marker(pytest.mark.xdist_group(group))
-    # What waits long must not be what all others wait for at the end.
-    items.sort(
-        key=lambda i: (not i.get_closest_marker("real_time"), not i.get_closest_marker("flaky"))
-    )
 
 
 @pytest.fixture(autouse=True)

@@ -42,7 +42,7 @@ repeats = 3
 @pytest.fixture(scope="module")
 def scheduler() -> Iterator[str]:
     with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
     ) as cluster:
         yield cluster.scheduler_address
 
@@ -58,6 +58,7 @@ def answers(out: Path) -> dict[str, Any]:
     return {f.stem: json.loads(f.read_text().replace(str(out), "")) for f in files}
 
 
+@pytest.mark.slow  # a campaign's trial three times over
 def test_a_campaign_on_a_cluster_says_what_it_says_here(tmp_path: Path, scheduler: str) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
     options = ["--nothing", 1, "--one", 0, "--two", 0, "--outside", 0, "--joints", 0, "--seed", 3]

@@ -95,8 +95,8 @@ def diagnose(
     held = rig_of(recordings, rig)
     if held is None:
         raise InputError("--rig", "", None, "a rig: these recordings carry none")
-    console, stderr = Console(highlight=False), Console(highlight=False, stderr=True)
-    with working(stderr, "diagnosis") as say:
+    console = Console(highlight=False)
+    with working(console, "diagnosis", quiet=json) as say:
         say("frequency responses")
         responses = estimated(recordings, None, output, "auto", gaps, band)
         found = found_by(

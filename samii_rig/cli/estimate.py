@@ -176,7 +176,7 @@ def report(
 
         if held is None:
             raise InputError("--rig", "", None, "a rig: these recordings carry none")
-        with working(Console(stderr=True, highlight=False), "diagnosis") as say:
+        with working(Console(highlight=False), "diagnosis", quiet=json) as say:
             found = diagnose(responses, held[0], band=band, progress=say, runs=recordings)
     written = []
     if page is not None:
