@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from importlib import import_module
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any
 
 from samii_rig.errors import InputError
@@ -31,9 +32,26 @@ def workers(n: int | None = None, scheduler: str = "") -> Iterator[Executor]:
     # Fresh processes: a forked one would share the threads of numerical libraries.
     with (
         _environment(_ONE_THREAD),
-        ProcessPoolExecutor(n or os.cpu_count(), mp_context=get_context("spawn")) as pool,
+        ProcessPoolExecutor(
+            n or os.cpu_count(), get_context("spawn"), ends_with_its_parent
+        ) as pool,
     ):
         yield pool
+
+
+def ends_with_its_parent() -> None:
+    """Have this process of `multiprocessing` end when the one that started it is gone.
+
+    One that is killed can end nobody, and its workers would wait for work for ever.
+    """
+    parent = parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(0)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _client(scheduler: str) -> Any:

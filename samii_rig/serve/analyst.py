@@ -19,7 +19,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,6 +40,7 @@ from samii_rig.serve.planned import planned
 from samii_rig.serve.sofar import SoFar
 from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_width
 from samii_rig.types import Complex, Float, FrequencyResponse, Int
+from samii_rig.workers import ends_with_its_parent
 
 if TYPE_CHECKING:
     from samii_rig.diagnose.result import Diagnosis
@@ -188,7 +189,8 @@ class Diagnoser:
 def _diagnosing(line: Connection, rig_toml: str) -> None:
     from samii_rig.diagnose.diagnose import diagnose
 
-    threading.Thread(target=_ends_with_the_analyst, daemon=True).start()
+    # A diagnosis that nobody waits for any more takes no processor from the next run.
+    ends_with_its_parent()
     rig = parse(Rig, rig_toml, RIG)
     # The one who asks is gone when nothing comes any more.
     with suppress(EOFError, OSError):
@@ -200,14 +202,6 @@ def _diagnosing(line: Connection, rig_toml: str) -> None:
             except SamiiRigError as error:
                 found = {"verdict": "", "trouble": str(error)}
             line.send({**about, **found, "took_s": time.monotonic() - begun})
-
-
-def _ends_with_the_analyst() -> None:
-    """A diagnosis that nobody waits for any more takes no processor from the next run."""
-    analyst = parent_process()
-    assert analyst is not None
-    analyst.join()
-    os._exit(0)
 
 
 def said(found: Diagnosis) -> dict[str, Any]:
@@ -297,7 +291,7 @@ def _short(x: Float) -> list[float | None]:
     return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in x.tolist()]
 
 
-def _ends_with_its_parent() -> None:
+def _ends_with_its_input() -> None:
     while os.read(0, 1):
         pass
     os._exit(0)
@@ -305,7 +299,7 @@ def _ends_with_its_parent() -> None:
 
 def main() -> None:
     """Entry point."""
-    threading.Thread(target=_ends_with_its_parent, daemon=True).start()
+    threading.Thread(target=_ends_with_its_input, daemon=True).start()
     os.nice(NICE)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     try:

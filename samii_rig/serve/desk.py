@@ -24,6 +24,7 @@ from typing import Any
 from samii_rig import errors
 from samii_rig.errors import SamiiRigError
 from samii_rig.plain import plain
+from samii_rig.workers import ends_with_its_parent
 
 WORKERS = 2
 WITHIN = 120.0  # s that a piece of work may take
@@ -74,6 +75,7 @@ def _pool() -> ProcessPoolExecutor:
 
 
 def _begin() -> None:
+    ends_with_its_parent()
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
 
 
