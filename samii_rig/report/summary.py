@@ -167,7 +167,7 @@ def summary(
     for name in ("response", "level", "peaks: Hz, gain, standard deviation"):
         table.add_column(name, overflow="fold")
     if found:
-        table.add_column("model/measured")
+        table.add_column("model/measured;\nlines outside 90 %")
     by_key = {(c.output, c.input, c.level): c for c in found}
     for i, y in enumerate(responses[0].outputs):
         for j, u in enumerate(responses[0].inputs):
@@ -181,9 +181,7 @@ def summary(
                 c = by_key.get((y.name, u.name, r.level))
                 if c is not None:
                     phase = round(c.phase_deg, 1) + 0.0
-                    row.append(
-                        f"\u00d7 {c.gain:.3f}, {phase:+.1f}\u00b0, {percent(c.outside)} outside"
-                    )
+                    row.append(f"\u00d7 {c.gain:.3f}, {phase:+.1f}\u00b0; {percent(c.outside)}")
                 table.add_row(*(Text(cell) for cell in row))
     return Group(*said, Text(""), table)
 
