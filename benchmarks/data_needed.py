@@ -16,9 +16,8 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +34,7 @@ from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import FrequencyResponse, Recording
+from samii_rig.workers import workers
 
 FROM = 10.0  # sigma of the whole data, from which an effect should be found
 Responses = list[FrequencyResponse]
@@ -139,13 +139,14 @@ CASES: dict[str, Callable[[Responses], Responses]] = {
 def answered(folder: Path, cases: Sequence[str]) -> None:
     """Diagnose one trial in those of `cases` that have no answer yet; each is kept in
     OUT/needed/CASE/TRIAL.json as soon as it is there."""
+    todo = [case for case in cases if not kept_at(folder, case).exists()]
+    if not todo:
+        return
     recordings = [read_recording(log) for log in sorted(folder.glob("*.mcap"))]
     rig = parse(Rig, recordings[0].rig_toml, str(folder))
     whole: Responses = []
-    for case in cases:
+    for case in todo:
         kept = kept_at(folder, case)
-        if kept.exists():
-            continue
         runs, own = recordings, rig
         if case == "half the bursts":
             runs = shorter(recordings)
@@ -193,7 +194,7 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", default=list(CASES))
     chosen = parser.parse_args()
     folders = sorted(p for p in (chosen.out / "recordings").iterdir() if list(p.glob("*.mcap")))
-    with ProcessPoolExecutor(chosen.workers, mp_context=get_context("spawn")) as pool:
+    with workers(chosen.workers) as pool:
         done = [pool.submit(answered, f, chosen.cases) for f in folders]
         for n, one in enumerate(as_completed(done), 1):
             one.result()

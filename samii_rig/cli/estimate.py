@@ -170,13 +170,13 @@ def report(
     responses = estimated(recordings, input_, output, method, gaps, band)
     held = rig_of(recordings, rig)
     curve = model_curve(held[0], responses) if held else None
-    found = None
+    console, found = Console(highlight=False), None
     if diagnosis:
         from samii_rig.diagnose.diagnose import diagnose
 
         if held is None:
             raise InputError("--rig", "", None, "a rig: these recordings carry none")
-        with working(Console(highlight=False), "diagnosis", quiet=json) as say:
+        with working(console, "diagnosis", quiet=json) as say:
             found = diagnose(responses, held[0], band=band, progress=say, runs=recordings)
     written = []
     if page is not None:
@@ -196,7 +196,6 @@ def report(
     if json:
         say_json({"written": written, "model_over_measurement": comparisons(responses, curve)})
         return
-    console = Console(highlight=False)
     console.print(summary(recordings, responses, curve, band or ALL))
     for path in written:
         console.print(f"written  {path}", soft_wrap=True)

@@ -72,7 +72,7 @@ def identify(
     console = Console(highlight=False)
     if method != "likelihood":
         responses = estimated(recordings, None, None, "auto", gaps, band)
-        with working(Console(highlight=False), "identifying", quiet=json):
+        with working(console, "identifying", quiet=json):
             by = methods.from_responses(
                 cast("methods.Method", method), responses, held[0], free or (), outputs=output,
                 band=band,
@@ -83,7 +83,7 @@ def identify(
             console.print(method_table(by))
         return
     responses = estimated(recordings, None, output, "auto", gaps, band)
-    with working(Console(highlight=False), "identifying", quiet=json):
+    with working(console, "identifying", quiet=json):
         found = maximum_likelihood(
             responses, held[0], free or uncertain(held[0]), prior=not free, band=band
         )

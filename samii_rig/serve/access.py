@@ -30,6 +30,12 @@ STOP = "/api/stop"
 OPEN = ("/", "/api/login", STOP)
 OPEN_FOLDER = "/page/"
 COOKIE = "samii_rig_token"
+# Of every page of ours, beside its own policy.
+PLAIN_PAGE = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cache-Control": "no-store",
+}
 MAX_BODY = 64 << 10  # bytes of a request that is no upload
 MAX_UPLOAD = 2 << 30  # bytes of an uploaded recording: an hour of ten channels at 5 kHz
 UPLOAD = ("POST", "/api/recordings")

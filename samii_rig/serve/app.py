@@ -22,7 +22,7 @@ import samii_rig
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig
 from samii_rig.serve import driving, library
-from samii_rig.serve.access import App, Guard, Receive, Scope, Send
+from samii_rig.serve.access import PLAIN_PAGE, App, Guard, Receive, Scope, Send
 from samii_rig.serve.job import LOST_AFTER, Job
 from samii_rig.serve.rooms import STATUS, NotThereError, Rooms
 from samii_rig.serve.settings import Settings, is_local
@@ -40,12 +40,7 @@ POLICY = (
     "img-src 'self' data:; connect-src 'self'; frame-ancestors 'none'; "
     "base-uri 'none'; form-action 'none'"
 )
-HEADERS = {
-    "Content-Security-Policy": POLICY,
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-}
+HEADERS = {**PLAIN_PAGE, "Content-Security-Policy": POLICY}
 TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
 
 

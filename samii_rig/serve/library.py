@@ -19,6 +19,7 @@ from samii_rig.index.query import Query as Asked
 from samii_rig.index.remarks import add_note, read_remarks, set_tags
 from samii_rig.index.store import PRIVATE
 from samii_rig.serve import desk, upload
+from samii_rig.serve.access import PLAIN_PAGE
 from samii_rig.serve.driving import Answer, Body
 from samii_rig.serve.rooms import Rooms, operator
 
@@ -28,10 +29,8 @@ MEDIA = "application/octet-stream"
 # What a recording says is shown in a page of its own that cannot ask us for anything; which
 # scripts it runs, the page itself says by their hashes.
 REPORT_HEADERS = {
+    **PLAIN_PAGE,
     "Content-Security-Policy": "sandbox allow-scripts allow-downloads; frame-ancestors 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
 }
 
 
