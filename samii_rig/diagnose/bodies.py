@@ -23,6 +23,8 @@ from samii_rig.rig.schema import (
 from samii_rig.types import Float
 
 COMPLIANCES = (1e-4, 0.01, 1.0)  # of a line's oil over the chain's own, at which a search starts
+# No material's loss is the same at all frequencies: relaxation makes it wander by some per cent.
+LOSS_WANDERS = 0.05
 DAMPED = (1e-7, 1e3)  # loss angle of a joint's spring with a damper, from invisible to gross
 
 
@@ -152,6 +154,7 @@ def _beams(rig: Rig, where: Places) -> Iterator[Effect]:
             parameters=lossy,
             touches=(eta,),
             causal=(e.name, middle(where) / (2 * math.pi)),
+            rough=LOSS_WANDERS,
         )
         for symbol in ("EI", "mu"):
             key = (e.name, symbol)

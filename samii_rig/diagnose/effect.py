@@ -84,6 +84,7 @@ class Effect:
     write : the rig as a file would have it, from the built rig and the unknowns.
     weight : prior weight against the other hypotheses.
     report : physical quantities to be reported, from the unknowns.
+    rough : part of what it does by which its law is known to be off; 0 for one that holds.
     variant : tells effects with one name and different changes apart.
     """
 
@@ -101,6 +102,7 @@ class Effect:
     weight: float = 1.0
     aliases: tuple[tuple[str, str], ...] = field(default=())
     report: Callable[[Float], Float] = lambda x: x
+    rough: float = 0.0
     variant: str = ""
 
     @property

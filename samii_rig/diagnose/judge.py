@@ -93,6 +93,8 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
     decide : lines that took no part in the fit, on which the best explanation must hold too.
     """
     thin = _thin(search)
+    for key, e in search.found.items():
+        search.found[key] = replace(e, fitted=e.fitted.roughly())
     kept = [e for e in search.ranked() if e.key not in thin]
     ranked = _decided(search, decide, kept) if decide is not None else kept
     weights = np.array([e.weight for e in ranked])
@@ -220,20 +222,31 @@ def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
 def _thin(search: Search) -> set[frozenset[str]]:
     """Explanations of linear effects of which one, beside the others, is not in the data: it spares
     the nominal parameters values that their tolerances make unlikely, and no more."""
-    ranked = search.ranked()
-    near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
-    out = set()
-    while near:
-        e = near.pop()
-        if len(e.effects) < 2 or e.key in out or any(x.quasi is not None for x in e.effects):
-            continue
-        for i in range(len(e.effects)):
-            less = search.without(e, i)
-            gained = less.fitted.chi2 - e.fitted.chi2 if less is not None else math.inf
-            if less is not None and gained < IN_DATA * search.temperature:
-                out.add(e.key)
-                near.append(less)
-    return out
+    out: set[frozenset[str]] = set()
+    while True:
+        ranked = [e for e in search.ranked() if e.key not in out]
+        near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
+        if not (thin := {e.key for e in near if _is_thin(search, e)}):
+            return out
+        out |= thin
+
+
+def _is_thin(search: Search, e: Explanation) -> bool:
+    if len(e.effects) < 2 or any(x.quasi is not None for x in e.effects):
+        return False
+    fewer = [search.without(e, i) for i in range(len(e.effects))]
+    return any(
+        less is not None and less.fitted.chi2 - e.fitted.chi2 < _worth(search, less)
+        for less in fewer
+    )
+
+
+def _worth(search: Search, less: Explanation) -> float:
+    """Chi-square that an effect beside those of `less` must explain: more than chance does, and
+    more than their own laws are off by."""
+    rough = max((e.rough for e in less.effects), default=0.0)
+    explained = search.nominal.fitted.chi2 - less.fitted.chi2
+    return max(IN_DATA * search.temperature, rough**2 * explained)
 
 
 def _decided(search: Search, lines: Measured, ranked: list[Explanation]) -> list[Explanation]:

@@ -46,7 +46,6 @@ SHARE, MORE = 0.3, 3.0  # of what it should gain between levels, that it does
 AGAIN, MOVED = 4, 0.5  # times that a force is computed anew at most; a move that is small
 REACH = 0.5  # of what the best explanation gains, that a rival may lose and still be computed
 RIVALS, REFITTED = 4, 8  # forces that are computed each time, and explanations refitted
-LAW = 0.01  # of a strength: what it was off by where it is hidden in strong forces
 GROWN = 3  # linear effects that are refitted beside a force
 ONE_LEVEL = (
     "all runs have one amplitude: friction, deadband, backlash, hardening and saturation cannot "
@@ -65,22 +64,24 @@ def compete(
     forces are computed in time; without them their describing functions must do. Returns the
     winner.
     """
-    lines = search.lines
-    if np.unique(lines.level).size < 2:
+    whole = search.lines
+    if np.unique(whole.level).size < 2:
         return None
-    grid = level_grid(search.rig, search.grid, lines, responses)
+    grid = level_grid(search.rig, search.grid, whole, responses)
     if grid is None:
         return None
     before = (search.problem, search.grid, search.table, search.found, search.temperature)
     ranked = search.ranked()
     kept = [e for e in ranked[:KEPT] if e.weight > ranked[0].weight - NEAR]
     kept += [e for e in (search.nominal,) if e not in kept]
+    given = drives(search.rig, whole, responses, runs)
+    timed = np.isin(whole.level, list(given))
+    # What a force does in time cannot be known of a level whose input does not repeat itself.
+    lines = whole.take(timed) if len(given) > 1 else whole
+    search.lines = lines
     bins = Bins.of(lines, ranked[0].fitted, search.grid)
     problem = Problem.of(bins.combined(), grid)
-    levels = Apart(
-        search, bins, grid, problem, list(forces(search.rig, problem)),
-        drives(search.rig, lines, responses, runs),
-    )  # fmt: skip
+    levels = Apart(search, bins, grid, problem, list(forces(search.rig, problem)), given)
     search.problem, search.grid = problem, grid
     search.use([*before[2], *levels.forces])
     bases = list({e.key: e for e in (ranked[0], search.nominal)}.values())
@@ -91,11 +92,12 @@ def compete(
         for e in kept:
             if (end := search.refitted(e.effects, e, far=False)) is not None:
                 search.keep(e.effects, end)
-        _force(search, promised)
+        _force(levels, promised)
         search.temper()
         forced = _settled(levels, before[2])
     search.table = before[2]
     if forced is None:
+        search.lines = whole
         search.problem, search.grid, table, search.found, search.temperature = before
         search.use(table)
     return forced
@@ -107,11 +109,13 @@ def _heard(promise: Promise) -> bool:
     return promise.gain > ALARM and low < promise.contrast < high
 
 
-def _force(search: Search, promised: Sequence[tuple[Explanation, list[Promise]]]) -> None:
+def _force(levels: Apart, promised: Sequence[tuple[Explanation, list[Promise]]]) -> None:
     """Refit each base with the force that promises most beside it, and with others that may come
     as near."""
+    search = levels.search
     for base, promise in [(base, p) for base, found in promised for p in _worth(found)]:
         effects = (*base.effects, promise.effect)
+        levels.as_promised(base, promise)
         ends = [search.refitted(effects, base, [math.log(p)]) for p in promise.starts]
         done = [end for end in ends if end is not None]
         if done:
@@ -147,20 +151,7 @@ def _settled(levels: Apart, table: Sequence[Effect]) -> Effect | None:
         _again(levels)
     if _force_in(search.ranked()[0]) is not None:
         _on_lines(levels, table)
-    for key, e in search.found.items():
-        search.found[key] = replace(e, fitted=_with_law_error(e.fitted))
     return _force_in(search.ranked()[0])
-
-
-def _with_law_error(fitted: Fitted) -> Fitted:
-    """The same, the strength of a force in the loop known no better than it is computed."""
-    model = fitted.model
-    if not isinstance(model, LevelModel) or model.quasi.kind == "command":
-        return fitted
-    both = fitted.covariance()
-    both[model.unknown, model.unknown] += LAW**2
-    prior = fitted.precision() - fitted.information
-    return replace(fitted, information=np.linalg.inv(both) - prior)
 
 
 def _again(levels: Apart) -> None:
@@ -243,8 +234,22 @@ def _on_lines(levels: Apart, table: Sequence[Effect]) -> None:
             # Not the better of both: the force was that of another explanation.
             del search.found[best.key]
             search.keep(best.effects, again)
-            search.temper()
+            _use_force_of(levels, again)
+            # What stands beside it may only have led out of a valley in which the force was stuck.
+            if (less := _without_linear(search, best.effects, again)) is not None:
+                search.keep(bare.effects, self_consistent(less, levels.on_lines))
+        _use_force_of(levels, search.ranked()[0].fitted)
+        search.temper()
     _use_force_of(levels, search.ranked()[0].fitted)
+
+
+def _without_linear(search: Search, effects: tuple[Effect, ...], fitted: Fitted) -> Fitted | None:
+    """A force and one linear effect without the latter, not refitted."""
+    linear = [i for i, e in enumerate(effects) if e.quasi is None]
+    if len(effects) != 2 or len(linear) != 1:
+        return None
+    less = search.bare(Explanation(effects, fitted, 0.0), linear[0])
+    return less.fitted if less is not None else None
 
 
 def _use_force_of(levels: Apart, fitted: Fitted) -> None:

@@ -97,11 +97,14 @@ class Apart:
                 cut = max((cut, cut / nearer, cut * nearer), key=lambda x: at(top - x))
         if not tried:
             return promise
-        best = max(tried.values(), key=lambda p: p.gain)
-        # Where it came nearest it is computed once more, and kept.
-        p = best.starts[0]
-        self.compute(model, np.append(base.fitted.x, math.log(p)), p)
-        return best
+        return max(tried.values(), key=lambda p: p.gain)
+
+    def as_promised(self, base: Explanation, promise: Promise) -> None:
+        """A force that was computed in time is what it is where it promised this, beside `base`."""
+        model = self.search.model((*base.effects, promise.effect))
+        if isinstance(model, LevelModel) and model.quasi in self.grid.extra:
+            p = promise.starts[0]
+            self.compute(model, np.append(base.fitted.x, math.log(p)), p)
 
     def compute(self, model: LevelModel, x: Float, p: float) -> bool:
         """Put what a force is in time, beyond its describing function, into grid and problem."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samii_rig.diagnose.measured import PERIODIC, Measured
+from samii_rig.diagnose.measured import PERIODIC, WHOLE, Measured
 from samii_rig.diagnose.nonlinear_inner import Inner
 from samii_rig.diagnose.nonlinear_levels import LevelGrid
 from samii_rig.diagnose.nonlinear_model import LevelModel
@@ -22,7 +22,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse, Int, Recording
 
 MOST_PERIODS = 40  # of the lines' distance in a period of the input
-WHOLE = 0.02  # of a line: how near a whole number of cycles is
+NEAR = 0.02  # of a line: how near a whole number of cycles is
 FAINT = 1e-4  # of the strongest line of the input: below, a ratio to it says nothing
 
 Drives = Mapping[int, Float]
@@ -46,7 +46,8 @@ def periods(
     runs: Sequence[Recording],
     names: Sequence[str],
 ) -> dict[int, Float]:
-    """(n_period, n, n_channel) of each level whose input repeats itself, but for the first."""
+    """(n_period, n, n_channel) of each level whose input repeats itself, but for the first. What
+    local models made of bursts that still ring is no whole period of one motion."""
     out = {}
     for k, (level, periodic) in enumerate(zip(lines.levels, lines.periodic, strict=True)):
         own = [
@@ -54,7 +55,8 @@ def periods(
             for r in responses
             if (r.level, r.level_unit) == level and (r.method.split()[0] in PERIODIC) == periodic
         ]
-        n = _period(own[0].frequency, rig.rate_hz) if len(own) == 1 else 0
+        whole = len(own) == 1 and own[0].method.split()[0] in WHOLE
+        n = _period(own[0].frequency, rig.rate_hz) if whole else 0
         blocks: list[Float] = []
         for run in runs if n else ():
             values = [
@@ -84,9 +86,9 @@ def _period(f: Float, rate_hz: float) -> int:
     step = float(np.min(np.diff(f)))
     for m in range(1, MOST_PERIODS):
         cycles = f * m / step
-        if np.all(np.abs(cycles - np.round(cycles)) < WHOLE):
+        if np.all(np.abs(cycles - np.round(cycles)) < NEAR):
             n = m / step * rate_hz
-            return round(n) if abs(n - round(n)) < WHOLE * n / 100 else 0
+            return round(n) if abs(n - round(n)) < NEAR * n / 100 else 0
     return 0
 
 

@@ -18,6 +18,7 @@ from samii_rig.rig.schema import ANGLE_SOURCES, SOURCES, Rig, TorsionalSpring
 from samii_rig.types import Float
 
 STARTS = 14
+COMPUTED = 0.01  # of a strength: what it was off by where it is hidden in strong forces
 RANGE = (1e-6, 30.0)  # of a strength over the one that doubles or halves the motion at its place
 WIDTHS = (1e-6, 2.0)  # of a gap or limit over the largest amplitude that meets it
 # Starts of a limit over the largest amplitude: one just below it cuts only a little.
@@ -114,6 +115,7 @@ def _force(physics: str, site: str, alias: str, quasi: Quasi, unknown: Unknown) 
         unknowns=(unknown,),
         quasi=quasi,
         aliases=((physics, alias),) if alias else (),
+        rough=0.0 if quasi.kind == "command" else COMPUTED,
         variant=f"{quasi.kind} {' '.join(quasi.across)}",
     )
 

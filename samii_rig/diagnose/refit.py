@@ -7,7 +7,7 @@ optimum the logarithm of the response is fitted first, which has fewer wrong min
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -103,6 +103,19 @@ class Fitted:
     def covariance(self) -> Float:
         """(n_x, n_x) of the logarithms."""
         return np.asarray(np.linalg.inv(self.precision()))
+
+    def roughly(self) -> Fitted:
+        """The same, the first unknown of each effect known no better than its law holds."""
+        rough = np.zeros(self.x.size)
+        at = self.model.n_nominal
+        for effect in self.model.effects:
+            rough[at : at + 1] = effect.rough**2
+            at += len(effect.unknowns)
+        if not rough.any():
+            return self
+        prior = self.precision() - self.information
+        both = np.linalg.inv(self.covariance() + np.diag(rough))
+        return replace(self, information=both - prior)
 
 
 def _prior_precision(model: Model) -> Float:

@@ -9,7 +9,7 @@ with every other in its place.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from samii_rig.types import Float
 MOST = 5  # effects in one explanation, if all are of one physics
 MIXED = 2  # effects of different physics: with more, sums of them mimic what is in no table
 FIRST, LATER = 30, 6  # candidates that are refitted in the first round, and in later ones
+STRAIGHT = 15  # of them, from the nominal parameters as the rig file has them
 WORTH = 8.0  # of chi-square, gain in the screen below which a candidate is not refitted
 ENOUGH = 1.15  # chi-square over its mean below which growth looks at one explanation only
 SATURATED = "torsional_compliance"  # joints that give: what is missing in many places at once
@@ -35,8 +36,11 @@ AGAIN, STILL = 4, 0.3  # times that bins are made anew at most, and a move that 
 SWAPS = 2  # rounds of them, the second about what won the first
 ANYHOW = 2  # of the most promising in another's place are refitted whatever the screen says
 SHARE = 0.3  # of the best candidate's gain: one that promises less is not refitted
+BENT = 3.0  # of the penalty of a nominal parameter above which the refit hides what is missing
 GROSS = 8.0  # chi-square over its mean above which candidates race before they are refitted
 AHEAD, FINALISTS = 5, 5  # steps of that race, and how many go on
+OTHERS = 3  # of other physics than theirs, that go on too
+BROAD = 4  # single effects of different physics that are grown where none is enough
 
 Candidate = tuple[float, tuple[Effect, ...], list[Float]]  # chi-square hoped for, and starts
 
@@ -48,6 +52,8 @@ class Search(Explanations):
         """Grow, swap, prune; all explanations, the most probable first. briefly : single effects
         alone."""
         self.grow(self.nominal, FIRST)
+        if self._bent(self.ranked()[0]):
+            self.grow(self._straight(), STRAIGHT, again=True)
         self.temper()
         if briefly:
             return self.ranked()
@@ -57,6 +63,9 @@ class Search(Explanations):
                 break
             self.renew(before)
             if turn == 0 and not self._enough(self.ranked()[0]):
+                # What is one of two often stands behind what mimics both.
+                for base in list(_each_physics(self.ranked()))[:BROAD]:
+                    self.grow(base, LATER)
                 self.saturate(SATURATED)
             for base in self._beam():
                 self.grow(base, LATER)
@@ -75,15 +84,31 @@ class Search(Explanations):
                 break
         return self.ranked()
 
-    def grow(self, base: Explanation, most: int) -> None:
-        """Refit `base` with each of the most promising further effects."""
+    def _bent(self, best: Explanation) -> bool:
+        """Whether nominal parameters at unlikely values may hide what is missing."""
+        n = self.nominal.fitted.model.n_nominal
+        hidden = not self._enough(best) and self.nominal.fitted.penalty > BENT * n
+        return hidden or best.fitted.penalty > BENT * n
+
+    def _straight(self) -> Explanation:
+        """The rig as its file has it: where the refitted one took values that their tolerances make
+        unlikely, it has done what is missing by them, and hides it."""
+        model = self.nominal.fitted.model
+        x = np.zeros(model.n)
+        h, dh = model.gradient(x, self.problem.at)
+        J, r = self.problem.whiten(dh), self.problem.residual(h)
+        return Explanation((), Fitted(model, x, float(r @ r), 0.0, J, J.T @ J), 0.0)
+
+    def grow(self, base: Explanation, most: int, *, again: bool = False) -> None:
+        """Refit `base` with each of the most promising further effects; again : those too that
+        were refitted from elsewhere."""
         if len(base.effects) >= MOST:
             return
         tried: list[Candidate] = []
         for drop, effect, starts in self.screen(base)[:most]:
             effects = (*base.effects, effect)
             model = self.model(effects)
-            known_ = frozenset(e.key for e in effects) in self.found
+            known_ = not again and frozenset(e.key for e in effects) in self.found
             if drop < WORTH or known_ or self._mixed(effects) or not model:
                 continue
             known = moved(base.fitted.model, base.fitted.x, model)
@@ -138,7 +163,11 @@ class Search(Explanations):
                 end = self.refitted_from(effects, x, steps=AHEAD)
                 if end is not None:
                     ends.append((end.cost, effects, [end.x]))
-        return sorted(ends, key=lambda end: end[0])[:FINALISTS]
+        ends.sort(key=lambda end: end[0])
+        first, rest = ends[:FINALISTS], ends[FINALISTS:]
+        seen = {end[1][-1].physics for end in first}
+        others = {end[1][-1].physics: end for end in reversed(rest)}
+        return first + [end for end in others.values() if end[1][-1].physics not in seen][-OTHERS:]
 
     def screen(self, base: Explanation) -> list[tuple[float, Effect, list[Start]]]:
         """How far chi-square should fall with each further effect, and one or two starts for its
@@ -199,6 +228,8 @@ class Search(Explanations):
             base = self.bare(whole, i)
             if base is None:
                 continue
+            if len(gone.unknowns) > 2:
+                self._elsewhere(whole, i, base, enough)
             screened = self.screen(base)
             for rank, (drop, effect, starts) in enumerate(screened[: LATER + 1]):
                 effects = (*base.effects, effect)
@@ -210,6 +241,24 @@ class Search(Explanations):
                 end = self.refitted(effects, base, np.log(starts[0]).tolist(), enough)
                 if end is not None:
                     self.keep(effects, end)
+
+    def _elsewhere(self, whole: Explanation, i: int, base: Explanation, enough: float) -> None:
+        """Effect i of `whole` at every other place, from the values that it has at its own: several
+        unknowns that start elsewhere may end far from them."""
+        gone = whole.effects[i]
+        first = whole.fitted.model.n_nominal + sum(len(e.unknowns) for e in whole.effects[:i])
+        own = whole.fitted.x[first : first + len(gone.unknowns)]
+        for effect in self.table:
+            alike = effect.physics == gone.physics and len(effect.unknowns) == own.size
+            if not alike or effect.key in {e.key for e in whole.effects}:
+                continue
+            effects = (*base.effects, effect)
+            bounds = np.log([(u.low, u.high) for u in effect.unknowns]).T
+            if self.model(effects) is None or self._mixed(effects):
+                continue
+            end = self.refitted(effects, base, np.clip(own, *bounds).tolist(), enough)
+            if end is not None and end.cost < enough:
+                self.keep(effects, end)
 
     def _nearest(self) -> Explanation:
         """The most probable explanation; where even that leaves much, the one nearest to the lines
@@ -242,11 +291,9 @@ class Search(Explanations):
     def renew(self, best: Explanation) -> None:
         """Bins anew about the best explanation until it stands still, for bins about a model that
         is off lead to one that is; and what may still compete refitted on them."""
-        keep = [
-            e
-            for e in self.ranked()[:FIRST]
-            if e.weight > best.weight - 4 * NEAR and e.fitted.cost < HOPELESS * best.fitted.cost
-        ]
+        near = [e for e in self.ranked()[:FIRST] if e.weight > best.weight - 4 * NEAR]
+        broad = list(_each_physics(self.ranked()))[:BROAD]
+        keep = [e for e in (*near, *broad) if e.fitted.cost < HOPELESS * best.fitted.cost]
         nominal = self.nominal
         for _ in range(AGAIN):
             self.rebin(best.fitted)
@@ -262,3 +309,12 @@ class Search(Explanations):
             end = self.refitted(e.effects, e)
             if end is not None:
                 self.keep(e.effects, end)
+
+
+def _each_physics(ranked: Sequence[Explanation]) -> Iterator[Explanation]:
+    """The first single effect of each physics."""
+    seen = set()
+    for e in ranked:
+        if len(e.effects) == 1 and e.effects[0].physics not in seen:
+            seen.add(e.effects[0].physics)
+            yield e
