@@ -10,15 +10,17 @@ from identify_kit import noiseless, samii, without_tolerances
 from samii_rig.diagnose.effect import Effect, Unknown
 from samii_rig.diagnose.measured import measured
 from samii_rig.diagnose.model import Model, grid
+from samii_rig.diagnose.nonlinear import compete
 from samii_rig.diagnose.nonlinear_confirm import seen
 from samii_rig.diagnose.nonlinear_consistent import self_consistent
-from samii_rig.diagnose.nonlinear_driven import driven, drives, forced
+from samii_rig.diagnose.nonlinear_driven import driven, drives, forced, timed
 from samii_rig.diagnose.nonlinear_laws import CUBIC, EXCESS, FRICTION, GAP
 from samii_rig.diagnose.nonlinear_levels import Extra, level_grid
 from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.diagnose.nonlinear_screen import Bins, Levels
 from samii_rig.diagnose.nonlinear_time import simulate
 from samii_rig.diagnose.refit import Problem, refit
+from samii_rig.diagnose.search import Search
 from samii_rig.types import Channel, Recording, Segment
 
 N = 6000  # samples of a period
@@ -195,3 +197,34 @@ def test_levels_against_each_other_tell_a_force_but_nothing_linear():
     assert there.contrast == pytest.approx(there.due, rel=0.05)
     assert there.starts[0] == pytest.approx(p, rel=0.1)
     assert not_there.contrast < 0.05 * max(not_there.due, not_there.gain, 1.0)
+
+
+def test_bursts_that_still_ring_have_no_period():
+    responses, lines, _ = campaign()
+    ringing = [replace(responses[0], method="local (drawn)"), responses[1]]
+    assert sorted(drives(samii(), lines, ringing, recorded(*CASES[0]))) == [1]
+
+
+@pytest.mark.parametrize("settled", [0, 1, 2])
+def test_levels_are_left_out_where_two_others_repeat_themselves(settled):
+    bursts = [
+        replace(r, method="settled (drawn)" if i < settled else "local (drawn)", level=level)
+        for i, (r, level) in enumerate(zip(campaign()[0] * 2, (0.5, 1.0, 0.7), strict=False))
+    ]
+    multisines = [replace(r, method="periodic (drawn)") for r in campaign()[0]]
+    responses = [*bursts, *multisines]
+    runs = recorded(*CASES[0])
+    runs += [
+        replace(r, segments=tuple(replace(s, kind="periodic") for s in r.segments)) for r in runs
+    ]
+    lines = measured(responses, samii()).splits()[0]
+    search = Search(samii(), lines, grid(samii(), *at_of(lines)), [])
+    assert compete(search, responses, runs) is None
+    assert search.lines is lines
+    given = drives(samii(), lines, responses, runs)
+    kept = timed(lines, given)
+    assert sorted(set(kept.level)) == ([0, 1] if settled == 2 else [0, 1, 2])
+
+
+def at_of(lines):
+    return lines.frequency, lines.sensor, lines.actuator

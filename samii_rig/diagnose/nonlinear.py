@@ -20,7 +20,7 @@ from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.nonlinear_apart import Apart
 from samii_rig.diagnose.nonlinear_confirm import seen
 from samii_rig.diagnose.nonlinear_consistent import self_consistent
-from samii_rig.diagnose.nonlinear_driven import drives
+from samii_rig.diagnose.nonlinear_driven import drives, timed
 from samii_rig.diagnose.nonlinear_forces import forces
 from samii_rig.diagnose.nonlinear_levels import LevelGrid, level_grid
 from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
@@ -75,10 +75,7 @@ def compete(
     kept = [e for e in ranked[:KEPT] if e.weight > ranked[0].weight - NEAR]
     kept += [e for e in (search.nominal,) if e not in kept]
     given = drives(search.rig, whole, responses, runs)
-    timed = np.isin(whole.level, list(given))
-    # What a force does in time cannot be known of a level whose input does not repeat itself.
-    lines = whole.take(timed) if len(given) > 1 else whole
-    search.lines = lines
+    lines = search.lines = timed(whole, given)
     bins = Bins.of(lines, ranked[0].fitted, search.grid)
     problem = Problem.of(bins.combined(), grid)
     levels = Apart(search, bins, grid, problem, list(forces(search.rig, problem)), given)

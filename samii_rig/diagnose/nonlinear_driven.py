@@ -39,6 +39,13 @@ def drives(
     return {k: blocks[:, :, 0] for k, blocks in found.items()}
 
 
+def timed(lines: Measured, given: Drives) -> Measured:
+    """The levels whose input repeats itself, if two do: of others it cannot be known what a force
+    does in time. All of them where no two do."""
+    known = np.isin(lines.level, list(given))
+    return lines.take(known) if np.unique(lines.level[known]).size > 1 else lines
+
+
 def periods(
     rig: Rig,
     lines: Measured,
