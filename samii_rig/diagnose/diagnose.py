@@ -27,7 +27,6 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
 
 ALTERNATIVES = 6
-DIFFER = 1.5  # chi-square per degree of freedom of levels against each other
 TWIN_POINTS = 40
 
 Progress = Callable[[str], None]
@@ -75,7 +74,7 @@ def diagnose(
     bands = answer.bands(search, nominal)
     progress("what is missing")
     # Linear effects bend towards what no linear rig does: a force comes first where levels differ.
-    gross = seen.differing() > DIFFER
+    gross = seen.torn()
     search.run(briefly=gross)
     progress("amplitude levels")
     if compete(search, sound, runs) is None and gross:

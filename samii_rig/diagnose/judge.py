@@ -220,7 +220,7 @@ def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
 
 
 def _thin(search: Search) -> set[frozenset[str]]:
-    """Explanations of linear effects of which one, beside the others, is not in the data: it spares
+    """Explanations of which one linear effect, beside the others, is not in the data: it spares
     the nominal parameters values that their tolerances make unlikely, and no more."""
     out: set[frozenset[str]] = set()
     while True:
@@ -232,9 +232,15 @@ def _thin(search: Search) -> set[frozenset[str]]:
 
 
 def _is_thin(search: Search, e: Explanation) -> bool:
-    if len(e.effects) < 2 or any(x.quasi is not None for x in e.effects):
+    if len(e.effects) < 2:
         return False
-    fewer = [search.without(e, i) for i in range(len(e.effects))]
+    fewer: list[Explanation | None] = []
+    for i, effect in enumerate(e.effects):
+        if all(x.quasi is None for x in e.effects):
+            fewer.append(search.without(e, i))
+        elif effect.quasi is None:
+            # A force is not refitted here: without this one it was fitted to itself, or not at all.
+            fewer.append(search.found.get(e.key - {effect.key}))
     return any(
         less is not None and less.fitted.chi2 - e.fitted.chi2 < _worth(search, less)
         for less in fewer

@@ -31,6 +31,7 @@ WHOLE = ("burst", "settled", "periodic")
 # Cycles a record up to which a slow drift leaves more than the covariance, pooled over
 # neighbouring lines, says: what is left of it falls with the square of the frequency.
 DRIFTING = 4.5
+DIFFER = 1.5  # chi-square per degree of freedom of levels against each other
 TRANSIENTS = "local"  # method of responses from single transients: see `usable`
 
 
@@ -91,6 +92,10 @@ class Measured:
         mean = float(np.sum((self.expected * (1 - 1 / times))[several]))
         left = float(np.sum(self.chi_square(common[which])[several]))
         return left / mean if mean > 0 else math.nan
+
+    def torn(self) -> bool:
+        """Whether levels differ by far more than noise makes them."""
+        return self.differing() > DIFFER
 
     def take(self, mask: NDArray[np.bool_]) -> Measured:
         """Some of the lines."""

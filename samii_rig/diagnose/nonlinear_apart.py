@@ -7,6 +7,7 @@ under the inputs that were recorded.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,9 +15,9 @@ import numpy as np
 from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.explanations import Explanation
 from samii_rig.diagnose.nonlinear_driven import Drives, Known, driven, top_of
-from samii_rig.diagnose.nonlinear_laws import EXCESS
+from samii_rig.diagnose.nonlinear_laws import CUBIC, EXCESS, GAP
 from samii_rig.diagnose.nonlinear_levels import Extra, LevelGrid
-from samii_rig.diagnose.nonlinear_model import LevelModel
+from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.diagnose.nonlinear_screen import Bins, Levels, Promise
 from samii_rig.diagnose.refit import Problem
 from samii_rig.diagnose.search import Search
@@ -28,6 +29,9 @@ BLIND = ("output_saturation", "flow_saturation")
 CUTS = (0.003, 0.012, 0.05, 0.2, 0.5)  # off the largest command, limits that are tried first
 NEARER = (2.0, 1.4, 1.2)  # factors on that, that are tried then
 HINT = 5.0  # of chi-square, gained in the screen: less is not looked at any closer
+STIFF = 3  # hardening joints that are computed in time in the screen
+STIFFER = (1.0, 4.0, 16.0)  # times as stiff as their describing functions say
+PLAYS = (1e-5, 1e-4, 1e-3, 1e-2)  # of the widest play that is looked for
 KEPT = 6  # forces that are kept
 FINE = 150  # bins of each level about a force in time, which varies from line to line
 
@@ -57,21 +61,40 @@ class Apart:
                 promise = look.promise(effect, model)
                 found += [promise] if promise is not None else []
         found.sort(key=lambda p: -p.gain)
-        kept = found[:KEPT] + [p for p in found[KEPT:] if p.effect.physics in BLIND]
-        closer = [self._closer(base, look, p) if self._inexact(p) else p for p in kept]
+        guessed = self._guesses(found)
+        blind = [p for p in found if p.effect.physics in BLIND or p.effect.key in guessed]
+        kept = found[:KEPT] + [p for p in found[KEPT:] if p in blind]
+        closer = []
+        for p in kept:
+            guesses = guessed.get(p.effect.key, ())
+            inexact = bool(guesses) or self._inexact(p)
+            closer.append(self._closer(base, look, p, guesses) if inexact else p)
         return sorted((p for p in closer if p.gain > HINT), key=lambda p: -p.gain)
+
+    def _guesses(self, found: Sequence[Promise]) -> dict[str, list[float]]:
+        """Strengths that are tried in time, by the force: of hardening joints that promise
+        something, which move a resonance by more than its width so that the first start is far too
+        soft; and of play where levels differ grossly: a joint within its play has no stiffness."""
+        cubes = [p for p in found[:KEPT] if p.gain > HINT and _quasi(p).law is CUBIC]
+        out = {p.effect.key: [p.starts[0] * x for x in STIFFER] for p in cubes[:STIFF]}
+        if self.bins.lines.torn():
+            plays = [p for p in found if _quasi(p).law is GAP and _quasi(p).kind == "joint"]
+            out |= {p.effect.key: [p.effect.unknowns[0].high * x for x in PLAYS] for p in plays}
+        return out
 
     @staticmethod
     def _inexact(promise: Promise) -> bool:
         """Whether it is worth while to compute a force in time before it is refitted."""
-        quasi = promise.effect.quasi
-        assert quasi is not None
+        quasi = _quasi(promise)
         by_command = quasi.kind == "command"
         likely = promise.gain > HINT or quasi.law is EXCESS
         return likely and (by_command or promise.effect.physics in BLIND)
 
-    def _closer(self, base: Explanation, look: Levels, promise: Promise) -> Promise:
-        """The same with the force in time, under the inputs that were recorded."""
+    def _closer(
+        self, base: Explanation, look: Levels, promise: Promise, guesses: Sequence[float]
+    ) -> Promise:
+        """The same with the force in time, under the inputs that were recorded; at the best of some
+        guesses, if there are any."""
         effect = promise.effect
         model = self.search.model((*base.effects, effect))
         assert isinstance(model, LevelModel)
@@ -88,10 +111,13 @@ class Apart:
                     tried[p] = replace(found, effect=effect)
             return tried[p].gain if p in tried else -math.inf
 
-        if model.quasi.law is not EXCESS:
+        if guesses:
+            p = max(guesses, key=at)
+            max((p / 2, 2 * p), key=at)
+        elif model.quasi.law is not EXCESS:
             at(promise.starts[0])
         elif self.given:
-            top = top_of(model, self.given)
+            top = top_of(model, self.given, self.bins.lines)
             cut = max((x * top for x in CUTS), key=lambda x: at(top - x))
             for nearer in NEARER if at(top - cut) > HINT else ():
                 cut = max((cut, cut / nearer, cut * nearer), key=lambda x: at(top - x))
@@ -113,7 +139,7 @@ class Apart:
         extra = driven(model, x, self.grid, self.given, p, self.known)
         if extra is None:
             return False
-        top = top_of(model, self.given)
+        top = top_of(model, self.given, self.bins.lines)
         quasi = model.quasi
         self.grid = replace(self.grid, extra={**self.grid.extra, quasi: Extra(extra, p, top)})
         self.problem = self.bins.better(self.problem, quasi, Extra(extra, p, top))
@@ -135,3 +161,8 @@ class Apart:
         self.bins = Bins.of(self.bins.lines, best.fitted, self.grid, FINE)
         self.problem = Problem.of(self.bins.combined(), self.grid)
         self.search.problem = self.problem
+
+
+def _quasi(promise: Promise) -> Quasi:
+    assert promise.effect.quasi is not None
+    return promise.effect.quasi

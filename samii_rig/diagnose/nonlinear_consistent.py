@@ -9,7 +9,7 @@ of the force in time itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -40,8 +40,8 @@ def self_consistent(fitted: Fitted, computed: Computed) -> Fitted:
     J[:m] = problem.whiten(model.gradient(x, problem.at)[1])
     J[m:, :n] = np.diag(1 / model.prior[:n])
     scale = np.minimum(model.prior, 1.0)  # inf of an unknown
-    # What a command drives does not move with the parameters.
-    command = model.quasi.kind == "command"
+    # What a command drives moves with its own strength alone.
+    moving = [model.unknown] if model.quasi.kind == "command" else list(range(model.n))
     damping, exact = FIRST, False
     for _ in range(STEPS):
         before = float(r @ r)
@@ -52,10 +52,11 @@ def self_consistent(fitted: Fitted, computed: Computed) -> Fitted:
             by = d / scale**2
             J += np.outer(change - J @ d, by) / (d @ by)
             exact = False
-        elif exact or command:
+        elif exact:
             break
         else:
-            J, exact, damping = _slopes(model, x, r, computed, scale), True, LEAST
+            J[:, moving] = _slopes(model, x, r, computed, scale, moving)
+            exact, damping = True, LEAST
     chi2, penalty = float(r[:m] @ r[:m]), float(r[m:] @ r[m:])
     return Fitted(model, x, chi2, penalty, J[:m], J[:m].T @ J[:m])
 
@@ -85,13 +86,15 @@ def _left(model: LevelModel, x: Float, problem: Problem) -> Float:
     return np.concatenate([data, x[:n] / model.prior[:n]])
 
 
-def _slopes(model: LevelModel, x: Float, r: Float, computed: Computed, scale: Float) -> Float:
-    """(r.size, n_x) by differences, towards the inside of the bounds."""
-    J = np.empty((r.size, model.n))
-    for j in range(model.n):
+def _slopes(
+    model: LevelModel, x: Float, r: Float, computed: Computed, scale: Float, moving: Sequence[int]
+) -> Float:
+    """(r.size, len(moving)) by differences, towards the inside of the bounds."""
+    J = np.empty((r.size, len(moving)))
+    for i, j in enumerate(moving):
         step = DIFFERENCE * float(scale[j])
         step = -step if x[j] + step > model.upper[j] else step
         ahead = x.copy()
         ahead[j] += step
-        J[:, j] = (_left(model, ahead, computed(model, ahead)) - r) / step
+        J[:, i] = (_left(model, ahead, computed(model, ahead)) - r) / step
     return J

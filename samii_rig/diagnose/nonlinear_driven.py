@@ -79,11 +79,12 @@ def periods(
     return out
 
 
-def top_of(model: LevelModel, given: Drives) -> float:
-    """The largest command, for a force that it drives; else 0."""
+def top_of(model: LevelModel, given: Drives, lines: Measured) -> float:
+    """The largest command at the levels of these lines, for a force that it drives; else 0."""
     if model.quasi.kind != "command":
         return 0.0
-    return max(float(np.max(np.abs(v))) for v in given.values())
+    levels = set(np.unique(lines.level).tolist())
+    return max((float(np.max(np.abs(v))) for k, v in given.items() if k in levels), default=0.0)
 
 
 def _period(f: Float, rate_hz: float) -> int:
