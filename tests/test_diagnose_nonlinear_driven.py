@@ -2,18 +2,21 @@
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from identify_kit import noiseless, samii, without_tolerances
 
 from samii_rig.diagnose.effect import Effect, Unknown
+from samii_rig.diagnose.judge import _is_thin
 from samii_rig.diagnose.measured import measured
 from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.nonlinear import compete
 from samii_rig.diagnose.nonlinear_confirm import seen
 from samii_rig.diagnose.nonlinear_consistent import self_consistent
-from samii_rig.diagnose.nonlinear_driven import driven, drives, forced, timed
+from samii_rig.diagnose.nonlinear_driven import driven, drives, forced, timed, top_of
+from samii_rig.diagnose.nonlinear_inner import Inner
 from samii_rig.diagnose.nonlinear_laws import CUBIC, EXCESS, FRICTION, GAP
 from samii_rig.diagnose.nonlinear_levels import Extra, level_grid
 from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
@@ -228,3 +231,43 @@ def test_levels_are_left_out_where_two_others_repeat_themselves(settled):
 
 def at_of(lines):
     return lines.frequency, lines.sensor, lines.actuator
+
+
+def test_a_rig_is_driven_until_its_force_repeats_itself():
+    """After two of these periods, which do not end at rest, it is still 2 % off."""
+    quasi, p = CASES[1]
+    _, model, x = model_of(quasi, p)
+    inner = Inner.of(model, x)
+    found = inner.force(sweep(1.0), p)
+    last = inner.force(np.tile(sweep(1.0), 5), p)[-found.size :]
+    assert np.linalg.norm(found - last) < 1e-3 * np.linalg.norm(found)
+
+
+def test_a_limit_is_looked_for_below_the_largest_command_of_the_levels_at_hand():
+    _, model, _ = model_of(*CASES[5])
+    lines = campaign()[1]
+    given = {0: sweep(0.5)[None], 1: sweep(1.0)[None], 7: sweep(3.0)[None]}
+    assert top_of(model, given, lines) == pytest.approx(1.0, abs=1e-3)
+    assert top_of(model, given, lines.take(lines.level == 0)) == pytest.approx(0.5, abs=1e-3)
+    _, joint, _ = model_of(*CASES[0])
+    assert top_of(joint, given, lines) == 0
+
+
+@pytest.mark.parametrize(("gained", "told"), [(14.0, False), (60.0, True)])
+def test_a_linear_effect_beside_a_force_must_show_in_the_data(gained, told):
+    force, _, _ = model_of(*CASES[0])
+    beside = Effect("added_mass", "beam")
+    one = SimpleNamespace(key=frozenset({force.key}), effects=(force,), fitted=fit_of(1000.0))
+    both = SimpleNamespace(
+        key=frozenset({force.key, beside.key}),
+        effects=(force, beside),
+        fitted=fit_of(1000.0 - gained),
+    )
+    search = SimpleNamespace(
+        found={one.key: one}, temperature=1.0, nominal=SimpleNamespace(fitted=fit_of(5000.0))
+    )
+    assert _is_thin(search, both) is not told
+
+
+def fit_of(chi2):
+    return SimpleNamespace(chi2=chi2)
