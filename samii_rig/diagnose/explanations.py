@@ -204,10 +204,8 @@ class Explanations:
         effects = whole.effects[:i] + whole.effects[i + 1 :]
         key = frozenset(e.key for e in effects)
         if key not in self.found:
-            model = whole.fitted.model
-            first = model.n_nominal + sum(len(e.unknowns) for e in whole.effects[:i])
-            gone = range(first, first + len(whole.effects[i].unknowns))
-            less = replace(whole.fitted, x=np.delete(whole.fitted.x, list(gone)))
+            gone = list(whole.fitted.model.own(i))
+            less = replace(whole.fitted, x=np.delete(whole.fitted.x, gone))
             base = Explanation(effects, less, 0.0)
             end = self.refitted(effects, base)
             if end is None:
@@ -222,9 +220,7 @@ class Explanations:
         old = whole.fitted.model
         if less is None or less.keys != old.keys:
             return None
-        first = old.n_nominal + sum(len(e.unknowns) for e in whole.effects[:i])
-        own = range(first, first + len(whole.effects[i].unknowns))
-        x = np.delete(whole.fitted.x, list(own))
+        x = np.delete(whole.fitted.x, list(old.own(i)))
         h, dh = less.gradient(x, self.problem.at)
         J, r = self.problem.whiten(dh), self.problem.residual(h)
         fitted = Fitted(less, x, float(r @ r), whole.fitted.penalty, J, J.T @ J)

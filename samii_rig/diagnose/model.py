@@ -132,6 +132,11 @@ class Model:
             at += len(effect.unknowns)
         return out
 
+    def own(self, i: int) -> range:
+        """Where the unknowns of effect i stand in x."""
+        first = self.n_nominal + sum(len(e.unknowns) for e in self.effects[:i])
+        return range(first, first + len(self.effects[i].unknowns))
+
     def values(self, x: Float) -> dict[Key, float]:
         """The chain's parameters that differ from the built rig's."""
         moved = dict(

@@ -62,8 +62,9 @@ class Apart:
                 found += [promise] if promise is not None else []
         found.sort(key=lambda p: -p.gain)
         guessed = self._guesses(found)
-        blind = [p for p in found if p.effect.physics in BLIND or p.effect.key in guessed]
-        kept = found[:KEPT] + [p for p in found[KEPT:] if p in blind]
+        kept = found[:KEPT] + [
+            p for p in found[KEPT:] if p.effect.physics in BLIND or p.effect.key in guessed
+        ]
         closer = []
         for p in kept:
             guesses = guessed.get(p.effect.key, ())

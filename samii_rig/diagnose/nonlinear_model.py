@@ -106,8 +106,7 @@ class LevelModel(Model):
         assert effect.quasi is not None
         self.quasi = effect.quasi
         self.chain = self.chain_of(self.quasi.widened(self.built))
-        first = self.n_nominal + sum(len(e.unknowns) for e in self.effects[: self._which])
-        self.unknown = first
+        self.unknown = self.own(self._which)[0]
 
     def response(self, x: Float, at: Grid) -> Complex:
         """(n, q) at the grid's lines."""

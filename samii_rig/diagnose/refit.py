@@ -107,10 +107,8 @@ class Fitted:
     def roughly(self) -> Fitted:
         """The same, the first unknown of each effect known no better than its law holds."""
         rough = np.zeros(self.x.size)
-        at = self.model.n_nominal
-        for effect in self.model.effects:
-            rough[at : at + 1] = effect.rough**2
-            at += len(effect.unknowns)
+        for i, effect in enumerate(self.model.effects):
+            rough[self.model.own(i)[:1]] = effect.rough**2
         if not rough.any():
             return self
         prior = self.precision() - self.information

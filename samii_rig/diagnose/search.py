@@ -17,7 +17,7 @@ import numpy as np
 from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.explanations import NEAR, Explanation, Explanations
 from samii_rig.diagnose.ranking import moved, ranking
-from samii_rig.diagnose.refit import Fitted
+from samii_rig.diagnose.refit import Fitted, refit
 from samii_rig.diagnose.screen import Screen, Start
 from samii_rig.types import Float
 
@@ -94,10 +94,8 @@ class Search(Explanations):
         """The rig as its file has it: where the refitted one took values that their tolerances make
         unlikely, it has done what is missing by them, and hides it."""
         model = self.nominal.fitted.model
-        x = np.zeros(model.n)
-        h, dh = model.gradient(x, self.problem.at)
-        J, r = self.problem.whiten(dh), self.problem.residual(h)
-        return Explanation((), Fitted(model, x, float(r @ r), 0.0, J, J.T @ J), 0.0)
+        there = refit(model, self.problem, np.zeros(model.n), far=False, steps=0)
+        return Explanation((), there, 0.0)
 
     def grow(self, base: Explanation, most: int, *, again: bool = False) -> None:
         """Refit `base` with each of the most promising further effects; again : those too that
@@ -246,8 +244,7 @@ class Search(Explanations):
         """Effect i of `whole` at every other place, from the values that it has at its own: several
         unknowns that start elsewhere may end far from them."""
         gone = whole.effects[i]
-        first = whole.fitted.model.n_nominal + sum(len(e.unknowns) for e in whole.effects[:i])
-        own = whole.fitted.x[first : first + len(gone.unknowns)]
+        own = whole.fitted.x[whole.fitted.model.own(i)]
         for effect in self.table:
             alike = effect.physics == gone.physics and len(effect.unknowns) == own.size
             if not alike or effect.key in {e.key for e in whole.effects}:
