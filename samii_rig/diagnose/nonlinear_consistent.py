@@ -20,7 +20,7 @@ from samii_rig.types import Float
 
 STEPS = 40  # at most
 TRIES, SHORTER = 5, 20.0  # of a step, and how much more each is damped
-DIFFERENCE = 1e-3  # of a tolerance, or of a logarithm without one, for slopes
+DIFFERENCE = 1e-2  # of a tolerance, or of a logarithm without one, for slopes
 SETTLED = 0.3  # of chi-square, gained by a step: less and it leads no further
 
 Computed = Callable[[LevelModel, Float], Problem]

@@ -8,6 +8,7 @@ step, so that errors fall with the square of its length.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,7 +23,9 @@ from samii_rig.types import Complex, Float, Int
 
 INNER = 8  # steps a sample
 NEWTON = 5  # steps to the root of a cubic that is monotonous
-LAPS, SAME = 5, 1e-3  # periods at most; of the largest force, by which the last two may differ
+LAPS, SAME = 10, 1e-3  # periods at most; of the largest force, by which the last two may differ
+MEMORY, KEPT = 4, 1e-8  # differences of earlier periods that are used, of what singular value
+STAYS = 0.02  # of a state, lost in a period: one that loses less is left where it is
 DRY, CUBE, PLAY, FLOW = range(4)
 _CODES: tuple[tuple[Law | None, int], ...] = ((FRICTION, DRY), (CUBIC, CUBE), (GAP, PLAY))
 
@@ -142,10 +145,16 @@ class Inner:
 
     def force(self, v: Float, p: float) -> Float:
         """(n INNER,) the force p in a period of a command v (n,) that has gone on until the force
-        repeats itself too: a lightly damped rig remembers more than one burst."""
-        w, e = np.zeros_like(self.grow), v
+        repeats itself too: a lightly damped rig remembers more than one burst.
+
+        A state that is the same before and after a period is what a linear rig has at once from
+        what one period makes of rest; what the force changes of it is found by Anderson's method.
+        """
+        start, e = np.zeros_like(self.grow), v
         before: Float | None = None
-        for _ in range(LAPS):
+        seen: list[tuple[Float, Float]] = []
+        for lap in range(LAPS):
+            w = start.copy()
             e = _lap(
                 w, self.grow, self.by_v, self.by_e, self.direct, self.g,
                 np.ascontiguousarray(v), self.late, INNER, self.code, p, self.scale,
@@ -153,13 +162,33 @@ class Inner:
             if before is not None and np.max(np.abs(e - before)) <= SAME * np.max(np.abs(e)):
                 break
             before = e
+            if lap == 0:
+                start = self._settled(w, v.size * INNER)
+            else:
+                seen = [*seen[-MEMORY:], (start.ravel(), (w - start).ravel())]
+                start = _mixed(seen).reshape(w.shape)
         return np.asarray(e)
+
+    def _settled(self, w: Float, steps: int) -> Float:
+        """The states that so many steps lead back to, where they lead from rest to w."""
+        kept = (self.grow[0] + 1j * self.grow[1]) ** steps
+        lost = np.where(np.abs(1 - kept) > STAYS, 1 - kept, 1.0)
+        return _parts((w[0] + 1j * w[1]) / lost)
 
     def lines(self, v: Float, bins: Int, p: float) -> Complex:
         """The same at these cycles a period; a sum over samples, as that of v."""
         f = np.asarray(bins * self.rate_hz / v.size)
         held = hold_response(f, self.rate_hz * INNER)
         return np.asarray(np.fft.rfft(self.force(v, p))[bins] / INNER * held)
+
+
+def _mixed(seen: Sequence[tuple[Float, Float]]) -> Float:
+    """Where a period should change nothing: from states (n,) and what a period changed of each, the
+    last as it is or led on by how the changes changed (Anderson, J. ACM 12, 1965)."""
+    x, f = (np.array(rows) for rows in zip(*seen, strict=True))
+    d_x, d_f = np.diff(x, axis=0).T, np.diff(f, axis=0).T
+    along = np.linalg.lstsq(d_f, f[-1], rcond=KEPT)[0]
+    return np.asarray(x[-1] + f[-1] - (d_x + d_f) @ along)
 
 
 def _parts(x: Complex) -> Float:

@@ -140,7 +140,7 @@ def find_poles(D: Characteristic, region: Region, near: Complex | None = None) -
     for box, n in zip(boxes, counts, strict=True):
         assert n is not None
         total += n if box.symmetric else 2 * n
-        found += _known(polished, box, n) or _isolate(D, box, n)
+        found += _isolate(D, box, n, polished)
     found.sort(key=lambda item: (abs(item[0]), item[0].imag))
     poles = np.array([p for p, _ in found], dtype=complex)
     multiplicity = np.array([m for _, m in found], dtype=np.int64)
@@ -254,8 +254,9 @@ def _known(polished: Complex, box: _Box, n: int) -> list[tuple[complex, int]]:
     return [(x, 1) for x in inside] if held == n else []
 
 
-def _isolate(D: Characteristic, box: _Box, n: int) -> list[tuple[complex, int]]:
-    """The zeros in a box that holds n, each with its multiplicity; Im >= 0 only."""
+def _isolate(D: Characteristic, box: _Box, n: int, polished: Complex) -> list[tuple[complex, int]]:
+    """The zeros in a box that holds n, each with its multiplicity; Im >= 0 only. polished : some
+    that are known, which are all in many a part of it."""
     found: list[tuple[complex, int]] = []
     stack = [(box, n)]
     while stack:
@@ -266,6 +267,9 @@ def _isolate(D: Characteristic, box: _Box, n: int) -> list[tuple[complex, int]]:
                 "the characteristic function has a pole there"
             )
         if count == 0:
+            continue
+        if known := _known(polished, here, count):
+            found += known
             continue
         if count == 1:
             root = _polish(D, here)
