@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from identify_kit import noiseless, samii, without_tolerances
 
+from samii_rig.diagnose import nonlinear_inner
 from samii_rig.diagnose.effect import Effect, Unknown
 from samii_rig.diagnose.judge import _is_thin
 from samii_rig.diagnose.measured import measured
@@ -16,7 +17,7 @@ from samii_rig.diagnose.nonlinear import compete
 from samii_rig.diagnose.nonlinear_confirm import seen
 from samii_rig.diagnose.nonlinear_consistent import self_consistent
 from samii_rig.diagnose.nonlinear_driven import driven, drives, forced, timed, top_of
-from samii_rig.diagnose.nonlinear_inner import Inner
+from samii_rig.diagnose.nonlinear_inner import Inner, _lap
 from samii_rig.diagnose.nonlinear_laws import CUBIC, EXCESS, FRICTION, GAP
 from samii_rig.diagnose.nonlinear_levels import Extra, level_grid
 from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
@@ -241,6 +242,32 @@ def test_a_rig_is_driven_until_its_force_repeats_itself():
     found = inner.force(sweep(1.0), p)
     last = inner.force(np.tile(sweep(1.0), 5), p)[-found.size :]
     assert np.linalg.norm(found - last) < 1e-3 * np.linalg.norm(found)
+
+
+@pytest.mark.parametrize(("quasi", "p"), [CASES[1], CASES[2]])
+def test_what_rings_for_many_periods_is_found_in_a_few(quasi, p, monkeypatch):
+    """A second of multisine: after five of them from rest the force is still far off."""
+    _, model, x = model_of(quasi, p)
+    inner = Inner.of(model, x)
+    n, rng = 500, np.random.default_rng(3)
+    t = np.arange(n) / n
+    v = sum(np.sin(2 * np.pi * (k * t + rng.uniform())) for k in range(1, 30)) / 8
+    periods = []
+
+    def counted(*given):
+        periods.append(given[6].size)
+        return _lap(*given)
+
+    monkeypatch.setattr(nonlinear_inner, "_lap", counted)
+    found = inner.force(v, p)
+    assert len(periods) <= nonlinear_inner.LAPS
+    state = np.zeros_like(inner.grow)
+    long = _lap(
+        state, inner.grow, inner.by_v, inner.by_e, inner.direct, inner.g, np.tile(v, 80),
+        inner.late, nonlinear_inner.INNER, inner.code, p, inner.scale,
+    ).reshape(80, -1)  # fmt: skip
+    assert np.linalg.norm(long[4] - long[-1]) > 0.02 * np.linalg.norm(long[-1])
+    assert np.linalg.norm(found - long[-1]) < 1e-3 * np.linalg.norm(long[-1])
 
 
 def test_a_limit_is_looked_for_below_the_largest_command_of_the_levels_at_hand():
