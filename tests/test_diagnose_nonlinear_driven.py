@@ -280,6 +280,20 @@ def test_a_limit_is_looked_for_below_the_largest_command_of_the_levels_at_hand()
     assert top_of(joint, given, lines) == 0
 
 
+def test_a_limit_that_was_computed_above_every_command_cuts_nothing():
+    """A refit may lead there; what follows must stay a number."""
+    quasi, p = CASES[5]
+    _, model, x = model_of(quasi, p)
+    _, lines, at = campaign()
+    zero = np.zeros((*at.driven.shape, at.sensor.size), complex)
+    beyond = replace(at, extra={quasi: Extra(zero, 1.2, 1.0)})
+    there = beyond.at(lines.frequency, lines.level)
+    h, dh = model.gradient(x, there)
+    bare, _ = model.gradient(x, at.at(lines.frequency, lines.level))
+    np.testing.assert_array_equal(h, bare)
+    assert np.all(np.isfinite(dh))
+
+
 @pytest.mark.parametrize(("gained", "told"), [(14.0, False), (60.0, True)])
 def test_a_linear_effect_beside_a_force_must_show_in_the_data(gained, told):
     force, _, _ = model_of(*CASES[0])

@@ -35,6 +35,7 @@ from samii_rig.rig.schema import (
 from samii_rig.types import Complex, Float
 
 CAP = 1.5  # power of its height, that what a limit cuts off a sine grows with
+LEAST_CUT = 1e-6  # of the largest command, height of what a limit cuts off
 EXTRA = f"{insert.PREFIX}force"  # the input and the sensor that the chain has more
 
 Kind = Literal["joint", "drive", "command", "flow"]
@@ -164,8 +165,10 @@ class LevelModel(Model):
             return 0.0, 0.0
         if self.quasi.law is EXCESS:
             # A cap of height a is cut off a sine over a time like sqrt(a).
-            left = np.maximum(extra.top - p, 1e-6 * extra.top)
-            grown = (left / (extra.top - extra.p)) ** CAP
+            # Nothing is cut by a limit that is not reached, now or when it was computed.
+            least = LEAST_CUT * extra.top
+            left = np.maximum(extra.top - p, least)
+            grown = (left / max(extra.top - extra.p, least)) ** CAP
             return np.asarray(extra.part * grown), np.asarray(-CAP * p / left)
         power = self.quasi.power
         return np.asarray(extra.part * (p / extra.p) ** power), float(power)
