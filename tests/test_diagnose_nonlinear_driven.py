@@ -280,13 +280,14 @@ def test_a_limit_is_looked_for_below_the_largest_command_of_the_levels_at_hand()
     assert top_of(joint, given, lines) == 0
 
 
-def test_a_limit_that_was_computed_above_every_command_cuts_nothing():
+@pytest.mark.parametrize("top", [1.0, 0.0])
+def test_a_limit_that_was_computed_above_every_command_cuts_nothing(top):
     """A refit may lead there; what follows must stay a number."""
     quasi, p = CASES[5]
     _, model, x = model_of(quasi, p)
     _, lines, at = campaign()
     zero = np.zeros((*at.driven.shape, at.sensor.size), complex)
-    beyond = replace(at, extra={quasi: Extra(zero, 1.2, 1.0)})
+    beyond = replace(at, extra={quasi: Extra(zero, 1.2, top)})
     there = beyond.at(lines.frequency, lines.level)
     h, dh = model.gradient(x, there)
     bare, _ = model.gradient(x, at.at(lines.frequency, lines.level))

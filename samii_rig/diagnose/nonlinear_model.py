@@ -164,6 +164,8 @@ class LevelModel(Model):
         if extra is None:
             return 0.0, 0.0
         if self.quasi.law is EXCESS:
+            if extra.top == 0:  # no command of these levels is known
+                return 0.0, 0.0
             # A cap of height a is cut off a sine over a time like sqrt(a).
             # Nothing is cut by a limit that is not reached, now or when it was computed.
             least = LEAST_CUT * extra.top
