@@ -252,15 +252,16 @@ def test_what_rings_for_many_periods_is_found_in_a_few(quasi, p, monkeypatch):
     n, rng = 500, np.random.default_rng(3)
     t = np.arange(n) / n
     v = sum(np.sin(2 * np.pi * (k * t + rng.uniform())) for k in range(1, 30)) / 8
-    periods = []
+    periods = 0
 
     def counted(*given):
-        periods.append(given[6].size)
+        nonlocal periods
+        periods += 1
         return _lap(*given)
 
     monkeypatch.setattr(nonlinear_inner, "_lap", counted)
     found = inner.force(v, p)
-    assert len(periods) <= nonlinear_inner.LAPS
+    assert periods < nonlinear_inner.LAPS  # it ended by itself
     state = np.zeros_like(inner.grow)
     long = _lap(
         state, inner.grow, inner.by_v, inner.by_e, inner.direct, inner.g, np.tile(v, 80),
