@@ -164,6 +164,26 @@ def test_what_decides_and_what_shows_took_no_part_in_the_fit():
     assert usable([single]) == [single]
 
 
+@pytest.mark.parametrize(
+    ("ringing", "more", "decides"),
+    [((), set(), {0.5, 2.0}), ((2.0,), {2.0}, {0.5}), ((1.0,), set(), {0.5, 2.0}),
+     ((0.5, 2.0), {2.0}, {0.5})],
+)  # fmt: skip
+def test_where_bursts_ring_the_periodic_run_of_that_level_is_fitted(ringing, more, decides):
+    levels = (0.5, 1.0, 2.0)
+    bursts = [
+        replace(concealing(), method="local" if x in ringing else "settled", level=x, n_averages=3)
+        for x in levels
+    ]
+    sines = [replace(concealing(seed=9), method="periodic", level=x) for x in levels]
+    whole = measured([*bursts, *sines], samii())
+    fit, decide, show = whole.splits()
+    assert {whole.levels[k][0] for k in fit.level if whole.periodic[k]} == more
+    assert {whole.levels[k][0] for k in decide.level} == decides
+    assert {whole.levels[k][0] for k in show.level} == {1.0}
+    assert fit.n + decide.n + show.n == whole.n
+
+
 def test_few_lines_leave_one_to_show_on():
     f = np.array([2.0, 5.0, 9.0, 14.0])
     fit, decide, show = measured([concealing(f=f)], samii()).splits()

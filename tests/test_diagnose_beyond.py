@@ -13,7 +13,7 @@ from samii_rig.diagnose.between_runs import between_runs
 from samii_rig.diagnose.classes import RIVAL, Class
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.explanations import Explanation
-from samii_rig.diagnose.judge import Judgement, judge, shown
+from samii_rig.diagnose.judge import Judgement, confirmed, judge, shown
 from samii_rig.diagnose.measured import measured
 from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.moebius import place_of
@@ -161,11 +161,20 @@ def test_a_probability_is_never_more_than_the_evidence_leaves_it():
     assert probability(replace(STRONG, odds=0.5)) < 1 / (1 + np.exp(-0.5)) + 1e-9
 
 
-def test_what_lies_where_two_models_are_alike_need_not_show():
+def test_what_is_large_may_not_make_worse_what_it_was_not_fitted_to():
     judged = Judgement("named", (), 0.0, 0.95, STRONG, 1.0)
     worse = Gap(-0.05, -0.7, 0.4)
-    assert shown(judged, worse, due=1.0).verdict == "named"
-    assert shown(judged, worse, due=100.0).verdict == "unknown"
+    assert shown(judged, worse).verdict == "unknown"
+    small = replace(judged, evidence=replace(STRONG, drop=400.0))
+    assert shown(small, worse).verdict == "named"
+    assert shown(small, Gap(-0.5, -0.7, -0.1)).verdict == "unknown"
+
+
+def test_several_effects_that_leave_much_are_no_answer_whatever_a_force_is_confirmed_to_be():
+    sure = replace(STRONG, effects=2, forced=True)
+    judged = Judgement("unknown", (), 0.0, 0.95, sure, 1.0, partly=True)
+    assert confirmed(judged).verdict == "unknown"
+    assert confirmed(replace(judged, partly=False)).verdict == "named"
 
 
 def test_a_damper_may_be_as_weak_as_the_data_can_see():

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal
 
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.signal import noise, statistics
 from samii_rig.signal.estimate import estimate
+from samii_rig.signal.periodic import transient_left
 from samii_rig.types import Channel, Recording, Segment
 
 STUDY = Path(__file__).resolve().parent.parent / "benchmarks" / "coverage_study.py"
@@ -135,6 +137,21 @@ def test_both_references_add_up_through_the_gain_of_the_loop(bursts):
     np.testing.assert_allclose(r.H, estimate([recording])[0].H, rtol=1e-9)
 
 
+def _periodic(u, y):
+    """One run at 100 Hz of a command that repeats itself."""
+    t = np.arange(u.size, dtype=np.int64)
+    values = np.stack([u, u, y], axis=1)
+    return Recording(
+        (Channel("u", "V", "reference"), Channel("v", "V", "command"), Channel("y", "rad")),
+        100.0,
+        t * 10_000_000,
+        t,
+        values,
+        np.zeros(values.shape, np.uint8),
+        (Segment("m", "periodic", 0, u.size, 1.0, "V"),),
+    )
+
+
 def test_whole_periods_of_a_multisine_are_free_of_leakage():
     rng = np.random.default_rng(2)
     n, periods = 400, 6
@@ -144,17 +161,7 @@ def test_whole_periods_of_a_multisine_are_free_of_leakage():
     y = np.zeros(u.size)
     for i in range(1, u.size):
         y[i] = 0.8 * y[i - 1] + 0.2 * u[i - 1]
-    values = np.stack([u, u, y + 1e-3 * rng.normal(size=u.size)], axis=1)
-    made = Recording(
-        (Channel("u", "V", "reference"), Channel("v", "V", "command"), Channel("y", "rad")),
-        100.0,
-        t * 10_000_000,
-        t.astype(np.int64),
-        values,
-        np.zeros(values.shape, np.uint8),
-        (Segment("m", "periodic", 0, u.size, 1.0, "V"),),
-    )
-    r = estimate([made])[0]
+    r = estimate([_periodic(u, y + 1e-3 * rng.normal(size=u.size))])[0]
     assert r.method.startswith("periodic")
     assert r.n_averages == periods - 1
     np.testing.assert_allclose(r.frequency, lines * 0.25)
@@ -280,3 +287,41 @@ def test_real_bursts_of_the_flexible_arm(recordings):
     # The tip resonates near 17 Hz.
     a = np.abs(r.H[:, 1, 0])
     assert 15 < r.frequency[middle][np.argmax(a[middle] * (r.frequency[middle] > 10))] < 20
+
+
+@pytest.mark.parametrize(("keeps", "noisy"), [(0.5, 0.02), (0.8, 0.02), (0.5, 0.5)])
+def test_what_the_start_left_ringing_is_in_the_covariance_of_a_periodic_run(keeps, noisy):
+    n, periods, rate = 1000, 6, 100.0
+    rng = np.random.default_rng(3)
+    lines = np.arange(5, 300, 2)
+    phase = rng.uniform(0, 2 * np.pi, lines.size)
+    t = np.arange(n) / n
+    one = np.cos(2 * np.pi * lines * t[:, None] + phase).sum(axis=1)
+    u = np.tile(one, periods)
+    pole = keeps ** (1 / n) * np.exp(2j * np.pi * 60.3 / n)
+    a, b = [1.0, -2 * pole.real, abs(pole) ** 2], [0.0, 0.02, 0.0]
+    y = signal.lfilter(b, a, u) + noisy * rng.standard_normal(u.size)
+    (r,) = estimate([_periodic(u, y)])
+    turn = np.exp(-2j * np.pi * r.frequency / rate)
+    true = (b[1] * turn) / (1 + a[1] * turn + a[2] * turn**2)
+    off = np.abs(r.H[:, 0, 0] - true) ** 2 / r.variance()[:, 0, 0]
+    near = np.abs(r.frequency - 6.03) < 0.5
+    assert off[near].max() < 9
+    assert np.mean(off) < 2
+    assert any("still rings" in f.message for f in r.findings)
+
+
+def test_a_periodic_run_that_has_settled_is_not_said_to_ring():
+    n = 1000
+    rng = np.random.default_rng(4)
+    lines = np.arange(5, 300, 2)
+    t = np.arange(n) / n
+    one = np.cos(2 * np.pi * lines * t[:, None] + rng.uniform(0, 6, lines.size)).sum(axis=1)
+    told = 0
+    for _ in range(40):
+        u = np.tile(one, 5)
+        y = u + 0.1 * rng.standard_normal(u.size)
+        Z = np.stack([np.fft.rfft(np.column_stack([u, y])[i : i + n], axis=0)[1:-1]
+                      for i in range(0, u.size, n)])  # fmt: skip
+        told += bool(np.any(transient_left(Z) != 0))
+    assert told <= 2

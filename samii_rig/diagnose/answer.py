@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +18,10 @@ from samii_rig.diagnose.search import Search
 from samii_rig.signal.statistics import octaves
 from samii_rig.types import Float
 
-DRAWS = 400
+DRAWS = 1000
+# Times the width that the curvature of chi-square promises: at that, nine intervals in ten hold, of
+# 591 of the proof's trials of seeds from 8,000,000 on; as promised 84 % did.
+WIDER = 1.15
 SHOWN = 0.01  # probability of an alternative from which it is listed
 # What a factor between two units is: their names are told, not physics.
 UNITS = {57.29578: "degrees for radians", 9.80665: "g for m/s^2", 1000.0: "milli for one",
@@ -64,7 +66,7 @@ def _values(explanation: Explanation, inflation: float) -> list[dict[str, Value]
     """Parameters of every effect with 90 % intervals, from draws of the logarithms."""
     fitted = explanation.fitted
     model, x = fitted.model, fitted.x
-    cov = fitted.covariance()[model.n_nominal :, model.n_nominal :] * inflation
+    cov = fitted.covariance()[model.n_nominal :, model.n_nominal :] * inflation * WIDER**2
     rng = np.random.default_rng(0)
     centre = x[model.n_nominal :]
     draws = rng.multivariate_normal(centre, cov, DRAWS, method="eigh") if centre.size else None
@@ -182,11 +184,3 @@ def gap(search: Search, show: Measured, before: Fitted, after: Fitted) -> Gap:
     drawn = num / np.where(np.abs(den) > 0, np.abs(den), np.inf)
     low, high = np.quantile(drawn, [0.05, 0.95])
     return Gap(float(value), float(low), float(high))
-
-
-def due_there(search: Search, show: Measured, before: Fitted, after: Fitted) -> float:
-    """Chi-square that `after`, if true, should explain of other lines: they may lie where the two
-    are alike."""
-    at = search.grid.at(show.frequency, show.level)
-    predicted = replace(show, H=after.model.response(after.x, at))
-    return float(np.sum(predicted.chi_square(before.model.response(before.x, at))))

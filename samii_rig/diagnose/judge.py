@@ -29,6 +29,7 @@ MOST_NAMES = 4  # of a class; more is no answer
 IN_DATA = 45.0  # of chi-square, that an effect must explain of the data to be called missing
 UNEXPLAINED = 3e-4  # chance that noise leaves as much as makes an empty answer "unknown"
 MUST_SHOW = 900.0  # of chi-square, that an effect explains of the data: 30 noise units
+PARTLY = 0.9  # of the mismatch: several effects that leave more, and more than noise, are no answer
 SAID = ("named", "ambiguous")  # verdicts that come with causes
 
 
@@ -40,6 +41,7 @@ class Judgement:
     nothing : probability of nothing missing. right : that the chosen explanation is right, up to
         its class, by its evidence. inflation : factor on covariances for what it leaves.
     beyond : what is in no table and explains the data better; the place is then its own.
+    partly : whether several effects together leave much of the mismatch.
     """
 
     verdict: Verdict
@@ -49,6 +51,7 @@ class Judgement:
     evidence: Evidence
     inflation: float
     beyond: Changing | OwnLaw | None = None
+    partly: bool = False
 
     @property
     def best(self) -> Explanation:
@@ -105,14 +108,19 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
     evidence = _evidence(search, ordered, ranked, decide)
     said = _verdict(ordered[0], evidence, search, decide)
     beyond = _beyond(search, ordered[0].first, evidence, decide) if said != "no_mismatch" else None
+    # What one effect does not explain may be another's; with two, sums of them mimic what is in no
+    # table.
+    leaves = evidence.left > threshold(search.lines, UNEXPLAINED) and evidence.closed < PARTLY
+    partly = leaves and evidence.effects > 1
     return Judgement(
-        verdict="unknown" if beyond else said,
+        verdict="unknown" if beyond or (partly and said in SAID) else said,
         classes=ordered,
         nothing=nothing,
         right=probability(evidence),
         evidence=evidence,
         inflation=search.temperature,
         beyond=beyond,
+        partly=partly,
     )
 
 
@@ -160,7 +168,7 @@ def _evidence(
 def confirmed(judged: Judgement) -> Judgement:
     """The same once a nonlinear force was confirmed in time."""
     evidence = replace(judged.evidence, confirmed=True)
-    said = "unknown" if evidence.names > MOST_NAMES else _said(evidence)
+    said = "unknown" if judged.partly or evidence.names > MOST_NAMES else _said(evidence)
     return replace(judged, verdict=said, right=probability(evidence), evidence=evidence)
 
 
@@ -206,14 +214,10 @@ def doubted(judged: Judgement, most: Verdict) -> Judgement:
     return replace(judged, verdict=most) if judged.verdict in SAID else judged
 
 
-def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
+def shown(judged: Judgement, gap: Gap) -> Judgement:
     """The same, but nothing is named that makes data worse which it was not fitted to: beyond what
-    chance does, or at all if it is so large that it must show, there too.
-
-    due : of `answer.due_there`.
-    """
-    must = judged.evidence.drop > MUST_SHOW and due > IN_DATA
-    worse = gap.high < 0 or (gap.value < 0 and must)
+    chance does, or at all if it is so large that it must show."""
+    worse = gap.high < 0 or (gap.value < 0 and judged.evidence.drop > MUST_SHOW)
     if judged.verdict in SAID and worse:
         return replace(judged, verdict="unknown")
     return judged

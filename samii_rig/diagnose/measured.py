@@ -44,7 +44,8 @@ class Measured:
         (n,), about twice the entries measured there; 0 where an entry was not measured.
     level : (n,) index into `levels`, -1 where several were combined; a periodic excitation
         and a transient of one level have an index each (`periodic`: of each level, whether it
-        is one).
+        is one). ringing : of each level, whether its runs ended while the rig still moved, so
+        that local models had to part the transient from the response.
     scatter : (n,) each line's part of the variance of chi-square.
     inside : chi-square lost by combining lines, and the mean of that under the truth.
     """
@@ -57,6 +58,7 @@ class Measured:
     scatter: Float
     levels: tuple[tuple[float, str], ...]
     periodic: tuple[bool, ...]
+    ringing: tuple[bool, ...]
     sensor: Int
     actuator: Int
     outputs: tuple[str, ...]
@@ -114,8 +116,10 @@ class Measured:
 
         Transients (bursts) are fitted. Of a periodic excitation the middle level shows and the
         others decide whether what was fitted holds; of less than three levels, lines in turn.
-        Where there is but one kind of excitation, one line in five of it shows, at least one,
-        and nothing but the fit decides.
+        One of a level whose bursts end while the rig rings is fitted as well, if another is left
+        to decide: what a force does is known where the input repeats itself alone. Where there
+        is but one kind of excitation, one line in five of it shows, at least one, and nothing
+        but the fit decides.
         """
         turn = np.zeros(self.n, dtype=np.int64)
         for level in np.unique(self.level):
@@ -128,12 +132,23 @@ class Measured:
             decides = repeats & (self.level != middle if len(own) > 2 else turn % 2 == 0)
             shown = repeats & ~decides
             if shown.any():
-                return self.take(~repeats), self.take(decides), self.take(shown)
+                fitted = ~repeats
+                if len(own) > 2:
+                    fitted |= np.isin(self.level, self._in_place_of_ringing(own, middle))
+                return self.take(fitted), self.take(decides & ~fitted), self.take(shown)
             return self.take(~repeats), None, self.take(repeats)
         shown = turn % TURN == SHOW
         if not shown.any():  # a few frequencies, one by one
             shown = np.arange(self.n) == self.n // 2
         return self.take(~shown), None, self.take(shown)
+
+    def _in_place_of_ringing(self, own: Sequence[int], middle: int) -> list[int]:
+        """Periodic levels whose bursts ring, of `own` from low to high; but for the middle one, and
+        the lowest if that leaves none."""
+        bursts = zip(self.levels, self.periodic, self.ringing, strict=True)
+        ring = {level for level, periodic, ringing in bursts if ringing and not periodic}
+        out = [k for k in own if k != middle and self.levels[k] in ring]
+        return out[1:] if len(out) == len(own) - 1 else out
 
     def chi_square(self, h: Complex) -> Float:
         """(n,) e^H W e of a prediction (n, q)."""
@@ -155,7 +170,7 @@ def usable(responses: Sequence[FrequencyResponse]) -> list[FrequencyResponse]:
     what the local models leave of the transient is not in their covariance. They are used only
     where there is nothing else.
     """
-    sound = [r for r in responses if r.method.split()[0] != TRANSIENTS or r.n_averages > 1]
+    sound = [r for r in responses if _method(r) != TRANSIENTS or r.n_averages > 1]
     return sound or list(responses)
 
 
@@ -174,6 +189,7 @@ def measured(
         {(int(s), int(a)) for d in data.lines for s, a in zip(d.sensor, d.actuator, strict=True)}
     )
     levels = tuple(dict.fromkeys(_level(d.response) for d in data.lines))
+    ringing = {_level(d.response) for d in data.lines if _method(d.response) == TRANSIENTS}
     blocks = []
     for d in data.lines:
         at = [pairs.index((int(s), int(a))) for s, a in zip(d.sensor, d.actuator, strict=True)]
@@ -203,6 +219,7 @@ def measured(
         scatter=noise[order],
         levels=tuple((value, unit) for value, unit, _ in levels),
         periodic=tuple(repeats for _, _, repeats in levels),
+        ringing=tuple(level in ringing for level in levels),
         sensor=np.array([s for s, _ in pairs], dtype=np.int64),
         actuator=np.array([a for _, a in pairs], dtype=np.int64),
         outputs=tuple(rig.sensor[s].name for s, _ in pairs),
@@ -212,12 +229,16 @@ def measured(
 
 
 def _level(response: FrequencyResponse) -> tuple[float, str, bool]:
-    return response.level, response.level_unit, response.method.split()[0] in PERIODIC
+    return response.level, response.level_unit, _method(response) in PERIODIC
+
+
+def _method(response: FrequencyResponse) -> str:
+    return response.method.split()[0]
 
 
 def _clear_of_drift(response: FrequencyResponse, f: Float) -> NDArray[np.bool_]:
     """Which lines a drift does not reach; all of them where that would be few."""
-    whole = response.method.split()[0] in WHOLE and response.frequency.size > 2 * DRIFTING
+    whole = _method(response) in WHOLE and response.frequency.size > 2 * DRIFTING
     if not whole:
         return np.ones(f.size, dtype=bool)
     return np.asarray(f > DRIFTING * float(np.min(np.diff(response.frequency))))

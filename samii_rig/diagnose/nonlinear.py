@@ -42,11 +42,13 @@ KEPT = 4  # linear explanations that are held against the levels
 PROMISING = 0.25  # of what the first gains in the screen, at least
 TRIED = 4  # physics of which a force is refitted beside each base
 ALARM, BETWEEN = 14.0, 8.0  # of chi-square, and of that between levels, that a force must gain
-SHARE, MORE = 0.3, 3.0  # of what it should gain between levels, that it does
+SHARE, MORE = 0.1, 3.0  # of what it should gain between levels, that it does
 AGAIN, MOVED = 4, 0.5  # times that a force is computed anew at most; a move that is small
+SWAPPED = 2  # times that another linear effect may take the place of one beside a force
+BETTER = 3.0  # of the logarithm of evidence, that it must be for the force to be computed anew
 REACH = 0.5  # of what the best explanation gains, that a rival may lose and still be computed
 RIVALS, REFITTED = 4, 8  # forces that are computed each time, and explanations refitted
-GROWN = 3  # linear effects that are refitted beside a force
+GROWN = 8  # linear effects that are refitted beside a force
 ONE_LEVEL = (
     "all runs have one amplitude: friction, deadband, backlash, hardening and saturation cannot "
     "be told from linear physics; runs at half and at twice the amplitude would"
@@ -122,7 +124,8 @@ def _force(levels: Apart, promised: Sequence[tuple[Explanation, list[Promise]]])
 def _worth(found: Sequence[Promise]) -> list[Promise]:
     """Those that may be the best: of each physics the first, and the first's at other places,
     for torques and angles of neighbouring joints go nearly together."""
-    heard = [p for p in found if _heard(p) and p.gain > PROMISING * found[0].gain]
+    heard = [p for p in found if _heard(p)]
+    heard = [p for p in heard if p.gain > PROMISING * heard[0].gain]
     first = {p.effect.physics: p for p in reversed(heard)}
     # `found` has the largest gain first, and so have these.
     elsewhere = [p for p in heard[1:] if p.effect.physics == heard[0].effect.physics]
@@ -224,20 +227,38 @@ def _on_lines(levels: Apart, table: Sequence[Effect]) -> None:
     _only(search, [e for e in (*near[:RIVALS], *rivals, search.nominal) if e.key != bare.key])
     search.keep(bare.effects, end)
     search.temper()
-    best = search.ranked()[0]
-    if _force_in(best) is not None and best.key != bare.key:
+    for _ in range(SWAPPED):
+        best = search.ranked()[0]
+        if _force_in(best) is None or best.key == bare.key:
+            break
         with suppress(SamiiRigError):
             again = self_consistent(best.fitted, levels.on_lines)
             # Not the better of both: the force was that of another explanation.
             del search.found[best.key]
             search.keep(best.effects, again)
             _use_force_of(levels, again)
+            _in_its_place(search, search.found[best.key], table)
             # What stands beside it may only have led out of a valley in which the force was stuck.
             if (less := _without_linear(search, best.effects, again)) is not None:
                 search.keep(bare.effects, self_consistent(less, levels.on_lines))
-        _use_force_of(levels, search.ranked()[0].fitted)
         search.temper()
+        if search.ranked()[0].weight < search.found[best.key].weight + BETTER:
+            break
     _use_force_of(levels, search.ranked()[0].fitted)
+    search.temper()
+
+
+def _in_its_place(search: Search, best: Explanation, table: Sequence[Effect]) -> None:
+    """Refit every other linear effect that promises as much beside the force of `best`, as it is
+    there: what was tried beside another force says nothing of what else would fit."""
+    linear = [i for i, e in enumerate(best.effects) if e.quasi is None]
+    base = search.bare(best, linear[0]) if len(best.effects) == 2 and len(linear) == 1 else None
+    if base is None:
+        return
+    force = base.key
+    for key in [k for k in search.found if force < k and k != best.key and len(k) == 2]:
+        del search.found[key]
+    _beside(search, base, table, best.fitted.cost + 4 * NEAR * search.temperature)
 
 
 def _without_linear(search: Search, effects: tuple[Effect, ...], fitted: Fitted) -> Fitted | None:
@@ -257,10 +278,13 @@ def _use_force_of(levels: Apart, fitted: Fitted) -> None:
             levels.search.problem = levels.on_lines(fitted.model, fitted.x)
 
 
-def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:
+def _beside(
+    search: Search, base: Explanation, table: Sequence[Effect], enough: float = math.inf
+) -> None:
     """Refit an explanation with a force and each of the most promising linear effects.
 
-    They are screened on what is left of the measurements without what the force adds.
+    They are screened on what is left of the measurements without what the force adds. enough :
+    chi-square above which a refit that leads no lower is given up.
     """
     model, x, whole, every = base.fitted.model, base.fitted.x, search.problem, search.table
     assert isinstance(model, LevelModel)
@@ -280,7 +304,7 @@ def _beside(search: Search, base: Explanation, table: Sequence[Effect]) -> None:
         mixed = len(effects) > MIXED and len({e.physics for e in effects}) > MIXED
         if drop < WORTH or mixed or frozenset(e.key for e in effects) in search.found:
             continue
-        ends = [search.refitted(effects, base, np.log(start).tolist()) for start in starts]
+        ends = [search.refitted(effects, base, np.log(start).tolist(), enough) for start in starts]
         done = [end for end in ends if end is not None]
         if done:
             search.keep(effects, min(done, key=lambda end: end.cost))

@@ -29,7 +29,7 @@ CLOSER = 3  # times that the best strengths are looked at closer
 APART = 2.5  # of a logarithm: strengths from which different optima may be reached
 SECOND = 0.6  # of the best strength's gain: less is no start of its own
 # Fields of `Measured` that are not of its lines.
-WHOLE = ("levels", "periodic", "sensor", "actuator", "outputs", "inside", "rate_hz")
+WHOLE = ("levels", "periodic", "ringing", "sensor", "actuator", "outputs", "inside", "rate_hz")
 
 
 @dataclass(frozen=True, slots=True)

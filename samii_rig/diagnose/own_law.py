@@ -30,7 +30,7 @@ POWER = (0.05, 1.95)  # a spring has 0, a mass 2
 PRICE = 6.0  # of chi-square, what a further unknown is worth
 CLEAR = 10.0  # by which a law that is in no table must be better than what is
 UNKNOWNS = 2  # of that part
-TRIED = 2  # joints at which it is refitted
+TRIED = 2  # joints at which it is refitted, wherever the effects are
 ROUNDS, MORE_ROUNDS = 8, 40  # of their refits, and of the best
 SETTLED = 1e-4  # of chi-square, relative, gained by a round: less and it ends
 
@@ -78,7 +78,10 @@ def own_law(search: Search, best: Explanation) -> OwnLaw | None:
             found.append((end[0], part, model, np.append(base.x, np.log(end[1][0]))))
     if not found:
         return None
-    found = sorted(found, key=lambda f: -f[0])[:TRIED]
+    found = sorted(found, key=lambda f: -f[0])
+    # What two effects do on either side of a joint is first of all the joint's own.
+    there = {site for effect in best.effects for _, site in effect.names}
+    found = found[:TRIED] + [f for f in found[TRIED:] if f[1].site in there]
     try:
         ends = [_refitted(search, part, model, y, ROUNDS) for _, part, model, y in found]
         at = int(np.argmin([cost for cost, _ in ends]))

@@ -168,6 +168,7 @@ def _lines(truth: Mapping[str, Any], arrays: Mapping[str, Any], rig: Rig) -> Mea
         scatter=np.full(f.size, 4.0 * q),
         levels=tuple((x, rig.actuator[0].unit) for x in levels),
         periodic=(False,) * len(levels),
+        ringing=(False,) * len(levels),
         sensor=np.array([names.index(s) for s in sensors], dtype=np.int64),
         actuator=np.zeros(q, dtype=np.int64),
         outputs=tuple(sensors),

@@ -180,6 +180,7 @@ def _repeats(
         names = [c.name for c in group.selection.outputs]
         seen = distortion(periods.spectra, lines, result.H, rounding, names)
         group.findings += seen.findings
+        result = _with_transient(result, periods, lines, group, spectra[0].frequency[lines])
     amplitude = (
         np.sqrt(2 * result.input_power / len(pieces[0]))
         if method == "periodic"
@@ -198,6 +199,25 @@ def _repeats(
         why=f"{why}; {result.remark}",
     )
     return replace(response, even=seen.even, odd=seen.odd)
+
+
+def _with_transient(
+    result: repeats.Lines, periods: periodic.Periods, lines: Int, group: Group, f: Float
+) -> repeats.Lines:
+    """The same with what the start of the run leaves in the mean of the periods in its covariance,
+    and a finding that says so: no scatter of periods that all ring alike holds it."""
+    left = periods.bias(lines)
+    rings = np.any(left != 0, axis=1)
+    if not rings.any():
+        return result
+    mean = np.mean([s.Z[lines, 0] for s in periods.independent], axis=0)
+    off = (left[:, 1:] - result.H * left[:, :1]) / mean[:, None]
+    text = (
+        f"what the start of the run left still rings in the periods at {np.sum(rings)} lines "
+        f"between {f[rings][0]:.3g} and {f[rings][-1]:.3g} Hz, which the covariance holds"
+    )
+    group.findings.append(Finding("leakage", "note", text))
+    return replace(result, covariance=result.covariance + off[:, :, None] * off[:, None, :].conj())
 
 
 def _no_lead_in(name: str) -> Finding:

@@ -14,14 +14,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
+from scipy.ndimage import binary_dilation, median_filter
 
 from samii_rig.errors import EstimateError
 from samii_rig.signal.groups import Group, Piece
 from samii_rig.signal.spectra import Spectrum, period, spectrum
-from samii_rig.types import Float
+from samii_rig.types import Complex, Float, Int
 
 # Relative difference of two amplitude spectra that are the same but for rounding and units.
 SAME_AMPLITUDE = 1e-3
+# Chances that noise alone is taken for a transient: anywhere, and at a line once there is one.
+FALSE_TRANSIENT, FALSE_LINE = 1e-3, 1e-3
+POOLED = 101  # lines over which the noise from period to period is pooled
+SKIRT = 3  # lines on either side of one at which a transient is seen
+SLOWEST = 0.97  # of itself that a transient keeps from period to period, at most
 
 
 def first_used(r: Float) -> int:
@@ -72,10 +79,14 @@ def _realisations(a: Group, b: Group) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Periods:
-    """The measured periods: one list of spectra a realisation, and the pieces of them all."""
+    """The measured periods: one list of spectra a realisation, and the pieces of them all.
+
+    before : of each realisation that has one, the period that was left out for its transient.
+    """
 
     spectra: list[list[Spectrum]]
     pieces: list[Piece]
+    before: dict[int, Spectrum]
 
     @property
     def independent(self) -> list[Spectrum]:
@@ -97,6 +108,17 @@ class Periods:
         """What the covariance is taken over, in words."""
         return "repeats" if len(self.spectra) == 1 else "realisations"
 
+    def bias(self, lines: Int) -> Complex:
+        """(n, 1 + p) what the transient of the start leaves in the mean of the periods at these
+        lines, as far as it stands out of the noise; else 0."""
+        left = [
+            transient_left(np.stack([s.Z for s in (first, *self.spectra[i])]))[lines]
+            for i, first in self.before.items()
+        ]
+        shape = (lines.size, self.spectra[0][0].Z.shape[1])
+        # A realisation that has no period to spare is not known to ring.
+        return np.asarray(sum(left, np.zeros(shape, complex)) / len(self.spectra))
+
     @property
     def why(self) -> str:
         """What the covariance contains, in words; "" for a single realisation."""
@@ -113,13 +135,45 @@ def periods(group: Group) -> Periods:
     """Every measured period of a group; EstimateError if there is only one."""
     p = period(group.pieces[0].r)
     spectra: dict[int, list[Spectrum]] = {}
+    before: dict[int, Spectrum] = {}
     out: list[Piece] = []
     for piece in group.pieces:
-        for k in range(first_used(piece.r) // p, len(piece) // p):
+        used = first_used(piece.r) // p
+        if used and piece.realisation not in spectra:
+            first = Piece(piece.name, piece.r[:p], piece.z[:p])
+            before[len(spectra)] = spectrum(first, group.rate_hz)
+        for k in range(used, len(piece) // p):
             rows = slice(k * p, (k + 1) * p)
             out.append(Piece(f"{piece.name}, period {k + 1}", piece.r[rows], piece.z[rows]))
             found = spectra.setdefault(piece.realisation, [])
             found.append(spectrum(out[-1], group.rate_hz))
     if len(out) < 2:
         raise EstimateError(f"{group.pieces[0].name}: one period; method 'local' needs only one")
-    return Periods(list(spectra.values()), out)
+    return Periods(list(spectra.values()), out, before)
+
+
+def transient_left(Z: Complex) -> Complex:
+    """(n, 1 + p) what is left of a transient in the mean of all periods but the first.
+
+    Z : (n_period, n, 1 + p) of successive periods, the input first. The slowest mode decays by one
+    complex factor from period to period, at all lines and outputs; what all periods together say
+    of it at a line tells what it leaves in their mean. 0 where nothing stands out of the noise.
+    """
+    d = np.diff(Z, axis=0)
+    p = Z.shape[2] - 1
+    # The last two periods differ by noise; a median does not see the few lines that still ring.
+    noise = median_filter(np.abs(d[-1, :, 1:]) ** 2, (POOLED, 1)) / np.log(2)
+    w = d[:, :, 1:] / np.sqrt(np.maximum(noise, 1e-300))
+    loud = np.sum(np.abs(w[0]) ** 2, axis=1) > stats.gamma.isf(FALSE_TRANSIENT / Z.shape[1], p)
+    if len(d) < 2 or not loud.any():
+        return np.zeros(Z.shape[1:], complex)
+    before, after = w[:-1, loud], w[1:, loud]
+    z = np.sum(before.conj() * after) / np.sum(np.abs(before) ** 2)
+    z *= min(1.0, SLOWEST / abs(z))
+    powers = z ** np.arange(len(d))
+    total = np.sum(np.abs(powers) ** 2)
+    known = np.sum(np.abs(np.tensordot(powers.conj(), w, 1)) ** 2, axis=1) / total
+    # A mode's skirt goes down beside the lines at which it is seen.
+    sure = binary_dilation(known > stats.gamma.isf(FALSE_LINE, p), iterations=SKIRT)
+    first = np.tensordot(powers.conj(), d, 1) / total / (z - 1)
+    return np.asarray(np.where(sure[:, None], first * np.mean(powers * z), 0.0))
