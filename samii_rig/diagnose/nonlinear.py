@@ -262,11 +262,10 @@ def _in_its_place(search: Search, best: Explanation, table: Sequence[Effect]) ->
 
 
 def _without_linear(search: Search, effects: tuple[Effect, ...], fitted: Fitted) -> Fitted | None:
-    """A force and one linear effect without the latter, not refitted."""
-    linear = [i for i, e in enumerate(effects) if e.quasi is None]
-    if len(effects) != 2 or len(linear) != 1:
-        return None
-    less = search.bare(Explanation(effects, fitted, 0.0), linear[0])
+    """A force and linear effects without the latter, not refitted."""
+    less: Explanation | None = Explanation(effects, fitted, 0.0)
+    while less is not None and len(less.effects) > 1:
+        less = search.bare(less, next(i for i, e in enumerate(less.effects) if e.quasi is None))
     return less.fitted if less is not None else None
 
 

@@ -103,7 +103,10 @@ class Search(Explanations):
         if len(base.effects) >= MOST:
             return
         tried: list[Candidate] = []
-        for drop, effect, starts in self.screen(base)[:most]:
+        gross = base.fitted.cost > GROSS * self.problem.expected
+        # Where the race decides, and nothing is known yet, it is open to all.
+        entered = None if gross and not base.effects else most
+        for drop, effect, starts in self.screen(base)[:entered]:
             effects = (*base.effects, effect)
             model = self.model(effects)
             known_ = not again and frozenset(e.key for e in effects) in self.found
@@ -112,7 +115,7 @@ class Search(Explanations):
             known = moved(base.fitted.model, base.fitted.x, model)
             whole = [np.append(known, np.log(start)) for start in starts]
             tried.append((base.fitted.cost - drop, effects, whole))
-        if base.fitted.cost > GROSS * self.problem.expected:
+        if gross:
             tried = self._ahead([*tried, *self._switches(base)])
         best = min((e.fitted.cost for e in self.found.values()), default=math.inf)
         reached = base.fitted.cost
@@ -164,8 +167,11 @@ class Search(Explanations):
         ends.sort(key=lambda end: end[0])
         first, rest = ends[:FINALISTS], ends[FINALISTS:]
         seen = {end[1][-1].physics for end in first}
-        others = {end[1][-1].physics: end for end in reversed(rest)}
-        return first + [end for end in others.values() if end[1][-1].physics not in seen][-OTHERS:]
+        others: dict[str, Candidate] = {}
+        for other in rest:
+            if (physics := other[1][-1].physics) not in seen:
+                others.setdefault(physics, other)
+        return first + list(others.values())[:OTHERS]
 
     def screen(self, base: Explanation) -> list[tuple[float, Effect, list[Start]]]:
         """How far chi-square should fall with each further effect, and one or two starts for its
