@@ -94,6 +94,9 @@ def compete(
         _force(levels, promised)
         search.temper()
         forced = _settled(levels, before[2])
+        if forced is not None:
+            ranked = search.ranked()
+            levels.everywhere(_each_force(ranked, ranked[0].weight - NEAR))
     search.table = before[2]
     if forced is None:
         search.lines = whole
@@ -177,20 +180,25 @@ def _again(levels: Apart) -> None:
             return
 
 
+def _each_force(ranked: Sequence[Explanation], least: float) -> list[Explanation]:
+    """The first explanation with each force, of those with at least this weight."""
+    first: dict[Quasi, Explanation] = {}
+    for e in ranked:
+        if isinstance(e.fitted.model, LevelModel) and e.weight >= least:
+            first.setdefault(e.fitted.model.quasi, e)
+    return list(first.values())
+
+
 def _computed(levels: Apart, reach: float) -> list[Explanation]:
     """The best explanation with each of the leading forces, computed where it was found; of those
     that lose less than `reach` of what the best gains."""
-    search = levels.search
-    ranked = search.ranked()
-    least = ranked[0].weight - reach * max(ranked[0].weight - search.nominal.weight, NEAR)
-    first: dict[Quasi, tuple[Explanation, LevelModel]] = {}
-    for e in ranked:
-        if isinstance(model := e.fitted.model, LevelModel) and e.weight >= least:
-            first.setdefault(model.quasi, (e, model))
-    rivals = list(first.values())[:RIVALS]
-    for e, model in rivals:
-        levels.compute(model, e.fitted.x, model.strength(e.fitted.x)[0])
-    return [e for e, _ in rivals]
+    ranked = levels.search.ranked()
+    least = ranked[0].weight - reach * max(ranked[0].weight - levels.search.nominal.weight, NEAR)
+    rivals = _each_force(ranked, least)[:RIVALS]
+    for e in rivals:
+        assert isinstance(e.fitted.model, LevelModel)
+        levels.compute(e.fitted.model, e.fitted.x, e.fitted.model.strength(e.fitted.x)[0])
+    return rivals
 
 
 def _only(search: Search, some: Sequence[Explanation]) -> None:

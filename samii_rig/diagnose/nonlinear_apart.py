@@ -40,7 +40,7 @@ FINE = 150  # bins of each level about a force in time, which varies from line t
 class Apart:
     """A search with its levels apart. grid, problem : with what of forces was computed in time.
 
-    given : one period of the input of each level that was recorded.
+    given : the periods of the input of each level that was recorded.
     """
 
     search: Search
@@ -49,7 +49,11 @@ class Apart:
     problem: Problem
     forces: list[Effect]
     given: Drives
-    known: Known = field(default_factory=list)
+    known: Known = field(default_factory=Known)
+
+    def __post_init__(self) -> None:
+        fitted = set(np.unique(self.bins.lines.level).tolist())
+        self._fitted = {k: v for k, v in self.given.items() if k in fitted}
 
     def promises(self, base: Explanation) -> list[Promise]:
         """What each force would gain beside a linear explanation, the largest gain first."""
@@ -117,8 +121,8 @@ class Apart:
             max((p / 2, 2 * p), key=at)
         elif model.quasi.law is not EXCESS:
             at(promise.starts[0])
-        elif self.given:
-            top = top_of(model, self.given, self.bins.lines)
+        elif self._fitted:
+            top = top_of(model, self._fitted, self.bins.lines)
             cut = max((x * top for x in CUTS), key=lambda x: at(top - x))
             for nearer in NEARER if at(top - cut) > HINT else ():
                 cut = max((cut, cut / nearer, cut * nearer), key=lambda x: at(top - x))
@@ -135,16 +139,27 @@ class Apart:
 
     def compute(self, model: LevelModel, x: Float, p: float) -> bool:
         """Put what a force is in time, beyond its describing function, into grid and problem."""
-        if not self.given:
+        if not self._fitted or not self._put(model, x, p, self._fitted):
             return False
-        extra = driven(model, x, self.grid, self.given, p, self.known)
+        quasi = model.quasi
+        self.problem = self.bins.better(self.problem, quasi, self.grid.extra[quasi])
+        self.search.problem = self.problem
+        return True
+
+    def everywhere(self, explanations: Sequence[Explanation]) -> None:
+        """Put what their forces are at all levels into the grid: of those that were not fitted it
+        was not asked for before."""
+        for e in explanations:
+            if isinstance(model := e.fitted.model, LevelModel):
+                self._put(model, e.fitted.x, model.strength(e.fitted.x)[0], self.given)
+
+    def _put(self, model: LevelModel, x: Float, p: float, given: Drives) -> bool:
+        extra = driven(model, x, self.grid, given, p, self.known)
         if extra is None:
             return False
-        top = top_of(model, self.given, self.bins.lines)
-        quasi = model.quasi
-        self.grid = replace(self.grid, extra={**self.grid.extra, quasi: Extra(extra, p, top)})
-        self.problem = self.bins.better(self.problem, quasi, Extra(extra, p, top))
-        self.search.problem, self.search.grid = self.problem, self.grid
+        top = top_of(model, given, self.bins.lines)
+        found = {**self.grid.extra, model.quasi: Extra(extra, p, top)}
+        self.grid = self.search.grid = replace(self.grid, extra=found)
         return True
 
     def on_lines(self, model: LevelModel, x: Float) -> Problem:
@@ -152,7 +167,7 @@ class Apart:
 
         Raises SamiiRigError where the rig has no partial fractions there.
         """
-        if self.given and not self.compute(model, x, model.strength(x)[0]):
+        if self._fitted and not self.compute(model, x, model.strength(x)[0]):
             raise SamiiRigError("no partial fractions")
         return Problem.of(self.search.lines, self.grid)
 

@@ -26,7 +26,25 @@ NEAR = 0.02  # of a line: how near a whole number of cycles is
 FAINT = 1e-4  # of the strongest line of the input: below, a ratio to it says nothing
 
 Drives = Mapping[int, Float]
-Known = list[Complex]  # poles of the chain where a force was computed last, of one at most
+
+
+@dataclass
+class Known:
+    """The chain where a force was computed last, from which the next one is found sooner."""
+
+    last: tuple[LevelModel, Float, Inner] | None = None
+
+    def inner(self, model: LevelModel, x: Float) -> Inner:
+        """Its partial fractions, which are its own whatever the force.
+
+        Raises SamiiRigError where it has none.
+        """
+        own = np.delete(x, model.unknown)
+        last = self.last
+        if last is None or last[0] is not model or not np.array_equal(last[1], own):
+            made = Inner.of(model, x, last[2].structure if last is not None else None)
+            last = self.last = (model, own, made)
+        return last[2]
 
 
 def drives(
@@ -117,18 +135,12 @@ class Driven:
 def forced(
     model: LevelModel, x: Float, given: Drives, p: float, known: Known | None = None
 ) -> list[Driven] | None:
-    """The force p under each input; None where the rig has no partial fractions.
-
-    known : poles from which they are looked for, and where they are left. They are the chain's own,
-        whatever the force.
-    """
-    known = [] if known is None else known
+    """The force p under each input; None where the rig has no partial fractions."""
     rate, quasi = model.rig.rate_hz, model.quasi
     inner: Inner | None = None
     if quasi.kind != "command":
         try:
-            inner = Inner.of(model, x, known[0] if known else None)
-            known[:] = [inner.structure]
+            inner = (known or Known()).inner(model, x)
         except SamiiRigError:
             return None
     out = []

@@ -51,7 +51,7 @@ class Search(Explanations):
     def run(self, *, briefly: bool = False) -> list[Explanation]:
         """Grow, swap, prune; all explanations, the most probable first. briefly : single effects
         alone."""
-        self.grow(self.nominal, FIRST)
+        self.grow(self.nominal, FIRST, open_to_all=not briefly)
         if self._bent(self.ranked()[0]):
             self.grow(self._straight(), STRAIGHT, again=True)
         self.temper()
@@ -97,15 +97,16 @@ class Search(Explanations):
         there = refit(model, self.problem, np.zeros(model.n), far=False, steps=0)
         return Explanation((), there, 0.0)
 
-    def grow(self, base: Explanation, most: int, *, again: bool = False) -> None:
+    def grow(
+        self, base: Explanation, most: int, *, again: bool = False, open_to_all: bool = False
+    ) -> None:
         """Refit `base` with each of the most promising further effects; again : those too that
-        were refitted from elsewhere."""
+        were refitted from elsewhere. open_to_all : where a race decides, not of those alone."""
         if len(base.effects) >= MOST:
             return
         tried: list[Candidate] = []
         gross = base.fitted.cost > GROSS * self.problem.expected
-        # Where the race decides, and nothing is known yet, it is open to all.
-        entered = None if gross and not base.effects else most
+        entered = None if gross and open_to_all else most
         for drop, effect, starts in self.screen(base)[:entered]:
             effects = (*base.effects, effect)
             model = self.model(effects)
