@@ -28,7 +28,7 @@ FEWER = 0.05  # of each further effect
 NEAR = 25.0  # of the logarithm of evidence: explanations further below the best are let go
 FIVE = 5.0  # standard deviations of chi-square beyond which what is left is more than noise
 ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and bins over which it is looked for
-EXACT = 2e-4  # of the mismatch: what beams, sensors and integrators are modelled to
+EXACT = 4e-4  # of the mismatch: what beams, sensors and integrators are modelled to
 
 
 @dataclass(frozen=True, slots=True)

@@ -110,8 +110,11 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
     beyond = _beyond(search, ordered[0].first, evidence, decide) if said != "no_mismatch" else None
     # What one effect does not explain may be another's; with two, sums of them mimic what is in no
     # table.
-    leaves = evidence.left > threshold(search.lines, UNEXPLAINED) and evidence.closed < PARTLY
-    partly = leaves and evidence.effects > 1
+    partly = (
+        evidence.effects > 1
+        and evidence.closed < PARTLY
+        and _unexplained(evidence, search, decide)
+    )
     return Judgement(
         verdict="unknown" if beyond or (partly and said in SAID) else said,
         classes=ordered,
@@ -238,6 +241,10 @@ def _thin(search: Search) -> set[frozenset[str]]:
 def _is_thin(search: Search, e: Explanation) -> bool:
     if len(e.effects) < 2:
         return False
+    single = [s for s in search.found.values() if len(s.effects) == 1 and not s.key <= e.key]
+    if any(s.fitted.chi2 - e.fitted.chi2 < _off(search, s) for s in single if s.effects[0].rough):
+        # Several effects that fit better than one, by no more than its own law may be off.
+        return True
     fewer: list[Explanation | None] = []
     for i, effect in enumerate(e.effects):
         if all(x.quasi is None for x in e.effects):
@@ -254,9 +261,13 @@ def _is_thin(search: Search, e: Explanation) -> bool:
 def _worth(search: Search, less: Explanation) -> float:
     """Chi-square that an effect beside those of `less` must explain: more than chance does, and
     more than their own laws are off by."""
-    rough = max((e.rough for e in less.effects), default=0.0)
-    explained = search.nominal.fitted.chi2 - less.fitted.chi2
-    return max(IN_DATA * search.temperature, rough**2 * explained)
+    return max(IN_DATA * search.temperature, _off(search, less))
+
+
+def _off(search: Search, e: Explanation) -> float:
+    """Chi-square that an explanation leaves because the laws of its effects do not quite hold."""
+    rough = max((effect.rough for effect in e.effects), default=0.0)
+    return rough**2 * (search.nominal.fitted.chi2 - e.fitted.chi2)
 
 
 def _decided(search: Search, lines: Measured, ranked: list[Explanation]) -> list[Explanation]:

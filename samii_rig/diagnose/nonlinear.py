@@ -42,7 +42,7 @@ KEPT = 4  # linear explanations that are held against the levels
 PROMISING = 0.25  # of what the first gains in the screen, at least
 TRIED = 4  # physics of which a force is refitted beside each base
 ALARM, BETWEEN = 14.0, 8.0  # of chi-square, and of that between levels, that a force must gain
-SHARE, MORE = 0.1, 3.0  # of what it should gain between levels, that it does
+SHARE, MORE = 0.1, 3.5  # of what it should gain between levels, that it does
 AGAIN, MOVED = 4, 0.5  # times that a force is computed anew at most; a move that is small
 SWAPPED = 2  # times that another linear effect may take the place of one beside a force
 BETTER = 3.0  # of the logarithm of evidence, that it must be for the force to be computed anew
@@ -247,8 +247,9 @@ def _on_lines(levels: Apart, table: Sequence[Effect]) -> None:
             _use_force_of(levels, again)
             _in_its_place(search, search.found[best.key], table)
             # What stands beside it may only have led out of a valley in which the force was stuck.
-            if (less := _without_linear(search, best.effects, again)) is not None:
-                search.keep(bare.effects, self_consistent(less, levels.on_lines))
+            less = _without_linear(search, replace(best, fitted=again))
+            if less is not None:
+                search.keep(less.effects, self_consistent(less.fitted, levels.on_lines))
         search.temper()
         if search.ranked()[0].weight < search.found[best.key].weight + BETTER:
             break
@@ -269,12 +270,12 @@ def _in_its_place(search: Search, best: Explanation, table: Sequence[Effect]) ->
     _beside(search, base, table, best.fitted.cost + 4 * NEAR * search.temperature)
 
 
-def _without_linear(search: Search, effects: tuple[Effect, ...], fitted: Fitted) -> Fitted | None:
+def _without_linear(search: Search, whole: Explanation) -> Explanation | None:
     """A force and linear effects without the latter, not refitted."""
-    less: Explanation | None = Explanation(effects, fitted, 0.0)
+    less: Explanation | None = whole
     while less is not None and len(less.effects) > 1:
         less = search.bare(less, next(i for i, e in enumerate(less.effects) if e.quasi is None))
-    return less.fitted if less is not None else None
+    return less
 
 
 def _use_force_of(levels: Apart, fitted: Fitted) -> None:

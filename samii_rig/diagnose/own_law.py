@@ -31,7 +31,8 @@ PRICE = 6.0  # of chi-square, what a further unknown is worth
 CLEAR = 10.0  # by which a law that is in no table must be better than what is
 UNKNOWNS = 2  # of that part
 TRIED = 2  # joints at which it is refitted, wherever the effects are
-ROUNDS, MORE_ROUNDS = 8, 40  # of their refits, and of the best
+BETWEEN = 0.5  # power from which it is refitted besides the screen's: half spring, half damper
+ROUNDS, MORE_ROUNDS = 8, 60  # of their refits, and of the best
 SETTLED = 1e-4  # of chi-square, relative, gained by a round: less and it ends
 
 
@@ -75,7 +76,9 @@ def own_law(search: Search, best: Explanation) -> OwnLaw | None:
         except SamiiRigError:
             continue
         if (end := look.through(place, part)) is not None:
-            found.append((end[0], part, model, np.append(base.x, np.log(end[1][0]))))
+            start = np.append(base.x, np.log(end[1][0]))
+            between = np.append(start[:-1], math.log(BETWEEN))
+            found.append((end[0], part, model, (start, between)))
     if not found:
         return None
     found = sorted(found, key=lambda f: -f[0])
@@ -83,10 +86,13 @@ def own_law(search: Search, best: Explanation) -> OwnLaw | None:
     there = {site for effect in best.effects for _, site in effect.names}
     found = found[:TRIED] + [f for f in found[TRIED:] if f[1].site in there]
     try:
-        ends = [_refitted(search, part, model, y, ROUNDS) for _, part, model, y in found]
-        at = int(np.argmin([cost for cost, _ in ends]))
-        _, part, model, _ = found[at]
-        cost, y = _refitted(search, part, model, ends[at][1], MORE_ROUNDS)
+        ends = [
+            (*_refitted(search, part, model, start, ROUNDS), part, model)
+            for _, part, model, starts in found
+            for start in starts
+        ]
+        _, y, part, model = min(ends, key=lambda end: end[0])
+        cost, y = _refitted(search, part, model, y, MORE_ROUNDS)
     except (SamiiRigError, ValueError):  # on the way the rig's values become ones that no rig has
         return None
     gain = (best.fitted.cost - cost) / search.temperature + PRICE * more
