@@ -161,13 +161,14 @@ def test_a_probability_is_never_more_than_the_evidence_leaves_it():
     assert probability(replace(STRONG, odds=0.5)) < 1 / (1 + np.exp(-0.5)) + 1e-9
 
 
-def test_what_is_large_may_not_make_worse_what_it_was_not_fitted_to():
+def test_what_should_show_may_not_make_worse_what_it_was_not_fitted_to():
     judged = Judgement("named", (), 0.0, 0.95, STRONG, 1.0)
     worse = Gap(-0.05, -0.7, 0.4)
-    assert shown(judged, worse).verdict == "unknown"
+    assert shown(judged, worse, due=1.0).verdict == "named"
+    assert shown(judged, worse, due=100.0).verdict == "unknown"
     small = replace(judged, evidence=replace(STRONG, drop=400.0))
-    assert shown(small, worse).verdict == "named"
-    assert shown(small, Gap(-0.5, -0.7, -0.1)).verdict == "unknown"
+    assert shown(small, worse, due=100.0).verdict == "named"
+    assert shown(small, Gap(-0.5, -0.7, -0.1), due=1.0).verdict == "unknown"
 
 
 def test_several_effects_that_leave_much_are_no_answer_whatever_a_force_is_confirmed_to_be():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import replace
 
 import numpy as np
 
@@ -184,3 +185,11 @@ def gap(search: Search, show: Measured, before: Fitted, after: Fitted) -> Gap:
     drawn = num / np.where(np.abs(den) > 0, np.abs(den), np.inf)
     low, high = np.quantile(drawn, [0.05, 0.95])
     return Gap(float(value), float(low), float(high))
+
+
+def due_there(search: Search, show: Measured, before: Fitted, after: Fitted) -> float:
+    """Chi-square that `after`, if true, should explain of other lines: they may lie where the two
+    are alike."""
+    at = search.grid.at(show.frequency, show.level)
+    predicted = replace(show, H=after.model.response(after.x, at))
+    return float(np.sum(predicted.chi_square(before.model.response(before.x, at))))

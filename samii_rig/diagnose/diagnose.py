@@ -84,8 +84,9 @@ def diagnose(
     nominal = search.nominal.fitted
     best = judged.best
     gap = answer.gap(search, show, nominal, best.fitted)
+    due = answer.due_there(search, show, nominal, best.fitted)
     holds, said = settle(judged, search, sound, runs)
-    judged = verdict.shown(verdict.confirmed(judged) if holds else judged, gap)
+    judged = verdict.shown(verdict.confirmed(judged) if holds else judged, gap, due)
     if clean.doubt:
         judged = verdict.doubted(judged, clean.doubt.most)
     if len(set(whole.outputs)) == 1 and len(best.effects) > 1:

@@ -111,9 +111,7 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
     # What one effect does not explain may be another's; with two, sums of them mimic what is in no
     # table.
     partly = (
-        evidence.effects > 1
-        and evidence.closed < PARTLY
-        and _unexplained(evidence, search, decide)
+        evidence.effects > 1 and evidence.closed < PARTLY and _unexplained(evidence, search, decide)
     )
     return Judgement(
         verdict="unknown" if beyond or (partly and said in SAID) else said,
@@ -217,10 +215,15 @@ def doubted(judged: Judgement, most: Verdict) -> Judgement:
     return replace(judged, verdict=most) if judged.verdict in SAID else judged
 
 
-def shown(judged: Judgement, gap: Gap) -> Judgement:
+def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
     """The same, but nothing is named that makes data worse which it was not fitted to: beyond what
-    chance does, or at all if it is so large that it must show."""
-    worse = gap.high < 0 or (gap.value < 0 and judged.evidence.drop > MUST_SHOW)
+    chance does, or at all if it is so large that it must show, there too.
+
+    due : of `answer.due_there`; a command that is clipped at the highest level alone shows at no
+        other.
+    """
+    must = judged.evidence.drop > MUST_SHOW and due > IN_DATA
+    worse = gap.high < 0 or (gap.value < 0 and must)
     if judged.verdict in SAID and worse:
         return replace(judged, verdict="unknown")
     return judged
