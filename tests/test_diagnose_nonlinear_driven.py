@@ -312,5 +312,24 @@ def test_a_linear_effect_beside_a_force_must_show_in_the_data(gained, told):
     assert _is_thin(search, both) is not told
 
 
+@pytest.mark.parametrize(("better", "rough", "told"), [(2000.0, 0.05, False), (6000.0, 0.05, True),
+                                                       (2000.0, 0.0, True)])  # fmt: skip
+def test_several_effects_must_outdo_a_law_by_more_than_it_is_off(better, rough, told):
+    loss = Effect("structural_damping", "beam", rough=rough)
+    a, b = Effect("torsional_compliance", "clamp"), Effect("viscous_damping", "joint_1")
+    one = SimpleNamespace(key=frozenset({loss.key}), effects=(loss,), fitted=fit_of(4500.0))
+    both = SimpleNamespace(
+        key=frozenset({a.key, b.key}), effects=(a, b), fitted=fit_of(4500.0 - better)
+    )
+    without = SimpleNamespace(effects=(a,), fitted=fit_of(1e5))
+    search = SimpleNamespace(
+        found={one.key: one},
+        temperature=1.0,
+        nominal=SimpleNamespace(fitted=fit_of(1.6e6)),
+        without=lambda _e, _i: without,
+    )
+    assert _is_thin(search, both) is not told
+
+
 def fit_of(chi2):
     return SimpleNamespace(chi2=chi2)
