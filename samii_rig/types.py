@@ -257,6 +257,11 @@ class FrequencyResponse:
     findings: tuple[Finding, ...] = ()
     sources: tuple[str, ...] = ()
 
+    @property
+    def estimator(self) -> str:
+        """The first word of `method`: `burst`, `settled`, `periodic`, `stepped`, `local`, ..."""
+        return self.method.split()[0]
+
     def variance(self) -> Float:
         """(n_freq, n_out, n_in) E|dH|^2, the diagonal of `covariance`."""
         return np.diagonal(self.covariance, axis1=1, axis2=2).real.reshape(self.H.shape)

@@ -289,15 +289,18 @@ def test_real_bursts_of_the_flexible_arm(recordings):
     assert 15 < r.frequency[middle][np.argmax(a[middle] * (r.frequency[middle] > 10))] < 20
 
 
-@pytest.mark.parametrize(("keeps", "noisy"), [(0.5, 0.02), (0.8, 0.02), (0.5, 0.5)])
-def test_what_the_start_left_ringing_is_in_the_covariance_of_a_periodic_run(keeps, noisy):
-    n, periods, rate = 1000, 6, 100.0
-    rng = np.random.default_rng(3)
+def _multisine(n, rng):
+    """One period of odd lines with random phases."""
     lines = np.arange(5, 300, 2)
     phase = rng.uniform(0, 2 * np.pi, lines.size)
-    t = np.arange(n) / n
-    one = np.cos(2 * np.pi * lines * t[:, None] + phase).sum(axis=1)
-    u = np.tile(one, periods)
+    return np.cos(2 * np.pi * lines * (np.arange(n) / n)[:, None] + phase).sum(axis=1)
+
+
+@pytest.mark.parametrize(("keeps", "noisy"), [(0.5, 0.02), (0.8, 0.02), (0.5, 0.5)])
+def test_what_the_start_left_ringing_is_in_the_covariance_of_a_periodic_run(keeps, noisy):
+    n, rate = 1000, 100.0
+    rng = np.random.default_rng(3)
+    u = np.tile(_multisine(n, rng), 6)
     pole = keeps ** (1 / n) * np.exp(2j * np.pi * 60.3 / n)
     a, b = [1.0, -2 * pole.real, abs(pole) ** 2], [0.0, 0.02, 0.0]
     y = signal.lfilter(b, a, u) + noisy * rng.standard_normal(u.size)
@@ -314,12 +317,9 @@ def test_what_the_start_left_ringing_is_in_the_covariance_of_a_periodic_run(keep
 def test_a_periodic_run_that_has_settled_is_not_said_to_ring():
     n = 1000
     rng = np.random.default_rng(4)
-    lines = np.arange(5, 300, 2)
-    t = np.arange(n) / n
-    one = np.cos(2 * np.pi * lines * t[:, None] + rng.uniform(0, 6, lines.size)).sum(axis=1)
+    u = np.tile(_multisine(n, rng), 5)
     told = 0
     for _ in range(40):
-        u = np.tile(one, 5)
         y = u + 0.1 * rng.standard_normal(u.size)
         Z = np.stack([np.fft.rfft(np.column_stack([u, y])[i : i + n], axis=0)[1:-1]
                       for i in range(0, u.size, n)])  # fmt: skip

@@ -21,7 +21,7 @@ from samii_rig.types import Float
 
 DRAWS = 1000
 # Times the width that the curvature of chi-square promises: at that, nine intervals in ten hold, of
-# 658 of the proof's trials of seeds from 8,000,000 on; as promised 83 % did.
+# 658 parameters in the proof's trials of seeds from 8,000,000 on; as promised 83 % did.
 WIDER = 1.15
 SHOWN = 0.01  # probability of an alternative from which it is listed
 # What a factor between two units is: their names are told, not physics.

@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.measured import TRANSIENTS
+from samii_rig.diagnose.measured import repeated
 from samii_rig.diagnose.result import Verdict
 from samii_rig.diagnose.wiring import FEW_LINES, lines_of, named, outputs_of, wired
 from samii_rig.errors import EstimateError, InputError
@@ -128,11 +128,6 @@ def lacks(responses: Sequence[FrequencyResponse], rig: Rig) -> tuple[str, ...]:
     return tuple(out)
 
 
-def repeated(response: FrequencyResponse) -> bool:
-    """Whether repeats tell a response's noise."""
-    return response.n_averages > 1 or response.method.split()[0] != TRANSIENTS
-
-
 def _belongs(response: FrequencyResponse, rig: Rig) -> None:
     measured = [c.name for c in response.outputs]
     sensors = [s.name for s in rig.sensor]
@@ -209,7 +204,7 @@ def _steady(
     families: dict[tuple[object, ...], list[int]] = {}
     for i, r in enumerate(out):
         names = tuple(c.name for c in (*r.inputs, *r.outputs))
-        key = (r.method.split()[0], r.frequency.tobytes(), names)
+        key = (r.estimator, r.frequency.tobytes(), names)
         families.setdefault(key, []).append(i)
     dropped: set[int] = set()
     for members in families.values():

@@ -163,6 +163,11 @@ def summed(values: Complex, which: Int, n: int) -> Complex:
     return out
 
 
+def repeated(response: FrequencyResponse) -> bool:
+    """Whether repeats tell a response's noise."""
+    return response.n_averages > 1 or response.estimator != TRANSIENTS
+
+
 def usable(responses: Sequence[FrequencyResponse]) -> list[FrequencyResponse]:
     """The responses whose intervals a chi-square test can rest on.
 
@@ -170,7 +175,7 @@ def usable(responses: Sequence[FrequencyResponse]) -> list[FrequencyResponse]:
     what the local models leave of the transient is not in their covariance. They are used only
     where there is nothing else.
     """
-    sound = [r for r in responses if _method(r) != TRANSIENTS or r.n_averages > 1]
+    sound = [r for r in responses if repeated(r)]
     return sound or list(responses)
 
 
@@ -189,7 +194,7 @@ def measured(
         {(int(s), int(a)) for d in data.lines for s, a in zip(d.sensor, d.actuator, strict=True)}
     )
     levels = tuple(dict.fromkeys(_level(d.response) for d in data.lines))
-    ringing = {_level(d.response) for d in data.lines if _method(d.response) == TRANSIENTS}
+    ringing = {_level(d.response) for d in data.lines if d.response.estimator == TRANSIENTS}
     blocks = []
     for d in data.lines:
         at = [pairs.index((int(s), int(a))) for s, a in zip(d.sensor, d.actuator, strict=True)]
@@ -229,16 +234,19 @@ def measured(
 
 
 def _level(response: FrequencyResponse) -> tuple[float, str, bool]:
-    return response.level, response.level_unit, _method(response) in PERIODIC
+    return response.level, response.level_unit, response.estimator in PERIODIC
 
 
-def _method(response: FrequencyResponse) -> str:
-    return response.method.split()[0]
+def of_level(
+    responses: Sequence[FrequencyResponse], level: tuple[float, str], periodic: bool
+) -> list[FrequencyResponse]:
+    """Those of one entry of `Measured.levels`."""
+    return [r for r in responses if _level(r) == (*level, periodic)]
 
 
 def _clear_of_drift(response: FrequencyResponse, f: Float) -> NDArray[np.bool_]:
     """Which lines a drift does not reach; all of them where that would be few."""
-    whole = _method(response) in WHOLE and response.frequency.size > 2 * DRIFTING
+    whole = response.estimator in WHOLE and response.frequency.size > 2 * DRIFTING
     if not whole:
         return np.ones(f.size, dtype=bool)
     return np.asarray(f > DRIFTING * float(np.min(np.diff(response.frequency))))

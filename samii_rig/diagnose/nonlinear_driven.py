@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samii_rig.diagnose.measured import PERIODIC, WHOLE, Measured
+from samii_rig.diagnose.measured import WHOLE, Measured, of_level
 from samii_rig.diagnose.nonlinear_inner import Inner
 from samii_rig.diagnose.nonlinear_levels import LevelGrid
 from samii_rig.diagnose.nonlinear_model import LevelModel
@@ -75,12 +75,8 @@ def periods(
     local models made of bursts that still ring is no whole period of one motion."""
     out = {}
     for k, (level, periodic) in enumerate(zip(lines.levels, lines.periodic, strict=True)):
-        own = [
-            r
-            for r in responses
-            if (r.level, r.level_unit) == level and (r.method.split()[0] in PERIODIC) == periodic
-        ]
-        whole = len(own) == 1 and own[0].method.split()[0] in WHOLE
+        own = of_level(responses, level, periodic)
+        whole = len(own) == 1 and own[0].estimator in WHOLE
         n = _period(own[0].frequency, rig.rate_hz) if whole else 0
         blocks: list[Float] = []
         for run in runs if n else ():

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from samii_rig.diagnose.measured import PERIODIC, Measured
+from samii_rig.diagnose.measured import Measured, of_level
 from samii_rig.diagnose.model import STEP, Grid
 from samii_rig.diagnose.nonlinear_laws import Law, Strength, starved, starved_gauss
 from samii_rig.model.sampled import hold_response, sensor_response
@@ -106,11 +106,7 @@ def level_grid(
     driven = np.zeros((len(lines.levels), at.frequency.size))
     random = np.zeros(len(lines.levels), dtype=bool)
     for k, (level, periodic) in enumerate(zip(lines.levels, lines.periodic, strict=True)):
-        own = [
-            r
-            for r in responses
-            if (r.level, r.level_unit) == level and (r.method.split()[0] in PERIODIC) == periodic
-        ]
+        own = of_level(responses, level, periodic)
         if not own:
             return None
         rms = [
@@ -119,7 +115,7 @@ def level_grid(
         ]
         if not np.all(np.isfinite(rms)):
             return None
-        random[k] = all(r.method.startswith("periodic") for r in own)
+        random[k] = all(r.estimator == "periodic" for r in own)
         if random[k]:
             # The lines of a comb count once each, wherever else a line may be.
             rms = [np.where(np.isin(at.frequency, r.frequency), x, 0.0)

@@ -187,7 +187,7 @@ def _root(C: Complex) -> Complex:
 def _shared(response: FrequencyResponse) -> tuple[float, float]:
     """Lines that share one covariance, and lines that share the data of one estimate."""
     dof, n = float(np.median(response.dof)), response.n_averages
-    if response.method.split()[0] == "local":
+    if response.estimator == "local":
         window = (dof + LOCAL_PARAMETERS) / max(n, 1)
         return max(1.0, window), max(1.0, window / INDEPENDENT)
     return max(1.0, dof / max(n - 1, 1)), 1.0

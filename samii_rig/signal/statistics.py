@@ -200,7 +200,16 @@ def difference(
     t2 = hotelling(error, a.covariance[ia] + b.covariance[ib])
     share = max(_lines_shared(a), _lines_shared(b))
     change = np.abs(error) / np.abs(a.H[ia]).reshape(-1, p)
-    return _by_band(f, t2, p, nu, change, bands, share, correlated=_local(a) or _local(b))
+    return _by_band(
+        f,
+        t2,
+        p,
+        nu,
+        change,
+        bands,
+        share,
+        correlated=a.estimator == "local" or b.estimator == "local",
+    )
 
 
 def model_difference(
@@ -222,7 +231,7 @@ def model_difference(
     t2 = np.abs(error[known]) ** 2 / np.maximum(response.variance()[known, output, input], least)
     change = (np.abs(error) / np.abs(response.H[:, output, input]))[known, None]
     share = _lines_shared(response)
-    return _by_band(f, t2, 1, nu, change, bands, share, correlated=_local(response))
+    return _by_band(f, t2, 1, nu, change, bands, share, correlated=response.estimator == "local")
 
 
 def _by_band(
@@ -258,10 +267,6 @@ def _by_band(
         p_value = float(stats.f.sf(ratio * rest / (rest - 2), 2 * p * independent, rest))
         out.append(Difference(low, high, ratio, p_value, float(np.median(change[inside]))))
     return tuple(out)
-
-
-def _local(response: FrequencyResponse) -> bool:
-    return response.method.startswith("local")
 
 
 def octaves(frequency: Float) -> tuple[tuple[float, float], ...]:
