@@ -167,7 +167,7 @@ def test_what_decides_and_what_shows_took_no_part_in_the_fit():
 @pytest.mark.parametrize(
     ("ringing", "more", "decides"),
     [((), set(), {0.5, 2.0}), ((2.0,), {2.0}, {0.5}), ((1.0,), set(), {0.5, 2.0}),
-     ((0.5, 2.0), {2.0}, {0.5})],
+     ((0.5, 2.0), {0.5, 2.0}, {1.0})],
 )  # fmt: skip
 def test_where_bursts_ring_the_periodic_run_of_that_level_is_fitted(ringing, more, decides):
     levels = (0.5, 1.0, 2.0)

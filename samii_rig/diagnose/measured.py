@@ -116,10 +116,10 @@ class Measured:
 
         Transients (bursts) are fitted. Of a periodic excitation the middle level shows and the
         others decide whether what was fitted holds; of less than three levels, lines in turn.
-        One of a level whose bursts end while the rig rings is fitted as well, if another is left
-        to decide: what a force does is known where the input repeats itself alone. Where there
-        is but one kind of excitation, one line in five of it shows, at least one, and nothing
-        but the fit decides.
+        One of a level whose bursts end while the rig rings is fitted as well: what a force does
+        is known where the input repeats itself alone. If that leaves none but the middle level,
+        its lines decide and show in turn. Where there is but one kind of excitation, one line
+        in five of it shows, at least one, and nothing but the fit decides.
         """
         turn = np.zeros(self.n, dtype=np.int64)
         for level in np.unique(self.level):
@@ -128,27 +128,24 @@ class Measured:
         repeats = np.array(self.periodic)[self.level]
         if repeats.any() and not repeats.all():
             own = sorted(np.unique(self.level[repeats]), key=lambda k: self.levels[k][0])
-            middle = own[len(own) // 2]
-            decides = repeats & (self.level != middle if len(own) > 2 else turn % 2 == 0)
-            shown = repeats & ~decides
+            others = [k for k in own if k != own[len(own) // 2]] if len(own) > 2 else []
+            in_place = [k for k in others if self._bursts_ring(k)]
+            fitted = ~repeats | np.isin(self.level, in_place)
+            deciding = [k for k in others if k not in in_place]
+            decides = np.isin(self.level, deciding) if deciding else ~fitted & (turn % 2 == 0)
+            shown = ~fitted & ~decides
             if shown.any():
-                fitted = ~repeats
-                if len(own) > 2:
-                    fitted |= np.isin(self.level, self._in_place_of_ringing(own, middle))
-                return self.take(fitted), self.take(decides & ~fitted), self.take(shown)
+                return self.take(fitted), self.take(decides), self.take(shown)
             return self.take(~repeats), None, self.take(repeats)
         shown = turn % TURN == SHOW
         if not shown.any():  # a few frequencies, one by one
             shown = np.arange(self.n) == self.n // 2
         return self.take(~shown), None, self.take(shown)
 
-    def _in_place_of_ringing(self, own: Sequence[int], middle: int) -> list[int]:
-        """Periodic levels whose bursts ring, of `own` from low to high; but for the middle one, and
-        the lowest if that leaves none."""
-        bursts = zip(self.levels, self.periodic, self.ringing, strict=True)
-        ring = {level for level, periodic, ringing in bursts if ringing and not periodic}
-        out = [k for k in own if k != middle and self.levels[k] in ring]
-        return out[1:] if len(out) == len(own) - 1 else out
+    def _bursts_ring(self, level: int) -> bool:
+        """Whether the transients of a periodic level's amplitude end while the rig moves."""
+        alike = zip(self.levels, self.periodic, self.ringing, strict=True)
+        return any(r and not p and x == self.levels[level] for x, p, r in alike)
 
     def chi_square(self, h: Complex) -> Float:
         """(n,) e^H W e of a prediction (n, q)."""
