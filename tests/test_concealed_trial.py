@@ -28,6 +28,7 @@ from sim.concealed.draw import draw, draw_values, trial_id
 from sim.concealed.effects import ROWS
 from sim.concealed.runs import Design
 from sim.concealed.scales import RIGID
+from sim.concealed.stated import Stated
 from sim.concealed.trial import make
 
 SHORT = Design(burst=20.0, ring_down=3.0, bursts=4, period=2.0, settle=2, periods=2, steps=2)
@@ -118,6 +119,17 @@ def test_estimated_response_is_the_truth_within_its_own_noise(trials: Path) -> N
     stated = n * arrays["open_noise"] / (3 * drive[:, None, None] ** 2)
     ratio = [np.median(stated[at][inside][:, i, i].real / C[:, i, i].real) for i in range(p)]
     assert ratio == pytest.approx([1.0] * p, rel=0.15)
+
+
+def test_noise_free_response_is_settled_where_the_rig_still_rings_after_a_burst(
+    tmp_path: Path,
+) -> None:
+    # A dead zone of no width leaves the plant linear, and its response the linear one.
+    none = Stated("valve_deadband", "joint_2_source", {"width": 1e-12})
+    folder = make("stated", 1, tmp_path, SAMII_TOML, SHORT, [none])
+    with np.load(tmp_path / "truth" / f"{folder.name}.npz") as arrays:
+        wrong = np.abs(arrays["settled"] / arrays["linear"] - 1)
+    assert wrong.max() < 1e-6
 
 
 def test_frf_command_reads_a_trial(trials: Path) -> None:

@@ -36,7 +36,7 @@ from sim.concealed.stated import Stated
 
 PARTIAL = ".partial"
 HEADROOM = 0.9  # of a converter's range that a run may use, else it is turned down
-SETTLED = 3  # bursts after which a noise-free run repeats itself
+SETTLED = 12  # bursts after which a noise-free run repeats itself, whatever rings
 TURNED_DOWN = 0.8  # of the range that it uses then
 
 
@@ -155,15 +155,16 @@ def not_linear(plant: Description) -> bool:
 def quiet_runs(
     drawn: Drawn, design: Design, planned: tuple[Run, ...], tables: Tables
 ) -> list[tuple[Float, Float, Float]]:
-    """v, sensors and probes' peaks of the first bursts of the swept sines, without errors: of all
-    levels where the plant is not linear, else of the loudest alone, which comes last."""
+    """v, sensors and probes' peaks of the swept sines' bursts without errors, repeated until the
+    rig repeats itself: of all levels where the plant is not linear, else of the loudest alone,
+    which comes last."""
     plant, n = drawn.plant, round(design.burst * drawn.nominal.rate_hz)
     swept = sorted(zip(design.levels, planned, strict=False), key=lambda pair: pair[0])
     loop = loop_of(drawn.nominal, plant, ideal=True)
     out = []
     for _, run in swept if not_linear(plant) else swept[-1:]:
-        head = replace(run, u=run.u[: SETTLED * n], theta_ref=run.theta_ref[: SETTLED * n])
-        out.append(ideally(head, tables, loop))
+        u, reference = (np.tile(x[:n], SETTLED) for x in (run.u, run.theta_ref))
+        out.append(ideally(replace(run, u=u, theta_ref=reference), tables, loop))
     return out
 
 
@@ -176,7 +177,7 @@ def responses(
     """Noise-free responses of the truth at the lines of the swept sine.
 
     frequency (n_freq,) Hz; linear (n_freq, m): of the finite element plant without its laws, held
-    and sampled, v to sensors. level (n_level,); settled (n_level, n_freq, m): of the third burst
+    and sampled, v to sensors. level (n_level,); settled (n_level, n_freq, m): of the last burst
     of each noise-free run, where the plant has laws or a dead zone. open_noise (n_freq, m, m):
     power of the open loop's noise a sample. reference (n_freq,): |DFT| of a burst of level 1;
     sensitivity (n_freq,): v by u of the linear loop. The noise of one response from r settled
