@@ -20,9 +20,6 @@ from samii_rig.signal.statistics import octaves
 from samii_rig.types import Float
 
 DRAWS = 1000
-# Times the width that the curvature of chi-square promises: at that, nine intervals in ten hold, of
-# 658 parameters in the proof's trials of seeds from 8,000,000 on; as promised 83 % did.
-WIDER = 1.15
 SHOWN = 0.01  # probability of an alternative from which it is listed
 # What a factor between two units is: their names are told, not physics.
 UNITS = {57.29578: "degrees for radians", 9.80665: "g for m/s^2", 1000.0: "milli for one",
@@ -67,7 +64,7 @@ def _values(explanation: Explanation, inflation: float) -> list[dict[str, Value]
     """Parameters of every effect with 90 % intervals, from draws of the logarithms."""
     fitted = explanation.fitted
     model, x = fitted.model, fitted.x
-    cov = fitted.covariance()[model.n_nominal :, model.n_nominal :] * inflation * WIDER**2
+    cov = fitted.covariance()[model.n_nominal :, model.n_nominal :] * inflation
     rng = np.random.default_rng(0)
     centre = x[model.n_nominal :]
     draws = rng.multivariate_normal(centre, cov, DRAWS, method="eigh") if centre.size else None
