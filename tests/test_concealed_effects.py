@@ -29,7 +29,7 @@ from sim.concealed.draw import edited
 from sim.concealed.effects import OUTSIDE, ROWS, physics, places
 from sim.concealed.modes import poles_of
 from sim.concealed.parts import Description, Law, described
-from sim.concealed.scales import DISPLACEMENT, RIGID, Concealed, Dose
+from sim.concealed.scales import DISPLACEMENT, RIGID, Concealed, Dose, Scales
 
 S = 2j * np.pi * FREQUENCY
 CLOSE = 5e-4  # relative, at every line of every sensor
@@ -135,6 +135,11 @@ def test_velocity_feedback_is_a_damper_in_series_with_the_source() -> None:
     element = spring("torsional_spring", True)({"c": effect.parameters["g_v"]})
     toml = added(SAMII_TOML, "joint_2_source", element, spanned_by="joint_2_source")
     alike(plant, modelled(toml, FREQUENCY))
+
+
+def test_effects_beside_velocity_feedback_have_the_scale_of_springs_that_hold() -> None:
+    plant, _ = put("give_way", "joint_2_source", 1.0)
+    assert Scales.of(plant) == Scales.of(described(SAMII))
 
 
 def test_oil_column_is_a_compliance_in_series_with_the_source() -> None:

@@ -28,9 +28,9 @@ class Scales:
 
     @classmethod
     def of(cls, plant: Description) -> Scales:
-        """Geometric mean of the springs, sums of the links."""
+        """Geometric mean of the springs that give and hold, sums of the links."""
         stiffness = [p.values["k"] for p in plant.parts if p.kind == "torsional_spring"]
-        springs = [k for k in stiffness if k < RIGID]
+        springs = [k for k in stiffness if 0 < k < RIGID]
         links = [p.values for p in plant.parts if p.kind == "rigid_link"]
         beams = [p.values for p in plant.parts if p.kind == "beam"]
         m = sum(v["m"] for v in links) + sum(v["mu"] * v["L"] for v in beams)
