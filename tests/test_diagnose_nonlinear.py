@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from identify_kit import noiseless, samii
+from identify_kit import noiseless, samii, without_tolerances
 
 from samii_rig.diagnose import nonlinear
 from samii_rig.diagnose.diagnose import diagnose, table
@@ -153,6 +153,17 @@ def test_a_gradient_is_the_derivative(quasi, p, method):
         step[j] = 1e-4
         slope = (model.response(x + step, there.at) - model.response(x - step, there.at)) / 2e-4
         assert np.allclose(dh[:, :, j], slope, rtol=5e-3, atol=1e-3 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize(("quasi", "p"), [(JOINT, 0.3), (DRIVE, 0.01)])
+def test_a_force_alone_has_a_gradient_where_the_rig_file_states_no_tolerance(quasi, p):
+    there = problem(LEVELS, LINES[::4], "burst (drawn)")
+    whole, x = model_of(quasi, p)
+    model = LevelModel(without_tolerances(samii()), whole.effects)
+    h, dh = model.gradient(x[-1:], there.at)
+    bare, every = whole.gradient(x, there.at)
+    np.testing.assert_allclose(h, bare, rtol=1e-12)
+    np.testing.assert_allclose(dh, every[:, :, -1:], rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -185,7 +185,7 @@ class LevelModel(Model):
         map_ = self._map(x, values)
         on = np.flatnonzero(np.any(map_, axis=0))
         # One product of two matrices, before the levels repeat its rows.
-        dG = (dG.reshape(-1, len(values)) @ map_[:, on]).reshape(*G.shape, on.size)
+        dG = (dG.reshape(G.size, len(values)) @ map_[:, on]).reshape(*G.shape, on.size)
         G, dG = G[which], dG[which]
         loop, r = self._loop(G, at)
         p, scale = self.strength(x)
