@@ -1,6 +1,7 @@
 """How much data a diagnosis needs, and what each part of it buys.
 
-    samii-rig prove --keep --nothing 12 --one 28 --two 0 --outside 0 --joints 0 --out kept
+    samii-rig prove --keep --nothing 6 --one 28 --two 0 --outside 0 --joints 0 \
+        --seed 9100000 --out kept
     python benchmarks/data_needed.py kept --workers 2
 
 Each kept trial is diagnosed again with less: more noise, fewer channels, one level, shorter runs;
@@ -36,7 +37,7 @@ from samii_rig.signal.estimate import estimate
 from samii_rig.types import FrequencyResponse, Recording
 from samii_rig.workers import workers
 
-FROM = 10.0  # sigma of the whole data, from which an effect should be found
+FROM = 10.0  # sigma that a refit leaves in the whole data, from which an effect should be found
 Responses = list[FrequencyResponse]
 
 
@@ -181,9 +182,12 @@ def trial_of(folder: Path, case: str) -> Trial | None:
     if "failed" in said:
         print(f"{folder.name} {case}: {said['failed']}", flush=True)
         return None
-    told = json.loads((folder.parents[1] / "truth" / f"{folder.name}.json").read_text("utf-8"))
+    told, sized = (
+        json.loads((folder.parents[1] / what / f"{folder.name}.json").read_text("utf-8"))
+        for what in ("truth", "sizes")
+    )
     effects = tuple(Hidden(e["physics"], e["site"], e["parameters"]) for e in told["effects"])
-    return Trial(Truth(told["kind"], told["seed"], effects, told["size"]), Answer.of(said))
+    return Trial(Truth(told["kind"], told["seed"], effects, sized["size"]), Answer.of(said))
 
 
 def main() -> None:
