@@ -1,7 +1,6 @@
 """How much data a diagnosis needs, and what each part of it buys.
 
-    samii-rig prove --keep --nothing 6 --one 28 --two 0 --outside 0 --joints 0 \
-        --seed 9100000 --out kept
+    samii-rig prove --keep --nothing 6 --one 28 --two 0 --outside 0 --joints 0 --out kept
     python benchmarks/data_needed.py kept --workers 2
 
 Each kept trial is diagnosed again with less: more noise, fewer channels, one level, shorter runs;
