@@ -25,8 +25,9 @@ import numpy as np
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.errors import SamiiRigError
 from samii_rig.plain import plain
+from samii_rig.prove.campaign import truth_of
 from samii_rig.prove.score import confidently_wrong, frequency
-from samii_rig.prove.trial import Answer, Hidden, Trial, Truth
+from samii_rig.prove.trial import Answer, Trial
 from samii_rig.record.export import replacing
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.elements import parameters
@@ -181,12 +182,7 @@ def trial_of(folder: Path, case: str) -> Trial | None:
     if "failed" in said:
         print(f"{folder.name} {case}: {said['failed']}", flush=True)
         return None
-    told, sized = (
-        json.loads((folder.parents[1] / what / f"{folder.name}.json").read_text("utf-8"))
-        for what in ("truth", "sizes")
-    )
-    effects = tuple(Hidden(e["physics"], e["site"], e["parameters"]) for e in told["effects"])
-    return Trial(Truth(told["kind"], told["seed"], effects, sized["size"]), Answer.of(said))
+    return Trial(truth_of(folder.parents[1], folder.name), Answer.of(said))
 
 
 def main() -> None:

@@ -161,7 +161,7 @@ def main() -> None:
             start = time.process_time()
             responses = estimate(runs, outputs=case.outputs)
             found = diagnose(responses, rig, runs=runs)
-            loudest = max(responses, key=lambda r: (r.method.startswith("settled"), r.level))
+            loudest = max(responses, key=lambda r: (r.estimator == "settled", r.level))
             show(name, found, phase(loudest, rig), time.process_time() - start)
             answer = out / f"{name}-{given.seed}.json"
             answer.write_text(json.dumps(found.plain(), indent=1), encoding="utf-8")

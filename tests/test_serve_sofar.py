@@ -168,7 +168,7 @@ def test_of_a_multisine_whole_periods_count(tmp_path: Path) -> None:
     methods = []
     for n in range(first + length // 2, last, length):
         so_far.take(until(recording, start + n), start)
-        methods += [r.method.split()[0] for r, going_on in so_far.responses() if going_on]
+        methods += [r.estimator for r, going_on in so_far.responses() if going_on]
     assert methods
     assert set(methods) == {"periodic"}
 

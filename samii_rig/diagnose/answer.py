@@ -17,7 +17,7 @@ from samii_rig.diagnose.refit import Fitted
 from samii_rig.diagnose.result import Band, Cause, Gap, Value
 from samii_rig.diagnose.search import Search
 from samii_rig.signal.statistics import octaves
-from samii_rig.types import Float
+from samii_rig.types import Complex
 
 DRAWS = 1000
 SHOWN = 0.01  # probability of an alternative from which it is listed
@@ -161,17 +161,11 @@ def bands(search: Search, fitted: Fitted) -> tuple[Band, ...]:
     return tuple(out)
 
 
-def per_dof(search: Search, lines: Measured, fitted: Fitted) -> tuple[float, Float]:
-    """Chi-square per degree of freedom on other lines, and of each line its share."""
-    h = fitted.model.response(fitted.x, search.grid.at(lines.frequency, lines.level))
-    chi = lines.chi_square(h)
-    return float(np.sum(chi) / np.sum(lines.expected)), chi
-
-
-def gap(search: Search, show: Measured, before: Fitted, after: Fitted) -> Gap:
-    """How far the way from the refitted nominal model to the noise was gone, on `show`."""
-    a, chi_before = per_dof(search, show, before)
-    b, chi_after = per_dof(search, show, after)
+def gap(show: Measured, before: Complex, after: Complex) -> Gap:
+    """How far the way from the refitted nominal model to the noise was gone, on `show`. before,
+    after : (n, q) what the models without and with the causes predict there."""
+    a, b = show.per_dof(before), show.per_dof(after)
+    chi_before, chi_after = show.chi_square(before), show.chi_square(after)
     rng = np.random.default_rng(1)
     rows = rng.integers(0, show.n, (DRAWS, show.n))
     floor = show.expected
@@ -184,9 +178,7 @@ def gap(search: Search, show: Measured, before: Fitted, after: Fitted) -> Gap:
     return Gap(float(value), float(low), float(high))
 
 
-def due_there(search: Search, show: Measured, before: Fitted, after: Fitted) -> float:
-    """Chi-square that `after`, if true, should explain of other lines: they may lie where the two
-    are alike."""
-    at = search.grid.at(show.frequency, show.level)
-    predicted = replace(show, H=after.model.response(after.x, at))
-    return float(np.sum(predicted.chi_square(before.model.response(before.x, at))))
+def due_there(show: Measured, before: Complex, after: Complex) -> float:
+    """Chi-square that the causes, if true, should explain of `show`: its lines may lie where the
+    two predictions are alike."""
+    return float(np.sum(replace(show, H=after).chi_square(before)))

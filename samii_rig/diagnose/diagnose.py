@@ -83,8 +83,9 @@ def diagnose(
     judged = verdict.judge(search, decide)
     nominal = search.nominal.fitted
     best = judged.best
-    gap = answer.gap(search, show, nominal, best.fitted)
-    due = answer.due_there(search, show, nominal, best.fitted)
+    there = search.grid.at(show.frequency, show.level)
+    before, after = (f.model.response(f.x, there) for f in (nominal, best.fitted))
+    gap, due = answer.gap(show, before, after), answer.due_there(show, before, after)
     holds, said = settle(judged, search, sound, runs)
     judged = verdict.shown(verdict.confirmed(judged) if holds else judged, gap, due)
     if clean.doubt:
@@ -106,7 +107,6 @@ def diagnose(
         for c, share in ranked[:ALTERNATIVES]
         if share >= answer.SHOWN and judged.verdict != "no_mismatch"
     )
-    fits = [(search.ratio(f), answer.per_dof(search, show, f)[0]) for f in (nominal, best.fitted)]
     return Diagnosis(
         verdict=judged.verdict,
         chi2_per_dof=first,
@@ -115,8 +115,8 @@ def diagnose(
         sites=tuple(answer.sites(judged)) if judged.verdict != "no_mismatch" else (),
         causes=shown,
         alternatives=alternatives,
-        nominal=fits[0],
-        with_causes=fits[1],
+        nominal=(search.ratio(nominal), show.per_dof(before)),
+        with_causes=(search.ratio(best.fitted), show.per_dof(after)),
         noise_floor=1.0,
         gap=gap,
         not_physics=tuple(dict.fromkeys(told)),

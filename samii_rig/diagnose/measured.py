@@ -152,6 +152,10 @@ class Measured:
         e = h - self.H
         return np.asarray(np.einsum("ni,nij,nj->n", e.conj(), self.W, e).real)
 
+    def per_dof(self, h: Complex) -> float:
+        """Chi-square of a prediction (n, q) per degree of freedom."""
+        return float(np.sum(self.chi_square(h)) / np.sum(self.expected))
+
 
 def summed(values: Complex, which: Int, n: int) -> Complex:
     """(n, ...) sums of `values` over the lines of each of n groups. which : of each line."""

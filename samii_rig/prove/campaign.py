@@ -207,11 +207,15 @@ def place_evidence(out: Path) -> list[tuple[Evidence, bool]]:
     return [found for truth, said in _answers(out) for found in places(truth, said)]
 
 
+def truth_of(out: Path, trial: str) -> Truth:
+    """What a trial conceals, at the size that a refit leaves of it where that was found."""
+    truth = json.loads((out / "truth" / f"{trial}.json").read_text("utf-8"))
+    effects = tuple(Hidden(e["physics"], e["site"], e["parameters"]) for e in truth["effects"])
+    file = out / "sizes" / f"{trial}.json"
+    sized = json.loads(file.read_text("utf-8")) if file.exists() else {"size": truth["size"]}
+    return Truth(truth["kind"], truth["seed"], effects, **sized)
+
+
 def _answers(out: Path) -> Iterator[tuple[Truth, dict[str, Any]]]:
     for answer in sorted((out / "answers").glob("*.json")):
-        truth = json.loads((out / "truth" / answer.name).read_text("utf-8"))
-        effects = tuple(Hidden(e["physics"], e["site"], e["parameters"]) for e in truth["effects"])
-        file = out / "sizes" / answer.name
-        sized = json.loads(file.read_text("utf-8")) if file.exists() else {"size": truth["size"]}
-        hidden = Truth(truth["kind"], truth["seed"], effects, **sized)
-        yield hidden, json.loads(answer.read_text("utf-8"))
+        yield truth_of(out, answer.stem), json.loads(answer.read_text("utf-8"))

@@ -200,16 +200,8 @@ def difference(
     t2 = hotelling(error, a.covariance[ia] + b.covariance[ib])
     share = max(_lines_shared(a), _lines_shared(b))
     change = np.abs(error) / np.abs(a.H[ia]).reshape(-1, p)
-    return _by_band(
-        f,
-        t2,
-        p,
-        nu,
-        change,
-        bands,
-        share,
-        correlated=a.estimator == "local" or b.estimator == "local",
-    )
+    local = "local" in (a.estimator, b.estimator)
+    return _by_band(f, t2, p, nu, change, bands, share, correlated=local)
 
 
 def model_difference(
