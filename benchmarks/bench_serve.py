@@ -1,12 +1,20 @@
 """The service under viewers and kills.
 
-    python benchmarks/bench_serve.py [--viewers 20] [--slow 5] [--stops 15] [--pairs 3] [--kills 20]
+    python benchmarks/bench_serve.py [--viewers 20] [--slow 5] [--stops 15] [--attacked 15]
+        [--pairs 3] [--kills 20]
 
 Stops: a simulated rig in real time, so many viewers of whom some never read. Prints how long a
 stop takes from the request to its answer and to zero volts, how long a plain request takes, what
 the viewers got and lost, and that no sample is missing in the recordings. When the output was zero
 is read from the recording; the device's clock is laid against this machine's by the promptest
-block that a viewer got, so that what is printed is too long by that block's own delay.
+block that a viewer got, so that what is printed is too long by that block's own delay. By turns the
+service and the stop's own listener are asked.
+
+Attacked: the same, with tokens and 1,024 descriptors, while another process at the same address
+holds 1,100 half-sent heads at each of the two ports (and opens those that are closed anew, 500 a
+second), shows 20 wrong tokens and sends 5 heads of 100 kB a second. It yields to all others where
+they want a processor: an attacker has one of their own. Where a proxy answers the service's port
+with an error, the listener's figures are what a page gets.
 
 Pairs: the simulated serial node in real time, a run without viewers and one with them by turns;
 prints how late the loop's sleeps ended in either, and that no sample is missing.
@@ -26,6 +34,8 @@ shipped swept sine as far as each of its segments, and as the page would ask.
 """
 
 import argparse
+import asyncio
+import json
 import math
 import os
 import random
@@ -37,8 +47,11 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
+from http.client import HTTPConnection
+from multiprocessing import get_context
 from pathlib import Path
 
+import httpx
 import numpy as np
 from websockets.sync.client import connect
 
@@ -50,6 +63,7 @@ from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
 from samii_rig.run.priority import PRIORITY
+from samii_rig.serve.access import Tokens
 from samii_rig.serve.sofar import SoFar
 from samii_rig.types import Recording
 
@@ -69,13 +83,15 @@ class Viewer(threading.Thread):
     apart : s, this machine's clock less the device's, by the promptest block of the run.
     """
 
-    def __init__(self, url: str, slow: bool) -> None:
+    def __init__(self, url: str, slow: bool, headers: dict[str, str]) -> None:
         super().__init__(daemon=True)
+        self.headers = headers
         self.url, self.slow, self.frames, self.lost, self.apart = url, slow, 0, 0, math.inf
         self.leave = threading.Event()
 
     def run(self) -> None:
-        with suppress(Exception), connect(self.url, max_size=None, ping_interval=None) as socket:
+        more = {"additional_headers": self.headers, "ping_interval": None}
+        with suppress(Exception), connect(self.url, max_size=None, **more) as socket:
             if self.slow:
                 self.leave.wait()
                 socket.socket.shutdown(2)
@@ -108,7 +124,7 @@ def watching(service: Service, count: int, slow: int):
     """So many viewers, of whom some never read, until the end."""
     url = service.url.replace("http", "ws") + "/api/live"
     with ExitStack() as kept:
-        all_ = [Viewer(url, i < slow) for i in range(count)]
+        all_ = [Viewer(url, i < slow, service.headers) for i in range(count)]
         for v in all_:
             kept.callback(v.leave.set)
             v.start()
@@ -130,15 +146,71 @@ def ended(service: Service, id_: str) -> dict:
     return service.until(over)
 
 
-def stops(arguments: argparse.Namespace) -> None:
-    took, zeros, plain, missing = [], [], [], 0
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        Service(Path(folder), "--pace", "1") as service,
-        watching(service, arguments.viewers, arguments.slow) as all_,
-        service.lease() as lease,
-    ):
-        for _ in range(arguments.stops):
+HALF = b"GET / HTTP/1.1\r\nhost: x\r\n"
+HELD, ANEW = 1100, 500  # half-sent heads at each port, and so many a second opened anew
+WRONG, LARGE = 20, 5  # wrong tokens and heads of 100 kB a second
+
+
+def attack(url: str, ports: Sequence[int]) -> None:
+    """All of it at once, until it is killed; it has descriptors enough of its own."""
+
+    os.nice(19)
+
+    async def hold(port: int) -> None:
+        held = list[tuple[asyncio.StreamReader, asyncio.StreamWriter]]()
+        while True:
+            held = [(r, w) for r, w in held if not r.at_eof() and not w.is_closing()]
+            for _ in range(min(ANEW // 10, HELD - len(held))):
+                with suppress(OSError):
+                    held.append(await asyncio.open_connection("127.0.0.1", port))
+                    held[-1][1].write(HALF)
+            await asyncio.sleep(0.1)
+
+    async def ask(rate: float, headers: dict[str, str]) -> None:
+        async with httpx.AsyncClient(timeout=2.0) as http:
+            while True:
+                with suppress(httpx.HTTPError):
+                    await http.get(f"{url}/api/state", headers=headers)
+                await asyncio.sleep(1.0 / rate)
+
+    async def all_() -> None:
+        asked = [ask(WRONG, {"authorization": "Bearer wrong"}), ask(LARGE, {"x": "y" * 100_000})]
+        await asyncio.gather(*(hold(port) for port in ports), *asked)
+
+    asyncio.run(all_())
+
+
+@contextmanager
+def attacked(service: Service, wanted: bool):
+    if not wanted:
+        yield
+        return
+    ports = [int(service.port), int(service.stop_port)]
+    process = get_context("spawn").Process(target=attack, args=(service.url, ports), daemon=True)
+    process.start()
+    time.sleep(5.0)  # until all are held
+    try:
+        yield
+        assert process.is_alive()
+    finally:
+        process.kill()
+        process.join()
+
+
+def stops(arguments: argparse.Namespace, count: int, under_attack: bool) -> None:
+    at: dict[str, tuple[list[float], list[float]]] = {"service": ([], []), "listener": ([], [])}
+    plain, missing = [], 0
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as kept:
+        options, more = ["--pace", "1"], {}
+        if under_attack:
+            tokens = Path(folder) / "tokens.json"
+            more = {"token": Tokens(tokens).add("Ada", "operator"), "descriptors": 1024}
+            options += ["--tokens", str(tokens)]
+        service = kept.enter_context(Service(Path(folder) / "runs", *options, **more))
+        all_ = kept.enter_context(watching(service, arguments.viewers, arguments.slow))
+        lease = kept.enter_context(service.lease())
+        kept.enter_context(attacked(service, under_attack))
+        for i in range(count):
             for v in all_:
                 v.apart = math.inf
             id_ = started(service, lease, sweep(duration=60.0), arguments.autogroup)
@@ -147,18 +219,28 @@ def stops(arguments: argparse.Namespace) -> None:
                 service.http.get("/page/page.css")
                 plain.append(1e3 * (time.perf_counter() - start))
                 time.sleep(random.uniform(0.02, 0.06))
+            asked = list(at)[i % 2]
+            port = service.stop_port if asked == "listener" else service.port
             start = time.monotonic()
-            service.http.post("/api/stop")
-            took.append(1e3 * (time.monotonic() - start))
+            # On a line of its own, as a page's that was idle is.
+            line = HTTPConnection("127.0.0.1", int(port), timeout=60.0)
+            line.request("POST", "/api/stop")
+            assert json.load(line.getresponse())["stopped"]
+            line.close()
+            at[asked][0].append(1e3 * (time.monotonic() - start))
             job = ended(service, id_)
-            recording = read_recording(Path(folder) / job["recording"])
+            recording = read_recording(Path(folder) / "runs" / job["recording"])
             missing += recording.stop.missing_samples
             v = recording.values[:, recording.column("v_2")]
             zero = recording.sequence[np.flatnonzero(v)[-1] + 1] / recording.rate_hz
-            zeros.append(1e3 * (zero + min(v.apart for v in all_) - start))
-    print(f"{len(all_)} viewers, {arguments.slow} of them never read")
-    told("stop, request to answer", took)
-    told("stop, request to zero volts", zeros)
+            at[asked][1].append(1e3 * (zero + min(v.apart for v in all_) - start))
+    said = "under attack" if under_attack else "not attacked"
+    print(f"{len(all_)} viewers, {arguments.slow} of them never read; {said}")
+    for asked, (took, zeros) in at.items():
+        if took:
+            told(f"stop at the {asked}, request to answer", took)
+            told(f"stop at the {asked}, request to zero volts", zeros)
+    told("stop, request to zero volts", at["service"][1] + at["listener"][1])
     told("a small file", plain)
     reading = [v for v in all_ if not v.slow]
     print(
@@ -345,6 +427,7 @@ def main() -> None:
     parser.add_argument("--viewers", type=int, default=20)
     parser.add_argument("--slow", type=int, default=5)
     parser.add_argument("--stops", type=int, default=15)
+    parser.add_argument("--attacked", type=int, default=15)
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--so-far", action=argparse.BooleanOptionalAction, default=True)
@@ -352,8 +435,9 @@ def main() -> None:
     parser.add_argument("--page", action=argparse.BooleanOptionalAction, default=True)
     arguments = parser.parse_args()
     prefer(arguments.autogroup)
-    if arguments.stops:
-        stops(arguments)
+    for count, under_attack in ((arguments.stops, False), (arguments.attacked, True)):
+        if count:
+            stops(arguments, count, under_attack)
     if arguments.pairs:
         pairs(arguments)
     if arguments.kills:

@@ -69,7 +69,7 @@ def file_agrees(place: Path, path: Path) -> None:
     samples = by_topic[SAMPLES]
     same("samples", len(samples), len(recording))
     samples_agree(samples, recording)
-    same("instants", [int(m["time"]) for m in samples], recording.time)
+    same("instants", [int(m["time"]) for m in samples], recording.wall_time)
     (about,) = (m for m in lines if m.get("channel") == SAMPLES)
     for name, channel in zip(field_names(recording.channels), recording.channels, strict=True):
         same("unit", about["metadata"][f"unit.{name}"], channel.unit)

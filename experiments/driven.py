@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from samii_rig.errors import InputError
-from samii_rig.rig.schema import Finite, Name, Positive, Rig, Strict
+from samii_rig.rig.schema import Finite, Name, Rig, Strict
 from samii_rig.run.limits import find_actuator
 from samii_rig.run.protocols import Plan, PlannedSegment
 from samii_rig.signal.excitation import Interpolation
@@ -20,6 +20,9 @@ HIGHEST = 0.45
 # Longer plans are better run one after another: the prediction holds the spectrum of the
 # whole plan in memory. 2.8 hours at 500 samples/s.
 MOST_SAMPLES = 5_000_000
+
+# Of any unit. No rig has levels beyond; inside, no product with another number of a plan overflows.
+Level = Annotated[float, Field(gt=0, le=1e9)]
 
 
 class Driven(Strict):
@@ -39,7 +42,7 @@ class Driven(Strict):
     actuator: Name
     unit: str
     drive: Literal["output", "reference"] = "output"
-    amplitudes: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
+    amplitudes: Annotated[tuple[Level, ...], Field(min_length=1, max_length=100)]
     interpolation: Interpolation = "logarithmic"
     kp: Finite | None = None
     seed: Annotated[int, Field(ge=0)] = 0
@@ -81,6 +84,26 @@ class Driven(Strict):
         if kp == 0 and self.drive == "reference":
             raise InputError(where, "kp", kp, "above 0: the reference acts through kp alone")
         return kp, centring.sensor if centring else rig.sensor[0].name
+
+    def check_band(
+        self, rig: Rig, where: str, low: tuple[str, float], high: tuple[str, float]
+    ) -> None:
+        """InputError unless the rig can be driven at both (field, Hz) of this experiment."""
+        most, least = HIGHEST * rig.rate_hz, rig.rate_hz / MOST_SAMPLES
+        for field, hz in (low, high):
+            if hz > most:
+                expected = f"at most {most:g} Hz, {HIGHEST:g} of the rate"
+                raise InputError(where, field, hz, expected)
+            if hz < least:
+                expected = f"at least {least:g} Hz, a period of the longest plan"
+                raise InputError(where, field, hz, expected)
+
+    def check_length(self, rig: Rig, where: str, field: str, samples: float) -> None:
+        """InputError, which blames `field`, if a plan of so many samples is too long."""
+        # A float, which may be infinite, until it is known to fit.
+        if not samples <= MOST_SAMPLES:
+            longest = f"a plan of at most {MOST_SAMPLES / rig.rate_hz / 3600:.0f} hours"
+            raise InputError(where, field, getattr(self, field), longest)
 
     def references(self, wave: Float) -> tuple[Float, Float]:
         """u and theta_ref, (n,) each, that drive with `wave` (n,); the other one rests."""

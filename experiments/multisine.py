@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from experiments.driven import HIGHEST, MOST_SAMPLES, Driven
+from experiments.driven import Driven
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import NonNegative, Positive, Rig
 from samii_rig.run.protocols import Plan, PlannedSegment
@@ -69,19 +69,16 @@ class Multisine(Driven):
         """
         where = f"experiment {self.name}"
         kp, sensor = self.loop(rig, where)
+        self.check_length(rig, where, "period", self.period * rig.rate_hz)
         n = round(self.period * rig.rate_hz)
         if abs(n / rig.rate_hz - self.period) > 1e-9 * self.period or n < 1:
             near = max(n, 1) / rig.rate_hz
             raise InputError(
                 where, "period", self.period, f"a whole number of samples, such as {near:g} s"
             )
-        if self.high_hz > HIGHEST * rig.rate_hz:
-            most = f"at most {HIGHEST * rig.rate_hz:g} Hz, {HIGHEST:g} of the rate"
-            raise InputError(where, "high_hz", self.high_hz, most)
+        self.check_band(rig, where, ("low_hz", self.low_hz), ("high_hz", self.high_hz))
         length = n * (self.settle + self.periods) + 2 * self.ramp * rig.rate_hz
-        if length * len(self.amplitudes) * self.realisations > MOST_SAMPLES:
-            longest = f"a plan of at most {MOST_SAMPLES / rig.rate_hz / 3600:.0f} hours"
-            raise InputError(where, "period", self.period, longest)
+        self.check_length(rig, where, "period", length * len(self.amplitudes) * self.realisations)
         grid, phases = np.random.SeedSequence(self.seed).spawn(2)
         lines = odd_lines(
             self.low_hz, self.high_hz, self.period, self.group, np.random.default_rng(grid)

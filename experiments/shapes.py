@@ -12,7 +12,8 @@ import numpy as np
 from scipy import stats
 
 from samii_rig.errors import EstimateError
-from samii_rig.identify.modal import Modes, Value
+from samii_rig.identify.modal import Modes
+from samii_rig.modal.modes import Value
 from samii_rig.model.shapes import ModeShape, mode_shape
 from samii_rig.rig.schema import Acceleration, Rig
 from samii_rig.types import Float

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from experiments.driven import HIGHEST, MOST_SAMPLES, Driven
+from experiments.driven import HIGHEST, Driven
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Positive, Rig
 from samii_rig.run.protocols import Plan, PlannedSegment
@@ -41,10 +41,10 @@ class Step(Driven):
             if seconds * rig.rate_hz < 1:
                 least = f"at least one sample, {1 / rig.rate_hz:g} s"
                 raise InputError(where, field, seconds, least)
+        longest = max(times, key=lambda field: times[field])
+        samples = sum(times.values()) * rig.rate_hz
+        self.check_length(rig, where, longest, samples * len(self.amplitudes) * self.repeats)
         n = [round(seconds * rig.rate_hz) for seconds in times.values()]
-        if sum(n) * len(self.amplitudes) * self.repeats > MOST_SAMPLES:
-            longest = f"a plan of at most {MOST_SAMPLES / rig.rate_hz / 3600:.0f} hours"
-            raise InputError(where, "ring_down", self.ring_down, longest)
         shape = np.repeat([0.0, 1.0, 0.0], n)
         segments = []
         for level in self.amplitudes:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from experiments.driven import HIGHEST, MOST_SAMPLES, Driven
+from experiments.driven import Driven
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Name, NonNegative, Positive, Rig
 from samii_rig.run.protocols import Dwell, Plan, PlannedSegment
@@ -90,10 +90,9 @@ class SteppedSine(Driven):
             expected = f"at least {len(names) + 2}, for a covariance of {len(names)} sensors"
             raise InputError(where, "least", self.least, expected)
         wanted = self._wanted_hz()
-        if wanted.max() > HIGHEST * rig.rate_hz:
-            most = f"at most {HIGHEST * rig.rate_hz:g} Hz, {HIGHEST:g} of the rate"
-            field = "frequencies" if self.frequencies else "high_hz"
-            raise InputError(where, field, float(wanted.max()), most)
+        low, high = ("frequencies",) * 2 if self.frequencies else ("low_hz", "high_hz")
+        self.check_band(rig, where, (low, float(wanted.min())), (high, float(wanted.max())))
+        self.check_length(rig, where, "block", self.block * rig.rate_hz)
         lines = [whole_periods(f, self.block, rig.rate_hz) for f in wanted]
         hz = np.array([cycles * rig.rate_hz / block for block, cycles in lines])
         far = np.abs(hz / wanted - 1) > MOVED
@@ -108,9 +107,7 @@ class SteppedSine(Driven):
                 raise InputError(where, "most", self.most, f"{expected} at {f:.4g} Hz")
         settle = self._settling(hz)
         longest = (float(settle.sum()) + len(hz) * (self.most + 2 * self.ramp)) * rig.rate_hz
-        if longest * len(self.amplitudes) > MOST_SAMPLES:
-            longest_h = MOST_SAMPLES / rig.rate_hz / 3600
-            raise InputError(where, "most", self.most, f"a plan of at most {longest_h:.0f} hours")
+        self.check_length(rig, where, "most", longest * len(self.amplitudes))
         factor = schedule_factor(hz, self.schedule, self.interpolation)
         return self.planned(
             rig,

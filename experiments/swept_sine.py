@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from experiments.driven import HIGHEST, MOST_SAMPLES, Driven
+from experiments.driven import Driven
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import NonNegative, Positive, Rig
 from samii_rig.run.protocols import Plan, PlannedSegment
@@ -66,22 +66,9 @@ class SweptSine(Driven):
             raise InputError(
                 where, "duration", self.duration, f"at least two samples, {2 / rig.rate_hz:g} s"
             )
-        for field in ("start_hz", "stop_hz"):
-            if getattr(self, field) > HIGHEST * rig.rate_hz:
-                raise InputError(
-                    where,
-                    field,
-                    getattr(self, field),
-                    f"at most {HIGHEST * rig.rate_hz:g} Hz, {HIGHEST:g} of the rate",
-                )
+        self.check_band(rig, where, ("start_hz", self.start_hz), ("stop_hz", self.stop_hz))
         samples = (self.lead_in + self.duration + self.ring_down) * rig.rate_hz
-        if samples * len(self.amplitudes) * self.repeats > MOST_SAMPLES:
-            raise InputError(
-                where,
-                "duration",
-                self.duration,
-                f"a plan of at most {MOST_SAMPLES / rig.rate_hz / 3600:.0f} hours",
-            )
+        self.check_length(rig, where, "duration", samples * len(self.amplitudes) * self.repeats)
         return self._plan(rig, kp, sensor)
 
     def _plan(self, rig: Rig, kp: float, sensor: str) -> Plan:

@@ -5,7 +5,23 @@ wrong, and what would be right. The command line prints that line and exits with
 class's `exit_code`; anything else that escapes is a defect of ours.
 """
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+
 MAX_SHOWN = 80  # characters of a wrong value that fit on the line beside the rest
+
+
+def one_of(value: object, names: Iterable[object]) -> str:
+    """What would be right in place of a name that is not known: `one of a, b, c; did you mean b?`.
+
+    A phrase that follows "expected".
+    """
+    known = [str(name) for name in names]
+    # Upper and lower case are the mistake that is made most.
+    by_lower = {name.lower(): name for name in reversed(known)}
+    near = get_close_matches(str(value).lower(), by_lower, n=1)
+    meant = f"; did you mean {by_lower[near[0]]}?" if near else ""
+    return f"one of {', '.join(known) or 'none'}{meant}"
 
 
 class SamiiRigError(Exception):
@@ -46,6 +62,12 @@ class RecordingError(SamiiRigError):
     """A recording is damaged, incomplete or not one of ours."""
 
     exit_code = 2
+
+
+class DiskError(RecordingError):
+    """The disk refused what was to be recorded: it is full, broken, or the folder went away."""
+
+    exit_code = 6
 
 
 class EstimateError(SamiiRigError):

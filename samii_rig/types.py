@@ -140,6 +140,7 @@ class Recording:
     rig_toml, experiment_toml : the files as they were, "" when there was none.
     metadata : seed, versions, operator, start time, device, import map, source hashes...
     source : where it was read from, for messages.
+    clock_offset : ns by which the wall clock was ahead of the device's; 0 where nobody knows.
     """
 
     channels: tuple[Channel, ...]
@@ -154,9 +155,15 @@ class Recording:
     metadata: dict[str, str] = field(default_factory=dict)
     stop: StopRecord = StopRecord("unknown", "the recording holds no stop record")
     source: str = ""
+    clock_offset: int = 0
 
     def __len__(self) -> int:
         return int(self.time.shape[0])
+
+    @property
+    def wall_time(self) -> Int:
+        """(n,) ns since 1970 in UTC: what the recording's messages are stamped with."""
+        return self.time + self.clock_offset
 
     def column(self, name: str) -> int:
         """Index of the channel called `name`; KeyError if there is none."""

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from samii_rig.rig.schema import Name, NonNegative, Positive, Rig, Strict
 from samii_rig.rig.settings import checked, wrong
+from sim import faults
 
 
 class Hum(Strict):
@@ -42,6 +43,7 @@ class SimSettings(Strict):
     pace : times real time at which simulated time passes at most, for who wants to watch; 0 for
         as fast as it can.
     drop : numbers of samples that the device takes but that never arrive.
+    faults : by name, such as "stuck a_1" (`sim.faults`); they add to the settings above.
     """
 
     seed: Annotated[int, Field(ge=0, default_factory=lambda: secrets.randbits(32))]
@@ -55,6 +57,7 @@ class SimSettings(Strict):
     nan: dict[Name, NonNegative] = Field(default_factory=dict)
     pace: NonNegative = 0.0
     drop: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    faults: tuple[str, ...] = ()
 
 
 def read_settings(rig: Rig, overrides: Mapping[str, object]) -> SimSettings:
@@ -65,4 +68,14 @@ def read_settings(rig: Rig, overrides: Mapping[str, object]) -> SimSettings:
         for name in getattr(settings, setting):
             if name not in names:
                 raise wrong(rig, setting, name, f"one of {', '.join(sorted(names))}")
+    for made in faults.settings(rig, settings.faults):
+        for setting, value in made.items():
+            settings = settings.model_copy(
+                update={setting: _both(getattr(settings, setting), value)}
+            )
     return settings
+
+
+def _both(one: Any, other: Any) -> Any:
+    """Of two dicts or two tuples."""
+    return {**one, **other} if isinstance(one, dict) else (*one, *other)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from importlib import resources
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -117,3 +118,11 @@ class Browser:
         self._socket.close()
         self._process.terminate()
         self._process.wait(WITHIN)
+
+
+def violations(browser: Browser) -> list[Any]:
+    """What axe finds wrong with the page as it is now."""
+    axe = (resources.files("axe_core_python") / "axe.min.js").read_text("utf-8")
+    browser.value(f"{axe}; undefined")
+    found = browser.value("axe.run(document).then((found) => JSON.stringify(found.violations))")
+    return [(v["id"], v["help"], [n["html"][:120] for n in v["nodes"]]) for v in json.loads(found)]

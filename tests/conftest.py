@@ -9,12 +9,19 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+# Of tests side by side each has one thread for linear algebra: matrices are small, and threads that
+# wait for each other on a busy machine take thirty times as long. Read when numpy is imported.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 # What runs a device in real time, on ports whose names the system gives out again.
 KITS = {"wire_kit", "can_kit", "faults_kit"}
-# How long an example takes is the machine's affair.
-settings.register_profile("patient", deadline=None)
-settings.load_profile("patient")
+# How long an example takes is the machine's affair. The examples are the same in every run, so that
+# a change is judged by what it changed; HYPOTHESIS_PROFILE=explore draws new ones.
+settings.register_profile("same", deadline=None, derandomize=True)
+settings.register_profile("explore", deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 TRIES_MORE, APART = 7, 2.0  # s; longer together than another program's burst of work
 
 

@@ -23,6 +23,8 @@ CHANNELS = (
     Channel("theta", "rad"),
 )
 RATE = 500.0
+# ns by which the wall clock of these runs is ahead of their device's: 2026-11-23 14:00 UTC.
+WALL = 1_795_442_400 * 10**9
 RIG = 'name = "test"\n'
 EXPERIMENT = 'name = "swept sine"\n'
 NOTES = {"seed": "7", "operator": "Ångström"}
@@ -88,6 +90,7 @@ def write_run(path: Path, parts: list[SampleBlock], *, compression: str = "lz4")
         rig_toml=RIG,
         experiment_toml=EXPERIMENT,
         metadata=NOTES,
+        clock_offset=WALL,
         compression=compression,  # type: ignore[arg-type]  # parametrised with its values
     )
     with writer:

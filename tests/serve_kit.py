@@ -69,17 +69,29 @@ def client(rooms: Rooms, headers: dict[str, str] | None = None) -> httpx.AsyncCl
 
 
 class Service:
-    """`samii-rig serve` in a process of its own, at a free port."""
+    """`samii-rig serve` in a process of its own, at a free port.
 
-    def __init__(self, folder: Path, *options: str, trust: str = "", token: str = "") -> None:
-        self.folder, self.options, self.port = folder, options, "0"
+    descriptors : that it may have open at once, 0 for as many as we.
+    """
+
+    def __init__(
+        self, folder: Path, *options: str, trust: str = "", token: str = "", descriptors: int = 0
+    ) -> None:
+        self.descriptors = descriptors
+        self.folder, self.options, self.port, self.stop_port = folder, options, "0", "0"
         self.trust = ssl.create_default_context(cafile=trust) if trust else True
-        self.headers = {"authorization": f"Bearer {token}"} if token else {}
+        self.headers = {"x-name": "Ada"}
+        if token:
+            self.headers["authorization"] = f"Bearer {token}"
         self.begin()
 
     def begin(self) -> None:
         program = "from samii_rig.cli import main; main()"
-        options = ["--folder", str(self.folder), "--port", self.port, *self.options]
+        if most := self.descriptors:
+            limited = f"resource.setrlimit(resource.RLIMIT_NOFILE, ({most}, {most}))"
+            program = f"import resource; {limited}; {program}"
+        ports = ["--port", self.port, "--stop-port", self.stop_port]
+        options = ["--folder", str(self.folder), *ports, *self.options]
         self.process = subprocess.Popen(
             [sys.executable, "-c", program, "serve", *options],
             stdout=subprocess.PIPE,
@@ -89,7 +101,9 @@ class Service:
         line = self.process.stdout.readline()
         assert line, "the service did not start"
         self.url = line.split(": ", 1)[1].strip()
-        self.port = self.url.rpartition(":")[2]  # the same when it is started again
+        self.stop_url = self.process.stdout.readline().split(": ", 1)[1].strip()
+        # The same when it is started again.
+        self.port, self.stop_port = (str(httpx.URL(u).port) for u in (self.url, self.stop_url))
         self.http = httpx.Client(
             base_url=self.url, timeout=WITHIN, verify=self.trust, headers=self.headers
         )
@@ -127,7 +141,7 @@ class Service:
         until `silent` is set."""
         answer = self.http.post("/api/lease")
         assert answer.status_code == 200, answer.text
-        headers = {"x-lease": answer.json()["lease"]}
+        headers = {**self.headers, "x-lease": answer.json()["lease"]}
         done = silent or threading.Event()
 
         def live() -> None:

@@ -110,7 +110,9 @@ def test_a_jog_brings_the_joint_there_and_is_recorded(wire, rig, tmp_path):
     out = moved(
         wire, rig, "jog", "--to", "0.02", "--speed", "0.1", "--out", str(tmp_path), "--json"
     )
-    assert out["after"] == pytest.approx(0.02, abs=0.002)
+    assert out["after"] == pytest.approx(0.02, abs=out["within"])
+    assert out["reached"]
+    assert out["within"] == pytest.approx(0.02 * 0.02, rel=0.1)
     assert Path(out["recording"]).exists()
     assert wire.history()["v"] == 0
 

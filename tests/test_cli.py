@@ -186,7 +186,7 @@ def test_a_folder_is_called_one(tmp_path: Path) -> None:
     for command in ("verify", "recover"):
         code, said = call(command, tmp_path)
         assert code == 2
-        assert said == f"{tmp_path} is a folder; expected a recording"
+        assert said == f"{tmp_path} is a folder; expected a recording, as {tmp_path}/*.mcap"
 
 
 @pytest.mark.parametrize(

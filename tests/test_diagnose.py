@@ -6,7 +6,10 @@ itself estimated. Few hypotheses compete in each test; the whole table is for th
 
 import json
 import math
+import sys
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +25,7 @@ from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.refit import Problem, refit
 from samii_rig.diagnose.rigfile import toml
 from samii_rig.diagnose.search import Search
+from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.identify.velocity_feedback import in_series
 from samii_rig.rig.load import load_rig, parse
@@ -85,8 +89,12 @@ def test_the_contract_is_plain_json_with_all_its_keys():
     plain = json.loads(json.dumps(found.plain()))
     assert set(plain) == {
         "verdict", "mismatch", "sites", "causes", "alternatives", "fit", "not_physics",
-        "next_experiment", "model",
+        "next_experiment", "model", "moved", "could_hide", "used", "evidence",
     }  # fmt: skip
+    assert plain["evidence"]["sigma"] > 10
+    assert plain["used"]["lines"] <= plain["used"]["of"]
+    assert set(plain["could_hide"][0]) == {"physics", "site", "parameter", "size", "unit"}
+    assert set(plain["next_experiment"]) == {"why", "experiment", "gain"}
     assert plain["causes"][0]["parameters"]["gain"]["value"] == pytest.approx(1.3, rel=0.02)
     assert {"value", "low", "high"} == set(plain["fit"]["gap_closed"])
     assert {b["channel"] for b in plain["mismatch"]["bands"]} == {s.name for s in samii().sensor}
@@ -255,10 +263,35 @@ def test_a_rig_file_survives_being_written():
         assert parse(Rig, toml(rig), name) == rig
 
 
-def test_the_page_on_adding_physics_adds_it(monkeypatch):
+def installed(folder: Path, code: str) -> None:
+    """A package `our_lab` in a folder, as pip would leave it, its effects in the module `hose`."""
+    (folder / "our_lab").mkdir()
+    (folder / "our_lab" / "__init__.py").touch()
+    (folder / "our_lab" / "hose.py").write_text(code, encoding="utf-8")
+    info = folder / "our_lab-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: our-lab\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(f"[{vocabulary.GROUP}]\nhose = our_lab.hose:hose\n")
+
+
+@pytest.fixture
+def a_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.syspath_prepend(tmp_path)
+    yield tmp_path
+    for name in ("our_lab", "our_lab.hose"):
+        sys.modules.pop(name, None)
+
+
+def test_effects_that_another_package_gets_wrong_are_one_line_with_its_name(a_package):
+    installed(a_package, "def hose(rig, low, high):\n    yield 'a hose'\n")
+    with pytest.raises(InputError, match=r"entry point hose = our_lab\.hose:hose.*an Effect"):
+        table(samii(), *BAND)
+
+
+def test_the_page_on_adding_physics_adds_it(a_package):
     page = (ROOT / "docs" / "add-physics.md").read_text(encoding="utf-8")
-    monkeypatch.setattr(vocabulary, "EXTRA", [])
-    exec(page.split("```python")[1].split("```")[0], {})
+    assert f'entry-points."{vocabulary.GROUP}"]\nhose = "our_lab.hose:hose"' in page
+    installed(a_package, page.split("```python")[1].split("```")[0])
     own = [e for e in table(samii(), *BAND) if "hose" in {p for p, _ in e.names}]
     assert len(own) == 1
     found = diagnose([concealing((own[0], [3e4, 20.0]))], samii(), effects=[own[0], *FEW])

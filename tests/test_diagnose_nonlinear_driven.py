@@ -25,6 +25,7 @@ from samii_rig.diagnose.nonlinear_screen import Bins, Levels
 from samii_rig.diagnose.nonlinear_time import simulate
 from samii_rig.diagnose.refit import Problem, refit
 from samii_rig.diagnose.search import Search
+from samii_rig.diagnose.stated import IN_DATA
 from samii_rig.types import Channel, Recording, Segment
 
 N = 6000  # samples of a period
@@ -307,7 +308,10 @@ def test_a_linear_effect_beside_a_force_must_show_in_the_data(gained, told):
         fitted=fit_of(1000.0 - gained),
     )
     search = SimpleNamespace(
-        found={one.key: one}, temperature=1.0, nominal=SimpleNamespace(fitted=fit_of(5000.0))
+        found={one.key: one},
+        temperature=1.0,
+        worth=IN_DATA,
+        nominal=SimpleNamespace(fitted=fit_of(5000.0)),
     )
     assert _is_thin(search, both) is not told
 
@@ -325,6 +329,7 @@ def test_several_effects_must_outdo_a_law_by_more_than_it_is_off(better, rough, 
     search = SimpleNamespace(
         found={one.key: one},
         temperature=1.0,
+        worth=IN_DATA,
         nominal=SimpleNamespace(fitted=fit_of(1.6e6)),
         without=lambda _e, _i: without,
     )

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from experiments.swept_sine import SweptSine
 from samii_rig.errors import InputError
 from samii_rig.rig.load import load_rig, parse
-from samii_rig.run import experiments
+from samii_rig.run import catalogue, experiments
 from samii_rig.run.experiments import fitting, load_experiment, shipped
 from samii_rig.run.protocols import Experiment
 
@@ -123,11 +123,11 @@ WRONG_IN_THE_FILE = [
     ({"amplitudes": [1.0, 1.0]}, "amplitudes", "each level once"),
     ({"start_hz": 0.0}, "start_hz", "greater than 0"),
     ({"stop_hz": float("nan")}, "stop_hz", "greater than 0|finite"),
-    ({"sweep": "quadratic"}, "sweep", "'linear' or 'logarithmic'"),
+    ({"sweep": "quadratic"}, "sweep", "one of linear, logarithmic"),
     ({"ramp": 6.0}, "", "do not fit"),
     ({"kp": -1.0}, "kp", "0 or more"),
     ({"repeats": 0}, "repeats", "greater than or equal to 1"),
-    ({"levels": 3}, "levels", "known"),
+    ({"levels": 3}, "levels", "no such field; expected one of description, "),
     ({"schedule": [[5.0, 1.0], [5.0, 0.5]]}, "", "must increase"),
     ({"schedule": [[5.0, 1.5]]}, "schedule", "less than or equal to 1"),
     ({"schedule": [[5.0, 0.0]]}, "", "needs interpolation"),
@@ -272,7 +272,7 @@ def test_a_name_that_is_nothing_lists_what_there_is():
 def test_an_entry_point_to_something_else_is_refused(monkeypatch, tmp_path, value):
     from importlib.metadata import EntryPoint
 
-    point = EntryPoint("odd", value, experiments.GROUP)
+    point = EntryPoint("odd", value, catalogue.GROUP)
     monkeypatch.setattr(experiments, "kinds", lambda: {"odd": point})
     monkeypatch.setattr(experiments, "shipped", dict)
     path = tmp_path / "odd.toml"

@@ -46,6 +46,25 @@ def test_csv_is_exact_and_carries_units_and_the_covariance(tmp_path):
     np.testing.assert_array_equal(column["coherence a_0 [1]"], r.coherence[:, 1])
 
 
+def test_csv_ends_with_gain_and_phase_for_a_spreadsheet(tmp_path):
+    r = measured()
+    with export_response(tmp_path / "r.csv", r).open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.reader(line for line in stream if not line.startswith("#")))
+    values = np.array(rows[1:], dtype=float)
+    a = "a_0/v_2"
+    assert rows[0][-4:] == [
+        f"gain {a} [m/s^2/V]",
+        f"sd gain {a} [m/s^2/V]",
+        f"phase {a} [deg]",
+        f"sd phase {a} [deg]",
+    ]
+    gain, sd_gain, phase, sd_phase = values[:, -4:].T
+    np.testing.assert_allclose(gain * np.exp(1j * np.deg2rad(phase)), r.H[:, 1, 0], rtol=1e-12)
+    sd = np.sqrt(r.variance()[:, 1, 0] / 2)
+    np.testing.assert_allclose(sd_gain, sd, rtol=1e-12)
+    np.testing.assert_allclose(np.deg2rad(sd_phase), sd / gain, rtol=1e-12)
+
+
 @pytest.mark.parametrize("even", [False, True])
 def test_uff_is_read_by_pyuff(tmp_path, even):
     r = measured(n=200)

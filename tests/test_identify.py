@@ -12,7 +12,7 @@ from rich.console import Console
 
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.identify import likelihood
-from samii_rig.identify.data import collect, factor
+from samii_rig.identify.data import collect
 from samii_rig.identify.identifiability import identifiability
 from samii_rig.identify.maximum_likelihood import identify, problem, solve
 from samii_rig.identify.parameters import Free, space, uncertain
@@ -24,6 +24,7 @@ from samii_rig.record.importer import import_file
 from samii_rig.record.maps import load_map
 from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
+from samii_rig.signal.whitening import factor
 
 DAMPERS = ("joint_1.c", "joint_2.c", "joint_2_source.K", "joint_2_source.p")
 
@@ -220,7 +221,7 @@ def renamed(**channels):
     ("changes", "words"),
     [
         ({"free": ["joint_9.k"]}, "joint_9.k.*an element of SAMII"),
-        ({"free": ["joint_1.q"]}, "joint_1.q.*a parameter of joint_1: k, c"),
+        ({"free": ["joint_1.q"]}, "joint_1.q.*a parameter of joint_1, one of k, c"),
         ({"free": ["joint_1"]}, "element.symbol, for example joint_1.k"),
         ({"free": ["joint_1.k", "joint_1.k"]}, "each parameter once"),
         ({"free": []}, "at least one"),

@@ -73,7 +73,7 @@ def test_method_2_identifies_joints_1_and_2_of_the_braced_rig(braced_log, tmp_pa
 
 def test_a_method_that_is_asked_for_wrongly_costs_one_line(braced_log):
     for option, words in (
-        (("--method", "3"), "likelihood, 1 or 2"),
+        (("--method", "3"), "one of likelihood, 1, 2"),
         (("--method", "2"), "what to identify"),
     ):
         code, said = call("identify", braced_log, *option)

@@ -169,8 +169,8 @@ def test_universal_files_and_their_units(tmp_path):
 
 BAD_FILES = {
     "no such file": (None, "No such file"),
-    "empty": ("", "no data"),
-    "a header alone": ("t,u,y\n", "no data"),
+    "empty": ("", "empty, no data"),
+    "a header alone": ("t,u,y\n", "header without data"),
     "one sample": ("t,u,y\n0,0,0\n", "1 samples'; expected at least two"),
     "a word": (GOOD + "0.03,zero,4\n", r"line 5, column 'u' is 'zero'; expected a number"),
     "an empty field": (GOOD + "0.03,,4\n", r"line 5, column 'u' is ''; expected a number"),
@@ -239,6 +239,104 @@ def test_a_map_whose_units_are_not_the_rigs(tmp_path):
 def test_an_unknown_map():
     with pytest.raises(InputError, match="or one of sflr, sflr_motor, sflr_motor_open"):
         load_map("none")
+
+
+@pytest.mark.parametrize(
+    ("text", "form", "message"),
+    [
+        (GOOD, 'delimiter = ";"', r"is the delimiter ','\?"),
+        (GOOD.replace(",", "\t"), "", r"is the delimiter a tab\?"),
+        (GOOD.replace(",", " "), "", r"is the delimiter white space\?"),
+        (
+            GOOD.replace(",", ";").replace(".", ","),
+            'delimiter = ";"',
+            r"'0,00'; expected a number; is the decimal mark ','\?",
+        ),
+    ],
+)
+def test_a_wrong_delimiter_and_a_wrong_decimal_mark_are_named(tmp_path, text, form, message):
+    with pytest.raises(InputError, match=message):
+        import_file(write(tmp_path, text), lab_map(form=form))
+
+
+def test_utf_16_is_named(tmp_path):
+    path = tmp_path / "run_amp-1_.csv"
+    for name in ("utf-16", "utf-16-le"):
+        path.write_bytes(GOOD.encode(name))
+        with pytest.raises(InputError, match="encoding is 'UTF-16'; expected UTF-8"):
+            import_file(path, lab_map())
+
+
+def test_names_in_latin_1_are_found(tmp_path):
+    path = tmp_path / "run_amp-1_.csv"
+    path.write_bytes("t,u,y [µrad]\n0,0,0\n1,0,0\n".encode("latin-1"))
+    with pytest.raises(InputError, match="'y' is 'µrad'; expected 'rad'"):
+        import_file(path, lab_map())
+
+
+DIVIDED = "t,u,y,seg,level\n" + "".join(
+    f"{i / 100},{i},0,{i // 10 % 3},{[0, 0.5, 1.0][i // 10 % 3]}\n" for i in range(60)
+)
+
+
+def divided(segment: str) -> ImportMap:
+    text = MAP.format(kind="csv", format="", time='column = "t"', channel="")
+    head = text[: text.index("[segment]")]
+    return parse(ImportMap, f'{head}[segment]\nlevel_unit = "V"\n{segment}', "lab.toml")
+
+
+@pytest.mark.parametrize(
+    ("segment", "expected"),
+    [
+        ("level = 0.25", [(0, 60, 0.25, 0)]),
+        (
+            'level_column = "level"',
+            [(10, 20, 0.5, 0), (20, 30, 1.0, 0), (40, 50, 0.5, 1), (50, 60, 1.0, 1)],
+        ),
+        (
+            'column = "seg"\npause = 1\nlevel = 2',
+            [(0, 10, 2.0, 0), (20, 30, 2.0, 1), (30, 40, 2.0, 2), (50, 60, 2.0, 3)],
+        ),
+        (
+            'column = "seg"\nlevel_column = "level"',
+            [(10, 20, 0.5, 0), (20, 30, 1.0, 0), (40, 50, 0.5, 1), (50, 60, 1.0, 1)],
+        ),
+        (
+            "[[segment.part]]\nstart = 0.05\nstop = 0.1\nlevel = 1\n"
+            '[[segment.part]]\nstart = 0.3\nstop = 9\nlevel = 2\nkind = "burst"',
+            [(5, 10, 1.0, 0), (30, 60, 2.0, 0)],
+        ),
+    ],
+)
+def test_a_file_of_several_segments(tmp_path, segment, expected):
+    recording = import_file(write(tmp_path, DIVIDED, "run.csv"), divided(segment))
+    found = [(s.start, s.stop, s.level, s.repeat) for s in recording.segments]
+    assert found == expected
+    assert len({s.name for s in recording.segments}) == len(expected)
+
+
+@pytest.mark.parametrize(
+    ("segment", "message"),
+    [
+        ("", "expected one of level, level_column and part"),
+        ('level = 1\nlevel_column = "level"', "expected one of level, level_column and part"),
+        ("level = -1", "level is -1; expected 0 or more"),
+        ("level = 1\npause = 0", "expected a column"),
+        ('level = 1\ncolumn = "seg"\nrepeat = "(?P<repeat>.)"', "expected no repeat"),
+        ("[[segment.part]]\nstart = 2\nstop = 1\nlevel = 1", "not before stop 1 s"),
+        ("[[segment.part]]\nstart = 5\nstop = 6\nlevel = 1", "where the file ends"),
+        ("[[segment.part]]\nstart = 0.001\nstop = 0.002\nlevel = 1", "expected samples in it"),
+        ('level_column = "u"', "changes of column 'u' is 1999; expected under 1000"),
+        ('column = "y"\npause = 0\nlevel = 1', "all of the file is pause"),
+        ('column = "nope"\nlevel = 1', "column is 'nope'"),
+        ('column = "y"\nlevel_column = "level"', "line 12, column 'level' is 0.5; expected 0"),
+    ],
+)
+def test_a_file_that_is_divided_wrongly(tmp_path, segment, message):
+    signal = "t,u,y\n" + "".join(f"{i / 100},{i + 1},0\n" for i in range(2000))
+    text = signal if '"u"' in segment else DIVIDED
+    with pytest.raises(InputError, match=message):
+        import_file(write(tmp_path, text, "run.csv"), divided(segment))
 
 
 LINES = st.lists(

@@ -16,12 +16,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from index_kit import lab, write_small
+from mcap.opcode import Opcode
 from record_kit import CHANNELS, RATE, block
 
 from samii_rig.errors import InputError, RecordingError
 from samii_rig.index.query import Query
 from samii_rig.index.remarks import add_note, read_remarks, remarks_path, set_diagnosis, set_tags
-from samii_rig.index.store import FILE, PRIVATE, Index
+from samii_rig.index.store import FILE, PRIVATE, Index, index_for_reading
+from samii_rig.record import scan
 from samii_rig.record.writer import RunWriter
 
 
@@ -153,6 +155,47 @@ def test_what_is_cut_off_or_foreign_is_listed_with_its_problem(index: Index) -> 
     assert (entry.rig, entry.samples) == ("SAMII", 30)
     assert "samii-rig recover" in entry.problem
     assert set(names(index, status="unreadable")) == {"foreign.mcap", "empty.mcap"}
+
+
+def test_a_recording_whose_bytes_changed_is_listed_as_damaged(index: Index) -> None:
+    whole = (index.folder / "a.mcap").read_bytes()
+    chunk = next(
+        s for s in scan.spans(memoryview(whole), 8, len(whole)) if s.opcode == Opcode.CHUNK
+    )
+    changed = bytearray(whole)
+    changed[chunk.end - 1] ^= 1
+    (index.folder / "changed.mcap").write_bytes(changed)
+    (index.folder / "cut.mcap").write_bytes(whole[: len(whole) // 2])
+    index.refresh()
+    found = {e.path: e for e in index.search(Query(status="damaged")).entries}
+    assert set(found) == {"changed.mcap", "cut.mcap"}
+    assert "samii-rig verify" in found["changed.mcap"].problem
+    assert "samii-rig recover" in found["cut.mcap"].problem
+    assert len(index.search(Query(status="completed")).entries) == 2
+
+
+def test_a_folder_that_cannot_be_written_to_is_listed_nevertheless(tmp_path: Path) -> None:
+    lab(tmp_path)
+    (tmp_path / PRIVATE).write_text("in the way")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(RecordingError, match="cannot be written"):
+        Index(tmp_path).refresh()
+    with index_for_reading(tmp_path) as index:
+        index.refresh()
+        assert len(names(index)) == 3
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_an_index_that_is_there_is_used_where_it_cannot_be_written(
+    index: Index, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(option: str, path: Path) -> None:
+        raise InputError(option, "", str(path), "a place that can be written to")
+
+    monkeypatch.setattr("samii_rig.index.store.check_folder", refused)
+    with index_for_reading(index.folder) as found:
+        assert found.refresh().read == 0
+        assert len(names(found)) == 3
 
 
 def test_a_recording_of_a_newer_version_says_so(

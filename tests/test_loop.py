@@ -20,9 +20,10 @@ from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import run
 from samii_rig.run.pace import LoopSettings
 from samii_rig.run.protocols import OpenRig, Plan, PlannedSegment
+from samii_rig.run.session import Move
 from samii_rig.run.sink import Collector, QueuedSink, recorded_channels
 from samii_rig.signal.excitation import swept_sine
-from samii_rig.types import Channel, Quality
+from samii_rig.types import Channel, Quality, StopRecord
 
 RIG = fake_rig()
 
@@ -655,3 +656,28 @@ def test_the_joint_ends_where_the_centring_loop_holds_it():
     _, _, sink = go()
     theta = sink.column("theta")
     assert abs(theta[-1]) < 0.5 * np.abs(theta).max()
+
+
+def test_a_plan_that_ends_off_centre_is_not_pulled_back_before_the_output_is_zero():
+    """A set point that fell to 0 with the plan would be a step of the output."""
+    n = 1000
+    theta_ref = 0.1 * (0.5 - 0.5 * np.cos(np.pi * np.minimum(np.arange(2 * n) / n, 1.0)))
+    move = PlannedSegment(
+        "move", "transient", 0.1, "V", 0, 0 * theta_ref, theta_ref, (0.0, 1.0), 0 * theta_ref
+    )
+    device, sink = FakeDevice(), Memory()
+    stop = run(Plan("move", RATE, "v", 4.0, "theta", (move,), 0), RIG, device.open(), sink)
+    assert stop.status == "completed"
+    end = np.searchsorted(sink.column("sequence"), move.u.size)
+    v, theta = sink.column("v")[end:], sink.column("theta")[end:]
+    assert theta[-1] == pytest.approx(theta[0], abs=0.001)
+    assert np.abs(v).max() < 0.1 * 4.0 * 0.1
+
+
+@pytest.mark.parametrize(
+    ("after", "status", "reached"),
+    [(0.0499, "completed", True), (0.0461, "completed", False), (0.05, "tripped", False)],
+)
+def test_a_move_is_done_where_it_was_to_go(after, status, reached, tmp_path):
+    move = Move(0.0, after, "rad", StopRecord(status, ""), tmp_path, to=0.05, within=0.001)
+    assert move.reached is reached

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_device import RATE, FakeDevice, fake_rig
+from burst_kit import PLAN, PREDICTED, RIG
+from fake_device import FakeDevice
 from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
@@ -15,16 +16,8 @@ from samii_rig.errors import DeviceError, EstimateError, GateError, InputError
 from samii_rig.record.reader import read_recording
 from samii_rig.run import campaign
 from samii_rig.run.campaign import Outcome, carry_out
-from samii_rig.run.dryrun import predict
-from samii_rig.run.protocols import CommandBlock, Plan, PlannedSegment
-from samii_rig.signal.excitation import swept_sine
+from samii_rig.run.protocols import CommandBlock
 from samii_rig.types import Channel
-
-RIG = fake_rig()
-U, F = swept_sine(RATE, 2.0, 20.0, 0.6, ramp=0.1, lead_in=0.1, ring_down=0.3)
-SEGMENT = PlannedSegment("burst", "burst", 1.0, "V", 0, U, np.zeros_like(U), (2.0, 20.0), F)
-PLAN = Plan("sweep", RATE, "v", 4.0, "theta", (SEGMENT,), 0)
-PREDICTED = predict(PLAN, RIG)
 
 
 @pytest.fixture

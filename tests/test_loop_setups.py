@@ -62,6 +62,8 @@ class Bench:
         self.spoil: dict[int, object] = {}
         self.rig = tmp_path / "rig.toml"
         self.rig.write_text(TEXT + '\n[device]\ndriver = "bench"\n')
+        self.experiment = tmp_path / "thrice.toml"
+        self.experiment.write_text("")  # what it would say is `Thrice`
         monkeypatch.setattr(campaign, "open_device", self.open)
 
     def open(self, rig, settings):
@@ -89,7 +91,7 @@ class Bench:
         out = str(self.path / "t.mcap")
         command = [
             "run",
-            "thrice",
+            str(self.experiment),
             "--rig",
             str(self.rig),
             "--out",
@@ -102,7 +104,8 @@ class Bench:
             assert not device.live
             device.sleep(1.0)
             assert device.rows[-1][1] == 0.0
-        left = sorted(p.name for p in self.path.iterdir() if p != self.rig)
+        given = (self.rig, self.experiment)
+        left = sorted(p.name for p in self.path.iterdir() if p not in given)
         for name in left:
             assert name.endswith(".mcap"), "half a file was left"
         return result, left
@@ -154,7 +157,9 @@ def test_ctrl_c_at_the_question_ends_with_130(bench, monkeypatch):
     result, left = bench.go("y\n")
     assert result.exit_code != 0
     assert left == ["t_1.mcap"]
-    monkeypatch.setattr("sys.argv", ["samii-rig", "run", "thrice", "--rig", str(bench.rig)])
+    monkeypatch.setattr(
+        "sys.argv", ["samii-rig", "run", str(bench.experiment), "--rig", str(bench.rig)]
+    )
     monkeypatch.chdir(bench.path)
     with pytest.raises(SystemExit) as end:
         main()

@@ -10,7 +10,7 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Schema
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
-from record_kit import CHANNELS, EXPERIMENT, NOTES, RIG, blocks, joined, response, write_run
+from record_kit import CHANNELS, EXPERIMENT, NOTES, RIG, WALL, blocks, joined, response, write_run
 
 from samii_rig.record import layout
 from samii_rig.types import Channel
@@ -28,7 +28,8 @@ def test_every_signal_is_a_named_field(path: Path) -> None:
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         seen = list(reader.iter_decoded_messages(topics=["/samples"]))
-    assert [m.message.log_time for m in seen] == time.tolist()
+    assert [m.message.log_time for m in seen] == (time + WALL).tolist()
+    assert [m.message.publish_time for m in seen] == (time + WALL).tolist()
     assert [m.decoded_message.sequence for m in seen] == sequence.tolist()
     for column, channel in enumerate(CHANNELS):
         found = [getattr(m.decoded_message, channel.name) for m in seen]
@@ -55,13 +56,15 @@ def test_the_index_and_the_statistics_agree_with_the_data(path: Path) -> None:
         in_order = list(reader.iter_messages(topics=["/samples"], log_time_order=True))
         one = list(
             reader.iter_messages(
-                topics=["/samples"], starting_at=1_002_000_000, ending_before=1_004_000_000
+                topics=["/samples"],
+                starting_at=WALL + 1_002_000_000,
+                ending_before=WALL + 1_004_000_000,
             )
         )
         attached = {a.name: a.data.decode() for a in reader.iter_attachments()}
         metadata = {m.name: m.metadata for m in reader.iter_metadata()}
     assert len(in_order) == 120
-    assert [m.log_time for _, _, m in one] == [1_002_000_000]
+    assert [m.log_time for _, _, m in one] == [WALL + 1_002_000_000]
     assert attached == {"rig.toml": RIG, "experiment.toml": EXPERIMENT}
     assert layout.unsealed(metadata[layout.NOTES], "notes") == NOTES
     assert metadata[layout.STOP]["status"] == "completed"
@@ -94,7 +97,10 @@ def test_an_event_is_a_log_message(path: Path) -> None:
         (seen,) = reader.iter_decoded_messages(["/events"])
     assert seen.schema is not None
     assert seen.schema.name == "rcl_interfaces/msg/Log"
-    assert (seen.decoded_message.name, seen.decoded_message.stamp.sec) == ("armed", 1)
+    assert (seen.decoded_message.name, seen.decoded_message.stamp.sec) == (
+        "armed",
+        WALL // 10**9 + 1,
+    )
 
 
 def test_awkward_names_still_make_a_schema_that_others_parse() -> None:

@@ -163,7 +163,8 @@ def test_relaxations_hold_the_loss_factor_over_the_band(eta, low, high):
     beam = fit_loss(eta, 0.0, low, high)
     f = np.geomspace(low, high, 77)
     m = beam.modulus(2j * np.pi * f)
-    np.testing.assert_allclose(m.imag / m.real, eta, rtol=0.01)
+    # The bounds of fit_loss's docstring.
+    np.testing.assert_allclose(m.imag / m.real, eta, rtol=0.004 if eta <= 0.05 else 0.013)
     assert np.all(beam.a > 0)
     # Kramers and Kronig: what loses also stiffens, 2 eta/pi for every factor e.
     assert np.all(np.diff(m.real) > 0)

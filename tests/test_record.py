@@ -101,14 +101,15 @@ def test_any_blocks_come_back(
         parts.append(
             SampleBlock(
                 channels,
-                rng.integers(0, 2**63 - 1, size),
+                rng.integers(0, 2**62, size),
                 sequence.astype(np.int64),
                 rng.integers(0, 2**63 - 1, (size, columns)).view(np.float64),
                 rng.integers(0, 16, (size, columns), dtype=np.uint8),
             )
         )
     path = tmp_path_factory.mktemp("any") / "run.mcap"
-    with RunWriter(path, channels, 1.0) as writer:
+    offset = data.draw(st.integers(0, 2**62))
+    with RunWriter(path, channels, 1.0, clock_offset=offset) as writer:
         for part in parts:
             writer.write(part)
         writer.close(STOP)
@@ -118,6 +119,7 @@ def test_any_blocks_come_back(
     np.testing.assert_array_equal(recording.sequence, np.concatenate([p.sequence for p in parts]))
     np.testing.assert_array_equal(recording.time, np.concatenate([p.time for p in parts]))
     np.testing.assert_array_equal(recording.quality, np.concatenate([p.quality for p in parts]))
+    assert recording.clock_offset == offset
 
 
 def test_a_run_can_be_read_before_it_is_closed(tmp_path: Path) -> None:

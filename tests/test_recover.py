@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 from record_kit import (
     CHANNELS,
     EXPERIMENT,
@@ -26,7 +27,7 @@ from record_kit import (
 
 from samii_rig.errors import RecordingError
 from samii_rig.record import scan
-from samii_rig.record.contents import read_contents
+from samii_rig.record.contents import read_contents, read_tail
 from samii_rig.record.reader import read_events, read_frequency_responses, read_recording
 from samii_rig.record.recover import NothingError, default_output, recover
 from samii_rig.record.verify import verify
@@ -261,3 +262,61 @@ def test_what_was_noted_later_stands_in_place_of_what_was_before(tmp_path: Path)
     assert verify(path).status == "whole"
     notes = read_recording(cut).metadata
     assert (notes["seed"], notes["clock"]) == ("7", "2 ms")
+
+
+def spans_of(whole: bytes, opcode: int) -> list[scan.Span]:
+    """The records of one kind in the data."""
+    data = memoryview(whole)
+    end = read_tail(data).summary_start
+    return [s for s in scan.spans(data, scan.MAGIC_SIZE, end) if s.opcode == opcode]
+
+
+def assert_all_back(path: Path, output: Path, code: int = 3) -> None:
+    """All samples, events, segments and results of `write_run`, in their order."""
+    recovered = recover(path, output)
+    assert recovered.exit_code == code, recovered.problems
+    assert_prefix(output, len(joined(blocks())[0]))
+    source = path.with_name("source.mcap")
+    assert read_events(output) == read_events(source)
+    assert read_recording(output).segments == read_recording(source).segments
+    assert len(read_frequency_responses(output)) == len(read_frequency_responses(source))
+    assert read_recording(output).stop == read_recording(source).stop
+    output.unlink()
+
+
+def test_chunks_that_changed_places_come_back_in_order(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "run.mcap"
+    (tmp_path / "source.mcap").write_bytes(whole)
+    chunks = spans_of(whole, Opcode.CHUNK)
+    indices = spans_of(whole, Opcode.MESSAGE_INDEX)
+    # The first holds an event, whose place among the samples tells nothing.
+    for i, j, code in ((0, 1, 0), (1, 3, 3), (0, 4, 3)):
+        a, b = ((chunks[k].start, indices[k].end) for k in (i, j))
+        path.write_bytes(
+            whole[: a[0]]
+            + whole[b[0] : b[1]]
+            + whole[a[1] : b[0]]
+            + whole[a[0] : a[1]]
+            + whole[b[1] :]
+        )
+        assert_all_back(path, tmp_path / "again.mcap", code)
+
+
+def test_a_byte_that_is_gone_from_an_index_costs_nothing(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "run.mcap"
+    (tmp_path / "source.mcap").write_bytes(whole)
+    rng = np.random.default_rng(5)
+    for index in spans_of(whole, Opcode.MESSAGE_INDEX):
+        for at in {index.start, index.start + 1, int(rng.integers(index.start, index.end))}:
+            path.write_bytes(whole[:at] + whole[at + 1 :])
+            assert_all_back(path, tmp_path / "again.mcap")
+
+
+def test_a_chunk_that_is_there_twice_comes_back_once(tmp_path: Path, whole: bytes) -> None:
+    path, output = tmp_path / "run.mcap", tmp_path / "again.mcap"
+    chunk, index = spans_of(whole, Opcode.CHUNK)[1], spans_of(whole, Opcode.MESSAGE_INDEX)[1]
+    path.write_bytes(whole[: index.end] + whole[chunk.start : index.end] + whole[index.end :])
+    recovered = recover(path, output)
+    assert recovered.exit_code == 3
+    assert any("already" in problem for problem in recovered.problems)
+    assert_prefix(output, len(joined(blocks())[0]))

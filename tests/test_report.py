@@ -21,9 +21,10 @@ from samii_rig.errors import InputError
 from samii_rig.report.compare import ModelCurve, compare
 from samii_rig.report.decimate import thin
 from samii_rig.report.drawing import draw
+from samii_rig.report.facts import names
 from samii_rig.report.figures import bode_figure, save_figure
+from samii_rig.report.modes import modes_of_all, rows, sentences
 from samii_rig.report.page import write_report
-from samii_rig.report.peaks import peaks
 from samii_rig.report.summary import LiveProgress, dry_run_summary, progress_line, summary
 from samii_rig.report.verdicts import verdicts
 from samii_rig.rig.load import load_rig
@@ -177,15 +178,26 @@ def test_a_gain_that_changes_with_level_is_called_so():
     assert "not linear" in said.text
 
 
-def test_peaks_are_the_modes_and_noise_has_none():
-    found = [p.frequency_hz for p in peaks(measured(relative=0.01), 1)]
-    for hz in MODES[:1] + MODES[2:]:
-        assert min(abs(f / hz - 1) for f in found) < 0.03
-    f = np.linspace(1, 40, 2000)
+def test_the_table_holds_the_modes_with_intervals_and_noise_has_none(page):
+    _, parsed = page
+    shown = modes_of_all([measured(relative=0.01)], None)
+    found = [m.frequency_hz for m in shown[0].found.modes]
+    for hz in MODES:
+        near = min(found, key=lambda x: abs(x.value - hz))
+        assert abs(near.value - hz) < 4 * near.sd < 0.01 * hz
+    assert all("\u00b1" in row["frequency"] for row in rows(shown))
+    assert "Damping ratio" in parsed.text
+    flat = replace(measured(), H=np.zeros_like(measured().H) + noise(measured().H.shape))
+    flat = replace(flat, covariance=np.repeat(np.eye(2)[None] + 0j, 500, axis=0))
+    nothing = modes_of_all([flat], None)
+    assert rows(nothing) == []
+    assert "no mode stands above the noise" in " ".join(sentences(nothing))
+
+
+def noise(shape):
+    """Circular noise of variance 1."""
     rng = np.random.default_rng(3)
-    noise = 1 + 0.3 * (rng.standard_normal((2000, 2, 1)) + 1j * rng.standard_normal((2000, 2, 1)))
-    flat = replace(measured(n=2000), frequency=f, H=noise)
-    assert peaks(flat, 0) == ()
+    return (rng.standard_normal(shape) + 1j * rng.standard_normal(shape)) / np.sqrt(2)
 
 
 @settings(max_examples=50)
@@ -225,7 +237,8 @@ def printed(thing, **options):
 
 
 def test_the_terminal_says_the_same():
-    said = printed(summary([recorded()], [measured(1.0)], model(0.6)))
+    modes = modes_of_all([measured(1.0)], None)
+    said = printed(summary([recorded()], [measured(1.0)], model(0.6), modes=modes))
     assert "The model differs from the measurement" in said
     assert "\u00d7 0.600" in said
     assert "2.3" in said
@@ -236,11 +249,58 @@ def test_a_dry_run_says_its_margins_and_errors():
     over = replace(margin, channel="a_0", unit="m/s^2", predicted=33.0, limit=30.0)
     band = BandError("theta_2", 4.0, "V", 1.0, 2.0, 1e-5, 0.013)
     peaks_ = np.zeros((1, 1))
-    said = printed(
-        dry_run_summary(DryRun(95.0, 95.0, ("v_2",), ("V",), peaks_, 0.0, (over, margin), (band,)))
-    )
-    for part in ("95 s", "33 m/s\u00b2", "-10 %", "20 %", "1\u20132 Hz", "1.3 %"):
+
+    def shown(*margins):
+        run = DryRun(95.0, 95.0, ("v_2",), ("V",), peaks_, 0.0, margins, (band,))
+        return printed(dry_run_summary(run))
+
+    said = shown(over, margin)
+    for part in ("95 s", "33 m/s\u00b2", "-10 %", "20 %", "OVER"):
         assert part in said
+    assert "1.3 %" not in said  # it is refused: nothing will be measured
+    said = shown(margin)
+    for part in ("1\u20132 Hz", "1.3 %"):
+        assert part in said
+    assert "OVER" not in said
+
+
+def test_a_dry_run_has_one_row_a_channel_and_tells_a_bound_from_a_peak():
+    margin = Margin("v_2", "limit", "V", 1.53, 5.0, "half", "sweep_4", 4.0, "V", 5.0)
+    rows = (
+        margin,
+        replace(margin, what="rate", unit="V/s", predicted=900.0, limit=2000.0),
+        replace(margin, channel="a_1", what="range", unit="m/s^2", predicted=45.0, limit=50.0),
+        replace(margin, channel="a_1", what="range", unit="m/s^2", predicted=44.0, limit=50.0),
+    )
+    rows = tuple(sorted(rows, key=lambda m: m.margin))
+    peaks_ = np.array([[0.9], [1.02]])
+    said = printed(dry_run_summary(DryRun(9.0, 9.0, ("v_2",), ("V",), peaks_, 0.0, rows, ())))
+    lines = [line.split()[0] for line in said.splitlines()[2:] if line.strip()]
+    assert lines == ["a_1", "v_2"]
+    assert "45 m/s" in said
+    assert "900 V/s" in said
+    alone = printed(dry_run_summary(DryRun(9.0, 9.0, ("v_2",), ("V",), peaks_, 0.0, (margin,), ())))
+    assert "\u2264 1.53 V, peak 1.02" in alone
+
+
+def test_levels_of_two_units_and_rows_of_two_experiments_are_told_apart():
+    a, b = measured(0.5), replace(measured(0.5), method="stepped")
+    c = replace(measured(0.2), level_unit="rad")
+    assert names([a, b, c]) == ["0.5 V, burst", "0.5 V, stepped", "0.2 rad"]
+    twice = [replace(a, sources=(f"runs/{name}.mcap",)) for name in ("x", "y")]
+    assert names(twice) == ["0.5 V, burst, x", "0.5 V, burst, y"]
+    run = recorded()
+    in_rad = replace(run, segments=tuple(replace(s, level=0.2, unit="rad") for s in run.segments))
+    assert any(" V and 0.2 rad, " in v.text for v in verdicts([run, in_rad], [a], ()))
+    # The levels of two units say nothing of the rig's linearity.
+    assert not any("amplitude" in v.title for v in verdicts([run], [a, c], ()))
+    told = {row["level"] for row in rows(modes_of_all([a, b, c], None))}
+    assert told == set(names([a, b, c]))
+    # Each row has the model's ratio of its own measurement.
+    half = replace(b, H=2 * b.H)
+    shown = printed(summary([run], [a, half], model()))
+    assert "\u00d7 1.00" in shown
+    assert "\u00d7 0.50" in shown
 
 
 def report(segment, frequency=3.2):

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from samii_rig.errors import InputError
+from samii_rig.rig import load
 from samii_rig.rig.load import load_rig, parse, shipped
 from samii_rig.rig.schema import Rig, TorsionalSpring, parameters
 
@@ -56,7 +57,7 @@ def test_samii_carries_table_ii_of_paper_1() -> None:
         ("value = 2.674e5", "value = -2.674e5", r"clamp.*-267400.*0 or more"),
         ("value = 2.674e5", "value = nan", r"clamp.*k\.value.*finite"),
         ("value = 2.674e5", 'value = "stiff"', r"clamp.*k\.value is 'stiff'"),
-        ('base = "clamped"', 'base = "glued"', r"base is 'glued'.*'clamped'"),
+        ('base = "clamped"', 'base = "glued"', r"base is 'glued'; expected one of clamped, "),
         ('base = "clamped"\n', "", r"base: missing; expected one of clamped, pinned, free$"),
         ('tip = "free"\n', "", r"tip: missing; expected one of clamped, pinned, free$"),
         (
@@ -80,7 +81,7 @@ def test_samii_carries_table_ii_of_paper_1() -> None:
         (
             'kind = "relative_angle"',
             'kind = "gyroscope"',
-            r"sensor\[theta_2\].kind is 'gyroscope'.*one of.*'relative_angle'",
+            r"sensor\[theta_2\].kind is 'gyroscope'; expected one of relative_angle, ",
         ),
         ('unit = "m/s^2"\nnoise', 'unit = "g"\nnoise', r"a_0.*unit: is 'g'.*'m/s\^2'"),
         ('channel = "theta_2"', 'channel = "theta_9"', r"limit on 'theta_9'.*no such channel"),
@@ -102,7 +103,7 @@ def test_a_rig_without_elements_or_a_missing_file_is_refused(tmp_path: Path) -> 
     assert "element" in rejected(re.sub(r"(?ms)^\[\[element\]\].*?(?=^#|^\[\[sensor)", "", SAMII))
     with pytest.raises(InputError, match=r"--rig is 'nowhere'.*samii, .*sflr"):
         load_rig("nowhere")
-    with pytest.raises(InputError, match="readable rig file"):
+    with pytest.raises(InputError, match="cannot be read: Is a directory; expected a rig file"):
         load_rig(str(tmp_path))
     (tmp_path / "latin.toml").write_bytes(b'name = "\xff"')
     with pytest.raises(InputError, match="UTF-8"):
@@ -194,3 +195,26 @@ def test_a_damaged_line_loads_or_is_an_input_error(at: int, instead: str) -> Non
     text = "\n".join([*LINES[:at], instead, *LINES[at + 1 :]])
     with contextlib.suppress(InputError):
         parse(Rig, text, "fuzz.toml")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a." * 20_000 + "a = 1",
+        "[" + "a . " * 17 + "a]",
+        '"\\"".' * 17 + "a = 1",
+        "x = { " + "'a'." * 17 + "a = 1 }",
+    ],
+)
+def test_a_key_of_very_many_parts_is_refused_before_it_is_parsed(text: str) -> None:
+    """The time that it takes to parse one grows with the square of its parts."""
+    with pytest.raises(InputError, match=r"line 1 is .*; expected keys of at most 16 dotted parts"):
+        parse(Rig, text, "x.toml")
+
+
+@pytest.mark.parametrize("text", ['"\\' * 24_000, '"' * 48_000, "a" * 48_000, "a = 1.5\n" * 6_000])
+def test_no_text_takes_long_to_be_looked_at(text: str) -> None:
+    steps = sum(1 for _ in load._TOKEN.finditer(text))
+    assert steps <= len(text)
+    assert "".join(m.group() for m in load._TOKEN.finditer(text)) == text
+    load.check_depth(text, "x.toml")

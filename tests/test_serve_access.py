@@ -34,6 +34,7 @@ TABLE = {
     ("GET", "/page/{name}"): NOBODY,
     ("POST", "/api/login"): NOBODY,
     ("POST", "/api/stop"): NOBODY,
+    ("GET", "/api/stop"): NOBODY,
     ("GET", "/api/openapi.json"): VIEWER,
     ("GET", "/api/rig"): VIEWER,
     ("GET", "/api/state"): VIEWER,
@@ -195,18 +196,80 @@ def test_who_asks_too_often_waits_but_may_stop(open_rooms: Rooms) -> None:
 
 
 @pytest.mark.usefixtures("_slow_to_forget")
-def test_tokens_cannot_be_guessed_at_speed(rooms: Rooms, tokens: dict[str, str]) -> None:
+def test_who_drives_is_heard_whatever_others_ask(
+    open_rooms: Rooms, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(open_rooms, "lease", Lease())
+
     async def ask() -> list[int]:
+        async with client(open_rooms) as http:
+            lease = {"x-lease": (await http.post("/api/lease")).json()["lease"]}
+            for _ in range(25):
+                await http.get("/page/none", headers={"x-lease": "guess"})
+            codes = [
+                (await http.post("/api/lease/beat", headers=headers)).status_code
+                for headers in (lease, {"x-lease": "guess"})
+            ]
+            return [*codes, (await http.delete("/api/lease", headers=lease)).status_code]
+
+    assert run(ask) == [200, 429, 200]
+
+
+@pytest.mark.usefixtures("_slow_to_forget")
+def test_tokens_cannot_be_guessed_at_speed_and_who_has_one_is_not_locked_out(
+    rooms: Rooms, tokens: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody at the operator's address tries tokens, and asks for more than their share."""
+    monkeypatch.setattr(rooms, "lease", Lease())  # whoever took it before
+
+    async def ask() -> tuple[list[int], list[int]]:
         async with client(rooms) as http:
             wrong = [
                 (await http.get("/api/state", headers=bearer(f"{i}"))).status_code
                 for i in range(int(GUESS_BURST) + 2)
             ]
-            right = await http.get("/api/state", headers=bearer(tokens[VIEWER]))
-            return [*wrong, right.status_code]
+            for _ in range(25):
+                await http.get("/page/none")
+            took = await http.post("/api/lease", headers=bearer(tokens[OPERATOR]))
+            lease = {**bearer(tokens[OPERATOR]), "x-lease": took.json()["lease"]}
+            right = [
+                (await http.post("/api/lease/beat", headers=lease)).status_code for _ in range(3)
+            ]
+            return wrong, [took.status_code, *right]
 
-    # The right one is not even looked at then.
-    assert run(ask) == [401] * int(GUESS_BURST) + [429] * 3
+    wrong, right = run(ask)
+    assert wrong == [401] * int(GUESS_BURST) + [429] * 2
+    assert right == [200] * 4
+
+
+@pytest.mark.parametrize(
+    ("proxies", "told", "found"),
+    [
+        ((), "10.0.0.7", "127.0.0.1"),  # anybody can write that
+        (("127.0.0.1",), "10.0.0.7", "10.0.0.7"),
+        (("127.0.0.1",), "6.6.6.6, 10.0.0.7", "10.0.0.7"),
+        (("127.0.0.1", "10.0.0.1"), "10.0.0.7, 10.0.0.1", "10.0.0.7"),
+        (("127.0.0.1",), "", "127.0.0.1"),
+        (("10.0.0.1",), "10.0.0.7", "127.0.0.1"),
+    ],
+)
+def test_only_a_proxy_of_ours_says_who_asks(
+    open_rooms: Rooms, proxies: tuple[str, ...], told: str, found: str
+) -> None:
+    async def ask() -> str:
+        http = client(open_rooms, {"x-name": "Zo%C3%AB", "x-forwarded-for": told})
+        guard = http._transport.app  # type: ignore[attr-defined]
+        guard._proxies = frozenset(proxies)
+        async with http:
+            note = {"text": ""}  # refused, once it is known who asks
+            await http.post(f"/api/recordings/{'0' * 16}/notes", json=note)
+        return str(asked[0].signed)
+
+    asked: list[access.Person] = []
+    claimed = access.claimed
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(access, "claimed", lambda *a: asked.append(claimed(*a)) or asked[-1])
+        assert run(ask) == f"Zoë at {found}"
 
 
 def test_a_bucket_fills_up_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -334,6 +397,8 @@ def test_a_folder_is_worked_on_by_one_service(tmp_path: Path) -> None:
         (["--folder", "/proc/runs"], "a folder that can be written"),
         (["--host", "0.0.0.0"], "--tls-cert"),
         (["--port", "99999"], "0 to 65535"),
+        (["--stop-port", "99999"], "--stop-port is 99999; expected 0 to 65535"),
+        (["--proxy", "proxy.lab"], "--proxy is 'proxy.lab'; expected the address of a proxy"),
         (["--tokens", "/proc/version"], "a file that --new-token made"),
         (["--new-token", "Ada"], "the file that keeps its hash"),
     ],
@@ -371,3 +436,4 @@ def test_tls_is_served(tmp_path: Path) -> None:
     with Service(tmp_path / "runs", *options, trust=str(cert), token=token) as service:
         assert service.url.startswith("https://")
         assert service.state()["you"] == {"name": "Ada", "role": "viewer"}
+        assert service.http.post(service.stop_url).json() == {"stopped": False, "moving": False}

@@ -6,14 +6,11 @@ Skips where no Chromium is installed.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import pytest
-from browser_kit import Browser
+from browser_kit import Browser, violations
 from index_kit import write_small
 from serve_kit import Service, sweep
 
@@ -27,6 +24,9 @@ DRAWN = """
     if (d[i + 3] > 200 && Math.max(d[i], d[i+1], d[i+2]) - Math.min(d[i], d[i+1], d[i+2]) > 90) n++;
   return n > 500; })()
 """
+
+# Where it says what is now.
+AT_ZERO = "document.getElementById('now').textContent.includes('The output is at zero.')"
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,13 @@ def test_an_afternoon_at_the_page(
         assert not browser.value("document.getElementById('changed').hidden")
         browser.click("plan")
         browser.until("document.getElementById('planned').textContent.includes('nearest to a')")
+        browser.choose("operator", "")
         browser.click("take")
+        browser.until("document.getElementById('alarm').textContent.startsWith('Your name first')")
+        browser.choose("operator", "Ada")
+        browser.click("take")
+        browser.until("document.getElementById('driver').textContent.startsWith('Ada drives')")
+        assert browser.text("start") == "Start"
         browser.click("start")
         browser.until("document.getElementById('now').textContent.includes('segment 1 of 2')")
         browser.until("document.getElementById('facts').textContent.includes('Run left')")
@@ -74,9 +80,18 @@ def test_an_afternoon_at_the_page(
         service.begin()
         browser.until("document.getElementById('link').textContent === 'live'")
         browser.until("document.getElementById('now').textContent.includes('segment')")
+        # Nobody watches over the run until somebody takes control again.
+        browser.until("!document.getElementById('unwatched').hidden")
+        assert "The service was started anew at" in browser.text("unwatched-text")
+        assert "no operator's page watches over this run" in browser.text("unwatched-text")
+        browser.click("take-here")
+        browser.until("document.getElementById('driver').textContent.startsWith('Ada drives')")
+        browser.until("document.getElementById('unwatched').hidden")
+        assert browser.text("start") == "Queue"
 
         browser.press("Escape")
-        browser.until("document.getElementById('now').textContent === 'No run.'")
+        browser.until(AT_ZERO)
+        assert browser.text("now").startswith("step: stopped by Ada at 127.0.0.1, ")
         browser.until("document.querySelectorAll('#list tr').length === 2")
         (path,) = (tmp_path / "runs").glob("*_step.mcap")
         recording = read_recording(path)
@@ -101,14 +116,6 @@ def type_into(browser: Browser, id_: str, replaced: str) -> None:
         f"(e => {{ e.value = e.value.replace({replaced}); e.dispatchEvent(new Event('input')); }})"
         f"(document.getElementById('{id_}'))"
     )
-
-
-def violations(browser: Browser) -> list[Any]:
-    """What axe finds wrong with the page as it is now."""
-    axe = (resources.files("axe_core_python") / "axe.min.js").read_text("utf-8")
-    browser.value(f"{axe}; undefined")
-    found = browser.value("axe.run(document).then((found) => JSON.stringify(found.violations))")
-    return [(v["id"], v["help"], [n["html"][:120] for n in v["nodes"]]) for v in json.loads(found)]
 
 
 def test_a_run_tells_what_it_knows_while_it_goes_on(
@@ -142,7 +149,7 @@ def test_a_run_tells_what_it_knows_while_it_goes_on(
                 browser.colours(scheme)
                 assert violations(browser) == []
             browser.press("Escape")
-            browser.until("document.getElementById('now').textContent === 'No run.'")
+            browser.until(AT_ZERO)
         # What was measured until then stays, as of a run that is over.
         browser.until("document.getElementById('frf-about').textContent.startsWith('Last run')")
         service.kill()

@@ -6,6 +6,8 @@ Plan: what each answer holds against the file itself; uploads that are whole, da
 from __future__ import annotations
 
 import asyncio
+import os
+import socket
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,10 +16,11 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
-from index_kit import write_small
+from index_kit import lab, write_small
 from record_kit import CHANNELS, RATE, STOP, block, blocks, response, write_run
 from serve_kit import client, settings
 
+from samii_rig.index.entry import identity
 from samii_rig.index.remarks import read_remarks
 from samii_rig.record.reader import read_frequency_responses, read_recording
 from samii_rig.record.writer import RunWriter
@@ -154,7 +157,7 @@ def test_notes_and_tags_are_found_at_once(rooms: Rooms) -> None:
         found = ask(rooms, "GET", "/api/recordings", params=asked).json()
         assert [e["path"] for e in found["recordings"]] == ["b.mcap"]
     (note,) = read_remarks(rooms.index.folder / "b.mcap").notes
-    assert (note.author, note.text) == ("local", "<b>squeaks</b>")
+    assert (note.author, note.text) == ("somebody at 127.0.0.1", "<b>squeaks</b>")
     wrong = ask(rooms, "PUT", f"/api/recordings/{id_}/tags", json={"tags": ["../x"]})
     assert wrong.status_code == 422
 
@@ -212,3 +215,31 @@ def test_a_check_that_takes_too_much_memory_ends_in_a_line(
     answer = bring(rooms, content)
     assert answer.status_code == 400
     assert "could not be checked" in answer.json()["error"]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "socket"])
+def test_what_is_no_file_is_listed_as_such_and_never_read(tmp_path: Path, kind: str) -> None:
+    lab(tmp_path)
+    odd = tmp_path / "odd.mcap"
+    with socket.socket(socket.AF_UNIX) as there:
+        if kind == "pipe":
+            os.mkfifo(odd)
+        else:
+            there.bind(str(odd))
+        os.mkfifo(tmp_path / "c.mcap.remarks.json")
+        rooms = Rooms(settings(tmp_path))
+        found = ask(rooms, "GET", "/api/recordings").json()["recordings"]
+        assert {e["path"] for e in found} == {"a.mcap", "march/b.mcap", "c.mcap", "odd.mcap"}
+        problem = {e["path"]: e["problem"] for e in found}
+        assert kind in problem["odd.mcap"]
+        assert "pipe" in problem["c.mcap"]  # its remarks
+        # One that became such a thing since it was listed.
+        path = tmp_path / "a.mcap"
+        path.unlink()
+        os.mkfifo(path)
+        for name in ("a.mcap", "odd.mcap"):
+            for end in ("/file", "/frf", "/signals", "/report", ""):
+                answer = ask(rooms, "GET", f"/api/recordings/{identity(name)}{end}")
+                assert answer.status_code == 404
+                assert f"{name} is no file" in answer.json()["error"]
+        rooms.desk.close()

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from browser_kit import Browser
+from browser_kit import Browser, violations
 from record_kit import block, write_run
 from replay_kit import opened, replayed
 from serve_kit import Service, sweep
@@ -78,8 +78,14 @@ def test_a_run_that_begins_ends_a_replay(service: Service, browser: Browser) -> 
         browser.click("replay")
         browser.until("scope.channels.every((c) => c.name !== 'theta_2') && !scope.empty")
         assert browser.text("now").startswith("short: ")
+        # Nobody takes it for what is now, wherever they look.
+        assert browser.value("document.body.classList.contains('replaying')")
+        assert violations(browser) == []
+        assert browser.text("replay-name") == f"REPLAY of {GAPPED}: not live."
         browser.press("Escape")
-        browser.until("document.getElementById('now').textContent === 'No run.'")
+        browser.until("document.getElementById('now').textContent.includes('output is at zero')")
+        browser.click("replay-end")
+        assert not browser.value("document.body.classList.contains('replaying')")
 
 
 @pytest.mark.parametrize(

@@ -6,24 +6,27 @@ the service during a run, the runner.
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import socket
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
 from serve_kit import Service, sweep
 from wait_kit import WITHIN
 
+from samii_rig.errors import RecordingError
 from samii_rig.index.store import Index
 from samii_rig.record.reader import read_recording
 from samii_rig.record.verify import verify
 from samii_rig.rig.load import load_rig
 from samii_rig.run.experiments import shipped
+from samii_rig.serve import runner
 from samii_rig.serve.job import Job, JobState, Request
 from samii_rig.serve.supervisor import Supervisor
 
@@ -78,19 +81,21 @@ def test_a_lab_s_afternoon(service: Service) -> None:
 
         # By another, with nothing to show.
         answer = service.http.post("/api/stop", headers={"origin": "http://elsewhere"})
-        assert answer.json() == {"stopped": True}
+        assert answer.json()["stopped"] is True
         job = ended(service, first)
         assert job["status"] == "stopped"
-        assert job["reason"].startswith("stop asked by local")
+        assert job["reason"].startswith("stop asked by Ada at 127.0.0.1")
         recording = read_recording(recording_of(service, job))
         assert recording.values[-1, recording.column("v_2")] == 0.0
-        found = service.http.get("/api/recordings", params={"text": "stop asked by local"})
+        found = service.http.get(
+            "/api/recordings", params={"text": "stop asked by Ada at 127.0.0.1"}
+        )
         assert found.json()["recordings"][0]["path"] == job["recording"]
 
         # What was stopped is looked at by a person before anything moves again.
         state = service.state()
         assert state["running"] is None
-        assert "stop asked by local" in state["held"]
+        assert "stop asked by Ada at 127.0.0.1" in state["held"]
         assert [j["id"] for j in state["queue"]] == [second]
         refused = service.http.post("/api/runs", headers=lease, json={"experiment": "step"})
         assert refused.status_code == 409
@@ -163,7 +168,7 @@ def test_a_service_ends_without_a_word_whatever_is_asked_of_it(
 def test_a_stop_while_it_starts_keeps_anything_from_moving(service: Service) -> None:
     with service.lease() as lease:
         id_ = service.start(lease, LONG)
-        assert service.http.post("/api/stop").json() == {"stopped": True}
+        assert service.http.post("/api/stop").json()["stopped"] is True
         job = ended(service, id_)
         assert job["phase"] in ("refused", "died")
         assert "before " in job["error"] + job["reason"]
@@ -216,7 +221,7 @@ def test_an_operator_who_goes_silent_stops_the_run(service: Service) -> None:
         silent.set()
         job = ended(service, id_)
         assert job["status"] == "stopped"
-        found = service.http.get("/api/recordings", params={"text": "local gave no sign of life"})
+        found = service.http.get("/api/recordings", params={"text": "Ada gave no sign of life"})
         assert found.json()["recordings"][0]["path"] == job["recording"]
 
 
@@ -252,6 +257,49 @@ def test_only_an_end_by_the_order_itself_lets_the_queue_go_on(
             job.stop("somebody")
     supervisor.turn()
     assert bool(supervisor.held) is held
+
+
+def test_a_recording_that_cannot_be_closed_did_not_go_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The queue is held, though the rig had come to rest in good order."""
+
+    def full(self: runner.Runner, *_: object) -> None:
+        self._set(phase="analysing", status="completed", reason="done", at_zero=True)
+        raise RecordingError("no space left on device")
+
+    monkeypatch.setattr(runner, "planned", lambda job: (None, "", None))
+    monkeypatch.setattr(runner.Runner, "_carry_out", full)
+    job = Job.make(tmp_path / ".samii-rig" / "jobs", Request("short", "run.mcap"), "", "")
+    rig, text = load_rig("samii")
+    supervisor = Supervisor(rig, text, Index(tmp_path), 0.0)
+    supervisor.held = ""
+    with pytest.raises(RecordingError):
+        runner.Runner(job, tmp_path).go()
+    assert (job.written.phase, job.written.status) == ("refused", "failed")
+    assert job.written.at_zero is True
+    supervisor._open = [job]
+    supervisor.turn()
+    assert "run.mcap: failed" in supervisor.held
+
+
+def test_a_disk_without_room_for_the_word_of_the_end_still_takes_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = load_rig("samii")[1]
+    request = Request("short", "run.mcap", diagnosis=False, settings={"pace": 0.0})
+    job = Job.make(tmp_path / ".samii-rig" / "jobs", request, text, sweep(1.5, 1))
+    put = Job.set
+
+    def full(self: Job, state: JobState) -> None:
+        if state.phase == "analysing":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        put(self, state)
+
+    monkeypatch.setattr(Job, "set", full)
+    with suppress(OSError):  # said again when there is more to say
+        runner.Runner(job, tmp_path).go()
+    assert verify(tmp_path / "run.mcap").status == "whole"
 
 
 def test_a_runner_that_is_killed_leaves_what_it_recorded(service: Service) -> None:

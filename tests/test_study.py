@@ -129,7 +129,10 @@ def test_a_picture_has_a_column_a_mode_and_a_curve_for_each_second_value() -> No
         (["--vary", "joint.k=1:2:400", "--vary", "joint.c=1:2:400"], "at most 100,000"),
         (["--vary", "joint.k=1:2:2", "--vary", "joint.k=1:2:2"], "each parameter once"),
         (["--vary", "joint.k=1:2:2", "--band", "5", "1"], "the lower one first"),
-        (["--vary", "joint.k=1:2:2", "--out", "{}/none/study.csv"], "a folder that can be written"),
+        (
+            ["--vary", "joint.k=1:2:2", "--out", "{}/none/study.csv"],
+            "a name in a folder that exists",
+        ),
         (["--vary", "joint.k=1:2:2", "--plot", "{}/study.gif"], ".svg or .pdf"),
         (
             [*(f"--vary={x}=1:2:2" for x in ("joint.k", "joint.c", "link.m")), "--plot={}/s.png"],

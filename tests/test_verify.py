@@ -16,16 +16,18 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
-from record_kit import CHANNELS, RATE, block, blocks, write_run
+from record_kit import CHANNELS, RATE, STOP, block, blocks, write_run
 
 from samii_rig.errors import RecordingError
-from samii_rig.record import cdr, events, layout, response, scan
-from samii_rig.record.appender import Appender, build_chunk, message_chunk
+from samii_rig.record import cdr, contents, events, layout, response, scan
+from samii_rig.record.appender import Appender, Compression, build_chunk, message_chunk
 from samii_rig.record.contents import read_contents
+from samii_rig.record.layout import SampleLayout
 from samii_rig.record.reader import read_events, read_frequency_responses, read_recording
 from samii_rig.record.recover import recover
 from samii_rig.record.verify import verify
-from samii_rig.types import SampleBlock
+from samii_rig.record.writer import RunWriter
+from samii_rig.types import Channel, SampleBlock
 
 
 @pytest.fixture(scope="module")
@@ -85,10 +87,14 @@ def test_anything_added_or_missing_is_detected(tmp_path: Path, whole: bytes) -> 
 
 def test_what_holds_no_sample_is_nothing(tmp_path: Path, whole: bytes) -> None:
     path = tmp_path / "run.mcap"
-    for content in (b"", b"hello", whole[:8], whole[:400], bytes(10_000)):
+    for content in (b"", whole[:3], whole[:8], whole[:400]):
         path.write_bytes(content)
         verdict = verify(path)
         assert (verdict.status, verdict.exit_code) == ("nothing", 1)
+    for content in (b"hello", bytes(10_000)):
+        path.write_bytes(content)
+        verdict = verify(path)
+        assert (verdict.status, verdict.exit_code) == ("foreign", 2)
     with pytest.raises(RecordingError, match="not there"):
         verify(tmp_path / "missing.mcap")
     with pytest.raises(RecordingError, match="is a folder; expected a recording"):
@@ -342,3 +348,57 @@ def test_a_damaged_length_is_no_reason_to_give_up(tmp_path: Path) -> None:
     verdict = verify(path)
     assert verdict.chunks >= len(chunks) // 2
     assert not any("given up" in problem for problem in verdict.problems)
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd"])
+@pytest.mark.parametrize("rows", [True, False], ids=["samples", "zeros"])
+def test_what_a_file_costs_is_bounded_by_its_size(
+    tmp_path: Path, compression: Compression, rows: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A few chunks of 60 MB that pack to next to nothing, written a hundred times."""
+    path = tmp_path / "run.mcap"
+    with RunWriter(path, CHANNELS, RATE) as writer:
+        record = SampleLayout(CHANNELS, RATE).blank(50_000_000 // 70, 1)
+        raw = record.view(np.uint8).data if rows else bytes(50_000_000)
+        time, offset = np.zeros(1, np.uint64), np.zeros(1, np.uint64)
+        chunk = build_chunk(raw, 1, time, offset, compression)
+        for _ in range(100):
+            writer._put(lambda appender: appender.add_chunk(chunk))
+        writer.close(STOP)
+    work = [0]
+    unpack = scan.unpack
+
+    def counted(data: memoryview, head: scan.ChunkHead) -> bytes | memoryview:
+        work[0] += head.size
+        return unpack(data, head)
+
+    monkeypatch.setattr(scan, "unpack", counted)
+    bound = max(contents.SMALL, contents.EXPANSION_FLOOR * path.stat().st_size)
+    verdict = verify(path)
+    assert work[0] <= bound
+    assert verdict.exit_code in (1, 3)
+    assert any("what follows is not looked at" in problem for problem in verdict.problems)
+    work[0] = 0
+    with contextlib.suppress(RecordingError):
+        recover(path)
+    assert work[0] <= 2 * bound
+
+
+def test_a_run_in_which_nothing_changes_is_not_too_small_for_what_it_holds(tmp_path: Path) -> None:
+    """Of many channels that stand still: no recording packs better."""
+    channels = tuple(Channel(f"x_{i}", "V") for i in range(160))
+    n = 60_000
+    still = SampleBlock(
+        channels,
+        np.arange(n) * 2_000_000,
+        np.arange(n),
+        np.zeros((n, 160)),
+        np.zeros((n, 160), np.uint8),
+    )
+    path = tmp_path / "run.mcap"
+    with RunWriter(path, channels, RATE, compression="zstd") as writer:
+        writer.write(still)
+        writer.close(STOP)
+    assert SampleLayout(channels, RATE).record.itemsize * n > contents.SMALL
+    assert verify(path).status == "whole"
+    assert recover(path).exit_code == 0

@@ -1,31 +1,60 @@
 """The command line: `samii-rig COMMAND`. The commands are thin; the work is in the rooms."""
 
 import os
+import signal
 import sys
+import threading
 
 
 def main() -> None:
     """Entry point of `samii-rig`: errors of ours end in one line and their exit code."""
+    from samii_rig.run.interrupts import one_press_counts
+
+    # Only Python's main thread may handle signals.
+    handles = threading.current_thread() is threading.main_thread()
+    if handles:
+        one_press_counts()
+    try:
+        code = _command()
+    finally:
+        if handles:
+            # It is over: another press has nothing left to break but the way out.
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+    sys.exit(code)
+
+
+def _command() -> int:
+    """Carry out the command; its exit code."""
     from typer import Abort
     from typer.exceptions import TyperException
 
     from samii_rig.cli.app import app
-    from samii_rig.errors import SamiiRigError
+    from samii_rig.errors import DiskError, SamiiRigError
+    from samii_rig.files import DISK_ERRORS
 
     try:
-        sys.exit(app(prog_name="samii-rig", standalone_mode=False))
+        return int(app(prog_name="samii-rig", standalone_mode=False) or 0)
     except SamiiRigError as error:
         print(f"samii-rig: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        return error.exit_code
     except TyperException as error:
         print(_usage(error), file=sys.stderr)
-        sys.exit(2)
-    except Abort:
-        sys.exit(130)
+        return 2
+    except (Abort, KeyboardInterrupt):
+        return 130
+    except MemoryError:
+        print("samii-rig: there is no memory left", file=sys.stderr)
+        return 1
     except BrokenPipeError:
         # The reader of our output went away (`samii-rig ... | head`): not an error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(0)
+        return 0
+    except OSError as error:
+        if error.errno not in DISK_ERRORS:
+            raise  # a defect of ours: where a name is wrong, it was looked at before
+        name = f"{error.filename}: " if error.filename else ""
+        print(f"samii-rig: {name}{error.strerror}", file=sys.stderr)
+        return DiskError.exit_code
 
 
 def _usage(error: Exception) -> str:

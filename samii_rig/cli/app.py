@@ -14,6 +14,7 @@ from samii_rig.cli import (
     estimate,
     files,
     identify,
+    modes,
     papers,
     prove,
     record,
@@ -28,8 +29,9 @@ app = typer.Typer(
     "hold the model against them.",
     no_args_is_help=True,
     rich_markup_mode=None,
-    epilog="Exit codes: 0 done, 2 bad input, 3 a recording is damaged, 4 the plan would break a "
-    "limit, 5 the safety gate tripped, 6 the device failed, 130 stopped.",
+    epilog="Exit codes: 0 done, 1 a file holds nothing, 2 bad input, 3 a recording is damaged, "
+    "4 the plan would break a limit, 5 the safety gate tripped, 6 the device or the disk failed, "
+    "130 stopped.",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -52,8 +54,10 @@ def _options(
 
 app.command("run")(record.run)
 app.command("import")(files.import_)
+app.command("export")(files.export)
 app.command("frf")(estimate.frf)
 app.command("report")(estimate.report)
+app.command("modes")(modes.modes)
 app.command("identify")(identify.identify)
 app.command("diagnose")(diagnose.diagnose)
 app.command("study")(study.study)

@@ -24,6 +24,10 @@ def devices(rig: RigOption = "samii", json: JsonOption = False) -> None:
 
     Example: samii-rig devices --rig my_rig.toml
     """
+    from samii_rig.cli.arguments import check_rig
+
+    check_rig(rig)
+
     from samii_rig.errors import SamiiRigError
     from samii_rig.rig.load import load_rig
     from samii_rig.run.devices import drivers
@@ -81,9 +85,16 @@ def doctor(
 
     Example: samii-rig doctor --rig my_rig.toml --move
     """
+    from samii_rig.cli.arguments import check_rig
+
+    check_rig(rig)
+
+    from samii_rig.files import check_folder
     from samii_rig.rig.load import load_rig
     from samii_rig.run.doctor import examine
 
+    if move:
+        check_folder("--out", out)
     the_rig, text = load_rig(rig)
     checks = []
     for check in examine(the_rig, text, out, move=move):
@@ -112,22 +123,35 @@ def jog(
 ) -> None:
     """Bring the joint slowly to an angle, through the gate; recorded like a run.
 
+    Exit code 6 if it ends further from there than 2 % of the way.
+
     Example: samii-rig jog --to 0.05 --rig my_rig.toml
     """
+    from samii_rig.cli.arguments import check_rig
+
+    check_rig(rig)
+
+    from samii_rig.files import check_folder
     from samii_rig.rig.load import load_rig
     from samii_rig.run.session import jog as go
 
+    check_folder("--out", out)
     the_rig, text = load_rig(rig)
     move = go(the_rig, text, to, speed, out)
+    code = EXIT.get(move.stop.status, 1)
+    if code == 0 and not move.reached:
+        code = EXIT["failed"]
     if json:
-        say_json({**asdict(move), "recording": str(move.recording)})
+        say_json({**asdict(move), "reached": move.reached, "recording": str(move.recording)})
     else:
-        unit = move.unit
-        typer.echo(f"{move.stop.status}: {move.before:.4f} {unit} -> {move.after:.4f} {unit}")
-        if move.stop.status != "completed":
+        unit, status = move.unit, move.stop.status
+        ended = "NOT REACHED" if status == "completed" and not move.reached else status
+        way = f"{move.before:.4f} {unit} -> {move.after:.4f} {unit}"
+        typer.echo(f"{ended}: {way}; asked for {move.to:.4f} within {move.within:.2g} {unit}")
+        if status != "completed":
             typer.echo(move.stop.reason)
         typer.echo(f"recording  {move.recording}")
-    raise typer.Exit(EXIT.get(move.stop.status, 1))
+    raise typer.Exit(code)
 
 
 def calibrate(
@@ -151,10 +175,16 @@ def calibrate(
 
     Example: samii-rig calibrate a_0 --reads 9.81 --reads -9.81 --rig my_rig.toml --to new.toml
     """
+    from samii_rig.cli.arguments import check_rig
+
+    check_rig(rig)
+
     import numpy as np
 
     from samii_rig.cli.common import check_target
     from samii_rig.errors import InputError
+    from samii_rig.files import check_folder
+    from samii_rig.record.export import replacing
     from samii_rig.rig.load import load_rig
     from samii_rig.run import calibrate as c
     from samii_rig.run.session import column, listen, opened
@@ -162,6 +192,7 @@ def calibrate(
     check_target("--to", to, (".toml",), [Path(rig)])
     if to.exists():
         raise InputError("calibrate", "--to", str(to), "a new name")
+    check_folder("--out", out)
     the_rig, text = load_rig(rig)
     if sensor == "null":
         new_text, said = _null(the_rig, text, rig, seconds, out)
@@ -187,7 +218,8 @@ def calibrate(
             f"{old.counts_per_unit:.8g} -> {new.counts_per_unit:.8g}, "
             f"offset {old.offset} -> {new.offset}"
         )
-    to.write_text(new_text, encoding="utf-8")
+    with replacing(to) as part:
+        part.write_text(new_text, encoding="utf-8")
     typer.echo(said)
     typer.echo(f"written    {to}")
 
@@ -237,8 +269,12 @@ def clear_fault(
 
     Example: samii-rig clear-fault --rig my_rig.toml --name Ada --reason "hose replaced"
     """
+    from samii_rig.cli.arguments import check_rig
+
+    check_rig(rig)
+
     from samii_rig.rig.load import load_rig
-    from samii_rig.run.devices import open_device
+    from samii_rig.run.devices import close_device, open_device
     from samii_rig.run.latch import Latch
 
     the_rig, _ = load_rig(rig)
@@ -250,7 +286,7 @@ def clear_fault(
             with latch.held(device):
                 pass
         finally:
-            device.close()
+            close_device(device)
     cleared = latch.clear(name, reason)
     typer.echo(f"{the_rig.name}: cleared by {cleared.person}: {cleared.reason}")
     typer.echo(f"it was     {cleared.fault}")

@@ -14,6 +14,7 @@ from samii_rig.plain import plain
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from samii_rig.errors import InputError
     from samii_rig.report.compare import ModelCurve
     from samii_rig.rig.schema import Rig
     from samii_rig.types import FrequencyResponse, Recording
@@ -21,14 +22,14 @@ if TYPE_CHECKING:
 
 def rigs(incomplete: str) -> list[str]:
     """Names of shipped rigs, for a shell that completes; where none fits it takes files."""
-    from samii_rig.rig.load import shipped
+    from samii_rig.rig.shipped import shipped
 
     return [name for name in shipped() if name.startswith(incomplete)]
 
 
 def experiments(incomplete: str) -> list[str]:
     """Names of shipped experiments, likewise."""
-    from samii_rig.run.experiments import shipped
+    from samii_rig.run.catalogue import shipped
 
     return [name for name in shipped() if name.startswith(incomplete)]
 
@@ -51,8 +52,10 @@ SchedulerOption = Annotated[
 def check_target(
     option: str, path: Path, suffixes: Sequence[str], inputs: Sequence[Path] = ()
 ) -> None:
-    """InputError unless `path` ends in one of `suffixes` and is none of the `inputs`."""
+    """InputError unless `path` can be written, ends in one of `suffixes` and is none of the
+    `inputs`. To be asked before the work whose result goes there."""
     from samii_rig.errors import InputError
+    from samii_rig.files import check_file
 
     if path.suffix.lower() not in suffixes:
         *most, last = suffixes
@@ -60,6 +63,7 @@ def check_target(
         raise InputError(option, "", str(path), f"a name that ends in {named}")
     if any(path.exists() and i.exists() and path.samefile(i) for i in inputs):
         raise InputError(option, "", str(path), "another file than the recordings that are read")
+    check_file(option, path)
 
 
 def say_json(data: dict[str, Any]) -> None:
@@ -77,6 +81,14 @@ def rig_of(recordings: Sequence[Recording], option: str | None) -> tuple[Rig, st
         return load_rig(option)
     text = next((r.rig_toml for r in recordings if r.rig_toml), "")
     return (parse(Rig, text, "the recording's rig file"), text) if text else None
+
+
+def without_rig() -> InputError:
+    """What is said where a model is needed and nobody named one."""
+    from samii_rig.errors import InputError
+
+    none = "these recordings carry no rig file; expected one, by its name or path (docs/rig.md)"
+    return InputError.saying("--rig", "", none)
 
 
 def comparisons(

@@ -48,6 +48,10 @@ def control(
 
     Example: samii-rig control --rig samii --out control
     """
+    from samii_rig.cli.arguments import check_rig
+
+    check_rig(rig)
+
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -56,10 +60,11 @@ def control(
     from samii_rig.control.pictures import write_pictures
     from samii_rig.control.result import lines, plain, rig_text, step_line
     from samii_rig.control.settle import settling
-    from samii_rig.errors import InputError
+    from samii_rig.files import check_folder, make_folder
     from samii_rig.record.reader import read_recording
     from samii_rig.rig.load import load_rig
 
+    check_folder("--out", out)
     the_rig, text = load_rig(rig)
     known = None
     if identified is not None and identified.suffix == ".toml":
@@ -69,11 +74,7 @@ def control(
         the_rig, text, known = found.rig, found.text, found.known
     judged = any(f.actuator == the_rig.actuator[0].name for f in the_rig.feedback)
     recordings = [read_recording(path) for path in steps or ()]
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        expected = f"a folder that can be made ({error.strerror})"
-        raise InputError("samii-rig control", "--out", str(out), expected) from error
+    make_folder("--out", out)
     console = Console(highlight=False, soft_wrap=True)
     columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True, disable=json) as bar:

@@ -14,8 +14,10 @@ from samii_rig.cli.common import (
     WorkersOption,
     rig_of,
     say_json,
+    without_rig,
 )
 from samii_rig.cli.estimate import (
+    GAPS,
     BandOption,
     GapsOption,
     OutputOption,
@@ -64,10 +66,21 @@ def diagnose(
 
     Example: samii-rig diagnose runs/*.mcap --rig samii --out diagnosis
     """
+    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+
+    check_rig(rig)
+    check_choice("--gaps", gaps, GAPS)
+    if not each:
+        check_logs(logs)
+
     from dataclasses import replace
 
     from rich.console import Console
 
+    from samii_rig.files import check_folder, make_folder
+
+    if out is not None:
+        check_folder("--out", out)
     if each:
         from samii_rig.diagnose.batch import How
         from samii_rig.rig.load import load_rig
@@ -80,7 +93,7 @@ def diagnose(
             band,
         )
         if out is not None:
-            _made(out)
+            make_folder("--out", out)
         with at_work(workers, scheduler) as executor:
             said = _each(logs, how, out, executor, Console(highlight=False, stderr=json))
         if json:
@@ -88,13 +101,12 @@ def diagnose(
         return
 
     from samii_rig.diagnose.diagnose import diagnose as found_by
-    from samii_rig.errors import InputError
     from samii_rig.report.summary import working
 
     recordings = read_all(logs)
     held = rig_of(recordings, rig)
     if held is None:
-        raise InputError("--rig", "", None, "a rig: these recordings carry none")
+        raise without_rig()
     console = Console(highlight=False)
     with working(console, "diagnosis", quiet=json) as say:
         say("frequency responses")
@@ -108,7 +120,7 @@ def diagnose(
         )
     own = all(r.rig_toml in ("", held[1]) for r in recordings)
     if own:
-        _keep(logs, {**found.plain(), "lines": list(found.lines())})
+        keep_diagnosis(logs, found)
     page = None
     if out is not None:
         from samii_rig.report.diagnosis import write_diagnosis
@@ -135,6 +147,11 @@ def diagnose(
         console.print("not kept with the recordings: they carry another rig file", soft_wrap=True)
 
 
+def keep_diagnosis(logs: list[Path], found: Diagnosis) -> None:
+    """Keep a diagnosis with its recordings, or say why that does not go."""
+    _keep(logs, {**found.plain(), "lines": list(found.lines())})
+
+
 def _keep(logs: list[Path], found: dict[str, Any]) -> None:
     """What was found, beside each recording, where `samii-rig recordings` finds it again."""
     from samii_rig.errors import RecordingError
@@ -146,16 +163,6 @@ def _keep(logs: list[Path], found: dict[str, Any]) -> None:
         except RecordingError as error:
             # A folder that only lets itself be read is no reason to diagnose nothing.
             typer.echo(f"samii-rig: the diagnosis is not kept: {error}", err=True)
-
-
-def _made(folder: Path) -> None:
-    """Make the folder of --out; InputError where that is not possible."""
-    from samii_rig.errors import InputError
-
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError("--out", "", str(folder), f"a folder to write to ({error})") from error
 
 
 def _each(
@@ -193,8 +200,9 @@ def _write(folder: Path, found: Diagnosis) -> str:
 
     from samii_rig.diagnose.rigfile import toml
     from samii_rig.errors import InputError
+    from samii_rig.files import make_folder
 
-    _made(folder)
+    make_folder("--out", folder)
     try:
         path = ""
         if found.rig is not None and found.causes:

@@ -17,6 +17,7 @@ from samii_rig.cli.common import (
     rig_of,
     rigs,
     say_json,
+    without_rig,
 )
 from samii_rig.errors import EstimateError, InputError
 
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from samii_rig.signal.gather import Gaps
     from samii_rig.types import FrequencyResponse, Recording
 
+# The words of `samii_rig.signal`, which takes a second to import; a test holds them to it.
+METHODS = ("auto", "burst", "periodic", "local", "h1", "h2", "hv")
+GAPS = ("refuse", "exclude", "model")
 ALL = (0.0, float("inf"))  # Hz: every line that was estimated
 
 RigOverride = Annotated[
@@ -63,8 +67,8 @@ def frf(
     export: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Write a .csv, .npz, .mat or .uff file, one a level, replaced if it exists. "
-            "May be repeated."
+            help="Write a .csv, .npz, .mat or .uff file, replaced if it exists; of several levels "
+            "one each, as NAME_0.5_V.csv. May be repeated."
         ),
     ] = None,
     save: Annotated[
@@ -79,11 +83,19 @@ def frf(
 
     Example: samii-rig frf runs/*.mcap --export frf.csv --save frf.mcap
     """
+    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+
+    check_rig(rig)
+    check_logs(logs)
+    check_choice("--method", method, METHODS)
+    check_choice("--gaps", gaps, GAPS)
+
     from rich.console import Console
 
     from samii_rig.record.derived import save_frequency_responses
     from samii_rig.record.export import export_response
     from samii_rig.report.compare import model_curve
+    from samii_rig.report.facts import names
     from samii_rig.report.summary import summary
 
     for path in export or ():
@@ -99,8 +111,8 @@ def frf(
     curve = model_curve(held[0], responses) if held else None
     written = []
     for path in export or ():
-        names = _one_a_level(path, responses)
-        written += [export_response(n, r) for n, r in zip(names, responses, strict=True)]
+        targets = _one_a_level(path, responses)
+        written += [export_response(t, r) for t, r in zip(targets, responses, strict=True)]
     if save:
         save_frequency_responses(save, responses, logs)
         written.append(save)
@@ -114,8 +126,8 @@ def frf(
         )
         return
     console.print(summary(recordings, responses, curve, band or ALL))
-    for r in responses:
-        console.print(f"\n{r.level:g} {r.level_unit}: {r.method}. {r.why}")
+    for r, name in zip(responses, names(responses), strict=True):
+        console.print(f"\n{name}: {r.method}. {r.why}")
     for path in written:
         console.print(f"written  {path}", soft_wrap=True)
 
@@ -153,11 +165,19 @@ def report(
 
     Example: samii-rig report runs/*.mcap --out report.html --figure bode.svg
     """
+    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+
+    check_rig(rig)
+    check_logs(logs)
+    check_choice("--method", method, METHODS)
+    check_choice("--gaps", gaps, GAPS)
+
     from rich.console import Console
 
     from samii_rig.record.reader import read_events
     from samii_rig.report.compare import model_curve
     from samii_rig.report.figures import bode_figure, save_figure
+    from samii_rig.report.modes import modes_of_all
     from samii_rig.report.page import write_report
     from samii_rig.report.summary import summary, working
 
@@ -175,9 +195,10 @@ def report(
         from samii_rig.diagnose.diagnose import diagnose
 
         if held is None:
-            raise InputError("--rig", "", None, "a rig: these recordings carry none")
+            raise without_rig()
         with working(console, "diagnosis", quiet=json) as say:
             found = diagnose(responses, held[0], band=band, progress=say, runs=recordings)
+    modes = modes_of_all(responses, held[0] if held else None)
     written = []
     if page is not None:
         write_report(
@@ -189,6 +210,7 @@ def report(
             band_hz=band or ALL,
             events=[event for path in logs for event in read_events(path)],
             diagnosis=found,
+            modes=modes,
         )
         written.append(page)
     for path in figure or ():
@@ -196,7 +218,7 @@ def report(
     if json:
         say_json({"written": written, "model_over_measurement": comparisons(responses, curve)})
         return
-    console.print(summary(recordings, responses, curve, band or ALL))
+    console.print(summary(recordings, responses, curve, band or ALL, modes))
     for path in written:
         console.print(f"written  {path}", soft_wrap=True)
 
@@ -234,10 +256,10 @@ def estimated(
 
 
 def _one_a_level(path: Path, responses: Sequence[FrequencyResponse]) -> list[Path]:
-    """The path itself for one response, else one name each that tells the level."""
+    """The path itself for one response, else one name each that tells which it is."""
+    from samii_rig.report.facts import names
+
     if len(responses) == 1:
         return [path]
-    names = [f"{path.stem}_{r.level:g}" for r in responses]
-    if len(set(names)) < len(names):
-        names = [f"{name}_{i + 1}" for i, name in enumerate(names)]
-    return [path.with_name(name + path.suffix) for name in names]
+    words = (re.sub(r"[^\w.+-]+", "_", name).strip("_") for name in names(responses))
+    return [path.with_name(f"{path.stem}_{word}{path.suffix}") for word in words]

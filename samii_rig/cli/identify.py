@@ -6,8 +6,9 @@ from typing import Annotated
 
 import typer
 
-from samii_rig.cli.common import JsonOption, Logs, rig_of, say_json
+from samii_rig.cli.common import JsonOption, Logs, rig_of, say_json, without_rig
 from samii_rig.cli.estimate import (
+    GAPS,
     BandOption,
     GapsOption,
     RigOverride,
@@ -50,6 +51,13 @@ def identify(
 
     Example: samii-rig identify runs/*.mcap --free joint_1.k --free joint_2.k
     """
+    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+
+    check_choice("--method", method, ("likelihood", "1", "2"))
+    check_rig(rig)
+    check_logs(logs)
+    check_choice("--gaps", gaps, GAPS)
+
     from typing import cast
 
     from rich.console import Console
@@ -61,14 +69,12 @@ def identify(
     from samii_rig.identify.table import method_table, summary_table
     from samii_rig.report.summary import working
 
-    if method not in ("likelihood", "1", "2"):
-        raise InputError("--method", "", method, "likelihood, 1 or 2")
     if method != "likelihood" and not free:
         raise InputError("--free", "", None, "what to identify, for example --free joint_1.k")
     recordings = read_all(logs)
     held = rig_of(recordings, rig)
     if held is None:
-        raise InputError("--rig", "", None, "a rig: these recordings carry none")
+        raise without_rig()
     console = Console(highlight=False)
     if method != "likelihood":
         responses = estimated(recordings, None, None, "auto", gaps, band)

@@ -43,10 +43,12 @@ def papers(
     from rich.console import Console
 
     from samii_rig.errors import InputError
+    from samii_rig.files import check_file, make_folder
     from samii_rig.papers.catalogue import entries
+
+    chosen = entries(ids or [])  # a wrong name is said before the plots are imported
     from samii_rig.report.figures import SUFFIXES
 
-    chosen = entries(ids or [])
     if f".{format_}" not in SUFFIXES:
         expected = f"one of {', '.join(s[1:] for s in SUFFIXES)}"
         raise InputError("samii-rig papers", "--format", format_, expected)
@@ -60,11 +62,9 @@ def papers(
             console.print(f"{e.id:14} {e.where}: {e.title}", soft_wrap=True)
         return
     if out is not None:
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            expected = f"a folder that can be made ({error.strerror})"
-            raise InputError("samii-rig papers", "--out", str(out), expected) from error
+        make_folder("--out", out)
+    if page is not None:
+        check_file("--page", page)
     done: dict[str, Result] = {}
     plain: list[dict[str, Any]] = []
     for number, entry in enumerate(chosen, 1):

@@ -51,15 +51,23 @@ def prove(
 
     Example: samii-rig prove --nothing 6 --one 28 --two 4 --outside 3 --out proof
     """
+    from samii_rig.cli.arguments import check_rig
+
+    check_rig(rig)
+
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
+    from samii_rig.files import check_file, check_folder
     from samii_rig.prove import campaign as trials
     from samii_rig.prove.page import write_page
     from samii_rig.prove.score import scores
     from samii_rig.rig.load import load_rig
     from samii_rig.workers import workers as at_work
 
+    check_folder("--out", out)
+    if calibrate is not None:
+        check_file("--calibrate", calibrate)
     console = Console(highlight=False)
     _, text = load_rig(rig)
     campaign = trials.Campaign(out.resolve(), text, keep=keep)

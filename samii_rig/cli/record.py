@@ -23,10 +23,13 @@ from samii_rig.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import Console
 
     from samii_rig.diagnose.result import Diagnosis
     from samii_rig.report.compare import ModelCurve
+    from samii_rig.report.modes import Modes
     from samii_rig.run.campaign import Outcome
     from samii_rig.run.dryrun import DryRun
     from samii_rig.run.protocols import Plan
@@ -85,25 +88,34 @@ def run(
 
     Example: samii-rig run swept_sine --rig samii
     """
+    from samii_rig.cli.arguments import check_experiment, check_rig
+
+    check_rig(rig)
+    check_experiment(experiment)
+
     from rich.console import Console
 
     from samii_rig.errors import EstimateError, InputError
+    from samii_rig.files import check_folder, make_folder
     from samii_rig.report.summary import show_dry_run, working
     from samii_rig.rig.load import load_rig
     from samii_rig.run.dryrun import predict
-    from samii_rig.run.experiments import load_experiment
-    from samii_rig.run.setups import Concludes, setups_of
+    from samii_rig.run.experiments import load_experiment, plan_of
+    from samii_rig.run.setups import Concludes, conclusion_of, setups_of
+    from samii_rig.run.space import room_for
 
     console = Console(highlight=False)
     if out is not None and out.suffix != ".mcap":
         raise InputError("samii-rig run", "--out", str(out), "a name that ends in .mcap")
+    if not describe:
+        check_folder("--out", out.parent if out else Path("runs"))
     the_rig, rig_text = load_rig(rig)
     the_experiment, experiment_text = load_experiment(experiment, the_rig)
     if describe:
         _describe(the_experiment, experiment_text)
         return
     setups = setups_of(the_experiment, the_rig, rig_text)
-    plans = [the_experiment.plan(s.rig) for s in setups]
+    plans = [plan_of(the_experiment, s.rig) for s in setups]
     with working(console, "predicting the run", quiet=json):
         predicted = [predict(p, s.rig) for p, s in zip(plans, setups, strict=True)]
     if not json:
@@ -119,16 +131,13 @@ def run(
         say_json({"status": "predicted", "dry_runs": [_prediction(p) for p in predicted]})
     for p in predicted:
         p.refuse()
-    if dry_run:
-        return
     slug = re.sub(r"[^a-z0-9]+", "_", the_rig.name.lower()).strip("_")
     name = plans[0].experiment
     path = out or Path("runs") / f"{datetime.now():%Y-%m-%dT%H-%M-%S}_{slug}_{name}.mcap"
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        expected = f"a folder that can be made ({error.strerror})"
-        raise InputError("samii-rig run", "--out", str(path.parent), expected) from error
+    room_for(path, plans, [s.rig for s in setups])
+    if dry_run:
+        return
+    make_folder("--out", path.parent)
     done: list[_Done] = []
     for i, (setup, plan) in enumerate(zip(setups, plans, strict=True)):
         if setup.instruction:
@@ -156,6 +165,7 @@ def run(
             break
     lines: tuple[str, ...] = ()
     written: tuple[Path, ...] = ()
+    defect = 0  # of the experiment itself, which the recordings do not suffer from
     last = done[-1].outcome.stop.status
     if last == "completed" and len(done) < len(setups):
         # A signal came while the last run was estimated or diagnosed: nothing moves any more.
@@ -163,10 +173,12 @@ def run(
     if last == "completed" and isinstance(the_experiment, Concludes):
         outcomes = [d.outcome for d in done]
         try:
-            found = the_experiment.conclude([s.rig for s in setups], outcomes, path.with_suffix(""))
+            rigs = [s.rig for s in setups]
+            found = conclusion_of(the_experiment, rigs, outcomes, path.with_suffix(""))
             lines, written = found.lines, found.written
-        except EstimateError as error:
+        except (EstimateError, InputError) as error:
             lines = (f"no conclusion: {error}",)
+            defect = error.exit_code if isinstance(error, InputError) else 0
     if json:
         runs = [d.as_json() for d in done]
         concluded = {"conclusion": lines, "written": written} if lines else {}
@@ -178,7 +190,7 @@ def run(
             console.print(line, soft_wrap=True)
         for file in written:
             console.print(f"written    {file}", soft_wrap=True)
-    raise typer.Exit(EXIT.get(last, 1))
+    raise typer.Exit(EXIT.get(last, 1) or defect)
 
 
 def _describe(experiment: object, text: str) -> None:
@@ -243,14 +255,18 @@ def _carry_out(
     json: bool,
 ) -> _Done:
     """One run with its page, and its summary on the console."""
-    from samii_rig.index.remarks import set_diagnosis
+    from samii_rig.cli.diagnose import keep_diagnosis
     from samii_rig.report.compare import model_curve
+    from samii_rig.report.modes import modes_of_all
     from samii_rig.report.summary import LiveProgress, summary
     from samii_rig.run.campaign import carry_out
     from samii_rig.run.heartbeat import Pipe
     from samii_rig.run.pace import LoopSettings
 
-    live = LiveProgress(console, plan.duration)
+    device = setup.rig.device
+    # Simulated time runs as fast as the processor can, unless it is told a pace.
+    own_time = device.driver == "simulated" and not device.settings.get("pace")
+    live = LiveProgress(console, plan.duration, "rig time" if own_time else "")
     with nullcontext() if json else live:
         outcome = carry_out(
             setup.rig,
@@ -268,24 +284,12 @@ def _carry_out(
     curve = model_curve(setup.rig, outcome.responses)
     found = _diagnosed(setup, outcome, console, json=json) if diagnosis else None
     if found:
-        set_diagnosis(path, {**found.plain(), "lines": list(found.lines())})
-    page = None
-    if report:
-        from samii_rig.record.reader import read_events
-        from samii_rig.report.page import write_report
-
-        page = write_report(
-            path.with_suffix(".html"),
-            outcome.recording,
-            outcome.responses,
-            rig=setup.rig,
-            model=curve,
-            events=read_events(path),
-            diagnosis=found,
-        )
+        keep_diagnosis([path], found)
+    modes = modes_of_all(outcome.responses, setup.rig) if report or not json else ()
+    page = _page(setup, outcome, curve, found, modes) if report else None
     if not json:
         console.print()
-        console.print(summary([outcome.recording], outcome.responses, curve))
+        console.print(summary([outcome.recording], outcome.responses, curve, modes=modes))
         if outcome.trouble:
             console.print(f"\nno frequency response: {outcome.trouble}")
         if found:
@@ -296,6 +300,35 @@ def _carry_out(
         if page:
             console.print(f"report     {page}", soft_wrap=True)
     return _Done(outcome, predicted, curve, page, found)
+
+
+def _page(
+    setup: Setup,
+    outcome: Outcome,
+    curve: ModelCurve | None,
+    found: Diagnosis | None,
+    modes: Sequence[Modes],
+) -> Path | None:
+    """The run's page, beside its recording; None where it cannot be written, which is said."""
+    from samii_rig.errors import InputError
+    from samii_rig.record.reader import read_events
+    from samii_rig.report.page import write_report
+
+    try:
+        return write_report(
+            outcome.path.with_suffix(".html"),
+            outcome.recording,
+            outcome.responses,
+            rig=setup.rig,
+            model=curve,
+            events=read_events(outcome.path),
+            diagnosis=found,
+            modes=modes,
+        )
+    except (InputError, OSError) as error:
+        # The run is over and its recording whole: what is known of it is still to be told.
+        typer.echo(f"samii-rig: no page: {error}; samii-rig report makes it", err=True)
+        return None
 
 
 def _diagnosed(setup: Setup, outcome: Outcome, console: Console, *, json: bool) -> Diagnosis | None:

@@ -24,7 +24,7 @@ def recordings(
     """Find recordings in a folder, newest first.
 
     The index of the folder, .samii-rig/index.sqlite, is brought up to date first; it can be
-    deleted at any time.
+    deleted at any time. Every new recording is read once: one whose bytes changed is `damaged`.
 
     Example: samii-rig recordings runs --experiment swept_sine --since 2026-11-01
     """
@@ -32,22 +32,21 @@ def recordings(
 
     from rich.console import Console
 
-    from samii_rig.index.store import Index
+    from samii_rig.index.store import index_for_reading
 
     query.where()  # a wrong time is said before a large folder is read
     query.page()
-    index = Index(folder)
     console = Console(highlight=False, stderr=json)
-    with console.status("index ...") as shown:
+    with console.status("index ...") as shown, index_for_reading(folder) as index:
         index.refresh(lambda done, of: shown.update(f"index: {done:,} of {of:,} recordings ..."))
-    found = index.search(query)
+        found = index.search(query)
     if json:
         say_json({"total": found.total, "recordings": [asdict(e) for e in found.entries]})
         return
     for entry in found.entries:
         console.print(_line(entry), soft_wrap=True)
     shown_of = "" if len(found.entries) == found.total else f"{len(found.entries)} of "
-    console.print(f"{shown_of}{found.total:,} recordings")
+    console.print(f"{shown_of}{found.total:,} recording{'' if found.total == 1 else 's'}")
 
 
 def _line(e: Entry) -> str:
@@ -77,6 +76,10 @@ def replay(
 
     Example: samii-rig replay runs/2026-11-22_samii_swept_sine.mcap --check
     """
+    from samii_rig.cli.arguments import check_logs
+
+    check_logs([log])
+
     from samii_rig.cli.common import response_json
     from samii_rig.run.repeat import repeat
 

@@ -21,6 +21,12 @@ def serve(
         str, typer.Option(help="Address to listen at; beyond this machine it wants TLS and tokens.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(help="Port to listen at; 0 for any that is free.")] = 8340,
+    stop_port: Annotated[
+        int | None,
+        typer.Option(
+            help="Port of the stop's own listener; 0 for any [default: the one after --port]"
+        ),
+    ] = None,
     tls_cert: Annotated[
         Path | None, typer.Option("--tls-cert", help="Certificate chain (PEM).")
     ] = None,
@@ -33,6 +39,12 @@ def serve(
     name: Annotated[
         list[str] | None,
         typer.Option(help="Name by which browsers call it, as through a proxy. May be repeated."),
+    ] = None,
+    proxy: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Address of a proxy whose X-Forwarded-For says who asks. May be repeated."
+        ),
     ] = None,
     pace: Annotated[
         float,
@@ -104,5 +116,7 @@ def serve(
             pace=pace,
             foxglove=foxglove,
             foxglove_open=foxglove_open,
+            stop_port=stop_port,
+            proxies=frozenset(proxy or ()),
         )
     )

@@ -44,6 +44,10 @@ def study(
 
     Example: samii-rig study --rig samii --vary joint_1.k=6800:27200:21:log --plot study.png
     """
+    from samii_rig.cli.arguments import check_rig
+
+    check_rig(rig)
+
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 

@@ -14,10 +14,10 @@ from samii_rig.diagnose.explanations import Explanation
 from samii_rig.diagnose.judge import MOST_NAMES, Judgement
 from samii_rig.diagnose.measured import Measured
 from samii_rig.diagnose.refit import Fitted
-from samii_rig.diagnose.result import Band, Cause, Gap, Value
+from samii_rig.diagnose.result import Band, Cause, Gap, Moved, Value
 from samii_rig.diagnose.search import Search
 from samii_rig.signal.statistics import octaves
-from samii_rig.types import Complex
+from samii_rig.types import Complex, Float
 
 DRAWS = 1000
 SHOWN = 0.01  # probability of an alternative from which it is listed
@@ -86,6 +86,18 @@ def _values(explanation: Explanation, inflation: float) -> list[dict[str, Value]
         at += n
         out.append(found)
     return out
+
+
+def moved(fitted: Fitted) -> tuple[Moved, ...]:
+    """Nominal parameters that are off by more than their tolerance, the farthest first."""
+    n = fitted.model.n_nominal
+    away = fitted.x[:n] / fitted.model.prior[:n]
+    out = [
+        Moved(".".join(key), float(a))
+        for key, a in zip(fitted.model.keys, away, strict=True)
+        if abs(a) > 1
+    ]
+    return tuple(sorted(out, key=lambda m: -abs(m.sigmas)))
 
 
 def told(judged: Judgement) -> list[str]:
@@ -164,13 +176,15 @@ def bands(search: Search, fitted: Fitted) -> tuple[Band, ...]:
 def gap(show: Measured, before: Complex, after: Complex) -> Gap:
     """How far the way from the refitted nominal model to the noise was gone, on `show`. before,
     after : (n, q) what the models without and with the causes predict there."""
-    a, b = show.per_dof(before), show.per_dof(after)
-    chi_before, chi_after = show.chi_square(before), show.chi_square(after)
-    rng = np.random.default_rng(1)
-    rows = rng.integers(0, show.n, (DRAWS, show.n))
-    floor = show.expected
-    num = (chi_before - chi_after)[rows].sum(axis=1)
-    den = (chi_before - floor)[rows].sum(axis=1)
+    return gap_of(show.chi_square(before), show.chi_square(after), show.expected)
+
+
+def gap_of(before: Float, after: Float, floor: Float) -> Gap:
+    """The same of chi-square (n,) line by line, `floor` (n,) where there is noise alone."""
+    a, b = (float(np.sum(x) / np.sum(floor)) for x in (before, after))
+    rows = np.random.default_rng(1).integers(0, before.size, (DRAWS, before.size))
+    num = (before - after)[rows].sum(axis=1)
+    den = (before - floor)[rows].sum(axis=1)
     # Where nothing is left to be closed, only the sign of the change says anything.
     value = (a - b) / (a - 1) if a > 1 else min(a - b, 0.0)
     drawn = num / np.where(np.abs(den) > 0, np.abs(den), np.inf)

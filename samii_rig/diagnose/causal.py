@@ -39,35 +39,43 @@ class CausalChain:
 
     def response(self, frequency_hz: Float) -> Complex:
         """As of `Chain`."""
+        return self.evaluate(np.asarray(2j * np.pi * frequency_hz, np.complex128))
+
+    def evaluate(self, s: Complex) -> Complex:
+        """As of `Chain`."""
         out: Complex | None = None
-        for _, chain, on, weight in self._nodes(frequency_hz):
-            H = chain.response(frequency_hz[on])
+        for _, chain, on, weight in self._nodes(s):
+            H = chain.evaluate(s[on])
             if out is None:
-                out = np.zeros((frequency_hz.size, *H.shape[1:]), complex)
+                out = np.zeros((s.size, *H.shape[1:]), complex)
             out[on] += weight[:, None, None] * H
         assert out is not None
         return out
 
     def gradient(self, frequency_hz: Float, wrt: Sequence[Key]) -> tuple[Complex, Complex]:
         """As of `Chain`."""
+        return self.gradient_at(np.asarray(2j * np.pi * frequency_hz, np.complex128), wrt)
+
+    def gradient_at(self, s: Complex, wrt: Sequence[Key]) -> tuple[Complex, Complex]:
+        """As of `Chain`."""
         keys = list(wrt)
         given = self.plain.values()
         stiff = [(b, s) for b in self._beams for s in STIFFNESS if (b, s) in self._at]
         every = (*keys, *(k for k in stiff if k not in keys))
         out: tuple[Complex, Complex] | None = None
-        for log, chain, on, weight in self._nodes(frequency_hz):
-            H, dH = chain.gradient(frequency_hz[on], every)
-            for b, s in stiff:
-                i = every.index((b, s))
+        for log, chain, on, weight in self._nodes(s):
+            H, dH = chain.gradient_at(s[on], every)
+            for b, name in stiff:
+                i = every.index((b, name))
                 ratio = math.exp(RISE * given[self._at[b, "eta"]] * log)
                 slope = dH[:, :, :, i] * ratio
                 dH[:, :, :, i] = slope
                 if (b, "eta") in keys:
                     dH[:, :, :, keys.index((b, "eta"))] += (
-                        slope * given[self._at[b, s]] * RISE * log
+                        slope * given[self._at[b, name]] * RISE * log
                     )
             if out is None:
-                n = frequency_hz.size
+                n = s.size
                 shape = dH.shape[1:3]
                 out = np.zeros((n, *shape), complex), np.zeros((n, *shape, len(keys)), complex)
             out[0][on] += weight[:, None, None] * H
@@ -75,9 +83,9 @@ class CausalChain:
         assert out is not None
         return out
 
-    def _nodes(self, f: Float) -> Iterator[tuple[float, Chain, Int, Float]]:
+    def _nodes(self, s: Complex) -> Iterator[tuple[float, Chain, Int, Float]]:
         """Of each node ln(f/middle), the chain, the frequencies it counts at and how much."""
-        log = np.log(f / self._middle)
+        log = np.log(np.abs(s) / (2 * math.pi * self._middle))
         low, high = float(np.min(log)), float(np.max(log))
         nodes = np.linspace(low, high, max(2, math.ceil((high - low) / SPACING) + 1))
         step = max(nodes[1] - nodes[0], 1e-12)

@@ -91,7 +91,7 @@ class Class:
 def distance(a: Explanation, b: Explanation, problem: Problem) -> float:
     """How far b, refitted, stays from what a predicts on the lines of `problem`, noise units."""
     predicted = a.fitted.model.response(a.fitted.x, problem.at)
-    there = Problem(replace(problem.data, H=predicted), problem.root, problem.at)
+    there = problem.toward(predicted)
     try:
         end = refit(b.fitted.model, there, b.fitted.x, far=False, steps=12)
     except (SamiiRigError, np.linalg.LinAlgError):

@@ -19,6 +19,7 @@ from samii_rig.diagnose.model import Grid, Model, grid
 from samii_rig.diagnose.nonlinear_model import model_of
 from samii_rig.diagnose.ranking import moved
 from samii_rig.diagnose.refit import STEPS, Fitted, Problem, refit
+from samii_rig.diagnose.stated import IN_DATA
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Float
@@ -122,11 +123,21 @@ class Explanations:
         for key, e in self.found.items():
             self.found[key] = replace(e, weight=self.weigh(e.effects, e.fitted))
 
+    @property
+    def worth(self) -> float:
+        """Chi-square that an effect must explain of the data to be called missing."""
+        return IN_DATA
+
+    @property
+    def spread(self) -> float:
+        """Relative variance of chi-square over all lines."""
+        return self.lines.spread
+
     def leftover(self, fitted: Fitted) -> float:
         """Chi-square per degree of freedom times the bins over which what is left is alike; 1
         where noise would leave as much."""
         left = self.ratio(fitted)
-        if left <= 1 + FIVE * math.sqrt(self.lines.spread):
+        if left <= 1 + FIVE * math.sqrt(self.spread):
             return 1.0
         h = fitted.model.response(fitted.x, self.problem.at)
         r = (self.problem.root @ (h - self.problem.data.H)[:, :, None])[:, :, 0]

@@ -28,6 +28,7 @@ FEW_REPEATS = 3
 SAID_PER_KIND = 3  # findings of one kind that are told; the rest is counted
 
 
+OF_LINES = ("leakage", "dof")  # kinds of findings that whole records do not know
 NO_REPEATS = (
     "nothing was repeated: the noise is guessed from neighbouring lines, and what local models "
     "leave of a transient may look like physics; three repeats would show it"
@@ -37,14 +38,21 @@ NO_REPEATS = (
 @dataclass(frozen=True, slots=True)
 class Sound:
     """responses : as they may be trusted. told : what was found, in words; lacks : what these
-    recordings cannot tell, in words. doubt : why nothing may be named, or None.
-    units : channels whose unit was mended."""
+    recordings cannot tell, in words. doubt : why nothing may be named, or None; guessed : the same
+    of responses line by line, whole records have it not.
+    units : channels whose unit was mended. mended : whether anything was, in the responses.
+    of_lines : of `told`, what concerns responses alone. spoilt : whether segments were left out for
+    what their samples are."""
 
     responses: tuple[FrequencyResponse, ...]
     told: tuple[str, ...]
     lacks: tuple[str, ...]
     doubt: Doubt | None
     units: frozenset[str]
+    mended: bool = False
+    guessed: Doubt | None = None
+    of_lines: frozenset[str] = frozenset()
+    spoilt: bool = False
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics: 9.81 is not 9.80665."""
@@ -83,16 +91,35 @@ def sound(
     finite, said = _finite(responses)
     mended, wiring, units = wired(finite, rig)
     steady, changed = _steady(mended)
-    if doubt is None and not any(repeated(r) for r in steady):
-        doubt = Doubt(NO_REPEATS, "repeat each run three times, each from rest", "ambiguous")
+    guessed = None
+    if not any(repeated(r) for r in steady):
+        guessed = Doubt(NO_REPEATS, "repeat each run three times, each from rest", "ambiguous")
     return Sound(
-        tuple(steady), tuple(told + said + wiring + changed), lacks(steady, rig), doubt, units
+        tuple(steady),
+        tuple(told + said + wiring + changed),
+        lacks(steady, rig),
+        doubt,
+        units,
+        mended=bool(said or wiring or changed),
+        guessed=guessed,
+        of_lines=frozenset(estimated(responses, OF_LINES)),
+        spoilt=any(
+            f.severity == "error" and f.kind not in (*OF_LINES, "gap")
+            for r in responses
+            for f in r.findings
+        ),
     )
 
 
-def estimated(responses: Iterable[FrequencyResponse]) -> list[str]:
-    """What the estimates found wrong with the recordings; many of one kind are counted."""
-    found = list(dict.fromkeys(f for r in responses for f in r.findings if f.severity != "note"))
+def estimated(
+    responses: Iterable[FrequencyResponse], kinds: Sequence[str] | None = None
+) -> list[str]:
+    """What the estimates found wrong with the recordings; many of one kind are counted.
+
+    kinds : of findings, all if None.
+    """
+    every = (f for r in responses for f in r.findings if f.severity != "note")
+    found = list(dict.fromkeys(f for f in every if kinds is None or f.kind in kinds))
     # What was left out comes before what weakens.
     found.sort(key=lambda f: f.severity != "error")
     out: list[str] = []
@@ -113,9 +140,7 @@ def lacks(responses: Sequence[FrequencyResponse], rig: Rig) -> tuple[str, ...]:
             f"only {next(iter(outputs))} was recorded: a place is told from another by the shape "
             "of one curve alone; a second sensor would show where"
         )
-    if not any(repeated(r) for r in responses):
-        out.append(NO_REPEATS)
-    elif max(r.n_averages for r in responses) < FEW_REPEATS:
+    if max((r.n_averages for r in responses if repeated(r)), default=FEW_REPEATS) < FEW_REPEATS:
         out.append(
             "only two repeats of a level could be used: were one of them wrong, it could not be "
             "told which; one more would tell"

@@ -18,16 +18,14 @@ from samii_rig.diagnose.own_law import OwnLaw, own_law
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Gap, Verdict
 from samii_rig.diagnose.search import Search
-from samii_rig.diagnose.stated import PLACE, TINY, Evidence, probability
+from samii_rig.diagnose.stated import IN_DATA, PLACE, TINY, Evidence, probability
 
-FALSE_ALARM = 0.003  # of the chi-square test of the nominal model alone
 NOTHING = 0.2  # probability of nothing missing below which it is called missing
 SURE = 0.8  # probability of an answer from which it is named
 DOUBT = 0.3  # probability of an answer below which none is given
 MOSTLY = 0.5  # of the mismatch; one cause that explains it is told whatever else is missing
 MOST_NAMES = 4  # of a class; more is no answer
-IN_DATA = 45.0  # of chi-square, that an effect must explain of the data to be called missing
-UNEXPLAINED = 3e-4  # chance that noise leaves as much as makes an empty answer "unknown"
+UNEXPLAINED = 3e-4  # chance that noise alone leaves more than the threshold
 MUST_SHOW = 900.0  # of chi-square, that an effect explains of the data: 30 noise units
 PARTLY = 0.9  # of the mismatch: several effects that leave more, and more than noise, are no answer
 SAID = ("named", "ambiguous")  # verdicts that come with causes
@@ -85,9 +83,10 @@ class Judgement:
         return max(0.0, 1 - sum(self.shares))
 
 
-def threshold(data: Measured, chance: float = FALSE_ALARM) -> float:
-    """Chi-square per degree of freedom that noise alone exceeds with this chance."""
-    return float(stats.gamma.isf(chance, 1 / data.spread, scale=data.spread))
+def threshold(spread: float) -> float:
+    """Chi-square per degree of freedom that noise alone exceeds as rarely as `UNEXPLAINED` says.
+    spread : its relative variance."""
+    return float(stats.gamma.isf(UNEXPLAINED, 1 / spread, scale=spread))
 
 
 def judge(search: Search, decide: Measured | None = None) -> Judgement:
@@ -131,8 +130,8 @@ def _beyond(
     """What is in no table and explains the data better."""
     if any(e.quasi is not None for e in best.effects):
         return None
-    if decide is not None and evidence.held > threshold(decide, UNEXPLAINED):
-        absorbed = evidence.drop <= IN_DATA
+    if decide is not None and evidence.held > threshold(decide.spread):
+        absorbed = evidence.drop <= search.worth
         base = search.nominal if absorbed else best
         if (changing := between_runs(search, base.fitted, decide)) is not None:
             return changing
@@ -163,6 +162,7 @@ def _evidence(
         names=chosen.names(),
         pair=len(first.effects) == 2 and len({e.physics for e in first.effects}) == 1,
         closed=(before - left) / (before - 1) if before > 1 else 0.0,
+        worth=search.worth,
     )
 
 
@@ -181,7 +181,7 @@ def _verdict(
 ) -> Verdict:
     if not chosen.first.effects:
         return "unknown" if _unexplained(evidence, search, decide) else "no_mismatch"
-    if evidence.drop <= IN_DATA:
+    if evidence.drop <= search.worth:
         # What a refit of the nominal parameters absorbs, at the cost of values that their
         # tolerances make unlikely, is not in the data.
         return "unknown" if _unexplained(evidence, search, decide) else "no_mismatch"
@@ -197,8 +197,8 @@ def _verdict(
 def _unexplained(evidence: Evidence, search: Search, decide: Measured | None) -> bool:
     """Whether more than noise is left on lines that were fitted or on those that were not: what
     changes from run to run is seen by the latter alone."""
-    held = decide is not None and evidence.held > threshold(decide, UNEXPLAINED)
-    return held or evidence.left > threshold(search.lines, UNEXPLAINED)
+    held = decide is not None and evidence.held > threshold(decide.spread)
+    return held or evidence.left > threshold(search.spread)
 
 
 def _said(evidence: Evidence) -> Verdict:
@@ -264,7 +264,7 @@ def _is_thin(search: Search, e: Explanation) -> bool:
 def _worth(search: Search, less: Explanation) -> float:
     """Chi-square that an effect beside those of `less` must explain: more than chance does, and
     more than their own laws are off by."""
-    return max(IN_DATA * search.temperature, _off(search, less))
+    return max(search.worth * search.temperature, _off(search, less))
 
 
 def _off(search: Search, e: Explanation) -> float:

@@ -11,7 +11,7 @@ tells whether the part can be there; the uncertain nominal parameters are projec
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -112,18 +112,19 @@ def traces(search: Search, judged: Judgement) -> tuple[Trace, ...]:
     found; then the places that explain most about the rig without the first. Where nothing is
     said to be missing, all are about the refitted nominal model.
     """
-    best = judged.best
+    best, problem = judged.best, search.problem.lines
     shown: list[Located] = []
     for i, effect in enumerate(best.effects):
         base = _without(search, best, i)
         if base is not None and effect.jump is not None and effect.jump.states is not None:
-            shown.append(locate(base.fitted, effect, search.problem, held=True))
+            shown.append(locate(at_lines(base.fitted, search), effect, problem, held=True))
     base = _without(search, best, 0) if best.effects else search.nominal
     if base is not None:
         taken = {i.effect.jump.place for i in shown if i.effect.jump is not None}
         mine = {e.key for e in base.effects}
+        fitted = at_lines(base.fitted, search)
         found = [
-            locate(base.fitted, e, search.problem)
+            locate(fitted, e, problem)
             for e in search.table
             if e.physics in PROBES
             and e.jump is not None
@@ -133,6 +134,16 @@ def traces(search: Search, judged: Judgement) -> tuple[Trace, ...]:
         ]
         shown += sorted(found, key=lambda item: item.chi2)
     return tuple(_trace(item, search) for item in shown[:SHOWN])
+
+
+def at_lines(fitted: Fitted, search: Search) -> Fitted:
+    """A fit with the derivatives of responses line by line."""
+    problem = search.problem.lines
+    if problem is search.problem:
+        return fitted
+    _, dh = fitted.model.gradient(fitted.x, problem.at)
+    J = problem.whiten(dh)
+    return replace(fitted, jacobian=J, information=J.T @ J)
 
 
 def _without(search: Search, best: Explanation, i: int) -> Explanation | None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from samii_rig.diagnose.causal import CausalChain
 from samii_rig.diagnose.effect import Effect, Key
-from samii_rig.model.sampled import hold_response, sampled_response, sensor_response
+from samii_rig.model.sampled import hold_at, sampled_response, sensors_at
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.types import Complex, Float, Int
@@ -21,12 +21,37 @@ STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
 
 
 @dataclass(frozen=True, slots=True)
+class Loop:
+    """A proportional loop of the device, v = r - kp y of one entry, closed around the rig."""
+
+    kp: float
+    entry: int
+
+    def part(self, H: Complex, b: Complex) -> tuple[Complex, Complex]:
+        """b (n, q) and c (n,) around which a part is closed that changes H by b x:
+        H + b x becomes, closed, H/(1 + L) + b' x/(1 - c x)."""
+        sensitivity = 1 / (1 + self.kp * H[:, self.entry])
+        back = self.kp * b[:, self.entry] * sensitivity
+        return sensitivity[:, None] * (b - back[:, None] * H), -back
+
+    def closed(self, H: Complex) -> Complex:
+        """(n, q) to the reference from those to the command."""
+        return np.asarray(H / (1 + self.kp * H[:, self.entry])[:, None])
+
+    def slopes(self, H: Complex, dH: Complex) -> Complex:
+        """(n, q, m) derivatives of `closed`."""
+        sensitivity = 1 / (1 + self.kp * H[:, self.entry])
+        back = self.kp * dH[:, self.entry, None, :] * self.closed(H)[:, :, None]
+        return np.asarray(sensitivity[:, None, None] * (dH - back))
+
+
+@dataclass(frozen=True, slots=True)
 class Grid:
-    """Frequencies (n,) with what does not change between models there.
+    """Frequencies (n,), at s = sigma + 2 pi j f, with what does not change between models there.
 
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
     folded : (order, n, q) of these the ones of `ORDERS`, or none. rate_hz : of the samples.
-    sensor, actuator : (q,) entries.
+    sensor, actuator : (q,) entries. loop : closed around them, if responses are to the reference.
     """
 
     frequency: Float
@@ -36,6 +61,13 @@ class Grid:
     rate_hz: float
     sensor: Int
     actuator: Int
+    sigma: float = field(default=0.0, kw_only=True)
+    loop: Loop | None = field(default=None, kw_only=True)
+
+    @property
+    def s(self) -> Complex:
+        """(n,) rad/s."""
+        return np.asarray(self.sigma + 2j * np.pi * self.frequency, np.complex128)
 
     def at(self, frequency: Float, level: Int | None = None) -> Grid:
         """The same on some of the frequencies; what depends on their level is in `LevelGrid`."""
@@ -43,14 +75,13 @@ class Grid:
         i = np.searchsorted(self.frequency, frequency)
         return Grid(
             frequency, self.factor[i], self.aliases[i], self.folded[:, i], self.rate_hz,
-            self.sensor, self.actuator,
+            self.sensor, self.actuator, sigma=self.sigma, loop=self.loop,
         )  # fmt: skip
 
     def orders(self) -> list[Complex]:
         """s (n,) of each order of `folded`."""
         known = ORDERS[: len(self.folded)]
-        f = (self.frequency + k * self.rate_hz for k in known)
-        return [np.asarray(2j * np.pi * x, np.complex128) for x in f]
+        return [self.s + 2j * np.pi * k * self.rate_hz for k in known]
 
 
 def grid(
@@ -59,31 +90,47 @@ def grid(
     sensor: Int,
     actuator: Int,
     chain: Chain | None = None,
+    sigma: float = 0.0,
+    loop: Loop | None = None,
 ) -> Grid:
     """The grid of a rig at sorted frequencies, Hz. chain : whose aliases these are, if they are
-    not the rig's own."""
+    not the rig's own. sigma : 1/s, how far beside the imaginary axis.
+    loop : closed around the entries."""
     f = np.unique(frequency)
 
-    def around(f: Float) -> Complex:
-        hold = np.stack([hold_response(f, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
-        return np.asarray(sensor_response(rig.sensor, f)[:, sensor] * hold[:, actuator])
+    def around(s: Complex) -> Complex:
+        hold = np.stack([hold_at(s, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
+        return np.asarray(sensors_at(rig.sensor, s)[:, sensor] * hold[:, actuator])
 
-    few = np.geomspace(f[0], f[-1], min(ALIAS_POINTS, f.size))
-    few[0], few[-1] = f[0], f[-1]
+    # Aliases hardly change from the imaginary axis to a line beside it.
+    few = np.geomspace(f[f > 0][0], f[-1], min(ALIAS_POINTS, f.size))
+    few[-1] = f[-1]
     chain = Chain(rig) if chain is None else chain
 
     def spread(few_: Complex) -> Complex:
         return np.stack([np.interp(f, few, r) for r in few_.T], axis=1)
 
     def term(f: Float) -> Complex:
-        return np.asarray(chain.response(f)[:, sensor, actuator] * around(f))
+        s = np.asarray(2j * np.pi * f, np.complex128)
+        return np.asarray(chain.response(f)[:, sensor, actuator] * around(s))
 
     rest = sampled_response(rig, few, chain)[:, sensor, actuator] - term(few)
     folded = []
     for k in ORDERS:
         there = term(np.abs(few + k * rig.rate_hz))
         folded.append(spread(there if k > 0 else there.conj()))
-    return Grid(f, around(f), spread(rest), np.stack(folded), rig.rate_hz, sensor, actuator)
+    s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
+    return Grid(
+        f,
+        around(s),
+        spread(rest),
+        np.stack(folded),
+        rig.rate_hz,
+        sensor,
+        actuator,
+        sigma=sigma,
+        loop=loop,
+    )
 
 
 class Model:
@@ -157,16 +204,17 @@ class Model:
     def response(self, x: Float, at: Grid) -> Complex:
         """(n, q) at the grid's frequencies."""
         chain = self.chain.with_values(self.values(x))
-        G = chain.response(at.frequency)[:, at.sensor, at.actuator]
+        G = chain.evaluate(at.s)[:, at.sensor, at.actuator]
         F, _ = self._factors(x, at, slopes=False)
-        return np.asarray(G * at.factor * F + self._aliases(x, at, slopes=False)[0])
+        H = np.asarray(G * at.factor * F + self._aliases(x, at, slopes=False)[0])
+        return H if at.loop is None else at.loop.closed(H)
 
     def gradient(self, x: Float, at: Grid) -> tuple[Complex, Complex]:
         """The same, and its derivatives (n, q, n_x)."""
         values = self.values(x)
         keys = tuple(values)
         chain = self.chain.with_values(values)
-        G, dG = chain.gradient(at.frequency, keys)
+        G, dG = chain.gradient_at(at.s, keys)
         G, dG = G[:, at.sensor, at.actuator], dG[:, at.sensor, at.actuator]
         F, slopes = self._factors(x, at, slopes=True)
         factor = at.factor * F
@@ -188,7 +236,8 @@ class Model:
         aliases, more = self._aliases(x, at, slopes=True)
         for j, slope in more:
             dH[:, :, j] += slope
-        return G * factor + aliases, dH
+        H = G * factor + aliases
+        return (H, dH) if at.loop is None else (at.loop.closed(H), at.loop.slopes(H, dH))
 
     def _aliases(
         self, x: Float, at: Grid, *, slopes: bool
@@ -215,7 +264,7 @@ class Model:
         """(n, q) product of the factors at s, by default at the grid's own, and its slopes."""
         total = np.ones((at.frequency.size, at.sensor.size), complex)
         parts = []
-        s = np.asarray(2j * np.pi * at.frequency if s is None else s, np.complex128)
+        s = at.s if s is None else s
         first = self.n_nominal
         for effect, theta in zip(self.effects, self.parts(x), strict=True):
             if effect.factor is not None:

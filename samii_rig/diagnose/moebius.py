@@ -49,7 +49,7 @@ def place_of(
     assert effect.jump is not None
     first = effect.unknowns[0]
     between = effect.unknowns[1 : len(effect.unknowns) - len(fixed)]
-    s = np.asarray(2j * np.pi * at.frequency, np.complex128)
+    s = at.s
     middle = np.sqrt(first.low * first.high)
     xs, g = [], []
     for strength in (middle / np.sqrt(APART), middle * np.sqrt(APART)):

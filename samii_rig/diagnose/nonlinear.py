@@ -386,15 +386,16 @@ def distorted(responses: Sequence[FrequencyResponse]) -> list[str]:
     return out
 
 
-def next_levels(judged: Judgement) -> tuple[str, str] | None:
-    """(why, experiment) where a nonlinear force is among the leading explanations."""
+def next_levels(judged: Judgement) -> tuple[str, str, None] | None:
+    """(why, experiment), of unknown gain, where a force is among the leading explanations."""
     forced = [e for c in judged.classes[:2] for e in (_force_in(c.first),) if e is not None]
     if judged.verdict == "no_mismatch" or not forced:
         return None
     if judged.verdict == "named":
-        return "", ""
+        return "", "", None
     return (
         f"{forced[0].physics.replace('_', ' ')} at {forced[0].site} changes with amplitude",
         "repeat the runs at half the lowest and at twice the highest amplitude, a random-phase "
         "multisine with odd lines among them",
+        None,
     )

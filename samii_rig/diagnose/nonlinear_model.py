@@ -244,7 +244,7 @@ class LevelModel(Model):
         n = len(self.rig.sensor)
         act = int(at.actuator[0])
         own = len(self.rig.actuator) if self.quasi.own_input else act
-        s = np.asarray(2j * np.pi * at.frequency, np.complex128)
+        s = at.s
         hold = at.hold.reshape(-1, *(1,) * (G.ndim - 2))
         if self.quasi.kind == "command":
             l0, l1 = at.hold[:, None], np.zeros((s.size, 1), complex)

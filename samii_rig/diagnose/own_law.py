@@ -119,7 +119,7 @@ def _refitted(
     n = nominal.n
     assert part.jump is not None
     law = part.jump.x
-    s = np.asarray(2j * np.pi * problem.at.frequency, np.complex128)
+    s = problem.at.s
 
     def left(y: Float) -> Float:
         a = nominal.response(y[:n], problem.at)

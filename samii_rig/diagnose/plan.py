@@ -36,21 +36,23 @@ KNOWN = 0.1  # of the chain's own mass, a mass that is added
 LIKELY = 0.05  # probability from which another class is to be told apart
 
 
-def next_experiment(search: Search, judged: Judgement) -> tuple[str, str]:
-    """(why, experiment) in words; both empty where nothing is to be told apart."""
+def next_experiment(search: Search, judged: Judgement) -> tuple[str, str, float | None]:
+    """(why, experiment) in words, both empty where nothing is to be told apart; and by how many
+    noise units the experiment would tell, if that is known."""
     rivals = _rivals(judged)
     if not rivals and judged.verdict != "no_mismatch" and (alone := _alone(search)):
-        return alone
+        return *alone, None
     if judged.verdict == "unknown" and not rivals:
         return (
             "no explanation passes: what is missing may depend on amplitude",
             "repeat the sweep at half and at twice the amplitude",
+            None,
         )
     if not rivals:
-        return "", ""
+        return "", "", None
     first, other = rivals
     if not first.effects and not other.effects:
-        return "", ""
+        return "", "", None
     what = f"{_said(first)} and {_said(other)} are not told apart"
     best = ("", 0.0)
     for words, rig_of, f in _experiments(search):
@@ -58,8 +60,9 @@ def next_experiment(search: Search, judged: Judgement) -> tuple[str, str]:
         if d > best[1]:
             best = (words, d)
     if best[1] < TELLING:
-        return what, "none tried would tell them: they are the same thing to every sensor here"
-    return f"{what}; predicted {best[1]:.0f} noise units apart", best[0]
+        none = "none tried would tell them: they are the same thing to every sensor here"
+        return what, none, best[1]
+    return f"{what}; predicted {best[1]:.0f} noise units apart", *best
 
 
 def _alone(search: Search) -> tuple[str, str] | None:

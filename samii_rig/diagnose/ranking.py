@@ -61,7 +61,7 @@ def _at_place(
     for fixed in product(*(u.starts for u in own)):
         key = (effect.jump.place, fixed)
         if key not in places:
-            places[key] = _place(look, base, effect, model_of, fixed)
+            places[key] = place_at(look, base, effect, model_of, fixed)
         place = places[key]
         found = look.through(place, effect, fixed) if place else None
         if found is not None and (best is None or found[0] > best[0]):
@@ -69,9 +69,10 @@ def _at_place(
     return best
 
 
-def _place(
+def place_at(
     look: Screen, base: tuple[Effect, ...], effect: Effect, model_of: ModelOf, fixed: Start
 ) -> Place | None:
+    """The place of a part beside those of `base`, with the unknowns that belong to it."""
     model = model_of((*base, effect))
     if model is None:
         return None

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from samii_rig.diagnose import forms
+from samii_rig.diagnose.forms import Form
 from samii_rig.diagnose.measured import Measured
 from samii_rig.diagnose.model import Grid, Model
 from samii_rig.errors import SamiiRigError
@@ -29,7 +31,7 @@ PATIENT = 3  # steps before that is asked
 SPAN = math.sqrt(12.0)  # of a uniform distribution in its standard deviations
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Problem:
     """Data with what a refit needs of them. root : (n, q, q) with root^H root = W."""
 
@@ -43,9 +45,39 @@ class Problem:
         return cls(data, data.root(), at.at(data.frequency, data.level))
 
     @property
+    def lines(self) -> Problem:
+        """Responses line by line, for what is seen better there than in the likelihood."""
+        return self
+
+    @property
     def expected(self) -> float:
         """Mean of chi-square at the truth."""
         return float(np.sum(self.data.expected))
+
+    def toward(self, h: Complex) -> Problem:
+        """The same had `h` (n, q) been measured without noise."""
+        return Problem(replace(self.data, H=h), self.root, self.at)
+
+    def form(self, b: Complex, left: Float, directions: Float) -> Form:
+        """Chi-square when a part moves the prediction by b phi.
+
+        left : residuals of data and priors. directions : orthonormal, that are projected out; rows
+        of zeros in them do not count.
+        """
+        # |v - Q Q'v|^2 = |v|^2 - |R Q'v|^2, R the identity where all rows count.
+        R = np.linalg.cholesky(2 * np.eye(directions.shape[1]) - directions.T @ directions)
+        directions = directions @ R
+        half = b.size
+        r = (left[:half] + 1j * left[half : 2 * half]).reshape(b.shape)
+        conj = (directions[:half] - 1j * directions[half : 2 * half]).reshape(*b.shape, -1)
+        v = (self.root @ b[:, :, None])[:, :, 0]
+        return forms.Lines(
+            lin=np.sum(r.conj() * v, axis=1),
+            square=np.sum(np.abs(v) ** 2, axis=1),
+            P=np.einsum("nqj,nq->nj", conj, v),
+            power=float(left @ left),
+            q=directions.T @ left,
+        )
 
     def residual(self, h: Complex) -> Float:
         """Real whitened residuals (2 n q,) of a prediction."""
@@ -246,15 +278,17 @@ def move(model: Model, x: Float, A: Float, g: Float, damping: float) -> Float | 
 def _logarithm(
     model: Model, problem: Problem, x: Float, h: Complex, dh: Complex, cost: float
 ) -> tuple[Float, Complex, Complex, float]:
-    """A few steps on log(model/measurement); kept only if chi-square fell too."""
-    d = problem.data.H
-    precision = np.diagonal(problem.data.W, axis1=1, axis2=2).real * np.abs(d) ** 2
+    """A few steps on log(model/measurement), line by line; kept only if chi-square fell too."""
+    lines = problem.lines
+    d = lines.data.H
+    precision = np.diagonal(lines.data.W, axis1=1, axis2=2).real * np.abs(d) ** 2
     # An entry that was not measured has none, and no weight.
     weight = np.sqrt(precision / (LOG_FLOOR**2 * precision + 2))
     n = model.n_nominal
     best = (x, h, dh, cost)
     damping, current = 1e-2, math.inf
-    y, hy, dhy = x, h, dh
+    same = lines is problem
+    y, (hy, dhy) = x, (h, dh) if same else model.gradient(x, lines.at)
     for _ in range(LOG_STEPS):
         left = weight * np.log(hy / np.where(d == 0, hy, d))
         slope = (weight / hy)[:, :, None] * dhy
@@ -271,11 +305,12 @@ def _logarithm(
         if new is None:
             break
         try:
-            hy, dhy = model.gradient(new, problem.at)
+            hy, dhy = model.gradient(new, lines.at)
+            at = (hy, dhy) if same else model.gradient(new, problem.at)
         except SamiiRigError:
             break
         y = new
-        there = _cost(model, problem, y, hy)
+        there = _cost(model, problem, y, at[0])
         if there < best[3]:
-            best = (y, hy, dhy, there)
+            best = (y, *at, there)
     return best

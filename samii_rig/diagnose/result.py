@@ -16,6 +16,14 @@ if TYPE_CHECKING:
 
 Verdict = Literal["no_mismatch", "named", "ambiguous", "unknown"]
 
+# Physics that a person asks for first: where any of it could hide, and with its size.
+HIDING = {
+    "added_mass": ("a mass", "a mass under"),
+    "torsional_compliance": ("a joint that gives", "a joint spring stiffer than"),
+    "viscous_damping": ("a damper", "a damper under"),
+    "transport_delay": ("a delay", "a delay under"),
+}
+SOFT = ("torsional_compliance",)  # the larger its number, the less of it
 LIKELY = 0.5  # probability of a site from which it is told as the place
 
 
@@ -84,6 +92,57 @@ class Gap:
 
 
 @dataclass(frozen=True, slots=True)
+class Moved:
+    """A nominal parameter that the refit moved, by how many of its tolerances."""
+
+    parameter: str
+    sigmas: float
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return {"parameter": self.parameter, "sigmas": self.sigmas}
+
+
+@dataclass(frozen=True, slots=True)
+class Hiding:
+    """What these data would not have shown: the smallest effect that would have been found with
+    90 %. size : None where none within its range would have been."""
+
+    physics: str
+    site: str
+    parameter: str
+    size: float | None
+    unit: str
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "physics": self.physics,
+            "site": self.site,
+            "parameter": self.parameter,
+            "size": self.size,
+            "unit": self.unit,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Used:
+    """Lines that took part, of all that were excited; records that did not, and why."""
+
+    lines: int
+    of: int
+    left_out: tuple[tuple[str, str], ...] = ()
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "lines": self.lines,
+            "of": self.of,
+            "left_out": [{"record": r, "why": w} for r, w in self.left_out],
+        }
+
+
+@dataclass(frozen=True, slots=True)
 class Trace:
     """x(w) of a place, free of any law: the part that is missing there, by itself.
 
@@ -105,13 +164,15 @@ class Diagnosis:
     """Everything that a diagnosis found; `plain()` is the contract.
 
     chi2_per_dof, threshold : of the refitted nominal model, and what noise would reach in
-        three of a thousand cases.
+        three of ten thousand cases.
     nominal, with_causes : chi-square per degree of freedom of the refitted nominal model and with
         the causes, each on the lines fitted and on those shown.
     rig : the nominal rig with the causes; traces : the best places, law-free.
     evidence : what the probability of the answer rests on (`stated.Evidence`), whether something
         `beyond` the table was found instead, and the causes of the most probable explanation,
         whether they are told or not.
+    moved : the largest first. sigma : root of the chi-square that the causes explain. gain : noise
+        units by which the next experiment would tell the rivals apart; None where none was found.
     """
 
     verdict: Verdict
@@ -133,6 +194,11 @@ class Diagnosis:
     traces: tuple[Trace, ...]
     evidence: dict[str, Any] = field(default_factory=dict)
     model: str = ""
+    moved: tuple[Moved, ...] = ()
+    could_hide: tuple[Hiding, ...] = ()
+    used: Used = Used(0, 0)
+    sigma: float = 0.0
+    gain: float | None = None
 
     def plain(self) -> dict[str, Any]:
         """The contract of `samii-rig diagnose --json`."""
@@ -159,8 +225,16 @@ class Diagnosis:
                     "high": self.gap.high,
                 },
             },
+            "moved": [m.plain() for m in self.moved],
+            "could_hide": [h.plain() for h in self.could_hide],
+            "used": self.used.plain(),
+            "evidence": {"sigma": self.sigma},
             "not_physics": list(self.not_physics),
-            "next_experiment": {"why": self.why, "experiment": self.experiment},
+            "next_experiment": {
+                "why": self.why,
+                "experiment": self.experiment,
+                "gain": self.gain,
+            },
             "model": self.model,
         }
 
@@ -232,7 +306,27 @@ class Diagnosis:
         parts = [sentence(told) for told in self.not_physics[:1]]
         if self.experiment:
             parts.append(f"Next: {self.experiment} ({self.why}).")
+        if not self.experiment and self.could_hide:
+            parts.append(f"What could hide: {'; '.join(_hides(self.could_hide))}.")
         return " ".join(parts) or "No further experiment is needed."
+
+
+def _hides(every: Sequence[Hiding]) -> list[str]:
+    """Of the physics that people ask for first, where the most of it could hide."""
+    out = []
+    for physics, words in HIDING.items():
+        own = [h for h in every if h.physics == physics]
+        if not own:
+            continue
+        unseen = [h for h in own if h.size is None]
+        worst = unseen[0] if unseen else max(own, key=lambda h: h.size or 0.0)
+        if physics in SOFT and not unseen:
+            worst = min(own, key=lambda h: h.size or 0.0)
+        if worst.size is None:
+            out.append(f"{words[0]} at {worst.site}, however large")
+        else:
+            out.append(f"{words[1]} {worst.size:.2g} {worst.unit} at {worst.site}")
+    return out
 
 
 def sentence(text: str) -> str:

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
 import numpy as np
 
 from samii_rig.diagnose.effect import Effect, Unknown
+from samii_rig.diagnose.forms import LONGEST, ROUNDS, SETTLED, Form, descend
 from samii_rig.diagnose.model import Model
 from samii_rig.diagnose.moebius import Place
 from samii_rig.diagnose.refit import Fitted, Problem
@@ -26,7 +27,6 @@ from samii_rig.errors import SamiiRigError
 from samii_rig.types import Complex, Float
 
 APART = 2.5  # of logarithms: two starts from which different optima may be reached
-LONGEST = 3.0  # a step of a logarithm
 LOOSE = 1e-3  # precision of an unknown without a prior, which keeps the projection regular
 OTHERS = 10  # starts behind the best among which a second is looked for
 FINER = 4  # times as many tries as starts where they cost next to nothing
@@ -34,9 +34,6 @@ WIDER = (1 / 12, 1.0, 8.0)  # tries about an only start
 MANY = 20  # starts that are already fine
 VALLEYS = 2  # tries that are brought to their optimum
 VALLEY = 0.7  # of a logarithm: tries in different valleys
-ROUNDS = 6  # of that, at most
-SETTLED = 0.05  # of chi-square, gained in one of them: less and they end
-STEP = 1e-4  # of a logarithm, for derivatives of a law
 SECOND = 0.6  # of the best try's gain: less is no start of its own
 
 Start = tuple[float, ...]
@@ -62,6 +59,18 @@ class Screen:
         Q = np.linalg.qr(np.concatenate([base.jacobian, rows]))[0]
         return cls(problem, base, Q, np.where(known, base.x / prior, 0.0))
 
+    def of_data(self) -> Screen:
+        """As if the effect were all there is, and what counts were the data alone: the parameters
+        stand where they are, and their priors hold them, at no cost."""
+        directions = self.directions.copy()
+        directions[len(directions) - self.tail.size :] = 0.0
+        problem = self.problem.toward(self.response)
+        return Screen(problem, self.base, directions, np.zeros_like(self.tail))
+
+    def bare(self) -> Screen:
+        """With no direction projected out."""
+        return replace(self, directions=self.directions[:, :0])
+
     @cached_property
     def response(self) -> Complex:
         """(n, q) of the fit."""
@@ -70,12 +79,12 @@ class Screen:
     @cached_property
     def s(self) -> Complex:
         """(n,) rad/s."""
-        return np.asarray(2j * np.pi * self.problem.at.frequency, np.complex128)
+        return self.problem.at.s
 
     def left(self) -> float:
         """Chi-square of what the fit leaves, with the directions projected out."""
-        r, _, whole = self._parts
-        return float(np.sum(np.abs(r) ** 2) + np.sum(self.tail**2) - np.sum(whole**2))
+        left = self._left(self._left_by)
+        return float(left @ left)
 
     def through(self, place: Place, effect: Effect, fixed: Start = ()) -> Found | None:
         """`look` for a part at a place. fixed : unknowns that belong to the place."""
@@ -92,27 +101,36 @@ class Screen:
 
     def channel(self, effect: Effect) -> Found | None:
         """`look` for a factor on a channel."""
+        return self._over(*self.factor(effect), effect.unknowns)
+
+    def factor(self, effect: Effect) -> tuple[Complex, Callable[[Float], Complex]]:
+        """b (n, q) of a factor on a channel, and phi (m, n) of its unknowns (m, k)."""
         factor = effect.factor
         assert factor is not None
         model, at = self.base.model, self.problem.at
         on = model.entries(effect, at)
-        b = np.zeros_like(self.response)
-        b[:, on] = (self.response - at.aliases)[:, on]
+        plain = self.base.model.response(self.base.x, replace(at, loop=None)) - at.aliases
+        b = np.zeros_like(plain)
+        b[:, on] = plain[:, on]
+        c = np.zeros(len(b), complex)
+        if at.loop is not None:
+            b, c = at.loop.part(plain, b)
 
         def phi(values: Float) -> Complex:
-            return np.stack([factor.value(self.s, one)[0] - 1 for one in values])
+            x = np.stack([factor.value(self.s, one)[0] - 1 for one in values])
+            return Place(b, c).phi(x)
 
-        return self._over(b, phi, effect.unknowns)
+        return b, phi
 
     def _over(
         self, b: Complex, phi: Callable[[Float], Complex], unknowns: tuple[Unknown, ...]
     ) -> Found | None:
         """All of a fine grid over the unknowns, and the optima that its best lead to."""
-        quad = self._quadratic(b)
+        form = self.form(b)
         finer = FINER if len(unknowns) < 3 else 1
         tries = np.array(list(product(*(_fine(u, finer) for u in unknowns))))
         with np.errstate(all="ignore"):
-            cost, _ = quad.cost(phi(tries))
+            cost = form.cost(phi(tries))
         order = np.argsort(cost)
         if not math.isfinite(cost[order[0]]):
             return None
@@ -126,7 +144,7 @@ class Screen:
             if all(np.max(np.abs(y[i] - y[j])) > VALLEY for j in chosen):
                 chosen.append(int(i))
         with np.errstate(all="ignore"):
-            end, at = quad.descend(phi, y[chosen], cost[chosen], unknowns)
+            end, at = descend(form, phi, y[chosen], cost[chosen], unknowns)
         best = np.argsort(end)
         gain = self.base.cost - end
         starts = [at[best[0]]]
@@ -136,29 +154,14 @@ class Screen:
                 starts.append(at[i])
         return float(gain[best[0]]), [tuple(np.exp(y).tolist()) for y in starts]
 
-    def _quadratic(self, b: Complex) -> _Quadratic:
+    def form(self, b: Complex) -> Form:
         """Chi-square as a function of phi."""
-        v = (self.problem.root @ b[:, :, None])[:, :, 0]
-        r, Q, whole = self._parts
-        P = np.einsum("nqj,nq->nj", Q, v)
-        return _Quadratic(
-            lin=np.sum(r.conj() * v, axis=1),
-            square=np.sum(np.abs(v) ** 2, axis=1),
-            P=P,
-            power=float(np.sum(np.abs(r) ** 2) + np.sum(self.tail**2)),
-            q=whole,
-        )
+        return self.problem.form(b, self._left_by, self.directions)
 
     @cached_property
-    def _parts(self) -> tuple[Complex, Complex, Float]:
-        """What is left (n, q), the directions' conjugates (n, q, m), and their product (m,)."""
-        e = self.response - self.problem.data.H
-        r = (self.problem.root @ e[:, :, None])[:, :, 0]
-        half = r.size
-        Q = self.directions
-        conj = (Q[:half] - 1j * Q[half : 2 * half]).reshape(*r.shape, -1)
-        whole = Q.T @ np.concatenate([r.real.ravel(), r.imag.ravel(), self.tail])
-        return r, conj, whole
+    def _left_by(self) -> Float:
+        """What the fit leaves of the data and of the priors, in noise units."""
+        return np.concatenate([self._base_residual(), self.tail])
 
     def look(self, model: Model, known: Float, effect: Effect) -> Found | None:
         """How far chi-square falls with `effect`, the last of `model`, and where to start.
@@ -174,7 +177,7 @@ class Screen:
             return None
         gain = 0.0
         if effect.unknowns:
-            nothing = self._left(np.concatenate([self._base_residual(), self.tail]))
+            nothing = self._left(self._left_by)
             best = min(tried, key=lambda t: t[0])
             weak = min(tried, key=lambda t: float(np.sum((t[2] - nothing) ** 2)))
             for cost, start, left in {best[1]: best, weak[1]: weak}.values():
@@ -199,14 +202,15 @@ class Screen:
     def _cost(self, model: Model, known: Float, start: Start) -> Tried | None:
         """Chi-square with the effect at `start`, and what is left."""
         try:
-            h = model.response(np.append(known, np.log(start)), self.problem.at)
+            left = self.left_with(model, np.append(known, np.log(start)))
         except SamiiRigError:
             return None
-        r = self.problem.residual(h)
-        if not np.all(np.isfinite(r)):
-            return None
-        left = self._left(np.concatenate([r, self.tail]))
-        return float(left @ left), start, left
+        return (float(left @ left), start, left) if np.all(np.isfinite(left)) else None
+
+    def left_with(self, model: Model, x: Float) -> Float:
+        """What a model with another effect leaves, with the directions projected out."""
+        r = self.problem.residual(model.response(x, self.problem.at))
+        return self._left(np.concatenate([r, self.tail]))
 
     def _descended(self, model: Model, known: Float, effect: Effect, best: Tried) -> Tried:
         """The best try after a few damped Gauss-Newton steps in all of the effect's unknowns."""
@@ -259,65 +263,6 @@ class Screen:
         inside = {min(max(w, unknown.low), unknown.high) for w in ways}
         found = [self._cost(model, known, (w, *start[1:])) for w in sorted(inside)]
         return [f for f in found if f is not None], power * step**2 if found else 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Quadratic:
-    """Chi-square with directions projected out, of residuals r + v phi.
-
-    lin (n,) : conj(r) v. square (n,) : |v|^2. P (n, m) : directions on v. power, q (m,) : of r.
-    """
-
-    lin: Complex
-    square: Float
-    P: Complex
-    power: float
-    q: Float
-
-    def cost(self, phi: Complex) -> tuple[Float, Float]:
-        """(m,) of phi (m, n), and the directions' parts."""
-        q = self.q + (phi @ self.P).real
-        power = self.power + 2 * (phi @ self.lin).real + (np.abs(phi) ** 2) @ self.square
-        cost = power - np.sum(q**2, axis=1)
-        return np.where(np.isfinite(cost), cost, np.inf), q
-
-    def descend(
-        self,
-        phi_of: Callable[[Float], Complex],
-        y: Float,
-        cost: Float,
-        unknowns: tuple[Unknown, ...],
-    ) -> tuple[Float, Float]:
-        """Chi-square and logarithms (m, k) after a few damped Gauss-Newton steps from y."""
-        low, high = np.log([(u.low, u.high) for u in unknowns]).T
-        m, k = y.shape
-        damping = np.full(m, 1e-2)
-        for turn in range(ROUNDS):
-            ahead = (y[:, None, :] + STEP * np.eye(k)).reshape(-1, k)
-            every = phi_of(np.exp(np.concatenate([y, ahead])))
-            phi = every[:m]
-            d = (every[m:].reshape(m, k, -1) - phi[:, None, :]) / STEP
-            q = self.q + (phi @ self.P).real
-            own = (d @ self.P).real
-            pull = self.lin.conj() + self.square * phi
-            g = np.einsum("mkn,mn->mk", d.conj(), pull).real - np.einsum("mkj,mj->mk", own, q)
-            H = ((d.conj() * self.square) @ d.swapaxes(1, 2)).real - own @ own.swapaxes(1, 2)
-            diagonal = np.einsum("mkk->mk", H)
-            tiny = 1e-9 * np.max(np.abs(diagonal), axis=1, initial=1e-30)[:, None]
-            A = H + (damping[:, None] * np.abs(diagonal) + tiny)[:, :, None] * np.eye(k)
-            if not (np.all(np.isfinite(A)) and np.all(np.isfinite(g))):
-                break
-            step = np.clip(-np.linalg.solve(A, g[:, :, None])[:, :, 0], -LONGEST, LONGEST)
-            new = np.clip(y + step, low, high)
-            there, _ = self.cost(phi_of(np.exp(new)))
-            better = there < cost
-            settled = turn > 0 and not np.any(cost - there > SETTLED)
-            y = np.where(better[:, None], new, y)
-            cost = np.where(better, there, cost)
-            damping = np.where(better, damping * 0.1, damping * 30)
-            if settled:
-                break
-        return cost, y
 
 
 def _fine(unknown: Unknown, finer: int) -> Float:

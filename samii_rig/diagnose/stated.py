@@ -22,6 +22,7 @@ ANSWER, PLACE = "weights", "place"  # tables of it
 ODDS = 8.0  # of a logarithm: beyond, evidence says no more
 LEFT = 3.0  # the same of what is left, chi-square per degree of freedom
 TINY = 1e-300
+IN_DATA = 45.0  # of chi-square, that an effect must explain of responses to be called missing
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +36,8 @@ class Evidence:
     gain : logarithm of evidence over that nothing is missing. drop : of chi-square, what it
         explains. names : how many names its class has. pair : whether it is two of one physics,
         which can pass for one that is in no table. closed : part of what the nominal model leaves
-        over the noise that it explains, on lines that were fitted.
+        over the noise that it explains, on lines that were fitted. worth : of chi-square, that an
+        effect must explain to be called missing.
     """
 
     odds: float
@@ -49,6 +51,7 @@ class Evidence:
     names: int
     pair: bool
     closed: float
+    worth: float = IN_DATA
 
     def features(self) -> dict[str, float]:
         """What the regression looks at."""

@@ -2,14 +2,15 @@
 
 A row of `POINTS` is a jump of one state at a port, driven by its conjugate (diagnosis of point
 faults), the element that makes it, and its unknowns. Rows of channels are factors. A lab adds
-a row, or a function to `EXTRA` that yields effects.
+effects by the entry point `samii_rig.effects`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from itertools import product
 from typing import Any, Literal
 
@@ -32,9 +33,11 @@ from samii_rig.rig.schema import (
     TranslationalGroundSpring,
     TranslationalSpring,
 )
+from samii_rig.run.plugins import asked, named, wrong
 from samii_rig.types import Complex, Float
 
 Law = Literal["spring", "softness", "column", "damper", "slip", "mass"]
+GROUP = "samii_rig.effects"  # of entry points
 LOSS = (1e-4, 10.0)  # damping force over spring force in mid band
 LOSS_STARTS = (0.05,)
 MOST_DAMPED = 0.3  # damping ratio of an oscillator; with more it is a damper and does not resonate
@@ -97,12 +100,23 @@ def hypotheses(rig: Rig, low_hz: float, high_hz: float) -> list[Effect]:
     out += _oscillators(rig, where)
     out += bodies.effects(rig, where)
     out += channels.effects(rig, low_hz, high_hz)
-    for extra in EXTRA:
-        out += extra(rig, low_hz, high_hz)
-    return out
+    return out + list(plugged(rig, low_hz, high_hz))
 
 
-EXTRA: list[Callable[[Rig, float, float], Iterator[Effect]]] = []
+def plugged(rig: Rig, low_hz: float, high_hz: float) -> Iterator[Effect]:
+    """The effects of other packages: each entry point of `samii_rig.effects` is a function
+    (rig, low_hz, high_hz) -> iterable of Effect, seen by the command line, the service and workers.
+
+    Raises InputError with the entry point's name for what it raises or gives in place of effects.
+    """
+    for point in entry_points(group=GROUP):
+        who = named(point)
+        with asked(who, "effects"):
+            made = list(point.load()(rig, low_hz, high_hz))
+        for effect in made:
+            if not isinstance(effect, Effect):
+                raise wrong(who, "effects", effect, "an Effect")
+        yield from made
 
 
 def _scale(row: Point, where: Places, port: int) -> float:

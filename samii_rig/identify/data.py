@@ -1,15 +1,4 @@
-"""Measured responses in noise units: what the likelihood is made of.
-
-With nu complex degrees of freedom the covariance C that was estimated for p entries is a
-complex Wishart matrix, and its inverse is too large, and by chance too large in some
-directions. For a linear model fitted with weights w C^-1,
-
-    E[C^-1] = nu/(nu - p) S^-1,   E[C^-1 S C^-1] = nu^3/((nu - p)((nu - p)^2 - 1)) S^-1,
-
-S the true covariance. The factor w = ((nu - p)^2 - 1)/nu^2 is the one for which the inverse
-of the information J^H w C^-1 J is the estimator's true covariance, and with several nu it
-weighs the lines best.
-"""
+"""Measured responses in noise units (`signal.whitening`), by the channels of a rig."""
 
 from __future__ import annotations
 
@@ -18,14 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samii_rig.errors import EstimateError, InputError
+from samii_rig.errors import InputError
 from samii_rig.rig.schema import Rig
+from samii_rig.signal.whitening import factor, mean_t2, root, shared_lines
 from samii_rig.types import Complex, Float, FrequencyResponse, Int
-
-# A local quadratic fit over m lines has 9/(4 m) of a line's variance, and neighbours share
-# their data: 9/4 of the m estimates are independent.
-INDEPENDENT = 2.25
-LOCAL_PARAMETERS = 6  # complex numbers of a local model at least: H and a transient, quadratic
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +20,7 @@ class Lines:
     frequency : (n,) Hz. H : (n, p). place : (n,) index into the union of all frequencies.
     sensor, actuator : (p,) index into the rig's. outputs, inputs : (p,) their names.
     root : (n, p, p) with root^H root = C^-1. sd : (n, p) standard deviation of each entry.
-    factor : (n,) w above over the number of lines that share data.
+    factor : (n,) w of `whitening.factor` over the number of lines that share data.
     dof : (n,). shared : lines that went into one covariance, and into one estimate.
     """
 
@@ -60,7 +45,7 @@ class Lines:
 
     def mean(self) -> Float:
         """(n,) the mean of T^2 = e^H C^-1 e when the model holds, nu p/(nu - p)."""
-        return np.asarray(self.dof * self.p / (self.dof - self.p))
+        return mean_t2(self.dof, self.p)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,16 +63,6 @@ class Data:
     def independent(self) -> float:
         """Real numbers measured, but for those that share data."""
         return sum(2 * part.H.size / part.shared[1] for part in self.lines)
-
-
-def factor(dof: Float, p: int) -> Float:
-    """w = ((nu - p)^2 - 1)/nu^2 (see above); EstimateError where nu is too small for it."""
-    if np.any(dof <= p + 1):
-        raise EstimateError(
-            f"{float(np.min(dof)):.3g} degrees of freedom are too few to weigh {p} outputs; "
-            "more repeats, a wider pooling or fewer outputs would do"
-        )
-    return np.asarray(((dof - p) ** 2 - 1) / dof**2)
 
 
 def collect(
@@ -151,7 +126,7 @@ def _lines(
     C = response.covariance[mask][:, entries[:, None], entries[None, :]]
     H = response.H[mask].reshape(int(mask.sum()), -1)[:, entries]
     dof = response.dof[mask]
-    sharing = _shared(response)
+    sharing = shared_lines(response)
     return Lines(
         response=response,
         frequency=response.frequency[mask],
@@ -161,33 +136,9 @@ def _lines(
         actuator=np.array([actuators.index(i) for _, i in used], dtype=np.int64),
         outputs=tuple(o for o, _ in used),
         inputs=tuple(i for _, i in used),
-        root=_root(C),
+        root=root(C),
         sd=np.sqrt(np.diagonal(C, axis1=1, axis2=2).real),
         factor=factor(dof, len(used)) / sharing[1],
         dof=dof,
         shared=sharing,
     )
-
-
-def _root(C: Complex) -> Complex:
-    """(n, p, p) inverse of the lower Cholesky factor of each C."""
-    scale = np.sqrt(np.diagonal(C, axis1=1, axis2=2).real)
-    if not np.all(scale > 0):
-        raise EstimateError("an output has no noise at some line; leave it out or pool more lines")
-    try:
-        lower = np.linalg.cholesky(C / (scale[:, :, None] * scale[:, None, :]))
-    except np.linalg.LinAlgError as failure:
-        raise EstimateError(
-            "the noise covariance is singular: two outputs carry the same noise; "
-            "leave one of them out"
-        ) from failure
-    return np.asarray(np.linalg.inv(lower) / scale[:, None, :])
-
-
-def _shared(response: FrequencyResponse) -> tuple[float, float]:
-    """Lines that share one covariance, and lines that share the data of one estimate."""
-    dof, n = float(np.median(response.dof)), response.n_averages
-    if response.estimator == "local":
-        window = (dof + LOCAL_PARAMETERS) / max(n, 1)
-        return max(1.0, window), max(1.0, window / INDEPENDENT)
-    return max(1.0, dof / max(n - 1, 1)), 1.0

@@ -27,8 +27,9 @@ from samii_rig.identify.likelihood import (
 )
 from samii_rig.identify.parameters import Free, Space, changed, space
 from samii_rig.identify.predict import Predictor
-from samii_rig.identify.result import Fit, Identification, bounds_met, fit_of, residuals_of
+from samii_rig.identify.result import Identification, bounds_met, residuals_of
 from samii_rig.rig.schema import Rig
+from samii_rig.signal.whitening import Fit, goodness
 from samii_rig.types import Float, FrequencyResponse
 
 STARTS = 8
@@ -71,7 +72,7 @@ class Problem:
 
     def fit(self, x: Float, n_free: int) -> Fit:
         """The test of the model at x."""
-        return fit_of(self.data, chi_square(self.data, self.predictor, x), n_free)
+        return goodness(self.data.lines, chi_square(self.data, self.predictor, x), n_free)
 
 
 def problem(

@@ -14,10 +14,11 @@ from typing import Literal, get_args
 
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.identify.actuator import BodeFit
-from samii_rig.identify.modal import Modes, Value, estimate_modes
+from samii_rig.identify.modal import Modes, estimate_modes
 from samii_rig.identify.parameters import Free, space
 from samii_rig.identify.targets import Match, Target, match
 from samii_rig.identify.velocity_feedback import SUFFIX, fit_gain
+from samii_rig.modal.modes import Value
 from samii_rig.rig.schema import Acceleration, RelativeAngle, Rig
 from samii_rig.types import Float, FrequencyResponse
 

@@ -4,7 +4,7 @@
     modes.modes[0].frequency_hz, modes.zeros_of("a_0")[0].frequency_hz
 
 Several modes at once and all channels together, by a rational model with common poles in
-noise units (`rational`); frequencies, damping, zeros and mode shapes are functions of its
+noise units (`modal.rational`); frequencies, damping, zeros and mode shapes are functions of its
 parameters and have their covariance by propagation.
 """
 
@@ -18,10 +18,13 @@ from scipy import stats
 
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.identify.data import Data, Lines, collect
-from samii_rig.identify.rational import EXTRAS, Rational, fit_rational, functions
-from samii_rig.identify.result import Fit, fit_of
+from samii_rig.modal.modes import Value
+from samii_rig.modal.rational import EXTRAS, Rational, functions
+from samii_rig.modal.selection import wald
+from samii_rig.modal.vector_fitting import fit_rational
 from samii_rig.model.sampled import hold_response, sensor_response
 from samii_rig.rig.schema import Rig
+from samii_rig.signal.whitening import Fit, goodness
 from samii_rig.types import Complex, Float, FrequencyResponse
 
 MOST_MODES = 8  # tried when their number is not given
@@ -33,19 +36,6 @@ HEAVY = 0.3  # damping ratio above which a pair of poles is background, not a mo
 VAGUE = 0.1  # relative standard deviation of a frequency above which it is none
 CHANCE = 1e-4  # probability that noise alone makes the residues of what is called a mode
 NEAR_AXIS = 0.5  # |Re z|/|z| below which a zero shows in a Bode diagram
-
-
-@dataclass(frozen=True, slots=True)
-class Value:
-    """A number with its standard deviation."""
-
-    value: float
-    sd: float
-
-    def interval(self, level: float = 0.9) -> tuple[float, float]:
-        """Two-sided interval of this probability."""
-        half = float(stats.norm.ppf((1 + level) / 2)) * self.sd
-        return self.value - half, self.value + half
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +162,7 @@ def _modes(model: Rational, data: Data, s: Complex, seen: Complex) -> Modes:
     d = data.lines[0]
     prediction = model.evaluate(s) * seen
     t2 = np.sum(np.abs(d.root @ (prediction - d.H)[:, :, None]) ** 2, axis=(1, 2))
-    fit = fit_of(data, [t2], model.n_poles + model.coefficients.size)
+    fit = goodness(data.lines, [t2], model.n_poles + model.coefficients.size)
     order = np.argsort(np.abs(model.pairs))
     low, high = abs(s[0]), abs(s[-1])
     modes, rest = [], list(model.real * model.scale + 0j)
@@ -243,9 +233,9 @@ def _place(model: Rational, k: int, m: int) -> int:
 def _ratio(model: Rational, m: int, a: int, b: int) -> tuple[complex, Float]:
     """Residue of entry a over that of b at pair m, and its covariance (2, 2)."""
     R = model.residues()[:, m]
-    ratio = complex(R[a] / R[b])
     if a == b:
-        return ratio, np.zeros((2, 2))
+        return 1 + 0j, np.zeros((2, 2))
+    ratio = complex(R[a] / R[b])
     at = [
         _place(model, a, m),
         _place(model, a, m) + 1,
@@ -259,12 +249,7 @@ def _ratio(model: Rational, m: int, a: int, b: int) -> tuple[complex, Float]:
 
 def _real(model: Rational, m: int) -> bool:
     """Whether noise would hardly make residues as large as those of pair m."""
-    at = np.array([_place(model, k, m) + i for k in range(len(model.coefficients)) for i in (0, 1)])
-    c = model.coefficients[:, 2 * m : 2 * m + 2].reshape(-1)
-    C = model.covariance[np.ix_(at, at)]
-    size = np.sqrt(np.diag(C))
-    z = np.linalg.solve(C / np.outer(size, size), c / size)
-    return bool(stats.chi2.sf(float(c / size @ z), c.size) < CHANCE)
+    return bool(stats.chi2.sf(wald(model, m), 2 * len(model.coefficients)) < CHANCE)
 
 
 def _zeros(

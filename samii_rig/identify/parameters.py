@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samii_rig.errors import InputError
+from samii_rig.errors import InputError, one_of
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.types import Float
 
@@ -162,5 +162,5 @@ def _named(name: str) -> Free:
 def _choices(rig: Rig, item: Free) -> str:
     for element in rig.element:
         if element.name == item.element:
-            return f"a parameter of {element.name}: {', '.join(parameters(element))}"
-    return f"an element of {rig.name}: {', '.join(e.name for e in rig.element)}"
+            return f"a parameter of {element.name}, {one_of(item.symbol, parameters(element))}"
+    return f"an element of {rig.name}, {one_of(item.element, [e.name for e in rig.element])}"

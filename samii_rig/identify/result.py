@@ -14,30 +14,10 @@ from samii_rig.identify.identifiability import Identifiability
 from samii_rig.identify.parameters import Space
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.statistics import octaves
+from samii_rig.signal.whitening import Fit
 from samii_rig.types import Complex, Float
 
-REFUSED = 0.01  # p-value below which the model is said not to fit
 AT_BOUND = 1e-3  # distance of log(value) from its bound that counts as on it
-
-
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """How well a model fits in noise units.
-
-    ratio : mean of T^2 over its mean if the model holds (Hotelling), corrected for the number
-        of parameters: chi-square per degree of freedom; 1 when the model holds.
-    p_value : probability of such a ratio when the model holds.
-    n_real : real numbers fitted.
-    """
-
-    ratio: float
-    p_value: float
-    n_real: int
-
-    @property
-    def holds(self) -> bool:
-        """Whether the noise alone can explain what is left."""
-        return self.p_value >= REFUSED
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,28 +133,6 @@ class Identification:
                 f"{self.reached} of {self.starts} starts ended here, the others at a worse fit."
             )
         return tuple(out)
-
-
-def fit_of(data: Data, t2: Sequence[Float], n_free: int) -> Fit:
-    """The test of a model from T^2 of every line, see `chi_square`.
-
-    T^2 of lines that share a covariance vary together, so the mean of n lines of p entries
-    in n_w groups has the relative variance 1/(p n) + 1/(p nu n_w); its distribution is taken
-    for a gamma of that variance.
-    """
-    size = np.array([d.p * len(d.frequency) for d in data.lines], dtype=np.float64)
-    total = sum(d.p * float(np.sum(q / d.mean())) for d, q in zip(data.lines, t2, strict=True))
-    sharing = np.array([d.shared[1] for d in data.lines])
-    taken = 0.5 * n_free * float(np.sum(size * sharing) / np.sum(size))
-    ratio = total / max(float(np.sum(size)) - taken, 1.0)
-    spread = 0.0
-    for d, n in zip(data.lines, size, strict=True):
-        groups = max(1.0, len(d.frequency) / d.shared[0])
-        alone = 1 / max(1.0, len(d.frequency) / d.shared[1])
-        spread += n**2 * (alone + 1 / (float(np.mean(d.dof)) * groups)) / d.p
-    spread /= float(np.sum(size)) ** 2
-    p_value = float(stats.gamma.sf(ratio, 1 / spread, scale=spread))
-    return Fit(ratio, p_value, data.n_real)
 
 
 def residuals_of(data: Data, prediction: Sequence[Complex]) -> tuple[Residual, ...]:

@@ -8,8 +8,9 @@ from rich.table import Table
 from rich.text import Text
 
 from samii_rig.identify.methods import Found
-from samii_rig.identify.modal import Modes, Value
+from samii_rig.identify.modal import Modes
 from samii_rig.identify.result import Identification, Residual
+from samii_rig.modal.modes import Value
 
 
 def summary_table(found: Identification) -> RenderableType:

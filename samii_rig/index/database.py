@@ -18,7 +18,7 @@ from samii_rig.index.entry import Entry
 if sys.platform != "win32":
     import fcntl
 
-VERSION = 1  # of the tables below; a file of another one is made anew
+VERSION = 2  # of the tables below; a file of another one is made anew
 # All that is searched stands in the index `searched` too, in the order of an answer, so that a
 # search reads that alone.
 BUSY = 20.0  # s that one waits for another's transaction

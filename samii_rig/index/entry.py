@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from hashlib import blake2b
 from pathlib import Path
 
-from samii_rig.errors import RecordingError
+from samii_rig.errors import InputError, RecordingError
 from samii_rig.index.remarks import Remarks, read_remarks
 from samii_rig.record import layout, scan
 from samii_rig.record.contents import Contents, attachment, read_contents, read_tail
 from samii_rig.record.reader import check_format, sample_channel
+from samii_rig.record.verify import data_whole
 from samii_rig.record.writer import PARTIAL
+from samii_rig.rig.load import tables
 
 SUFFIX = ".mcap"
 ID_BYTES = 8  # 10,000 recordings share one by chance once in 10^11 folders
@@ -27,7 +28,8 @@ class Entry:
     path : below the folder, with `/`.
     started : UTC, ISO 8601; where the recording does not say, the time of the file.
     status : of its stop record; `unfinished` for a file that is being written or was cut off,
-        `unreadable` for one that is none of ours or damaged. problem : why.
+        `damaged` for one whose bytes are not as they were written, `unreadable` for one that is
+        none of ours, or too damaged to tell. problem : why.
     verdict, tags, notes : from its remarks; notes are joined line by line.
     """
 
@@ -75,6 +77,9 @@ def read_entry(folder: Path, path: str) -> Entry:
     entry = Entry(identity(path), path, started=made, bytes=stat.st_size)
     try:
         entry = _read(file, entry)
+    except scan.DamagedError as error:
+        remedy = "samii-rig recover gives back what is whole"
+        entry = replace(entry, status="damaged", problem=f"{_without(file, error)}; {remedy}")
     except RecordingError as error:
         entry = replace(entry, status="unreadable", problem=_without(file, error))
     try:
@@ -115,9 +120,11 @@ def _read(file: Path, entry: Entry) -> Entry:
         status, reason = "unfinished", ""
         problem = "not closed: it is being written, or was cut off; samii-rig recover closes it"
         samples = _counted(contents)
+    elif not data_whole(data, contents):
+        status, problem = "damaged", "some of its bytes changed; samii-rig verify says which"
     return replace(
         entry,
-        started=_time(notes.get("started", "")) or entry.started,
+        started=_time(notes.get("started", "")) or _stamp(contents) or entry.started,
         rig=_named(data, contents, layout.RIG_FILE),
         experiment=notes.get("experiment") or _named(data, contents, layout.EXPERIMENT_FILE),
         operator=notes.get("operator", ""),
@@ -140,8 +147,8 @@ def _counted(contents: Contents) -> int:
 def _named(data: memoryview, contents: Contents, name: str) -> str:
     """The name that an attached file gives itself; "" where it has none."""
     try:
-        found = tomllib.loads((attachment(data, contents, name) or b"").decode())
-    except (ValueError, RecursionError):
+        found = tables((attachment(data, contents, name) or b"").decode(), name)
+    except (UnicodeDecodeError, InputError):
         return ""
     named = found.get("name", "")
     return named if isinstance(named, str) else ""
@@ -161,6 +168,17 @@ def _time(text: str) -> str:
         found = datetime.fromisoformat(text)
         return found.astimezone(UTC).isoformat(timespec="seconds")
     except (ValueError, OverflowError):
+        return ""
+
+
+def _stamp(contents: Contents) -> str:
+    """The stamp of the first sample or event, "" where stamps are not the wall clock's."""
+    if not contents.clock_offset() or not contents.chunks:
+        return ""
+    seconds = contents.chunks[0].head.start_time * 1e-9
+    try:
+        return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")
+    except (ValueError, OverflowError, OSError):
         return ""
 
 

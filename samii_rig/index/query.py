@@ -34,7 +34,7 @@ class Query:
     rig: str = _asked("Name of the rig, as its file says.")
     experiment: str = _asked("Name of the experiment.")
     operator: str = _asked("Who stood at the rig.")
-    status: str = _asked("completed, stopped, tripped, failed, unfinished or unreadable.")
+    status: str = _asked("completed, stopped, tripped, failed, unfinished, damaged or unreadable.")
     verdict: str = _asked("Of the diagnosis: no_mismatch, named, ambiguous or unknown.")
     tag: str = _asked("A tag.")
     since: str = _asked("First day or time, such as 2026-11-01.")

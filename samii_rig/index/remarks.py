@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from samii_rig.errors import InputError, RecordingError
+from samii_rig.files import SpecialFileError, open_file, reason
 from samii_rig.plain import plain
 
 if sys.platform != "win32":
@@ -69,12 +70,12 @@ def read_remarks(recording: Path) -> Remarks:
     """
     path = remarks_path(recording)
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             raw = file.read(MAX_BYTES + 1)
     except FileNotFoundError:
         return Remarks()
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+        raise RecordingError(f"{path} cannot be read: {reason(error)}") from error
     try:
         if len(raw) > MAX_BYTES:
             raise ValueError("too large")
@@ -148,9 +149,11 @@ def _change(recording: Path, change: Callable[[Remarks], Remarks]) -> Remarks:
 def _alone(recording: Path) -> Iterator[None]:
     """Nobody else changes the remarks of this recording meanwhile."""
     try:
-        with recording.open("rb") as file:
+        with open_file(recording) as file:
             if sys.platform != "win32":
                 fcntl.flock(file, fcntl.LOCK_EX)
             yield
     except FileNotFoundError as error:
         raise RecordingError(f"{recording} is not there; expected a recording") from error
+    except SpecialFileError as error:
+        raise RecordingError(f"{recording} cannot be read: {reason(error)}") from error

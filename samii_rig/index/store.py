@@ -7,12 +7,16 @@ beside them, and does so by itself when the file is damaged, missing or of anoth
 from __future__ import annotations
 
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 from samii_rig.errors import InputError
+from samii_rig.files import check_folder
 from samii_rig.index.database import COLUMNS, Database, UnsoundError, entry_of, row_of
 from samii_rig.index.entry import Entry, identity, is_recording, read_entry
 from samii_rig.index.query import Query
@@ -50,11 +54,12 @@ class Index:
     written.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, private: Path | None = None) -> None:
+        """private : where the index is kept, in place of a folder of its own in `folder`."""
         if not folder.is_dir():
             raise InputError("FOLDER", "", str(folder), "a folder of recordings")
         self.folder = folder
-        self._database = Database(folder / PRIVATE / FILE)
+        self._database = Database((private or folder / PRIVATE) / FILE)
 
     def refresh(self, progress: Callable[[int, int], None] | None = None) -> Refreshed:
         """Bring the index up to date with the folder.
@@ -193,6 +198,21 @@ class Index:
             return work()
         except (ValueError, TypeError) as error:
             raise UnsoundError(str(error)) from error
+
+
+@contextmanager
+def index_for_reading(folder: Path) -> Iterator[Index]:
+    """The index of a folder; of one that cannot be written to, a copy that is forgotten after."""
+    try:
+        check_folder("FOLDER", folder / PRIVATE)
+    except InputError:
+        with tempfile.TemporaryDirectory() as place:
+            # What another has indexed there need not be read again; what is unsound is made anew.
+            with suppress(OSError):
+                shutil.copy(folder / PRIVATE / FILE, place)
+            yield Index(folder, Path(place))
+    else:
+        yield Index(folder)
 
 
 def _stamps(folder: Path) -> Iterator[tuple[str, str]]:

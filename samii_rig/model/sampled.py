@@ -33,6 +33,12 @@ def hold_response(frequency_hz: Float, rate_hz: float, delay: float = 0.0) -> Co
     return np.asarray(lag * np.sinc(f / rate_hz))
 
 
+def hold_at(s: Complex, rate_hz: float, delay: float = 0.0) -> Complex:
+    """The same at complex s (not 0), rad/s: (1 - e^{-s T})/(s T) e^{-s delay}."""
+    s = np.asarray(s, dtype=np.complex128)
+    return np.asarray(-np.expm1(-s / rate_hz) * rate_hz / s * np.exp(-s * delay))
+
+
 def lowpass_poles(sensor: SensorBase) -> Complex:
     """Poles of the sensor's anti-alias Butterworth filter, then of its lag, rad/s."""
     lag = np.full(1 if sensor.lag > 0 else 0, -1 / sensor.lag if sensor.lag > 0 else 0.0)
@@ -82,7 +88,11 @@ def filter_residues(sensor: SensorBase) -> Complex:
 def sensor_response(sensors: Sequence[SensorBase], frequency_hz: Float) -> Complex:
     """Filters and delays of the sensors, (n_freq, n_sensor); a delay is a negative phase."""
     f = np.asarray(frequency_hz, dtype=np.float64)
-    s = np.asarray(2j * np.pi * f, dtype=np.complex128)
+    return sensors_at(sensors, np.asarray(2j * np.pi * f, dtype=np.complex128))
+
+
+def sensors_at(sensors: Sequence[SensorBase], s: Complex) -> Complex:
+    """The same at complex s, rad/s."""
     columns = [filter_response(x, s) * np.exp(-s * x.delay) for x in sensors]
     return np.stack(columns, axis=1)
 

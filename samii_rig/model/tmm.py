@@ -126,7 +126,13 @@ class Chain:
 
         Raises InputError for a frequency that is not above 0 Hz or an unknown parameter.
         """
-        s, c = _s(frequency_hz), self._c
+        return self.gradient_at(_s(frequency_hz), wrt)
+
+    def gradient_at(
+        self, s: ArrayLike, wrt: Sequence[tuple[str, str]] | None = None
+    ) -> tuple[Complex, Complex]:
+        """The same at any complex s, rad/s, as `evaluate`."""
+        s, c = _vector(s), self._c
         keys = self.parameters if wrt is None else tuple(wrt)
         place = np.full(len(self.parameters) + 1, -1)
         for i, key in enumerate(keys):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import cast
 
-from samii_rig.errors import InputError
+from samii_rig.errors import InputError, one_of
 from samii_rig.papers.result import Result
 
 
@@ -127,5 +127,5 @@ def entries(ids: list[str]) -> tuple[Entry, ...]:
     known = {e.id: e for e in ENTRIES}
     for name in ids:
         if name not in known:
-            raise InputError("samii-rig papers", "ID", name, f"one of {', '.join(known)}")
+            raise InputError("samii-rig papers", "ID", name, one_of(name, known))
     return tuple(known[name] for name in ids) if ids else ENTRIES

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize, special
 
-from samii_rig.diagnose.judge import IN_DATA
-from samii_rig.diagnose.stated import ANSWER, PLACE, Evidence
+from samii_rig.diagnose.stated import ANSWER, IN_DATA, PLACE, Evidence
 from samii_rig.errors import InputError
 from samii_rig.prove.trial import Answer, Trial, Truth
 from samii_rig.record.export import replacing
@@ -33,13 +32,13 @@ def row(truth: Truth, answer: Mapping[str, Any]) -> tuple[Evidence, bool] | None
     if not _asked(told) or not told["causes"]:
         return None
     said = replace(Answer.of({**answer, "causes": told["causes"]}), verdict="named")
-    known = {f.name: told[f.name] for f in fields(Evidence)}
+    known = {f.name: told[f.name] for f in fields(Evidence) if f.name in told}
     return Evidence(**known), len(Trial(truth, said).matches()) == len(said.causes)
 
 
 def _asked(told: Mapping[str, Any]) -> bool:
     """Whether the answer rests on the probability of its evidence."""
-    return bool(told["drop"] > IN_DATA and not told["beyond"])
+    return bool(told["drop"] > told.get("worth", IN_DATA) and not told["beyond"])
 
 
 def places(truth: Truth, answer: Mapping[str, Any]) -> list[tuple[Evidence, bool]]:
@@ -48,7 +47,7 @@ def places(truth: Truth, answer: Mapping[str, Any]) -> list[tuple[Evidence, bool
     told = answer["evidence"]
     if not _asked(told):
         return []
-    known = Evidence(**{f.name: told[f.name] for f in fields(Evidence)})
+    known = Evidence(**{f.name: told[f.name] for f in fields(Evidence) if f.name in told})
     causes = Answer.of({**answer, "causes": told["causes"]}).causes
     hidden = {e.site for e in truth.effects}
     return [(known, bool(hidden & {site for _, site in c.names})) for c in causes]

@@ -12,6 +12,7 @@ from typing import TypeVar
 from isal.isal_zlib import crc32
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, DataEnd, Footer, Header, McapRecord, Metadata, Schema
+from mcap.writer import MCAP0_MAGIC
 
 from samii_rig.errors import RecordingError
 from samii_rig.record import layout, scan
@@ -20,11 +21,17 @@ from samii_rig.record.scan import ChunkHead, DamagedError, Span
 _MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel id, sequence, log time, publish time
 _INDEX_HEAD = struct.Struct("<HI")  # channel id, bytes of entries
 _INDEX_ENTRY = 16  # log time and offset, u64 each
-# Bytes that looking for whole chunks may read or unpack in vain, as a multiple of the file.
+# What the packed chunks of a file may unpack to, as a multiple of the file. A sample takes 16 bytes
+# of a message index, which is not packed, so that rows of s bytes come to s/16 at most; events
+# and results stay under the floor. Above the ceiling a file is made to cost time and memory,
+# whatever its channels are said to be.
+EXPANSION_FLOOR, EXPANSION_CEILING = 16, 100
+SMALL = 64 << 20  # bytes that are never too many
+# Bytes that looking for whole records may read or unpack in vain, as a multiple of the file.
 # Damage by chance costs each chunk's unpacked size at most once; samples pack to more than
 # 1/64 unless next to all of them are constant.
 _VAIN = 64
-_GIVEN_UP = "false chunks overlap; the search for whole ones behind is given up"
+_GIVEN_UP = "false records overlap; the search for whole ones behind is given up"
 
 Item = TypeVar("Item")
 Record = TypeVar("Record", bound=McapRecord)
@@ -75,6 +82,12 @@ class Contents:
         """The run's notes; what was noted later stands instead of what was before."""
         return {key: text for found in self.maps(layout.NOTES) for key, text in found.items()}
 
+    def clock_offset(self) -> int:
+        """ns by which the log times are ahead of the device's clock; recordings that do not say
+        are stamped with the device's clock itself."""
+        found = self.one_map(layout.CLOCK)
+        return 0 if found is None else layout.clock_from_map(found)
+
     def one_map(self, name: str) -> dict[str, str] | None:
         """The one metadata record of this name, None if there is none."""
         found = self.maps(name)
@@ -83,36 +96,45 @@ class Contents:
         return found[0] if found else None
 
 
+class ForeignError(RecordingError):
+    """A file of another kind."""
+
+
 def check_start(data: memoryview) -> None:
-    """RecordingError for a file that is no recording at all."""
+    """ForeignError for a file that is no recording at all, RecordingError for the start of one."""
     if not scan.has_magic(data, 0):
-        raise RecordingError("it does not begin as an MCAP file")
+        if MCAP0_MAGIC.startswith(data[: scan.MAGIC_SIZE]):
+            raise RecordingError("it ends before the first record of an MCAP file")
+        raise ForeignError("it does not begin as an MCAP file")
 
 
 def read_contents(data: memoryview, stop: int, *, strict: bool) -> Contents:
     """Walk the data section, which ends before `stop`.
 
-    strict : raise the first DamagedError; otherwise note it, look for the next whole chunk behind
-        it and go on.
+    strict : raise the first DamagedError; otherwise note it, look for the next record that is
+        whole by its own checksum and go on there.
     """
     check_start(data)
     contents = Contents()
-    search = _ChunkSearch(data, stop)
-    at = scan.MAGIC_SIZE
+    search = _RecordSearch(data, stop)
+    at = sure = scan.MAGIC_SIZE
     while at < stop and contents.data_crc is None:
         span = None
         try:
             span = next(scan.spans(data, at, stop))
             _take(contents, data, span)
             at = contents.end = span.end
+            # A message index has no checksum: where a byte of it is gone, it ends in what follows.
+            if span.opcode != Opcode.MESSAGE_INDEX:
+                sure = at
         except DamagedError as damaged:
             if strict:
                 raise
             contents.damage.append(damaged)
-            # If its length is right the record ends where it says; if a whole chunk begins
-            # before that, the length is what was damaged.
-            chunk = search.first(at + 1)
-            ends = [x for x in (chunk, span.end if span else None) if x is not None]
+            # If its length is right the record ends where it says; if a whole one begins before
+            # that, the length is what was damaged.
+            whole = search.first(sure)
+            ends = [x for x in (whole, span.end if span else None) if x is not None]
             if search.given_up:
                 contents.damage.append(DamagedError(at, _GIVEN_UP))
             if not ends or search.given_up:
@@ -165,26 +187,42 @@ def _take_index(contents: Contents, data: memoryview, span: Span) -> None:
     counts[channel_id] = counts.get(channel_id, 0) + length // _INDEX_ENTRY
 
 
-class _ChunkSearch:
-    """Finds chunks that are whole down to their CRC among bytes that have lost their order.
+def _mark(name: str) -> bytes:
+    """A name as MCAP writes one."""
+    return struct.pack("<I", len(name)) + name.encode()
+
+
+# Of a chunk before its compression's name: opcode and length, two times, size and CRC.
+_BEFORE_NAME = scan.HEAD + 8 + 8 + 8 + 4
+# What tells where a record may begin, and how many of its bytes stand before that.
+_MARKS = (
+    *((_mark(name), _BEFORE_NAME) for name in ("lz4", "zstd")),
+    *((_mark(name), scan.HEAD) for name in layout.MAPS),
+)
+
+
+class _RecordSearch:
+    """Finds chunks, and metadata of ours, that are whole down to their checksum among bytes that
+    have lost their order.
 
     False chunks may lie inside each other and share the bytes that they make one unpack, so
     that the work could grow with the square of the file. What is read or unpacked in vain is
     therefore charged, and beyond `_VAIN` times the file and one chunk the search gives up.
     """
 
-    # Before the compression's name: opcode and length, two times, size and CRC.
-    _BEFORE = scan.HEAD + 8 + 8 + 8 + 4
-    _MARKS = tuple(struct.pack("<I", len(name)) + name for name in (b"lz4", b"zstd"))
-
     def __init__(self, data: memoryview, stop: int) -> None:
         self._data = data
         self._stop = stop
         self._known: tuple[int, int | None] | None = None  # searched from, found at
         # Each mark is passed once, as nobody searches backwards.
-        hits = (re.finditer(re.escape(mark), data[:stop]) for mark in self._MARKS)
-        self._hits = (hit.start() - self._BEFORE for hit in merge(*hits, key=re.Match.start))
+        self._hits = merge(*(self._found(mark, before) for mark, before in _MARKS))
         self._budget = _VAIN * stop + scan.MAX_CHUNK
+
+    def _found(self, mark: bytes, before: int) -> Iterator[int]:
+        """Where records may begin, by one mark."""
+        for hit in re.finditer(re.escape(mark), self._data[: self._stop]):
+            if hit.start() >= before:
+                yield hit.start() - before
 
     @property
     def given_up(self) -> bool:
@@ -196,7 +234,7 @@ class _ChunkSearch:
         self._budget -= size
 
     def first(self, start: int) -> int | None:
-        """Offset of the first whole chunk at or after `start`, None if there is none."""
+        """Offset of the first whole record at or after `start`, None if there is none."""
         if self._known is not None:
             searched, found = self._known
             if searched <= start and (found is None or start <= found):
@@ -214,6 +252,8 @@ class _ChunkSearch:
     def _whole(self, at: int) -> bool:
         try:
             span = next(scan.spans(self._data, at, self._stop))
+            if span.opcode == Opcode.METADATA:
+                return self._sealed(span)
             if span.opcode != Opcode.CHUNK:
                 return False
             head = scan.chunk_head(self._data, span)
@@ -225,6 +265,42 @@ class _ChunkSearch:
             self.charge(head.size + span.end - span.start)
             return False
         return True
+
+    def _sealed(self, span: Span) -> bool:
+        self.charge(span.end - span.start)
+        try:
+            record = scan.parse(Metadata, self._data, span)
+            layout.unsealed(record.metadata, record.name)
+        except RecordingError:
+            return False
+        return True
+
+
+class Unpacker:
+    """Unpacks the chunks of a file, and no more in all than a run with its channels can hold, so
+    that what a file costs is bounded by its size on the disk."""
+
+    def __init__(self, data: memoryview, row: int) -> None:
+        """row : bytes of a sample's record, 0 for a file without samples."""
+        self._data = data
+        most = min(max(row / _INDEX_ENTRY, EXPANSION_FLOOR), EXPANSION_CEILING)
+        self._most = self._left = max(SMALL, round(most * len(data)))
+
+    def __call__(self, head: ChunkHead) -> bytes | memoryview:
+        """The chunk's records; DamagedError if it is not whole, ExpandedError if it is too much."""
+        if head.compression:
+            self._left -= head.size
+        if self._left < 0:
+            raise ExpandedError(
+                f"byte {head.span.start}: the chunks up to here claim more than "
+                f"{self._most / 1e6:.0f} MB unpacked, and a run in a file of "
+                f"{len(self._data) / 1e6:.1f} MB has no more; what follows is not looked at"
+            )
+        return scan.unpack(self._data, head)
+
+
+class ExpandedError(RecordingError):
+    """A file that is made to cost time and memory."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,7 +92,11 @@ def samples(recording: Recording) -> xarray.Dataset:
             "time": (
                 "time",
                 seconds(r),
-                {"units": "s", "start_ns": int(r.time[0]) if len(r) else 0},
+                {
+                    "units": "s",
+                    "start_ns": int(r.time[0]) if len(r) else 0,
+                    "wall_start_ns": int(r.wall_time[0]) if len(r) else 0,
+                },
             ),
             "sequence": ("time", r.sequence),
             "channel": [c.name for c in r.channels],

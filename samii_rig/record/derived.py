@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from samii_rig.errors import RecordingError
+from samii_rig.files import open_file, reason
 from samii_rig.record.writer import RunWriter
 from samii_rig.types import FrequencyResponse, StopRecord
 
@@ -16,10 +17,10 @@ _PREFIX = "source."  # metadata key `source.NAME` holds the SHA-256 of the recor
 def sha256_of(path: Path) -> str:
     """SHA-256 of a file's bytes, in hexadecimal."""
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise RecordingError(f"{path} cannot be read: {error.strerror}") from error
+        raise RecordingError(f"{path} cannot be read: {reason(error)}") from error
 
 
 def save_frequency_responses(
@@ -37,7 +38,12 @@ def save_frequency_responses(
         raise RecordingError(f"there is no frequency response to write to {path}")
     hashes = {f"{_PREFIX}{source.name}": sha256_of(source) for source in sources}
     with RunWriter(
-        path, (), responses[0].rate_hz, metadata={**(metadata or {}), **hashes}
+        # No device's clock is behind it: zero is the moment at which it is written.
+        path,
+        (),
+        responses[0].rate_hz,
+        metadata={**(metadata or {}), **hashes},
+        keep_partial=False,
     ) as writer:
         for item in responses:
             writer.frequency_response(item)

@@ -2,18 +2,30 @@
 
 from __future__ import annotations
 
+import errno
 import queue
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 
-from samii_rig.errors import RecordingError
+from samii_rig.errors import DiskError
 from samii_rig.record.appender import Appender
 
 Action = Callable[[Appender], None]
 
 SYNC_PERIOD = 0.4  # s between syncs; with the sync itself under the promised second
 MAX_WAITING = 8  # actions between the caller and the disk; then the caller waits
+# s that a caller waits for the disk, or for the thread, before it is taken for dead. Disks that
+# spin up and file servers that start again answer within it.
+ANSWERS_WITHIN = 60.0
+POLL = 0.0005  # s between two looks of one who waits; a sync takes some ms
+
+
+class _Mark:
+    """Queued behind actions; `done` once they are on the disk."""
+
+    done = False
 
 
 class DiskThread:
@@ -21,15 +33,22 @@ class DiskThread:
 
     pending : called before a periodic sync when nothing is queued; returns the action that
         appends what the caller has gathered so far, or None. It must not block.
+    name : of the file; a sync fails if nothing is there any more, as nobody would find what is
+        recorded from then on.
 
-    Once an action or a sync fails nothing more is written, and every call says why.
+    Once an action or a sync fails nothing more is written, and every call says why. Nobody waits
+    for ever, whatever ends the thread: a caller looks again and again, and holds no lock that an
+    exception between two lines of it could leave locked.
     """
 
-    def __init__(self, appender: Appender, pending: Callable[[], Action | None]) -> None:
+    def __init__(
+        self, appender: Appender, pending: Callable[[], Action | None], name: Path
+    ) -> None:
         self._appender = appender
+        self._name = name
         self._pending = pending
-        self._queue: queue.Queue[Action | threading.Event | None] = queue.Queue(MAX_WAITING)
-        self._failure: Exception | None = None
+        self._queue: queue.SimpleQueue[Action | _Mark | None] = queue.SimpleQueue()
+        self._failure: BaseException | None = None
         self._dirty = False
         self._thread = threading.Thread(target=self._run, name="record", daemon=True)
         self._thread.start()
@@ -39,31 +58,52 @@ class DiskThread:
         return self._queue.empty()
 
     def check(self) -> None:
-        """RecordingError if the disk refused something earlier."""
+        """DiskError if the disk refused something earlier."""
         if self._failure is not None:
-            raise RecordingError(f"recording failed: {self._failure}") from self._failure
+            failure = self._failure
+            reason = getattr(failure, "strerror", None) or str(failure) or type(failure).__name__
+            raise DiskError(f"{self._name} cannot be written: {reason}") from failure
 
     def put(self, action: Action) -> None:
         """Queue an action; waits while the disk is `MAX_WAITING` actions behind."""
+        self._wait(lambda: self._queue.qsize() < MAX_WAITING)
         self.check()
         self._queue.put(action)
 
     def barrier(self) -> None:
         """Return when all that was queued is on the disk."""
-        done = threading.Event()
-        self._queue.put(done)
-        done.wait()
+        mark = _Mark()
+        self._queue.put(mark)
+        self._wait(lambda: mark.done)
         self.check()
 
-    def stop(self) -> None:
-        """Carry out what is queued and end the thread."""
+    def stop(self) -> bool:
+        """Carry out what is queued and end the thread; whether it has ended."""
         self._queue.put(None)
-        self._thread.join()
+        self._thread.join(ANSWERS_WITHIN)
+        return not self._thread.is_alive()
+
+    def _wait(self, over: Callable[[], bool]) -> None:
+        give_up = time.monotonic() + ANSWERS_WITHIN
+        while not over():
+            if not self._thread.is_alive():
+                self.check()
+                raise DiskError(f"{self._name} cannot be written: its thread has ended")
+            if time.monotonic() > give_up:
+                late = f"the disk did not answer in {ANSWERS_WITHIN:g} s"
+                raise DiskError(f"{self._name} cannot be written: {late}")
+            time.sleep(POLL)
 
     def _run(self) -> None:
+        try:
+            self._serve()
+        except BaseException as error:  # handed to the caller by `check`
+            self._failure = self._failure or error
+
+    def _serve(self) -> None:
         deadline = time.monotonic() + SYNC_PERIOD
         while True:
-            action: Action | threading.Event | None = None
+            action: Action | _Mark | None = None
             try:
                 action = self._queue.get(timeout=max(deadline - time.monotonic(), 0.0))
             except queue.Empty:
@@ -77,18 +117,23 @@ class DiskThread:
                     self._act(action)
                 if due and self._queue.empty() and (gathered := self._pending()):
                     self._act(gathered)
-                if self._dirty and (due or isinstance(action, threading.Event)):
-                    self._appender.sync()
-                    self._dirty = False
-            except Exception as error:  # handed to the caller by `check`
+                if self._dirty and (due or isinstance(action, _Mark)):
+                    self._sync()
+            except Exception as error:
                 self._failure = self._failure or error
                 self._dirty = False
             if due:
                 deadline = time.monotonic() + SYNC_PERIOD
-            if isinstance(action, threading.Event):
-                action.set()
+            if isinstance(action, _Mark):
+                action.done = True
 
     def _act(self, action: Action) -> None:
         if self._failure is None:
             self._dirty = True
             action(self._appender)
+
+    def _sync(self) -> None:
+        self._appender.sync()
+        if not self._name.exists():
+            raise FileNotFoundError(errno.ENOENT, "it was moved or removed meanwhile")
+        self._dirty = False

@@ -38,7 +38,8 @@ _NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened during a run: `time` in ns on the device's clock."""
+    """Something that happened during a run: `time` in ns, on the device's clock once read; in the
+    message, where it is the `stamp`, on the wall clock."""
 
     time: int
     name: str

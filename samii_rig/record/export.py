@@ -4,17 +4,16 @@ A file is written beside its place and renamed when whole, so that nothing half-
 ever found under its name. What each format can hold:
 
 - NPZ, MAT: all of it, as arrays without pickle; as variables of MATLAB 5.
-- CSV: all of it but the findings, one row a frequency, units in the names of the columns.
+- CSV: all of it but the findings, one row a frequency, units in the names of the columns; gain
+  and phase with their standard deviations in the last ones, for a spreadsheet.
 - UFF 58: H (function type 4), coherence (6); the format has no place for a covariance.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
 import os
 import tempfile
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -22,15 +21,9 @@ import numpy as np
 
 from samii_rig.errors import InputError
 from samii_rig.record.convert import arrays
-from samii_rig.types import Channel, Complex, Float, FrequencyResponse
-
-# Codes of the universal file format, data set 58.
-_FRF, _COHERENCE = 4, 6
-_FREQUENCY, _ACCELERATION, _UNKNOWN = 18, 12, 0
-_PLUS_X, _PLUS_Z_ROTATION = 1, 6
-# The format writes an uneven abscissa in single precision (E13.5, 5 digits after the
-# point); an even one as start and step. Beyond this relative deviation it is uneven.
-_EVEN = 1e-9
+from samii_rig.record.uff.channels import response_sets
+from samii_rig.record.uff.file import write_uff
+from samii_rig.types import Float, FrequencyResponse
 
 
 def export_response(path: Path | str, response: FrequencyResponse) -> Path:
@@ -89,7 +82,8 @@ def table(response: FrequencyResponse) -> tuple[list[str], Float]:
     Columns: frequency; real and imaginary part of each entry of H, outputs first; the
     covariance C = E[dH dH^H] of the entries in that order, its upper triangle, real and
     imaginary part (the diagonal is real); its degrees of freedom; coherence of each
-    output; amplitude of each input; even and odd distortion where known.
+    output; amplitude of each input; even and odd distortion where known; gain and phase of each
+    entry, with standard deviations sqrt(C/2) and sqrt(C/2)/|H|.
     """
     r = response
     entries = [(f"{y.name}/{u.name}", f"{y.unit}/{u.unit}") for y in r.outputs for u in r.inputs]
@@ -119,6 +113,14 @@ def table(response: FrequencyResponse) -> tuple[list[str], Float]:
             for i, y in enumerate(r.outputs):
                 names.append(f"{what} distortion {y.name} [1]")
                 columns.append(level[:, i])
+    for i, (name, unit) in enumerate(entries):
+        gain = np.abs(flat[:, i])
+        sd = np.sqrt(0.5 * r.covariance[:, i, i].real)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            sd_phase = np.rad2deg(sd / gain)
+        names += [f"gain {name} [{unit}]", f"sd gain {name} [{unit}]"]
+        names += [f"phase {name} [deg]", f"sd phase {name} [deg]"]
+        columns += [gain, sd, np.angle(flat[:, i], deg=True), sd_phase]
     return names, np.column_stack(columns)
 
 
@@ -148,75 +150,7 @@ def _write_mat(path: Path, response: FrequencyResponse) -> None:
 
 
 def _write_uff(path: Path, response: FrequencyResponse) -> None:
-    import pyuff
-
-    r = response
-    sets = []
-    for i, y in enumerate(r.outputs):
-        for j, u in enumerate(r.inputs):
-            unit = f"{y.unit}/{u.unit}"
-            sets.append(_uff_set(r, _FRF, r.H[:, i, j], (i, y), (j, u), unit))
-        sets.append(_uff_set(r, _COHERENCE, r.coherence[:, i], (i, y), (0, r.inputs[0]), ""))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        file = pyuff.UFF(str(path))
-        with contextlib.redirect_stdout(io.StringIO()):  # it reports its errors by print
-            for number, one in enumerate(sets):
-                file.write_sets(one, mode="overwrite" if number == 0 else "add")
-
-
-def _uff_set(
-    r: FrequencyResponse,
-    kind: int,
-    data: Complex | Float,
-    response: tuple[int, Channel],
-    reference: tuple[int, Channel],
-    unit: str,
-) -> dict[str, object]:
-    (i, y), (j, u) = response, reference
-    what = "FRF" if kind == _FRF else "Coherence"
-    f = r.frequency
-    step = (f[-1] - f[0]) / (len(f) - 1) if len(f) > 1 else 0.0
-    even = len(f) > 1 and bool(np.all(np.abs(np.diff(f) / step - 1) < _EVEN))
-    return {
-        "type": 58,
-        "binary": 0,
-        "func_type": kind,
-        "id1": f"{what} {y.name}/{u.name}"[:80],
-        "id2": f"level {r.level:g} {r.level_unit}, {r.n_averages} averages"[:80],
-        "id3": "NONE",
-        "id4": (f"method {' '.join(r.method.split())}")[:80],
-        "id5": "NONE",
-        "ver_num": 0,
-        "load_case_id": 0,
-        "rsp_ent_name": y.name[:10],
-        "rsp_node": i + 1,
-        "rsp_dir": _direction(y),
-        "ref_ent_name": u.name[:10],
-        "ref_node": j + 1,
-        "ref_dir": _direction(u),
-        "ord_data_type": 4 if kind == _COHERENCE else 6,
-        "num_pts": len(f),
-        "abscissa_spacing": int(even),
-        "abscissa_min": float(f[0]) if even else 0.0,
-        "abscissa_inc": float(step) if even else 0.0,
-        "z_axis_value": 0.0,
-        "abscissa_spec_data_type": _FREQUENCY,
-        "abscissa_axis_lab": "Frequency",
-        "abscissa_axis_units_lab": "Hz",
-        "ordinate_spec_data_type": _ACCELERATION if y.unit == "m/s^2" else _UNKNOWN,
-        "ordinate_axis_lab": what,
-        "ordinate_axis_units_lab": unit[:20] or "NONE",
-        "orddenom_spec_data_type": _UNKNOWN,
-        "z_axis_spec_data_type": _UNKNOWN,
-        "x": f,
-        "data": data,
-    }
-
-
-def _direction(channel: Channel) -> int:
-    """Direction code: an angle turns about +Z, an acceleration goes along +X, else scalar."""
-    return {"rad": _PLUS_Z_ROTATION, "m/s^2": _PLUS_X}.get(channel.unit, 0)
+    write_uff(path, response_sets(response))
 
 
 def _umask() -> int:

@@ -8,22 +8,30 @@ from __future__ import annotations
 
 import hashlib
 import re
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from samii_rig.errors import InputError
+from samii_rig.files import open_file, reason
+from samii_rig.record.channel_table import ChannelTable, calibrated
+from samii_rig.record.delimited import read_text_table
 from samii_rig.record.maps import (
     ColumnMap,
     CsvFormat,
     ImportMap,
+    JsonFormat,
     MatFormat,
+    ParquetFormat,
     TextFormat,
     UffFormat,
 )
-from samii_rig.record.tables import Table, read_mat_table, read_text_table, read_uff_table
+from samii_rig.record.segmenting import segments_of
+from samii_rig.record.structured import read_json_table, read_parquet_table
+from samii_rig.record.tables import Table, read_mat_table, read_uff_table
 from samii_rig.rig.load import load_rig
-from samii_rig.types import Channel, Flags, Float, Int, Quality, Recording, Segment, StopRecord
+from samii_rig.types import Channel, Flags, Float, Int, Quality, Recording, StopRecord
 
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _LAST_SECOND = 9.2e9  # s, int64 nanoseconds end a little later
@@ -31,12 +39,20 @@ _LAST_COUNT = 2.0**53  # beyond it a float64 column cannot count samples
 # A step of a time column may be off a whole number of periods by this many periods: a
 # column rounded to its last digit is, and beyond it gap and jitter cannot be told apart.
 _JITTER = 0.25
+# ns, 30 years: no device has run for so long, so that a time beyond it counts from 1970.
+_COUNTS_FROM_1970 = 30 * 365 * 86_400 * 1_000_000_000
 
 
-def import_file(path: Path | str, layout: ImportMap, map_text: str = "") -> Recording:
-    """The file at `path` as a recording of one segment, as the map `layout` says.
+def import_file(
+    path: Path | str,
+    layout: ImportMap,
+    map_text: str = "",
+    sensors: ChannelTable | None = None,
+) -> Recording:
+    """The file at `path` as a recording, as the map `layout` says.
 
-    map_text : the map file as it is, kept in the recording's metadata.
+    map_text : the map file as it is, kept in the recording's metadata. sensors : the table of the
+        bench's sensors, whose sensitivities are applied; it is kept in the metadata, too.
 
     Raises
     ------
@@ -49,6 +65,9 @@ def import_file(path: Path | str, layout: ImportMap, map_text: str = "") -> Reco
         expected = f"a name with {layout.file_name!r} (the map {layout.name!r} is for those)"
         raise InputError(where, "file name", path.name, expected)
     table = _read(path, layout)
+    if sensors is not None:
+        layout = calibrated(layout, sensors, table.units)
+    _check_units(table, layout)
     first = next(iter(table.columns.values()))
     for column, data in table.columns.items():
         if data.size != first.size:
@@ -56,6 +75,7 @@ def import_file(path: Path | str, layout: ImportMap, map_text: str = "") -> Reco
     if first.size < 2:
         raise InputError(where, "", f"{first.size} samples", "at least two")
     rate_hz, time, sequence = _time_base(table, layout)
+    offset, dated = _date(layout, time)
     values = np.stack([_scaled(table, c) for c in layout.channel], axis=1)
     lost = int(sequence[-1] - sequence[0]) + 1 - len(sequence)
     return Recording(
@@ -65,9 +85,10 @@ def import_file(path: Path | str, layout: ImportMap, map_text: str = "") -> Reco
         sequence=sequence,
         values=values,
         quality=_quality(values, layout),
-        segments=(_segment(path, layout, int(sequence[0]), int(sequence[-1]) + 1),),
+        segments=segments_of(path, layout.segment, table, sequence, time),
         rig_toml=_rig_text(layout),
         metadata={
+            **dated,
             **layout.metadata,
             "import_file": path.name,
             "import_sha256": digest,
@@ -78,20 +99,36 @@ def import_file(path: Path | str, layout: ImportMap, map_text: str = "") -> Reco
         },
         stop=StopRecord("unknown", "imported; the file does not say how it ended", 0, lost),
         source=where,
+        clock_offset=offset,
     )
+
+
+def _date(layout: ImportMap, time: Int) -> tuple[int, dict[str, str]]:
+    """ns by which the wall clock was ahead of the file's, and when it began, where known."""
+    offset = 0
+    if layout.time.start is not None:
+        seconds = int(layout.time.start.timestamp())
+        begin = seconds * 1_000_000_000 + layout.time.start.microsecond * 1000
+        offset = begin - int(time[0])
+    elif time[0] < _COUNTS_FROM_1970:
+        return 0, {}
+    first = datetime.fromtimestamp((int(time[0]) + offset) * 1e-9, UTC)
+    return offset, {"started": first.isoformat(timespec="seconds")}
 
 
 def _digest(path: Path) -> str:
     try:
-        with path.open("rb") as stream:
+        with open_file(path) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(str(path), "", error.strerror, "a readable file") from error
+        said = f"cannot be read: {reason(error)}; expected a file to import"
+        raise InputError.saying(str(path), "", said) from error
 
 
 def _read(path: Path, layout: ImportMap) -> Table:
     wanted = [c.column for c in layout.channel]
     wanted += [name for name in (layout.time.column, layout.time.sequence) if name]
+    wanted += layout.segment.columns
     wanted = list(dict.fromkeys(wanted))
     match layout.format:
         case TextFormat() | CsvFormat():
@@ -99,7 +136,16 @@ def _read(path: Path, layout: ImportMap) -> Table:
         case MatFormat():
             table = read_mat_table(path, layout.format, wanted)
         case UffFormat():
-            table = read_uff_table(path, layout.format, wanted)
+            table = read_uff_table(path, wanted)
+        case JsonFormat():
+            table = read_json_table(path, layout.format, wanted)
+        case ParquetFormat():
+            table = read_parquet_table(path, wanted)
+    return table
+
+
+def _check_units(table: Table, layout: ImportMap) -> None:
+    """InputError where the file states another unit than the map."""
     for channel in layout.channel:
         stated, expected = table.units.get(channel.column, ""), channel.unit_in_file()
         if stated and expected and stated != expected:
@@ -109,7 +155,6 @@ def _read(path: Path, layout: ImportMap) -> Table:
     stated = table.units.get(layout.time.column, "")
     if stated and stated != layout.time.unit:
         raise InputError(table.where, "unit of time", stated, f"{layout.time.unit!r}")
-    return table
 
 
 def _time_base(table: Table, layout: ImportMap) -> tuple[float, Int, Int]:
@@ -202,41 +247,6 @@ def _quality(values: Float, layout: ImportMap) -> Flags:
     high = np.array([c.high for c in layout.channel])
     clipped = (values <= low) | (values >= high)
     return np.where(clipped, Quality.CLIPPED, Quality.GOOD).astype(np.uint8)
-
-
-def _segment(path: Path, layout: ImportMap, start: int, stop: int) -> Segment:
-    name = path.name
-    kind = layout.segment.kind
-    for pattern, named in layout.segment.kind_by_name.items():
-        if re.search(pattern, name):
-            kind = named
-            break
-    level = _number(path, layout.segment.level, "level")
-    if not (0 <= level < np.inf):
-        raise InputError(str(path), "level in the file name", level, "0 or more")
-    repeat = 0
-    if layout.segment.repeat:
-        number = _number(path, layout.segment.repeat, "repeat")
-        if number != int(number) or number < layout.segment.first_repeat:
-            expected = f"a whole number from {layout.segment.first_repeat}"
-            raise InputError(str(path), "repeat in the file name", number, expected)
-        repeat = int(number) - layout.segment.first_repeat
-    return Segment(path.stem, kind, start, stop, level, layout.segment.level_unit, repeat)
-
-
-def _number(path: Path, pattern: str, group: str) -> float:
-    match = re.search(pattern, path.name)
-    if match is None or match[group] is None:
-        expected = f"a name in which {pattern!r} finds the {group}"
-        raise InputError(str(path), "file name", path.name, expected)
-    try:
-        number = float(match[group].replace(",", "."))
-    except ValueError as error:
-        place = f"{group} in the file name"
-        raise InputError(str(path), place, match[group], "a number") from error
-    if not np.isfinite(number):
-        raise InputError(str(path), f"{group} in the file name", number, "a finite number")
-    return number
 
 
 def _rig_text(layout: ImportMap) -> str:

@@ -2,7 +2,8 @@
 
 A recording is an MCAP file. `/samples` carries one message a sample, whose fields are the
 channels by name; every message has the same size, so a chunk's bytes are a numpy structured
-array. `docs/decisions/0003-recording-layout.md` says why.
+array. Messages are stamped with the wall clock; the metadata `samii_rig.clock` say how far it
+was ahead of the device's own. `docs/decisions/0003-recording-layout.md` says why.
 """
 
 from __future__ import annotations
@@ -34,9 +35,11 @@ SCHEMA_ENCODING = "ros2msg"
 
 RUN = "samii_rig.run"  # metadata record: format, rate; written first
 NOTES = "samii_rig.notes"  # metadata record: seed, versions, operator, calibration, hashes
+CLOCK = "samii_rig.clock"  # metadata record: offset_ns, log time minus device's time
 SEGMENT = "samii_rig.segment"
 STOP = "samii_rig.stop"
 RESPONSE = "samii_rig.frequency_response"
+MAPS = (RUN, NOTES, SEGMENT, STOP, RESPONSE)
 RIG_FILE = "rig.toml"  # attachments
 EXPERIMENT_FILE = "experiment.toml"
 
@@ -44,6 +47,7 @@ SEAL = "crc32"  # key under which `sealed` stores its check
 MAX_CHANNELS = 4096  # more columns than any rig has; bounds what a hostile file may claim
 
 _FIELD = re.compile(r"[^a-z0-9]+")
+MAX_OFFSET = 1 << 62  # ns, 146 years: the year 2116; no sum with a device's time overflows
 _HEAD = 9  # opcode u8 and record length u64 before every MCAP record's content
 
 
@@ -223,6 +227,28 @@ def segment_from_map(data: dict[str, str]) -> Segment:
         )
     except (KeyError, ValueError) as error:
         raise RecordingError("a segment of the recording cannot be read") from error
+
+
+def checked_offset(offset: int) -> int:
+    """What the wall clock is ahead of the device's, ns; RecordingError beyond `MAX_OFFSET`."""
+    if abs(offset) > MAX_OFFSET:
+        raise RecordingError(
+            f"the wall clock is {offset} ns ahead of the device's; expected within {MAX_OFFSET}"
+        )
+    return offset
+
+
+def clock_to_map(offset: int) -> dict[str, str]:
+    """That offset as a metadata map."""
+    return {"offset_ns": str(offset)}
+
+
+def clock_from_map(data: dict[str, str]) -> int:
+    """The inverse; RecordingError on anything else."""
+    try:
+        return checked_offset(int(data["offset_ns"]))
+    except (KeyError, ValueError) as error:
+        raise RecordingError("the offset of the device's clock cannot be read") from error
 
 
 def stop_to_map(stop: StopRecord, samples: int) -> dict[str, str]:

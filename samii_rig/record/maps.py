@@ -5,21 +5,25 @@ base is, each `[[channel]]` turns one column into one channel,
 
     value = (raw - offset) * scale,
 
-and `[segment]` says what was done in the file (the whole file is one segment). Maps that
-come with the package are found by name, as rigs are.
+and `[segment]` says what was done in the file, or in its parts. Maps that come with the
+package are found by name, as rigs are.
 """
 
 from __future__ import annotations
 
 import re
+from datetime import datetime
 from importlib import resources
+from itertools import pairwise
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, AwareDatetime, Field, field_validator, model_validator
 
 from samii_rig.rig.load import load_named, names_in
 from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Strict
 from samii_rig.types import Kind, Role
+
+MAX_YEAR = 2100  # stamps are 64 bits of ns
 
 _FOLDER = resources.files("samii_rig.record") / "data"
 
@@ -32,7 +36,16 @@ def _pattern(text: str) -> str:
     return text
 
 
+def _level(value: float | str) -> float | str:
+    if isinstance(value, str):
+        return _pattern(value)
+    if not 0 <= value < float("inf"):
+        raise ValueError(f"level is {value:g}; expected 0 or more, or a pattern")
+    return value
+
+
 Pattern = Annotated[str, AfterValidator(_pattern)]
+Level = Annotated[float | str, AfterValidator(_level)]  # a number or a pattern
 
 
 class _Delimited(Strict):
@@ -41,6 +54,7 @@ class _Delimited(Strict):
     header : where the names of the columns stand: in the last comment before the data,
         in the first row, or in `columns` ("none").
     A name may carry a unit in square brackets, `theta [rad]`, which is then checked.
+    units_row : the row after the row of names holds the units, which are checked likewise.
     decimal : the decimal mark.
     """
 
@@ -48,6 +62,7 @@ class _Delimited(Strict):
     skip_lines: Annotated[int, Field(ge=0)] = 0
     columns: tuple[str, ...] = ()
     decimal: Literal[".", ","] = "."
+    units_row: bool = False
 
     @model_validator(mode="after")
     def _names(self) -> Self:
@@ -56,6 +71,8 @@ class _Delimited(Strict):
             raise ValueError('columns go with header = "none", and only with it')
         if header == "comment" and not self.comment:
             raise ValueError('header = "comment" needs a comment character')
+        if self.units_row and header != "row":
+            raise ValueError('units_row goes with header = "row"')
         if self.decimal == getattr(self, "delimiter", ""):
             raise ValueError("delimiter and decimal mark are the same")
         return self
@@ -102,7 +119,28 @@ class UffFormat(Strict):
     kind: Literal["uff58"]
 
 
-Format = Annotated[TextFormat | CsvFormat | MatFormat | UffFormat, Field(discriminator="kind")]
+class JsonFormat(Strict):
+    """JSON: an object of arrays, `{"t": [0, 1], "u": [2, 3]}`, an array of objects, or of arrays
+    whose columns `columns` names; or one object or array a line.
+
+    under : keys down to it, joined by dots; "" for the whole file.
+    """
+
+    kind: Literal["json"]
+    under: str = ""
+    columns: tuple[str, ...] = ()
+
+
+class ParquetFormat(Strict):
+    """Apache Parquet; a column's unit is its metadata `unit`, or stands in its name."""
+
+    kind: Literal["parquet"]
+
+
+Format = Annotated[
+    TextFormat | CsvFormat | MatFormat | UffFormat | JsonFormat | ParquetFormat,
+    Field(discriminator="kind"),
+]
 
 
 class TimeBase(Strict):
@@ -111,12 +149,21 @@ class TimeBase(Strict):
     column, unit : instants of sampling. sequence : counts every sample that the device
     took, so that a jump is a loss. rate_hz : nominal rate; without it the median step of
     `column` decides. A step of more than one period is a loss, never filled.
+    start : date and time of the first sample, with its offset from UTC.
     """
 
     column: str = ""
     unit: Literal["s", "ms", "us", "ns"] = "s"
     sequence: str = ""
     rate_hz: Positive | None = None
+    start: AwareDatetime | None = None
+
+    @field_validator("start")
+    @classmethod
+    def _dated(cls, start: datetime | None) -> datetime | None:
+        if start is not None and not 1970 <= start.year <= MAX_YEAR:
+            raise ValueError(f"start is in {start.year}; expected 1970 to {MAX_YEAR}")
+        return start
 
 
 class ColumnMap(Strict):
@@ -152,29 +199,80 @@ class ColumnMap(Strict):
         return self.raw_unit or (self.unit if plain else "")
 
 
+class PartMap(Strict):
+    """A stretch of a file: from `start` up to `stop`, in s after the file's first sample."""
+
+    start: NonNegative
+    stop: Positive
+    level: NonNegative
+    kind: Kind | None = None
+
+    @model_validator(mode="after")
+    def _forwards(self) -> Self:
+        if not self.start < self.stop:
+            raise ValueError(f"part: start {self.start:g} s is not before stop {self.stop:g} s")
+        return self
+
+
 class SegmentMap(Strict):
-    """What was done in the file: it is one segment.
+    """What was done in the file. It is one segment, unless a column or parts divide it.
 
     kind_by_name : pattern of the file's name -> kind; the first that is found decides,
         otherwise `kind`.
-    level, repeat : patterns with a group of that name, searched in the file's name.
-    first_repeat : the number that the files give the first repeat.
+    level : the level of every file; or a pattern with a group of that name, searched in the
+        file's name. level_column : the column that holds it instead; stretches of level 0
+        belong to no segment.
+    column : a column that numbers the segments: where its value changes, another one begins.
+        pause : its value where nothing is done.
+    part : stretches in s, each with its level, instead of columns.
+    repeat : pattern with a group of that name, searched in the file's name; segments of one
+        file are counted. first_repeat : the number that the files give the first repeat.
     """
 
     kind: Kind = "single"
     kind_by_name: dict[Pattern, Kind] = Field(default_factory=dict)
-    level: Pattern
+    level: Level | None = None
+    level_column: str = ""
     level_unit: str = Field(min_length=1)
+    column: str = ""
+    pause: Finite | None = None
+    part: tuple[PartMap, ...] = ()
     repeat: Pattern = ""
     first_repeat: Annotated[int, Field(ge=0)] = 1
 
     @field_validator("level", "repeat")
     @classmethod
-    def _group(cls, pattern: str, info: object) -> str:
+    def _group(cls, pattern: object, info: object) -> object:
         name = str(getattr(info, "field_name", ""))
-        if pattern and name not in re.compile(pattern).groupindex:
+        if isinstance(pattern, str) and pattern and name not in re.compile(pattern).groupindex:
             raise ValueError(f"{pattern!r} has no group (?P<{name}>...)")
         return pattern
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        ways = [self.level is not None, bool(self.level_column), bool(self.part)]
+        if sum(ways) != 1:
+            raise ValueError("segment: expected one of level, level_column and part")
+        if self.part and self.column:
+            raise ValueError("segment: part and column both divide the file; expected one of them")
+        if self.pause is not None and not self.column:
+            raise ValueError("segment: pause is a value of column; expected a column")
+        if self.divided and self.repeat:
+            raise ValueError("segment: repeats within a file are counted; expected no repeat")
+        for before, after in pairwise(self.part):
+            if after.start < before.stop:
+                raise ValueError(f"part: {after.start:g} s is inside the part before it")
+        return self
+
+    @property
+    def divided(self) -> bool:
+        """Whether the file may hold several segments."""
+        return bool(self.part or self.column or self.level_column)
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of the file that are read to divide it."""
+        return tuple(name for name in (self.column, self.level_column) if name)
 
 
 class ImportMap(Strict):

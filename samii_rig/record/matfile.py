@@ -24,7 +24,8 @@ _TIMEOUT = 300.0  # s, for files of gigabytes
 
 
 def load(path: Path, names: list[str]) -> dict[str, NDArray[np.generic]]:
-    """Those of the variables `names` that the file holds and that are plain real arrays.
+    """Those of the variables `names` that the file holds and that are plain arrays; without
+    names, all of these.
 
     Raises
     ------
@@ -51,13 +52,13 @@ def _main(path: str, names: list[str]) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            content = scipy_io.loadmat(path, variable_names=names)
+            content = scipy_io.loadmat(path, variable_names=names or None)
     except NotImplementedError:
         return _VERSION_73
     except Exception as error:  # the parser raises anything on a damaged file
         sys.stderr.write(" ".join(str(error).split()) or type(error).__name__)
         return _DAMAGED
-    arrays = {n: np.asarray(content[n]) for n in names if n in content}
+    arrays = {n: np.asarray(content[n]) for n in names or content if n in content}
     plain = {n: a for n, a in arrays.items() if a.dtype.kind in "fiubc"}
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, **plain)

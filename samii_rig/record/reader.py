@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,8 @@ from mcap.opcode import Opcode
 from samii_rig.errors import RecordingError
 from samii_rig.record import events, layout, response, scan
 from samii_rig.record.contents import (
+    EXPANSION_CEILING,
+    SMALL,
     Chunk,
     Contents,
     attachment,
@@ -28,11 +31,6 @@ from samii_rig.record.scan import DamagedError
 from samii_rig.types import FrequencyResponse, Recording, StopRecord
 
 THREADS = min(4, os.cpu_count() or 1)
-# Samples in memory against bytes in the file: about 6 in a recording that compresses well.
-# A file beyond this is made to fill the memory.
-MAX_EXPANSION = 100
-SMALL = 64 << 20  # bytes of samples that are never too many
-
 _Records = np.ndarray[Any, np.dtype[np.void]]
 
 
@@ -49,7 +47,8 @@ def read_recording(path: Path, *, partial: bool = False) -> Recording:
     """
     with _contents(path, partial=partial) as (data, contents):
         sample_id, sample_layout = sample_channel(contents)
-        arrays = _read_samples(data, contents, sample_id, sample_layout)
+        offset = contents.clock_offset()
+        arrays = _read_samples(data, contents, sample_id, sample_layout, offset)
         time, sequence, values, quality = arrays
         stop = contents.one_map(layout.STOP)
         if stop is None:
@@ -71,6 +70,7 @@ def read_recording(path: Path, *, partial: bool = False) -> Recording:
             metadata=contents.notes(),
             stop=stop_record,
             source=str(path),
+            clock_offset=offset,
         )
 
 
@@ -83,7 +83,9 @@ def read_frequency_responses(path: Path, *, partial: bool = False) -> list[Frequ
 def read_events(path: Path, *, partial: bool = False) -> list[Event]:
     """The events logged in a recording, in the order in which they were logged."""
     with _contents(path, partial=partial) as (data, contents):
-        return decoded(data, contents, layout.EVENTS, events.decode)
+        offset = contents.clock_offset()
+        found = decoded(data, contents, layout.EVENTS, events.decode)
+        return [replace(event, time=event.time - offset) for event in found]
 
 
 def read_notes(path: Path, *, partial: bool = False) -> dict[str, str]:
@@ -106,6 +108,9 @@ def _contents(path: Path, *, partial: bool) -> Iterator[tuple[memoryview, Conten
                 raise DamagedError(contents.end, "the summary does not follow the data")
         check_format(contents)
         yield data, contents
+    except DamagedError as error:
+        remedy = f"samii-rig recover {path} gives back what is whole"
+        raise RecordingError(f"{path}: {error}; {remedy}") from error
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
 
@@ -169,9 +174,16 @@ def sample_records(
 
 
 def _read_samples(
-    data: memoryview, contents: Contents, channel_id: int, sample_layout: SampleLayout
+    data: memoryview,
+    contents: Contents,
+    channel_id: int,
+    sample_layout: SampleLayout,
+    offset: int,
 ) -> tuple[np.ndarray[Any, Any], ...]:
-    """time, sequence, values, quality of all samples, each chunk unpacked to its place."""
+    """time, sequence, values, quality of all samples, each chunk unpacked to its place.
+
+    offset : ns by which the log times are ahead of the device's.
+    """
     dtype = sample_layout.record
     columns = len(sample_layout.channels)
     places: list[tuple[Chunk, int, int]] = []
@@ -187,7 +199,7 @@ def _read_samples(
             places.append((chunk, rows, count))
             rows += count
     size = rows * (16 + 9 * columns)
-    if size > max(SMALL, MAX_EXPANSION * len(data)):
+    if size > max(SMALL, EXPANSION_CEILING * len(data)):
         raise RecordingError(f"{len(data)} bytes claim {size} bytes of samples")
     time, sequence = np.empty(rows, np.int64), np.empty(rows, np.int64)
     values, quality = np.empty((rows, columns)), np.empty((rows, columns), np.uint8)
@@ -215,6 +227,9 @@ def _read_samples(
         raise RecordingError("its samples are not in the order of their sequence")
     if rows and time.min() < 0:
         raise RecordingError("a sample's time stamp is beyond 2^63 ns")
+    time -= offset
+    if rows and time.min() < 0:
+        raise RecordingError("a sample's time stamp is before the zero of the device's clock")
     return time, sequence, values, quality
 
 

@@ -11,10 +11,13 @@ from typing import TypeVar
 import numpy as np
 
 from samii_rig.errors import RecordingError
+from samii_rig.files import require_file
 from samii_rig.record import events, layout, response, scan
 from samii_rig.record.contents import (
     Chunk,
     Contents,
+    ExpandedError,
+    Unpacker,
     attachment,
     messages,
     read_contents,
@@ -27,6 +30,7 @@ from samii_rig.record.writer import PARTIAL, RunWriter
 from samii_rig.types import Channel, SampleBlock, StopRecord
 
 Item = TypeVar("Item")
+_BEFORE_ALL = -1 << 63  # a sequence number before every other
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,13 +72,14 @@ def default_output(path: Path) -> Path:
 def recover(path: Path, output: Path | None = None) -> Recovered:
     """Write every sample, event and result of `path` that is whole into a new file.
 
-    What counts as whole is a chunk whose CRC fits: nothing is guessed. The new file names its
-    source and the source's SHA-256 in its metadata; the source is left alone.
+    What counts as whole is a chunk whose CRC fits: nothing is guessed. Samples come in the order
+    of their sequence, events in that of their time, wherever their chunks stood. The new file
+    names its source and the source's SHA-256 in its metadata; the source is left alone.
 
     NothingError if nothing can be had; RecordingError if there is no file or the new one cannot
     be written.
     """
-    scan.require_file(path)
+    require_file(path)
     try:
         data = scan.mapped(path)
         contents = _contents(data)
@@ -82,21 +87,18 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
         channels, rate_hz, sample_id = _samples_of(contents)
     except RecordingError as error:
         raise NothingError(f"{path}: nothing can be recovered: {error}") from error
-    good: list[Chunk] = []
-    for chunk in contents.chunks:
-        try:
-            scan.unpack(data, chunk.head)
-            good.append(chunk)
-        except RecordingError as error:
-            problems.append(str(error))
+    row = SampleLayout(channels, rate_hz).record if sample_id is not None else None
+    good = _whole(data, contents, sample_id, row, problems)
     notes = {k: v for m in _maps(contents, layout.NOTES, problems) for k, v in m.items()}
     segments = [layout.segment_from_map(item) for item in _maps(contents, layout.SEGMENT, problems)]
     stops = [layout.stop_from_map(item) for item in _maps(contents, layout.STOP, problems)]
+    clocks = [layout.clock_from_map(item) for item in _maps(contents, layout.CLOCK, problems)]
+    offset = clocks[0] if clocks else 0
     notes["recovered_from"] = path.name
     notes["recovered_from_sha256"] = hashlib.sha256(data).hexdigest()
     if problems:
         notes["recovered_problems"] = "; ".join(problems[:20])
-    if not good:
+    if not (good.samples or good.others):
         raise NothingError(f"{path}: nothing can be recovered: no whole chunk is in it")
     target = output or default_output(path)
     with RunWriter(
@@ -106,20 +108,22 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
         rig_toml=_text(data, contents, layout.RIG_FILE),
         experiment_toml=_text(data, contents, layout.EXPERIMENT_FILE),
         metadata=notes,
+        clock_offset=offset,
+        keep_partial=False,
     ) as writer:
         samples = 0
-        if sample_id is not None:
-            for chunk in good:
-                samples += _copy(data, chunk, sample_id, channels, rate_hz, writer, problems)
-        happened = _decoded(data, contents, good, layout.EVENTS, events.decode)
+        if sample_id is not None and row is not None:
+            samples = _copy(data, good.samples, sample_id, row, offset, writer, problems)
+        happened = _decoded(data, contents, good.others, layout.EVENTS, events.decode)
+        happened.sort(key=lambda event: event.time)
         for event in happened:
-            writer.event(event.time, event.name, event.payload)
+            writer.event(event.time - offset, event.name, event.payload)
         for segment in segments:
             writer.segment(segment)
-        results = _decoded(data, contents, good, layout.RESPONSES, response.decode)
+        results = _decoded(data, contents, good.others, layout.RESPONSES, response.decode)
         for result in results:
             writer.frequency_response(result)
-        lost = stops[0][1] - samples if stops else 0
+        lost = max(0, stops[0][1] - samples) if stops else 0
         if lost:
             problems.append(f"{lost} samples of the run are lost")
         writer.close(_stop(stops, lost))
@@ -167,35 +171,84 @@ def _samples_of(contents: Contents) -> tuple[tuple[Channel, ...], float, int | N
     return sample_layout.channels, sample_layout.rate_hz, sample_id
 
 
+@dataclass(frozen=True, slots=True)
+class _Good:
+    """The whole chunks: those of samples, by their first sequence number, and the others."""
+
+    samples: list[Chunk]
+    others: list[Chunk]
+
+
+def _whole(
+    data: memoryview,
+    contents: Contents,
+    sample_id: int | None,
+    row: np.dtype[np.void] | None,
+    problems: list[str],
+) -> _Good:
+    """Unpack every chunk once; what does not fit is added to `problems`.
+
+    What is in a chunk is read from the chunk itself: its index has no checksum.
+    """
+    unpack = Unpacker(data, row.itemsize if row is not None else 0)
+    samples: list[tuple[int, Chunk]] = []
+    others = []
+    for chunk in contents.chunks:
+        try:
+            raw = unpack(chunk.head)
+            records = sample_records(raw, sample_id, row) if sample_id and row is not None else None
+        except ExpandedError as error:
+            problems.append(str(error))
+            break
+        except RecordingError as error:
+            problems.append(str(error))
+            continue
+        if records is None:
+            others.append(chunk)
+        else:
+            samples.append((int(records["sequence"][0]), chunk))
+    in_order = sorted(samples, key=lambda found: found[0])
+    if in_order != samples:
+        problems.append("chunks of samples had changed places; they are back in order")
+    return _Good([chunk for _, chunk in in_order], others)
+
+
 def _copy(
     data: memoryview,
-    chunk: Chunk,
+    chunks: list[Chunk],
     sample_id: int,
-    channels: tuple[Channel, ...],
-    rate_hz: float,
+    row: np.dtype[np.void],
+    offset: int,
     writer: RunWriter,
     problems: list[str],
 ) -> int:
-    """Copy one chunk's samples; returns how many."""
-    columns = len(channels)
-    dtype = SampleLayout(channels, rate_hz).record
-    try:
-        records = sample_records(scan.unpack(data, chunk.head), sample_id, dtype)
-        if records is None:
-            return 0
+    """Copy the samples of whole chunks, in their order; returns how many."""
+    columns = len(writer.channels)
+    copied, last = 0, _BEFORE_ALL
+    for chunk in chunks:
+        records = sample_records(scan.unpack(data, chunk.head), sample_id, row)
+        assert records is not None  # it was looked at before
+        sequence, stamp = records["sequence"].astype(np.int64), records["log_time"].astype(np.int64)
+        time = stamp - offset
+        before = np.maximum.accumulate(np.concatenate(([last], sequence[:-1])))
+        new = (sequence > before) & (stamp >= 0) & (time >= 0)
+        if not new.all():
+            what = f"{np.count_nonzero(~new)} samples are there already, or have no time"
+            problems.append(f"byte {chunk.head.span.start}: {what}")
+        if not new.any():
+            continue
+        values, quality = records["values"][new], records["quality"][new]
         writer.write(
             SampleBlock(
-                channels=channels,
-                time=records["log_time"].astype(np.int64),
-                sequence=records["sequence"].astype(np.int64),
-                values=np.ascontiguousarray(records["values"]).view("<f8").reshape(-1, columns),
-                quality=np.ascontiguousarray(records["quality"]).view("u1").reshape(-1, columns),
+                channels=writer.channels,
+                time=time[new],
+                sequence=sequence[new],
+                values=np.ascontiguousarray(values).view("<f8").reshape(-1, columns),
+                quality=np.ascontiguousarray(quality).view("u1").reshape(-1, columns),
             )
         )
-    except RecordingError as error:
-        problems.append(f"byte {chunk.head.span.start}: {error}")
-        return 0
-    return len(records)
+        copied, last = copied + int(np.count_nonzero(new)), int(sequence[new][-1])
+    return copied
 
 
 def _decoded(
@@ -207,10 +260,10 @@ def _decoded(
 ) -> list[Item]:
     """The messages of a topic in the whole chunks."""
     channel_id = contents.channel_id(topic)
+    if channel_id is None:
+        return []
     found: list[Item] = []
     for chunk in chunks:
-        if channel_id is None or (chunk.counts and channel_id not in chunk.counts):
-            continue
         raw = scan.unpack(data, chunk.head)
         found.extend(decode(payload) for _, payload in messages(raw, channel_id))
     return found

@@ -24,6 +24,7 @@ from mcap.records import Attachment, McapRecord
 from mcap.writer import MCAP0_MAGIC
 
 from samii_rig.errors import RecordingError
+from samii_rig.files import open_file, reason
 from samii_rig.record.encoded import encoded
 
 # Viewers' chunks are 1 to 4 MB, ours 1 MB. A chunk that claims more than this is hostile or
@@ -70,27 +71,19 @@ class CutError(DamagedError):
     """The bytes end before the record at `offset` does."""
 
 
-def require_file(path: Path) -> None:
-    """RecordingError unless there is a file at `path`."""
-    if path.is_dir():
-        raise RecordingError(f"{path} is a folder; expected a recording")
-    if not path.is_file():
-        raise RecordingError(f"{path} is not there; expected a recording")
-
-
 def mapped(path: Path) -> memoryview:
     """The bytes of a file, mapped, not read; the mapping ends with the last view of it.
 
     RecordingError if the file cannot be read or is empty.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             if os.fstat(file.fileno()).st_size == 0:
                 raise RecordingError(f"{path} is empty; expected an MCAP file")
             return memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     except (OSError, ValueError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
-        raise RecordingError(f"{path} cannot be read: {reason}") from error
+        why = reason(error) if isinstance(error, OSError) else error
+        raise RecordingError(f"{path} cannot be read: {why}") from error
 
 
 def spans(data: memoryview, start: int, stop: int) -> Iterator[Span]:
@@ -178,7 +171,9 @@ def unpack(data: memoryview, head: ChunkHead) -> bytes | memoryview:
         else:
             raw = packed
     except (RuntimeError, ValueError, EOFError, MemoryError, zstandard.ZstdError) as error:
-        raise DamagedError(head.span.start, f"a chunk cannot be unpacked: {error}") from error
+        # What the libraries say of it is for who knows their insides.
+        own = str(error) if type(error) is ValueError else f"its {head.compression} is damaged"
+        raise DamagedError(head.span.start, f"a chunk cannot be unpacked: {own}") from error
     if len(raw) != head.size:
         raise DamagedError(head.span.start, f"a chunk holds {len(raw)} bytes, not {head.size}")
     if crc32(raw) != head.crc:

@@ -17,6 +17,8 @@ def write_recording(path: Path, recording: Recording) -> None:
         rig_toml=recording.rig_toml,
         experiment_toml=recording.experiment_toml,
         metadata=recording.metadata,
+        clock_offset=recording.clock_offset,
+        keep_partial=False,
     ) as writer:
         writer.write(
             SampleBlock(

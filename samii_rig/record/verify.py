@@ -10,13 +10,22 @@ import numpy as np
 from isal.isal_zlib import crc32
 
 from samii_rig.errors import RecordingError
+from samii_rig.files import require_file
 from samii_rig.record import layout, scan
-from samii_rig.record.contents import Contents, Tail, read_contents, read_tail
+from samii_rig.record.contents import (
+    Contents,
+    ExpandedError,
+    ForeignError,
+    Tail,
+    Unpacker,
+    read_contents,
+    read_tail,
+)
 from samii_rig.record.reader import check_format, sample_channel, sample_records
 from samii_rig.types import Int, StopRecord
 
-Status = Literal["whole", "lossy", "nothing"]
-EXIT_CODES: dict[Status, int] = {"whole": 0, "lossy": 3, "nothing": 1}
+Status = Literal["whole", "lossy", "nothing", "foreign"]
+EXIT_CODES: dict[Status, int] = {"whole": 0, "lossy": 3, "nothing": 1, "foreign": 2}
 _STEP = 16 << 20  # bytes of a CRC at a time: touches little of a file larger than the memory
 
 
@@ -25,7 +34,8 @@ class Verdict:
     """What is in a file.
 
     status : `whole` if every byte is as it was written and the run was ended; `lossy` if not
-        but samples or results can be had from it; `nothing` if none can.
+        but samples or results can be had from it; `nothing` if none can; `foreign` for a file
+        that is no MCAP file at all.
     samples : how many can be read from whole chunks. gaps : jumps of the sequence between them,
         missing : samples that the device took and that are not there.
     backwards : how often the time stamps step back.
@@ -49,16 +59,22 @@ class Verdict:
 
     @property
     def exit_code(self) -> int:
-        """0 whole, 3 lossy, 1 nothing."""
+        """0 whole, 3 lossy, 1 nothing, 2 no MCAP file."""
         return EXIT_CODES[self.status]
 
 
 def verify(path: Path) -> Verdict:
-    """Check every byte of a file; never raises for what is in it, only if there is no file."""
-    scan.require_file(path)
+    """Check every byte of a file; never raises for what is in it, only if there is no file.
+
+    A file whose chunks unpack to more than a run can hold is checked up to there: what it costs
+    is bounded by its size.
+    """
+    require_file(path)
     size = path.stat().st_size
     try:
         return _verify(path, scan.mapped(path))
+    except ForeignError as error:
+        return Verdict(str(path), "foreign", size, problems=(str(error),))
     except RecordingError as error:
         return Verdict(str(path), "nothing", size, problems=(str(error),))
 
@@ -81,6 +97,7 @@ def _verify(path: Path, data: memoryview) -> Verdict:
         else:
             check_format(contents)
         contents.notes()
+        contents.clock_offset()
         contents.maps(layout.RESPONSE)
         for item in contents.maps(layout.SEGMENT):
             layout.segment_from_map(item)
@@ -117,14 +134,19 @@ def _verify(path: Path, data: memoryview) -> Verdict:
     )
 
 
+def data_whole(data: memoryview, contents: Contents) -> bool:
+    """Whether the data of a finished file are as they were written, by the CRC over all of them."""
+    crc = 0
+    for at in range(0, contents.data_end, _STEP):
+        crc = crc32(data[at : min(at + _STEP, contents.data_end)], crc)
+    return crc == contents.data_crc
+
+
 def _data_problems(data: memoryview, contents: Contents, tail: Tail | None) -> list[str]:
     if contents.data_crc is None:
         return ["the data end without their CRC: the file was not finished"]
     problems = []
-    crc = 0
-    for at in range(0, contents.data_end, _STEP):
-        crc = crc32(data[at : min(at + _STEP, contents.data_end)], crc)
-    if crc != contents.data_crc:
+    if not data_whole(data, contents):
         problems.append("the CRC over all data does not fit")
     if tail and contents.end != tail.summary_start:
         problems.append(f"byte {contents.end}: the summary does not follow the data")
@@ -174,9 +196,10 @@ def _count(
             names = tuple(c.name for c in sample_layout.channels)
     except RecordingError as error:
         problems.append(str(error))
+    unpack = Unpacker(data, dtype.itemsize if dtype is not None else 0)
     for chunk in contents.chunks:
         try:
-            raw = scan.unpack(data, chunk.head)
+            raw = unpack(chunk.head)
             if sample_id is None or dtype is None:
                 records = None
             else:
@@ -186,6 +209,9 @@ def _count(
                 if chunk.counts != {sample_id: len(records)}:
                     problems.append(f"byte {chunk.head.span.end}: the index does not fit its chunk")
                 continue
+        except ExpandedError as error:
+            problems.append(str(error))
+            break
         except RecordingError as error:
             problems.append(str(error))
             continue

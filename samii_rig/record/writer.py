@@ -10,11 +10,12 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from samii_rig.errors import RecordingError
+from samii_rig.errors import DiskError, RecordingError
+from samii_rig.files import DISK_ERRORS
 from samii_rig.record import events, layout, response
 from samii_rig.record.appender import (
     Appender,
@@ -23,14 +24,15 @@ from samii_rig.record.appender import (
     build_chunk,
     message_chunk,
 )
-from samii_rig.record.disk import Action, DiskThread
-from samii_rig.types import Channel, FrequencyResponse, SampleBlock, Segment, StopRecord
+from samii_rig.record.disk import ANSWERS_WITHIN, Action, DiskThread
+from samii_rig.types import Channel, FrequencyResponse, Int, SampleBlock, Segment, StopRecord
 
 CHUNK_BYTES = 1 << 20  # of message records: what viewers expect, and fits a core's cache
 PARTIAL = ".partial"
 COMPRESSORS = 2  # threads; the third, on the disk's side, takes about half a core
 
 _Bytes = np.ndarray[Any, Any]
+Times = TypeVar("Times", int, Int)  # ns
 
 
 class RunWriter:
@@ -39,7 +41,7 @@ class RunWriter:
     Samples, events and results go to `path` + ".partial", synced at least once a second by a
     thread of its own whether or not samples come; `close` gives the file its name. Left by an
     exception, or without `close`, the `.partial` stays, whole up to its last chunk, for
-    `recover`. Calls may come from several threads.
+    `recover`, if `keep_partial`. Calls may come from several threads.
 
     Parameters
     ----------
@@ -49,9 +51,14 @@ class RunWriter:
     rig_toml, experiment_toml : the files' text, kept as attachments.
     metadata : seed, versions, operator, calibration, limits, start: all that repeats the run.
     compression : "lz4", "zstd" (smaller, slower) or "" for none.
+    clock_offset : ns by which the wall clock, which stamps the messages, is ahead of the
+        device's; 0 where nothing is known of it. By default the first call of `clocks` says it,
+        or else the moment of the first sample or event.
+    keep_partial : False for what can be written again, as a copy; it leaves no `.partial`.
 
-    Raises RecordingError when the file cannot be made; later calls raise it too once the
-    disk refused something, so that a full disk ends the run.
+    Raises RecordingError when the file cannot be made, DiskError when the disk refuses it; later
+    calls raise DiskError too once the disk refused something, or the file was moved or removed
+    by somebody, so that a full disk ends the run.
 
     >>> with RunWriter(Path("run.mcap"), channels, 500.0, metadata={"seed": "7"}) as writer:
     ...     writer.write(block)
@@ -68,8 +75,11 @@ class RunWriter:
         experiment_toml: str = "",
         metadata: dict[str, str] | None = None,
         compression: Compression = "lz4",
+        clock_offset: int | None = None,
+        keep_partial: bool = True,
     ) -> None:
         self.path = path
+        self._keep_partial = keep_partial
         self.partial_path = path.with_name(path.name + PARTIAL)
         self.channels = channels
         self._compression = compression
@@ -77,8 +87,10 @@ class RunWriter:
         self._responses = 0
         self._last_sequence = -1 << 63
         self._last_time = 0
+        self._offset: int | None = None
         self._open = True
         self._lock = threading.RLock()
+        layout.checked_offset(clock_offset or 0)
         if path.exists():
             raise RecordingError(f"{path} exists already; expected a new name")
         try:
@@ -88,7 +100,7 @@ class RunWriter:
                 f"{self.partial_path} is left from a run that was cut off; recover or move it first"
             ) from error
         except OSError as error:
-            raise RecordingError(f"{path} cannot be written: {error.strerror}") from error
+            raise _refused(path, error) from error
         try:
             appender = Appender(self._file, layout.PROFILE)
             self._describe(appender, rate_hz, metadata or {})
@@ -102,15 +114,17 @@ class RunWriter:
             self._register(appender, rate_hz)
             appender.sync()
             _sync_directory(path.parent)
-        except OSError as error:
-            self._file.close()
-            raise RecordingError(f"{path} cannot be written: {error.strerror}") from error
-        except BaseException:
-            self._file.close()
-            self.partial_path.unlink()
+        except BaseException as error:
+            # There is no sample in it yet.
+            self._close_file()
+            self._discard()
+            if isinstance(error, OSError):
+                raise _refused(path, error) from error
             raise
-        self._pool = ThreadPoolExecutor(COMPRESSORS, thread_name_prefix="compress")
-        self._disk = DiskThread(appender, self._gathered)
+        self._pool = _started_pool()
+        self._disk = DiskThread(appender, self._gathered, self.partial_path)
+        if clock_offset is not None:
+            self.clocks(0, clock_offset)
 
     @staticmethod
     def _describe(appender: Appender, rate_hz: float, metadata: dict[str, str]) -> None:
@@ -153,13 +167,14 @@ class RunWriter:
         with self._lock:
             self._check()
             values, quality = self._checked(block)
+            stamps = self._stamped(block.time, int(block.time[-1]))
             done = 0
             while done < n:
                 take = min(n - done, self._rows - self._fill)
                 part = slice(done, done + take)
                 records = self._buffer[self._fill : self._fill + take]
-                records["log_time"] = block.time[part]
-                records["publish_time"] = block.time[part]
+                records["log_time"] = stamps[part]
+                records["publish_time"] = stamps[part]
                 records["sequence"] = block.sequence[part]
                 records["values"] = values[part]
                 records["quality"] = quality[part]
@@ -171,10 +186,26 @@ class RunWriter:
             self._last_sequence = int(block.sequence[-1])
             self._last_time = int(block.time[-1])
 
+    def clocks(self, device: int, wall: int) -> None:
+        """The device's clock and the wall clock showed these times (ns) at one moment.
+
+        The first pair lays down the stamps of the whole file: what lies between two of them is
+        the device's time, whatever is done to the wall clock meanwhile. Later pairs do nothing.
+        RecordingError where the two are further apart than stamps can say.
+        """
+        with self._lock:
+            if self._offset is None:
+                self._check()
+                offset = layout.checked_offset(wall - device)
+                data = layout.sealed(layout.clock_to_map(offset))
+                self._put(lambda appender: appender.add_metadata(layout.CLOCK, data))
+                self._offset = offset
+
     def event(self, time_ns: int, name: str, payload: dict[str, Any] | None = None) -> None:
         """Log an event (a gate transition, an operator's note) at a time of the device."""
-        data = events.encode(events.Event(time_ns, name, payload or {}))
-        self._put_message(self._events_id, time_ns, data)
+        stamp = self._stamped(time_ns, time_ns)
+        data = events.encode(events.Event(stamp, name, payload or {}))
+        self._put_message(self._events_id, stamp, data)
 
     def note(self, metadata: dict[str, str]) -> None:
         """Metadata that were not known, or were others, when the file was made."""
@@ -190,7 +221,8 @@ class RunWriter:
         """Log a result of the run beside its samples; may be called once a level."""
         data = response.encode(estimate)
         about = layout.sealed({"number": str(self._responses), **response.summary(estimate)})
-        self._put_message(self._responses_id, self._last_time, data)
+        stamp = self._stamped(self._last_time, self._last_time)
+        self._put_message(self._responses_id, stamp, data)
         self._put(lambda appender: appender.add_metadata(layout.RESPONSE, about))
         self._responses += 1
 
@@ -222,14 +254,16 @@ class RunWriter:
             self.partial_path.rename(self.path)
             _sync_directory(self.path.parent)
         except OSError as error:
-            raise RecordingError(f"{self.path} cannot be written: {error.strerror}") from error
+            raise _refused(self.path, error) from error
 
     def abort(self) -> None:
-        """Stop recording; what was given so far is synced and stays as `.partial`."""
+        """Stop recording; what was given so far is synced and stays as `.partial`, if it is to."""
         if self._open:
             with contextlib.suppress(RecordingError):
                 self.flush()
             self._end()
+        if not self._keep_partial:
+            self._discard()
 
     def __enter__(self) -> Self:
         return self
@@ -273,11 +307,23 @@ class RunWriter:
         quality = np.ascontiguousarray(block.quality, "u1").view(f"V{columns}")[:, 0]
         return values, quality
 
+    def _stamped(self, device: Times, now: int) -> Times:
+        """The device's times as stamps; `now`, by its clock, is paired with this moment if
+        nobody said anything of the clocks before."""
+        if self._offset is None:
+            self.clocks(now, time.time_ns())
+        assert self._offset is not None
+        first, last = int(np.min(device)) + self._offset, int(np.max(device)) + self._offset
+        if first < 0 or last >= 1 << 63:
+            shown = first if first < 0 else last
+            raise RecordingError(f"a stamp would be {shown} ns since 1970; expected 0 to 2^63")
+        return device + self._offset
+
     def _cut(self) -> None:
         """Hand the gathered samples to the compressors and take a new buffer; lock held."""
         if self._fill:
             future = self._pool.submit(self._compress, *self._take())
-            self._disk.put(lambda appender: appender.add_chunk(future.result()))
+            self._disk.put(lambda appender: appender.add_chunk(future.result(ANSWERS_WITHIN)))
 
     def _gathered(self) -> Action | None:
         """The samples gathered since the last chunk, for the disk's periodic sync."""
@@ -323,10 +369,35 @@ class RunWriter:
     def _end(self) -> None:
         with self._lock:
             self._open = False
-        self._disk.stop()
-        self._pool.shutdown()
-        with contextlib.suppress(OSError):  # what matters was synced, or is reported already
+        ended = self._disk.stop()
+        self._pool.shutdown(wait=ended, cancel_futures=not ended)
+        if ended:  # else closing would wait for the thread that hangs in the file
+            self._close_file()
+
+    def _close_file(self) -> None:
+        # Closing writes what is left, which a full disk refuses again: what matters was synced, or
+        # is reported already.
+        with contextlib.suppress(OSError):
             self._file.close()
+
+    def _discard(self) -> None:
+        with contextlib.suppress(OSError):
+            self.partial_path.unlink()
+
+
+def _started_pool() -> ThreadPoolExecutor:
+    """The compressors, all running: when the memory runs out no thread can be started any more."""
+    pool = ThreadPoolExecutor(COMPRESSORS, thread_name_prefix="compress")
+    together = threading.Barrier(COMPRESSORS + 1)
+    for _ in range(COMPRESSORS):
+        pool.submit(together.wait)
+    together.wait()
+    return pool
+
+
+def _refused(path: Path, error: OSError) -> RecordingError:
+    kind = DiskError if error.errno in DISK_ERRORS else RecordingError
+    return kind(f"{path} cannot be written: {error.strerror}")
 
 
 def _sync_directory(folder: Path) -> None:

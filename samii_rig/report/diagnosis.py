@@ -45,6 +45,7 @@ class Section:
     rivals: list[dict[str, str]]
     fit_rows: list[tuple[str, str, str]]
     bands: words.Table
+    hiding: tuple[list[str], list[tuple[str, list[str]]]]
     findings: list[str]
     why: str
     experiment: str
@@ -107,6 +108,7 @@ def section(
         rivals=words.rivals(diagnosis),
         fit_rows=words.fit_rows(diagnosis),
         bands=words.band_table(diagnosis.bands, diagnosis.threshold),
+        hiding=words.hiding_table(diagnosis),
         findings=words.findings(diagnosis),
         why=diagnosis.why,
         experiment=diagnosis.experiment,

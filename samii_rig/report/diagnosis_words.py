@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from samii_rig.diagnose.result import (
+    HIDING,
     LIKELY,
     Band,
     Cause,
@@ -196,7 +197,7 @@ def _facts(found: Diagnosis) -> list[tuple[str, str, str]]:
         value = f"{ratio(before)} \u2192 {ratio(after)}"
         return [("Chi-square per degree of freedom", value, "with that set right; noise leaves 1")]
     if not answer(found):
-        limit = f"of the refitted model; noise passes {found.threshold:.3g} in 3 of 1000 cases"
+        limit = f"of the refitted model; noise passes {found.threshold:.3g} in 3 of 10,000 cases"
         return [("Chi-square per degree of freedom", ratio(found.chi2_per_dof), limit)]
     sure = min(c.probability for c in found.causes)
     g = found.gap
@@ -331,3 +332,23 @@ def band_table(bands: Sequence[Band], threshold: float) -> Table:
             cells.append(Left(ratio(x), round(weight, 2)))
         rows.append((channel, cells))
     return [f"{low:.3g}\u2013{high:.3g} Hz" for low, high in spans], rows
+
+
+def hiding_table(found: Diagnosis) -> tuple[list[str], list[tuple[str, list[str]]]]:
+    """Columns (physics) and rows (site, cells): the smallest that would have been seen there."""
+    columns = [p for p in HIDING if any(h.physics == p for h in found.could_hide)]
+    of = {(h.site, h.physics): h for h in found.could_hide}
+    sites = dict.fromkeys(h.site for h in found.could_hide if h.physics in columns)
+    rows = []
+    for site in sites:
+        cells = []
+        for physics in columns:
+            hiding = of.get((site, physics))
+            if hiding is None:
+                cells.append("")
+            elif hiding.size is None:
+                cells.append("any")
+            else:
+                cells.append(f"{hiding.size:.2g} {hiding.unit}")
+        rows.append((site, cells))
+    return [said(p) for p in columns], rows

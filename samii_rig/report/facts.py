@@ -1,17 +1,16 @@
-"""What the report states in tables: what was done, peaks, limits, method, findings."""
+"""What the report states in tables: what was done, limits, method, findings."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from samii_rig.record.events import Event
-from samii_rig.report.compare import Comparison, ModelCurve, percent, pretty, telling
-from samii_rig.report.peaks import peaks
-from samii_rig.report.plots import unit
+from samii_rig.report.compare import Comparison, percent, pretty, telling
 from samii_rig.report.verdicts import counted, duration, without_folders
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
@@ -65,32 +64,6 @@ def headline(output: str, input: str, comparisons: Sequence[Comparison]) -> str:
         f"median at {top.level:g} {top.level_unit}; shaded where the difference is more than noise "
         f"({top.low_hz:.3g}\u2013{top.high_hz:.3g} Hz compared)"
     )
-
-
-def peak_rows(
-    responses: Sequence[FrequencyResponse], model: ModelCurve | None
-) -> list[dict[str, str]]:
-    """One row a peak, output by output, level by level."""
-    rows = []
-    for i, y in enumerate(responses[0].outputs if responses else ()):
-        for j, u in enumerate(responses[0].inputs):
-            for r in responses:
-                for p in peaks(r, i, j):
-                    ratio = math.nan
-                    if model is not None:
-                        H = model.at(np.array([p.frequency_hz]), y.name, u.name)
-                        ratio = float(np.abs(H[0])) / p.gain
-                    rows.append(
-                        {
-                            "response": f"{y.name}/{u.name}",
-                            "level": level(r),
-                            "frequency": f"{p.frequency_hz:.3f} Hz",
-                            "gain": f"{p.gain:.4g} {unit(y, u)}",
-                            "sigma": f"{100 * p.sigma / p.gain:.2g} %",
-                            "model": f"{ratio:.3f}" if math.isfinite(ratio) else "\u2013",
-                        }
-                    )
-    return rows
 
 
 def limit_rows(recordings: Sequence[Recording], rig: Rig) -> list[dict[str, object]]:
@@ -232,6 +205,22 @@ def metadata(recordings: Sequence[Recording]) -> list[tuple[str, str]]:
 def level(r: FrequencyResponse) -> str:
     """`75 count`, or that levels are mixed."""
     return f"{r.level:g} {r.level_unit}" if math.isfinite(r.level) else "mixed"
+
+
+def names(responses: Sequence[FrequencyResponse]) -> list[str]:
+    """A name for each, by which a person tells it from the others: its level, and where two
+    have the same, how it was measured; then what it was measured from."""
+    first = [level(r) for r in responses]
+    more = [f"{name}, {r.method}" for name, r in zip(first, responses, strict=True)]
+    whence = [
+        f"{name}, {' '.join(Path(s).stem for s in r.sources)}"
+        for name, r in zip(more, responses, strict=True)
+    ]
+    for better in (more, whence):
+        first = [
+            b if first.count(name) > 1 else name for name, b in zip(first, better, strict=True)
+        ]
+    return first
 
 
 def _plan(recordings: Sequence[Recording]) -> dict[tuple[str, str, float], int]:

@@ -14,6 +14,8 @@ from samii_rig.record.events import Event
 from samii_rig.report import facts, plots, series
 from samii_rig.report.compare import ModelCurve, compare, pretty
 from samii_rig.report.drawing import draw
+from samii_rig.report.modes import Modes, modes_of_all, rows, sentences
+from samii_rig.report.modes_drawing import motions
 from samii_rig.report.shell import Plot, check_suffix, page_text, put
 from samii_rig.report.verdicts import verdicts
 from samii_rig.rig.schema import Rig
@@ -36,13 +38,14 @@ def write_report(
     band_hz: tuple[float, float] = (0.0, np.inf),
     events: Sequence[Event] = (),
     diagnosis: Diagnosis | None = None,
+    modes: Sequence[Modes] | None = None,
 ) -> Path:
     """Write the page about `recordings` and what was estimated from them to `path`.
 
     responses : one for each amplitude level, all with the same inputs and outputs.
     model : laid over every response. band_hz : where it is compared in numbers.
     spectrogram_channel : "" takes the last sensor. events : of the gate and the loop.
-    diagnosis : of `rig` by `responses`, shown first.
+    diagnosis : of `rig` by `responses`, shown first. modes : of `responses`; None to find them.
 
     Raises
     ------
@@ -62,8 +65,10 @@ def write_report(
         from samii_rig.report.diagnosis import section  # loads the model and its compiler
 
         found = section(diagnosis, responses, rig, band_hz)
+    if modes is None:
+        modes = modes_of_all(responses, rig)
     page = render(
-        recordings, responses, rig, model, title, spectrogram_channel, band_hz, events, found
+        recordings, responses, rig, model, title, spectrogram_channel, band_hz, events, found, modes
     )
     return put(path, page)
 
@@ -78,6 +83,7 @@ def render(
     band_hz: tuple[float, float],
     events: Sequence[Event],
     diagnosis: Section | None,
+    modes: Sequence[Modes] = (),
 ) -> str:
     """The page as text; `responses` in the order in which they are drawn."""
     comparisons = (
@@ -90,7 +96,7 @@ def render(
         for i, y in enumerate(first.outputs):
             for j, u in enumerate(first.inputs):
                 name, id_ = f"{y.name}/{u.name}", f"{i}-{j}"
-                figure = plots.headline(curves, i, j, model, comparisons)
+                figure = plots.headline(curves, i, j, model, comparisons, modes)
                 said = facts.headline(y.name, u.name, comparisons)
                 headlines.append(Plot(f"head-{id_}", name, said, figure))
                 said = plots.distortion_caption(responses)
@@ -111,7 +117,10 @@ def render(
         bode=bodes,
         ratios=ratios,
         comparisons=comparisons,
-        peaks=facts.peak_rows(responses, model),
+        modes=rows(modes),
+        modes_said=sentences(modes),
+        modes_held=any(m.known for m in modes),
+        modes_motions=motions(modes),
         series=time,
         spectrogram=spectrum,
         done=facts.done(recordings, rig),

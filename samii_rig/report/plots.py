@@ -20,14 +20,14 @@ from samii_rig.report.canvas import (
     ticked,
 )
 from samii_rig.report.compare import BAND, Comparison, ModelCurve, pretty, telling
-from samii_rig.report.peaks import peaks
+from samii_rig.report.modes import Modes
 from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_width
 from samii_rig.types import Channel, Float, FrequencyResponse, Int
 
 _BINS = 1200  # of log-frequency; more than the pixels of a wide screen
 _NOISE_PART = 0.004  # of the lines may lie outside a gain axis
 DEGREES = "%{y:.1f}\u00b0"
-_PEAK_LABELS = 4  # more would stand on each other
+_LABELS = 4  # more would stand on each other
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,8 +54,10 @@ def headline(
     input: int,
     model: ModelCurve | None,
     comparisons: Sequence[Comparison],
+    modes: Sequence[Modes] = (),
 ) -> Figure:
-    """Gain of one output, its bands and the model's curve, differences shaded: one look."""
+    """Gain of one output, its bands and the model's curve, differences shaded, the modes of the
+    last response named: one look."""
     responses = [c.response for c in curves]
     y, u = responses[0].outputs[output], responses[0].inputs[input]
     figure = stacked(1, [f"{y.name}/{u.name} [{unit(y, u)}]"], 330)
@@ -70,23 +72,36 @@ def headline(
     worst = telling(comparisons).get((y.name, u.name))
     if worst is not None:
         figure["layout"]["shapes"] = [shade(span) for span in worst.spans_hz]
-    found = peaks(responses[-1], output, input)
-    found = tuple(sorted(found, key=lambda p: -p.prominence_db)[:_PEAK_LABELS])
-    figure["layout"]["annotations"] = [
-        {
-            "x": float(np.log10(p.frequency_hz)),
-            "y": float(np.log10(p.gain)),
-            "text": f"{p.frequency_hz:.3g} Hz",
-            "ax": 0,
-            "ay": -26,
-            "arrowcolor": "@muted",
-            "arrowwidth": 1,
-            "arrowhead": 0,
-            "font": {"size": 12, "color": "@ink"},
-        }
-        for p in found
-    ]
+    figure["layout"]["annotations"] = _mode_labels(responses[-1], output, input, modes)
     return figure
+
+
+def _mode_labels(
+    r: FrequencyResponse, output: int, input: int, modes: Sequence[Modes]
+) -> list[dict[str, Any]]:
+    """The natural frequencies of the response's modes, written at its curve."""
+    own = next((m for m in modes if m.response is r), None)
+    found = sorted(own.found.modes, key=lambda m: -m.sigma)[:_LABELS] if own else []
+    gain = np.abs(r.H[:, output, input])
+    out = []
+    for mode in found:
+        k = int(np.argmin(np.abs(r.frequency - mode.frequency_hz.value)))
+        if not (np.isfinite(gain[k]) and gain[k] > 0):
+            continue
+        out.append(
+            {
+                "x": float(np.log10(mode.frequency_hz.value)),
+                "y": float(np.log10(gain[k])),
+                "text": f"{mode.frequency_hz.value:.3g} Hz",
+                "ax": 0,
+                "ay": -26,
+                "arrowcolor": "@muted",
+                "arrowwidth": 1,
+                "arrowhead": 0,
+                "font": {"size": 12, "color": "@ink"},
+            }
+        )
+    return out
 
 
 def bode(
@@ -250,7 +265,7 @@ def fit_gain(
     low = min(float(np.quantile(p, _NOISE_PART)) for p in logs)
     high = max(float(p.max()) for p in logs)
     room = 0.06 * (high - low) + 0.05
-    # The names of the peaks need room above them.
+    # The names of the modes need room above them.
     figure["layout"]["yaxis"] |= ticked(low - room, high + 4 * room)
 
 

@@ -14,9 +14,9 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from samii_rig.report.compare import ModelCurve, compare, percent, pretty
-from samii_rig.report.facts import level
-from samii_rig.report.peaks import peaks
+from samii_rig.report.compare import Comparison, ModelCurve, compare, percent, pretty
+from samii_rig.report.facts import names
+from samii_rig.report.modes import Modes, modes_table
 from samii_rig.report.plots import unit
 from samii_rig.report.verdicts import Verdict, duration, verdicts
 from samii_rig.types import FrequencyResponse, Recording
@@ -26,7 +26,6 @@ if TYPE_CHECKING:  # it compiles the model, which showing needs not
 
 _STYLES = {"good": "green", "note": "blue", "warning": "yellow", "bad": "bold red"}
 _WORDS = {"good": "good", "note": "note", "warning": "look", "bad": "ATTENTION"}
-_SHOWN = 4  # peaks in one cell of the table
 _MARGIN_CLOSE = 0.2  # of a limit left: shown as close
 _BAR = 30  # characters
 
@@ -71,8 +70,11 @@ class ProgressLike(Protocol):
         """1 - |value|/limit of that channel."""
 
 
-def progress_line(progress: ProgressLike, total_s: float) -> RenderableType:
-    """One line of bar and one of words: `sweep 3/9 ... 41 s left, 12.3 Hz at 2 V, ...`."""
+def progress_line(progress: ProgressLike, total_s: float, of: str = "") -> RenderableType:
+    """One line of bar and one of words: `sweep 3/9 ... 41 s left, 12.3 Hz at 2 V, ...`.
+
+    of : said after the time that is left.
+    """
     p = progress
     done = max(0.0, min(1.0, 1 - p.time_left / total_s)) if total_s > 0 else 1.0
     head = Table.grid(padding=(0, 1))
@@ -80,7 +82,7 @@ def progress_line(progress: ProgressLike, total_s: float) -> RenderableType:
         f"{p.name} {p.segment}/{p.n_segments}",
         ProgressBar(total=1.0, completed=done, width=_BAR),
         f"{percent(done)}",
-        f"{duration(max(p.time_left, 0.0))} left",
+        f"{duration(max(p.time_left, 0.0))}{of} left",
     )
     now = "at rest" if math.isnan(p.frequency) else f"{p.frequency:.2f} Hz"
     now = "the whole band" if math.isinf(p.frequency) else now
@@ -102,8 +104,10 @@ class LiveProgress:
     Without a terminal (a pipe, a log file) it prints one plain line a segment instead.
     """
 
-    def __init__(self, console: Console, total_s: float) -> None:
+    def __init__(self, console: Console, total_s: float, clock: str = "") -> None:
+        """clock : whose time is left, where it is not that of who waits."""
         self._console, self._total = console, total_s
+        self._of = f" of {clock}" if clock else ""
         self._live = Live(console=console, refresh_per_second=4, transient=True)
         self._segment = 0
 
@@ -124,12 +128,13 @@ class LiveProgress:
     def __call__(self, progress: ProgressLike) -> None:
         """Show `progress`."""
         if self._console.is_terminal:
-            self._live.update(progress_line(progress, self._total))
+            self._live.update(progress_line(progress, self._total, self._of))
         elif progress.segment != self._segment:
             self._segment = progress.segment
             self._console.print(
                 f"{progress.segment}/{progress.n_segments} {progress.name}, "
-                f"{progress.level:g} {progress.unit}, {duration(progress.time_left)} left",
+                f"{progress.level:g} {progress.unit}, "
+                f"{duration(progress.time_left)}{self._of} left",
                 highlight=False,
             )
 
@@ -156,50 +161,63 @@ def summary(
     responses: Sequence[FrequencyResponse],
     model: ModelCurve | None = None,
     band_hz: tuple[float, float] = (0.0, math.inf),
+    modes: Sequence[Modes] = (),
 ) -> RenderableType:
-    """The verdicts and one table: peaks and model over measurement, per level and output."""
+    """The verdicts, the modes, and a table of model over measurement, per level and output."""
     responses = sorted(responses, key=lambda r: (not math.isfinite(r.level), r.level))
-    found = [] if model is None else [c for r in responses for c in compare(r, model, band_hz)]
-    said = [verdict_line(v) for v in verdicts(recordings, responses, found)]
-    if not responses:
-        return Group(*said)
-    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    for name in ("response", "level", "peaks: Hz, gain, standard deviation"):
-        table.add_column(name, overflow="fold")
+    compared = [compare(r, model, band_hz) if model is not None else () for r in responses]
+    found = [c for of_one in compared for c in of_one]
+    parts: list[RenderableType] = [verdict_line(v) for v in verdicts(recordings, responses, found)]
+    if modes:
+        parts += [Text(""), modes_table(modes)]
     if found:
-        table.add_column("model/measured;\nlines outside 90 %")
-    by_key = {(c.output, c.input, c.level): c for c in found}
-    for i, y in enumerate(responses[0].outputs):
-        for j, u in enumerate(responses[0].inputs):
-            for r in responses:
-                tall = sorted(peaks(r, i, j), key=lambda p: -p.prominence_db)[:_SHOWN]
-                cells = [
-                    f"{p.frequency_hz:.2f} Hz {p.gain:.3g} \u00b1{100 * p.sigma / p.gain:.1f} %"
-                    for p in sorted(tall, key=lambda p: p.frequency_hz)
-                ]
-                row = [f"{y.name}/{u.name} [{unit(y, u)}]", level(r), "\n".join(cells) or "none"]
-                c = by_key.get((y.name, u.name, r.level))
-                if c is not None:
-                    phase = round(c.phase_deg, 1) + 0.0
-                    row.append(f"\u00d7 {c.gain:.3f}, {phase:+.1f}\u00b0; {percent(c.outside)}")
-                table.add_row(*(Text(cell) for cell in row))
-    return Group(*said, Text(""), table)
+        parts += [Text(""), _comparisons(responses, compared)]
+    return Group(*parts)
+
+
+def _comparisons(
+    responses: Sequence[FrequencyResponse], compared: Sequence[Sequence[Comparison]]
+) -> Table:
+    """One row a level of each output; `compared` holds those of each response."""
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    for name in ("response", "level", "model/measured", "lines outside 90 %"):
+        table.add_column(name, overflow="fold")
+    for y in responses[0].outputs:
+        for u in responses[0].inputs:
+            for name, own in zip(names(responses), compared, strict=True):
+                c = next((c for c in own if (c.output, c.input) == (y.name, u.name)), None)
+                if c is None:
+                    continue
+                phase = round(c.phase_deg, 1) + 0.0
+                agreement = f"\u00d7 {c.gain:.3f}, {phase:+.1f}\u00b0"
+                row = (f"{y.name}/{u.name} [{unit(y, u)}]", name, agreement)
+                table.add_row(*map(Text, (*row, percent(c.outside))))
+    return table
 
 
 def dry_run_summary(predicted: DryRun) -> RenderableType:
     """What a plan will come to: duration, margins (worst first), expected error per band."""
     margins = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
-    for name in ("channel", "held to its", "predicted", "limit", "margin", "where"):
+    for name in ("channel", "held to its", "predicted", "limit", "margin", "where", ""):
         margins.add_column(name)
-    for m in predicted.margins:
+    peaks_of = dict(zip(predicted.channels, predicted.peaks.max(axis=0), strict=True))
+    actuator = predicted.channels[0]
+    # The worst of each channel; the others are no nearer.
+    worst = {m.channel: m for m in reversed(predicted.margins)}
+    for m in sorted(worst.values(), key=lambda m: m.margin):
         style = "green" if m.margin > _MARGIN_CLOSE else "yellow" if m.margin >= 0 else "bold red"
+        value = f"{m.predicted:.3g} {pretty(m.unit)}"
+        if m.channel == actuator and m.what == "limit":
+            # The gate judges the output by a bound on what the device may add to the reference.
+            value = f"\u2264 {value}, peak {peaks_of[m.channel]:.3g}"
         margins.add_row(
             m.channel,
             m.what,
-            f"{m.predicted:.3g} {pretty(m.unit)}",
+            value,
             f"{m.limit:g} {pretty(m.unit)}",
             Text(percent(m.margin), style=style),
             m.segment,
+            Text("OVER", style=style) if m.margin < 0 else "",
         )
     channels = list(dict.fromkeys(b.channel for b in predicted.bands))
     errors = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
@@ -215,7 +233,8 @@ def dry_run_summary(predicted: DryRun) -> RenderableType:
     if predicted.shortest < predicted.duration:
         takes = f"{duration(predicted.shortest)} to {takes}"
     head = Text(f"The plan takes {takes}. Predicted by the model:")
-    return Group(head, margins, Text(""), errors) if rows else Group(head, margins)
+    refused = any(m.margin < 0 for m in predicted.margins)  # then nothing will be measured
+    return Group(head, margins, Text(""), errors) if rows and not refused else Group(head, margins)
 
 
 def show_dry_run(predicted: DryRun, console: Console | None = None) -> None:

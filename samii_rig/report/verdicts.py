@@ -10,9 +10,8 @@ from typing import Literal
 import numpy as np
 
 from samii_rig.report.compare import Comparison, percent, telling
-from samii_rig.report.peaks import relative_sigma
 from samii_rig.signal.statistics import difference, octaves
-from samii_rig.types import Finding, FrequencyResponse, Recording
+from samii_rig.types import Finding, Float, FrequencyResponse, Recording
 
 Mark = Literal["good", "note", "warning", "bad"]
 
@@ -69,11 +68,14 @@ def _run(recordings: Sequence[Recording]) -> list[Verdict]:
     if all("import_file" in r.metadata for r in recordings):
         title = f"{counted(len(recordings), 'recording')} imported"
     segments = sum(len(r.segments) for r in recordings)
-    levels = sorted({(s.unit, s.level) for r in recordings for s in r.segments})
+    levels: dict[str, set[float]] = {}  # by unit, in the order of the recordings
+    for s in (s for r in recordings for s in r.segments):
+        levels.setdefault(s.unit, set()).add(s.level)
     seconds = sum(len(r) / r.rate_hz for r in recordings)
     text = f"{counted(segments, 'segment')}"
     if levels:
-        text += f" at {', '.join(f'{level:g}' for _, level in levels)} {levels[0][0]}"
+        listed = (f"{', '.join(f'{x:g}' for x in sorted(s))} {unit}" for unit, s in levels.items())
+        text += f" at {' and '.join(listed)}"
     text += f", {duration(seconds)} at {recordings[0].rate_hz:g} samples/s"
     lost = sum(max(r.stop.missing_samples, _jumped(r)) for r in recordings)
     late = sum(r.stop.late_ticks for r in recordings)
@@ -102,7 +104,7 @@ def _measured(
     poor = False
     first = responses[0]
     for i, y in enumerate(first.outputs):
-        sigma = np.concatenate([relative_sigma(r)[:, i].ravel() for r in responses])
+        sigma = np.concatenate([_relative_sigma(r)[:, i].ravel() for r in responses])
         useful = float(np.mean(sigma < _USELESS))
         poor |= useful < 0.5
         parts.append(
@@ -132,7 +134,13 @@ def _model(comparisons: Sequence[Comparison]) -> list[Verdict]:
 
 def _levels(responses: Sequence[FrequencyResponse]) -> list[Verdict]:
     """Lowest against highest level; with one level nothing can be said of linearity."""
-    known = sorted((r for r in responses if np.isfinite(r.level)), key=lambda r: r.level)
+    kinds: dict[tuple[str, str], list[FrequencyResponse]] = {}
+    for r in responses:
+        if np.isfinite(r.level):
+            kinds.setdefault((r.level_unit, r.method), []).append(r)
+    # Levels of one unit and one kind of experiment: of those with the most.
+    known = max(kinds.values(), key=len, default=[])
+    known = sorted(known, key=lambda r: r.level)
     if len({r.level for r in known}) < 2:
         return []
     low, high = known[0], known[-1]
@@ -200,3 +208,9 @@ def duration(seconds: float) -> str:
     if minutes < 120:
         return f"{minutes} min {rest} s" if rest else f"{minutes} min"
     return f"{minutes // 60} h {minutes % 60} min"
+
+
+def _relative_sigma(response: FrequencyResponse) -> Float:
+    """(n_freq, n_out, n_in) standard deviation of |H| over |H|, to first order."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.sqrt(response.variance() / 2) / np.abs(response.H)

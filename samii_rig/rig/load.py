@@ -2,50 +2,88 @@
 
 from __future__ import annotations
 
+import codecs
+import re
 import tomllib
-from importlib import resources
+from contextlib import suppress
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import TypeVar, get_args
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
+from pydantic.fields import FieldInfo
 
-from samii_rig.errors import InputError
+from samii_rig.errors import InputError, one_of
+from samii_rig.files import open_file, reason
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.shipped import FOLDER
+from samii_rig.rig.shipped import names_in as names_in
+from samii_rig.rig.shipped import shipped as shipped
 
 Model = TypeVar("Model", bound=BaseModel)
-_FOLDER = resources.files("samii_rig.rig") / "data"
 MAX_BYTES = 4_000_000  # a rig file is a few kB; more is not one
-
-
-def shipped() -> tuple[str, ...]:
-    """Names of the rigs that come with the package."""
-    return names_in(_FOLDER)
-
-
-def names_in(folder: Traversable) -> tuple[str, ...]:
-    """Names of the TOML files that come with the package in `folder`."""
-    return tuple(sorted(p.name.removesuffix(".toml") for p in folder.iterdir()))
+MAX_PARTS = 16  # of a dotted key; ours have three, and the time to parse one grows with the square
+# Every character belongs to one of these and is passed once, whatever the text.
+_TOKEN = re.compile(
+    r"""(?P<part>[\w-]++|"(?:[^"\\\n]|\\.)*+"?|'[^'\n]*+'?)|(?P<dot>\.)|[ \t]++"""
+    r"""|(?P<other>[^\w"'.\t -]++)"""
+)
 
 
 def read_text(path: Path, what: str) -> str:
     """The text of a file, or an InputError that says why it cannot be read."""
     try:
-        if path.stat().st_size > MAX_BYTES:
+        with open_file(path) as file:
+            raw = file.read(MAX_BYTES + 1)
+        if len(raw) > MAX_BYTES:
             raise InputError(str(path), "", path.stat().st_size, f"a {what} under 4 MB")
-        return path.read_text(encoding="utf-8")
+        # As text files are read: any end of a line is a line break.
+        return raw.decode().replace("\r\n", "\n").replace("\r", "\n")
     except OSError as error:
-        raise InputError(str(path), "", error.strerror, f"a readable {what}") from error
+        said = f"cannot be read: {reason(error)}; expected a {what}"
+        raise InputError.saying(str(path), "", said) from error
     except UnicodeDecodeError as error:
-        raise InputError(str(path), "", error.reason, f"a {what} in UTF-8") from error
+        said = f"byte {error.start} is not UTF-8{_encoding(raw)}; expected a {what} in UTF-8"
+        raise InputError.saying(str(path), "", said) from error
+
+
+def _encoding(raw: bytes) -> str:
+    """What a text that is not UTF-8 gives itself out for, by its first bytes."""
+    marked = raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return " (the file begins as UTF-16)" if marked else ""
+
+
+def check_depth(text: str, where: str) -> None:
+    """InputError for a key of so many parts that it would take long to parse."""
+    parts, dotted = 0, False
+    for token in _TOKEN.finditer(text):
+        match token.lastgroup:
+            case "part":
+                parts, dotted = parts + 1 if dotted else 1, False
+                if parts > MAX_PARTS:
+                    line = text.count("\n", 0, token.start()) + 1
+                    expected = f"keys of at most {MAX_PARTS} dotted parts"
+                    raise InputError(where, f"line {line}", token.group(), expected)
+            case "dot":
+                dotted = True
+            case "other":
+                parts, dotted = 0, False
+
+
+def tables(text: str, where: str) -> dict[str, Any]:
+    """`text` (TOML) as plain data; InputError names `where` and the line that is wrong."""
+    check_depth(text, where)
+    try:
+        return tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        why = str(error) or "nested too deep"
+        said = f"is not valid TOML: {why[0].lower()}{why[1:]}"
+        raise InputError.saying(where, "", said) from error
 
 
 def parse(model: type[Model], text: str, where: str) -> Model:
     """`text` (TOML) as `model`; InputError names `where`, the field and what would be right."""
-    try:
-        data = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(where, "", str(error) or "nested too deep", "valid TOML") from error
+    data = tables(text, where)
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -54,7 +92,7 @@ def parse(model: type[Model], text: str, where: str) -> Model:
 
 def load_rig(name: str) -> tuple[Rig, str]:
     """The rig called `name` (shipped, or the path of a file) and the text of its file."""
-    return load_named(Rig, name, _FOLDER, "--rig", "rig file")
+    return load_named(Rig, name, FOLDER, "--rig", "rig file")
 
 
 def load_named(
@@ -70,7 +108,7 @@ def load_named(
         return parse(model, text, f"{name}.toml"), text
     path = Path(name)
     if not path.exists():
-        expected = f"the path of a {what} or one of {', '.join(names)}"
+        expected = f"the path of a {what} or {one_of(name, names)}"
         raise InputError(option, "", name, expected)
     text = read_text(path, what)
     return parse(model, text, str(path)), text
@@ -113,11 +151,54 @@ def _one_line(
             beside = first["loc"][:-1]
             missing = (e["loc"] for e in found if e["type"] == "missing")
             lacking = [str(loc[-1]) for loc in missing if loc[:-1] == beside]
-            expected = " or ".join(lacking) or "a known name"
+            known = [k for k in _fields_at(model, beside) if k not in _given(data, beside)]
+            near = one_of(first["loc"][-1], known) if known else "no more than there is"
+            expected = " or ".join(lacking) or near
             return InputError.saying(where, field, f"no such field; expected {expected}")
         case "union_tag_not_found":
             return InputError.saying(where, field, "has no kind; expected one, as in the docs")
         case "union_tag_invalid":
-            kinds = first["ctx"]["expected_tags"]
-            return InputError(where, f"{field}.kind", first["ctx"]["tag"], f"one of {kinds}")
+            kinds = re.findall(r"'([^']*)'", first["ctx"]["expected_tags"])
+            tag = first["ctx"]["tag"]
+            return InputError(where, f"{field}.kind", tag, one_of(tag, kinds))
+        case "literal_error":
+            choices = re.findall(r"'([^']*)'", message)
+            if choices:
+                return InputError(where, field, first["input"], one_of(first["input"], choices))
     return InputError(where, field, first.get("input"), message)
+
+
+def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    """Names of the fields that may stand in the table at `loc` of a file of this model."""
+    there = [model]
+    for key in loc:
+        if isinstance(key, int):
+            continue
+        inside = [m for t in there if key in t.model_fields for m in _models(t.model_fields[key])]
+        # A key that is no field is the tag of a union, which picks one of its kinds.
+        tagged = [t for t in there if any(key in _words(f) for f in t.model_fields.values())]
+        there = inside or tagged or there
+    return list(dict.fromkeys(name for t in there for name in t.model_fields))
+
+
+def _models(field: FieldInfo) -> list[type[BaseModel]]:
+    """The tables of which a field may hold one, or many."""
+    waiting, found = [field.annotation], []
+    while waiting:
+        kind = waiting.pop(0)
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            found.append(kind)
+        waiting += get_args(kind)
+    return found
+
+
+def _words(field: FieldInfo) -> tuple[object, ...]:
+    return get_args(field.annotation) if get_origin(field.annotation) is Literal else ()
+
+
+def _given(data: Any, loc: tuple[int | str, ...]) -> set[str]:
+    """What stands in the table at `loc` already."""
+    for key in loc:
+        with suppress(KeyError, IndexError, TypeError):  # the tag of a union, which no file shows
+            data = data[key]
+    return set(data) if isinstance(data, dict) else set()

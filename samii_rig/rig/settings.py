@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from samii_rig.errors import InputError
+from samii_rig.errors import InputError, one_of
 from samii_rig.rig.schema import Rig
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -35,7 +35,7 @@ def checked(
             raise InputError.saying(rig.name, field, f"is missing; see {page}") from error
         words = first["msg"].removeprefix("Input should be ")
         if first["type"] == "extra_forbidden":
-            words = f"one of {', '.join(model.model_fields)}"
+            words = one_of(first["loc"][-1], model.model_fields)
         raise InputError(rig.name, field, first["input"], expected or words) from error
 
 

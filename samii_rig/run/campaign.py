@@ -14,20 +14,22 @@ from importlib import metadata
 from pathlib import Path
 from threading import Event
 
-from samii_rig.errors import DeviceError, SamiiRigError
+from samii_rig.errors import SamiiRigError
 from samii_rig.record.reader import read_frequency_responses, read_recording
 from samii_rig.record.writer import RunWriter
 from samii_rig.rig.schema import Rig
-from samii_rig.run.devices import open_device
+from samii_rig.run.devices import close_device, open_device
 from samii_rig.run.dryrun import DryRun
+from samii_rig.run.ending import finish
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.latch import Latch
 from samii_rig.run.loop import run
 from samii_rig.run.pace import LoopSettings
 from samii_rig.run.priority import prioritised
 from samii_rig.run.progress import Progress
-from samii_rig.run.protocols import OpenRig, Plan
+from samii_rig.run.protocols import Plan
 from samii_rig.run.sink import Watched, recorded_channels
+from samii_rig.run.space import room_for
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import FrequencyResponse, Recording, SampleBlock, StopRecord
 
@@ -66,19 +68,22 @@ def carry_out(
     alive: Callable[[], bool] | None = None,
     loop: LoopSettings | None = None,
     watch: Callable[[SampleBlock], None] | None = None,
+    at_rest: Callable[[StopRecord], None] | None = None,
 ) -> Outcome:
     """Run `plan` on the rig's device into the recording `path`, estimate, close.
 
     However the run ends, the recording is whole and says how; what was measured until then
     is estimated where it suffices. A FAULT on a real rig is latched (`samii_rig.run.latch`), and
     while one is, nothing is opened. alive, loop : see `samii_rig.run.loop.run`. watch : gets
-    every block after it was recorded, for a display; it must neither wait nor raise.
+    every block after it was recorded, for a display; it must neither wait nor raise. at_rest : is
+    told how the run ended once nothing moves, before the estimate is made and the recording closed.
 
     Raises GateError for a latched fault, DeviceError if the rig does not open or another program
-    drives it, and RecordingError if the file cannot be written; the output is at zero before
-    each of them.
+    drives it, RecordingError if the file cannot be made, and DiskError if the disk has no room or
+    refuses it later; the output is at zero before each of them.
     """
     predicted.refuse()
+    room_for(path, [plan], [rig])
     latch = Latch(rig.name, rig.device.driver)
     latch.refuse()
     # Before any device waits: the samples of a run before are garbage in cycles, which by itself
@@ -134,23 +139,18 @@ def carry_out(
                 interrupts.ending = True
                 writer.close(StopRecord("failed", _line(error)))
                 raise
+            if at_rest is not None:
+                at_rest(ended)
             # What the device has learnt meanwhile, as how well its clocks are known.
             told = {f"device_{key}": value for key, value in device.metadata.items()}
             if news := dict(told.items() - notes.items()):
                 writer.note(news)
             trouble = _estimate_into(writer, interrupts)
-            writer.close(ended)
+            finish(writer, ended)
     finally:
-        _close(device)
+        close_device(device)
     responses = tuple(read_frequency_responses(path))
     return Outcome(path, read_recording(path), responses, ended, trouble, interrupts.came)
-
-
-def _close(device: OpenRig) -> None:
-    try:
-        device.close()
-    except Exception as error:
-        raise DeviceError(f"the device did not close: {_line(error)}") from error
 
 
 def versions() -> dict[str, str]:

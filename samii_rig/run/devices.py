@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from importlib import metadata
 
-from samii_rig.errors import DeviceError, InputError
+from samii_rig.errors import DeviceError, InputError, SamiiRigError, one_of
 from samii_rig.rig.schema import Rig
+from samii_rig.run.plugins import asked, checked_device, named
 from samii_rig.run.protocols import OpenRig
 
 GROUP = "samii_rig.devices"
@@ -19,15 +20,27 @@ def drivers() -> dict[str, metadata.EntryPoint]:
 def open_device(rig: Rig, settings: dict[str, object]) -> OpenRig:
     """Open the rig's device; `settings` override those of the rig file.
 
-    InputError for an unknown driver or setting, DeviceError if the device does not open.
+    InputError for an unknown driver or setting, or for a driver that does not do what it promises;
+    DeviceError if the device does not open.
     """
     known = drivers()
     if rig.device.driver not in known:
-        expected = f"one of {', '.join(sorted(known))}"
+        expected = one_of(rig.device.driver, sorted(known))
         raise InputError("rig file", "device.driver", rig.device.driver, expected)
-    opened = known[rig.device.driver].load()(rig, {**rig.device.settings, **settings})
-    if not isinstance(opened, OpenRig):
-        raise DeviceError(
-            f"driver {rig.device.driver} returned {type(opened).__name__}, no OpenRig"
-        )
-    return opened
+    point = known[rig.device.driver]
+    with asked(named(point), ""):
+        opened = point.load()(rig, {**rig.device.settings, **settings})
+        return checked_device(opened, named(point))
+
+
+def close_device(device: OpenRig) -> None:
+    """Close a device; DeviceError if it does not do so."""
+    try:
+        device.close()
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a driver's SystemExit must not end this as if all were well
+        text = " ".join(str(error).split())
+        known = isinstance(error, SamiiRigError)
+        said = text if known else f"{type(error).__name__}: {text}"
+        raise DeviceError(f"the device did not close: {said}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import time
@@ -110,7 +111,8 @@ def _disk(folder: Path) -> Check:
             "disk", "bad", f"{folder}: {error.strerror}", "record to another folder: --out"
         )
     finally:
-        probe.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            probe.unlink()
     rate, free = DISK / (end - start), shutil.disk_usage(folder).free
     found = f"{rate / 1e6:.0f} MB/s, sync {end - sync:.2f} s, {free / 1e9:.1f} GB free in {folder}"
     if rate < SLOWEST or end - sync > SLOWEST_SYNC:

@@ -4,21 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from samii_rig.errors import DeviceError, SamiiRigError
+from samii_rig.errors import DeviceError, DiskError, RecordingError, SamiiRigError
+from samii_rig.record.reader import read_recording
+from samii_rig.record.writer import RunWriter
 from samii_rig.run.limits import ChannelLimit
 from samii_rig.run.protocols import OpenRig
-from samii_rig.types import SampleBlock
+from samii_rig.types import SampleBlock, StopRecord
 
 # s after zero within which the read-back must show it: samples on their way at that moment
 # may still show the output before.
 SHOWN_WITHIN = 0.1
 TRIES = 3  # calls of zero() after the gate's own have failed
+# Parts of the deadman's time after zero() in which the output must be, and stay, at zero: later
+# than any command takes to arrive, and before the deadman itself makes it so.
+OBEYED, DROPPED = 0.5, 0.9
 
 Status = Literal["completed", "stopped", "tripped", "failed"]
+
+# How the reason of a stop says that the output may not be at zero.
+_NOT_ZEROED = "the output could not be zeroed"
+_NOT_AT_ZERO = "THE OUTPUT IS NOT AT ZERO"
+_NOT_SHOWN = "no sample shows"
 
 
 def attempt(step: Callable[[], None]) -> str:
@@ -39,6 +50,36 @@ def with_troubles(status: Status, reason: str, troubles: list[str]) -> tuple[Sta
     return status, reason
 
 
+def finish(writer: RunWriter, stop: StopRecord) -> None:
+    """Close the recording of a run that is over.
+
+    DiskError says how the run ended, and what of it is on the disk, if the disk refuses that.
+    """
+    try:
+        writer.close(stop)
+    except RecordingError as error:
+        raise DiskError("; ".join((_known(error, stop), _left(writer.partial_path)))) from error
+
+
+def _known(error: RecordingError, stop: StopRecord) -> str:
+    """What went wrong, and whether the output is at zero nevertheless."""
+    if any(text in stop.reason for text in (_NOT_ZEROED, _NOT_AT_ZERO, _NOT_SHOWN)):
+        return f"{stop.reason}; {error}"
+    more = "" if str(error) in stop.reason else f" ({stop.status}: {stop.reason})"
+    return f"{error}; the output is at zero{more}"
+
+
+def _left(partial: Path) -> str:
+    """What `samii-rig recover` will find; counted, because a disk that fails also forgets."""
+    if not partial.exists():
+        return "wherever it is now, samii-rig recover gives back what was flushed into it"
+    try:
+        samples = len(read_recording(partial, partial=True))
+    except RecordingError as error:
+        return f"nothing of it can be read back: {error}"
+    return f"samii-rig recover {partial} gives back the {samples:,} samples that are on the disk"
+
+
 class Zero:
     """The last resort for a device that does not do what zero() promises.
 
@@ -56,30 +97,40 @@ class Zero:
             try:
                 self._device.actuator.zero()
             except BaseException as error:
-                self.trouble = f"the output could not be zeroed: {type(error).__name__}: {error}"
+                self.trouble = f"{_NOT_ZEROED}: {type(error).__name__}: {error}"
             else:
                 self.trouble = ""
                 return
 
-    def check(self, tick: float, keep: Callable[[SampleBlock], None], *, spoke: bool) -> None:
+    def check(
+        self, tick: float, keep: Callable[[SampleBlock], None], zeroed: int, *, spoke: bool
+    ) -> None:
         """Read on until the output shows zero; if it does not, zero again and say so.
 
+        zeroed : when zero() was called, ns on the device's clock. An output that is at zero only
+        once the deadman has dropped it did not obey, and that is said too.
         spoke : whether the device ever gave a sample; one that did not was never driven.
         DeviceError if nothing comes back any more.
         """
-        shown = self._shown(tick, keep)
-        if abs(shown) <= self._least or not spoke:
+        held = min(self._device.actuator.deadman or SHOWN_WITHIN, SHOWN_WITHIN) * 1e9
+        window = (zeroed + round(OBEYED * held), zeroed + round(DROPPED * held))
+        shown, disobeyed = self._shown(tick, keep, window)
+        if not spoke:
+            return
+        if abs(shown) <= self._least:
+            name, unit = self._output.channel, self._output.unit
+            if disobeyed > self._least and not self.trouble:
+                text = f"{name} read {disobeyed:.4g} {unit} after zero(), which did nothing"
+                self.trouble = f"{_NOT_AT_ZERO}: {text}; the deadman ended it"
             return
         before = self.trouble
         self.force()
-        self._shown(tick, keep)
+        self._shown(tick, keep, (0, 0))
         name, unit = self._output.channel, self._output.unit
         if math.isnan(shown):
-            raise DeviceError(f"no sample shows {name} at zero: none came any more")
+            raise DeviceError(f"{_NOT_SHOWN} {name} at zero: none came any more")
         self.trouble = (
-            self.trouble
-            or before
-            or (f"THE OUTPUT IS NOT AT ZERO: {name} read {shown:.4g} {unit} after zero")
+            self.trouble or before or (f"{_NOT_AT_ZERO}: {name} read {shown:.4g} {unit} after zero")
         )
 
     @property
@@ -87,16 +138,25 @@ class Zero:
         """What the output's converter cannot tell from zero."""
         return self._output.slack / 2
 
-    def _shown(self, tick: float, keep: Callable[[SampleBlock], None]) -> float:
-        """The newest output that came back once zero had time to show; NaN if none came."""
-        clock, shown = self._device.clock, math.nan
+    def _shown(
+        self, tick: float, keep: Callable[[SampleBlock], None], window: tuple[int, int]
+    ) -> tuple[float, float]:
+        """The newest output that came back once zero had time to show, NaN if none came; and the
+        largest of those samples that the device took inside the window of its time, ns."""
+        clock, shown, inside = self._device.clock, math.nan, 0.0
         until = clock.now() + round(SHOWN_WITHIN * 1e9)
+        newest = -1
         while True:
             clock.sleep(tick)
             block = self._device.sensor.read()
             keep(block)
-            v = block.values[:, self._column]
-            v = v[np.isfinite(v)]
-            shown = float(v[-1]) if len(v) else shown
-            if abs(shown) <= self._least or clock.now() >= until:
-                return shown
+            v = np.abs(block.values[:, self._column])
+            there = np.isfinite(v)
+            if there.any():
+                time = block.time[there]
+                shown, newest = float(v[there][-1]), int(time[-1])
+                judged = (time >= window[0]) & (time < window[1])
+                inside = max(inside, float(v[there][judged].max(initial=0.0)))
+            over = abs(shown) <= self._least and newest >= window[1]
+            if over or clock.now() >= until:
+                return shown, inside

@@ -3,36 +3,18 @@
 from __future__ import annotations
 
 import re
-import tomllib
-from importlib import metadata, resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from pydantic import BaseModel
 
-from samii_rig.errors import InputError
-from samii_rig.rig.load import parse, read_text
+from samii_rig.errors import InputError, one_of
+from samii_rig.rig.load import parse, read_text, tables
 from samii_rig.rig.schema import Rig
-from samii_rig.run.protocols import Experiment
-
-GROUP = "samii_rig.experiments"
-
-
-def kinds() -> dict[str, metadata.EntryPoint]:
-    """Entry points by the kind of experiment that they load (`experiment = "..."`)."""
-    return {point.name: point for point in metadata.entry_points(group=GROUP)}
-
-
-def shipped() -> dict[str, Traversable]:
-    """Experiment files by name, from the `data` folder of every package with experiments."""
-    found: dict[str, Traversable] = {}
-    for package in dict.fromkeys(point.module.partition(".")[0] for point in kinds().values()):
-        folder = resources.files(package) / "data"
-        if folder.is_dir():
-            for file in sorted(folder.iterdir(), key=lambda f: f.name):
-                if file.name.endswith(".toml"):
-                    found.setdefault(file.name.removesuffix(".toml"), file)
-    return found
+from samii_rig.run.catalogue import kinds as kinds
+from samii_rig.run.catalogue import shipped as shipped
+from samii_rig.run.plugins import asked, checked_plan, named
+from samii_rig.run.protocols import Experiment, Plan
 
 
 def fitting(rig: Rig) -> dict[str, Traversable]:
@@ -67,23 +49,40 @@ def load_experiment(name: str, rig: Rig) -> tuple[Experiment, str]:
             return _load(files[candidate].read_text("utf-8"), f"{candidate}.toml")
     path = Path(name)
     if not path.exists():
-        expected = f"the path of an experiment file or one of {', '.join(files)}"
+        expected = f"the path of an experiment file or {one_of(name, files)}"
         raise InputError("EXPERIMENT", "", name, expected)
     return _load(read_text(path, "experiment file"), str(path))
 
 
 def _load(text: str, where: str) -> tuple[Experiment, str]:
     known = kinds()
-    try:
-        kind = tomllib.loads(text).get("experiment")
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(where, "", str(error) or "nested too deep", "valid TOML") from error
+    kind = tables(text, where).get("experiment")
     if not isinstance(kind, str) or kind not in known:
-        raise InputError(where, "experiment", kind, f"one of {', '.join(sorted(known))}")
-    model = known[kind].load()
+        raise InputError(where, "experiment", kind, one_of(kind, sorted(known)))
+    who = named(known[kind])
+    with asked(who, ""):
+        model = known[kind].load()
     if not (isinstance(model, type) and issubclass(model, BaseModel)):
         raise InputError(where, "experiment", kind, f"a pydantic model behind {known[kind].value}")
-    experiment = parse(model, text, where)
+    with asked(who, where):
+        experiment = parse(model, text, where)
     if not isinstance(experiment, Experiment):
         raise InputError(where, "experiment", kind, f"a plan() in {known[kind].value}")
     return experiment, text
+
+
+def origin(experiment: object) -> str:
+    """The entry point that an experiment came from, in words for an error's line."""
+    kind = type(experiment)
+    value = f"{kind.__module__}:{kind.__qualname__}"
+    return next((named(p) for p in kinds().values() if p.value == value), f"experiment {value}")
+
+
+def plan_of(experiment: Experiment, rig: Rig) -> Plan:
+    """The plan of an experiment for this rig.
+
+    InputError if the rig cannot be asked this, or if what the experiment gives is no plan.
+    """
+    who = origin(experiment)
+    with asked(who, "plan()"):
+        return checked_plan(experiment.plan(rig), rig, who)

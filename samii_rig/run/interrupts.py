@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType, TracebackType
@@ -12,15 +14,55 @@ SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 
+# s; what an ending takes at most until its output is at zero, and less than a person's patience.
+PAUSE = 0.5
+
+
+# s after which a signal is looked at again that came in a function that the compiler calls back:
+# an exception there would be printed and forgotten, and the press with it.
+AGAIN = 0.05
+_CALLED_BACK = ("_raw_object_cache_notify", "_raw_object_cache_getbuffer")
+
+
+def one_press_counts() -> None:
+    """From now on SIGINT raises KeyboardInterrupt, but not again within `PAUSE`: an impatient
+    second press would break what the first one has begun to put in order."""
+    deaf_until = 0.0
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        nonlocal deaf_until
+        now = time.monotonic()
+        if now < deaf_until:
+            return
+        if _called_back(frame):
+            again = threading.Timer(AGAIN, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+            return
+        deaf_until = now + PAUSE
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGINT, handle)
+
+
+def _called_back(frame: FrameType | None) -> bool:
+    """Whether llvmlite, which compiles for numba, has called Python back."""
+    while frame is not None:
+        if frame.f_code.co_name in _CALLED_BACK:
+            return True
+        frame = frame.f_back
+    return False
+
 
 class Interrupts:
     """While this context is open, SIGINT, SIGTERM and SIGHUP set `reason` instead of killing.
 
     A second signal, for a program that hangs in a device and never looks at the flag,
-    raises KeyboardInterrupt; once `ending` is set (the output is at zero and only the
-    recording is being closed) further signals are ignored. `give_up` is for work in between
-    that can be left out: the next signal raises KeyboardInterrupt, the rest are ignored. Only
-    Python's main thread may handle signals; in any other this does nothing.
+    raises KeyboardInterrupt, but not again within `PAUSE`: of a key that is held down one press
+    counts, or no line of the ending would ever be reached. Once `ending` is set (the output is at
+    zero and only the recording is being closed) further signals are ignored. `give_up` is for
+    work in between that can be left out: the next signal raises KeyboardInterrupt, the rest are
+    ignored. Only Python's main thread may handle signals; in any other this does nothing.
 
     came : name of the first signal, also of one that was ignored: whoever would go on to
     another run must not.
@@ -30,6 +72,7 @@ class Interrupts:
         self.reason = self.came = ""
         self.ending = False
         self._optional = False
+        self._deaf_until = 0.0
         self._before: dict[int, object] = {}
 
     def __enter__(self) -> Interrupts:
@@ -67,5 +110,9 @@ class Interrupts:
             self.ending = True
             raise KeyboardInterrupt(name)
         if self.reason:
+            now = time.monotonic()
+            if now < self._deaf_until:
+                return
+            self._deaf_until = now + PAUSE
             raise KeyboardInterrupt(name)
         self.reason = f"{name} (Ctrl-C)" if number == signal.SIGINT else name

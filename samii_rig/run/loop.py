@@ -8,6 +8,7 @@ the run, the first thing done is the output at zero; the recording is closed aft
 from __future__ import annotations
 
 import math
+import time
 import traceback
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -27,7 +28,7 @@ from samii_rig.run.limits import gate_limits
 from samii_rig.run.pace import COUNTS_AS_LATE, LoopSettings, choose_ahead, choose_tick
 from samii_rig.run.progress import Progress, nearer
 from samii_rig.run.protocols import CommandBlock, OpenRig, Plan, Reports
-from samii_rig.run.sink import Collector, QueuedSink, Sink
+from samii_rig.run.sink import Collector, QueuedSink, Sink, pair_clocks
 from samii_rig.types import Quality, SampleBlock, Segment, StopRecord
 
 FIRST_SAMPLE = 1.0  # s to wait for the device's first sample
@@ -120,7 +121,10 @@ class _Run:
         self.sink: Sink = self.queued or sink
         self.newest = -1  # newest sample that arrived
         self.reckoned, self.reckoned_at = 0.0, 0  # the device's sample by the host's clock, ns
-        self.apart = 0  # ns, host's clock minus the device's
+        self.apart = 0  # ns, host's clock minus the device's, as the newest sample has it
+        # The same as the promptest block of late has it, and when that came.
+        self.promptly, self.promptly_at = 0, -1
+        self.zeroed = 0  # ns on the device's clock, when zero() had returned
         self.start = -1  # sample at which the plan begins
         self.sent = 0  # samples of the plan that were sent, and of the rest after it
         self.done = 0  # segments that are whole and reported
@@ -179,6 +183,8 @@ class _Run:
                 late_ticks=late,
                 latest_tick=self.latest,
                 missing_samples=missing,
+                # Against the event's own stamp: how far the device's clock has drifted.
+                **({} if self.queued is None else {"wall_ns": time.time_ns()}),
             )
         )
         if self.queued is not None:
@@ -238,11 +244,19 @@ class _Run:
         if self.alive is not None and self.alive():
             self.gate.beat(self.clock.now())
         block = self.sensor.read()
+        if len(block):
+            # Before anything that logs an event, whose time follows from it.
+            now = self.clock.now()
+            self.apart = now - int(block.time[-1])
+            drift = round(CLOCK_DRIFT * (now - self.promptly_at))
+            if self.promptly_at < 0 or self.apart < self.promptly + drift:
+                self.promptly, self.promptly_at = self.apart, now
+            if self.newest < 0:
+                pair_clocks(self.sink, int(block.time[-1]), time.time_ns())
         self.collector.add(block)
         self.gate.observe(block, self.clock.now())
         self._tell()
         if len(block):
-            self.apart = self.clock.now() - int(block.time[-1])
             self._count(block)
             self._shorten(block)
             self.margin = nearer(self.margin, self.gate.margin())
@@ -275,8 +289,8 @@ class _Run:
                 self.sink.event(event.time, event.name, dict(event.fields))
 
     def _send(self) -> None:
-        """Send the reference up to `ahead` past the newest sample. After the plan's end go on
-        with rest, so that the deadman stays fed until the last sample has arrived.
+        """Send the reference up to `ahead` past the newest sample. After the plan's end stay at its
+        last set point, so that the deadman stays fed until the last sample has arrived.
 
         Samples come in blocks. In between they are reckoned on by the clock, so that every tick
         sends, and thus feeds the deadman.
@@ -291,7 +305,7 @@ class _Run:
         n = upto - self.sent
         if n <= 0:
             return
-        u, theta_ref = np.zeros(n), np.zeros(n)
+        u, theta_ref = np.zeros(n), np.full(n, self.reference.theta_ref[-1])
         part = slice(self.sent, min(upto, len(self.reference.u)))
         if part.start < part.stop:
             u[: part.stop - part.start] = self.reference.u[part]
@@ -341,10 +355,11 @@ class _Run:
             (self.gate.fail if failed else self.gate.stop)(reason, self.clock.now())
         except BaseException:
             self.zero.force()
+        self.zeroed = self.clock.now() - self.promptly
 
     def _tail(self) -> None:
         """The samples after the end, which must show the output at zero."""
-        self.zero.check(self.tick, self.collector.add, spoke=self.newest >= 0)
+        self.zero.check(self.tick, self.collector.add, self.zeroed, spoke=self.newest >= 0)
         self._tell()
 
     def _flush(self) -> None:

@@ -7,19 +7,22 @@ moves are bounded here.
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from samii_rig.errors import DeviceError, InputError
+from samii_rig.files import make_folder
 from samii_rig.record.writer import RunWriter
 from samii_rig.rig.schema import Rig
-from samii_rig.run.devices import open_device
+from samii_rig.run.devices import close_device, open_device
+from samii_rig.run.ending import finish
 from samii_rig.run.latch import Latch
 from samii_rig.run.limits import gate_limits
 from samii_rig.run.loop import run
@@ -31,6 +34,9 @@ from samii_rig.types import Float, SampleBlock, StopRecord
 FASTEST = 0.2  # of the centring sensor's unit per s, at which a person can still step back
 SPEED = 0.05  # the same, where nothing is asked for
 FURTHEST = 0.8  # of the centring sensor's limit
+# How near a move comes to where it was to go: parts of the way, of which five time constants leave
+# 0.7 %, and multiples of what the sensor cannot tell.
+NEAR, NEAR_NOISE = 0.02, 5.0
 SETTLE = 0.5  # s at the end of a move, and so many time constants of the centring loop
 SETTLE_CONSTANTS, LONGEST_SETTLE = 5.0, 10.0  # and s
 PULSE = 0.2  # s of the pulse that tells the encoder's sign
@@ -39,13 +45,25 @@ PULSE_PART = 0.05  # of the actuator's limit
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """A small move: where the joint was, where it is, and how it ended."""
+    """A small move: where the joint was, where it is, and how it ended.
+
+    to, within : where it was to go and how near that is, in `unit`; NaN and inf where the move has
+    no such place.
+    """
 
     before: float
     after: float
     unit: str
     stop: StopRecord
     recording: Path
+    to: float = math.nan
+    within: float = math.inf
+
+    @property
+    def reached(self) -> bool:
+        """Whether it went through, and the joint is where it was to go."""
+        there = math.isnan(self.to) or abs(self.after - self.to) <= self.within
+        return self.stop.status == "completed" and there
 
 
 @contextmanager
@@ -61,7 +79,7 @@ def opened(rig: Rig) -> Iterator[OpenRig]:
         with latch.held(device):
             yield device
     finally:
-        device.close()
+        close_device(device)
 
 
 def listen(device: OpenRig, seconds: float) -> SampleBlock:
@@ -113,7 +131,11 @@ def jog(rig: Rig, rig_toml: str, to: float, speed: float, folder: Path) -> Move:
         settle = min(SETTLE_CONSTANTS / pull, LONGEST_SETTLE) if pull else SETTLE
         rest = np.full(round(max(settle, SETTLE) * rig.rate_hz), to)
         theta_ref = np.concatenate([before + (to - before) * way, rest])
-        return _moved(rig, rig_toml, device, 0.0 * theta_ref, theta_ref, rig.centring.kp, folder)
+        kp = rig.centring.kp
+        move = _moved(rig, rig_toml, device, 0.0 * theta_ref, theta_ref, kp, folder)
+        reads = next(x for x in rig.sensor if x.name == sensor)
+        blind = NEAR_NOISE * math.hypot(reads.noise_rms, reads.resolution)
+        return replace(move, to=to, within=max(NEAR * abs(to - before), blind))
 
 
 def pulse(rig: Rig, rig_toml: str, folder: Path) -> Move:
@@ -159,7 +181,7 @@ def _moved(
     )
     plan = Plan("jog", rig.rate_hz, actuator.name, kp, sensor, (segment,), 0)
     before = float(np.mean(column(listen(device, 0.1), sensor)))
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder("--out", folder)
     path = folder / f"{datetime.now(UTC):%Y-%m-%dT%H-%M-%S-%f}_jog.mcap"
     real = device.metadata.get("clock") != "simulated"
     with RunWriter(
@@ -181,7 +203,7 @@ def _moved(
                 writer,
                 latch=Latch(rig.name, rig.device.driver).set if real else None,
             )
-        writer.close(stop)
+        finish(writer, stop)
     after = float(np.mean(column(listen(device, 0.1), sensor)))
     return Move(before, after, rig.units()[sensor], stop, path)
 

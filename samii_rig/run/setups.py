@@ -9,6 +9,8 @@ from typing import Protocol, runtime_checkable
 
 from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import Outcome
+from samii_rig.run.experiments import origin
+from samii_rig.run.plugins import asked, wrong
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +57,24 @@ class Concludes(Protocol):
 
 def setups_of(experiment: object, rig: Rig, rig_toml: str) -> tuple[Setup, ...]:
     """The runs of an experiment; a single one on the rig as it is unless it says otherwise."""
-    if isinstance(experiment, HasSetups):
-        return experiment.setups(rig, rig_toml)
-    return (Setup(rig, rig_toml),)
+    if not isinstance(experiment, HasSetups):
+        return (Setup(rig, rig_toml),)
+    who = origin(experiment)
+    with asked(who, "setups()"):
+        found = tuple(experiment.setups(rig, rig_toml))
+    if not found or not all(isinstance(s, Setup) for s in found):
+        raise wrong(who, "setups()", found, "a Setup for each run, at least one")
+    return found
+
+
+def conclusion_of(
+    experiment: Concludes, rigs: Sequence[Rig], outcomes: Sequence[Outcome], stem: Path
+) -> Conclusion:
+    """What an experiment makes of its own recordings; raises as `Concludes.conclude`, and
+    InputError if what it gives is no conclusion."""
+    who = origin(experiment)
+    with asked(who, "conclude()"):
+        found = experiment.conclude(rigs, outcomes, stem)
+    if not isinstance(found, Conclusion):
+        raise wrong(who, "conclude()", found, "a Conclusion")
+    return found

@@ -3,16 +3,14 @@ handed over without ever making the loop wait."""
 
 from __future__ import annotations
 
-import contextlib
 import queue
 import threading
-import time
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from samii_rig.errors import DeviceError
+from samii_rig.errors import DeviceError, DiskError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.dwell import Reference
 from samii_rig.run.protocols import Plan
@@ -36,20 +34,37 @@ class Sink(Protocol):
         """A part of the plan was done, whole; its samples were written before."""
 
 
+@runtime_checkable
+class Dated(Protocol):
+    """A sink that stamps what it gets with the wall clock."""
+
+    def clocks(self, device: int, wall: int, /) -> None:
+        """The device's clock and the wall clock showed these times, ns, at one moment."""
+
+
+def pair_clocks(sink: Sink, device: int, wall: int) -> None:
+    """Tell `sink` these two times if it wants to know."""
+    if isinstance(sink, Dated):
+        sink.clocks(device, wall)
+
+
 class QueuedSink:
     """Lets a slow sink work in a thread of its own, so that a slow disk never moves the output.
 
     What the thread raises comes out of every later call here: samples are lost from then on,
-    and a caller that swallows it once must not end as if they were not. A queue that is full
-    raises DeviceError: a run that cannot be recorded ends.
+    and a caller that swallows it once must not end as if they were not. So does a DiskError when
+    the thread is gone. A queue that is full raises DeviceError: a run that cannot be recorded ends.
 
     close_within : s that `close` waits for what is still queued.
     """
 
     def __init__(self, sink: Sink, depth: int = 256, close_within: float = CLOSE_WITHIN) -> None:
-        self._sink, self._close_within = sink, close_within
-        self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(depth)
+        self._sink, self._depth, self._close_within = sink, depth, close_within
+        # No queue with locks of its own: an exception that comes from outside (Ctrl-C, the end of
+        # the memory) in the wrong place would leave them locked for ever.
+        self._queue: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._error: BaseException | None = None
+        self._done = False
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
 
@@ -61,16 +76,18 @@ class QueuedSink:
         """Queue an event."""
         self._put(lambda: self._sink.event(time, name, payload))
 
+    def clocks(self, device: int, wall: int) -> None:
+        """Queue a pair of times."""
+        self._put(lambda: pair_clocks(self._sink, device, wall))
+
     def segment(self, segment: Segment) -> None:
         """Queue a finished segment."""
         self._put(lambda: self._sink.segment(segment))
 
     def close(self) -> None:
         """Return when all is written; raises what went wrong, DeviceError if it takes too long."""
-        give_up = time.monotonic() + self._close_within
-        with contextlib.suppress(queue.Full):
-            self._queue.put(None, timeout=self._close_within)
-        self._thread.join(max(0.0, give_up - time.monotonic()))
+        self._queue.put(None)
+        self._thread.join(self._close_within)
         self._raise()
         if self._thread.is_alive():
             raise DeviceError(
@@ -80,26 +97,35 @@ class QueuedSink:
 
     def _put(self, job: Callable[[], None]) -> None:
         self._raise()
-        try:
-            self._queue.put_nowait(job)
-        except queue.Full:
+        if self._queue.qsize() >= self._depth:
             raise DeviceError(
-                f"the recorder fell {self._queue.maxsize} blocks behind; expected a faster disk"
-            ) from None
+                f"the recorder fell {self._depth} blocks behind; expected a faster disk"
+            )
+        self._queue.put(job)
 
     def _raise(self) -> None:
-        if self._error is not None:
-            raise self._error
+        error = self._error
+        if isinstance(error, Exception):
+            raise error
+        if error is not None:  # an end of the thread is none of the program
+            raise DiskError(f"the recorder was ended by {type(error).__name__}") from error
+        if not (self._done or self._thread.is_alive()):
+            raise DiskError("the recorder's thread has ended")
 
     def _work(self) -> None:
-        failed = False
-        while (job := self._queue.get()) is not None:
-            if failed:
-                continue  # keeps emptying the queue so that close() returns
-            try:
-                job()
-            except BaseException as error:
-                self._error, failed = error, True
+        try:
+            while (job := self._queue.get()) is not None:
+                if self._error is None:
+                    job()
+            self._done = True
+        except BaseException as error:
+            self._error = error
+            self._empty()
+
+    def _empty(self) -> None:
+        """Nothing is kept any more; what is queued goes."""
+        while self._queue.get() is not None:
+            pass
 
 
 class Watched:
@@ -108,6 +134,10 @@ class Watched:
     def __init__(self, sink: Sink, watch: Callable[[SampleBlock], None]) -> None:
         self._sink, self._watch = sink, watch
         self.event, self.segment = sink.event, sink.segment
+
+    def clocks(self, device: int, wall: int) -> None:
+        """Hand on a pair of times."""
+        pair_clocks(self._sink, device, wall)
 
     def write(self, block: SampleBlock) -> None:
         """Keep the samples, then show them."""

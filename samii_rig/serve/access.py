@@ -6,6 +6,7 @@ a path that is not named as open wants a token where there are any.
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import hmac
 import json
@@ -16,6 +17,7 @@ from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import parse_qs, unquote
 
 from samii_rig.errors import InputError
 
@@ -36,20 +38,30 @@ PLAIN_PAGE = {
     "Referrer-Policy": "no-referrer",
     "Cache-Control": "no-store",
 }
+MAX_HEAD = 32 << 10  # bytes of a request's head
 MAX_BODY = 64 << 10  # bytes of a request that is no upload
+BODY_WITHIN = 30.0  # s for the next bytes of a body
 MAX_UPLOAD = 2 << 30  # bytes of an uploaded recording: an hour of ten channels at 5 kHz
 UPLOAD = ("POST", "/api/recordings")
 RATE, BURST = 40.0, 200.0  # requests/s and at once, of one address
 GUESSES, GUESS_BURST = 0.2, 10.0  # wrong tokens/s and at once, of one address
 MOST_ADDRESSES = 4096
+MAX_NAME = 40  # characters
 
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """Who asks. role : None for somebody who showed no token."""
+    """Who asks, and from where. role : None for somebody who showed no token. name : "" for
+    somebody who gave none."""
 
     name: str
     role: Role | None
+    address: str = ""
+
+    @property
+    def signed(self) -> str:
+        """Who it was, for what is written down."""
+        return f"{self.name or 'somebody'} at {self.address}" if self.address else self.name
 
     @property
     def drives(self) -> bool:
@@ -98,7 +110,7 @@ class Tokens:
             raise InputError("--tokens", "", str(self.path), expected) from error
         return token
 
-    def person(self, token: str) -> Person | None:
+    def person(self, token: str, address: str = "") -> Person | None:
         """Whose token it is; every one is compared, in constant time."""
         given, found = _hash(token), None
         for item in self.known:
@@ -106,7 +118,14 @@ class Tokens:
                 found = item
         if found is None:
             return None
-        return Person(found["name"], "operator" if found["role"] == "operator" else "viewer")
+        role: Role = "operator" if found["role"] == "operator" else "viewer"
+        return Person(found["name"], role, address)
+
+
+def claimed(name: str, address: str) -> Person:
+    """Somebody of this machine, where no tokens tell who it is: by the name that they give."""
+    name = "".join(c for c in name if c.isprintable()).strip()[:MAX_NAME]
+    return Person(name, "operator", address)
 
 
 def _hash(token: str) -> str:
@@ -140,10 +159,24 @@ class Guard:
 
     hosts : names and ports under which the service may be called; a browser that was led here
     by another name (DNS rebinding) is refused.
+    crowded : whether this address has so many connections that only a stop is served.
+    proxies : addresses whose X-Forwarded-For is believed; nobody else's is.
+    holds : whether this is the secret of who drives.
     """
 
-    def __init__(self, app: App, tokens: Tokens | None, hosts: frozenset[str], tls: bool) -> None:
+    def __init__(
+        self,
+        app: App,
+        tokens: Tokens | None,
+        hosts: frozenset[str],
+        tls: bool,
+        *,
+        crowded: Callable[[str], bool] = lambda address: False,
+        proxies: frozenset[str] = frozenset(),
+        holds: Callable[[str], bool] = lambda secret: False,
+    ) -> None:
         self._app, self._tokens, self._hosts = app, tokens, hosts
+        self._crowded, self._proxies, self._holds = crowded, proxies, holds
         self._scheme = "https" if tls else "http"
         self._asked = Buckets(RATE, BURST)
         self._guessed = Buckets(GUESSES, GUESS_BURST)
@@ -171,28 +204,30 @@ class Guard:
 
     def _judged(self, scope: Scope, headers: dict[str, str]) -> tuple[int, str] | None:
         """Status and line of a refusal; None to let it pass."""
-        address = scope["client"][0] if scope.get("client") else ""
-        path = scope["path"]
-        person = Person("local", "operator") if self._tokens is None else Person(address, None)
+        peer = scope["client"][0] if scope.get("client") else ""
+        address = self._came_from(peer, headers)
+        path, token = scope["path"], token_of(headers)
+        known = self._tokens.person(token, address) if self._tokens and token else None
+        person = known or self._unknown(scope, headers, address)
         scope.setdefault("state", {})["person"] = person
-        token = _token(headers)
         # The stop is for everybody, always: no token, no rate, whoever called us by what name.
         if path == STOP:
-            if self._tokens is not None and token:
-                scope["state"]["person"] = self._tokens.person(token) or person
             return None
+        if self._crowded(peer):
+            return 503, "too many connections; expected a try in some seconds"
+        if (size := _head(scope)) > MAX_HEAD:
+            return 431, f"a head of {size} bytes; expected at most {MAX_HEAD}"
         host = headers.get("host", "").lower()
         if host not in self._hosts:
             return 421, f"called as {host[:80]!r}; expected one of {', '.join(sorted(self._hosts))}"
-        if self._tokens is not None and token:
-            if self._guessed.left(address) < 1.0:
-                return 429, "too many wrong tokens; wait a minute"
-            found = self._tokens.person(token)
-            if found is not None:
-                scope["state"]["person"] = person = found
-            else:
-                self._guessed.take(address)
-        if not self._asked.take(address):
+        # A token of 256 bits is not guessed, at whatever rate: who shows a right one is heard, and
+        # counted by their name, whatever others at the same address do. So is who drives.
+        if self._tokens is not None and token and known is None and not self._guessed.take(address):
+            return 429, "too many wrong tokens; wait a minute"
+        counted = f"token of {known.name}" if known else address
+        if self._holds(headers.get("x-lease", "")):
+            counted = "who drives"
+        if not self._asked.take(counted):
             return 429, "too many requests; expected fewer than 40 a second"
         origin = headers.get("origin")
         if origin is not None and origin.lower() not in {f"{s}://{host}" for s in self._schemes()}:
@@ -203,12 +238,37 @@ class Guard:
             return 401, "no valid token; expected Authorization: Bearer TOKEN"
         return None
 
+    def _came_from(self, peer: str, headers: dict[str, str]) -> str:
+        """The address behind the proxies that are ours: the last that one of them was told by
+        somebody else, as what stands before it may be made up."""
+        if peer not in self._proxies:
+            return peer
+        hops = [hop.strip() for hop in headers.get("x-forwarded-for", "").split(",")]
+        outside = [hop for hop in hops if hop and hop not in self._proxies]
+        return outside[-1][:MAX_NAME] if outside else peer
+
+    def _unknown(self, scope: Scope, headers: dict[str, str], address: str) -> Person:
+        """Somebody without a valid token."""
+        if self._tokens is not None:
+            return Person("", None, address)
+        query = parse_qs(scope.get("query_string", b"").decode("latin-1"))
+        name = query.get("name", [""])[0] if scope["path"] == STOP else ""
+        return claimed(name or unquote(headers.get("x-name", "")), address)
+
     def _schemes(self) -> tuple[str, ...]:
         # Behind a proxy that ends TLS the page comes by https, and we are asked by http.
         return (self._scheme,) if self._scheme == "https" else ("http", "https")
 
 
-def _token(headers: dict[str, str]) -> str:
+def _head(scope: Scope) -> int:
+    """Bytes of a request's head, within a few: one that comes at once is whole before the
+    parser's own limit sees it."""
+    lines = sum(len(name) + len(value) + 4 for name, value in scope["headers"])
+    return lines + len(scope.get("raw_path") or b"") + len(scope.get("query_string") or b"")
+
+
+def token_of(headers: dict[str, str]) -> str:
+    """The token that a request shows, "" for none."""
     kind, _, token = headers.get("authorization", "").partition(" ")
     if kind.lower() == "bearer":
         return token.strip()
@@ -220,12 +280,17 @@ def _token(headers: dict[str, str]) -> str:
 
 
 def _bounded(receive: Receive, most: int) -> Receive:
-    """A body that claims nothing and goes on for ever ends here."""
-    taken = 0
+    """A body that claims nothing and goes on for ever ends here, and one that stalls."""
+    taken, more = 0, True
 
     async def bounded() -> MutableMapping[str, Any]:
-        nonlocal taken
-        message = await receive()
+        nonlocal taken, more
+        try:
+            # Once the body is whole this waits for the end of the connection.
+            message = await asyncio.wait_for(receive(), BODY_WITHIN if more else None)
+        except TimeoutError:
+            return {"type": "http.disconnect"}
+        more = bool(message.get("more_body"))
         taken += len(message.get("body", b""))
         if taken > most:
             return {"type": "http.disconnect"}

@@ -86,6 +86,9 @@ def _answered(work: Callable[..., dict[str, Any]], arguments: tuple[Any, ...]) -
         return {"raised": type(error).__name__, "line": str(error)}
     except MemoryError:
         return {"raised": "RecordingError", "line": "it does not fit into the memory"}
+    except SystemExit as error:
+        # Some package's own; it would end whoever waits for this answer.
+        return {"raised": "RecordingError", "line": f"it ended its process ({error})"}
 
 
 def rig(rig_toml: str) -> dict[str, Any]:
@@ -121,11 +124,12 @@ def dry_run(rig_toml: str, name: str, text: str) -> dict[str, Any]:
     name : of a shipped experiment, or `text` : of its file. No path from a client is ever opened.
     refused : the line of what limit would be broken, "" if none. text : of the experiment.
     """
-    from samii_rig.errors import InputError, LimitError
+    from samii_rig.errors import InputError, LimitError, one_of
     from samii_rig.rig.load import parse
     from samii_rig.rig.schema import Rig
     from samii_rig.run.dryrun import predict
-    from samii_rig.run.experiments import load_experiment, shipped
+    from samii_rig.run.experiments import load_experiment, plan_of, shipped
+    from samii_rig.run.plugins import asked
     from samii_rig.run.setups import setups_of
     from samii_rig.serve.words import prediction
 
@@ -134,7 +138,7 @@ def dry_run(rig_toml: str, name: str, text: str) -> dict[str, Any]:
         raise InputError("experiment", "", name, "a name or a text, one of the two")
     if name:
         if name not in shipped():
-            raise InputError("experiment", "", name, f"one of {', '.join(shipped())}")
+            raise InputError("experiment", "", name, one_of(name, shipped()))
         _, text = load_experiment(name, the_rig)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "experiment.toml"
@@ -145,8 +149,9 @@ def dry_run(rig_toml: str, name: str, text: str) -> dict[str, Any]:
             raise _renamed(error, str(file)) from error
     runs, refused = [], ""
     for setup in setups_of(experiment, the_rig, rig_toml):
-        plan = experiment.plan(setup.rig)
-        predicted = predict(plan, setup.rig)
+        plan = plan_of(experiment, setup.rig)
+        with asked(f"experiment {experiment.name!r}", "prediction"):
+            predicted = predict(plan, setup.rig)
         try:
             predicted.refuse()
         except LimitError as error:

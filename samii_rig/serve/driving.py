@@ -107,7 +107,7 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
             planned["experiment"],
             planned["text"],
             planned["runs"],
-            asked.operator or who.name,
+            asked.operator or who.name or who.signed,
             diagnosis=asked.diagnosis,
             seed=asked.seed,
             stop_when_certain=asked.stop_when_certain,
@@ -135,9 +135,13 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
     @router.post(STOP.removeprefix("/api"))
     async def stop(request: Request) -> Answer:
         """Zero output now. Works for everybody, always: no token, no lease."""
-        client = request.client.host if request.client else "somebody"
-        who = person(request)
-        return {"stopped": rooms.supervisor.stop(f"{who.name} ({client})")}
+        stopped = rooms.supervisor.stop(person(request).signed)
+        return {"stopped": stopped, "moving": rooms.supervisor.moving}
+
+    @router.get(STOP.removeprefix("/api"))
+    async def stopped() -> Answer:
+        """Whether a run may still drive the rig: whoever asked for a stop sees that it is done."""
+        return {"moving": rooms.supervisor.moving}
 
     @router.delete("/queue/{id_}")
     async def cancel(request: Request, id_: str) -> Answer:
@@ -174,7 +178,8 @@ def _lease(router: APIRouter, rooms: Rooms) -> None:
     @router.post("/lease")
     async def take(request: Request) -> Answer:
         """Become the one who drives. Silence for `lasts_s` ends it, and the run with it."""
-        secret = rooms.lease.take(operator(request).name)
+        who = operator(request)
+        secret = rooms.lease.take(who.name or who.signed)
         return {"lease": secret, "every_s": EVERY, "lasts_s": LASTS}
 
     @router.post("/lease/beat")

@@ -7,7 +7,9 @@ the rig (a brace, a mass, a sensor) is not.
 from __future__ import annotations
 
 import re
-import tomllib
+
+from samii_rig.errors import InputError
+from samii_rig.rig.load import tables
 
 NUMBER = r"([-+.\deE]+)"
 STARTS, ENDS = ("start_hz", "low_hz"), ("stop_hz", "high_hz")
@@ -19,8 +21,8 @@ def following(words: str, experiment_toml: str) -> str:
     words : `Diagnosis.experiment`. experiment_toml : of the run that was diagnosed.
     """
     try:
-        before = tomllib.loads(experiment_toml)
-    except tomllib.TOMLDecodeError:
+        before = tables(experiment_toml, "experiment.toml")
+    except InputError:
         return ""
     levels = before.get("amplitudes", [])
     changes: dict[str, object] = {}
@@ -40,8 +42,8 @@ def following(words: str, experiment_toml: str) -> str:
         said = f'"{value}"' if isinstance(value, str) else str(value)
         text = re.sub(rf"(?m)^{key}\s*=.*$", f"{key} = {said}", text)
     try:
-        after = tomllib.loads(text)
-    except tomllib.TOMLDecodeError:
+        after = tables(text, "experiment.toml")
+    except InputError:
         return ""
     # A value that was written over several lines is none that we change.
     return text if after == before | changes else ""

@@ -13,6 +13,7 @@ import re
 import secrets
 import signal
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
@@ -40,6 +41,12 @@ REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS 
 # s without a sign of the service after which it counts as gone: it gives one every half second.
 LOST_AFTER = 5.0
 MOST_STOPS = 20  # that are written down
+# s from the first stop until another one sends its signal once more: a run that obeys is at zero
+# long before, and one that hangs in its device is cut off by the second.
+INSIST_AFTER = 1.0
+LOOKED = 0.002  # s; who only looks whether a job is run has its lock for microseconds
+JOBS = "jobs"  # folder of all of them
+ASKED = "stop_asked.json"  # in it: word of a stop to the service, which holds its queue
 
 Phase = Literal[
     "queued", "starting", "running", "analysing", "done", "refused", "cancelled", "died"
@@ -67,7 +74,9 @@ class Request:
 @dataclass(frozen=True, slots=True)
 class JobState:
     """How it stands. status, reason : of the stop record. error : why there is none.
-    live : path of the live data. early : why it ended before its plan did, in good order."""
+    live : path of the live data. early : why it ended before its plan did, in good order.
+    at_zero : whether the last sample showed the output at zero; None where none was seen.
+    ended : when, UTC, ISO 8601."""
 
     phase: Phase = "queued"
     pid: int = 0
@@ -78,6 +87,8 @@ class JobState:
     trouble: str = ""
     verdict: str = ""
     early: str = ""
+    at_zero: bool | None = None
+    ended: str = ""
     time: str = ""
 
 
@@ -161,30 +172,66 @@ class Job:
         GateError if another does already.
         """
         with (self.folder / LOCK).open("ab") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise GateError(f"{self.id} is run by another process") from error
+            for last in (False, False, True):
+                try:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                except BlockingIOError as error:
+                    if last:
+                        raise GateError(f"{self.id} is run by another process") from error
+                    time.sleep(LOOKED)
             yield file.fileno()
 
     def stop(self, by: str) -> bool:
         """Have the runner end at zero output; False if there is none. by : recorded.
 
-        A runner that has not even said its number yet finds it written, before anything moves.
+        Any number may ask at once, from any process. A runner that has not even said its number
+        yet finds the stop written, before anything moves.
         """
         if not self.alive():
             return False
-        # The signal first: what is written about it can wait.
-        pid = self.written.pid
-        if pid:
-            with suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGTERM)
-        now = datetime.now(UTC).isoformat(timespec="milliseconds")
-        if len(self.stops()) >= MOST_STOPS:
-            return True
-        with (self.folder / STOPS).open("a", encoding="utf-8") as file:
-            file.write(json.dumps({"time": now, "by": by}) + "\n")
+        if self._first_to_stop(by) or (self.moving and self._insists()):
+            with suppress(ProcessLookupError, RecordingError):
+                if pid := self.written.pid:
+                    os.kill(pid, signal.SIGTERM)
         return True
+
+    def _first_to_stop(self, by: str) -> bool:
+        """Write the stop down; whether it is the first, or could not be written."""
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
+        line = (json.dumps({"time": now, "by": by}) + "\n").encode()
+        path, how = self.folder / STOPS, os.O_WRONLY | os.O_CREAT | os.O_APPEND
+        first = True
+        with suppress(OSError):  # a full disk keeps nobody from stopping
+            try:
+                file = os.open(path, how | os.O_EXCL, 0o644)
+            except FileExistsError:
+                first = False
+                if len(self.stops()) >= MOST_STOPS:
+                    return False
+                file = os.open(path, how)
+            try:
+                os.write(file, line)
+            finally:
+                os.close(file)
+        return first
+
+    def _insists(self) -> bool:
+        """Whether the first stop has had its time."""
+        stops = self.stops()
+        if not stops:
+            return True
+        first = datetime.fromisoformat(stops[0]["time"])
+        # Of a clock that was set back nothing is known.
+        return not 0.0 <= (datetime.now(UTC) - first).total_seconds() < INSIST_AFTER
+
+    @property
+    def moving(self) -> bool:
+        """Whether it may drive the rig now, or soon; one that cannot be read may."""
+        phase: Phase = "running"
+        with suppress(RecordingError):
+            phase = self.written.phase
+        return phase in ("starting", "running") and self.alive()
 
     def early(self, state: JobState) -> bool:
         """Whether it ended by its own order, and by nothing else that came on the way there."""
@@ -196,7 +243,37 @@ class Job:
             lines = (self.folder / STOPS).read_text(encoding="utf-8").splitlines()
         except FileNotFoundError:
             return []
-        return [json.loads(line) for line in lines]
+        # Of a full disk the last one may be half.
+        found = []
+        for line in lines:
+            with suppress(ValueError):
+                found.append(json.loads(line))
+        return found
+
+
+def ask_all_to_stop(jobs: Path, by: str) -> bool:
+    """Stop whatever runs, and leave word for the service; whether anything ran."""
+    # The newest first, each at once: what runs is among the last that were asked for.
+    stopped = [job.stop(by) for job in reversed(Job.all(jobs))]
+    with suppress(OSError):
+        _put(jobs / ASKED, {"by": by}, durable=False)
+    return any(stopped)
+
+
+def moving(jobs: Path) -> bool:
+    """Whether any of them may drive the rig now."""
+    return any(job.moving for job in Job.all(jobs) if job.alive())
+
+
+def asked_to_stop(jobs: Path) -> str:
+    """Who left word of a stop since this was asked last; "" for nobody."""
+    path = jobs / ASKED
+    found: dict[str, Any] = {}
+    if path.exists():
+        with suppress(RecordingError):
+            found = _get(path)
+        path.unlink(missing_ok=True)
+    return str(found.get("by", ""))
 
 
 def _put(path: Path, data: dict[str, Any], *, durable: bool) -> None:

@@ -40,9 +40,13 @@ class Lease:
 
     def check(self, secret: str) -> None:
         """GateError unless this is the lease."""
-        if not self.alive or not hmac.compare_digest(secret.encode(), self._secret.encode()):
+        if not self.holds(secret):
             held = f"{self.holder} drives" if self.alive else "nobody drives"
             raise GateError(f"not your lease: {held}; expected POST /api/lease first")
+
+    def holds(self, secret: str) -> bool:
+        """Whether this is the lease; compared in constant time."""
+        return self.alive and hmac.compare_digest(secret.encode(), self._secret.encode())
 
     def give_back(self, secret: str) -> None:
         """End it in good order: what runs goes on."""

@@ -148,7 +148,7 @@ def _change(router: APIRouter, rooms: Rooms) -> None:
         """Add a note to a recording."""
         who = operator(request)
         entry, path = rooms.entry(id_)
-        remarks = add_note(path, who.name, body.text)
+        remarks = add_note(path, who.name or who.signed, body.text)
         return {"recording": rooms.index.update(entry.path), "remarks": remarks}
 
     @router.post("/recordings", status_code=201)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
-from samii_rig.run.experiments import load_experiment
+from samii_rig.run.experiments import load_experiment, plan_of
 from samii_rig.run.protocols import Plan
 from samii_rig.run.setups import Setup, setups_of
 from samii_rig.serve.job import EXPERIMENT, RIG, Job
@@ -17,4 +17,4 @@ def planned(job: Job) -> tuple[Setup, str, Plan]:
     rig = parse(Rig, rig_toml, RIG)
     experiment, text = load_experiment(str(job.folder / EXPERIMENT), rig)
     setup = setups_of(experiment, rig, rig_toml)[job.request.setup]
-    return setup, text, experiment.plan(setup.rig)
+    return setup, text, plan_of(experiment, setup.rig)

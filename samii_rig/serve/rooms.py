@@ -7,6 +7,7 @@ import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +44,17 @@ class Rooms:
     """The service's parts, and the work that it does by itself.
 
     progress : of reading the folder, which takes a while where there is no index yet.
+    stop_port : of the stop's own listener, 0 where there is none.
     """
 
     def __init__(
-        self, settings: Settings, progress: Callable[[int, int], None] | None = None
+        self,
+        settings: Settings,
+        progress: Callable[[int, int], None] | None = None,
+        stop_port: int = 0,
     ) -> None:
-        self.settings = settings
+        self.settings, self.stop_port = settings, stop_port
+        self.started = datetime.now(UTC).isoformat(timespec="seconds")
         self.index = Index(settings.folder)
         self.index.refresh(progress)
         self.supervisor = Supervisor(settings.rig, settings.rig_toml, self.index, settings.pace)
@@ -137,6 +143,8 @@ class Rooms:
             **self.supervisor.state(),
             "so_far": self.analysis.state() if self.supervisor.current else None,
             "rig": self.settings.rig.name,
+            "started": self.started,
+            "stop_port": self.stop_port,
             "real": real,
             "pace": 1.0 if real else self.settings.pace,
             "fault": asdict(fault) if fault else None,
@@ -150,7 +158,10 @@ class Rooms:
         entry = self.index.get(id_)
         if entry is None:
             raise NotThereError(f"no recording {id_[:40]!r}; expected the id of one in the list")
-        return entry, self.index.path_of(entry)
+        path = self.index.path_of(entry)
+        if not path.is_file():
+            raise NotThereError(f"{entry.path} is no file (any more); expected a recording")
+        return entry, path
 
     def drives(self, request: Request) -> Person:
         """Who asks, if they hold the lease; GateError or ForbiddenError otherwise."""
@@ -173,7 +184,7 @@ def operator(request: Request) -> Person:
     """Who asks, if they may change something; ForbiddenError if they are a viewer."""
     who = person(request)
     if not who.drives:
-        raise ForbiddenError(f"{who.name} is a viewer; expected an operator")
+        raise ForbiddenError(f"{who.signed} is a viewer; expected an operator")
     return who
 
 

@@ -15,14 +15,18 @@ import os
 import sys
 from contextlib import suppress
 from dataclasses import asdict, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
 from typing import Any
+
+import numpy as np
 
 from samii_rig.errors import GateError, SamiiRigError
 from samii_rig.index.remarks import add_note, set_diagnosis
 from samii_rig.run.campaign import Outcome, carry_out
 from samii_rig.run.dryrun import predict
+from samii_rig.run.limits import gate_limits
 from samii_rig.run.progress import Progress
 from samii_rig.run.protocols import Plan
 from samii_rig.run.setups import Setup
@@ -30,7 +34,7 @@ from samii_rig.serve.following import following
 from samii_rig.serve.job import DIAGNOSIS, LOST_AFTER, Job, JobState
 from samii_rig.serve.live import LiveWriter, live_folder
 from samii_rig.serve.planned import planned
-from samii_rig.types import SampleBlock
+from samii_rig.types import SampleBlock, StopRecord
 
 
 class Runner:
@@ -43,6 +47,7 @@ class Runner:
         self.live: LiveWriter | None = None
         self.stop = Event()
         self.lost = False
+        self._shown = math.nan  # the output, by the newest sample that says it
         self._enough_in = 0  # the segment in which the service asked for no more
 
     def go(self) -> None:
@@ -52,20 +57,15 @@ class Runner:
         try:
             setup, text, plan = planned(self.job)
             outcome = self._carry_out(setup, text, plan, live)
-            self._set(
-                phase="analysing",
-                status=outcome.stop.status,
-                reason=self._reason(outcome),
-                trouble=outcome.trouble,
-            )
+            self._set(trouble=outcome.trouble)
             self._note()
             verdict = self._diagnosed(setup, text, outcome)
             self._set(phase="done", verdict=verdict)
         except SamiiRigError as error:
-            self._set(phase="refused", error=str(error))
+            self._failed(str(error))
             raise
         except BaseException as error:
-            self._set(phase="refused", error=f"{type(error).__name__}: {error}")
+            self._failed(f"{type(error).__name__}: {error}")
             raise
         finally:
             if self.live is not None:
@@ -75,6 +75,10 @@ class Runner:
         self.state = replace(self.state, **changes)
         self.job.set(self.state)
 
+    def _failed(self, error: str) -> None:
+        # A run whose recording could not be closed did not go through, however it had ended.
+        self._set(phase="refused", status="failed" if self.state.status else "", error=error)
+
     def _carry_out(self, setup: Setup, text: str, plan: Plan, live: Path) -> Outcome:
         predicted = predict(plan, setup.rig)
         if self.job.stops():
@@ -82,6 +86,7 @@ class Runner:
         self._set(phase="running")
 
         def watch(block: SampleBlock) -> None:
+            self._note_output(block, plan.actuator)
             # A display that fails is none of the run's business.
             with suppress(Exception):
                 if self.live is None:
@@ -102,6 +107,20 @@ class Runner:
                 self.stop.set()
             return True
 
+        def at_rest(ended: StopRecord) -> None:
+            # Whoever asked for the stop waits for this, not for the estimate.
+            limits = gate_limits(setup.rig, plan.actuator, plan.kp, plan.centring_sensor)
+            at_zero = abs(self._shown) <= limits.output.slack / 2
+            # A disk that is full for this word may still take the recording's end.
+            with suppress(OSError):
+                self._set(
+                    phase="analysing",
+                    status=ended.status,
+                    reason=self._reason(ended),
+                    at_zero=None if math.isnan(self._shown) else at_zero,
+                    ended=datetime.now(UTC).isoformat(timespec="seconds"),
+                )
+
         return carry_out(
             setup.rig,
             setup.rig_toml,
@@ -115,7 +134,15 @@ class Runner:
             stop=self.stop,
             alive=alive,
             watch=watch,
+            at_rest=at_rest,
         )
+
+    def _note_output(self, block: SampleBlock, actuator: str) -> None:
+        """What a sample last said of the output."""
+        column = [c.name for c in block.channels].index(actuator)
+        known = block.values[np.isfinite(block.values[:, column]), column]
+        if len(known):
+            self._shown = float(known[-1])
 
     def _end_at_rest(self, now: Progress) -> None:
         """Once the service asks for no more: end after the segment that goes on, at rest."""
@@ -129,12 +156,12 @@ class Runner:
             self.state = replace(self.state, early=early)
             self.stop.set()
 
-    def _reason(self, outcome: Outcome) -> str:
+    def _reason(self, ended: StopRecord) -> str:
         """Why it ended; who asked for it says more than the signal by which that came."""
         stops = self.job.stops()
-        if outcome.stop.status == "stopped" and stops:
+        if ended.status == "stopped" and stops:
             return f"stop asked by {stops[0]['by']}"
-        return outcome.stop.reason
+        return ended.reason
 
     def _note(self) -> None:
         """Who stopped it, beside the recording."""

@@ -9,6 +9,7 @@ import os
 import socket
 import ssl
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,9 +19,11 @@ from samii_rig.errors import InputError
 from samii_rig.index.store import PRIVATE
 from samii_rig.rig.schema import Rig
 from samii_rig.serve.access import Tokens
+from samii_rig.serve.job import JOBS
 
 WHERE = "samii-rig serve"
 LOCK = "service.lock"
+MAKES_WAY = 3.0  # s in which the stop's listener of a service before us sees that we are there
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +35,8 @@ class Settings:
     pace : of a simulated rig, times real time; 0 for as fast as it can.
     foxglove : port of this machine that shows runs to Foxglove, 0 for any; None for none. Its
     protocol has no token: where others must show one, `foxglove_open` says that this is meant.
+    stop_port : of the stop's own listener; None for the one after `port`, 0 for any.
+    proxies : addresses that bring others' requests, and whose word counts on whose they are.
     """
 
     rig: Rig
@@ -45,11 +50,31 @@ class Settings:
     pace: float = 1.0
     foxglove: int | None = None
     foxglove_open: bool = False
+    stop_port: int | None = None
+    proxies: frozenset[str] = frozenset()
+
+    @property
+    def jobs(self) -> Path:
+        """The folder of the jobs."""
+        return self.folder / PRIVATE / JOBS
+
+    @property
+    def lock(self) -> Path:
+        """The file that holds the number of the process that works on the folder."""
+        return self.folder / PRIVATE / LOCK
 
     def check(self) -> None:
         """InputError for what cannot work or would let strangers drive."""
         if not 0 <= self.port <= 65535:
             raise InputError(WHERE, "--port", self.port, "0 to 65535")
+        if self.stop_port is not None and not 0 <= self.stop_port <= 65535:
+            raise InputError(WHERE, "--stop-port", self.stop_port, "0 to 65535")
+        for proxy in self.proxies:
+            try:
+                ipaddress.ip_address(proxy)
+            except ValueError as error:
+                expected = "the address of a proxy, such as 127.0.0.1"
+                raise InputError(WHERE, "--proxy", proxy, expected) from error
         if not is_local(self.host) and self.tls is None:
             expected = "127.0.0.1, or --tls-cert and --tls-key to be reached from elsewhere"
             raise InputError(WHERE, "--host", self.host, expected)
@@ -80,7 +105,7 @@ class Settings:
 
         Two would start each other's runs and stop them.
         """
-        path = self.folder / PRIVATE / LOCK
+        path = self.lock
         path.parent.mkdir(exist_ok=True)
         with path.open("a+", encoding="utf-8") as file:
             try:
@@ -95,18 +120,35 @@ class Settings:
 
     def bound(self) -> socket.socket:
         """The socket that listens; InputError if the port is taken or the host is not ours."""
+        return self._bound("--port", self.port)
+
+    def bound_for_stop(self) -> socket.socket:
+        """That of the stop's own listener, likewise. One that outlived a service makes way."""
+        asked = self.stop_port
+        if asked is None:
+            asked = self.port + 1 if 0 < self.port < 65535 else 0
+        until = time.monotonic() + MAKES_WAY
+        while True:
+            try:
+                return self._bound("--stop-port", asked)
+            except InputError:
+                if time.monotonic() > until:
+                    raise
+            time.sleep(0.1)
+
+    def _bound(self, option: str, port: int) -> socket.socket:
         family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
         listening = socket.socket(family, socket.SOCK_STREAM)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            listening.bind((self.host, self.port))
+            listening.bind((self.host, port))
             listening.listen(128)
         except OSError as error:
             listening.close()
             ours = error.errno in (errno.EADDRINUSE, errno.EACCES)
             if ours:
                 expected = f"a free port of {self.host} ({error.strerror})"
-                raise InputError(WHERE, "--port", self.port, expected) from error
+                raise InputError(WHERE, option, port, expected) from error
             expected = f"an address of this machine ({error.strerror})"
             raise InputError(WHERE, "--host", self.host, expected) from error
         return listening

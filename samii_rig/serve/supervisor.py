@@ -22,10 +22,9 @@ from samii_rig.index.store import PRIVATE, Index
 from samii_rig.record.recover import recover
 from samii_rig.record.writer import PARTIAL
 from samii_rig.rig.schema import Rig
-from samii_rig.serve.job import ID, LOG, OVER, Job, JobState, Request
+from samii_rig.serve.job import ID, JOBS, LOG, OVER, Job, JobState, Request, asked_to_stop
 from samii_rig.serve.live import LiveReader
 
-JOBS = "jobs"
 MOST_QUEUED = 50
 KEPT = 200  # jobs that are over
 
@@ -164,8 +163,13 @@ class Supervisor:
             self.held = f"stop asked by {by}"
         return stopped
 
+    @property
+    def moving(self) -> bool:
+        """Whether a run may drive the rig now."""
+        return self.current is not None and self.current.moving
+
     def turn(self) -> None:
-        """Look after the jobs: take note of what ended, start what is next."""
+        """Look after the jobs: take note of what ended and was asked, start what is next."""
         self._children = [c for c in self._children if c.poll() is None]
         running = None
         for job in list(self._open):
@@ -175,9 +179,19 @@ class Supervisor:
             elif state.phase != "queued":
                 running = job
         self.current = running
+        if by := asked_to_stop(self._jobs):
+            self._heed(by)
         waiting = self.queue()
         if running is None and waiting and not self.held:
             self._start(waiting[0])
+
+    def _heed(self, by: str) -> None:
+        """A stop came beside us (see `stopper`): nothing follows by itself."""
+        if self.current is not None and not self.current.stops():
+            # It began just then.
+            self.current.stop(by)
+        if self._open:
+            self.held = f"stop asked by {by}"
 
     def _start(self, job: Job) -> None:
         command = [sys.executable, "-m", "samii_rig.serve.runner"]
@@ -199,15 +213,15 @@ class Supervisor:
         self._open.remove(job)
         self._readers.pop(job.id, None)
         recording = job.request.recording
-        if state.phase == "died" and state.status:
+        partial = self._index.folder / f"{recording}{PARTIAL}"
+        if state.phase == "died" and state.status and not partial.exists():
             # The run itself was over and its recording whole.
             state = replace(state, phase="done", error="the diagnosis was given up")
             job.set(state)
         elif state.phase == "died":
-            partial = self._index.folder / f"{recording}{PARTIAL}"
             moved = partial.exists() or not job.stops()
             reason = "its process ended without a word" if moved else "stopped before it moved"
-            state = JobState(phase="died", live=state.live, status="failed", reason=reason)
+            state = replace(state, phase="died", status="failed", reason=reason, error="")
             job.set(state)
         if state.phase != "cancelled" and state.status != "completed" and not job.early(state):
             self.held = f"{recording}: {state.status or 'refused'}, {state.reason or state.error}"

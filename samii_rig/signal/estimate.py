@@ -9,7 +9,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from samii_rig.errors import EstimateError, InputError
+from samii_rig.errors import EstimateError, InputError, one_of
 from samii_rig.signal import local, periodic, repeats, stepped, welch
 from samii_rig.signal.choose import Method, at_rest, choose, drop_foreign, drop_stuck
 from samii_rig.signal.distortion import Distortion, distortion
@@ -81,11 +81,13 @@ def estimate(
         groups can be estimated, a group that cannot be becomes a finding of the first.
     """
     if method not in get_args(Method):
-        raise InputError("estimate", "method", method, f"one of {', '.join(get_args(Method))}")
+        raise InputError("estimate", "method", method, one_of(method, get_args(Method)))
     if gaps not in get_args(Gaps):
-        raise InputError("estimate", "gaps", gaps, f"one of {', '.join(get_args(Gaps))}")
+        raise InputError("estimate", "gaps", gaps, one_of(gaps, get_args(Gaps)))
     if band is not None and not 0 <= band[0] < band[1]:
-        raise InputError("estimate", "band", band, "(low, high) in Hz, low below high")
+        raise InputError(
+            "estimate", "band", band, "two frequencies in Hz, 0 or more, low below high"
+        )
     out: list[FrequencyResponse] = []
     failed: list[EstimateError] = []
     skews = skews_of(recordings)

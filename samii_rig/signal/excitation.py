@@ -52,8 +52,8 @@ def cosine_ramp(n: int, rate_hz: float, ramp: float) -> Float:
     if ramp <= 0.0:
         return np.ones(n)
     t = np.arange(n) / rate_hz
-    to_edge = np.minimum(t, n / rate_hz - t) / ramp
-    return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.clip(to_edge, 0.0, 1.0)), dtype=np.float64)
+    to_edge = np.clip(np.minimum(t, n / rate_hz - t), 0.0, ramp) / ramp
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * to_edge), dtype=np.float64)
 
 
 def schedule_factor(

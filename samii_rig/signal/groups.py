@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from samii_rig.errors import EstimateError, InputError
+from samii_rig.errors import EstimateError, InputError, one_of
+from samii_rig.rig.load import tables
 from samii_rig.types import Channel, Finding, Float, Recording, Segment
 
 # Correlation of two references above which they are the same experiment repeated; a lost
@@ -95,7 +95,7 @@ def select(recording: Recording, input: str | None, outputs: Sequence[str] | Non
         outputs = [n for n in recording.names("sensor") if n != input]
     for name, option in [(input, "input"), *((n, "outputs") for n in outputs)]:
         if name not in by_name:
-            raise InputError(where, option, name, f"one of {', '.join(by_name)}")
+            raise InputError(where, option, name, one_of(name, by_name))
     if not outputs:
         raise InputError(where, "outputs", [], "at least one sensor")
     return Selection(by_name[input], tuple(by_name[n] for n in outputs))
@@ -140,7 +140,7 @@ def reference_of(
     if reference is not None:
         if reference not in {c.name for c in cut.channels}:
             names = ", ".join(c.name for c in cut.channels)
-            raise InputError(where, "reference", reference, f"one of {names}")
+            raise InputError(where, "reference", reference, one_of(reference, names))
         return _column(cut, reference), reference, None
     used = [n for n in cut.names("reference") if np.nanmax(np.abs(_column(cut, n)), initial=0) > 0]
     if not used:
@@ -208,7 +208,7 @@ def _column(recording: Recording, name: str) -> Float:
 def _centring_gain(recording: Recording) -> float | None:
     """kp of the rig file that the recording carries, None if it carries none."""
     try:
-        gain = tomllib.loads(recording.rig_toml)["centring"]["kp"]
-    except (tomllib.TOMLDecodeError, KeyError, TypeError):
+        gain = tables(recording.rig_toml, "rig file")["centring"]["kp"]
+    except (InputError, KeyError, TypeError):
         return None
     return float(gain) if isinstance(gain, int | float) else None

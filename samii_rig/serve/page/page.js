@@ -4,29 +4,37 @@ import { controls } from "/page/controls.js";
 import { Motion } from "/page/motion.js";
 import { SoFar } from "/page/sofar.js";
 import { Replay } from "/page/replay.js";
+import { Stop } from "/page/stop.js";
 
 const $ = (id) => document.getElementById(id);
 const scope = new Scope($("scope"), (text) => { $("scope-state").textContent = text; });
 const motion = new Motion($("motion"), scope, (text) => { $("motion").setAttribute("aria-label", text); });
-let lease = "", beating = 0, state = null, heard = 0, job = "", wanted = true;
+let lease = "", beating = 0, state = null, heard = 0, job = "", wanted = true, anew = "";
 
 // The verdicts of a diagnosis, for who has not read its manual.
 const VERDICTS = {
   no_mismatch: "nothing is missing", named: "cause named", ambiguous: "several causes fit", unknown: "mismatch, cause unknown",
 };
 const PHASES = {
-  starting: "starting; predicted once more, nothing moves yet", analysing: "over and at rest; estimated and diagnosed",
+  starting: "starting; predicted once more, nothing moves yet",
 };
+const MOVES = ["starting", "running"];
+const REFUSED = [401, 403, 409]; // by the service itself
 const GONE = "The service does not answer.";
+const name = () => $("operator").value.trim();
 async function ask(method, path, body, headers = {}) {
   const answer = await fetch(`/api${path}`, {
     method,
-    headers: { ...(lease ? { "X-Lease": lease } : {}), ...(body ? { "Content-Type": "application/json" } : {}), ...headers },
+    headers: { "X-Name": encodeURIComponent(name()), ...(lease ? { "X-Lease": lease } : {}), ...(body ? { "Content-Type": "application/json" } : {}), ...headers },
     body: body ? JSON.stringify(body) : undefined,
   }).catch(() => { throw new Error(GONE); });
   const found = await answer.json().catch(() => ({}));
   if (answer.status === 401) { $("login").hidden = false; $("token").focus(); }
-  if (!answer.ok) throw new Error(found.error || `${answer.status} ${answer.statusText}`);
+  // A proxy may have no words of its own.
+  if (!answer.ok) {
+    const said = found.error || `The service answered with ${answer.status} ${answer.statusText}`.trim();
+    throw Object.assign(new Error(said), { status: answer.status });
+  }
   return found;
 }
 
@@ -49,19 +57,23 @@ function put(parent, tag, text, name = "") {
   return e;
 }
 
-Object.assign(window, { scope, motion }); // to measure what they cost and show
+Object.assign(window, { scope, motion, show }); // to measure what they cost and show
 const soFar = new SoFar($, ask, put);
 
 // The stop: no lease, no token, and Escape from anywhere.
-async function stop() {
-  $("now").textContent = "Stop asked for …";
-  for (let i = 0; i < 3; i++) {
-    try { await fetch("/api/stop", { method: "POST", keepalive: true }); return; } catch { /* again */ }
-  }
-  alarm("THE STOP DID NOT REACH THE SERVICE. Use the emergency stop at the rig.");
-}
-$("stop").addEventListener("click", stop);
-document.addEventListener("keydown", (e) => { if (e.key === "Escape") { e.preventDefault(); stop(); } });
+const live = () => heard && performance.now() - heard < 3000;
+const stop = new Stop({
+  urls: () => {
+    const query = name() ? `?name=${encodeURIComponent(name())}` : "", port = state?.stop_port;
+    return ["", ...(port ? [`${location.protocol}//${location.hostname}:${port}`] : [])].map((at) => `${at}/api/stop${query}`);
+  },
+  running: () => live() && MOVES.includes(state?.running?.phase),
+  said: (text) => { $("stopping").textContent = text; $("stopping").hidden = !text; },
+  alarm: (text) => { if ($("stop-failed").textContent !== text) $("stop-failed").textContent = text; $("stop-alarm").hidden = !text; },
+});
+$("stop").onclick = $("stop-again").onclick = () => stop.press();
+$("stop-drop").onclick = () => stop.drop();
+document.addEventListener("keydown", (e) => { if (e.key === "Escape") { e.preventDefault(); stop.press(); } });
 
 // Live data, or a recording in their place
 function take(data) {
@@ -75,13 +87,13 @@ const replay = new Replay({
     return answer.arrayBuffer();
   },
   show: take,
-  began: ({ channels: list }) => {
-    $("replay-row").hidden = false;
+  began: ({ name: recording, channels: list }) => {
+    marked(`REPLAY of ${recording}: not live.`);
     motion.hz = null;
     if (JSON.stringify(list) !== JSON.stringify(scope.channels)) channels(list);
     scope.clear(); motion.clear();
   },
-  ended: () => { $("replay-row").hidden = true; scope.clear(); motion.clear(); },
+  ended: () => { marked(""); scope.clear(); motion.clear(); },
   said: (text, part) => {
     if (part === undefined) { alarm(text); return; }
     $("replay-state").textContent = text;
@@ -89,6 +101,13 @@ const replay = new Replay({
     if (document.activeElement !== $("replay-place")) $("replay-place").value = 1000 * part;
   },
 });
+// Over the whole page: nobody takes what was for what is.
+function marked(text) {
+  $("replay-row").hidden = $("replay-mark").hidden = !text;
+  $("replay-name").textContent = text;
+  document.body.classList.toggle("replaying", Boolean(text));
+  scope.recorded = Boolean(text);
+}
 $("replay-end").onclick = () => replay.stop();
 $("replay-speed").onchange = () => { replay.speed = Number($("replay-speed").value); };
 $("replay-place").onchange = () => replay.seek((replay.about.duration * $("replay-place").value) / 1000);
@@ -111,10 +130,11 @@ function listen() {
 setInterval(() => {
   const silent = heard ? (performance.now() - heard) / 1000 : Infinity;
   const on = silent < 3;
-  $("link").textContent = on ? "live" : heard ? `connection lost for ${Math.round(silent)} s` : "connecting";
-  $("link").className = `pill ${on ? "on" : heard ? "off" : ""}`;
+  $("link").textContent = on ? (replay.on ? "replay, not live" : "live") : heard ? `connection lost for ${Math.round(silent)} s` : "connecting";
+  $("link").className = `pill ${on ? (replay.on ? "" : "on") : heard ? "off" : ""}`;
   scope.live = on;
   if (!on) {
+    $("unwatched").hidden = true;
     scope.why = heard ? `Connection lost ${Math.round(silent)} s ago: this is not live` : "";
     if (heard) $("now").textContent = "Unknown: the connection to the service is lost. A run may be going on.";
     $("facts").replaceChildren();
@@ -123,6 +143,22 @@ setInterval(() => {
   } else scope.why = state && !replay.on && !state.running && scope.empty ? "No run" : "";
   $("lost").textContent = scope.lost ? `${scope.lost} frames were skipped, as this viewer was slow` : "";
 }, 500);
+
+// How a run ended, who ended it, and that the output is at zero.
+const ENDS = { completed: "completed", stopped: "stopped", tripped: "stopped by a limit", failed: "FAILED" };
+const OUTPUT = { true: "The output is at zero.", false: "THE OUTPUT WAS NOT SEEN AT ZERO: use the emergency stop at the rig." };
+function ended(l) {
+  const at = new Date(l.ended || l.time), today = at.toDateString() === new Date().toDateString();
+  const when = today ? at.toLocaleTimeString() : at.toLocaleString();
+  if (l.phase === "refused" && !l.status) return `${l.experiment}: did not start, ${when}: ${l.error}. Nothing moved.`;
+  if (l.phase === "died") {
+    const output = l.reason.startsWith("stopped") ? "Nothing moved." : "The device's own deadman drops the output: look at the rig.";
+    return `${l.experiment}: ${l.reason}, ${when}. ${l.at_zero ? OUTPUT.true : output}`;
+  }
+  const by = l.reason.startsWith("stop asked by ") ? ` by ${l.reason.slice(14)}` : "";
+  const why = by || l.status === "completed" ? "" : `: ${l.early || (l.status === "failed" && l.error) || l.reason}`;
+  return `${l.experiment}: ${ENDS[l.status] ?? l.status}${by}, ${when}${why}. ${OUTPUT[l.at_zero] ?? ""}`;
+}
 
 function show(s) {
   const before = state;
@@ -136,11 +172,14 @@ function show(s) {
     if (s.channels.length && JSON.stringify(s.channels) !== JSON.stringify(scope.channels)) channels(s.channels);
     motion.hz = s.running?.progress.frequency ?? null;
   }
-  const r = s.running, p = r ? r.progress : {};
-  if (!r) $("now").textContent = s.fault ? "FAULT" : "No run.";
-  else if (r.phase === "running" && p.segment) {
+  const r = s.running, moves = MOVES.includes(r?.phase), p = moves ? r.progress : {};
+  if (moves && p.segment && r.phase === "running") {
     $("now").textContent = `${r.experiment}: ${p.name}, segment ${p.segment} of ${p.n_segments}`;
-  } else $("now").textContent = `${r.experiment}: ${PHASES[r.phase] ?? r.phase}`;
+  } else if (moves) $("now").textContent = `${r.experiment}: ${PHASES[r.phase] ?? r.phase}`;
+  else if (r) $("now").textContent = `${ended(r)} Being estimated and diagnosed.`;
+  else $("now").textContent = `${s.fault ? `FAULT: ${s.fault.reason}. ` : ""}${s.last ? ended(s.last) : s.fault ? "" : "No run."}`;
+  unwatched(s, before, moves);
+  $("start").textContent = r ? "Queue" : "Start";
   $("bar").hidden = !p.segment;
   if (p.segment) $("bar").value = 1 - Math.max(0, p.time_left) / p.duration;
   const facts = p.segment ? {
@@ -171,9 +210,18 @@ function show(s) {
   const l = s.last;
   const told = l ? [l.status || l.phase, l.error || l.reason, VERDICTS[l.verdict]].filter(Boolean) : [];
   $("last").textContent = l ? `Last: ${l.experiment}: ${told.join("; ")}.` : "";
-  scope.over = motion.over = !r && !replay.on;
+  scope.over = motion.over = !moves && !replay.on;
   soFar.show(s);
   if (before && l && (!before.last || before.last.id !== l.id)) find();
+}
+
+// A run that no operator's page watches over, as after the service was started anew.
+function unwatched(s, before, moves) {
+  if (before && before.started !== s.started) anew = new Date(s.started).toLocaleTimeString();
+  if (s.operator) anew = "";
+  const said = [anew ? `The service was started anew at ${anew}.` : "", moves ? "Nobody drives: no operator's page watches over this run." : "Nobody drives."];
+  $("unwatched").hidden = Boolean(s.operator) || !(moves || anew);
+  $("unwatched-text").textContent = said.filter(Boolean).join(" ");
 }
 
 const channels = controls($, put, scope);
@@ -187,12 +235,24 @@ function driving(secret) {
   $("drives").hidden = Boolean(lease);
   if (!lease) return;
   beating = setInterval(async () => {
-    try { await ask("POST", "/lease/beat"); } catch (error) { driving(""); alarm(error.message); }
+    try { await ask("POST", "/lease/beat"); } catch (error) {
+      // A line that is lost for a moment is not the lease, nor is a proxy's or a crowd's error.
+      if (!REFUSED.includes(error.status)) return;
+      driving("");
+      alarm(`You do not drive any more: ${error.message}`);
+    }
   }, 2000);
 }
+async function take_() {
+  if (!name()) { $("operator").focus(); throw new Error("Your name first: it stands with every run."); }
+  driving((await ask("POST", "/lease")).lease);
+}
+$("take-here").onclick = tried(take_);
 $("take").onclick = tried(async () => {
-  if (lease) { await ask("DELETE", "/lease"); driving(""); } else driving((await ask("POST", "/lease")).lease);
+  if (lease) { await ask("DELETE", "/lease"); driving(""); } else await take_();
 });
+$("operator").value = localStorage.getItem("samii-rig name") ?? "";
+$("operator").onchange = () => localStorage.setItem("samii-rig name", name());
 addEventListener("pagehide", () => {
   if (lease && !(state && state.running)) fetch("/api/lease", { method: "DELETE", keepalive: true, headers: { "X-Lease": lease } });
 });
@@ -212,7 +272,7 @@ $("plan").onclick = tried(async () => {
   $("planned").textContent = found.refused ? `Refused: ${found.refused}`
     : `${found.runs.length > 1 ? `${found.runs.length} runs, ` : ""}${planned(total)}; nearest to a limit: ${worst.channel} in ${worst.segment}, ${(100 * worst.margin).toFixed(0)} % left of ${worst.limit} ${worst.unit}`;
 });
-const order = (what) => ask("POST", "/runs", { ...what, operator: $("operator").value, stop_when_certain: $("early").checked });
+const order = (what) => ask("POST", "/runs", { ...what, operator: name(), stop_when_certain: $("early").checked });
 $("next").onclick = tried(async () => order({ experiment_toml: await soFar.next() }));
 $("start").onclick = tried(async () => {
   $("planned").textContent = "predicting …";
@@ -221,7 +281,7 @@ $("start").onclick = tried(async () => {
   } finally { $("planned").textContent = ""; }
 });
 $("resume").onclick = tried(() => ask("POST", "/queue/resume"));
-$("clear").onclick = tried(() => ask("POST", "/clear-fault", { name: $("operator").value, reason: $("why").value }));
+$("clear").onclick = tried(() => ask("POST", "/clear-fault", { name: name(), reason: $("why").value }));
 $("login").onsubmit = tried(async () => {
   const who = await ask("POST", "/login", null, { Authorization: `Bearer ${$("token").value}` });
   if (!who.role) throw new Error("that is no valid token");
@@ -326,6 +386,8 @@ async function begin() {
   $("experiment").replaceChildren();
   for (const name of Object.keys(experiments)) put($("experiment"), "option", name);
   if ("swept_sine" in experiments) $("experiment").value = "swept_sine";
+  const { you } = await ask("GET", "/state");
+  if (you.name && !name()) $("operator").value = you.name;
   files = experiments;
   $("experiment").onchange();
   if (wanted) { wanted = false; listen(); }

@@ -110,7 +110,7 @@ export class Scope {
     g.globalAlpha = 1;
     g.fillStyle = ink("--muted"); g.textAlign = "left";
     const zero = view.at === null || view.at === undefined ? view.from + this.span : view.at;
-    const told = (t) => (Math.abs(t) < 1e-9 ? (view.at === null ? (this.over ? "end" : "now") : "trigger") : `${t > 0 ? "+" : "−"}${Math.abs(t).toPrecision(3)} s`);
+    const told = (t) => (Math.abs(t) < 1e-9 ? (view.at === null ? (this.over ? "end" : this.recorded ? "shown" : "now") : "trigger") : `${t > 0 ? "+" : "−"}${Math.abs(t).toPrecision(3)} s`);
     g.fillText(told(view.from - zero), LEFT, h - 4);
     g.textAlign = "right"; g.fillText(this.frozen && view.at === null ? "paused" : told(view.from + this.span - zero), w - 8, h - 4);
     if (this.cursors) this.marks(g, width, h);

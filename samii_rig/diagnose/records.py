@@ -1,0 +1,363 @@
+"""The search on whole records: every explanation held against every sample.
+
+Explanations are compared by the likelihood of whole records (`samii_rig.likelihood`) about the
+best one so far, made anew whenever that moves. Responses line by line serve for what is seen
+better there: a first step from far away, and pictures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from samii_rig.diagnose import forms
+from samii_rig.diagnose.answer import gap_of
+from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.explanations import FIVE, Explanation
+from samii_rig.diagnose.forms import Form
+from samii_rig.diagnose.model import Grid, Loop, Model, grid
+from samii_rig.diagnose.moebius import place_of
+from samii_rig.diagnose.ranking import moved
+from samii_rig.diagnose.refit import Fitted, Problem, refit
+from samii_rig.diagnose.result import Band, Gap, Used
+from samii_rig.diagnose.search import Search
+from samii_rig.errors import SamiiRigError
+from samii_rig.likelihood.noise import Shape
+from samii_rig.likelihood.pieces import Piece, Wiring, pieces_of, wiring
+from samii_rig.likelihood.reduce import Left, Records, Reduced, Response, left_by, reduced
+from samii_rig.rig.schema import Rig
+from samii_rig.signal.statistics import octaves
+from samii_rig.types import Complex, Float, Int, Recording
+
+AXIS = 200  # frequencies, on which the power of what disturbs is scaled
+FORCED = ("added_mass", "added_inertia")  # physics at every place where a force acts
+SHOW, TURN = 9, 10  # one line in ten is kept apart, to show on what was found
+WIDER = 1.1  # of the band that is excited, the band that takes part
+EXCITED = 3e-2  # of the largest, an input's amplitude density that excites: 1e-3 of its power
+HIGHEST = 0.45  # of the rate: aliases of both sides meet above
+MOST_MADE = 6  # times that the likelihood is made about the nominal model
+# Noise units by which a change from the reference may be off between nodes, where it is taken for
+# linear, for the likelihood to stand: less than noise makes of one unknown.
+BETWEEN = 0.5
+ALARM = 2e-3  # chance that noise alone makes the best of all effects look missing
+HIGHEST_WORTH = 1e3  # of chi-square, beyond what any table asks for
+ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and octaves' parts over which it is sought
+
+
+@dataclass(frozen=True)
+class Whole:
+    """Records, and how a model predicts them."""
+
+    rig: Rig
+    records: Records
+    wired: Wiring
+    ports: tuple[Effect, ...]
+    left_out: tuple[tuple[str, str], ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        runs: Sequence[Recording],
+        rig: Rig,
+        band: tuple[float, float] | None = None,
+        table: Sequence[Effect] = (),
+    ) -> Whole:
+        """All runs of one rig. table : in which the places are found where a force may act.
+
+        Raises EstimateError where they hold nothing to compare.
+        """
+        wired = wiring(runs, rig)
+        pieces = tuple(pieces_of(runs, rig, wired))
+        bands = tuple(band or excited(piece, rig.rate_hz) for piece in pieces)
+        ports = tuple(e for e in table if e.physics in FORCED and e.jump and not e.jump.fixed)
+        return cls(rig, Records(pieces, rig.rate_hz, bands), wired, ports)
+
+    @property
+    def sensor(self) -> Int:
+        """(q,) indices into the rig's sensors."""
+        names = [s.name for s in self.rig.sensor]
+        return np.array([names.index(n) for n in self.wired.sensors], np.int64)
+
+    @property
+    def loop(self) -> Loop | None:
+        """The loop around the sensors."""
+        if not self.wired.kp:
+            return None
+        return Loop(self.wired.kp, self.wired.sensors.index(self.wired.centring))
+
+    @property
+    def _loop(self) -> tuple[float, int] | None:
+        return (self.loop.kp, self.loop.entry) if self.loop else None
+
+    def grid(self, frequency: Float, sigma: float, fitted: Fitted) -> Grid:
+        """The grid beside the imaginary axis, with the aliases of a fit."""
+        names = [a.name for a in self.rig.actuator]
+        actuator = np.full(self.sensor.size, names.index(self.wired.command))
+        chain = fitted.model.plain(fitted.x)
+        return grid(self.rig, frequency, self.sensor, actuator, chain, sigma, self.loop)
+
+    def response(self, fitted: Fitted) -> Response:
+        """Of a fit, at any s of one contour."""
+
+        def at(s: Complex) -> Complex:
+            f = np.minimum(s.imag / (2 * np.pi), self.rig.rate_hz / 2)  # but for rounding
+            there = self.grid(f, float(s.real[0]), fitted)
+            return fitted.model.response(fitted.x, there)
+
+        return at
+
+    def disturbed(self, fitted: Fitted) -> Shape:
+        """How much, squared, a force moves the rig where it acts: of all places the mean.
+
+        The input need not see a mode that a force or the floor excites; every place does.
+        """
+
+        axis = np.geomspace(*self.records.band, AXIS)
+        scale = np.median(self._moved(fitted, axis), axis=1)
+
+        def at(f: Float) -> Float:
+            once, which = np.unique(f, return_inverse=True)
+            return np.asarray((np.mean(self._moved(fitted, once).T / scale, axis=1))[which])
+
+        return at
+
+    def _moved(self, fitted: Fitted, f: Float) -> Float:
+        """(m, n) of the sensors by the input, and of each place by a force there, squared."""
+        there = self.grid(f, 0.0, fitted)
+        h = fitted.model.response(fitted.x, there)
+        each = list(np.abs(h).T ** 2)
+        for effect in self.ports:
+            try:
+                model = Model(self.rig, (*fitted.model.effects, effect))
+                known = moved(fitted.model, fitted.x, model)
+                each.append(np.abs(place_of(model, known, effect, there, h).c) ** 2)
+            except SamiiRigError:
+                continue
+        return np.stack(each)
+
+    def about(self, fitted: Fitted) -> Reduced:
+        """The likelihood near a fit, on the lines that are fitted."""
+        shape = self.disturbed(fitted)
+        return reduced(self.records, self.response(fitted), shape, self._loop, _fitted)
+
+    def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
+        """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
+        part = _shown if shown else _fitted
+        return left_by(self.records, self.response(fitted), noise, self._loop, part)
+
+
+def excited(piece: Piece, rate_hz: float) -> tuple[float, float]:
+    """Hz, the band in which a piece's input has more than a small part of its density."""
+    R = np.abs(np.fft.rfft(piece.r)) / math.sqrt(piece.r.size)
+    f = np.arange(R.size) * (rate_hz / piece.r.size)
+    # The offset's line, and the one that it leaks to, are no excitation.
+    on = np.flatnonzero(R[2:] > EXCITED * np.max(R[2:])) + 2
+    return float(f[on[0]]) / WIDER, min(WIDER * float(f[on[-1]]), HIGHEST * rate_hz)
+
+
+def _fitted(k: Int) -> NDArray[np.bool_]:
+    return np.asarray(k % TURN != SHOW)
+
+
+def _shown(k: Int) -> NDArray[np.bool_]:
+    return np.asarray(k % TURN == SHOW)
+
+
+@dataclass(frozen=True)
+class RecordProblem(Problem):
+    """The likelihood of whole records near a reference. at : the nodes of its contour.
+
+    data, root : of responses line by line; `by_line` is the problem that they pose.
+    """
+
+    by_line: Problem = field(kw_only=True)
+    reduced: Reduced = field(kw_only=True)
+
+    @classmethod
+    def about(cls, whole: Whole, fitted: Fitted, by_line: Problem) -> RecordProblem:
+        """About a fit."""
+        found = whole.about(fitted)
+        at = whole.grid(found.frequency, found.sigma, fitted)
+        return cls(by_line.data, by_line.root, at, by_line=by_line, reduced=found)
+
+    @property
+    def lines(self) -> Problem:
+        """As of `Problem`."""
+        return self.by_line
+
+    @property
+    def expected(self) -> float:
+        """As of `Problem`."""
+        return self.reduced.known
+
+    def residual(self, h: Complex) -> Float:
+        """As of `Problem`."""
+        return self.reduced.residual(h)
+
+    def whiten(self, dh: Complex) -> Float:
+        """As of `Problem`."""
+        return self.reduced.slopes(dh)
+
+    def toward(self, h: Complex) -> RecordProblem:
+        """As of `Problem`."""
+        goal = self.reduced.slopes((h - self.reduced.reference)[:, :, None])[:, 0]
+        return replace(self, reduced=replace(self.reduced, target=goal))
+
+    def form(self, b: Complex, left: Float, directions: Float) -> Form:
+        """As of `Problem`."""
+        F = self.reduced.factor
+        p = F.shape[0]
+        parts = F.reshape(p, -1, b.shape[0])
+        by_one, by_j = (np.stack([x.real, x.imag], axis=1) for x in (b.T, 1j * b.T))
+        K = np.concatenate(
+            [np.einsum("pcn,cn->pn", parts, x.reshape(-1, b.shape[0])) for x in (by_one, by_j)],
+            axis=1,
+        )
+        Q = directions[:p]
+        r = left - directions @ (directions.T @ left)
+        # Rows of the priors are moved by the projection too: kept as the projection's own part.
+        turn = Q.T @ K
+        K_left = np.concatenate([K - Q @ turn, -directions[p:] @ turn])
+        return forms.Dense(K_left, r, 0.0)
+
+
+class RecordSearch(Search):
+    """As `Search`, on whole records."""
+
+    def __init__(self, whole: Whole, by_line: Search) -> None:
+        self.whole, self.by_line = whole, by_line
+        super().__init__(by_line.rig, by_line.lines, by_line.grid, by_line.table)
+
+    def __post_init__(self) -> None:
+        self.use(self.table)
+        fitted = self.by_line.nominal.fitted
+        self._about(fitted)
+        for _ in range(MOST_MADE):
+            fitted = refit(fitted.model, self.problem, fitted.x)
+            if self._stands(fitted):
+                break
+            self._about(fitted)
+        else:  # a gross mismatch: the nominal model is weighed where the likelihood stands now
+            fitted = refit(fitted.model, self.problem, fitted.x)
+        self.keep((), fitted)
+
+    def _about(self, fitted: Fitted) -> None:
+        """The likelihood anew, about a fit."""
+        self.problem = RecordProblem.about(self.whole, fitted, self.by_line.problem)
+        f = self.reduced.frequency
+        between = self.whole.grid((f[:-1] + f[1:]) / 2, self.reduced.sigma, fitted)
+        self._between = between, fitted.model.response(fitted.x, between)
+
+    def _stands(self, fitted: Fitted) -> bool:
+        """Whether a fit changes the response as linearly between nodes as the likelihood has it."""
+        between, reference = self._between
+        d = fitted.model.response(fitted.x, self.problem.at) - self.reduced.reference
+        middle = fitted.model.response(fitted.x, between) - reference
+        off = middle - (d[:-1] + d[1:]) / 2
+        f = self.reduced.frequency
+        # Nodes on neighbouring lines of the contour have nothing between them.
+        off[np.diff(f) < 1.5 * (f[1:] - f[:-1]).min()] = 0.0
+        at_nodes = np.zeros_like(d)
+        at_nodes[:-1] += off / 2
+        at_nodes[1:] += off / 2
+        return float(np.linalg.norm(self.reduced.slopes(at_nodes[:, :, None]))) < BETWEEN
+
+    @property
+    def reduced(self) -> Reduced:
+        """The likelihood in use."""
+        assert isinstance(self.problem, RecordProblem)
+        return self.problem.reduced
+
+    @property
+    def spread(self) -> float:
+        """As of `Explanations`."""
+        free = self.reduced.inside[1]
+        return 2.0 / self.problem.expected + 2.0 / free  # the noise is known to so much
+
+    @property
+    def worth(self) -> float:
+        """As of `Explanations`: with `ALARM`, noise reaches it in the best of the whole table."""
+        unknowns = np.array([max(len(e.unknowns), 1) for e in self.table])
+
+        def chance(t: float) -> float:
+            return float(np.sum(stats.chi2.sf(t, unknowns))) - ALARM
+
+        return float(optimize.brentq(chance, 1.0, HIGHEST_WORTH))
+
+    def ratio(self, fitted: Fitted) -> float:
+        """Chi-square per degree of freedom of what a change of the response explains."""
+        taken = float(np.trace(np.linalg.solve(fitted.precision(), fitted.information)))
+        return fitted.chi2 / max(self.problem.expected - taken, 1.0)
+
+    def inconsistent(self) -> tuple[float, float]:
+        """Chi-square per degree of freedom of what no change of one linear response explains, and
+        its standard deviation from noise."""
+        both = (self.reduced.inside, self.reduced.differing)
+        each = ((found / mean, math.sqrt(2 / mean)) for found, mean in both if mean > 0)
+        return max(each, key=lambda one: (one[0] - 1) / one[1])
+
+    def leftover(self, fitted: Fitted) -> float:
+        """As of `Explanations`."""
+        left = self.ratio(fitted)
+        if left <= 1 + FIVE * math.sqrt(self.spread):
+            return 1.0
+        h = fitted.model.response(fitted.x, self.problem.at)
+        r = self.problem.residual(h)
+        # What is left in the directions of the nodes, in units of what each would have.
+        F = self.reduced.factor
+        pull = np.tensordot(r, F, 1) / np.linalg.norm(F, axis=0)
+        pull = pull.reshape(-1, F.shape[3]).T
+        power, alike = float(np.sum(pull**2)), 1.0
+        for lag in range(1, min(MOST_ALIKE, len(pull) - 1)):
+            rho = float(np.sum(pull[lag:] * pull[:-lag])) / power
+            if rho < ALIKE:
+                break
+            alike += 2 * rho
+        return left * alike
+
+    def rebin(self, fitted: Fitted) -> None:
+        """The likelihood anew, about this fit, unless the one in use serves."""
+        if self._stands(fitted):
+            return
+        self._about(fitted)
+
+    def _nearest(self) -> Explanation:
+        return self.ranked()[0]
+
+    def bands(self, fitted: Fitted) -> tuple[Band, ...]:
+        """Chi-square per degree of freedom of each sensor in each octave."""
+        left = self.whole.left(fitted, self.reduced)
+        out = []
+        for low, high in octaves(left.frequency):
+            inside = (left.frequency >= low) & (left.frequency < high)
+            if inside.any():
+                top = min(high, float(left.frequency[-1]))
+                mean = np.mean(left.each[inside], axis=0)
+                names = self.whole.wired.sensors
+                out += [Band(n, low, top, float(x)) for n, x in zip(names, mean, strict=True)]
+        return tuple(out)
+
+    def used(self) -> Used:
+        """Lines of the whole records, those kept apart too; all that were excited take part."""
+        lines = sum(self.whole.records.lines(p).k.size for p in self.whole.records.pieces)
+        return Used(lines, lines, self.whole.left_out)
+
+    def shown(self, before: Fitted, after: Fitted) -> tuple[float, float, Gap]:
+        """On the lines kept apart: chi-square per degree of freedom of both, and the gap closed."""
+        a, b = (self.whole.left(x, self.reduced, shown=True).chi2 for x in (before, after))
+        floor = np.full(a.size, 2.0 * self.whole.sensor.size)
+        mean = float(np.sum(floor))
+        return float(np.sum(a)) / mean, float(np.sum(b)) / mean, gap_of(a, b, floor)
+
+    def at_lines(self, explanation: Explanation) -> Explanation:
+        """An explanation of records as one of responses line by line."""
+        fitted, problem = explanation.fitted, self.by_line.problem
+        h, dh = fitted.model.gradient(fitted.x, problem.at)
+        J, r = problem.whiten(dh), problem.residual(h)
+        there = replace(fitted, chi2=float(r @ r), jacobian=J, information=J.T @ J)
+        return replace(explanation, fitted=there)

@@ -1,0 +1,79 @@
+"""What is in a record beside response and noise, up to amplitudes that nobody knows.
+
+Each is a shape over the lines and sensors of one piece with one real amplitude. The likelihood is
+that of the best amplitudes, which for diffuse Gaussian ones is the marginal likelihood.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from samii_rig.likelihood.contour import Contour
+from samii_rig.likelihood.pieces import Piece
+from samii_rig.types import Complex, Float, Int
+
+WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
+# Samples before a piece at which an unknown input may have acted: three to an octave, so that
+# what is left of the motion of every mode is a sum of their answers.
+AN_OCTAVE = 3.0
+NEW = 1e-5  # of the largest, a direction in which past inputs still differ
+
+
+def wander(n: int, k: Int, q: int) -> Complex:
+    """(n_lines, q, WANDER q) of each sensor's own slow drift."""
+    t = np.linspace(-1, 1, n)
+    shapes = legendre.legvander(t, WANDER)[:, 1:]
+    spectra = np.fft.rfft(shapes, axis=0)[k]
+    out = np.zeros((k.size, q, q, WANDER), complex)
+    for c in range(q):
+        out[:, c, c] = spectra
+    return out.reshape(k.size, q, -1)
+
+
+def offsets(
+    piece: Piece, k: Int, H: Complex, contour: Contour, loop: tuple[float, int] | None
+) -> Complex:
+    """(n_lines, q, 1 or 2) of an input that has an offset, and of a loop's sensor that has one:
+    both act from the first sample on.
+
+    H : (M//2 + 1, q) from the input on the contour. loop : its kp, and the sensor.
+    """
+    step = contour.damped(np.ones(piece.r.size))[:, None]
+    shapes = [H * step]
+    if loop is not None:
+        kp, entry = loop
+        sensed = -kp * H
+        sensed[:, entry] += 1
+        shapes.append(sensed * step)
+    return np.stack([_window(piece, k, Y, contour) for Y in shapes], axis=2)
+
+
+def past(piece: Piece, k: Int, H: Complex, contour: Contour) -> Complex:
+    """(n_lines, q, m) of motion from before the first sample: answers to inputs that acted then."""
+    longest = len(piece.z)
+    lags = np.unique(np.rint(2 ** np.arange(0, np.log2(longest), 1 / AN_OCTAVE)).astype(np.int64))
+    spectra = []
+    for lag in lags:
+        impulse = np.zeros(lag)
+        impulse[0] = 1.0
+        y = contour.record(H * contour.damped(impulse)[:, None], int(lag) + len(piece.z))
+        spectra.append(np.fft.rfft(y[lag:], axis=0)[k])
+    return _independent(np.stack(spectra, axis=2))
+
+
+def _independent(shapes: Complex) -> Complex:
+    """The directions (n, q, m) in which shapes (n, q, p) really differ."""
+    n, q, p = shapes.shape
+    scale = np.linalg.norm(shapes, axis=(0, 2))
+    flat = (shapes / scale[:, None]).reshape(n * q, p)
+    rows = np.concatenate([flat.real, flat.imag])
+    size = np.linalg.norm(rows, axis=0)
+    _, values, turn = np.linalg.svd(rows / size, full_matrices=False)
+    kept = turn[values > NEW * values[0]].T / size[:, None]
+    return np.asarray(shapes @ kept)
+
+
+def _window(piece: Piece, k: Int, Y: Complex, contour: Contour) -> Complex:
+    y: Float = contour.record(Y, piece.r.size)[piece.history :]
+    return np.asarray(np.fft.rfft(y, axis=0)[k])

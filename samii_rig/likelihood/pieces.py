@@ -1,0 +1,164 @@
+"""Recordings as pieces: a stretch of samples that a model can predict from the input alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samii_rig.errors import EstimateError
+from samii_rig.rig.schema import Rig
+from samii_rig.signal.groups import segments_of
+from samii_rig.types import Float, Quality, Recording, Segment
+
+ALIKE = 0.02  # part of an input that is not proportional to another, below which it is for all
+SPOILT = Quality.MISSING | Quality.CLIPPED | Quality.STALE
+LEAST_SAMPLES = 256  # fewer say nothing of a structure
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """r (history + n,) input, z (n, q) sensors."""
+
+    r: Float
+    z: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One stretch of samples; of several whose inputs are proportional, what tells the response.
+
+    Proportional inputs c_i r and their sensors z_i are turned by an orthonormal matrix whose first
+    row is c/|c|: the first sum has all of the input and the noise of one record, the others have
+    next to no input and tell noise (`repeats`) or what changes with the level (`contrasts`).
+
+    r : (history + n,) input of the loop, or of the rig where none is closed; the rig is at rest
+        before it, unless `moving`. z : (n, q) sensors. history : samples of input before them.
+    levels : as the segments state them, with their unit.
+    """
+
+    name: str
+    r: Float
+    z: Float
+    history: int
+    levels: tuple[tuple[float, str], ...]
+    moving: bool = False
+    repeats: tuple[Samples, ...] = ()
+    contrasts: tuple[Samples, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Wiring:
+    """Which columns are read, and how the loop runs: v = r - kp theta, if kp is not 0."""
+
+    command: str
+    sensors: tuple[str, ...]
+    centring: str
+    kp: float
+
+
+def wiring(recordings: Sequence[Recording], rig: Rig) -> Wiring:
+    """The columns of all recordings that the rig file knows.
+
+    Raises EstimateError where they have no sensor or no command in common.
+    """
+    known = [s.name for s in rig.sensor]
+    common = set.intersection(*({c.name for c in r.channels} for r in recordings))
+    sensors = tuple(n for n in known if n in common)
+    command = next((a.name for a in rig.actuator if a.name in common), "")
+    if not sensors or not command:
+        raise EstimateError("the recordings have no command and no sensor of the rig in common")
+    centring = rig.centring
+    if centring is None or centring.sensor not in sensors or rig.feedback:
+        return Wiring(command, sensors, "", 0.0)
+    return Wiring(command, sensors, centring.sensor, centring.kp)
+
+
+def pieces_of(recordings: Sequence[Recording], rig: Rig, wired: Wiring) -> list[Piece]:
+    """Every segment as a piece, those with proportional inputs as one.
+
+    The input of the loop is v + kp theta as they were recorded: it holds the reference, the
+    rounding and the clipping of the command, and nothing of the sensors' noise.
+    """
+    found: list[Piece] = []
+    for recording in recordings:
+        columns = [recording.column(n) for n in (wired.command, *wired.sensors)]
+        values = recording.values[:, columns]
+        bad = (recording.quality[:, columns] & SPOILT) != 0
+        bad[:, 0] = False  # what went out is known, limited or not
+        whole = np.all(np.isfinite(values) & ~bad, axis=1)
+        r = values[:, 0].copy()
+        if wired.kp:
+            r += wired.kp * values[:, 1 + wired.sensors.index(wired.centring)]
+        for segment in segments_of(recording):
+            found += _cut(recording, segment, r, values[:, 1:], whole)
+    return _joined(_joined(found, levels=False), levels=True)
+
+
+def _cut(
+    recording: Recording, segment: Segment, r: Float, z: Float, whole: NDArray[np.bool_]
+) -> list[Piece]:
+    """The stretches of a segment between gaps, each with the input before it."""
+    a, b = np.searchsorted(recording.sequence, [segment.start, segment.stop])
+    jumps = np.flatnonzero(np.diff(recording.sequence) != 1) + 1
+    ends = np.unique(np.concatenate([jumps, np.flatnonzero(np.diff(whole.astype(np.int8))) + 1]))
+    edges = [0, *ends.tolist(), len(r)]
+    out = []
+    for start, stop in pairwise(edges):
+        low, high = max(start, int(a)), min(stop, int(b))
+        if high - low < LEAST_SAMPLES or not whole[low]:
+            continue
+        history = min(low - start, high - low)
+        moving = start > 0 and history < high - low
+        name = f"{recording.source}, {segment.name}" if recording.source else segment.name
+        part = r[low - history : high]
+        level = (segment.level, segment.unit)
+        out.append(Piece(name, part, z[low:high], history, (level,), moving))
+    return out
+
+
+def _joined(pieces: list[Piece], *, levels: bool) -> list[Piece]:
+    """Pieces with proportional inputs, of one level or of any, as one."""
+    groups: list[list[Piece]] = []
+    for piece in pieces:
+        for group in groups:
+            if _proportional(group[0], piece, levels=levels):
+                group.append(piece)
+                break
+        else:
+            groups.append([piece])
+    return [_turned(group, levels=levels) if len(group) > 1 else group[0] for group in groups]
+
+
+def _proportional(one: Piece, other: Piece, *, levels: bool) -> bool:
+    if (one.r.size, one.history) != (other.r.size, other.history) or one.moving or other.moving:
+        return False
+    if not levels and one.levels != other.levels:
+        return False
+    a, b = float(one.r @ one.r), float(other.r @ other.r)
+    across = float(one.r @ other.r)
+    return across > 0 and across**2 > (1 - ALIKE**2) * a * b
+
+
+def _turned(group: list[Piece], *, levels: bool) -> Piece:
+    first = group[0]
+    c = np.array([p.r @ first.r for p in group])
+    # The first row of U^T of a Householder reflection that sends c to its own axis.
+    U = np.linalg.qr(np.column_stack([c, np.eye(c.size)[:, 1:]]))[0].T
+    U[0] *= np.sign(U[0] @ c)
+    r = U @ np.stack([p.r for p in group])
+    z = np.tensordot(U, np.stack([p.z for p in group]), axes=1)
+    others = tuple(Samples(r[i], z[i]) for i in range(1, len(group)))
+    return Piece(
+        first.name,
+        r[0],
+        z[0],
+        first.history,
+        tuple(dict.fromkeys(level for p in group for level in p.levels)),
+        first.moving,
+        tuple(s for p in group for s in p.repeats) + (() if levels else others),
+        tuple(s for p in group for s in p.contrasts) + (others if levels else ()),
+    )

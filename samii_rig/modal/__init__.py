@@ -1,0 +1,1 @@
+"""Modes from measured frequency responses: poles and shapes, each with its interval."""

@@ -1,0 +1,114 @@
+"""Somebody else's experiments and devices: what goes wrong in them is one line with their name.
+
+An entry point may come from any package. What it raises, or returns in place of what it promised,
+is told as wrong input, so that a command neither ends with a traceback nor, on a SystemExit, as if
+all had gone well.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import EntryPoint
+from typing import get_args
+
+import numpy as np
+
+from samii_rig.errors import InputError, SamiiRigError, one_of
+from samii_rig.rig.schema import Rig
+from samii_rig.run.protocols import Actuator, Clock, Dwell, OpenRig, Plan, PlannedSegment, Sensor
+from samii_rig.types import Channel, Kind
+
+
+def named(point: EntryPoint) -> str:
+    """An entry point as its package declares it."""
+    return f"entry point {point.name} = {point.value}"
+
+
+@contextmanager
+def asked(who: str, what: str) -> Iterator[None]:
+    """Around a call of `what` in the code behind the entry point `who`: whatever that raises but
+    our own errors and Ctrl-C becomes an InputError."""
+    try:
+        yield
+    except (SamiiRigError, KeyboardInterrupt):
+        raise
+    except BaseException as error:
+        text = " ".join(str(error).split())
+        said = f"{type(error).__name__}: {text}" if text else type(error).__name__
+        raise InputError.saying(who, what, f"raised {said}") from error
+
+
+def wrong(who: str, what: str, value: object, expected: str) -> InputError:
+    """The code behind the entry point `who` gave `value` as `what`."""
+    return InputError(who, what, value, expected)
+
+
+def checked_device(opened: object, who: str) -> OpenRig:
+    """What a driver returned, if it is a rig whose parts are there; else InputError."""
+    if not isinstance(opened, OpenRig):
+        raise InputError.saying(who, "", f"returned {type(opened).__name__}; expected an OpenRig")
+    for part, kind in (("actuator", Actuator), ("sensor", Sensor), ("clock", Clock)):
+        found = getattr(opened, part)
+        if not isinstance(found, kind):
+            raise wrong(who, part, found, f"what has all of a {kind.__name__}")
+    channels, told = opened.sensor.channels, opened.metadata
+    if not (isinstance(channels, tuple) and all(isinstance(c, Channel) for c in channels)):
+        raise wrong(who, "sensor.channels", channels, "a tuple of Channel")
+    texts = isinstance(told, dict) and all(isinstance(x, str) for kv in told.items() for x in kv)
+    if not texts:
+        raise wrong(who, "metadata", told, "texts by name")
+    return opened
+
+
+def checked_plan(plan: object, rig: Rig, who: str) -> Plan:
+    """What an experiment's plan() returned, if it is a plan for this rig; else InputError."""
+    if not isinstance(plan, Plan):
+        raise InputError.saying(who, "plan()", f"returned {type(plan).__name__}; expected a Plan")
+    actuators, sensors = [a.name for a in rig.actuator], [s.name for s in rig.sensor]
+    for field, names in (("actuator", actuators), ("centring_sensor", sensors)):
+        if getattr(plan, field) not in names:
+            given = getattr(plan, field)
+            raise wrong(
+                who, f"plan().{field}", given, f"a name of {rig.name}, {one_of(given, names)}"
+            )
+    for field in ("rate_hz", "kp"):
+        if not _number(getattr(plan, field)):
+            raise wrong(who, f"plan().{field}", getattr(plan, field), "a finite number")
+    if not isinstance(plan.segments, tuple) or not plan.segments:
+        raise wrong(who, "plan().segments", plan.segments, "a tuple of at least one PlannedSegment")
+    for i, segment in enumerate(plan.segments):
+        _check_segment(segment, f"plan().segments[{i}]", who)
+    return plan
+
+
+def _check_segment(s: object, where: str, who: str) -> None:
+    if not isinstance(s, PlannedSegment):
+        raise wrong(who, where, s, "a PlannedSegment")
+    n = len(s.u) if isinstance(s.u, np.ndarray) else 0
+    for field, finite in (("u", True), ("theta_ref", True), ("frequency", False)):
+        x = getattr(s, field)
+        fits = isinstance(x, np.ndarray) and x.dtype.kind == "f" and x.shape == (n,) and n > 0
+        if not fits or (finite and not np.isfinite(x).all()):
+            values = "finite floats" if finite else "floats"
+            raise wrong(who, f"{where}.{field}", x, f"an array of {values}, one a sample")
+    band = s.band_hz
+    if not (isinstance(band, tuple) and len(band) == 2 and all(map(_number, band))):
+        raise wrong(who, f"{where}.band_hz", band, "two frequencies in Hz")
+    if not 0.0 <= band[0] <= band[1]:
+        raise wrong(who, f"{where}.band_hz", band, "the lower frequency first, 0 or more")
+    if s.kind not in get_args(Kind):
+        raise wrong(who, f"{where}.kind", s.kind, f"one of {', '.join(get_args(Kind))}")
+    if not (_number(s.level) and isinstance(s.name, str) and isinstance(s.unit, str)):
+        raise wrong(who, where, (s.name, s.level, s.unit), "a name, a finite level and its unit")
+    part = s.recorded or (0, n)
+    if not (isinstance(part, tuple) and len(part) == 2 and 0 <= part[0] < part[1] <= n):
+        raise wrong(who, f"{where}.recorded", part, f"a first and a last sample of {n}")
+    dwell = s.dwell
+    if dwell is not None and not (isinstance(dwell, Dwell) and 0 <= dwell.first < dwell.last <= n):
+        raise wrong(who, f"{where}.dwell", dwell, f"a Dwell inside the segment's {n} samples")
+
+
+def _number(x: object) -> bool:
+    return isinstance(x, int | float | np.integer | np.floating) and math.isfinite(x)

@@ -1,0 +1,133 @@
+"""Effects that are no linear element: forces of joints, and what the drive does to its command."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim.assumed_modes.effects import Draft, Numbers, angle_source
+from sim.assumed_modes.parts import ANGLE_SOURCES, JOINTS, SOURCES, Force, Setup
+
+Rng = np.random.Generator
+START = 1e-3  # of a joint's swing, or its spring's largest moment: what a force begins with
+
+
+@dataclass(frozen=True, slots=True)
+class Swing:
+    """What the nominal rig does at the trial's largest level: peaks of the joints' relative motion
+    (rad or m), of the moment at the source (N m) and of the command (actuator unit)."""
+
+    joints: dict[str, float]
+    moment: float
+    command: float
+
+
+def joint(rng: Rng, setup: Setup, swing: Swing) -> tuple[str, float, float]:
+    """A joint that moves: its name, its stiffness and its peak."""
+    names = [p.name for p in setup.parts if p.kind in JOINTS and p.values["k"] > 0]
+    name = str(rng.choice(names))
+    return name, setup.part(name).values["k"], swing.joints[name]
+
+
+def units(setup: Setup, on: str) -> tuple[str, str]:
+    """Units of a joint's force and of its motion."""
+    return ("N m", "rad") if setup.part(on).kind == "torsional_spring" else ("N", "m")
+
+
+def on_joint(law: str, on: str) -> Callable[[Setup, Numbers], Setup]:
+    """Puts a law on a joint, with the joint's stiffness beside the law's own numbers."""
+
+    def apply(s: Setup, v: Numbers) -> Setup:
+        return replace(s, forces=(*s.forces, Force(law, on, {**v, "k": s.part(on).values["k"]})))
+
+    return apply
+
+
+def _also(physics: str, setup: Setup, on: str) -> tuple[tuple[str, str], ...]:
+    """A joint's source counts as the joint: the neighbours of its spring without extent."""
+    names = [p.name for p in setup.parts]
+    at = names.index(on)
+    beside = [p for p in setup.parts[max(at - 1, 0) : at + 2] if p.kind in ANGLE_SOURCES]
+    return tuple((physics, p.name) for p in beside)
+
+
+def friction(rng: Rng, setup: Setup, swing: Swing) -> Draft:
+    """Dry friction of a joint."""
+    on, k, peak = joint(rng, setup, swing)
+    return Draft(
+        "coulomb_friction", on, None, {"T_c": units(setup, on)[0]}, lambda x: {"T_c": x},
+        on_joint("coulomb_friction", on), START * k * peak, 0.3 * k * peak,
+        also=_also("coulomb_friction", setup, on),
+    )  # fmt: skip
+
+
+def play(rng: Rng, setup: Setup, swing: Swing) -> Draft:
+    """Play of a joint: its spring carries nothing within the width."""
+    on, _, peak = joint(rng, setup, swing)
+    return Draft(
+        "backlash", on, None, {"width": units(setup, on)[1]}, lambda x: {"width": x},
+        on_joint("backlash", on), START * peak, peak, also=_also("backlash", setup, on),
+    )  # fmt: skip
+
+
+def hardening(rng: Rng, setup: Setup, swing: Swing) -> Draft:
+    """A spring that hardens; softening ends at half of the stiffness."""
+    on, k, peak = joint(rng, setup, swing)
+    sign = 1.0 if rng.random() < 0.7 else -1.0
+    whole = k / peak**2
+    return Draft(
+        "cubic_stiffness", on, None, {"k3": "{}/{}^3".format(*units(setup, on))},
+        lambda x: {"k3": sign * x},
+        on_joint("cubic_stiffness", on), START * whole, (2.0 if sign > 0 else 0.15) * whole,
+        also=_also("cubic_stiffness", setup, on),
+    )  # fmt: skip
+
+
+def _of_drive(
+    physics: str, setup: Setup, units: dict[str, str], values: Callable[[float], Numbers],
+    start: float, most: float,
+) -> Draft:  # fmt: skip
+    source = next(p.name for p in setup.parts if p.kind in SOURCES)
+    on = setup.actuator.name
+
+    def apply(s: Setup, v: Numbers) -> Setup:
+        return replace(s, forces=(*s.forces, Force(physics, on, v)))
+
+    return Draft(physics, source, None, units, values, apply, start, most, also=((physics, on),))
+
+
+def dead_zone(rng: Rng, setup: Setup, swing: Swing) -> Draft:
+    """Overlap of the valve's spool."""
+    return _of_drive(
+        "valve_deadband", setup, {"width": setup.actuator.unit}, lambda x: {"width": x},
+        START * swing.command, swing.command,
+    )  # fmt: skip
+
+
+def clipping(rng: Rng, setup: Setup, swing: Swing) -> Draft:
+    """The command is clipped behind the converter that is recorded."""
+    return _of_drive(
+        "output_saturation", setup, {"limit": setup.actuator.unit},
+        lambda x: {"limit": swing.command * (1.0 - x)}, START, 0.8,
+    )  # fmt: skip
+
+
+def orifice(rng: Rng, setup: Setup, swing: Swing) -> Draft:
+    """Flow through the valve falls as the load takes the pressure: v sqrt(1 - sgn(v) M/M_stall)."""
+    angle_source(setup)
+    return _of_drive(
+        "flow_saturation", setup, {"M_stall": "N m"}, lambda x: {"M_stall": swing.moment / x},
+        START, 0.8,
+    )  # fmt: skip
+
+
+FORCES: dict[str, Callable[[Rng, Setup, Swing], Draft]] = {
+    "coulomb_friction": friction,
+    "backlash": play,
+    "cubic_stiffness": hardening,
+    "valve_deadband": dead_zone,
+    "output_saturation": clipping,
+    "flow_saturation": orifice,
+}

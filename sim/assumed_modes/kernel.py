@@ -1,0 +1,213 @@
+"""The loop in time: converters, controller and plant, sample by sample, compiled.
+
+The linear part moves by the exact pieces of a `Timeline`. A law that is not linear is a force held
+over a piece: a smooth law the mean of its values at both ends, found by iteration, so that the
+error falls with the square of the piece; dry friction the value at the end, solved for exactly
+(stick is an equation there, not a tolerance).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from samii_rig.types import Float, Int
+
+# Laws by number, as the compiled loop knows them, with their numbers in order.
+CUBIC, BACKLASH, FRICTION, BOUC_WEN, PARAMETRIC, FLOW = range(6)
+ITERATIONS = 6  # of a smooth law; each gains a factor k h^2/2m, about 1 %
+N_VALUES = 5
+
+
+class Pieces(NamedTuple):
+    """The arrays of a `Timeline` and of the plant; see there. g (p, n_law): how far a unit force
+    of each law moves its own place in a piece; gv the same for its velocity."""
+
+    Phi: Float
+    Gamma: Float
+    new: Int
+    read: Int
+    late: Int
+    wait: int
+    h: Float
+    C: Float
+    D: Float
+    Z: Float
+    g: Float
+    gv: Float
+
+
+class Laws(NamedTuple):
+    """law (n_law,) of the numbers above; value (n_law, N_VALUES)."""
+
+    law: Int
+    value: Float
+
+
+class Controller(NamedTuple):
+    """The loop: v = r - kp theta, rounded to `step` and clipped to low, high. dead, clip : width
+    of a dead zone, and a limit, between the converter and the source; 0 for none."""
+
+    theta: int
+    kp: float
+    step: float
+    low: float
+    high: float
+    dead: float
+    clip: float
+
+
+class Converters(NamedTuple):
+    """(n_y,) each: what the converters do, in the sensors' units."""
+
+    step: Float
+    low: Float
+    high: Float
+    offset: Float
+
+
+@njit(cache=True)
+def smooth(law: int, p: Float, z: float, dz: float, t: float, memory: float, h: float) -> float:
+    """The force of a smooth law at displacement z, velocity dz and time t."""
+    if law == 0:  # hardening, p = k3
+        return float(-p[0] * z**3)
+    if law == 1:  # play, p = k, width: takes the joint's spring away inside it
+        half = 0.5 * p[1]
+        return float(p[0] * min(max(z, -half), half))
+    if law == 3:  # Bouc-Wen, p = force at yield, displacement at yield, beta, (1 - beta), n
+        return float(-p[0] * bouc_wen(p, dz, memory, h))
+    # parametric, p = k, depth 1, w1, depth 2, w2
+    return float(-p[0] * z * (p[1] * np.sin(p[2] * t) + p[3] * np.sin(p[4] * t)))
+
+
+@njit(cache=True)
+def bouc_wen(p: Float, dz: float, x: float, h: float) -> float:
+    """The hysteretic state after `h` at velocity dz, by the midpoint rule:
+    x' = (dz - beta |dz| |x|^(n-1) x - (1 - beta) dz |x|^n)/z_y."""
+    n = p[4]
+    out = x
+    mid = x
+    for _ in range(3):
+        a = abs(mid)
+        rate = (dz - p[2] * abs(dz) * a ** (n - 1.0) * mid - p[3] * dz * a**n) / p[1]
+        out = x + h * rate
+        mid = 0.5 * (x + out)
+    return out
+
+
+@njit(cache=True)
+def run(
+    pieces: Pieces,
+    laws: Laws,
+    control: Controller,
+    converters: Converters,
+    r: Float,
+    noise: Float,
+    push: Float,
+    x: Float,
+    t: float,
+) -> tuple[Float, Float]:
+    """Samples (n, n_y) and commands (n,) of a run from the state x at time t; x moves on.
+
+    r (n,) : what the loop is asked for. noise (n, n_y), push (n, n_d) : sensors' errors and
+    disturbances. A step of 0 leaves a value as it is.
+    """
+    n, n_y, n_law = r.size, pieces.C.shape[0], laws.law.size
+    y, v = np.zeros((n, n_y)), np.zeros(n)
+    deep = pieces.late.max()
+    line = np.zeros((deep + 1, n_y))  # line[k]: what is shown k samples from now
+    old = np.zeros(pieces.wait + 2)  # outputs, the newest first
+    u = np.zeros(pieces.Gamma.shape[2])
+    f = np.zeros(n_law)
+    memory = np.zeros(n_law)
+    z = np.zeros(2 * n_law)
+    for k in range(n):
+        for i in range(n_y):
+            value = line[0, i] + noise[k, i] + converters.offset[i]
+            if converters.step[i] > 0.0:
+                value = np.rint(value / converters.step[i]) * converters.step[i]
+            y[k, i] = min(max(value, converters.low[i]), converters.high[i])
+        out = r[k] - control.kp * y[k, control.theta]
+        if control.step > 0.0:
+            out = np.rint(out / control.step) * control.step
+        out = min(max(out, control.low), control.high)
+        v[k] = out
+        if control.dead > 0.0:
+            half = 0.5 * control.dead
+            out = out - min(max(out, -half), half)
+        if control.clip > 0.0:
+            out = min(max(out, -control.clip), control.clip)
+        for j in range(old.size - 1, 0, -1):
+            old[j] = old[j - 1]
+        old[0] = out
+        for j in range(deep):
+            line[j] = line[j + 1]
+        for j in range(push.shape[1]):
+            u[1 + n_law + j] = push[k, j]
+        for p in range(pieces.h.size):
+            u[0] = old[pieces.wait + 1 - pieces.new[p]]
+            t += pieces.h[p]
+            if n_law == 0:
+                x[:] = np.dot(pieces.Phi[p], x) + np.dot(pieces.Gamma[p], u)
+            else:
+                _with_laws(pieces, laws, p, x, u, f, memory, z, t)
+            for i in range(n_y):
+                if pieces.read[i] == p:
+                    line[pieces.late[i] - 1, i] = np.dot(pieces.C[i], x) + np.dot(pieces.D[i], u)
+    return y, v
+
+
+@njit(cache=True)
+def _with_laws(
+    pieces: Pieces,
+    laws: Laws,
+    p: int,
+    x: Float,
+    u: Float,
+    f: Float,
+    memory: Float,
+    z: Float,
+    t: float,
+) -> None:
+    """One piece with laws: x, the forces f at its end, the memories and z move on."""
+    n_law, h = laws.law.size, pieces.h[p]
+    for i in range(n_law):
+        u[1 + i] = 0.0
+        if laws.law[i] == 5:  # flow through an orifice: less under load, more when pulled
+            u[0] *= np.sqrt(max(0.0, 1.0 - np.sign(u[0]) * z[2 * i] / laws.value[i, 0]))
+        elif laws.law[i] != 2:
+            u[1 + i] = 0.5 * f[i]
+    x[:] = np.dot(pieces.Phi[p], x) + np.dot(pieces.Gamma[p], u)
+    z[:] = np.dot(pieces.Z, x)
+    for i in range(n_law):
+        law, value = laws.law[i], laws.value[i]
+        if law == 5:
+            continue
+        at, speed = z[2 * i], z[2 * i + 1]
+        push = 0.0
+        if law == 2:
+            push = -speed / pieces.gv[p, i]
+            push = min(max(push, -value[0]), value[0])
+            f[i] = push
+        else:
+            force = f[i]
+            for _ in range(ITERATIONS):
+                force = smooth(
+                    law,
+                    value,
+                    at + pieces.g[p, i] * 0.5 * force,
+                    speed + pieces.gv[p, i] * 0.5 * force,
+                    t,
+                    memory[i],
+                    h,
+                )
+            push = 0.5 * force
+            if law == 3:
+                memory[i] = bouc_wen(value, speed + pieces.gv[p, i] * push, memory[i], h)
+            f[i] = force
+        u[1 + i] += push
+        for j in range(x.size):
+            x[j] += pieces.Gamma[p, j, 1 + i] * push
+        z[:] = np.dot(pieces.Z, x)

@@ -1,0 +1,183 @@
+"""What is simulated: a chain of parts with what hangs on it, its sensors and its input's path.
+
+It begins as the rig file says, with the nominal parameters that were drawn; an effect returns
+another one with something added or changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from samii_rig.errors import InputError
+from samii_rig.rig.schema import ActuatorSpec, Rig, SensorBase, parameters
+
+Key = tuple[str, str]  # (element, symbol) of a physical parameter
+Values = Mapping[Key, float]
+
+KINDS = (
+    "beam",
+    "rigid_link",
+    "lumped_mass",
+    "torsional_spring",
+    "translational_spring",
+    "torsional_ground_spring",
+    "translational_ground_spring",
+    "gravity_stiffness",
+    "oil_column",
+    "angular_velocity_source",
+    "angular_velocity_source_2",
+    "torque_source",
+    "force_source",
+)
+EXTENDED = ("beam", "rigid_link")  # kinds on which a place may lie between two ports
+SOURCES = ("angular_velocity_source", "angular_velocity_source_2", "torque_source", "force_source")
+ANGLE_SOURCES = SOURCES[:2]
+JOINTS = ("torsional_spring", "translational_spring")
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One element of the chain with its numbers, by the rig file's symbols, SI units."""
+
+    name: str
+    kind: str
+    values: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """Something at a place of the chain: `x` m from the upstream end of the part `on`; of a part
+    without extent `x` is 0 and means right behind it.
+
+    mass : values m (kg) and J (kg m^2). ground, ground_torsion : spring k and damper c to the
+    ground. oscillator : a mass m on a spring k and a damper c, across the chain.
+    """
+
+    kind: Literal["mass", "ground", "ground_torsion", "oscillator"]
+    on: str
+    x: float
+    values: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Relaxation:
+    """Maxwell branches beside the spring of the joint `on`: sum of k s t/(1 + s t), for k in
+    `stiffness` (N m/rad or N/m) and t in `times` (s)."""
+
+    on: str
+    stiffness: tuple[float, ...]
+    times: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Force:
+    """A law that is not linear: `law` of `samii_rig`'s vocabulary or `bouc_wen`, `parametric`.
+
+    on : the joint whose relative motion it opposes, or the actuator. values : its numbers.
+    """
+
+    law: str
+    on: str
+    values: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Lag:
+    """A filter in the input's path: p/(s + p), or omega^2/(s^2 + 2 zeta omega s + omega^2)."""
+
+    p: float = 0.0
+    omega: float = 0.0
+    zeta: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """The whole of what is simulated.
+
+    delay : s by which the source acts later than the converter's output changes.
+    """
+
+    base: str
+    parts: tuple[Part, ...]
+    sensors: tuple[SensorBase, ...]
+    actuator: ActuatorSpec
+    attachments: tuple[Attachment, ...] = ()
+    relaxations: tuple[Relaxation, ...] = ()
+    forces: tuple[Force, ...] = ()
+    path: tuple[Lag, ...] = ()
+    delay: float = 0.0
+
+    def part(self, name: str) -> Part:
+        """The part called `name`; KeyError if there is none."""
+        for part in self.parts:
+            if part.name == name:
+                return part
+        raise KeyError(name)
+
+    def with_value(self, name: str, symbol: str, value: float) -> Setup:
+        """The same with one number of one part changed."""
+        parts = tuple(
+            replace(p, values={**p.values, symbol: value}) if p.name == name else p
+            for p in self.parts
+        )
+        return replace(self, parts=parts)
+
+    def inserted(self, after: str | None, part: Part) -> Setup:
+        """The same with `part` behind the part `after`, or at the base."""
+        at = 0 if after is None else [p.name for p in self.parts].index(after) + 1
+        return replace(self, parts=(*self.parts[:at], part, *self.parts[at:]))
+
+    def attached(self, *items: Attachment) -> Setup:
+        """The same with more that hangs on it."""
+        return replace(self, attachments=(*self.attachments, *items))
+
+
+@dataclass(frozen=True, slots=True)
+class Nominal:
+    """The physical parameters that the rig file gives with a tolerance.
+
+    keys : (n,) which; tolerance : relative standard deviation of each; value : the file's.
+    """
+
+    keys: tuple[Key, ...]
+    value: tuple[float, ...]
+    tolerance: tuple[float, ...]
+    units: tuple[str, ...] = field(default=())
+
+
+def nominal(rig: Rig) -> Nominal:
+    """The parameters of `rig` that have a tolerance and are not 0."""
+    found = [
+        ((e.name, symbol), p.value, p.tolerance, p.unit)
+        for e in rig.element
+        for symbol, p in parameters(e).items()
+        if p.tolerance > 0 and p.value != 0
+    ]
+    keys, value, tolerance, units = zip(*found, strict=True) if found else ((), (), (), ())
+    return Nominal(keys, value, tolerance, units)
+
+
+def setup_of(rig: Rig, values: Values) -> Setup:
+    """The rig as its file says, with `values` in place of the file's.
+
+    InputError for what this plant cannot simulate: more than one actuator, feedback beside the
+    centring, a tip that is not free, elements outside `KINDS`.
+    """
+    if len(rig.actuator) != 1:
+        raise InputError(rig.name, "actuator", len(rig.actuator), "one actuator for this plant")
+    if rig.feedback:
+        raise InputError(rig.name, "feedback", rig.feedback[0].name, "none for this plant")
+    if rig.tip != "free":
+        raise InputError(rig.name, "tip", rig.tip, "'free' for this plant")
+    parts = []
+    for e in rig.element:
+        if e.kind not in KINDS:
+            raise InputError(rig.name, f"element[{e.name}].kind", e.kind, f"one of {KINDS}")
+        own = {s: values.get((e.name, s), p.value) for s, p in parameters(e).items()}
+        parts.append(Part(e.name, e.kind, own))
+    delays = {p.values["tau"] for p in parts if p.kind in SOURCES}
+    if len(delays) != 1:
+        raise InputError(rig.name, "tau", sorted(delays), "one dead time for all sources")
+    return Setup(rig.base, tuple(parts), rig.sensor, rig.actuator[0], delay=delays.pop())

@@ -1,0 +1,271 @@
+"""The continuous plant: mechanism, sources, the input's path and the sensors' filters as one
+
+    x' = A x + B u,    y = C x + D u,    z = Z x
+
+with the inputs u = [v at the source, the forces' laws, the disturbances], y what the converters
+sample and z the motions that the laws read. Everything is linear here and a matrix.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from samii_rig.errors import SamiiRigError
+from samii_rig.rig.schema import AbsoluteAngle, Acceleration, Moment, RelativeAngle, SensorBase
+from samii_rig.types import Float
+from sim.assumed_modes.parts import Lag, Part, Setup
+from sim.assumed_modes.ritz import FLOOR, Mechanism
+
+GRAVITY = 9.80665  # m/s^2, as the rig file's `tilt` means it
+
+
+@dataclass(frozen=True, slots=True)
+class Push:
+    """A disturbance's place: `floor` (m/s^2), `valve` (actuator unit at the source), or a force
+    `w` (N), a torque `theta` (N m) at `x` m along the part `on`, or `joint` (N m across one)."""
+
+    kind: str
+    on: str = ""
+    x: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Plant:
+    """Matrices of the continuous plant.
+
+    A (n, n), B (n, n_u), C (n_y, n), D (n_y, n_u). Z : (2 n_law, n), displacement and velocity of
+    each law in turn, or the moment at the source and 0 for a law of the flow.
+    n_law : laws; the inputs are v, then n_law forces, then the disturbances.
+    """
+
+    A: Float
+    B: Float
+    C: Float
+    D: Float
+    Z: Float
+    n_law: int
+
+
+class _Signals:
+    """Rows over [x, u], appended to as states are found."""
+
+    def __init__(self, n_x: int, n_u: int) -> None:
+        self.n_x, self.n_u = n_x, n_u
+        self.rate = np.zeros((n_x, n_x + n_u))
+        self._used = 0
+
+    def states(self, n: int) -> slice:
+        """Room for n more states."""
+        self._used += n
+        return slice(self._used - n, self._used)
+
+    def unit(self, at: int) -> Float:
+        """The row that reads one entry of [x, u]."""
+        row = np.zeros(self.n_x + self.n_u)
+        row[at] = 1.0
+        return row
+
+    def filtered(self, row: Float, sections: list[tuple[Float, Float, Float, float]]) -> Float:
+        """The row behind a cascade of filters (a, b, c, d)."""
+        for a, b, c, d in sections:
+            own = self.states(len(a))
+            self.rate[own] += np.outer(b, row)
+            self.rate[own, own] += a
+            row = d * row
+            row[own] += c
+        return row
+
+
+def _lag(p: float) -> tuple[Float, Float, Float, float]:
+    return np.array([[-p]]), np.array([p]), np.ones(1), 0.0
+
+
+def _second(omega: float, zeta: float) -> tuple[Float, Float, Float, float]:
+    # The states are the output and its rate over omega, both of the output's size.
+    a = omega * np.array([[0.0, 1.0], [-1.0, -2.0 * zeta]])
+    return a, np.array([0.0, omega]), np.array([1.0, 0.0]), 0.0
+
+
+def sensor_sections(sensor: SensorBase) -> list[tuple[Float, Float, Float, float]]:
+    """Filters of a sensor's chain in series: Butterworth pairs, lag, high-pass."""
+    out = []
+    if sensor.antialias is not None:
+        n, corner = sensor.antialias.order, 2 * np.pi * sensor.antialias.corner_hz
+        out += [
+            _second(corner, float(np.sin(np.pi * (2 * k + 1) / (2 * n)))) for k in range(n // 2)
+        ]
+        out += [_lag(corner)] * (n % 2)
+    if sensor.lag > 0:
+        out.append(_lag(1.0 / sensor.lag))
+    if sensor.highpass_hz > 0:
+        a = 2 * np.pi * sensor.highpass_hz
+        out.append((np.array([[-a]]), np.array([a]), -np.ones(1), 1.0))
+    return out
+
+
+def _path_sections(path: tuple[Lag, ...]) -> list[tuple[Float, Float, Float, float]]:
+    return [_second(f.omega, f.zeta) if f.omega > 0 else _lag(f.p) for f in path]
+
+
+def _source_states(part: Part) -> int:
+    if part.kind == "angular_velocity_source":
+        return 2
+    if part.kind == "angular_velocity_source_2":
+        return 3
+    return int(part.values.get("p", 0.0) > 0)
+
+
+NO_MASS = 1e-12  # of the mass matrix scaled to a unit diagonal; SAMII's smallest is 6e-7
+
+
+class UnphysicalError(SamiiRigError):
+    """A mass or stiffness that no body has: negative kinetic energy, or a motion out of bounds."""
+
+
+def _split(M: Float) -> tuple[Float, Float]:
+    """Columns that span the coordinates with mass, and those without: two springs in series."""
+    if not np.all(np.diag(M) > 0):
+        raise UnphysicalError("a coordinate without mass or with a negative one")
+    scale = 1.0 / np.sqrt(np.diag(M))
+    value, vector = np.linalg.eigh(M * np.outer(scale, scale))
+    if value[0] < -NO_MASS:
+        raise UnphysicalError("a motion with a negative mass")
+    some = value > NO_MASS
+    if np.all(some):
+        return np.eye(len(M)), np.zeros((len(M), 0))
+    columns = scale[:, None] * vector
+    return columns[:, some], columns[:, ~some]
+
+
+def _solution(A: Float, b: Float) -> Float:
+    try:
+        return np.asarray(np.linalg.solve(A, b), dtype=np.float64)
+    except np.linalg.LinAlgError as error:
+        raise UnphysicalError("a motion that nothing resists") from error
+
+
+def plant(setup: Setup, pushes: tuple[Push, ...] = ()) -> Plant:
+    """The continuous plant of `setup`, with inputs for its laws and for the disturbances."""
+    mech = Mechanism(setup)
+    sources = [p for p in setup.parts if p.kind.endswith(("source", "source_2"))]
+    filters = [sensor_sections(s) for s in setup.sensors]
+    path = _path_sections(setup.path)
+    f = mech.free
+    heavy, light = _split(mech.M[np.ix_(f, f)])
+    n_p, n_r = heavy.shape[1], light.shape[1]
+    n_x = 2 * n_p + n_r + len(mech.maxwell) + sum(_source_states(p) for p in sources)
+    n_x += sum(len(a) for s in (*filters, path) for a, *_ in s)
+    n_law, n_u = len(setup.forces), 1 + len(setup.forces) + len(pushes)
+    sig = _Signals(n_x, n_u)
+    place, speed, between = sig.states(n_p), sig.states(n_p), sig.states(n_r)
+    n = mech.size
+    Q, dQ, ddQ = (np.zeros((n, n_x + n_u)) for _ in range(3))
+    Q[f, place], Q[f, between], dQ[f, speed] = heavy, light, heavy
+    v = sig.unit(n_x)
+    for j, push in enumerate(pushes):
+        if push.kind == "valve":
+            v = v + sig.unit(n_x + 1 + n_law + j)
+    drive = sig.filtered(v, path)
+    load = np.zeros((n, n_x + n_u))  # generalised forces
+    for part in sources:
+        _source(sig, mech, part, drive, (Q, dQ, ddQ), load)
+    for i, force in enumerate(setup.forces):
+        if force.on in mech.joints:
+            load[mech.joints[force.on], n_x + 1 + i] += 1.0
+    _pushes(mech, pushes, n_x + 1 + n_law, load, ddQ)
+    for branch in mech.maxwell:
+        own = sig.states(1)
+        sig.rate[own] += Q[branch.at] / branch.t
+        sig.rate[own, own] -= 1.0 / branch.t
+        load[branch.at] -= branch.k * Q[branch.at]
+        load[branch.at, own] += branch.k
+    if n_r:
+        # Without mass the forces balance at once: C r' = ... gives the rate of what lies between.
+        balance = _solution(
+            light.T @ mech.C[np.ix_(f, f)] @ light,
+            light.T @ (load - mech.C @ dQ - mech.K @ Q)[f],
+        )
+        dQ[f] += light @ balance
+        sig.rate[between] = balance
+    load -= mech.C @ dQ + mech.K @ Q
+    moved = _solution(heavy.T @ mech.M[np.ix_(f, f)] @ heavy, heavy.T @ (load[f] - mech.M[f] @ ddQ))
+    ddQ[f] = heavy @ moved  # no sensor of acceleration stands on what has no mass
+    sig.rate[place, speed], sig.rate[speed] = np.eye(n_p), moved
+    # What holds a locked rotation is the moment inside the chain at that place.
+    inside = load - mech.M @ ddQ
+    rows = [
+        s.gain * sig.filtered(_seen(s, mech, (Q, dQ, ddQ), inside), sections)
+        for s, sections in zip(setup.sensors, filters, strict=True)
+    ]
+    Y = np.array(rows)
+    Z = np.array([row for x in setup.forces for row in _read(x.on, mech, Q, dQ, inside)])
+    Z = Z.reshape(2 * n_law, n_x + n_u)[:, :n_x]
+    return Plant(sig.rate[:, :n_x], sig.rate[:, n_x:], Y[:, :n_x], Y[:, n_x:], Z, n_law)
+
+
+def _source(
+    sig: _Signals,
+    mech: Mechanism,
+    part: Part,
+    drive: Float,
+    motion: tuple[Float, Float, Float],
+    load: Float,
+) -> None:
+    """The states of a source and what it does: its angle prescribed, or a force."""
+    values, (Q, dQ, ddQ) = part.values, motion
+    if part.name in mech.sources:
+        at = mech.sources[part.name]
+        second = part.kind == "angular_velocity_source_2"
+        own = sig.states(1)
+        section = _second(values["omega"], values["zeta"]) if second else _lag(values["p"])
+        before = sig._used
+        speed = sig.filtered(values["K"] * drive, [section])
+        Q[at] = sig.unit(own.start)
+        dQ[at] = speed
+        sig.rate[own] = speed
+        ddQ[at] = sig.rate[before]  # the first state of either filter is the speed itself
+        return
+    row = mech.before(part.name)[0 if part.kind == "force_source" else 1]
+    lag = [_lag(values["p"])] if values.get("p", 0.0) > 0 else []
+    load += np.outer(row, sig.filtered(values["K"] * drive, lag))
+
+
+def _pushes(mech: Mechanism, pushes: tuple[Push, ...], first: int, load: Float, ddQ: Float) -> None:
+    for j, push in enumerate(pushes):
+        if push.kind == "floor":
+            ddQ[FLOOR, first + j] += 1.0
+        elif push.kind == "joint":
+            load[mech.joints[push.on], first + j] += 1.0
+        elif push.kind in ("w", "theta"):
+            load[:, first + j] += mech.place(push.on, push.x)[int(push.kind == "theta")]
+
+
+def _seen(
+    sensor: SensorBase, mech: Mechanism, motion: tuple[Float, Float, Float], inside: Float
+) -> Float:
+    """The quantity at a sensor's place as a row over [x, u], before its filters."""
+    Q, _, ddQ = motion
+    row: Float
+    match sensor:
+        case RelativeAngle():
+            row = (mech.after(sensor.across[-1])[1] - mech.before(sensor.across[0])[1]) @ Q
+        case AbsoluteAngle():
+            row = mech.after(sensor.after)[1] @ Q
+        case Acceleration():
+            w, theta = mech.place(sensor.on, sensor.position)
+            row = w @ ddQ + sensor.tilt * GRAVITY * (theta @ Q)
+        case Moment():
+            row = inside[mech.cuts[sensor.after]]
+        case _:
+            raise TypeError(type(sensor))
+    return row
+
+
+def _read(on: str, mech: Mechanism, Q: Float, dQ: Float, inside: Float) -> tuple[Float, Float]:
+    """Displacement and velocity of a joint; of an actuator's law the moment at its source."""
+    if on in mech.joints:
+        return Q[mech.joints[on]], dQ[mech.joints[on]]
+    at = next(iter(mech.sources.values()))
+    return inside[at], np.zeros_like(inside[at])

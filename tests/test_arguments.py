@@ -1,0 +1,145 @@
+"""A name that is mistyped is answered at once, with what would be right and what was meant.
+
+Plan: every kind of name has its list and its suggestion; what a command is given is looked at
+before numpy and the model's compiler are imported, which is counted, not timed.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import get_args
+
+import pytest
+from fake_device import RIG as TEXT
+from typer.testing import CliRunner
+
+from samii_rig.cli.app import app
+from samii_rig.cli.estimate import GAPS, METHODS
+from samii_rig.errors import InputError, SamiiRigError, one_of
+from samii_rig.rig.load import load_rig, parse
+from samii_rig.rig.schema import Rig
+from samii_rig.run.experiments import load_experiment
+from samii_rig.signal.choose import Method
+from samii_rig.signal.gather import Gaps
+
+HEAVY = ("numpy", "scipy", "numba", "mcap", "matplotlib", "plotly", "control", "rich.progress")
+WRONG = [
+    "ruin",
+    "run --sed 1 swept_sine",
+    "run swept_sin",
+    "run swept_sine --rig sami",
+    "frf no.mcap",
+    "frf no.mcap --rig sami",
+    "report no.mcap",
+    "modes no.mcap",
+    "identify no.mcap --method x",
+    "diagnose no.mcap",
+    "diagnose no.mcap --gaps leave",
+    "study --vary joint_1.k=1:2:3 --rig sami",
+    "control --rig sami",
+    "prove --rig sami",
+    "verify no.mcap",
+    "recover no.mcap",
+    "replay no.mcap",
+    "import no.csv --map sflr",
+    "import x.csv --map slfr",
+    "devices --rig sami",
+    "doctor --rig sami",
+    "jog --rig sami",
+    "calibrate a_0 --to new.toml --rig sami",
+    "clear-fault --name a --reason b --rig sami",
+]
+COUNT = """
+import json, sys
+from samii_rig.cli import main
+found = {{}}
+for line in {lines!r}:
+    sys.argv = ["samii-rig", *line.split()]
+    try:
+        main()
+    except SystemExit as end:
+        found[line] = [end.code, [m for m in {heavy!r} if m in sys.modules]]
+print(json.dumps(found))
+"""
+
+
+def test_a_wrong_argument_imports_nothing_heavy(tmp_path: Path) -> None:
+    code = COUNT.format(lines=WRONG, heavy=HEAVY)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
+    )
+    assert json.loads(done.stdout) == {line: [2, []] for line in WRONG}
+    assert len(done.stderr.splitlines()) == len(WRONG)
+
+
+def test_the_words_of_the_options_are_those_of_the_estimate() -> None:
+    assert get_args(Method) == METHODS
+    assert get_args(Gaps) == GAPS
+
+
+@pytest.mark.parametrize(
+    ("given", "names", "said"),
+    [
+        ("sami", ["samii", "sflr"], "one of samii, sflr; did you mean samii?"),
+        ("SFLR", ["samii", "sflr"], "one of samii, sflr; did you mean sflr?"),
+        ("x", ["samii", "sflr"], "one of samii, sflr"),
+        (None, ["a"], "one of a"),
+        ("x", [], "one of none"),
+    ],
+)
+def test_what_was_probably_meant_is_said(given: object, names: list[str], said: str) -> None:
+    assert one_of(given, names) == said
+
+
+def refused(*words: str) -> str:
+    result = CliRunner().invoke(app, list(words))
+    assert isinstance(result.exception, SamiiRigError), result.output
+    return str(result.exception)
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (("run", "swept_sin"), "swept_sine"),
+        (("run", "step", "--rig", "sami"), "samii"),
+        (("import", "x", "--map", "slfr"), "sflr"),
+        (("papers", "tabel-1"), "table-1"),
+    ],
+)
+def test_every_name_has_its_suggestion(words: tuple[str, ...], meant: str) -> None:
+    said = refused(*words)
+    assert "one of " in said
+    assert said.endswith(f"did you mean {meant}?")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("rate_hz", "rate_hzz", "rate_hzz: no such field; expected rate_hz"),
+        ("kp = 4.0", "kp = 4.0\nscael = 1", "scael: no such field; expected no more than there is"),
+        ('kind = "rigid_link"', 'kind = "rigid_lnk"', "did you mean rigid_link?"),
+        ("low = -2.0", "low = -2.0\nresoluton = 1", "did you mean resolution?"),
+        ('reason = "the frame"', 'reason = "the frame"\nmax_rat = 1', "did you mean max_rate?"),
+    ],
+)
+def test_a_field_that_is_not_known_is_told_from_those_that_are(
+    old: str, new: str, said: str
+) -> None:
+    with pytest.raises(InputError) as wrong:
+        parse(Rig, TEXT.replace(old, new, 1), "rig.toml")
+    assert said in str(wrong.value)
+
+
+def test_what_is_wrong_with_a_text_is_said_as_such(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    for content, said in (
+        (b"a = {b = 1", "is not valid TOML: unclosed inline table"),
+        ("name = 'x'".encode("utf-16"), "the file begins as UTF-16"),
+    ):
+        path.write_bytes(content)
+        for load in (load_rig, lambda name: load_experiment(name, parse(Rig, TEXT, "rig"))):
+            with pytest.raises(InputError, match=said):
+                load(str(path))

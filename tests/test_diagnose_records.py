@@ -1,0 +1,100 @@
+"""Diagnosis of whole records: sweeps that end with their record, once each, nothing repeated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from concealed_kit import SAMII, SAMII_TOML
+
+from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.measured import measured
+from samii_rig.diagnose.model import Model, grid
+from samii_rig.diagnose.records import RecordProblem, Whole
+from samii_rig.diagnose.refit import Fitted, Problem, refit
+from samii_rig.diagnose.result import Diagnosis
+from samii_rig.record.reader import read_recording
+from samii_rig.signal.estimate import estimate
+from samii_rig.types import Recording
+from sim.concealed.runs import Design
+from sim.concealed.stated import Stated
+from sim.concealed.trial import make
+
+DESIGN = Design(levels=(0.5, 1.0), bursts=1, burst=30.0, steps=1, periods=2, settle=1, period=4.0)
+SLOW_VALVE = "actuator_lag joint_2_source p=150"
+
+
+def cut_sweeps(folder: Path, *effects: str) -> list[Recording]:
+    """One sweep a level, each record cut off where its sweep ends."""
+    stated = tuple(Stated.of(words.split()) for words in effects)
+    kind = "stated" if stated else "nothing"
+    made = make(kind, 11, folder, SAMII_TOML, DESIGN, stated)
+    out = []
+    for path in sorted(made.glob("*.mcap")):
+        run = read_recording(path)
+        first = run.segments[0]
+        if first.kind != "burst":
+            continue
+        n = round((DESIGN.burst - DESIGN.ring_down) * run.rate_hz)
+        whole = replace(first, kind="single", start=0, stop=n)
+        out.append(
+            replace(
+                run,
+                time=run.time[:n],
+                sequence=run.sequence[:n],
+                values=run.values[:n],
+                quality=run.quality[:n],
+                segments=(whole,),
+            )
+        )
+    assert len(out) == 2
+    return out
+
+
+def found_in(runs: list[Recording]) -> Diagnosis:
+    return diagnose(estimate(runs), SAMII, runs=runs)
+
+
+@pytest.fixture(scope="module")
+def nothing(tmp_path_factory: pytest.TempPathFactory) -> list[Recording]:
+    return cut_sweeps(tmp_path_factory.mktemp("nothing"))
+
+
+def test_where_nothing_is_missing_it_says_so_and_what_could_hide(nothing: list[Recording]):
+    found = found_in(nothing)
+    assert found.verdict == "no_mismatch"
+    assert found.chi2_per_dof < found.threshold < 1.3
+    assert found.used.lines == found.used.of > 500
+    hiding = {(h.physics, h.site): h for h in found.could_hide}
+    # What the tolerances of the links' masses do not absorb is seen from grams to kilos.
+    assert 1e-3 < hiding["added_mass", "link_3_6"].size < 5.0
+    assert "What could hide: a mass under" in found.lines()[2]
+
+
+def test_a_valve_that_lags_is_named_though_every_sweep_ends_with_its_record(tmp_path: Path):
+    found = found_in(cut_sweeps(tmp_path, SLOW_VALVE))
+    names = {(c.physics, c.site) for c in found.causes}
+    names |= {n for c in found.causes for n in c.equivalents}
+    assert found.verdict in ("named", "ambiguous")
+    assert ("actuator_lag", "joint_2_source") in names
+    assert found.sigma > 10
+
+
+def test_what_could_hide_is_what_a_refit_leaves(nothing: list[Recording]):
+    """The size is told from weak effects; a refit of the stated size leaves that many sigma."""
+    found = found_in(nothing)
+    told = next(h for h in found.could_hide if h.physics == "transport_delay")
+    every = table(SAMII, 0.5, 40.0)
+    whole = Whole.of(nothing, SAMII, None, every)
+    model = Model(SAMII)
+    none = Fitted(model, np.zeros(model.n), 0.0, 0.0, np.zeros((0, model.n)), np.eye(model.n))
+    lines = measured(estimate(nothing), SAMII)
+    by_line = Problem.of(lines, grid(SAMII, lines.frequency, lines.sensor, lines.actuator))
+    problem = RecordProblem.about(whole, none, by_line)
+    (effect,) = (e for e in every if e.name == ("transport_delay", told.site))
+    hidden = Model(SAMII, (effect,))
+    h = hidden.response(np.append(none.x, np.log(told.size)), problem.at)
+    left = refit(model, problem.toward(h), none.x, far=False)
+    assert 3.0 < np.sqrt(left.chi2) < 9.0

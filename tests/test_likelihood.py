@@ -1,0 +1,195 @@
+"""The likelihood of whole records: exact to the last sample, noise as it is, no sigma lost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
+from samii_rig.likelihood.leak import columns
+from samii_rig.likelihood.noise import Noise
+from samii_rig.likelihood.pieces import Piece, pieces_of, wiring
+from samii_rig.likelihood.reduce import Records, left_by, reduced
+from samii_rig.rig.load import load_rig
+from samii_rig.types import Channel, Complex, Float, Quality, Recording, Segment
+
+RATE = 200.0
+SAMII = load_rig("samii")[0]
+NUMERATOR = np.array([[0.0, 0.02, 0.015], [0.0, -0.01, 0.03]])
+
+
+def poles(frequency: float = 4.0, damping: float = 0.02) -> Float:
+    """Denominator in z of one mode."""
+    p = np.exp((-damping + 1j * np.sqrt(1 - damping**2)) * 2 * np.pi * frequency / RATE)
+    return np.array([1.0, -2 * p.real, abs(p) ** 2])
+
+
+def response(s: Complex, denominator: Float) -> Complex:
+    z = np.exp(s / RATE)
+    b = NUMERATOR @ np.stack([np.ones_like(z), 1 / z, 1 / z**2])
+    return (b / (denominator @ np.stack([np.ones_like(z), 1 / z, 1 / z**2]))).T
+
+
+def from_rest(u: Float, denominator: Float) -> Float:
+    """The recursion itself."""
+    return np.column_stack([signal.lfilter(b, denominator, u) for b in NUMERATOR])
+
+
+def sweep(n: int, low: float = 1.0, high: float = 12.0) -> Float:
+    t = np.arange(n) / RATE
+    return signal.chirp(t, low, t[-1], high)
+
+
+def piece(u: Float, z: Float, name: str = "sweep") -> Piece:
+    return Piece(name, u, z, 0, ((1.0, "V"),))
+
+
+def test_a_record_that_ends_in_full_motion_is_predicted_to_its_last_sample():
+    u, a = sweep(1500), poles()
+    contour = Contour.over(u.size, RATE, EXACT)
+    Y = response(contour.s, a) * contour.damped(u)[:, None]
+    exact = from_rest(u, a)
+    assert np.max(np.abs(exact[-50:])) > 0.05 * np.max(np.abs(exact))
+    np.testing.assert_allclose(contour.record(Y, u.size), exact, atol=1e-9 * np.max(np.abs(exact)))
+
+
+@pytest.mark.parametrize("history", [0, 300])
+def test_what_a_change_between_nodes_does_to_a_spectrum_is_in_closed_form(history: int):
+    u = sweep(900)
+    contour = Contour.over(u.size, RATE, SMOOTH)
+    nodes = np.array([20, 31, 33, 60, 61, 100])
+    lines = np.arange(5, 60)
+    n = u.size - history
+    one, turned = columns(contour, contour.damped(u)[None], nodes, history, n, lines)
+    rng = np.random.default_rng(1)
+    d = rng.standard_normal(nodes.size) + 1j * rng.standard_normal(nodes.size)
+    change = np.zeros(contour.frequency.size, complex)
+    every = np.arange(nodes[0], nodes[-1] + 1)
+    change[every] = np.interp(every, nodes, d.real) + 1j * np.interp(every, nodes, d.imag)
+    y = contour.record((change * contour.damped(u))[:, None], u.size)[history:, 0]
+    made = one[0] @ d.real + turned[0] @ d.imag
+    np.testing.assert_allclose(made, np.fft.rfft(y)[lines], atol=1e-10 * np.max(np.abs(y)) * n)
+
+
+def noisy(seed: int, n: int = 3000, sd: float = 0.02) -> tuple[Float, Float]:
+    u = sweep(n)
+    rng = np.random.default_rng(seed)
+    return u, from_rest(u, poles()) + sd * rng.standard_normal((n, 2))
+
+
+def flat(f: Float) -> Float:
+    return np.ones(f.size)
+
+
+def likelihood(u: Float, z: Float, denominator: Float):
+    records = Records((piece(u, z),), RATE, ((0.8, 15.0),))
+    return records, reduced(records, lambda s: response(s, denominator), flat)
+
+
+def test_at_the_truth_chi_square_is_its_degrees_of_freedom_however_the_record_ends():
+    left = []
+    for seed in range(12):
+        _, found = likelihood(*noisy(seed), poles())
+        left.append(float(found.target @ found.target) / found.known)
+    # 12 times some 150 degrees of freedom: 0.03; the noise itself is known to 5 %.
+    assert np.mean(left) == pytest.approx(1.0, abs=0.12)
+
+
+@pytest.mark.parametrize("off", [0.9995, 1.0005])
+def test_of_a_shifted_mode_nearly_all_sigma_is_kept_in_a_cut_record(off: float):
+    sd, kept = 0.02, []
+    for seed in range(6):
+        u, z = noisy(seed, sd=sd)
+        _, found = likelihood(u, z, poles(4.0 * off))
+        at = found.sigma + 2j * np.pi * found.frequency
+        before = float(found.target @ found.target)
+        after = float(np.sum(found.residual(response(at, poles())) ** 2))
+        there = from_rest(u, poles()) - from_rest(u, poles(4.0 * off))
+        kept.append((before - after) / (np.sum(there**2) / sd**2))
+    assert 0.81 < np.mean(kept) < 1.15  # of chi-square: 0.9 of sigma, and no more than there is
+
+
+def test_an_offset_and_a_slow_wander_of_a_sensor_are_no_mismatch():
+    u, z = noisy(3)
+    t = np.linspace(-1, 1, len(z))
+    records, found = likelihood(u, z + np.column_stack([0.5 + 0.3 * t**2, -2.0 * t**3]), poles())
+    left = left_by(records, lambda s: response(s, poles()), found)
+    assert float(np.mean(left.chi2)) == pytest.approx(4.0, rel=0.15)
+
+
+def test_a_disturbed_mode_makes_noise_at_that_mode_and_nowhere_else():
+    rng = np.random.default_rng(5)
+    f = np.linspace(2, 8, 600)
+    power = np.abs(response(2j * np.pi * f, poles(4.0, 0.01))[:, 0]) ** 2
+    power /= np.median(power)
+    direction = np.array([1.0, 0.5])
+    white = (rng.standard_normal((f.size, 2)) + 1j * rng.standard_normal((f.size, 2))) / np.sqrt(2)
+    pushed = (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)) / np.sqrt(2)
+    left = white + (np.sqrt(power) * pushed)[:, None] * direction
+    found = Noise.of(f, left, np.ones(f.size), lambda g: np.interp(g, f, power))
+    C = found.covariance(f)[:, 0, 0].real
+    truth = 1 + power
+    peak = power > 20
+    assert np.median(C[peak] / truth[peak]) == pytest.approx(1.0, abs=0.35)
+    assert np.median(C[~peak] / truth[~peak]) == pytest.approx(1.0, abs=0.15)
+    whitened = found.whitened(f, left[:, :, None])
+    assert np.mean(np.abs(whitened) ** 2) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_inverse_of_the_noise_is_the_sum_of_its_parts():
+    rng = np.random.default_rng(2)
+    f = np.linspace(1, 9, 300)
+    left = rng.standard_normal((f.size, 3)) + 1j * rng.standard_normal((f.size, 3))
+    left[140:160] += 8 * rng.standard_normal((20, 1)) * np.array([1, 1j, -1])
+    shape = lambda g: 1 + 60 * np.exp(-(((g - 5) / 0.2) ** 2))  # noqa: E731 -- a formula
+    found = Noise.of(f, left, np.ones(f.size), shape)
+    for block, (a, b) in enumerate(found.ranges(f)):
+        W = sum(w[:, None, None] * part for part, w in found.parts(shape(f[a:b]), block))
+        C = found.covariance(f[a:b])
+        np.testing.assert_allclose(W @ C, np.broadcast_to(np.eye(3), C.shape), atol=0.08)
+
+
+def recording(n: int = 2000, level: float = 0.5, repeat: int = 0) -> Recording:
+    names = ["v_2", *(s.name for s in SAMII.sensor)]
+    rng = np.random.default_rng(repeat)
+    values = 1e-3 * rng.standard_normal((n, len(names)))
+    values[:, 0] = level * sweep(n)
+    return Recording(
+        tuple(Channel(x, "V") for x in names),
+        SAMII.rate_hz,
+        np.arange(n),
+        np.arange(n),
+        values,
+        np.zeros(values.shape, np.int64),
+        (Segment("sweep", "single", 0, n, level, "V", repeat),),
+    )
+
+
+def test_records_of_proportional_inputs_are_one_with_the_noise_of_one():
+    runs = [recording(level=x, repeat=i) for i, x in enumerate((0.5, 0.5, 1.0))]
+    wired = replace(wiring(runs, SAMII), kp=0.0)
+    (one,) = pieces_of(runs, SAMII, wired)
+    assert (len(one.repeats), len(one.contrasts)) == (1, 1)
+    power = sum(float(np.sum(r.values[:, 0] ** 2)) for r in runs)
+    assert float(one.r @ one.r) == pytest.approx(power, rel=1e-6)
+    for other in (*one.repeats, *one.contrasts):
+        assert float(other.r @ other.r) < 1e-6 * power
+        assert np.std(other.z) == pytest.approx(1e-3, rel=0.05)
+
+
+def test_a_gap_and_a_missing_sample_begin_a_piece_that_moves():
+    run = recording()
+    run.quality[700:720, 2] = Quality.MISSING
+    kept = np.flatnonzero((np.arange(2000) < 1300) | (np.arange(2000) >= 1350))
+    run = replace(
+        run,
+        time=run.time[kept],
+        sequence=run.sequence[kept],
+        values=run.values[kept],
+        quality=run.quality[kept],
+    )
+    found = pieces_of([run], SAMII, wiring([run], SAMII))
+    assert [(len(p.z), p.moving) for p in found] == [(700, False), (580, True), (650, True)]
