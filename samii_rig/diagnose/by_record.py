@@ -5,16 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 from samii_rig.diagnose import judge as verdict
-from samii_rig.diagnose.by_line import at_first, settled
 from samii_rig.diagnose.judge import Judgement
-from samii_rig.diagnose.nonlinear import compete
+from samii_rig.diagnose.nonlinear_search import ForceSearch, compete_on_records
 from samii_rig.diagnose.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.stages import Case, Progress, Shown, told
-from samii_rig.errors import EstimateError
+from samii_rig.errors import EstimateError, SamiiRigError
 
 MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
-RIVALS = 4  # explanations of the records that forces must beat
 
 
 def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | None:
@@ -29,23 +27,31 @@ def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | N
         return None
 
 
-def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis:
-    """What whole records say."""
+def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis | None:
+    """What whole records say; None where levels differ grossly and no force is found by which."""
     nominal = search.nominal.fitted
     first, bands = search.ratio(nominal), search.bands(nominal)
     progress("what is missing")
-    search.run()
+    # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
+    search.run(briefly=True)
     progress("amplitude levels")
-    before = at_first(case)
-    for explanation in search.ranked()[:RIVALS]:
-        there = search.at_lines(explanation)
-        case.search.keep(there.effects, there.fitted)
-    if compete(case.search, case.responses, case.runs) is not None:
-        return settled(case, before, progress)
+    forced = forces_on(case, search)
+    if case.search.lines.torn():
+        if forced is None:
+            return None
+    elif forced is None or not forced.is_enough():
+        search.run()
+        forced = None if forced is None else forces_on(case, search)
     progress("what cannot be told apart")
+    if forced is not None:
+        search = forced
+        first, bands = search.ratio(search.nominal.fitted), search.bands(search.nominal.fitted)
     judged = verdict.judge(search)
     nominal, best = search.nominal.fitted, judged.best
     plain, after, gap = search.shown(nominal, best.fitted)
+    if any(e.quasi is not None for e in best.effects) and gap.low > 0:
+        # Computed in time, and seen on lines that it was not fitted to.
+        judged = verdict.confirmed(judged)
     judged = verdict.shown(judged, gap, judged.evidence.drop / (TURN - 1))
     shown = Shown(
         first=first,
@@ -57,9 +63,19 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
         used=search.used(),
     )
     of_lines = case.clean.of_lines
-    judged, said = _consistent(search, judged)
+    judged, said = (judged, ()) if forced is not None else _consistent(search, judged)
     clean = replace(case.clean, told=tuple(w for w in case.clean.told if w not in of_lines))
     return told(replace(case, clean=clean), search, judged, shown, said)
+
+
+def forces_on(case: Case, search: RecordSearch) -> ForceSearch | None:
+    """The search among forces, where one explains the records best; None where none does, or where
+    the rig has no partial fractions in which it could be computed."""
+    whole = Whole.of(case.runs, search.rig, search.whole.band, search.by_line.table, apart=True)
+    try:
+        return compete_on_records(search, whole)
+    except SamiiRigError:
+        return None
 
 
 def _consistent(search: RecordSearch, judged: Judgement) -> tuple[Judgement, tuple[str, ...]]:

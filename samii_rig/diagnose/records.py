@@ -27,6 +27,7 @@ from samii_rig.diagnose.refit import Fitted, Problem, refit
 from samii_rig.diagnose.result import Band, Gap, Used
 from samii_rig.diagnose.search import Search
 from samii_rig.errors import SamiiRigError
+from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.noise import Shape
 from samii_rig.likelihood.pieces import Piece, Wiring, pieces_of, wiring
 from samii_rig.likelihood.reduce import Left, Records, Reduced, Response, left_by, reduced
@@ -58,6 +59,7 @@ class Whole:
     wired: Wiring
     ports: tuple[Effect, ...]
     left_out: tuple[tuple[str, str], ...] = ()
+    band: tuple[float, float] | None = None  # Hz, as it was asked for
 
     @classmethod
     def of(
@@ -66,16 +68,19 @@ class Whole:
         rig: Rig,
         band: tuple[float, float] | None = None,
         table: Sequence[Effect] = (),
+        *,
+        apart: bool = False,
     ) -> Whole:
         """All runs of one rig. table : in which the places are found where a force may act.
+        apart : the levels are not summed up.
 
         Raises EstimateError where they hold nothing to compare.
         """
         wired = wiring(runs, rig)
-        pieces = tuple(pieces_of(runs, rig, wired))
+        pieces = tuple(pieces_of(runs, rig, wired, apart=apart))
         bands = tuple(band or excited(piece, rig.rate_hz) for piece in pieces)
         ports = tuple(e for e in table if e.physics in FORCED and e.jump and not e.jump.fixed)
-        return cls(rig, Records(pieces, rig.rate_hz, bands), wired, ports)
+        return cls(rig, Records(pieces, rig.rate_hz, bands), wired, ports, band=band)
 
     @property
     def sensor(self) -> Int:
@@ -144,6 +149,11 @@ class Whole:
         """The likelihood near a fit, on the lines that are fitted."""
         shape = self.disturbed(fitted)
         return reduced(self.records, self.response(fitted), shape, self._loop, _fitted)
+
+    def complete(self, fitted: Fitted) -> Complete:
+        """The same, with what no linear model explains."""
+        shape = self.disturbed(fitted)
+        return Complete.about(self.records, self.response(fitted), shape, self._loop, _fitted)
 
     def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
         """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
@@ -307,9 +317,9 @@ class RecordSearch(Search):
         if left <= 1 + FIVE * math.sqrt(self.spread):
             return 1.0
         h = fitted.model.response(fitted.x, self.problem.at)
-        r = self.problem.residual(h)
         # What is left in the directions of the nodes, in units of what each would have.
         F = self.reduced.factor
+        r = self.problem.residual(h)[: F.shape[0]]
         pull = np.tensordot(r, F, 1) / np.linalg.norm(F, axis=0)
         pull = pull.reshape(-1, F.shape[3]).T
         power, alike = float(np.sum(pull**2)), 1.0
@@ -329,9 +339,13 @@ class RecordSearch(Search):
     def _nearest(self) -> Explanation:
         return self.ranked()[0]
 
+    def left(self, fitted: Fitted, *, shown: bool = False) -> Left:
+        """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
+        return self.whole.left(fitted, self.reduced, shown=shown)
+
     def bands(self, fitted: Fitted) -> tuple[Band, ...]:
         """Chi-square per degree of freedom of each sensor in each octave."""
-        left = self.whole.left(fitted, self.reduced)
+        left = self.left(fitted)
         out = []
         for low, high in octaves(left.frequency):
             inside = (left.frequency >= low) & (left.frequency < high)
@@ -349,7 +363,7 @@ class RecordSearch(Search):
 
     def shown(self, before: Fitted, after: Fitted) -> tuple[float, float, Gap]:
         """On the lines kept apart: chi-square per degree of freedom of both, and the gap closed."""
-        a, b = (self.whole.left(x, self.reduced, shown=True).chi2 for x in (before, after))
+        a, b = (self.left(x, shown=True).chi2 for x in (before, after))
         floor = np.full(a.size, 2.0 * self.whole.sensor.size)
         mean = float(np.sum(floor))
         return float(np.sum(a)) / mean, float(np.sum(b)) / mean, gap_of(a, b, floor)
