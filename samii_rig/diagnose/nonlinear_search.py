@@ -20,7 +20,7 @@ from samii_rig.diagnose.explanations import NEAR, Explanation, Explanations
 from samii_rig.diagnose.judge import threshold
 from samii_rig.diagnose.model import Model
 from samii_rig.diagnose.nonlinear_consistent import self_consistent
-from samii_rig.diagnose.nonlinear_forces import forces, moves, per_input
+from samii_rig.diagnose.nonlinear_forces import RANGE, forces, moves, per_input
 from samii_rig.diagnose.nonlinear_laws import EXCESS, GAP
 from samii_rig.diagnose.nonlinear_model import CAP, LevelModel, Quasi
 from samii_rig.diagnose.nonlinear_records import Chains, ForceProblem, Moved
@@ -39,6 +39,9 @@ WIDTHS = (3e-4, 2e-3, 1e-2, 4e-2, 0.15, 0.5)
 CLOSER = 2  # times that the best strength is looked at closer
 TIMES = (0.05, 20.0)  # of a strength, one such step
 TRIED = 4  # physics of which a force is refitted
+# Of what the best linear explanation gains, that a force gains in the screen, unless it gains
+# something beside that: strong ones were seen to gain 3 times as much once refitted.
+ENOUGH = 0.3
 PROMISING = 0.25  # of what the best force gains, at least
 AGAIN = 3  # times that the likelihood is made anew about the best explanation
 STILL = 0.5  # standard deviations, a move from one to the next that is none
@@ -195,6 +198,7 @@ class ForceSearch(RecordSearch):
         (unknown,) = effect.unknowns
         left = [look.left_by() for look in looks]
         tried: list[tuple[float, float, float]] = []
+        most = np.full(len(looks), -math.inf)
         starts = self._starts(effect)
         for turn in range(1 + CLOSER):
             for p in starts:
@@ -204,12 +208,17 @@ class ForceSearch(RecordSearch):
                     return None
                 gains = [_gained(g, look, r) for look, r in zip(looks, left, strict=True)]
                 tried.append((*max(gains), p))
+                most = np.maximum(most, [gain for gain, _ in gains])
             gain, times, p = max(tried)
             if turn == CLOSER or not math.isfinite(times) or times <= 0:
                 break
             starts = [self._scaled(model, p, times)]
             starts = [min(max(x, unknown.low), unknown.high) for x in starts]
         gain, _, p = max(tried)
+        # Beside the nominal parameters alone it must do as much as a linear effect did.
+        ahead = looks[0].base.cost - min(look.base.cost for look in looks)
+        if most[0] < ENOUGH * ahead and most[-1] < self.worth / 2:
+            return None
         return Hope(effect, gain, p) if gain > 0 else None
 
     def _starts(self, effect: Effect) -> list[float]:
@@ -222,7 +231,7 @@ class ForceSearch(RecordSearch):
             return [unknown.high / 2 * x for x in WIDTHS]
         if law is None:
             return [unknown.high * WEAK]
-        return [math.sqrt(unknown.low * unknown.high) * WEAK * 10]
+        return [unknown.low / RANGE[0] * WEAK]
 
     def _scaled(self, model: LevelModel, p: float, times: float) -> float:
         times = float(min(max(times, TIMES[0]), TIMES[1]))
@@ -287,7 +296,10 @@ def compete_on_records(linear: RecordSearch, whole: Whole) -> ForceSearch | None
 def _worth_while(hopes: Sequence[Hope], worth: float) -> list[Hope]:
     """Those that may be the best: of each physics the first, and the first's at other places."""
     some = [h for h in hopes if h.gain > max(worth / 2, PROMISING * hopes[0].gain)]
+    if not some:
+        return []
     first = {h.effect.physics: h for h in reversed(some)}
+    # Torques and angles of neighbouring joints go nearly together.
     elsewhere = [h for h in some[1:] if h.effect.physics == some[0].effect.physics]
     ranked = sorted(first.values(), key=lambda h: -h.gain)[:TRIED]
     return list({h.effect.key: h for h in (*ranked, *elsewhere[:TRIED])}.values())
