@@ -176,6 +176,10 @@ class Recording:
         """Names of all channels with this role, in column order."""
         return tuple(c.name for c in self.channels if c.role == role)
 
+    def place(self, segment: Segment) -> str:
+        """Where a segment is, for messages: the source, if there is one, and its name."""
+        return f"{self.source}, {segment.name}" if self.source else segment.name
+
     def cut(self, segment: Segment) -> Recording:
         """The samples of one segment as a recording of its own."""
         a, b = np.searchsorted(self.sequence, [segment.start, segment.stop])

@@ -19,7 +19,7 @@ from samii_rig.diagnose.result import Verdict
 from samii_rig.diagnose.wiring import FEW_LINES, lines_of, named, outputs_of, wired
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.rig.schema import Rig, parameters
-from samii_rig.types import FrequencyResponse
+from samii_rig.types import Finding, FrequencyResponse
 
 LOST_GAIN = 0.02  # relative change of one channel's gain between levels that is told
 FLAT = 2.0  # chi-square per degree of freedom up to which a change is a constant
@@ -41,8 +41,8 @@ class Sound:
     recordings cannot tell, in words. doubt : why nothing may be named, or None; guessed : the same
     of responses line by line, whole records have it not.
     units : channels whose unit was mended. mended : whether anything was, in the responses.
-    of_lines : of `told`, what concerns responses alone. spoilt : whether segments were left out for
-    what their samples are."""
+    of_lines : of `told`, what concerns responses alone. samples : why segments or channels were
+    left out for what their samples are."""
 
     responses: tuple[FrequencyResponse, ...]
     told: tuple[str, ...]
@@ -52,7 +52,13 @@ class Sound:
     mended: bool = False
     guessed: Doubt | None = None
     of_lines: frozenset[str] = frozenset()
-    spoilt: bool = False
+    samples: tuple[Finding, ...] = ()
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Outputs that every response holds."""
+        names = [[c.name for c in r.outputs] for r in self.responses]
+        return tuple(n for n in names[0] if all(n in other for other in names))
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics: 9.81 is not 9.80665."""
@@ -87,7 +93,8 @@ def sound(
         _belongs(r, rig)
     if responses:
         _covered(responses, band)
-    responses, doubt = _timed(responses, told)
+    given = responses
+    responses, doubt = _timed(given, told)
     finite, said = _finite(responses)
     mended, wiring, units = wired(finite, rig)
     steady, changed = _steady(mended)
@@ -103,10 +110,11 @@ def sound(
         mended=bool(said or wiring or changed),
         guessed=guessed,
         of_lines=frozenset(estimated(responses, OF_LINES)),
-        spoilt=any(
-            f.severity == "error" and f.kind not in (*OF_LINES, "gap")
-            for r in responses
+        samples=tuple(
+            f
+            for r in given
             for f in r.findings
+            if (f.severity == "error" and f.kind not in (*OF_LINES, "gap")) or f.kind == "clock"
         ),
     )
 

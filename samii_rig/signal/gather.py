@@ -57,7 +57,7 @@ def gather(
         if remark and remark not in group.findings:
             group.findings.append(remark)
         group.findings += seen.found
-        name = f"{recording.source}, {segment.name}" if recording.source else segment.name
+        name = recording.place(segment)
         z = cut.values[:, [cut.column(n) for n in own.names]]
         kept, breaks = _whole_rows(cut, seen.names)
         measured = np.ptp(z[kept][:, 1:]) > 0
