@@ -120,7 +120,7 @@ class StopRecord:
 class Finding:
     """Something noticed in the data that is not physics, in plain words.
 
-    kind : one of gap, clipping, range, stuck, repeat, leakage, timing, clock, offset,
+    kind : one of gap, clipping, range, resolution, stuck, repeat, leakage, timing, clock, offset,
         saturation, closed_loop, distortion, dof.
     severity : `note` tells, `warning` weakens the result, `error` made us exclude or refuse.
     """

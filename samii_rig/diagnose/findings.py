@@ -7,6 +7,7 @@ and left out where it is not, so that what is named afterwards does not rest on 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -56,9 +57,10 @@ class Sound:
 
     @property
     def sensors(self) -> tuple[str, ...]:
-        """Outputs that every response holds."""
-        names = [[c.name for c in r.outputs] for r in self.responses]
-        return tuple(n for n in names[0] if all(n in other for other in names))
+        """Outputs that half of the responses hold, or more: it costs less to leave out the records
+        of the others."""
+        held = Counter(c.name for r in self.responses for c in r.outputs)
+        return tuple(n for n, times in held.items() if 2 * times >= len(self.responses))
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics: 9.81 is not 9.80665."""
@@ -95,7 +97,7 @@ def sound(
         _covered(responses, band)
     given = responses
     responses, doubt = _timed(given, told)
-    finite, said = _finite(responses)
+    finite, said = _finite(_fine(responses))
     mended, wiring, units = wired(finite, rig)
     steady, changed = _steady(mended)
     guessed = None
@@ -114,7 +116,8 @@ def sound(
             f
             for r in given
             for f in r.findings
-            if (f.severity == "error" and f.kind not in (*OF_LINES, "gap")) or f.kind == "clock"
+            if (f.severity == "error" and f.kind not in (*OF_LINES, "gap"))
+            or (f.severity == "warning" and f.kind in ("clock", "resolution"))
         ),
     )
 
@@ -193,7 +196,9 @@ def _timed(
     responses: Sequence[FrequencyResponse], told: list[str]
 ) -> tuple[list[FrequencyResponse], Doubt | None]:
     """Without responses whose clock and rate disagree, as long as there are others."""
-    doubtful = [any(f.kind == "clock" for f in r.findings) for r in responses]
+    doubtful = [
+        any(f.kind == "clock" and f.severity != "note" for f in r.findings) for r in responses
+    ]
     if not any(doubtful):
         return list(responses), None
     if not all(doubtful):
@@ -206,6 +211,21 @@ def _timed(
         "set rate_hz to what the clock says, or mend the clock, and estimate again",
         "unknown",
     )
+
+
+def _fine(responses: Sequence[FrequencyResponse]) -> list[FrequencyResponse]:
+    """Without outputs whose rounding hides the response, which the estimate has told."""
+    out = []
+    for r in responses:
+        hidden = {f.channel for f in r.findings if f.kind == "resolution"}
+        keep = [i for i, c in enumerate(r.outputs) if c.name not in hidden]
+        if keep:
+            out.append(outputs_of(r, keep) if hidden else r)
+    if responses and not out:
+        raise EstimateError(
+            "no sensor moves by as much as one step of its converter; drive the rig harder"
+        )
+    return out
 
 
 def _finite(

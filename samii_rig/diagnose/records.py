@@ -32,6 +32,7 @@ from samii_rig.likelihood.noise import Shape
 from samii_rig.likelihood.pieces import Piece, Wiring, pieces_of, wiring
 from samii_rig.likelihood.reduce import Left, Records, Reduced, Response, left_by, reduced
 from samii_rig.rig.schema import Rig
+from samii_rig.signal.columns import aligned
 from samii_rig.signal.groups import segments_of
 from samii_rig.signal.statistics import octaves
 from samii_rig.types import Complex, Finding, Float, Int, Recording
@@ -78,6 +79,7 @@ class Whole:
 
         Raises EstimateError where they hold nothing to compare.
         """
+        runs = [aligned(run)[0] for run in runs]
         wired = wiring(runs, rig, sensors)
         bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
         without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
