@@ -18,10 +18,11 @@ MORE = 5.0  # standard deviations of chi-square beyond which it is more than noi
 def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | None:
     """The search on whole records, where they can be used as they are."""
     clean = case.clean
-    if not case.runs or clean.mended or clean.doubt or clean.spoilt:
+    if not case.runs or clean.mended or clean.doubt:
         return None
     try:
-        whole = Whole.of(case.runs, case.search.rig, band, case.search.table)
+        table = case.search.table
+        whole = Whole.of(case.runs, case.search.rig, band, table, clean.sensors, clean.samples)
         return RecordSearch(whole, case.search)
     except EstimateError:
         return None
@@ -35,13 +36,13 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
     # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
     search.run(briefly=True)
     progress("amplitude levels")
-    forced = forces_on(case, search)
+    forced = forces_on(search)
     if case.search.lines.torn():
         if forced is None:
             return None
     elif forced is None or not forced.is_enough():
         search.run()
-        forced = None if forced is None else forces_on(case, search)
+        forced = None if forced is None else forces_on(search)
     progress("what cannot be told apart")
     if forced is not None:
         search = forced
@@ -68,12 +69,11 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
     return told(replace(case, clean=clean), search, judged, shown, said)
 
 
-def forces_on(case: Case, search: RecordSearch) -> ForceSearch | None:
+def forces_on(search: RecordSearch) -> ForceSearch | None:
     """The search among forces, where one explains the records best; None where none does, or where
     the rig has no partial fractions in which it could be computed."""
-    whole = Whole.of(case.runs, search.rig, search.whole.band, search.by_line.table, apart=True)
     try:
-        return compete_on_records(search, whole)
+        return compete_on_records(search)
     except SamiiRigError:
         return None
 

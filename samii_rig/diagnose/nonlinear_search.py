@@ -100,7 +100,8 @@ class Hope:
 class ForceSearch(RecordSearch):
     """As `RecordSearch`, on the complete likelihood, with every level by itself."""
 
-    def __init__(self, linear: RecordSearch, whole: Whole) -> None:
+    def __init__(self, linear: RecordSearch) -> None:
+        whole = linear.whole.by_level()
         self._chains = Chains()
         self.linear = linear
         actuator = int(linear.grid.actuator[0])
@@ -284,12 +285,12 @@ def _gained(g: Float, look: Screen, left: Float) -> tuple[float, float]:
     return 2 * along - power, along / power
 
 
-def compete_on_records(linear: RecordSearch, whole: Whole) -> ForceSearch | None:
+def compete_on_records(linear: RecordSearch) -> ForceSearch | None:
     """Let forces compete with what the linear search of whole records found; None where none wins.
 
     Raises SamiiRigError where no force can be computed on this rig.
     """
-    search = ForceSearch(linear, whole)
+    search = ForceSearch(linear)
     return search if search.settled() else None
 
 
