@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 
 from samii_rig.diagnose import judge as verdict
+from samii_rig.diagnose.by_line import at_first, settled
 from samii_rig.diagnose.judge import Judgement
+from samii_rig.diagnose.nonlinear import compete
 from samii_rig.diagnose.nonlinear_search import ForceSearch, compete_on_records
 from samii_rig.diagnose.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.stages import Case, Progress, Shown, told
 from samii_rig.errors import EstimateError, SamiiRigError
 
+RIVALS = 4  # explanations of the records that forces must beat
 MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 
 
@@ -36,7 +39,7 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
     # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
     search.run(briefly=True)
     progress("amplitude levels")
-    forced = forces_on(search)
+    linear, forced = search, forces_on(search)
     if case.search.lines.torn():
         if forced is None:
             return None
@@ -54,6 +57,12 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
         # Computed in time, and seen on lines that it was not fitted to.
         judged = verdict.confirmed(judged)
     judged = verdict.shown(judged, gap, judged.evidence.drop / (TURN - 1))
+    judged, said = (judged, ()) if forced is not None else _consistent(search, judged)
+    if judged.verdict == "unknown":
+        if case.search.lines.torn():
+            return None
+        if (found := on_levels(case, linear, progress)) is not None:
+            return found
     shown = Shown(
         first=first,
         threshold=verdict.threshold(search.spread),
@@ -64,7 +73,6 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
         used=search.used(),
     )
     of_lines = case.clean.of_lines
-    judged, said = (judged, ()) if forced is not None else _consistent(search, judged)
     clean = replace(case.clean, told=tuple(w for w in case.clean.told if w not in of_lines))
     return told(replace(case, clean=clean), search, judged, shown, said)
 
@@ -76,6 +84,18 @@ def forces_on(search: RecordSearch) -> ForceSearch | None:
         return compete_on_records(search)
     except SamiiRigError:
         return None
+
+
+def on_levels(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis | None:
+    """What the lines of each level say, if a force among them wins, alone or beside linear effects:
+    of whole records nothing is known of both together."""
+    before = at_first(case)
+    for explanation in search.ranked()[:RIVALS]:
+        there = search.at_lines(explanation)
+        case.search.keep(there.effects, there.fitted)
+    if compete(case.search, case.responses, case.runs) is None:
+        return None
+    return settled(case, before, progress)
 
 
 def _consistent(search: RecordSearch, judged: Judgement) -> tuple[Judgement, tuple[str, ...]]:
