@@ -13,9 +13,14 @@ from cut_kit import DESIGN, cut_sweeps
 
 from samii_rig.diagnose.diagnose import diagnose, table
 from samii_rig.diagnose.effect import Effect, Unknown
+from samii_rig.diagnose.measured import measured
+from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.nonlinear_inner import Inner
 from samii_rig.diagnose.nonlinear_laws import CUBIC, FRICTION, GAP
 from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
+from samii_rig.diagnose.nonlinear_records import Chains, ForceProblem
+from samii_rig.diagnose.records import RecordProblem, Whole
+from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
@@ -87,7 +92,33 @@ def test_a_valve_that_lags_is_no_force(tmp_path: Path):
     assert [c.physics for c in found.causes] == ["actuator_lag"]
 
 
-def test_where_nothing_is_missing_no_force_is(tmp_path: Path):
-    found = found_in(cut_sweeps(tmp_path, design=ONE))
+@pytest.fixture(scope="module")
+def nothing(tmp_path_factory: pytest.TempPathFactory) -> list[Recording]:
+    return cut_sweeps(tmp_path_factory.mktemp("nothing"), design=ONE)
+
+
+def test_where_nothing_is_missing_no_force_is(nothing: list[Recording]):
+    found = found_in(nothing)
     assert found.verdict == "no_mismatch"
     assert found.causes == ()
+
+
+def test_linear_models_are_weighed_alike_with_and_without_the_lines_no_model_explains(
+    nothing: list[Recording],
+):
+    whole = Whole.of(nothing, SAMII).by_level()
+    model = Model(SAMII)
+    none = Fitted(model, np.zeros(model.n), 0.0, 0.0, np.zeros((0, model.n)), np.eye(model.n))
+    lines = measured(estimate(nothing), SAMII)
+    by_line = Problem.of(lines, grid(SAMII, lines.frequency, lines.sensor, lines.actuator))
+    few = RecordProblem.about(whole, none, by_line)
+    every = ForceProblem.near(whole, none, by_line, Chains())
+    chi2 = np.array(
+        [
+            [float(np.sum(problem.residual(h) ** 2)) for problem in (few, every)]
+            for h in (model.response(x, few.at) for x in (none.x, none.x + 1e-3))
+        ]
+    )
+    assert chi2[0, 1] - chi2[1, 1] == pytest.approx(chi2[0, 0] - chi2[1, 0], rel=1e-6)
+    # A disturbance that hardly shows is left out of the quadratic form alone.
+    assert chi2[0, 1] == pytest.approx(chi2[0, 0] + few.reduced.inside[0], rel=0.02)
