@@ -193,6 +193,11 @@ def test_a_run_is_seen_without_scrolling(page: Browser) -> None:
             page.press("Escape")
         page.until("document.getElementById('now').textContent.includes('output is at zero')")
     assert "stopped by " in page.text("now")
+    # Why it was stopped is asked once it is at rest, and stands where it says what is now.
+    page.until("!document.getElementById('why-stopped').hidden")
+    page.value("document.getElementById('why-stopped-text').value = 'a hose touched the frame'")
+    page.value("document.querySelector('#why-stopped button').click()")
+    page.until("document.getElementById('why-said').textContent.includes('a hose touched')")
 
 
 def seen_at_once(page: Browser) -> None:

@@ -6,6 +6,7 @@ import { Replay } from "/page/replay.js";
 import { known, live } from "/page/stopping.js";
 import { Lamps, bounds } from "/page/lamps.js";
 import { Fields } from "/page/fields.js";
+import { Why } from "/page/why.js";
 import { Notes } from "/page/notes.js";
 import { Panel } from "/page/panel.js";
 import { Recordings } from "/page/recordings.js";
@@ -51,6 +52,7 @@ function put(parent, tag, text, name = "") {
 }
 
 const lamps = new Lamps($, put);
+const why = new Why({ $, ask, tried });
 const panel = new Panel($, put, (text) => pin(text).catch((error) => alarm(error.message)));
 const notes = new Notes(ask, (texts) => { panel.notes = texts; panel.draw(); });
 // A note at a frequency is the run's, or the recording's where only recordings are shown.
@@ -174,6 +176,7 @@ function show(s) {
   lamps.state(s, moves);
   soFar.show(s);
   notes.about(s);
+  why.show(s);
   if (before && l && (!before.last || before.last.id !== l.id)) recordings.find();
 }
 
