@@ -111,7 +111,7 @@ def test_a_field_writes_the_file_and_each_limit_says_what_would_be_left(page: Br
     page.until("document.getElementById('text').value.includes('amplitudes = [0.1, 0.05]')")
     page.until(
         f"document.getElementById('checked').textContent === 'Within every limit.' && ({left})[0] !== {before[0]!r}"
-    )  # noqa: E501
+    )
     typed(page, "amplitudes", "Levels [rad]", "9")
     page.until("document.getElementById('checked').textContent.startsWith('Refused: theta_2')")
     typed(page, "repeats", "Repeats", "2.5")
@@ -172,7 +172,7 @@ def test_layout_and_colours_stay_with_the_browser(page: Browser) -> None:
     assert page.value("scope.span") == 2
     assert page.value(
         "document.getElementById('rig-here').contains(document.getElementById('motion'))"
-    )  # noqa: E501
+    )
     page.click("rig-size")
     page.choose("theme", "")
 
