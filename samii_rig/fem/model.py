@@ -124,7 +124,7 @@ class Fem:
                     complex(at),
                     "no pole, and no part without mass and stiffness",
                 ) from error
-            H[i] = m.angle @ x[:n] + at**2 * (m.acceleration @ x[:n])
+            H[i] = m.angle @ x[:n] + at * (m.velocity @ x[:n]) + at**2 * (m.acceleration @ x[:n])
             for sensor, row in m.moment:
                 H[i, sensor] = unit * x[n + row]
         return H

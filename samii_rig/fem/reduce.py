@@ -167,8 +167,7 @@ def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced
             rig.name, "flexible", flexible, "fewer modes: these leave a joint without inertia"
         )
 
-    position, acceleration = m.angle @ phi, m.acceleration @ phi
-    velocity = np.zeros_like(position)
+    position, velocity, acceleration = m.angle @ phi, m.velocity @ phi, m.acceleration @ phi
     carried = np.zeros((len(position), len(m.loads)))
     at_loads = [load.coordinate for load in m.loads]
     for sensor, row in m.moment:

@@ -5,9 +5,11 @@ All of it is computed here with numpy, once for all s of a call, and given to th
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
 
-from samii_rig.model import respond, timoshenko
+from samii_rig.model import respond, rod, timoshenko
 from samii_rig.model.chain import LINE_AT, SOURCE_WIDTH, WIDTH, CompiledChain
 from samii_rig.model.laws import LINE_FILTERS, POINTS, SOURCE_LAWS
 from samii_rig.model.registers import Factors
@@ -66,8 +68,13 @@ def _matrices(c: CompiledChain, s: Complex) -> Complex:
         if e in branches:
             out[row] = _branch_matrix(impedance(branches[e], s))
         else:
-            out[row] = timoshenko.matrix(s, c.system.pars[e])
+            out[row] = _law(c.kinds[e]).matrix(s, c.system.pars[e])
     return out
+
+
+def _law(kind: str) -> ModuleType:
+    """The module with matrix, scaling and gradient of an element of waves."""
+    return rod if kind == "rod" else timoshenko
 
 
 def impedance(inner: CompiledChain, s: Complex) -> Complex:
@@ -114,7 +121,7 @@ def add_waves(
         if e in branches:
             by = _branch_gradient(inner, s, z[row], zh[row])
         else:
-            by = timoshenko.gradient(s, x.pars[e], z[row], zh[row])
+            by = _law(c.kinds[e]).gradient(s, x.pars[e], z[row], zh[row])
         for m in np.flatnonzero((to >= 0) & (slots >= 0)):
             for source, (_, actuator) in enumerate(x.source):
                 dH[:, :, actuator, to[m]] += x.source_c[source, 4] * by[m, :, :, source]
@@ -168,7 +175,7 @@ def characteristic(c: CompiledChain, s: Complex, clear: bool) -> tuple[Complex, 
     branches = {e for e, _, _ in c.branches}
     for e in c.waves:
         if e not in branches:
-            factor, more = timoshenko.scaling(s, c.system.pars[e])
+            factor, more = _law(c.kinds[e]).scaling(s, c.system.pars[e])
             mantissa, log = mantissa * factor, log + more
     if not clear:
         return mantissa, log

@@ -229,19 +229,16 @@ LINE_FILTERS = {
     "lumped_line": (_lump_filter, _lump_filter_relative),
 }
 
+_ACROSS = Law(
+    W_V, lambda s, p: -_compliance(s, p), lambda s, p: -_compliance_slopes(s, p), _clear_spring
+)
+_TO_GROUND = Law(V_W, lambda s, p: -_impedance(s, p), lambda s, p: -_impedance_slopes(s, p))
 # By kind of element, parameters in the order of its class.
 POINTS: dict[str, Law] = {
     "torsional_spring": Law(THETA_M, _compliance, _compliance_slopes, _clear_spring),
-    "translational_spring": Law(
-        W_V,
-        lambda s, p: -_compliance(s, p),
-        lambda s, p: -_compliance_slopes(s, p),
-        _clear_spring,
-    ),
+    **dict.fromkeys(("translational_spring", "spring", "damper"), _ACROSS),
     "torsional_ground_spring": Law(M_THETA, _impedance, _impedance_slopes),
-    "translational_ground_spring": Law(
-        V_W, lambda s, p: -_impedance(s, p), lambda s, p: -_impedance_slopes(s, p)
-    ),
+    **dict.fromkeys(("translational_ground_spring", "ground_spring", "ground_damper"), _TO_GROUND),
     "gravity_stiffness": Law(M_THETA, _constant, _constant_slopes),
     "oil_column": Law(THETA_M, _oil, _oil_slopes),
     "hydraulic_line": Law(THETA_M, _line, _line_slopes, _clear_line),
@@ -290,10 +287,37 @@ def _effort_relative(s: Complex, p: Float) -> Complex:
     return np.stack([np.ones_like(s), K * s / p[1] ** 2 / (1 + s / p[1]), -K * s])
 
 
+def _second_at_rest(s: Complex, p: Float) -> Complex:
+    """omega^2/(s^2 + 2 zeta omega s + omega^2): p = K, omega, zeta, tau."""
+    return np.asarray(p[1] ** 2 * _table(s, p))
+
+
+def _second_at_rest_relative(s: Complex, p: Float) -> Complex:
+    K, w = p[0], p[1]
+    relative = _table_relative(s, p)
+    relative[1] += 2 * K / w
+    return relative
+
+
+def _table(s: Complex, p: Float) -> Complex:
+    """1/(s^2 + 2 zeta omega s + omega^2): p = K, omega, zeta, tau."""
+    return np.asarray(_inverse(s**2 + 2 * p[2] * p[1] * s + p[1] ** 2) * _late(s, p[3]))
+
+
+def _table_relative(s: Complex, p: Float) -> Complex:
+    K, w, zeta = p[0], p[1], p[2]
+    N = s**2 + 2 * zeta * w * s + w**2
+    return np.stack([np.ones_like(s), -K * (2 * zeta * s + 2 * w) / N, -2 * K * w * s / N, -K * s])
+
+
 _ANGLE = (0.0, 0.0, -1.0, 0.0)  # theta jumps by +1
+_WAY = (0.0, 0.0, 0.0, 1.0)  # w jumps by +1
 SOURCE_LAWS: dict[str, SourceLaw] = {
     "angular_velocity_source": SourceLaw(_ANGLE, _first, _first_relative),
     "angular_velocity_source_2": SourceLaw(_ANGLE, _second, _second_relative),
     "torque_source": SourceLaw((0.0, -1.0, 0.0, 0.0), _effort, _effort_relative),  # M by -1
     "force_source": SourceLaw((-1.0, 0.0, 0.0, 0.0), _effort, _effort_relative),  # V by +1
+    "displacement_source": SourceLaw(_WAY, _second_at_rest, _second_at_rest_relative),
+    "velocity_source": SourceLaw(_WAY, _first, _first_relative),
+    "acceleration_source": SourceLaw(_WAY, _table, _table_relative),
 }

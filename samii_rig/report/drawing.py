@@ -11,11 +11,16 @@ from html import escape
 
 from samii_rig.report.compare import pretty
 from samii_rig.rig.elements import (
+    MOTION_SOURCES,
     SOURCES,
     Beam,
     Element,
+    ForceSource,
     GravityStiffness,
+    LumpedMass,
+    Parameter,
     RigidLink,
+    Rod,
     TimoshenkoBeam,
     TorsionalGroundSpring,
     TorsionalSpring,
@@ -23,7 +28,16 @@ from samii_rig.rig.elements import (
     TranslationalSpring,
     parameters,
 )
-from samii_rig.rig.schema import AbsoluteAngle, Acceleration, Moment, RelativeAngle, Rig
+from samii_rig.rig.schema import (
+    AbsoluteAngle,
+    Acceleration,
+    Displacement,
+    Force,
+    Moment,
+    RelativeAngle,
+    Rig,
+    Velocity,
+)
 
 # All in user units of the drawing, about a pixel.
 _BEAM, _LINK, _SPRING, _SOURCE, _OTHER = 190.0, 96.0, 44.0, 56.0, 70.0  # widths
@@ -82,7 +96,7 @@ def draw(rig: Rig, suspects: Mapping[str, Suspect] | None = None) -> str:
 
 def _width(element: Element) -> float:
     match element:
-        case Beam() | TimoshenkoBeam():
+        case Beam() | TimoshenkoBeam() | Rod():
             return _BEAM
         case RigidLink():
             return _LINK
@@ -94,7 +108,7 @@ def _width(element: Element) -> float:
 def _element(element: Element, a: float, b: float) -> str:
     y, middle = _AXIS, (a + b) / 2
     match element:
-        case Beam() | TimoshenkoBeam():
+        case Beam() | TimoshenkoBeam() | Rod():
             return f'<rect class="beam" x="{a:.1f}" y="{y - 4}" width="{b - a:.1f}" height="8"/>'
         case RigidLink():
             span = element.L.value
@@ -104,6 +118,8 @@ def _element(element: Element, a: float, b: float) -> str:
                 f'height="{2 * _HALF}" rx="7"/>'
                 f'<circle class="centre" cx="{at:.1f}" cy="{y}" r="3.5"/>'
             )
+        case TranslationalSpring() if element.k.value == 0:
+            return _dashpot(a, b)
         case TorsionalSpring() | TranslationalSpring():
             steps = 6
             w = (b - a - 12) / steps
@@ -115,6 +131,11 @@ def _element(element: Element, a: float, b: float) -> str:
     along = f'<path class="spring" d="M{a:.1f} {y}H{b:.1f}"/>'
     if isinstance(element, SOURCES):
         up = y + 17
+        if isinstance(element, (ForceSource, *MOTION_SOURCES)):
+            return (
+                f'{along}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
+                f'<path class="arrow" d="M{middle - 9:.1f} {y}h18m-5 -5l5 5l-5 5"/>'
+            )
         return (
             f'{along}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
             f'<path class="arrow" d="M{middle - 8:.1f} {up - 12:.1f}a10 10 0 1 1 15 0'
@@ -138,17 +159,22 @@ def _element(element: Element, a: float, b: float) -> str:
 def _label(element: Element, x: float, y: float) -> str:
     match element:
         case Beam() | TimoshenkoBeam():
-            detail = f"EI {_si(element.EI.value, pretty('N m^2'))}, {element.L.value:.3g} m"
+            detail = f"EI {_value(element.EI)}, {_value(element.L)}"
+        case Rod():
+            detail = f"EA {_value(element.EA)}, {_value(element.L)}"
         case RigidLink():
-            detail = f"{element.m.value:.3g} kg, {element.L.value:.3g} m"
+            detail = f"{_value(element.m)}, {_value(element.L)}"
+        case LumpedMass() if element.m.value > 0:
+            detail = _value(element.m)
         case _ if isinstance(element, SOURCES):
             detail = f"input {element.input}"
         case _:
             found = parameters(element)
             detail = element.kind.replace("_", " ")
-            if found:
-                symbol, p = next(iter(found.items()))
-                detail = f"{symbol} {_si(p.value, pretty(p.unit))}"
+            told = [(symbol, p) for symbol, p in found.items() if p.value != 0]
+            if told:
+                symbol, p = told[0]
+                detail = f"{symbol} {_value(p)}"
     top = _AXIS + (_DROP + 8 if isinstance(element, _TO_GROUND) else 22)
     leader = f'<path class="leader" d="M{x:.1f} {top}V{y - 15:.1f}"/>' if top < y - 15 else ""
     return (
@@ -193,7 +219,10 @@ def _sensors(
         match sensor:
             case RelativeAngle():
                 span = spans[sensor.across[0]][0], spans[sensor.across[-1]][1]
-            case AbsoluteAngle() | Moment():
+            case Displacement() | Velocity() if sensor.against is not None:
+                one, other = spans[sensor.against][1], spans[sensor.after][1]
+                span = min(one, other), max(one, other)
+            case AbsoluteAngle() | Moment() | Displacement() | Velocity() | Force():
                 span = (spans[sensor.after][1],) * 2
             case Acceleration():
                 a, b = spans[sensor.on]
@@ -217,6 +246,21 @@ def _sensors(
             f'<text class="sensorname{style}" x="{x:.1f}" y="{row:.1f}">{escape(text)}</text>'
         )
     return out
+
+
+def _dashpot(a: float, b: float) -> str:
+    """A pot open to the left and the piston in it."""
+    y, m = _AXIS, (a + b) / 2
+    return (
+        f'<path class="spring" d="M{a:.1f} {y}H{m:.1f}m0 -7v14'
+        f'M{m - 8:.1f} {y - 10}H{m + 9:.1f}v20H{m - 8:.1f}M{m + 9:.1f} {y}H{b:.1f}"/>'
+    )
+
+
+def _value(p: Parameter) -> str:
+    """A parameter as the file writes it; in the SI with a prefix of thousands."""
+    value, unit = p.shown()
+    return f"{value:.4g} {pretty(unit)}" if p.written else _si(value, pretty(unit))
 
 
 def _si(value: float, unit: str) -> str:

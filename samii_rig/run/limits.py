@@ -12,10 +12,13 @@ from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     AbsoluteAngle,
     ActuatorSpec,
+    Displacement,
     Feedback,
     RelativeAngle,
     Rig,
     Sensor,
+    TranslationalGroundSpring,
+    VelocitySource,
 )
 from samii_rig.run.agreement import Agreement
 from samii_rig.run.protocols import DeviceLoop
@@ -268,7 +271,8 @@ def _refuse_blind(
     where, follows = f"sensor[{sensor.name}]", _angle_gain(rig, actuator.name, sensor) != 0.0
     if centring and not follows:
         expected = (
-            f"an angle that {actuator.name} turns through an angular velocity source, or kp = 0: "
+            f"an angle that {actuator.name} turns through an angular velocity source, or a "
+            "displacement through a velocity source, or kp = 0: "
             "the gate sees no other one stand still in time"
         )
         raise InputError(
@@ -283,10 +287,12 @@ def _refuse_blind(
 
 
 def _angle_gain(rig: Rig, actuator: str, sensor: Sensor) -> float:
-    """Low-frequency rad/s of the sensor per unit of the actuator; 0 if the angle does not
-    follow it: slowly turned, springs and beams of a clamped chain turn along. A torque or a
-    force turns nothing at a known speed."""
+    """Low-frequency rad/s or m/s of the sensor per unit of the actuator; 0 if it does not
+    follow it: slowly turned or pushed, springs and beams of a clamped chain go along. A torque or a
+    force moves nothing at a known speed."""
     order = [e.name for e in rig.element]
+    if isinstance(sensor, Displacement):
+        return _way_gain(rig, actuator, sensor, order)
     if isinstance(sensor, RelativeAngle):
         seen = set(sensor.across)
     elif isinstance(sensor, AbsoluteAngle) and rig.base == "clamped":
@@ -297,6 +303,21 @@ def _angle_gain(rig: Rig, actuator: str, sensor: Sensor) -> float:
         e.K.value
         for e in rig.element
         if isinstance(e, ANGLE_SOURCES) and e.input == actuator and e.name in seen
+    )
+
+
+def _way_gain(rig: Rig, actuator: str, sensor: Displacement, order: list[str]) -> float:
+    """The same of a displacement, which velocity sources push; what is held behind them gives
+    way at no known speed."""
+    held = any(isinstance(e, TranslationalGroundSpring) and e.k.value > 0 for e in rig.element)
+    if held or rig.tip != "free" or (sensor.against is None and rig.base != "clamped"):
+        return 0.0
+    first = 0 if sensor.against is None else order.index(sensor.against) + 1
+    last = order.index(sensor.after) + 1
+    between = rig.element[min(first, last) : max(first, last)]
+    sign = 1.0 if last >= first else -1.0
+    return sign * sum(
+        e.K.value for e in between if isinstance(e, VelocitySource) and e.input == actuator
     )
 
 
