@@ -76,7 +76,7 @@ def draw(rig: Rig, suspects: Mapping[str, Suspect] | None = None) -> str:
         if element.name in suspects:
             shapes.insert(0, _halo(suspects[element.name], x, end))
             shapes.append(_suspicion(suspects[element.name], (x + end) / 2, row))
-        shapes.append(_element(element, x, end))
+        shapes.append(_element(element, x, end, rig.motion == "axial"))
         shapes.append(_label(element, (x + end) / 2, row))
         x = end
     width = x + _MARGIN
@@ -105,7 +105,7 @@ def _width(element: Element) -> float:
     return _SOURCE if isinstance(element, SOURCES) else _OTHER
 
 
-def _element(element: Element, a: float, b: float) -> str:
+def _element(element: Element, a: float, b: float, along: bool) -> str:
     y, middle = _AXIS, (a + b) / 2
     match element:
         case Beam() | TimoshenkoBeam() | Rod():
@@ -128,16 +128,19 @@ def _element(element: Element, a: float, b: float) -> str:
                 for k in range(steps)
             )
             return f'<path class="spring" d="{path}h6"/>'
-    along = f'<path class="spring" d="M{a:.1f} {y}H{b:.1f}"/>'
+    line = f'<path class="spring" d="M{a:.1f} {y}H{b:.1f}"/>'
     if isinstance(element, SOURCES):
         up = y + 17
         if isinstance(element, (ForceSource, *MOTION_SOURCES)):
+            arrow = f"M{middle:.1f} {y + 9}v-18m-5 5l5 -5l5 5"
+            if along:
+                arrow = f"M{middle - 9:.1f} {y}h18m-5 -5l5 5l-5 5"
             return (
-                f'{along}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
-                f'<path class="arrow" d="M{middle - 9:.1f} {y}h18m-5 -5l5 5l-5 5"/>'
+                f'{line}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
+                f'<path class="arrow" d="{arrow}"/>'
             )
         return (
-            f'{along}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
+            f'{line}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
             f'<path class="arrow" d="M{middle - 8:.1f} {up - 12:.1f}a10 10 0 1 1 15 0'
             f'm-5 -1l5 1l1 -6"/>'
         )
@@ -147,11 +150,11 @@ def _element(element: Element, a: float, b: float) -> str:
         )
         hatch = "".join(f"M{middle - 14 + 7 * k:.1f} {y + _DROP}l-5 5" for k in range(5))
         return (
-            f'{along}<path class="spring" d="M{middle:.1f} {y}v5{turns}v5"/>'
+            f'{line}<path class="spring" d="M{middle:.1f} {y}v5{turns}v5"/>'
             f'<path class="ground" d="M{middle - 16:.1f} {y + _DROP}h32{hatch}"/>'
         )
     return (
-        f'{along}<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
+        f'{line}<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
         f'height="{2 * _HALF}"/>'
     )
 
@@ -164,16 +167,17 @@ def _label(element: Element, x: float, y: float) -> str:
             detail = f"EA {_value(element.EA)}, {_value(element.L)}"
         case RigidLink():
             detail = f"{_value(element.m)}, {_value(element.L)}"
-        case LumpedMass() if element.m.value > 0:
-            detail = _value(element.m)
+        case LumpedMass():
+            told = [p for p in (element.m, element.I) if p.value > 0]
+            detail = ", ".join(_value(p) for p in told)
         case _ if isinstance(element, SOURCES):
             detail = f"input {element.input}"
         case _:
             found = parameters(element)
             detail = element.kind.replace("_", " ")
-            told = [(symbol, p) for symbol, p in found.items() if p.value != 0]
-            if told:
-                symbol, p = told[0]
+            first = next(((symbol, p) for symbol, p in found.items() if p.value != 0), None)
+            if first:
+                symbol, p = first
                 detail = f"{symbol} {_value(p)}"
     top = _AXIS + (_DROP + 8 if isinstance(element, _TO_GROUND) else 22)
     leader = f'<path class="leader" d="M{x:.1f} {top}V{y - 15:.1f}"/>' if top < y - 15 else ""
