@@ -20,7 +20,15 @@ from samii_rig.run.experiments import load_experiment
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
 
-BENCHES = ("one_mass", "two_masses", "three_masses", "beam_on_shaker", "flexible_joint", "carriage")
+BENCHES = (
+    "one_mass",
+    "two_masses",
+    "three_masses",
+    "beam_on_shaker",
+    "flexible_joint",
+    "carriage",
+    "spindle_drive",
+)
 
 
 def swept(rig: Rig, text: str, truth: Rig, folder: Path) -> Recording:

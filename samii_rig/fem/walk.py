@@ -18,6 +18,7 @@ from samii_rig.errors import InputError
 from samii_rig.fem import hermite, lagrange
 from samii_rig.fem.drive import Feedback, Load, Prescribed, law
 from samii_rig.fem.mechanism import Mechanism, Places
+from samii_rig.rig.axial import turning
 from samii_rig.rig.elements import End
 from samii_rig.rig.schema import (
     MOTION_SOURCES,
@@ -33,6 +34,7 @@ from samii_rig.rig.schema import (
     Element,
     Force,
     ForceSource,
+    Gear,
     GravityStiffness,
     LumpedLine,
     LumpedMass,
@@ -43,6 +45,7 @@ from samii_rig.rig.schema import (
     RigidLink,
     Rod,
     Sensor,
+    Spindle,
     TimoshenkoBeam,
     TorqueSource,
     TorsionalGroundSpring,
@@ -106,9 +109,10 @@ class Walk:
 
     def base(self) -> None:
         """Fix the base as the rig file says."""
-        if self._rig.base == "free":
+        turns = self._rig.motion == "lateral" or bool(turning(self._rig))
+        if self._rig.base == "free" and not turning(self._rig):
             self.w = self._new()
-        if self._rig.base != "clamped" and self._rig.motion == "lateral":
+        if self._rig.base != "clamped" and turns:
             self.theta = self._new()
         self._place("")
 
@@ -129,6 +133,12 @@ class Walk:
                 self._body(0.0, 0.0, e.m.value, e.I.value, e.name)
             case Rod():
                 self._rod(e)
+            case Gear():
+                node = self._point(e.name)
+                self.theta = {node + 1: 1 / e.n.value}
+            case Spindle():
+                node = self._point(e.name)
+                self.w, self.theta = {node + 1: e.lead.value}, {}
             case TorsionalSpring():
                 j = self._joint(e.name)
                 if e.name in rigid:

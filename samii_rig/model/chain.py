@@ -31,6 +31,7 @@ from samii_rig.model.registers import (
     System,
 )
 from samii_rig.model.sensing import source_feed, terms
+from samii_rig.rig.axial import turning
 from samii_rig.rig.schema import (
     BEAMS,
     LINES,
@@ -39,10 +40,12 @@ from samii_rig.rig.schema import (
     Beam,
     Branch,
     Element,
+    Gear,
     LumpedMass,
     Rig,
     RigidLink,
     Rod,
+    Spindle,
     TimoshenkoBeam,
     TorsionalSpring,
     parameters,
@@ -50,8 +53,10 @@ from samii_rig.rig.schema import (
 from samii_rig.types import Float, Int
 
 ENDS = {"free": FREE_END, "pinned": PINNED, "clamped": CLAMPED}
-# Of a chain that moves along itself theta is free at the base, held at the tip and so 0.
-AXIAL_BASE = {"free": "free", "clamped": "pinned"}
+# Of a chain that moves along itself theta is free at the base, held at the tip and so 0; of one
+# that turns first and slides behind its spindle, w is free at the base in its place.
+AXIAL_BASE = {"free": FREE_END, "clamped": PINNED}
+TURNING_BASE = {"free": FREE_END, "clamped": GUIDED}
 AXIAL_TIP = {"free": GUIDED, "clamped": CLAMPED}
 WIDTH = 7  # the most parameters that an element has
 L_OF_BEAM = 2  # place of L among the beams' parameters
@@ -121,7 +126,7 @@ def _kind(element: Element) -> int:
     match element:
         case Beam():
             return BEAM_KIND
-        case TimoshenkoBeam() | Branch() | Rod():
+        case TimoshenkoBeam() | Branch() | Rod() | Gear() | Spindle():
             return WAVES
         case RigidLink() | LumpedMass():
             return LINK
@@ -253,7 +258,8 @@ def compile_chain(rig: Rig, extra: Mapping[str, Sequence[float]] | None = None) 
     dual = np.array([SOURCE_LAWS[kind].dual for kind in parts.sources]).reshape(-1, 4)
     ends = ENDS[rig.base], ENDS[rig.tip]
     if rig.motion == "axial":
-        ends = ENDS[AXIAL_BASE[rig.base]], AXIAL_TIP[rig.tip]
+        base = TURNING_BASE if turning(rig) else AXIAL_BASE
+        ends = base[rig.base], AXIAL_TIP[rig.tip]
     return _assemble(
         parts,
         ends,

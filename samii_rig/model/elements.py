@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from samii_rig.model.laws import POINTS, SOURCE_LAWS
+from samii_rig.model.transformer import plain
 from samii_rig.rig.schema import (
     MOTION_SOURCES,
     SOURCES,
@@ -23,9 +24,11 @@ from samii_rig.rig.schema import (
     Branch,
     Element,
     ForceSource,
+    Gear,
     LumpedMass,
     RigidLink,
     Rod,
+    Spindle,
     TimoshenkoBeam,
     TorqueSource,
     TorsionalSpring,
@@ -196,6 +199,10 @@ def matrix(element: Element, s: Complex) -> Complex:
             return torsional_spring_matrix(s, **p)
         case Rod():
             return rod_matrix(s, **p)
+        case Gear() | Spindle():
+            U = _identity(np.asarray(s, dtype=complex))
+            U[..., :4, :4] = plain(element.kind, *p.values())
+            return U
         case Branch():
             return branch_matrix(element, s)
     if not isinstance(element, SOURCES):

@@ -16,6 +16,7 @@ from samii_rig.rig.schema import (
     Acceleration,
     Displacement,
     Force,
+    Gear,
     Moment,
     RelativeAngle,
     Rig,
@@ -72,7 +73,7 @@ def terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Int, Float]:
                     law = POINTS.get(element.kind)
                     if law and law.pair == THETA_M:
                         add(i, before[name], M=1.0, factor=COMPLIANCE, spring=before[name])
-                    elif isinstance(element, BEAMS):
+                    elif isinstance(element, (*BEAMS, Gear)):
                         add(i, behind[name], theta=1.0)
                         add(i, before[name], theta=-1.0)
             case AbsoluteAngle():

@@ -16,11 +16,13 @@ from samii_rig.rig.elements import (
     Beam,
     Element,
     ForceSource,
+    Gear,
     GravityStiffness,
     LumpedMass,
     Parameter,
     RigidLink,
     Rod,
+    Spindle,
     TimoshenkoBeam,
     TorsionalGroundSpring,
     TorsionalSpring,
@@ -42,6 +44,7 @@ from samii_rig.rig.schema import (
 # All in user units of the drawing, about a pixel.
 _BEAM, _LINK, _SPRING, _SOURCE, _OTHER = 190.0, 96.0, 44.0, 56.0, 70.0  # widths
 _DROP = 34.0  # from the chain down to the ground beside it
+_POT = "v9m-6 0h12m-16 -4v14h20v-14m-10 14"  # a dashpot, 24 high, as a spring's turns are
 _SERIES = (TorsionalSpring, TranslationalSpring)
 _TO_GROUND = (TorsionalGroundSpring, TranslationalGroundSpring, GravityStiffness)
 _MARGIN = 64.0
@@ -145,13 +148,25 @@ def _element(element: Element, a: float, b: float, along: bool) -> str:
             f'm-5 -1l5 1l1 -6"/>'
         )
     if isinstance(element, _TO_GROUND):
+        damps = not isinstance(element, GravityStiffness) and element.k.value == 0
         turns = "".join(
             f"l{7 if k % 2 == 0 else -7} 3l{-7 if k % 2 == 0 else 7} 3" for k in range(4)
         )
         hatch = "".join(f"M{middle - 14 + 7 * k:.1f} {y + _DROP}l-5 5" for k in range(5))
         return (
-            f'{line}<path class="spring" d="M{middle:.1f} {y}v5{turns}v5"/>'
+            f'{line}<path class="spring" d="M{middle:.1f} {y}v5{_POT if damps else turns}v5"/>'
             f'<path class="ground" d="M{middle - 16:.1f} {y + _DROP}h32{hatch}"/>'
+        )
+    if isinstance(element, Gear):
+        return (
+            f'{line}<circle class="link" cx="{middle - 11:.1f}" cy="{y}" r="10"/>'
+            f'<circle class="link" cx="{middle + 16:.1f}" cy="{y}" r="17"/>'
+        )
+    if isinstance(element, Spindle):
+        thread = "".join(f"M{a + 10 + 8 * k:.1f} {y + _HALF}l8 {-2 * _HALF}" for k in range(6))
+        return (
+            f'{line}<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
+            f'height="{2 * _HALF}"/><path class="spring" d="{thread}"/>'
         )
     return (
         f'{line}<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
@@ -264,6 +279,8 @@ def _dashpot(a: float, b: float) -> str:
 def _value(p: Parameter) -> str:
     """A parameter as the file writes it; in the SI with a prefix of thousands."""
     value, unit = p.shown()
+    if unit == "1":
+        return f"{value:.4g}"
     return f"{value:.4g} {pretty(unit)}" if p.written else _si(value, pretty(unit))
 
 

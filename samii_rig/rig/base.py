@@ -150,6 +150,15 @@ def some_stiffness(v: Mapping[str, float]) -> str | None:
     return "k and c are both 0; expected one above 0" if v["k"] == 0 and v["c"] == 0 else None
 
 
+def not_zero(symbol: str) -> Rule:
+    """The rule of a ratio."""
+
+    def rule(v: Mapping[str, float]) -> str | None:
+        return f"{symbol} is 0; expected another number" if v[symbol] == 0 else None
+
+    return rule
+
+
 def some_mass(v: Mapping[str, float]) -> str | None:
     """The rule of a body."""
     return "I without m; expected a mass above 0" if v["m"] == 0 and v["I"] > 0 else None

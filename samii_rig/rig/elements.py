@@ -27,6 +27,7 @@ from samii_rig.rig.base import (
     contradiction,
     converted,
     not_negative,
+    not_zero,
     parameters,
     positive,
     quantities,
@@ -105,6 +106,38 @@ class LumpedMass(ElementBase):
     kind: Literal["lumped_mass", "mass"]
     m: Annotated[Parameter, not_negative("kg")]
     I: Annotated[Parameter, not_negative("kg m^2")] = zero("kg m^2")  # noqa: E741
+
+
+class Inertia(LumpedMass):
+    """A lumped mass that only turns: a rotor, a flywheel, a pulley."""
+
+    kind: Literal["inertia"]  # type: ignore[assignment]
+    m: Annotated[Parameter, not_negative("kg")] = zero("kg")
+    I: Annotated[Parameter, positive("kg m^2")]  # noqa: E741
+
+
+class Gear(ElementBase):
+    """A gear or belt drive without play: theta+ = theta-/n, M+ = n M-.
+
+    n is how often the base's side turns for one turn behind it; negative for the other sense.
+    """
+
+    rule: ClassVar[Rule | None] = not_zero("n")
+
+    kind: Literal["gear"]
+    n: Annotated[Parameter, AfterValidator(Quantity("1", "any"))]
+
+
+class Spindle(ElementBase):
+    """From rotation to translation, a screw or a rack: w+ = lead theta-, V+ = -M-/lead.
+
+    Before it an axial chain turns, behind it it slides; what turned stays behind.
+    """
+
+    rule: ClassVar[Rule | None] = not_zero("lead")
+
+    kind: Literal["spindle"]
+    lead: Annotated[Parameter, AfterValidator(Quantity("m/rad", "any"))]
 
 
 class TorsionalSpring(ElementBase):
@@ -321,6 +354,7 @@ Passive = Annotated[
     | TimoshenkoBeam
     | RigidLink
     | LumpedMass
+    | Inertia
     | TorsionalSpring
     | TranslationalSpring
     | TorsionalGroundSpring
@@ -357,12 +391,16 @@ MOTION_SOURCES = (DisplacementSource, VelocitySource, AccelerationSource)  # pre
 SOURCES = (*ANGLE_SOURCES, TorqueSource, ForceSource, *MOTION_SOURCES)
 BEAMS = (Beam, TimoshenkoBeam)
 LINES = (HydraulicLine, LumpedLine)
+TRANSFORMERS = (Gear, Spindle)
 
 Element = Annotated[
     Beam
     | TimoshenkoBeam
     | RigidLink
     | LumpedMass
+    | Inertia
+    | Gear
+    | Spindle
     | TorsionalSpring
     | TranslationalSpring
     | TorsionalGroundSpring
@@ -392,6 +430,19 @@ AXIAL = (
     Branch,
     ForceSource,
     *MOTION_SOURCES,
+)
+
+# What may stand before its spindle.
+TURNING = (
+    LumpedMass,
+    TorsionalSpring,
+    TorsionalGroundSpring,
+    GravityStiffness,
+    OilColumn,
+    Gear,
+    *LINES,
+    *ANGLE_SOURCES,
+    TorqueSource,
 )
 
 

@@ -28,6 +28,7 @@ from samii_rig.rig.schema import (
     MOTION_SOURCES,
     SOURCES,
     Force,
+    ForceSource,
     GravityStiffness,
     Moment,
     Rig,
@@ -187,7 +188,9 @@ def _joint_moments(rig: Rig, actuator: str) -> tuple[Moment | Force, ...]:
     for before, e in zip((None, *rig.element), rig.element, strict=False):
         if not isinstance(e, SOURCES) or e.input != actuator:
             continue
-        pulls = rig.motion == "axial" or isinstance(e, MOTION_SOURCES)
+        pulls = isinstance(e, MOTION_SOURCES) or (
+            rig.motion == "axial" and isinstance(e, ForceSource)
+        )
         name = f"{'F' if pulls else 'M'}_{e.name}"[:40]
         passes = isinstance(e, (*ANGLE_SOURCES, *MOTION_SOURCES))
         at = (e if before is None or passes else before).name

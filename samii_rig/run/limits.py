@@ -9,14 +9,17 @@ from samii_rig.errors import InputError
 from samii_rig.model.feedback import reach
 from samii_rig.rig import schema
 from samii_rig.rig.schema import (
-    ANGLE_SOURCES,
     AbsoluteAngle,
     ActuatorSpec,
+    AngularVelocitySource,
+    AngularVelocitySource2,
     Displacement,
     Feedback,
+    Gear,
     RelativeAngle,
     Rig,
     Sensor,
+    Spindle,
     TranslationalGroundSpring,
     VelocitySource,
 )
@@ -290,35 +293,36 @@ def _angle_gain(rig: Rig, actuator: str, sensor: Sensor) -> float:
     """Low-frequency rad/s or m/s of the sensor per unit of the actuator; 0 if it does not
     follow it: slowly turned or pushed, springs and beams of a clamped chain go along. A torque or a
     force moves nothing at a known speed."""
-    order = [e.name for e in rig.element]
-    if isinstance(sensor, Displacement):
-        return _way_gain(rig, actuator, sensor, order)
-    if isinstance(sensor, RelativeAngle):
-        seen = set(sensor.across)
-    elif isinstance(sensor, AbsoluteAngle) and rig.base == "clamped":
-        seen = set(order[: order.index(sensor.after) + 1])
-    else:
-        return 0.0
-    return sum(
-        e.K.value
-        for e in rig.element
-        if isinstance(e, ANGLE_SOURCES) and e.input == actuator and e.name in seen
-    )
-
-
-def _way_gain(rig: Rig, actuator: str, sensor: Displacement, order: list[str]) -> float:
-    """The same of a displacement, which velocity sources push; what is held behind them gives
-    way at no known speed."""
     held = any(isinstance(e, TranslationalGroundSpring) and e.k.value > 0 for e in rig.element)
-    if held or rig.tip != "free" or (sensor.against is None and rig.base != "clamped"):
-        return 0.0
-    first = 0 if sensor.against is None else order.index(sensor.against) + 1
-    last = order.index(sensor.after) + 1
-    between = rig.element[min(first, last) : max(first, last)]
-    sign = 1.0 if last >= first else -1.0
-    return sign * sum(
-        e.K.value for e in between if isinstance(e, VelocitySource) and e.input == actuator
-    )
+    speed = _speeds(rig, actuator)
+    clamped = rig.base == "clamped"
+    match sensor:
+        case RelativeAngle():
+            before = rig.element[: [e.name for e in rig.element].index(sensor.across[0])]
+            return speed[sensor.across[-1]] - (speed[before[-1].name] if before else 0.0)
+        case AbsoluteAngle() if clamped:
+            return speed[sensor.after]
+        # What is held behind a velocity source gives way at no known speed.
+        case Displacement() if not held and rig.tip == "free":
+            if sensor.against is not None:
+                return speed[sensor.after] - speed[sensor.against]
+            return speed[sensor.after] if clamped else 0.0
+    return 0.0
+
+
+def _speeds(rig: Rig, actuator: str) -> dict[str, float]:
+    """The same behind each element, against the base."""
+    out, speed = {}, 0.0
+    for e in rig.element:
+        match e:
+            case AngularVelocitySource() | AngularVelocitySource2() | VelocitySource():
+                speed += e.K.value if e.input == actuator else 0.0
+            case Gear():
+                speed /= e.n.value
+            case Spindle():
+                speed *= e.lead.value
+        out[e.name] = speed
+    return out
 
 
 def _channel(
