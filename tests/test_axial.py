@@ -303,5 +303,7 @@ def test_a_rod_is_stretched_by_an_axial_chain_alone() -> None:
         '"rod", EA = {value = 1, unit = "kN", source = "x"}, '
         'mu = {value = 1, unit = "g/cm", source = "x"}, L = {value = 1, unit = "cm", source = "x"}',
     )
-    with pytest.raises(InputError, match=r"kind 'rod' moves along the chain; expected motion = \"axial\""):
+    with pytest.raises(
+        InputError, match=r"kind 'rod' moves along the chain; expected motion = \"axial\""
+    ):
         parse(Rig, text, "bench.toml")

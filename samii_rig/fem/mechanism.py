@@ -35,7 +35,8 @@ class Mechanism:
     joints : coordinate of every joint by element name.
     angle, velocity, acceleration : (n_sensor, n_q) rows on q, q' and q''; zero for a sensor of
         another kind, but for gravity on a tilted accelerometer's angle.
-    moment : (sensor, row of Phi) of every moment or force sensor at a joint that can carry one.
+    moment : (sensor, row of Phi, factor) of every moment, force or pressure sensor at a joint that
+        can carry one.
     """
 
     M: csc_array
@@ -52,5 +53,5 @@ class Mechanism:
     angle: csc_array
     velocity: csc_array
     acceleration: csc_array
-    moment: tuple[tuple[int, int], ...]
+    moment: tuple[tuple[int, int, float], ...]
     places: Places

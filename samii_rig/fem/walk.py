@@ -29,6 +29,7 @@ from samii_rig.rig.schema import (
     AngularVelocitySource2,
     Beam,
     Branch,
+    Cylinder,
     Displacement,
     DisplacementSource,
     Element,
@@ -40,6 +41,7 @@ from samii_rig.rig.schema import (
     LumpedMass,
     Moment,
     OilColumn,
+    Pressure,
     RelativeAngle,
     Rig,
     RigidLink,
@@ -133,6 +135,8 @@ class Walk:
                 self._body(0.0, 0.0, e.m.value, e.I.value, e.name)
             case Rod():
                 self._rod(e)
+            case Cylinder():
+                self._cylinder(e)
             case Gear():
                 node = self._point(e.name)
                 self.theta = {node + 1: 1 / e.n.value}
@@ -213,6 +217,21 @@ class Walk:
             self._C.add(at, e.tau.value * k)
         self.x += e.L.value
         self.w = {first + step * n: 1.0}
+
+    def _cylinder(self, e: Cylinder) -> None:
+        """The oil as springs and a damper: k_0 beside k_1 in series with c_1, which the leak is."""
+        a, b, V, W, B = (p.value for p in (e.A_1, e.A_2, e.V_1, e.V_2, e.B))
+        oil, slipping = self._n, self._n + 1
+        self.w = {**self.w, **self._new()}
+        S0, S1 = 1 / V + 1 / W, a / V + b / W
+        k_0, k_1 = B * (a - b) ** 2 / (V * W) / S0, B * S1**2 / S0
+        if e.leak.value == 0:
+            self._spring(oil, k_0 + k_1)
+            return
+        self._n += 1
+        self._spring(oil, k_0)
+        self._K.add([oil, slipping], [[k_1, -k_1], [-k_1, k_1]])
+        self._C.add([slipping], k_1 / (B * e.leak.value * S0))
 
     def _body(self, L: float, r: float, m: float, I: float, name: str) -> None:  # noqa: E741
         first = self._nodes[name] = self._n
@@ -303,12 +322,12 @@ class Walk:
             Places(np.array(x), element, _stack(w, n), _stack(theta, n)),
         )
 
-    def _multipliers(self, sensors: tuple[Sensor, ...]) -> Iterator[tuple[int, int]]:
+    def _multipliers(self, sensors: tuple[Sensor, ...]) -> Iterator[tuple[int, int, float]]:
         for i, s in enumerate(sensors):
-            if isinstance(s, Moment | Force):
+            if isinstance(s, Moment | Force | Pressure):
                 rows = self._moment if isinstance(s, Moment) else self._force
                 if s.after in rows:
-                    yield i, rows[s.after]
+                    yield i, rows[s.after], -1 / s.area if isinstance(s, Pressure) else 1.0
 
     def _new(self) -> Row:
         self._n += 1

@@ -91,6 +91,58 @@ def _oil_slopes(s: Complex, p: Float) -> Complex:
     return np.stack([np.full_like(s, -2 * C_h / D**3), np.full_like(s, 1 / D**2)])
 
 
+@dataclass(frozen=True, slots=True)
+class _Chambers:
+    """1/k = N/D of a `schema.Cylinder` at each s, p = (A_1, A_2, V_1, V_2, B, leak):
+    N = s + g S_0, D = B (S_2 s + g d^2/(V_1 V_2)), d = A_1 - A_2, g = B leak."""
+
+    s: Complex
+    p: Float
+
+    def parts(self) -> tuple[Complex, Complex]:
+        """N and D; without a leak 1 and B S_2, as s is in both."""
+        a, b, V, W, B, leak = self.p[:6]
+        S2 = a**2 / V + b**2 / W
+        if leak == 0:
+            return np.ones_like(self.s), np.full_like(self.s, B * S2)
+        g = B * leak
+        return self.s + g * (1 / V + 1 / W), B * (S2 * self.s + g * (a - b) ** 2 / (V * W))
+
+    def slopes(self) -> Complex:
+        """(6, n) of N/D."""
+        a, b, V, W, B, leak = self.p[:6]
+        s, g, d = self.s, B * leak, a - b
+        S0, S2 = 1 / V + 1 / W, a**2 / V + b**2 / W
+        N, E = s + g * S0, S2 * s + g * d**2 / (V * W)  # D = B E
+        zero = np.zeros_like(s)
+        one = np.ones_like(s)
+        dN = np.stack([zero, zero, -g / V**2 * one, -g / W**2 * one, leak * S0 * one, B * S0 * one])
+        far = d**2 / (V * W)
+        dE = np.stack(
+            [
+                2 * a / V * s + 2 * g * d / (V * W),
+                2 * b / W * s - 2 * g * d / (V * W),
+                -((a / V) ** 2) * s - g * far / V,
+                -((b / W) ** 2) * s - g * far / W,
+                leak * far * one,
+                B * far * one,
+            ]
+        )
+        out = _inverse(B * E) * (dN - N * _inverse(E) * dE)
+        out[4] -= N * _inverse(B * E) / B
+        return np.asarray(out)
+
+
+def _chambers(s: Complex, p: Float) -> Complex:
+    N, D = _Chambers(s, p).parts()
+    return np.asarray(-N * _inverse(D))
+
+
+def _clear_chambers(s: Complex, p: Float) -> Clearing:
+    _, D = _Chambers(s, p).parts()
+    return D / (p[4] * (p[0] ** 2 / p[2] + p[1] ** 2 / p[3])), 0.0
+
+
 def _constant(s: Complex, p: Float) -> Complex:
     return np.full_like(s, p[0])
 
@@ -239,6 +291,7 @@ POINTS: dict[str, Law] = {
     **dict.fromkeys(("translational_spring", "spring", "damper"), _ACROSS),
     "torsional_ground_spring": Law(M_THETA, _impedance, _impedance_slopes),
     **dict.fromkeys(("translational_ground_spring", "ground_spring", "ground_damper"), _TO_GROUND),
+    "cylinder": Law(W_V, _chambers, lambda s, p: -_Chambers(s, p).slopes(), _clear_chambers),
     "gravity_stiffness": Law(M_THETA, _constant, _constant_slopes),
     "oil_column": Law(THETA_M, _oil, _oil_slopes),
     "hydraulic_line": Law(THETA_M, _line, _line_slopes, _clear_line),

@@ -18,6 +18,7 @@ from samii_rig.rig.schema import (
     Force,
     Gear,
     Moment,
+    Pressure,
     RelativeAngle,
     Rig,
     RigidLink,
@@ -87,6 +88,8 @@ def terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Int, Float]:
                     add(i, behind[sensor.against], w=-1.0, factor=factor)
             case Force():
                 add(i, behind[sensor.after], V=-1.0)
+            case Pressure():
+                add(i, behind[sensor.after], V=1.0 / sensor.area)
             case Acceleration():
                 port, arm = before[sensor.on], sensor.position
                 if isinstance(elements[sensor.on], BEAMS):

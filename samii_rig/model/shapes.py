@@ -31,6 +31,7 @@ from samii_rig.rig.schema import (
     Element,
     Force,
     Moment,
+    Pressure,
     RelativeAngle,
     Rig,
     RigidLink,
@@ -271,3 +272,5 @@ def _reading(
             return complex(s * w if isinstance(sensor, Velocity) else w)
         case Force():
             return complex(-state[ports[order.index(sensor.after) + 1], 3])
+        case Pressure():
+            return complex(state[ports[order.index(sensor.after) + 1], 3] / sensor.area)

@@ -14,6 +14,7 @@ from samii_rig.rig.elements import (
     MOTION_SOURCES,
     SOURCES,
     Beam,
+    Cylinder,
     Element,
     ForceSource,
     Gear,
@@ -36,6 +37,7 @@ from samii_rig.rig.schema import (
     Displacement,
     Force,
     Moment,
+    Pressure,
     RelativeAngle,
     Rig,
     Velocity,
@@ -162,6 +164,13 @@ def _element(element: Element, a: float, b: float, along: bool) -> str:
             f'{line}<circle class="link" cx="{middle - 11:.1f}" cy="{y}" r="10"/>'
             f'<circle class="link" cx="{middle + 16:.1f}" cy="{y}" r="17"/>'
         )
+    if isinstance(element, Cylinder):
+        piston = f"M{middle - 6:.1f} {y - _HALF}v{2 * _HALF}m5 0v{-2 * _HALF}"
+        return (
+            f'<rect class="link" x="{a + 4:.1f}" y="{y - _HALF}" width="{b - a - 18:.1f}" '
+            f'height="{2 * _HALF}"/><path class="spring" d="M{a:.1f} {y}h4{piston}'
+            f'M{middle - 1:.1f} {y}H{b:.1f}"/>'
+        )
     if isinstance(element, Spindle):
         thread = "".join(f"M{a + 10 + 8 * k:.1f} {y + _HALF}l8 {-2 * _HALF}" for k in range(6))
         return (
@@ -241,7 +250,7 @@ def _sensors(
             case Displacement() | Velocity() if sensor.against is not None:
                 one, other = spans[sensor.against][1], spans[sensor.after][1]
                 span = min(one, other), max(one, other)
-            case AbsoluteAngle() | Moment() | Displacement() | Velocity() | Force():
+            case AbsoluteAngle() | Moment() | Displacement() | Velocity() | Force() | Pressure():
                 span = (spans[sensor.after][1],) * 2
             case Acceleration():
                 a, b = spans[sensor.on]

@@ -10,6 +10,7 @@ from samii_rig.rig.elements import (
     MOTION_SOURCES,
     TURNING,
     Branch,
+    Cylinder,
     ForceSource,
     LumpedMass,
     Rod,
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from samii_rig.rig.schema import Element, Rig, Sensor
 
 ANGULAR = (AbsoluteAngle, Moment, RelativeAngle)  # sensors that read theta or M
-GIVES = (TranslationalSpring, Rod)
+GIVES = (TranslationalSpring, Rod, Cylinder)
 
 
 def turning(rig: Rig) -> tuple[Element, ...]:

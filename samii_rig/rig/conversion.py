@@ -28,6 +28,7 @@ SENSOR_UNITS = {
         (sensors.Displacement, "m"),
         (sensors.Velocity, "m/s"),
         (sensors.Force, "N"),
+        (sensors.Pressure, "Pa"),
     )
 }
 IN_SENSOR_UNIT = ("noise_rms", "resolution", "offset", "low", "high")

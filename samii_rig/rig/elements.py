@@ -215,6 +215,26 @@ class OilColumn(ElementBase):
     C_h: Annotated[Parameter, not_negative("m^3/Pa")]
 
 
+class Cylinder(ElementBase):
+    """The oil in a cylinder's two chambers, which gives way: w+ = w- - V/k(s).
+
+    It stands behind the velocity source that the valve's flow makes, K = flow gain/A_1, flows
+    in and out as A_1 to A_2. A_1, A_2 piston areas, V_1, V_2 volumes at the working point with
+    the pipes, B bulk modulus, leak between the chambers as flow a pressure. With
+    S_k = A_1^k/V_1 + A_2^k/V_2 and g = B leak,
+    k(s) = B (S_2 s + g (S_2 S_0 - S_1^2))/(s + g S_0) (Merritt, Hydraulic Control Systems, 6-1,
+    for both chambers apart).
+    """
+
+    kind: Literal["cylinder"]
+    A_1: Annotated[Parameter, positive("m^2")]
+    A_2: Annotated[Parameter, positive("m^2")]
+    V_1: Annotated[Parameter, positive("m^3")]
+    V_2: Annotated[Parameter, positive("m^3")]
+    B: Annotated[Parameter, positive("Pa")]
+    leak: Annotated[Parameter, not_negative("m^3/(s Pa)")] = zero("m^3/(s Pa)")
+
+
 class HydraulicLine(ElementBase):
     """A line of length L between a valve and a vane, with waves in it.
 
@@ -361,7 +381,8 @@ Passive = Annotated[
     | TranslationalGroundSpring
     | GravityStiffness
     | Rod
-    | OilColumn,
+    | OilColumn
+    | Cylinder,
     Field(discriminator="kind"),
 ]
 
@@ -408,6 +429,7 @@ Element = Annotated[
     | GravityStiffness
     | Rod
     | OilColumn
+    | Cylinder
     | HydraulicLine
     | LumpedLine
     | Branch
@@ -427,6 +449,7 @@ AXIAL = (
     TranslationalSpring,
     TranslationalGroundSpring,
     Rod,
+    Cylinder,
     Branch,
     ForceSource,
     *MOTION_SOURCES,

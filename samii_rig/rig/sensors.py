@@ -130,8 +130,27 @@ class Force(SensorBase):
     unit: Annotated[str, _unit("N")]
 
 
+class Pressure(SensorBase):
+    """The load pressure behind the element `after`, a cylinder: its push V over `area`, m^2.
+
+    Of chambers with pressures p_1 and p_2 it is (A_1 p_1 - A_2 p_2)/area.
+    """
+
+    kind: Literal["pressure"]
+    after: Name
+    area: Positive
+    unit: Annotated[str, _unit("Pa")]
+
+
 Sensor = Annotated[
-    RelativeAngle | AbsoluteAngle | Acceleration | Moment | Displacement | Velocity | Force,
+    RelativeAngle
+    | AbsoluteAngle
+    | Acceleration
+    | Moment
+    | Displacement
+    | Velocity
+    | Force
+    | Pressure,
     Field(discriminator="kind"),
 ]
 
@@ -141,7 +160,7 @@ def places(sensor: SensorBase) -> tuple[str, ...]:
     match sensor:
         case RelativeAngle():
             return sensor.across
-        case AbsoluteAngle() | Moment() | Force():
+        case AbsoluteAngle() | Moment() | Force() | Pressure():
             return (sensor.after,)
         case Displacement() | Velocity():
             return (sensor.after,) if sensor.against is None else (sensor.after, sensor.against)
