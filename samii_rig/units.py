@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from itertools import product
-from math import isfinite, pi
+from math import inf, isfinite, pi
 
 STANDARD_GRAVITY = 9.80665  # m/s^2, exactly
 
@@ -205,5 +205,8 @@ def convert(value: float, given: str, wanted: str) -> float | None:
     for a, b in _pairs(given, wanted):
         # As the number was written: 0.1 is a tenth.
         exact = Fraction(repr(float(value))) * a.scale / b.scale
-        return float(exact) * pi ** (a.turns - b.turns)
+        try:
+            return float(exact) * pi ** (a.turns - b.turns)
+        except OverflowError:  # larger than any float, which who reads it refuses
+            return inf if exact > 0 else -inf
     return None

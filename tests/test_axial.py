@@ -3,10 +3,13 @@ integrator written by hand, and their gradients against differences."""
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from axial_kit import SECOND, axial, branch, part, place
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from samii_rig.errors import InputError
 from samii_rig.fem.model import Fem
@@ -65,6 +68,31 @@ def test_responses_are_those_of_finite_elements(kind: str, between: str) -> None
         H, expected = Chain(rig).response(F), Fem(rig, elements=20).response(F)
         size = np.maximum(np.abs(expected), 1e-9 * np.abs(expected).max(axis=0) + 1e-30)
         assert np.max(np.abs(H - expected) / size) < 1e-6
+
+
+SIZE = st.floats(0.2, 5.0)
+ANY = st.one_of(
+    st.builds(lambda a, b: part("spring", k=2e3 * a, c=2.0 * b), SIZE, SIZE),
+    st.builds(lambda a: part("mass", m=a), SIZE),
+    st.builds(lambda a: part("damper", c=50.0 * a), SIZE),
+    st.builds(lambda a, b: part("ground_spring", k=900.0 * a, c=b), SIZE, SIZE),
+    st.builds(lambda a, b: part("rod", EA=1e5 * a, mu=b, L=0.5, tau=1e-4), SIZE, SIZE),
+)
+
+
+@settings(max_examples=40)
+@given(st.lists(ANY, max_size=6), st.sampled_from(["clamped", "free"]))
+def test_any_order_of_parts_is_that_of_finite_elements(parts: list[Any], tip: str) -> None:
+    named = [{**p, "name": f"part_{i}"} for i, p in enumerate(parts)]
+    rig = axial(
+        part("spring", "front", k=1e4, c=5.0), part("mass", "one", m=1.0),
+        part("force_source", K=2.0), *named, part("mass", "last", m=0.5),
+        part("spring", "back", k=1e4, c=1.0), part("mass", "end", m=0.1),
+        sensor=[place("acceleration", "last", "a"), SENSORS[4]], tip=tip,
+    )  # fmt: skip
+    f = np.array([0.5, 3.0, 11.0, 25.0])
+    H, expected = Chain(rig).response(f), Fem(rig, elements=10).response(f)
+    assert np.max(np.abs(H - expected) / np.abs(expected).max(axis=0)) < 1e-6
 
 
 @pytest.mark.parametrize("between", [*BETWEEN])

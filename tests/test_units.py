@@ -1,6 +1,7 @@
 """Units as people write them: exact factors, one table for recordings and rig files."""
 
 import math
+from contextlib import suppress
 from fractions import Fraction
 
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from samii_rig.errors import InputError
+from samii_rig.rig.conversion import in_si
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
 from samii_rig.run.limits import gate_limits
@@ -111,9 +113,30 @@ def test_the_gate_knows_the_way_that_a_velocity_source_makes() -> None:
         gate_limits(held, "v", 1.0, "y")
 
 
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(["m", "mm", "v"]),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(
+        st.sampled_from(["name", "kind", "unit", "K", "value", "input", "channel", "max"]),
+        inner, max_size=5,
+    ),
+    max_leaves=12,
+)  # fmt: skip
+TABLES = ["sensor", "actuator", "element", "limit", "agreement", "feedback", "centring", "device"]
+
+
+@given(st.dictionaries(st.sampled_from(TABLES), JSON))
+def test_tables_of_any_form_come_through_or_are_refused(data: dict[str, object]) -> None:
+    with suppress(ValueError):
+        in_si(data)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
+        ("max = 8.0", f"max = 1{'0' * 400}", "limit[0].max"),
+        ("high = 10.0", f"high = 1{'0' * 400}", "sensor[x_1].high"),
+        ("value = 12.0", "value = 1e306", "element[spring_1].k: value inf N/m; expected a finite"),
+        ("value = 12.0", "value = nan", "element[spring_1].k"),
         ('unit = "N/mm"', 'unit = "N mm"', "element[spring_1].k: unit 'N mm'; expected 'N/m'"),
         ('unit = "g"', 'unit = "mm"', "element[mass_2].m: unit 'mm'; expected 'kg'"),
         (

@@ -69,14 +69,17 @@ def _units(data: Table) -> dict[str, str]:
     """Units of actuators, sensors and monitors by name, as far as they are told."""
     out = {}
     for key in ("actuator", "sensor", "monitor"):
-        for item in data.get(key) or ():
+        items = data.get(key)
+        for item in items if isinstance(items, list | tuple) else ():
             if isinstance(item, dict) and isinstance(item.get("unit"), str):
                 out[str(item.get("name"))] = item["unit"]
     return out
 
 
 def _number(table: Table, key: str) -> bool:
-    return isinstance(table.get(key), int | float) and not isinstance(table[key], bool)
+    value = table.get(key)
+    # A whole number beyond every float is left to the check that refuses it.
+    return isinstance(value, float) or (type(value) is int and abs(value) < 10**300)
 
 
 def _scaled(table: Table, keys: tuple[str, ...], given: str, wanted: str) -> Table:
