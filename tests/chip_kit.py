@@ -1,8 +1,8 @@
 """The chip that the firmware is flashed to, register by register, with its converters.
 
 `board_stm32f405.c`, `main.c`, `wire.c` and `ticks.c` are compiled for this machine; what they read
-and write of the chip's registers ends here. The model is written from the chip's manual and the data
-sheets of the converters, not from the firmware.
+and write of the chip's registers ends here. The model is written from the chip's manual and the
+data sheets of the converters, not from the firmware.
 """
 
 from __future__ import annotations

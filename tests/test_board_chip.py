@@ -179,7 +179,7 @@ def test_its_clocks_are_those_that_the_numbers_assume(boots):
     assert 42e6 / r[0x4000_4408] == pytest.approx(921600, rel=0.01)
     assert 42e6 / (2 << (r[0x4000_3800] >> 3 & 7)) < 17e6, "the ADC's fastest clock"
     assert r[0x4002_3800] & 1 << 19, "a crystal that stops is an NMI"
-    assert r[0x4000_7000] >> 4 & 15 == 15, "below 2.9 V is an interrupt"
+    assert r[0x4000_7000] >> 4 & 15 == 5 << 1 | 1, "below 2.7 V is an interrupt"
     assert r[0x4000_7000] >> 14 & 1, "the core's voltage that 168 MHz need"
     assert pll >> 28 == 2, "reserved bits stay"
 

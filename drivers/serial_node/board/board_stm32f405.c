@@ -127,10 +127,10 @@ static int start_clock(void)
     return became(RCC_CFGR, RCC_CFGR_SWS, RCC_CFGR_SWS_PLL, WAITS);
 }
 
-/* A supply of the chip below 2.9 V ends at null, before the chip stops at 1.8 V. */
+/* A supply of the chip below 2.7 V ends at null, before the chip stops at 1.8 V. A Discovery has 3.0. */
 static void start_supply_watch(void)
 {
-    reg_on(PWR_CR, PWR_CR_PLS_2V9 | PWR_CR_PVDE);
+    reg_on(PWR_CR, PWR_CR_PLS_2V7 | PWR_CR_PVDE);
     reg_on(EXTI_RTSR, EXTI_PVD);
     reg_on(EXTI_IMR, EXTI_PVD);
     reg_set(NVIC_ISER(IRQ_PVD), NVIC_BIT(IRQ_PVD));

@@ -11,9 +11,19 @@ int main(void);
 void tim4_handler(void);
 void usart2_handler(void);
 
+typedef void (*handler)(void);
+
+typedef struct {
+    uint32_t *stack;
+    handler handlers[CORE - 1u + N_IRQ];
+} table;
+
+extern const table vectors;
+
 __attribute__((noreturn)) void reset_handler(void);
 void reset_handler(void)
 {
+    reg_set(SCB_VTOR, (uint32_t)&vectors); /* a boot loader may have left its own */
     const uint32_t *from = data_from;
     for (uint32_t *to = data_start; to < data_end;) {
         *to++ = *from++;
@@ -37,13 +47,6 @@ void wrong_handler(void)
                    "mov sp, r0\n"
                    "b fault_handler\n");
 }
-
-typedef void (*handler)(void);
-
-typedef struct {
-    uint32_t *stack;
-    handler handlers[CORE - 1u + N_IRQ];
-} table;
 
 __attribute__((section(".vectors"), used)) const table vectors = {
     stack_top,

@@ -92,7 +92,7 @@ static inline void reg_on(uint32_t address, uint32_t bits)
 /* Supply voltage: 5.4; interrupt lines: 12.3 */
 #define PWR_CR 0x40007000u
 #define PWR_CR_PVDE (1u << 4)
-#define PWR_CR_PLS_2V9 (7u << 5)
+#define PWR_CR_PLS_2V7 (5u << 5)
 #define EXTI_IMR 0x40013C00u
 #define EXTI_RTSR 0x40013C08u
 #define EXTI_PR 0x40013C14u
@@ -173,6 +173,7 @@ static inline void reg_on(uint32_t address, uint32_t bits)
 #define IRQ_PVD 1u
 #define IRQ_TIM4 30u
 #define IRQ_USART2 38u
+#define SCB_VTOR 0xE000ED08u
 #define SCB_AIRCR 0xE000ED0Cu
 #define SCB_AIRCR_RESET 0x05FA0004u
 

@@ -10,7 +10,7 @@
 #define PRIORITY_PORT 0x20u /* above the sample's: see ticks.c */
 
 typedef struct {
-    uint8_t bytes[SIZE];
+    volatile uint8_t bytes[SIZE]; /* each is there before it is counted */
     volatile uint32_t in, out; /* how many went in and came out, mod 2^32 */
 } ring;
 
