@@ -19,7 +19,7 @@ import shutil
 import socket
 import struct
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import mkdtemp
@@ -88,18 +88,28 @@ class Watchdog:
 
 
 @contextlib.contextmanager
-def _together() -> Iterator[None]:
-    """What is started meanwhile runs on one core: its threads hand each byte to each other, which
-    takes 30 us there and 60 us across cores."""
+def _on(cores: Callable[[set[int]], set[int]]) -> Iterator[None]:
+    """What is started or runs meanwhile is on some of this process's cores, where there are any."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
     mine = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(mine)})
+    os.sched_setaffinity(0, cores(mine) or mine)
     try:
         yield
     finally:
         os.sched_setaffinity(0, mine)
+
+
+def last_core() -> contextlib.AbstractContextManager[None]:
+    """For the emulator: its threads hand each byte to each other, which takes 30 us on one core and
+    60 us across two."""
+    return _on(lambda mine: {max(mine)})
+
+
+def other_cores() -> contextlib.AbstractContextManager[None]:
+    """For who runs in real time beside it: together they would use up what a core gives to them."""
+    return _on(lambda mine: mine - {max(mine)})
 
 
 class Emulator:
@@ -120,7 +130,7 @@ class Emulator:
         self._to, self._from, self._log = (os.open(pipes[n], os.O_RDWR) for n in names)
         os.set_blocking(self._log, False)
         listening = [self._listening(name) for name in ("wire", "control")]
-        with _together(), prioritised():
+        with last_core(), prioritised():
             self._process = subprocess.Popen(
                 [
                     *(qemu, "-M", MACHINE, "-kernel", str(image), "-display", "none"),
@@ -152,6 +162,12 @@ class Emulator:
             accepted = s.accept()[0]
         accepted.settimeout(WITHIN)
         return accepted
+
+    @property
+    def ended(self) -> str:
+        """How QEMU ended, "" while it runs."""
+        code = self._process.poll()
+        return "" if code is None else f"; QEMU ended with {code}"
 
     def boot(self, config: NodeConfig, boot: int, sample: int) -> None:
         """What the board is, to an image that starts; `boot` 0: one more than before."""

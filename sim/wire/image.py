@@ -73,7 +73,9 @@ class ImageNode(Node):
             self._ended = True
             return self._no_sample()
         if said is None:
-            raise DeviceError(f"the image says nothing at sample {self.sample}")
+            raise DeviceError(
+                f"the image says nothing at sample {self.sample}{self._emulator.ended}"
+            )
         data = self._emulator.receive(said.went)
         mine = said.counts, said.boot, self._on, data
         expected = super().take(clock_us, encoders, adcs, emergency)
