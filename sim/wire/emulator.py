@@ -147,6 +147,7 @@ class Emulator:
         self.watchdog = Watchdog()
         self._line = b""
         self.sent = self.came = 0
+        self._arrived = b""
         self.booted = self._asked = False
 
     def _listening(self, name: str) -> socket.socket:
@@ -173,6 +174,9 @@ class Emulator:
         """What the board is, to an image that starts; `boot` 0: one more than before."""
         c = config
         self.watchdog, self.sent, self.came = Watchdog(), 0, 0
+        while select.select([self.wire], [], [], 0.0)[0]:
+            self.wire.recv(READ)  # of the boot before
+        self._arrived = b""
         numbers = c.period_ns, c.deadman_ms, c.n_encoder, c.n_adc, c.batch, c.dac_low, c.dac_high
         more = c.null, c.max_output, c.max_step, c.max_jump, c.firmware, c.serial
         os.write(self._to, TOLD.pack(*numbers, *more, sample, boot))
@@ -196,9 +200,10 @@ class Emulator:
 
     def receive(self, went: int) -> bytes:
         """Bytes from it, up to the last of `went` since its start."""
-        data, n = b"", (went - self.came) % WORD
-        while len(data) < n:
-            data += self.wire.recv(n - len(data))
+        n = (went - self.came) % WORD
+        while len(self._arrived) < n:
+            self._arrived += self.wire.recv(READ)
+        data, self._arrived = self._arrived[:n], self._arrived[n:]
         self.came = went
         return data
 
@@ -217,9 +222,14 @@ class Emulator:
 
     def outputs(self, within: float) -> Outputs | None:
         """What the image said next, None if it says nothing."""
-        ready, _, _ = select.select([self._from], [], [], within)
-        if not ready:
-            return None
+        wire, ready = self.wire.fileno(), [-1]
+        while self._from not in ready:
+            ready, _, _ = select.select([self._from, wire], [], [], within)
+            # It sends byte by byte, and waits where nobody reads: a socket holds 280 such bytes.
+            data = self.wire.recv(READ) if wire in ready else b""
+            self._arrived += data
+            if not data and self._from not in ready:
+                return None
         said = Outputs(*OUTPUTS.unpack(os.read(self._from, OUTPUTS.size)))
         self._listen()
         return said
