@@ -133,8 +133,9 @@ def timed_run(wire: Wire, plan: Plan, predicted: DryRun, path: Path) -> tuple[Ou
 def wired(rate: float, folder: Path, seed: int, *more: str) -> Wire:
     text = load_rig("samii")[1].replace("rate_hz = 500.0", f"rate_hz = {rate}")
     if "--image" in more:  # an emulator may be late by tens of ms, as no board is
-        for name in ("deadman", "stale_after"):
-            text = text.replace(f"{name} = 0.05", f"{name} = 0.2")
+        late = "stale_after = 0.2\n"
+        text = text.replace("deadman = 0.05", "deadman = 0.2").replace("stale_after = 0.05\n", "")
+        text = text.replace("[[sensor]]\n", f"[[sensor]]\n{late}")
     path = folder / "rig.toml"
     path.write_text(text)
     return Wire("--seed", str(seed), *more, rig=str(path))

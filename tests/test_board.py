@@ -134,6 +134,15 @@ def test_the_image_begins_as_the_chip_expects_it_and_leaves_the_boots_alone(flas
     assert len(flashed) < SECTOR - 0x0800_0000, "the sector that counts the boots"
 
 
+@pytest.mark.parametrize(
+    "wrong", ["RATE_HZ=333", "DEADMAN_MS=4", "ADCS=9", "BATCH=6", "CRYSTAL_HZ=25000000"]
+)
+def test_a_wrong_number_ends_the_making_with_what_would_be_right(wrong, tmp_path):
+    with pytest.raises(AssertionError, match=rf'static assertion failed: "{wrong.split("=")[0]}: '):
+        made(tmp_path, "stm32f405", wrong)
+    assert not (tmp_path / "node.bin").exists()
+
+
 def test_an_image_or_an_emulator_that_is_not_there_is_one_line(tmp_path, monkeypatch):
     firmware = image()
     with pytest.raises(InputError, match="board=qemu"):

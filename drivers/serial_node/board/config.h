@@ -32,13 +32,24 @@
 #define ENCODERS 2u /* 1 or 2 */
 #endif
 #ifndef ADCS
-#define ADCS 8u /* 0 to 8 */
+#define ADCS 8u /* 1 to 8 */
 #endif
 #ifndef BATCH
 #define BATCH 4u /* samples in a frame; together at most 10 ms */
 #endif
 #ifndef SERIAL
-#define SERIAL "BOARD-0001"
+#define SERIAL "BOARD-0001" /* at most 16 characters */
 #endif
+
+_Static_assert(CRYSTAL_HZ % 2000000u == 0, "CRYSTAL_HZ: a whole number of 2 MHz");
+_Static_assert(RATE_HZ >= 20 && 1000000u % RATE_HZ == 0, "RATE_HZ: at least 20, a whole number of us a sample");
+_Static_assert(DEADMAN_MS * 17u * RATE_HZ > 2u * 47000u, "DEADMAN_MS: at least six samples, for the watchdog's clock");
+_Static_assert(NULL_COUNTS >= -32768 && NULL_COUNTS <= 32767, "NULL_COUNTS: of 16 bit");
+_Static_assert(MAX_OUTPUT <= 65535u && MAX_STEP <= 65535u, "MAX_OUTPUT, MAX_STEP: of 16 bit");
+_Static_assert(MAX_JUMP >= 0, "MAX_JUMP: at least 0");
+_Static_assert(ENCODERS >= 1 && ENCODERS <= 2, "ENCODERS: 1 or 2");
+_Static_assert(ADCS >= 1 && ADCS <= 8, "ADCS: 1 to 8");
+_Static_assert(BATCH >= 1 && BATCH <= 8 && BATCH * 100u <= RATE_HZ, "BATCH: 1 to 8 samples, at most 10 ms");
+_Static_assert(sizeof SERIAL <= 17, "SERIAL: at most 16 characters");
 
 #endif
