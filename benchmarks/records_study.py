@@ -1,6 +1,6 @@
 """Diagnosis of the second plant's recordings, by style: what is kept of sigma, found, named.
 
-python -m sim.assumed_modes one 7 --out trials --style clean,cut      # for each seed
+python -m sim.assumed_modes one 7 --out trials --style clean,cut      # for each seed; or force
 python benchmarks/records_study.py trials
 
 sigma kept is the root of the chi-square that the named causes explain, over what whole records
@@ -38,19 +38,20 @@ def answered(folder: Path) -> Diagnosis:
 
 def scored(truth: dict[str, Any], found: Diagnosis) -> tuple[bool, bool]:
     """Whether all places, and all names up to what the answer calls equivalent, are right."""
-    also = [tuple(n) for n in truth.get("also", [])]
     said = [{(c.physics, c.site), *c.equivalents} for c in found.causes]
     name = place = found.verdict in SPOKEN
     for effect in truth["effects"]:
+        also = {(n["physics"], n["site"]) for n in effect["also"]}
         names = {(effect["physics"], effect["site"]), *also}
+        sites = {site for _, site in names}
         name = name and any(names & s for s in said)
-        place = place and any(effect["site"] in {site for _, site in s} for s in said)
+        place = place and any(sites & {site for _, site in s} for s in said)
     return place or name, name
 
 
 def row(truth: dict[str, Any], folder: Path) -> dict[str, Any] | None:
     """One trial's figures."""
-    start = time.perf_counter()
+    start = time.process_time()
     try:
         found = answered(folder)
     except SamiiRigError as error:
@@ -66,7 +67,7 @@ def row(truth: dict[str, Any], folder: Path) -> dict[str, Any] | None:
         "place": place,
         "name": name,
         "wrong": found.verdict == "named" and not name,
-        "seconds": time.perf_counter() - start,
+        "seconds": time.process_time() - start,
     }
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from concealed_kit import SAMII, SAMII_TOML
+from concealed_kit import SAMII
+from cut_kit import cut_sweeps
 
 from samii_rig.diagnose.diagnose import diagnose, table
 from samii_rig.diagnose.measured import measured
@@ -15,42 +16,10 @@ from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.records import RecordProblem, Whole
 from samii_rig.diagnose.refit import Fitted, Problem, refit
 from samii_rig.diagnose.result import Diagnosis
-from samii_rig.record.reader import read_recording
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
-from sim.concealed.runs import Design
-from sim.concealed.stated import Stated
-from sim.concealed.trial import make
 
-DESIGN = Design(levels=(0.5, 1.0), bursts=1, burst=30.0, steps=1, periods=2, settle=1, period=4.0)
 SLOW_VALVE = "actuator_lag joint_2_source p=150"
-
-
-def cut_sweeps(folder: Path, *effects: str) -> list[Recording]:
-    """One sweep a level, each record cut off where its sweep ends."""
-    stated = tuple(Stated.of(words.split()) for words in effects)
-    kind = "stated" if stated else "nothing"
-    made = make(kind, 11, folder, SAMII_TOML, DESIGN, stated)
-    out = []
-    for path in sorted(made.glob("*.mcap")):
-        run = read_recording(path)
-        first = run.segments[0]
-        if first.kind != "burst":
-            continue
-        n = round((DESIGN.burst - DESIGN.ring_down) * run.rate_hz)
-        whole = replace(first, kind="single", start=0, stop=n)
-        out.append(
-            replace(
-                run,
-                time=run.time[:n],
-                sequence=run.sequence[:n],
-                values=run.values[:n],
-                quality=run.quality[:n],
-                segments=(whole,),
-            )
-        )
-    assert len(out) == 2
-    return out
 
 
 def found_in(runs: list[Recording]) -> Diagnosis:

@@ -8,13 +8,14 @@ from samii_rig.diagnose import judge as verdict
 from samii_rig.diagnose.by_line import at_first, settled
 from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.nonlinear import compete
+from samii_rig.diagnose.nonlinear_search import ForceSearch, compete_on_records
 from samii_rig.diagnose.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.stages import Case, Progress, Shown, told
-from samii_rig.errors import EstimateError
+from samii_rig.errors import EstimateError, SamiiRigError
 
-MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 RIVALS = 4  # explanations of the records that forces must beat
+MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 
 
 def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | None:
@@ -30,24 +31,38 @@ def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | N
         return None
 
 
-def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis:
-    """What whole records say."""
+def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis | None:
+    """What whole records say; None where levels differ grossly and no force is found by which."""
     nominal = search.nominal.fitted
     first, bands = search.ratio(nominal), search.bands(nominal)
     progress("what is missing")
-    search.run()
+    # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
+    search.run(briefly=True)
     progress("amplitude levels")
-    before = at_first(case)
-    for explanation in search.ranked()[:RIVALS]:
-        there = search.at_lines(explanation)
-        case.search.keep(there.effects, there.fitted)
-    if compete(case.search, case.responses, case.runs) is not None:
-        return settled(case, before, progress)
+    linear, forced = search, forces_on(search)
+    if case.search.lines.torn():
+        if forced is None:
+            return None
+    elif forced is None or not forced.is_enough():
+        search.run()
+        forced = None if forced is None else forces_on(search)
     progress("what cannot be told apart")
+    if forced is not None:
+        search = forced
+        first, bands = search.ratio(search.nominal.fitted), search.bands(search.nominal.fitted)
     judged = verdict.judge(search)
     nominal, best = search.nominal.fitted, judged.best
     plain, after, gap = search.shown(nominal, best.fitted)
+    if any(e.quasi is not None for e in best.effects) and gap.low > 0:
+        # Computed in time, and seen on lines that it was not fitted to.
+        judged = verdict.confirmed(judged)
     judged = verdict.shown(judged, gap, judged.evidence.drop / (TURN - 1))
+    judged, said = (judged, ()) if forced is not None else _consistent(search, judged)
+    if judged.verdict == "unknown":
+        if case.search.lines.torn():
+            return None
+        if (found := on_levels(case, linear, progress)) is not None:
+            return found
     shown = Shown(
         first=first,
         threshold=verdict.threshold(search.spread),
@@ -58,9 +73,29 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
         used=search.used(),
     )
     of_lines = case.clean.of_lines
-    judged, said = _consistent(search, judged)
     clean = replace(case.clean, told=tuple(w for w in case.clean.told if w not in of_lines))
     return told(replace(case, clean=clean), search, judged, shown, said)
+
+
+def forces_on(search: RecordSearch) -> ForceSearch | None:
+    """The search among forces, where one explains the records best; None where none does, or where
+    the rig has no partial fractions in which it could be computed."""
+    try:
+        return compete_on_records(search)
+    except SamiiRigError:
+        return None
+
+
+def on_levels(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis | None:
+    """What the lines of each level say, if a force among them wins, alone or beside linear effects:
+    of whole records nothing is known of both together."""
+    before = at_first(case)
+    for explanation in search.ranked()[:RIVALS]:
+        there = search.at_lines(explanation)
+        case.search.keep(there.effects, there.fitted)
+    if compete(case.search, case.responses, case.runs) is None:
+        return None
+    return settled(case, before, progress)
 
 
 def _consistent(search: RecordSearch, judged: Judgement) -> tuple[Judgement, tuple[str, ...]]:

@@ -65,7 +65,6 @@ def diagnose(
         effects = table(rig, float(lines.frequency[0]), float(lines.frequency[-1]))
     by_line = Search(rig, seen, at, clean.competing(effects))
     case = Case(clean, sound, runs, lines, by_line, decide, show)
-    by_record = None if seen.torn() else on_records(case, band)
-    if by_record is None:
-        return by_lines(case, progress)
-    return by_records(case, by_record, progress)
+    by_record = on_records(case, band)
+    found = by_records(case, by_record, progress) if by_record is not None else None
+    return by_lines(case, progress) if found is None else found

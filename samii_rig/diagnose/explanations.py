@@ -237,6 +237,10 @@ class Explanations:
         fitted = Fitted(less, x, float(r @ r), whole.fitted.penalty, J, J.T @ J)
         return Explanation(effects, fitted, 0.0)
 
+    def beside(self, best: Explanation) -> tuple[Explanations, Explanation]:
+        """Where linear effects can be weighed beside `best`, and the linear part of it there."""
+        return self, best
+
     def rebin(self, fitted: Fitted) -> None:
         """Bins, and aliases, as of this model: those of a rigid joint are not those of one that
         gives, by as little as a large effect leaves room for a small one."""

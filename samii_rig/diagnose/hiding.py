@@ -12,11 +12,10 @@ from scipy import stats
 
 from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.explanations import Explanation
+from samii_rig.diagnose.explanations import Explanation, Explanations
 from samii_rig.diagnose.ranking import moved, place_at
 from samii_rig.diagnose.result import Hiding
 from samii_rig.diagnose.screen import Screen
-from samii_rig.diagnose.search import Search
 from samii_rig.errors import SamiiRigError
 from samii_rig.types import Float
 
@@ -24,7 +23,7 @@ FOUND = 0.9  # probability with which an effect of the size that is told would h
 TRIES = 16  # strengths over the range of an effect, log-spaced, for one that is weak
 
 
-def could_hide(search: Search, best: Explanation) -> tuple[Hiding, ...]:
+def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
     """Of each physics and site, beside what was found, the smallest that would have been seen."""
     look = Screen.of(search.problem, best.fitted).of_data()
     needed = math.sqrt(search.worth * search.temperature) + float(stats.norm.ppf(FOUND))
@@ -40,7 +39,7 @@ def could_hide(search: Search, best: Explanation) -> tuple[Hiding, ...]:
 
 
 def _smallest(
-    search: Search, best: Explanation, look: Screen, effect: Effect, needed: float
+    search: Explanations, best: Explanation, look: Screen, effect: Effect, needed: float
 ) -> Hiding | None:
     """Where noise units reach what is needed. What a refit leaves grows with a weak strength, or
     with its inverse, in proportion: so far as a refit bends, this is exact for what is weak."""
@@ -64,7 +63,7 @@ def _smallest(
 
 
 def _changed(
-    search: Search, best: Explanation, look: Screen, effect: Effect, values: Float
+    search: Explanations, best: Explanation, look: Screen, effect: Effect, values: Float
 ) -> tuple[Float, Float] | None:
     """Chi-square (m,) of what an effect with unknowns (m, k) changes: all of it, and what a refit
     leaves; None where the rig does not allow it."""
@@ -85,7 +84,7 @@ def _changed(
 
 
 def _with_model(
-    search: Search, best: Explanation, look: Screen, effect: Effect, values: Float
+    search: Explanations, best: Explanation, look: Screen, effect: Effect, values: Float
 ) -> tuple[Float, Float] | None:
     model = search.model((*best.effects, effect))
     if model is None:

@@ -21,7 +21,7 @@ from samii_rig.diagnose.nonlinear_apart import Apart
 from samii_rig.diagnose.nonlinear_confirm import seen
 from samii_rig.diagnose.nonlinear_consistent import self_consistent
 from samii_rig.diagnose.nonlinear_driven import drives, timed
-from samii_rig.diagnose.nonlinear_forces import forces
+from samii_rig.diagnose.nonlinear_forces import LineReach, forces, softens
 from samii_rig.diagnose.nonlinear_levels import LevelGrid, level_grid
 from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.diagnose.nonlinear_screen import Bins, Promise
@@ -80,7 +80,8 @@ def compete(
     lines = search.lines = timed(whole, given)
     bins = Bins.of(lines, ranked[0].fitted, search.grid)
     problem = Problem.of(bins.combined(), grid)
-    levels = Apart(search, bins, grid, problem, list(forces(search.rig, problem)), given)
+    every = forces(search.rig, LineReach.of(search.rig, problem))
+    levels = Apart(search, bins, grid, problem, [e for e in every if not softens(e)], given)
     search.problem, search.grid = problem, grid
     search.use([*before[2], *levels.forces])
     bases = list({e.key: e for e in (ranked[0], search.nominal)}.values())

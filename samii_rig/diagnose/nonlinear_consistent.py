@@ -26,10 +26,13 @@ SETTLED = 0.3  # of chi-square, gained by a step: less and it leads no further
 Computed = Callable[[LevelModel, Float], Problem]
 
 
-def self_consistent(fitted: Fitted, computed: Computed) -> Fitted:
+def self_consistent(
+    fitted: Fitted, computed: Computed, moving: Sequence[int] | None = None
+) -> Fitted:
     """The least squares that `fitted` leads to.
 
     computed : the problem with the force as it is in time at a vector of the model.
+    moving : unknowns whose slopes are differences of the force in time; None for all that move it.
     """
     model, x = fitted.model, fitted.x
     assert isinstance(model, LevelModel)
@@ -41,7 +44,8 @@ def self_consistent(fitted: Fitted, computed: Computed) -> Fitted:
     J[m:, :n] = np.diag(1 / model.prior[:n])
     scale = np.minimum(model.prior, 1.0)  # inf of an unknown
     # What a command drives moves with its own strength alone.
-    moving = [model.unknown] if model.quasi.kind == "command" else list(range(model.n))
+    if moving is None or model.quasi.kind == "command":
+        moving = [model.unknown] if model.quasi.kind == "command" else list(range(model.n))
     damping, exact = FIRST, False
     for _ in range(STEPS):
         before = float(r @ r)

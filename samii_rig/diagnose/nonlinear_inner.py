@@ -17,8 +17,9 @@ from numba import njit
 from samii_rig.diagnose.nonlinear_laws import CUBIC, FRICTION, GAP, Law
 from samii_rig.diagnose.nonlinear_model import LevelModel
 from samii_rig.diagnose.rigfile import valued
-from samii_rig.model.realise import realise
+from samii_rig.model.realise import Realisation, realise
 from samii_rig.model.sampled import hold_response
+from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, Int
 
 INNER = 8  # steps a sample
@@ -89,6 +90,49 @@ def _lap(
     return e
 
 
+@njit(cache=True, fastmath={"reassoc", "contract", "nsz"})
+def _read(
+    e: Float, grow: Float, by_e: Float, direct: Float, inner: int, late: Int, n: int
+) -> Float:
+    """(n, q) what sensors show of a force e (n inner,), before each sample's steps.
+
+    grow : (2, n_pole); by_e : (2, q, n_pole) what a force held over a step makes of each sensor's
+    state. late : (q,) steps of each sensor's delay.
+    """
+    q, n_pole = by_e.shape[1], by_e.shape[2]
+    out = np.zeros((n, q))
+    wr, wi = np.zeros(n_pole), np.zeros(n_pole)
+    before = 0.0
+    for step in range(e.size):
+        for i in range(q):
+            if (step + late[i]) % inner == 0 and (step + late[i]) // inner < n:
+                y = direct[i] * before
+                for k in range(n_pole):
+                    y += by_e[0, i, k] * wr[k] - by_e[1, i, k] * wi[k]
+                out[(step + late[i]) // inner, i] = y
+        before = e[step]
+        for k in range(n_pole):
+            real = grow[0, k] * wr[k] - grow[1, k] * wi[k] + before
+            wi[k] = grow[0, k] * wi[k] + grow[1, k] * wr[k]
+            wr[k] = real
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Sensed:
+    """A rig's partial fractions from a force to its sensors, no loop closed; as `_read` has it."""
+
+    grow: Float
+    by_e: Float
+    direct: Float
+    late: Int
+
+    def of(self, e: Float) -> Float:
+        """(n, q) of a force e (n INNER,) from rest."""
+        n = e.size // INNER
+        return _read(e, self.grow, self.by_e, self.direct, INNER, self.late, n)
+
+
 @dataclass(frozen=True, slots=True)
 class Inner:
     """A rig's partial fractions from command and force to what drives the force, by exact steps.
@@ -116,32 +160,57 @@ class Inner:
 
         Raises InputError as that does.
         """
-        quasi, values = model.quasi, model.values(x)
-        rig = model.built.model_copy(
-            update={"element": tuple(valued(e, values, {}) for e in model.built.element)}
-        )
-        wide = quasi.widened(rig)
-        own = wide.model_copy(update={"sensor": wide.sensor[len(rig.sensor) :]})
-        made = realise(own, near=near)
+        wide = _widened(model, x)
+        own = wide.model_copy(update={"sensor": wide.sensor[len(model.built.sensor) :]})
+        return cls._made(model, x, realise(own, near=near))
+
+    @classmethod
+    def sensed(
+        cls, model: LevelModel, x: Float, near: Complex | None = None
+    ) -> tuple[Inner, Sensed]:
+        """As `of`, and the way from the force to the rig's sensors."""
+        made = realise(_widened(model, x), near=near)
+        rig = model.built
+        n = len(rig.sensor)
         h = 1 / (rig.rate_hz * INNER)
-        grow = np.exp(made.poles * h)
-        still = np.abs(made.poles) * h < 1e-12
-        push = np.where(still, h, (grow - 1) / np.where(still, 1.0, made.poles))
-        pairs = np.where(made.poles.imag > 0, 2.0, 1.0)[:, None]
+        grow, push = _steps(made.poles, h)
+        pairs = np.where(made.poles.imag > 0, 2.0, 1.0)
+        by_e = made.residues[:, :n, -1].T * (pairs * push)
+        late = np.array([round(s.delay / h) for s in rig.sensor], np.int64)
+        parts = np.ascontiguousarray(_parts(by_e))
+        return cls._made(model, x, made), Sensed(_parts(grow), parts, made.direct[:n, -1], late)
+
+    @classmethod
+    def _made(cls, model: LevelModel, x: Float, made: Realisation) -> Inner:
+        """From partial fractions whose last sensor is what drives the force."""
+        quasi, rig = model.quasi, model.built
+        h = 1 / (rig.rate_hz * INNER)
         late = round((rig.actuator[0].delay + float(made.late[0])) / h)
         code = next((c for law, c in _CODES if law is quasi.law), FLOW)
         scale = quasi.sign * model.strength(x)[1]
-        R = made.residues[:, 0] * pairs
-        D = made.direct[0]
+        on = np.any(made.residues[:, -1] != 0, axis=1)  # the others are of sensors' filters
+        poles = made.poles[on]
+        grow, push = _steps(poles, h)
+        R = made.residues[on, -1] * np.where(poles.imag > 0, 2.0, 1.0)[:, None]
+        D = made.direct[-1]
         if code == DRY:  # driven by the speed, and at once by what changes it
             D = R.sum(axis=0).real
-            R = R * made.poles[:, None]
+            R = R * poles[:, None]
         both = push[:, None] * R
         g = float(D[-1] + both[:, -1].real.sum())
         return cls(
             _parts(grow), _parts(both[:, 0]), _parts(both[:, -1]), float(D[0]), g, late, code,
             scale, rig.rate_hz, made.structure.poles,
         )  # fmt: skip
+
+    def from_rest(self, v: Float, p: float) -> Float:
+        """(n INNER,) the force p under a command v (n,) that begins when the rig is at rest."""
+        quiet = -(-self.late // INNER)  # samples before the command arrives
+        e = _lap(
+            np.zeros_like(self.grow), self.grow, self.by_v, self.by_e, self.direct, self.g,
+            np.concatenate([v, np.zeros(quiet)]), self.late, INNER, self.code, p, self.scale,
+        )  # fmt: skip
+        return e[: v.size * INNER]
 
     def force(self, v: Float, p: float) -> Float:
         """(n INNER,) the force p in a period of a command v (n,) that has gone on until the force
@@ -180,6 +249,20 @@ class Inner:
         f = np.asarray(bins * self.rate_hz / v.size)
         held = hold_response(f, self.rate_hz * INNER)
         return np.asarray(np.fft.rfft(self.force(v, p))[bins] / INNER * held)
+
+
+def _widened(model: LevelModel, x: Float) -> Rig:
+    """The rig at x with what its force needs more."""
+    values = model.values(x)
+    element = tuple(valued(e, values, {}) for e in model.built.element)
+    return model.quasi.widened(model.built.model_copy(update={"element": element}))
+
+
+def _steps(poles: Complex, h: float) -> tuple[Complex, Complex]:
+    """What a step h makes of the state of each pole, and of an input held over it."""
+    grow = np.exp(poles * h)
+    still = np.abs(poles) * h < 1e-12
+    return grow, np.where(still, h, (grow - 1) / np.where(still, 1.0, poles))
 
 
 def _mixed(seen: Sequence[tuple[Float, Float]]) -> Float:

@@ -6,7 +6,7 @@ act at once, so that what counts is the standard deviation of them all.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse, Int
 
 if TYPE_CHECKING:
-    from samii_rig.diagnose.nonlinear_model import Quasi
+    from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 
 SWEEPS, SETTLED = 60, 1e-9  # of the amplitude, at most; change of x at which they end
 STEEPEST = 0.7  # slope of a sweep that is believed where the next one is guessed from two
@@ -91,6 +91,17 @@ class LevelGrid(Grid):
             level, power,
             {} if level is None else {key: e.at(level, i) for key, e in self.extra.items()},
         )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class RecordGrid(Grid):
+    """The nodes of whole records, where a force is computed in time under every record's input.
+
+    added : (model, x) -> (n, q) what the force adds to the records' lines. A model with a force
+    predicts the nodes, and these lines behind them.
+    """
+
+    added: Callable[[LevelModel, Float], Complex] = field(kw_only=True)
 
 
 def level_grid(

@@ -21,9 +21,10 @@ from samii_rig.diagnose import insert
 from samii_rig.diagnose.effect import Effect, Key
 from samii_rig.diagnose.model import STEP, Grid, Model
 from samii_rig.diagnose.nonlinear_laws import EXCESS, Law, Strength
-from samii_rig.diagnose.nonlinear_levels import LevelGrid, Loop
+from samii_rig.diagnose.nonlinear_levels import LevelGrid, Loop, RecordGrid
 from samii_rig.errors import InputError
 from samii_rig.model.sampled import sensor_response
+from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import (
     ActuatorSpec,
     Moment,
@@ -36,6 +37,7 @@ from samii_rig.types import Complex, Float
 
 CAP = 1.5  # power of its height, that what a limit cuts off a sine grows with
 LEAST_CUT = 1e-6  # of the largest command, height of what a limit cuts off
+DIFFERENCE = 1e-3  # of the strength's logarithm, for what the force does in time
 EXTRA = f"{insert.PREFIX}force"  # the input and the sensor that the chain has more
 
 Kind = Literal["joint", "drive", "command", "flow"]
@@ -109,8 +111,14 @@ class LevelModel(Model):
         self.chain = self.chain_of(self.quasi.widened(self.built))
         self.unknown = self.own(self._which)[0]
 
+    def plain(self, x: Float) -> Chain:
+        """As of `Model`, without the force's input and sensor."""
+        return Chain(self.built).with_values(self.values(x))
+
     def response(self, x: Float, at: Grid) -> Complex:
-        """(n, q) at the grid's lines."""
+        """(n, q) at the grid's lines; of whole records, behind these what the force adds to all."""
+        if isinstance(at, RecordGrid):
+            return np.concatenate([super().response(x, at), at.added(self, x)])
         if not isinstance(at, LevelGrid) or at.power is None:
             return super().response(x, at)
         G, loop, r = self.looped(x, at)
@@ -177,6 +185,8 @@ class LevelModel(Model):
 
     def gradient(self, x: Float, at: Grid) -> tuple[Complex, Complex]:
         """The same, and its derivatives (n, q, n_x)."""
+        if isinstance(at, RecordGrid):
+            return self._with_lines(x, at)
         if not isinstance(at, LevelGrid) or at.power is None:
             return super().gradient(x, at)
         values = self.values(x)
@@ -221,6 +231,19 @@ class LevelModel(Model):
         for j, slope in folded:
             dy[:, :, j] += slope
         return np.asarray(own * F + aliases + more), dy
+
+    def _with_lines(self, x: Float, at: RecordGrid) -> tuple[Complex, Complex]:
+        """`gradient` on whole records: the force moves with its strength; what the chain's own
+        parameters do to it is of second order."""
+        h, dh = super().gradient(x, at)
+        ahead = x.copy()
+        inside = x[self.unknown] + DIFFERENCE <= self.upper[self.unknown]
+        ahead[self.unknown] += DIFFERENCE if inside else -DIFFERENCE
+        added = at.added(self, x)
+        more = np.zeros((*added.shape, self.n), complex)
+        step = ahead[self.unknown] - x[self.unknown]
+        more[:, :, self.unknown] = (at.added(self, ahead) - added) / step
+        return np.concatenate([h, added]), np.concatenate([dh, more])
 
     def _map(self, x: Float, values: dict[Key, float]) -> Float:
         """(key, n_x) derivatives of the chain's parameters."""

@@ -28,8 +28,9 @@ from samii_rig.diagnose.refit import Fitted, Problem, refit
 from samii_rig.diagnose.result import Band, Gap, Used
 from samii_rig.diagnose.search import Search
 from samii_rig.errors import EstimateError, SamiiRigError
+from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.noise import Shape
-from samii_rig.likelihood.pieces import Piece, Wiring, pieces_of, wiring
+from samii_rig.likelihood.pieces import Piece, Wiring, joined, pieces_of, wiring
 from samii_rig.likelihood.reduce import Left, Records, Reduced, Response, left_by, reduced
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned
@@ -61,6 +62,7 @@ class Whole:
     wired: Wiring
     ports: tuple[Effect, ...]
     left_out: tuple[tuple[str, str], ...] = ()
+    apart: Records | None = None  # the same, every level by itself
 
     @classmethod
     def of(
@@ -83,14 +85,16 @@ class Whole:
         wired = wiring(runs, rig, sensors)
         bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
         without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
-        pieces = tuple(pieces_of(runs, rig, wired, without))
-        if not pieces:
+        levels = pieces_of(runs, rig, wired, without, apart=True)
+        if not levels:
             raise EstimateError("no segment is sound")
-        driven = [(p, b) for p, b in zip(pieces, excited(pieces, rig.rate_hz), strict=True) if b]
-        pieces = tuple(p for p, _ in driven)
-        bands = tuple(band or (float(b[0]), float(b[1])) for _, b in driven)
+        all_, apart = (_records(p, rig, band) for p in (joined(levels), levels))
         ports = tuple(e for e in table if e.physics in FORCED and e.jump and not e.jump.fixed)
-        return cls(rig, Records(pieces, rig.rate_hz, bands), wired, ports, tuple(without.items()))
+        return cls(rig, all_, wired, ports, tuple(without.items()), apart)
+
+    def by_level(self) -> Whole:
+        """The same records, the levels not summed up: for what depends on amplitude."""
+        return self if self.apart is None else replace(self, records=self.apart)
 
     @property
     def sensor(self) -> Int:
@@ -160,10 +164,22 @@ class Whole:
         shape = self.disturbed(fitted)
         return reduced(self.records, self.response(fitted), shape, self._loop, _fitted)
 
+    def complete(self, fitted: Fitted) -> Complete:
+        """The same, with what no linear model explains."""
+        shape = self.disturbed(fitted)
+        return Complete.about(self.records, self.response(fitted), shape, self._loop, _fitted)
+
     def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
         """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
         part = _shown if shown else _fitted
         return left_by(self.records, self.response(fitted), noise, self._loop, part)
+
+
+def _records(pieces: Sequence[Piece], rig: Rig, band: tuple[float, float] | None) -> Records:
+    """Those that anything drives."""
+    driven = [(p, b) for p, b in zip(pieces, excited(pieces, rig.rate_hz), strict=True) if b]
+    bands = tuple(band or (float(b[0]), float(b[1])) for _, b in driven)
+    return Records(tuple(p for p, _ in driven), rig.rate_hz, bands)
 
 
 def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float] | None]:
@@ -339,9 +355,9 @@ class RecordSearch(Search):
         if left <= 1 + FIVE * math.sqrt(self.spread):
             return 1.0
         h = fitted.model.response(fitted.x, self.problem.at)
-        r = self.problem.residual(h)
         # What is left in the directions of the nodes, in units of what each would have.
         F = self.reduced.factor
+        r = self.problem.residual(h)[: F.shape[0]]
         pull = np.tensordot(r, F, 1) / np.linalg.norm(F, axis=0)
         pull = pull.reshape(-1, F.shape[3]).T
         power, alike = float(np.sum(pull**2)), 1.0
@@ -361,9 +377,13 @@ class RecordSearch(Search):
     def _nearest(self) -> Explanation:
         return self.ranked()[0]
 
+    def left(self, fitted: Fitted, *, shown: bool = False) -> Left:
+        """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
+        return self.whole.left(fitted, self.reduced, shown=shown)
+
     def bands(self, fitted: Fitted) -> tuple[Band, ...]:
         """Chi-square per degree of freedom of each sensor in each octave."""
-        left = self.whole.left(fitted, self.reduced)
+        left = self.left(fitted)
         out = []
         for low, high in octaves(left.frequency):
             inside = (left.frequency >= low) & (left.frequency < high)
@@ -381,7 +401,7 @@ class RecordSearch(Search):
 
     def shown(self, before: Fitted, after: Fitted) -> tuple[float, float, Gap]:
         """On the lines kept apart: chi-square per degree of freedom of both, and the gap closed."""
-        a, b = (self.whole.left(x, self.reduced, shown=True).chi2 for x in (before, after))
+        a, b = (self.left(x, shown=True).chi2 for x in (before, after))
         floor = np.full(a.size, 2.0 * self.whole.sensor.size)
         mean = float(np.sum(floor))
         return float(np.sum(a)) / mean, float(np.sum(b)) / mean, gap_of(a, b, floor)

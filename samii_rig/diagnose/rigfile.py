@@ -35,7 +35,8 @@ def explained(fitted: Fitted) -> Rig:
         if effect.quasi is not None:
             symbol, unit = effect.unknowns[0].symbol, effect.unknowns[0].unit
             found = f"{effect.physics.replace('_', ' ')} at {effect.site}"
-            told = f"Found beside this linear rig: {found}, {symbol} = {theta[0]:.4g} {unit}."
+            value = f"{symbol} = {effect.report(theta)[0]:.4g} {unit}"
+            told = f"Found beside this linear rig: {found}, {value}."
             rig = rig.model_copy(update={"description": f"{rig.description} {told}".strip()})
     return rig
 

@@ -81,6 +81,10 @@ class Screen:
         """(n,) rad/s."""
         return self.problem.at.s
 
+    def left_by(self) -> Float:
+        """What the fit leaves of data and priors, with the directions projected out."""
+        return self._left(self._left_by)
+
     def left(self) -> float:
         """Chi-square of what the fit leaves, with the directions projected out."""
         left = self._left(self._left_by)

@@ -110,7 +110,7 @@ def told(
         rig=explained(best.fitted) if best.effects else None,
         traces=traces(search, judged) if missing else (),
         moved=answer.moved(best.fitted),
-        could_hide=could_hide(search, best),
+        could_hide=could_hide(*search.beside(best)),
         used=shown.used,
         sigma=math.sqrt(max(judged.evidence.drop, 0.0)) if best.effects else 0.0,
         gain=gain,

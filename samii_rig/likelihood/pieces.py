@@ -28,6 +28,17 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True)
+class Command:
+    """What one of the records behind a piece told the rig, and its part in the piece.
+
+    v : (history + n,) as recorded. part : the piece's r and z have so many times this record's.
+    """
+
+    v: Float
+    part: float
+
+
+@dataclass(frozen=True, slots=True)
 class Piece:
     """One stretch of samples; of several whose inputs are proportional, what tells the response.
 
@@ -38,6 +49,7 @@ class Piece:
     r : (history + n,) input of the loop, or of the rig where none is closed; the rig is at rest
         before it, unless `moving`. z : (n, q) sensors. history : samples of input before them.
     levels : as the segments state them, with their unit.
+    commands : of all records that the piece is a sum of.
     """
 
     name: str
@@ -48,6 +60,7 @@ class Piece:
     moving: bool = False
     repeats: tuple[Samples, ...] = ()
     contrasts: tuple[Samples, ...] = ()
+    commands: tuple[Command, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,10 +97,16 @@ def wiring(
 
 
 def pieces_of(
-    recordings: Sequence[Recording], rig: Rig, wired: Wiring, without: Collection[str] = ()
+    recordings: Sequence[Recording],
+    rig: Rig,
+    wired: Wiring,
+    without: Collection[str] = (),
+    *,
+    apart: bool = False,
 ) -> list[Piece]:
     """Every segment as a piece, those with proportional inputs as one. without : places of
-    segments to leave out, as `Recording.place` gives them.
+    segments to leave out, as `Recording.place` gives them. apart : of one level only, for what
+    depends on the level.
 
     The input of the loop is v + kp theta as they were recorded: it holds the reference, the
     rounding and the clipping of the command, and nothing of the sensors' noise.
@@ -105,14 +124,21 @@ def pieces_of(
         for segment in segments_of(recording):
             if recording.place(segment) in without:
                 continue
-            found += _cut(recording, segment, r, values[:, 1:], whole)
-    return _joined(_joined(found, levels=False), levels=True)
+            found += _cut(recording, segment, r, values, whole)
+    repeats = _joined(found, levels=False)
+    return repeats if apart else joined(repeats)
+
+
+def joined(pieces: list[Piece]) -> list[Piece]:
+    """Pieces of different levels with proportional inputs as one."""
+    return _joined(pieces, levels=True)
 
 
 def _cut(
-    recording: Recording, segment: Segment, r: Float, z: Float, whole: NDArray[np.bool_]
+    recording: Recording, segment: Segment, r: Float, values: Float, whole: NDArray[np.bool_]
 ) -> list[Piece]:
-    """The stretches of a segment between gaps, each with the input before it."""
+    """The stretches of a segment between gaps, each with the input before it. values : of the
+    command, then of the sensors."""
     a, b = np.searchsorted(recording.sequence, [segment.start, segment.stop])
     jumps = np.flatnonzero(np.diff(recording.sequence) != 1) + 1
     ends = np.unique(np.concatenate([jumps, np.flatnonzero(np.diff(whole.astype(np.int8))) + 1]))
@@ -127,7 +153,9 @@ def _cut(
         name = recording.place(segment)
         part = r[low - history : high]
         level = (segment.level, segment.unit)
-        out.append(Piece(name, part, z[low:high], history, (level,), moving))
+        told = Command(values[low - history : high, 0].copy(), 1.0)
+        z = values[low:high, 1:]
+        out.append(Piece(name, part, z, history, (level,), moving, commands=(told,)))
     return out
 
 
@@ -172,4 +200,9 @@ def _turned(group: list[Piece], *, levels: bool) -> Piece:
         first.moving,
         tuple(s for p in group for s in p.repeats) + (() if levels else others),
         tuple(s for p in group for s in p.contrasts) + (others if levels else ()),
+        tuple(
+            Command(told.v, float(part) * told.part)
+            for part, p in zip(U[0], group, strict=True)
+            for told in p.commands
+        ),
     )

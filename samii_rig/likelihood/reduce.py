@@ -149,7 +149,7 @@ def left_by(
     n, q = rows.e.shape
     white = np.sqrt(2) * noise.noise.whitened(rows.f, rows.e[:, :, None])[:, :, 0]
     N = np.sqrt(2) * noise.noise.whitened(rows.f, rows.N).reshape(n * q, -1)
-    Q = _orthonormal(np.concatenate([N.real, N.imag]))
+    Q = orthonormal(np.concatenate([N.real, N.imag]))
     goal = np.concatenate([white.real.ravel(), white.imag.ravel()])
     goal -= Q @ (Q.T @ goal)
     white = (goal[: n * q] + 1j * goal[n * q :]).reshape(n, q)
@@ -178,6 +178,7 @@ class Rows:
 
     X : (n, 2 b) what a change on the nodes does. e : (n, q) what the reference leaves.
     N : (n, q, m) nuisances. f : (n,) Hz. k : (n,) numbers of the lines. piece : (n,) which.
+    order : (n,) of the lines of all pieces, one after the other, which these are.
     """
 
     X: Complex
@@ -186,12 +187,13 @@ class Rows:
     f: Float
     k: Int
     piece: Int
+    order: Int
 
     def take(self, which: Any) -> Rows:
         """Some of the lines."""
         return Rows(
             self.X[which], self.e[which], self.N[which], self.f[which], self.k[which],
-            self.piece[which],
+            self.piece[which], self.order[which],
         )  # fmt: skip
 
     def weighted(self, weight: Float) -> Rows:
@@ -213,6 +215,17 @@ def reduced(
     loop : kp and sensor of the loop that `response` has closed. part : which lines of a piece
     count, by their number.
     """
+    return formed(records, response, shape, loop, part)[0]
+
+
+def formed(
+    records: Records,
+    response: Response,
+    shape: Shape,
+    loop: tuple[float, int] | None = None,
+    part: Callable[[Int], NDArray[np.bool_]] | None = None,
+) -> tuple[Reduced, Rows]:
+    """As `reduced`, and the lines that it was made of."""
     smooth, exact = records.smooth(), records.exact()
     H, S = response(exact.s), response(smooth.s)
     inside = (smooth.frequency > records.band[0]) & (smooth.frequency < records.band[1])
@@ -228,7 +241,7 @@ def reduced(
     form = _quadratic(rows, power, S[nodes])
     at = smooth.frequency[nodes]
     count = 2.0 * rows.e.shape[1] * int(counted.sum()) - form.nuisances
-    return Reduced(
+    made = Reduced(
         frequency=at,
         sigma=smooth.sigma,
         reference=S[nodes],
@@ -239,6 +252,7 @@ def reduced(
         noise=power,
         differing=_differing(records, H, exact, loop, power),
     )
+    return made, rows
 
 
 def _with_repeats(
@@ -318,7 +332,7 @@ def _rows(
         N[row : row + x.shape[0], :, column : column + x.shape[2]] = x
         row, column = row + x.shape[0], column + x.shape[2]
     X, e, f, k, of = (np.concatenate(x)[order] for x in (spectra, errors, frequency, number, which))
-    return Rows(X, e, N[order], f, k, of)
+    return Rows(X, e, N[order], f, k, of, order)
 
 
 def _nuisances(
@@ -338,7 +352,7 @@ def _without(e: Complex, N: Complex) -> tuple[Complex, Float]:
     n, q = e.shape
     out, used = np.zeros_like(e), np.zeros(2 * n)
     for c in range(q):
-        Q = _orthonormal(_real(N[:, c][:, np.any(N[:, c] != 0, axis=0)]))
+        Q = orthonormal(_real(N[:, c][:, np.any(N[:, c] != 0, axis=0)]))
         goal = _real(e[:, c])
         goal = goal - Q @ (Q.T @ goal)
         used += np.sum(Q**2, axis=1)
@@ -381,13 +395,13 @@ def _residual(rows: Rows) -> tuple[Complex, Float]:
 
 
 def _of_piece(rows: Rows) -> tuple[Complex, Float]:
-    Q = _orthonormal(_real(rows.X))
+    Q = orthonormal(_real(rows.X))
     n, q = rows.e.shape
     left, used = np.zeros((n, q), complex), np.sum(Q**2, axis=1) * q
     for c in range(q):
         goal, more = _real(rows.e[:, c]), _real(rows.N[:, c])
         more = more[:, np.any(more != 0, axis=0)]
-        more = _orthonormal(more - Q @ (Q.T @ more))
+        more = orthonormal(more - Q @ (Q.T @ more))
         goal = goal - Q @ (Q.T @ goal)
         goal -= more @ (more.T @ goal)
         used += np.sum(more**2, axis=1)
@@ -395,7 +409,7 @@ def _of_piece(rows: Rows) -> tuple[Complex, Float]:
     return left, np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
 
 
-def _orthonormal(X: Float) -> Float:
+def orthonormal(X: Float) -> Float:
     """The directions of the columns of X (n, m), n > m."""
     scale = np.linalg.norm(X, axis=0)
     X = X / np.where(scale > 0, scale, 1.0)

@@ -115,7 +115,7 @@ def clipping(rng: Rng, setup: Setup, swing: Swing) -> Draft:
 
 
 def orifice(rng: Rng, setup: Setup, swing: Swing) -> Draft:
-    """Flow through the valve falls as the load takes the pressure: v sqrt(1 - sgn(v) M/M_stall)."""
+    """Flow through the valve falls as the load takes the pressure: v sqrt(1 + sgn(v) M/M_stall)."""
     angle_source(setup)
     return _of_drive(
         "flow_saturation", setup, {"M_stall": "N m"}, lambda x: {"M_stall": swing.moment / x},

@@ -175,8 +175,9 @@ def _with_laws(
     n_law, h = laws.law.size, pieces.h[p]
     for i in range(n_law):
         u[1 + i] = 0.0
-        if laws.law[i] == 5:  # flow through an orifice: less under load, more when pulled
-            u[0] *= np.sqrt(max(0.0, 1.0 - np.sign(u[0]) * z[2 * i] / laws.value[i, 0]))
+        # Flow through an orifice: less under load, which is a chain's moment against v.
+        if laws.law[i] == 5:
+            u[0] *= np.sqrt(max(0.0, 1.0 + np.sign(u[0]) * z[2 * i] / laws.value[i, 0]))
         elif laws.law[i] != 2:
             u[1 + i] = 0.5 * f[i]
     x[:] = np.dot(pieces.Phi[p], x) + np.dot(pieces.Gamma[p], u)

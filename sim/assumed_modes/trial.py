@@ -39,7 +39,7 @@ from sim.assumed_modes.simulate import Control, recorded
 from sim.assumed_modes.size import LEAST, MOST, records, records_by_run, solve
 from sim.assumed_modes.styles import Style
 
-KINDS = ("nothing", "one", "two", "outside")
+KINDS = ("nothing", "one", "two", "outside", "force")
 FARTHEST = 2.5  # tolerances that a nominal parameter is drawn from the file's value at most
 SMALLEST = 0.2  # of the file's value: no damping is drawn to nothing
 FORCED_TRIES = 40  # effects drawn until one has a size
@@ -277,11 +277,12 @@ def _concealed(
     rng: Rng, kind: str, scene: Scene, refit: Refit, beyond: str = ""
 ) -> list[Concealed]:
     wanted = 2 if kind == "two" else 1
+    names = (*(table.LINEAR if kind != "force" else ()), *FORCES)
     swing = _swing(scene)
     found: list[Concealed] = []
     for _ in range(FORCED_TRIES):
         target = float(np.exp(rng.uniform(np.log(LEAST), np.log(MOST))))
-        draft = _draft(rng, beyond, scene, swing)
+        draft = _draft(rng, names, beyond, scene, swing)
         if draft is None or any(_clash(f.draft, draft) for f in found):
             continue
         one = _solved(scene, refit, draft, target)
@@ -301,10 +302,12 @@ def _clash(one: Draft, other: Draft) -> bool:
     return forces == 2
 
 
-def _draft(rng: Rng, beyond: str, scene: Scene, swing: Swing) -> Draft | None:
+def _draft(
+    rng: Rng, names: tuple[str, ...], beyond: str, scene: Scene, swing: Swing
+) -> Draft | None:
     if beyond:
         return OUTSIDE[beyond](rng, scene.setup, swing)
-    name = str(rng.choice([*table.LINEAR, *FORCES]))
+    name = str(rng.choice(names))
     try:
         if name in FORCES:
             return FORCES[name](rng, scene.setup, swing)

@@ -1,0 +1,90 @@
+"""Whole records, and what no change of one linear response explains of them.
+
+`Reduced` keeps of the lines what tells a response. A force that depends on amplitude moves the rest
+too: harmonics, and levels against each other. With the whitened lines g, nuisances projected out,
+and the whitened columns A = Q C of all changes d on the nodes,
+
+    |g - A d|^2 = |C d - Q' g|^2 + |g - Q Q' g|^2,
+
+the first part that of `Reduced`. A force changes g, and so both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import linalg
+
+from samii_rig.likelihood.noise import Shape
+from samii_rig.likelihood.reduce import Records, Reduced, Response, Rows, formed, orthonormal
+from samii_rig.types import Complex, Float, Int
+
+
+@dataclass(frozen=True)
+class Complete:
+    """Chi-square of all lines, split.
+
+    rows : the lines. root : (n, q, q) so that root e has real and imaginary parts of variance 1.
+    nuisances : of each piece its lines and orthonormal columns over their real, then imaginary
+    parts. factor : (m, m) C.
+    """
+
+    reduced: Reduced
+    rows: Rows
+    root: Complex
+    nuisances: tuple[tuple[Int, Float], ...]
+    factor: Float
+
+    @classmethod
+    def about(
+        cls,
+        records: Records,
+        response: Response,
+        shape: Shape,
+        loop: tuple[float, int] | None = None,
+        part: Callable[[Int], NDArray[np.bool_]] | None = None,
+    ) -> Complete:
+        """As `reduced`."""
+        found, rows = formed(records, response, shape, loop, part)
+        own = np.linalg.cholesky(found.noise.covariance(rows.f))
+        root = np.sqrt(2) * np.linalg.inv(own)
+        each = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
+        nuisances = tuple((on, _columns(root[on] @ rows.N[on])) for on in each)
+        m = found.factor.shape[0]
+        return cls(found, rows, root, nuisances, found.factor.reshape(m, m))
+
+    @property
+    def expected(self) -> float:
+        """Mean of chi-square."""
+        return self.reduced.known + self.reduced.inside[1]
+
+    def split(self, e: Complex) -> Float:
+        """(m + 2 n q,) both parts of lines e (n, q), in noise units."""
+        g = self._white(e)
+        X, q = self.rows.X, e.shape[1]
+        back = np.einsum("nji,nj->ni", self.root.conj(), g)
+        head = (X.conj().T @ back).real.T.ravel()
+        t = linalg.solve_triangular(self.factor, head, trans="T", check_finite=False)
+        d = linalg.solve_triangular(self.factor, t, check_finite=False)
+        rest = g - self._white(X @ d.reshape(q, -1).T)
+        return np.concatenate([t, rest.real.ravel(), rest.imag.ravel()])
+
+    def _white(self, e: Complex) -> Complex:
+        """(n, q) whitened, without nuisances."""
+        white = (self.root @ e[:, :, None])[:, :, 0]
+        for on, Q in self.nuisances:
+            own = white[on].ravel()
+            goal = np.concatenate([own.real, own.imag])
+            goal -= Q @ (Q.T @ goal)
+            white[on] = (goal[: own.size] + 1j * goal[own.size :]).reshape(-1, e.shape[1])
+        return np.asarray(white, np.complex128)
+
+
+def _columns(N: Complex) -> Float:
+    """(2 n q, m) directions of one piece's nuisances (n, q, m_all)."""
+    flat = N.reshape(-1, N.shape[2])
+    flat = flat[:, np.any(flat != 0, axis=0)]
+    return orthonormal(np.concatenate([flat.real, flat.imag]))
