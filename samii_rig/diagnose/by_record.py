@@ -9,7 +9,7 @@ from samii_rig.diagnose.by_line import at_first, settled
 from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.nonlinear import compete
 from samii_rig.diagnose.records import TURN, RecordSearch, Whole
-from samii_rig.diagnose.result import Diagnosis
+from samii_rig.diagnose.result import Band, Diagnosis
 from samii_rig.diagnose.stages import Case, Progress, Shown, told
 from samii_rig.errors import EstimateError
 
@@ -42,6 +42,18 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
         case.search.keep(there.effects, there.fitted)
     if compete(case.search, case.responses, case.runs) is not None:
         return settled(case, before, progress)
+    return by_samples(case, search, first, bands, progress)
+
+
+def by_samples(
+    case: Case,
+    search: RecordSearch,
+    first: float,
+    bands: tuple[Band, ...],
+    progress: Progress,
+) -> Diagnosis:
+    """The answer, once all explanations of the records were tried. first, bands : what the refitted
+    nominal model left before, in all and by band."""
     progress("what cannot be told apart")
     judged = verdict.judge(search)
     nominal, best = search.nominal.fitted, judged.best
