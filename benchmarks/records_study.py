@@ -33,7 +33,7 @@ def answered(folder: Path) -> Diagnosis:
     """The diagnosis of all recordings in a folder with the rig file that they carry."""
     runs = [read_recording(path) for path in sorted(folder.glob("*.mcap"))]
     rig = parse(Rig, runs[0].rig_toml, "the recording's rig file")
-    return diagnose(estimate(runs), rig, runs=runs)
+    return diagnose(estimate(runs, gaps="model"), rig, runs=runs)
 
 
 def scored(truth: dict[str, Any], found: Diagnosis) -> tuple[bool, bool]:

@@ -29,7 +29,6 @@ from sim.assumed_modes.states import make_states
 
 STYLE = ("clean", "cut", "bursts", "multisine")
 SAMPLES = 30_000  # of a trial's loop: a minute of records, so that a trial is told in a minute
-BAND = (1.0, 45.0)  # Hz; what drifts below it is not modelled well enough (docs/whole-records.md)
 SIZES = ((3.0, 5.0), (5.0, 10.0), (10.0, 30.0))  # sigma
 SPOKEN = ("named", "ambiguous")
 
@@ -62,9 +61,9 @@ def told(folder: Path) -> dict[str, Any]:
         start = time.process_time()
         try:
             found = (
-                changed(before, after, rig, band=BAND)
+                changed(before, after, rig)
                 if name == "two"
-                else diagnose(after.responses, rig, runs=after.runs, band=BAND)
+                else diagnose(after.responses, rig, runs=after.runs)
             )
             out[name] = plain(found.plain()) | {"lines": list(found.lines())}
         except SamiiRigError as error:

@@ -120,7 +120,7 @@ class StopRecord:
 class Finding:
     """Something noticed in the data that is not physics, in plain words.
 
-    kind : one of gap, clipping, range, stuck, repeat, leakage, timing, clock, offset,
+    kind : one of gap, clipping, range, resolution, stuck, repeat, leakage, timing, clock, offset,
         saturation, closed_loop, distortion, dof.
     severity : `note` tells, `warning` weakens the result, `error` made us exclude or refuse.
     """
@@ -175,6 +175,10 @@ class Recording:
     def names(self, role: Role) -> tuple[str, ...]:
         """Names of all channels with this role, in column order."""
         return tuple(c.name for c in self.channels if c.role == role)
+
+    def place(self, segment: Segment) -> str:
+        """Where a segment is, for messages: the source, if there is one, and its name."""
+        return f"{self.source}, {segment.name}" if self.source else segment.name
 
     def cut(self, segment: Segment) -> Recording:
         """The samples of one segment as a recording of its own."""

@@ -172,6 +172,18 @@ def test_a_dead_sensor_is_left_out_and_refused_when_it_was_asked_for():
         estimate([dead], outputs=["a"])
 
 
+@pytest.mark.parametrize(("steps", "hidden"), [(0.3, True), (0.9, True), (1.2, False), (5, False)])
+def test_a_sensor_that_moves_by_less_than_its_step_is_told(steps: float, hidden: bool):
+    run = sweeps()
+    theta = run.values[:, 2]
+    step = float(np.std(theta[: 2 * N])) / steps
+    coarse = changed(run, slice(None), 2, np.rint(theta / step) * step)
+    # Rounding makes small motion smaller still: the step is of what the sensor reads.
+    found = [f for f in estimate([coarse])[0].findings if f.kind == "resolution"]
+    assert bool(found) == hidden
+    assert all(f.channel == "theta" and "of its step of" in f.message for f in found)
+
+
 def test_a_sensor_that_freezes_in_one_repeat_costs_that_repeat():
     frozen = changed(sweeps(4), slice(N + 500, N + 700), 2, 0.1)
     r = estimate([frozen])[0]

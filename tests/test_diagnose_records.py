@@ -73,6 +73,41 @@ def test_where_nothing_is_missing_it_says_so_and_what_could_hide(nothing: list[R
     assert "What could hide: a mass under" in found.lines()[2]
 
 
+def with_column(run: Recording, name: str, values: np.ndarray) -> Recording:
+    changed = run.values.copy()
+    changed[:, run.column(name)] = values
+    return replace(run, values=changed)
+
+
+def test_a_sensor_that_stands_still_takes_no_part(nothing: list[Recording]):
+    runs = [with_column(run, "a_1", np.full(len(run), 0.01)) for run in nothing]
+    found = found_in(runs)
+    assert found.verdict == "no_mismatch"
+    assert found.used.lines == found.used.of > 500
+    assert {b.channel for b in found.bands} == {"theta_2", "a_0", "a_2"}
+    assert any("a_1 never changes" in words for words in found.not_physics)
+
+
+def test_a_segment_in_which_a_sensor_freezes_is_left_out_and_told(nothing: list[Recording]):
+    a_1 = nothing[0].values[:, nothing[0].column("a_1")].copy()
+    a_1[len(a_1) // 2 :] = a_1[len(a_1) // 2]
+    rng = np.random.default_rng(1)
+    live = replace(nothing[0], source="live.mcap")
+    runs = [
+        replace(with_column(nothing[0], "a_1", a_1 + 0.0), source="frozen.mcap"),
+        # The same sweep once more, with other noise of the converter's size.
+        with_column(
+            live, "a_1", live.values[:, live.column("a_1")] + rng.normal(0, 1e-3, len(a_1))
+        ),
+        nothing[1],
+    ]
+    every = diagnose(estimate(runs), SAMII, runs=runs)
+    ((place, why),) = every.used.left_out
+    assert place.startswith("frozen.mcap")
+    assert "a_1 stands still" in why
+    assert every.verdict == "no_mismatch"
+
+
 def test_a_valve_that_lags_is_named_though_every_sweep_ends_with_its_record(tmp_path: Path):
     found = found_in(cut_sweeps(tmp_path, SLOW_VALVE))
     names = {(c.physics, c.site) for c in found.causes}

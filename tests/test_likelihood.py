@@ -139,6 +139,24 @@ def test_a_disturbed_mode_makes_noise_at_that_mode_and_nowhere_else():
     assert np.mean(np.abs(whitened) ** 2) == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.parametrize("corner", [0.0, 0.3, 2.0])
+def test_a_sensor_that_wanders_is_as_loud_as_that_at_the_lowest_lines(corner: float):
+    """In a short record, whose lowest block is octaves wide, of one sensor of two."""
+    rng = np.random.default_rng(4)
+    chi2 = []
+    for _ in range(20):
+        f = np.arange(2, 400) * 0.033
+        truth = np.stack([1 + (corner / f) ** 2, np.ones(f.size)], axis=1)
+        white = rng.standard_normal((f.size, 2)) + 1j * rng.standard_normal((f.size, 2))
+        left = np.sqrt(truth / 2) * white
+        found = Noise.of(f, left, np.ones(f.size), np.ones_like)
+        chi2.append(np.abs(found.whitened(f, left[:, :, None])[:, :, 0]) ** 2)
+    mean = np.mean(chi2, axis=0)
+    for low, high in ((0, 5), (5, 15), (15, 50), (50, 398)):
+        each = np.mean(mean[low:high], axis=0)
+        np.testing.assert_allclose(each, 1.0, atol=0.35 if low == 0 else 0.2)
+
+
 def test_the_inverse_of_the_noise_is_the_sum_of_its_parts():
     rng = np.random.default_rng(2)
     f = np.linspace(1, 9, 300)

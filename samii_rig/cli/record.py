@@ -342,7 +342,8 @@ def _diagnosed(setup: Setup, outcome: Outcome, console: Console, *, json: bool) 
         return None
     try:
         with working(console, "diagnosis", quiet=json) as say:
-            return diagnose(outcome.responses, setup.rig, progress=say)
+            runs = [outcome.recording]
+            return diagnose(outcome.responses, setup.rig, progress=say, runs=runs)
     except (EstimateError, InputError) as error:
         why = str(error)
     except KeyboardInterrupt:

@@ -117,6 +117,11 @@ def told(judged: Judgement) -> list[str]:
                     f"{effect.site} is {1e3 * t.value:.4g} ms ({1e3 * t.low:.4g} to "
                     f"{1e3 * t.high:.4g}) ahead of the other channels: stamped or read too early"
                 )
+            case "input_not_held":
+                out.append(
+                    f"{effect.site} was not held between samples but recorded as a meter sees it, "
+                    "half a sample from what the rig file states"
+                )
             case "common_gain":
                 g = found["gain"]
                 out.append(

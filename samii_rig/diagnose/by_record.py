@@ -20,10 +20,11 @@ RIVALS = 4  # explanations of the records that forces must beat
 def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | None:
     """The search on whole records, where they can be used as they are."""
     clean = case.clean
-    if not case.runs or clean.mended or clean.doubt or clean.spoilt:
+    if not case.runs or clean.mended or clean.doubt:
         return None
     try:
-        whole = Whole.of(case.runs, case.search.rig, band, case.search.table)
+        table = case.search.table
+        whole = Whole.of(case.runs, case.search.rig, band, table, clean.sensors, clean.samples)
         return RecordSearch(whole, case.search)
     except EstimateError:
         return None

@@ -22,7 +22,6 @@ from samii_rig.diagnose.rigfile import explained
 from samii_rig.diagnose.stages import Case, Progress
 from samii_rig.diagnose.states import Both, StatesSearch
 from samii_rig.errors import EstimateError
-from samii_rig.likelihood.pieces import wiring
 from samii_rig.rig.schema import Parameter, RelativeAngle, Rig
 from samii_rig.types import FrequencyResponse, Recording
 
@@ -103,14 +102,17 @@ def _named(state: State) -> tuple[str, ...]:
 
 def _both(first: Case, second: Case, band: Band | None) -> tuple[Both, RecordSearch]:
     """The records of both states, and the search on those before."""
-    wired = wiring((*first.runs, *second.runs), first.search.rig)
+    common = [name for name in first.clean.sensors if name in second.clean.sensors]
     wholes = []
     for name, case in (("before", first), ("after", second)):
         clean = case.clean
-        if case.search.lines.torn() or clean.mended or clean.doubt or clean.spoilt:
+        if case.search.lines.torn() or clean.mended or clean.doubt:
             why = (*clean.told, "they depend on the level as no linear rig does")[0]
             raise EstimateError(f"the recordings {name} cannot be compared sample by sample: {why}")
-        wholes.append(Whole.of(case.runs, case.search.rig, band, case.search.table, wired))
+        search = case.search
+        wholes.append(Whole.of(case.runs, search.rig, band, search.table, common, clean.samples))
+    if wholes[0].wired != wholes[1].wired:
+        raise EstimateError("the two states have no command and no sensor in common")
     longest = max(w.records.longest for w in wholes)
     before, after = (replace(w, records=replace(w.records, least=longest)) for w in wholes)
     start = RecordSearch(before, first.search)

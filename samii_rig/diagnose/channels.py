@@ -25,7 +25,14 @@ from samii_rig.types import Complex, Float
 Law = Callable[[Complex, Float], tuple[Complex, list[Complex]]]
 
 # Not physics: wiring, units and signs. They compete with physics and are reported apart.
-NOT_PHYSICS = ("channel_swap", "sign_error", "common_gain", "time_offset", "unit_rest")
+NOT_PHYSICS = (
+    "channel_swap",
+    "sign_error",
+    "common_gain",
+    "time_offset",
+    "unit_rest",
+    "input_not_held",
+)
 
 
 def dead_time(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
@@ -60,6 +67,14 @@ def gain(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
 def minus(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
     """-1."""
     return np.full(s.shape, -1.0, complex), []
+
+
+def not_held(s: Complex, _x: Float, rate_hz: float) -> tuple[Complex, list[Complex]]:
+    """s T/(1 - exp(-s T)), the inverse of the converter's hold: the input was measured at the
+    samples, a smooth signal between them that has no images above half the rate."""
+    T = 1 / rate_hz
+    inside = np.abs(s.imag) < math.pi / T
+    return np.where(inside, s * T / -np.expm1(-s * T), 0.0), []
 
 
 def second_order(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
@@ -161,6 +176,8 @@ def _input(rig: Rig, name: str, low_hz: float, high_hz: float) -> Iterator[Effec
         factor=Factor("input", name, gain),
     )
     yield Effect(physics="sign_error", site=name, factor=Factor("input", name, minus))
+    unheld = partial(not_held, rate_hz=rig.rate_hz)
+    yield Effect(physics="input_not_held", site=name, factor=Factor("input", name, unheld))
 
 
 def _sensor(name: str, low_hz: float, high_hz: float) -> Iterator[Effect]:

@@ -7,6 +7,7 @@ and left out where it is not, so that what is named afterwards does not rest on 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -19,7 +20,7 @@ from samii_rig.diagnose.result import Verdict
 from samii_rig.diagnose.wiring import FEW_LINES, lines_of, named, outputs_of, wired
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.rig.schema import Rig, parameters
-from samii_rig.types import FrequencyResponse
+from samii_rig.types import Finding, FrequencyResponse
 
 LOST_GAIN = 0.02  # relative change of one channel's gain between levels that is told
 FLAT = 2.0  # chi-square per degree of freedom up to which a change is a constant
@@ -41,8 +42,8 @@ class Sound:
     recordings cannot tell, in words. doubt : why nothing may be named, or None; guessed : the same
     of responses line by line, whole records have it not.
     units : channels whose unit was mended. mended : whether anything was, in the responses.
-    of_lines : of `told`, what concerns responses alone. spoilt : whether segments were left out for
-    what their samples are."""
+    of_lines : of `told`, what concerns responses alone. samples : why segments or channels were
+    left out for what their samples are."""
 
     responses: tuple[FrequencyResponse, ...]
     told: tuple[str, ...]
@@ -52,7 +53,14 @@ class Sound:
     mended: bool = False
     guessed: Doubt | None = None
     of_lines: frozenset[str] = frozenset()
-    spoilt: bool = False
+    samples: tuple[Finding, ...] = ()
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Outputs that half of the responses hold, or more: it costs less to leave out the records
+        of the others."""
+        held = Counter(c.name for r in self.responses for c in r.outputs)
+        return tuple(n for n, times in held.items() if 2 * times >= len(self.responses))
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics: 9.81 is not 9.80665."""
@@ -87,8 +95,9 @@ def sound(
         _belongs(r, rig)
     if responses:
         _covered(responses, band)
-    responses, doubt = _timed(responses, told)
-    finite, said = _finite(responses)
+    given = responses
+    responses, doubt = _timed(given, told)
+    finite, said = _finite(_fine(responses))
     mended, wiring, units = wired(finite, rig)
     steady, changed = _steady(mended)
     guessed = None
@@ -103,10 +112,12 @@ def sound(
         mended=bool(said or wiring or changed),
         guessed=guessed,
         of_lines=frozenset(estimated(responses, OF_LINES)),
-        spoilt=any(
-            f.severity == "error" and f.kind not in (*OF_LINES, "gap")
-            for r in responses
+        samples=tuple(
+            f
+            for r in given
             for f in r.findings
+            if (f.severity == "error" and f.kind not in (*OF_LINES, "gap"))
+            or (f.severity == "warning" and f.kind in ("clock", "resolution"))
         ),
     )
 
@@ -185,7 +196,9 @@ def _timed(
     responses: Sequence[FrequencyResponse], told: list[str]
 ) -> tuple[list[FrequencyResponse], Doubt | None]:
     """Without responses whose clock and rate disagree, as long as there are others."""
-    doubtful = [any(f.kind == "clock" for f in r.findings) for r in responses]
+    doubtful = [
+        any(f.kind == "clock" and f.severity != "note" for f in r.findings) for r in responses
+    ]
     if not any(doubtful):
         return list(responses), None
     if not all(doubtful):
@@ -198,6 +211,21 @@ def _timed(
         "set rate_hz to what the clock says, or mend the clock, and estimate again",
         "unknown",
     )
+
+
+def _fine(responses: Sequence[FrequencyResponse]) -> list[FrequencyResponse]:
+    """Without outputs whose rounding hides the response, which the estimate has told."""
+    out = []
+    for r in responses:
+        hidden = {f.channel for f in r.findings if f.kind == "resolution"}
+        keep = [i for i, c in enumerate(r.outputs) if c.name not in hidden]
+        if keep:
+            out.append(outputs_of(r, keep) if hidden else r)
+    if responses and not out:
+        raise EstimateError(
+            "no sensor moves by as much as one step of its converter; drive the rig harder"
+        )
+    return out
 
 
 def _finite(

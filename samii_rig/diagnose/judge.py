@@ -179,16 +179,13 @@ def _verdict(
     search: Search,
     decide: Measured | None,
 ) -> Verdict:
-    if not chosen.first.effects:
-        return "unknown" if _unexplained(evidence, search, decide) else "no_mismatch"
-    if evidence.drop <= search.worth:
-        # What a refit of the nominal parameters absorbs, at the cost of values that their
-        # tolerances make unlikely, is not in the data.
+    # What a refit of the nominal parameters absorbs, at the cost of values that their tolerances
+    # make unlikely, is not in the data; what is no physics is told beside the verdict.
+    physics = [e for e in chosen.first.effects if e.physics not in NOT_PHYSICS]
+    if not physics or evidence.drop <= search.worth:
         return "unknown" if _unexplained(evidence, search, decide) else "no_mismatch"
     if evidence.names > MOST_NAMES:
         return "unknown"
-    if all(e.physics in NOT_PHYSICS for e in chosen.first.effects):
-        return "no_mismatch"
     said = _said(evidence)
     # A nonlinear force is named once it was confirmed in time: see `confirmed`.
     return "ambiguous" if said == "named" and evidence.forced else said

@@ -8,7 +8,8 @@ better there: a first step from far away, and pictures.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
@@ -28,13 +29,15 @@ from samii_rig.diagnose.ranking import moved
 from samii_rig.diagnose.refit import Fitted, Problem, refit
 from samii_rig.diagnose.result import Band, Gap, Used
 from samii_rig.diagnose.search import Search
-from samii_rig.errors import SamiiRigError
+from samii_rig.errors import EstimateError, SamiiRigError
 from samii_rig.likelihood.noise import Shape
 from samii_rig.likelihood.pieces import Piece, Wiring, pieces_of, wiring
 from samii_rig.likelihood.reduce import Left, Records, Reduced, Response, left_by, reduced
 from samii_rig.rig.schema import Rig
+from samii_rig.signal.columns import aligned
+from samii_rig.signal.groups import segments_of
 from samii_rig.signal.statistics import octaves
-from samii_rig.types import Complex, Float, Int, Recording
+from samii_rig.types import Complex, Finding, Float, Int, Recording
 
 AXIS = 200  # frequencies, on which the power of what disturbs is scaled
 FORCED = ("added_mass", "added_inertia")  # physics at every place where a force acts
@@ -68,18 +71,26 @@ class Whole:
         rig: Rig,
         band: tuple[float, float] | None = None,
         table: Sequence[Effect] = (),
-        wired: Wiring | None = None,
+        sensors: Sequence[str] | None = None,
+        findings: Sequence[Finding] = (),
     ) -> Whole:
         """All runs of one rig. table : in which the places are found where a force may act.
-        wired : the columns to read, if not all that the runs have.
+
+        sensors : those that are sound, all that were recorded if None. findings : of the samples;
+        segments that they are about are left out, but not for a sensor that is left out itself.
 
         Raises EstimateError where they hold nothing to compare.
         """
-        wired = wired or wiring(runs, rig)
-        pieces = tuple(pieces_of(runs, rig, wired))
+        runs = [aligned(run)[0] for run in runs]
+        wired = wiring(runs, rig, sensors)
+        bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
+        without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
+        pieces = tuple(pieces_of(runs, rig, wired, without))
+        if not pieces:
+            raise EstimateError("no segment is sound")
         bands = tuple(band or excited(piece, rig.rate_hz) for piece in pieces)
         ports = tuple(e for e in table if e.physics in FORCED and e.jump and not e.jump.fixed)
-        return cls(rig, Records(pieces, rig.rate_hz, bands), wired, ports)
+        return cls(rig, Records(pieces, rig.rate_hz, bands), wired, ports, tuple(without.items()))
 
     @property
     def sensor(self) -> Int:
@@ -175,6 +186,17 @@ def excited(piece: Piece, rate_hz: float) -> tuple[float, float]:
     # The offset's line, and the one that it leaks to, are no excitation.
     on = np.flatnonzero(R[2:] > EXCITED * np.max(R[2:])) + 2
     return float(f[on[0]]) / WIDER, min(WIDER * float(f[on[-1]]), HIGHEST * rate_hz)
+
+
+def _named_in(messages: Sequence[str], places: Iterable[str]) -> dict[str, str]:
+    """The first message that names each of the places, of those that any names."""
+    out = {}
+    for place in places:
+        whole = re.compile(rf"(?<![\w.]){re.escape(place)}(?![\w.])")
+        why = next((m for m in messages if whole.search(m)), None)
+        if why is not None:
+            out[place] = why
+    return out
 
 
 def _fitted(k: Int) -> NDArray[np.bool_]:

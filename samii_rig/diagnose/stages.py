@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from samii_rig.diagnose import answer
 from samii_rig.diagnose import judge as verdict
+from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.findings import Doubt, Sound
 from samii_rig.diagnose.hiding import could_hide
 from samii_rig.diagnose.judge import Judgement
@@ -73,6 +74,9 @@ def told(
         # Trials of four channels say nothing of how often one curve tells several places apart.
         judged = verdict.doubted(judged, "ambiguous")
     missing = judged.verdict != "no_mismatch"
+    if not missing and best.effects and all(e.physics in NOT_PHYSICS for e in best.effects):
+        # The model is held against what was meant to be recorded.
+        shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
     causes = answer.causes_of(judged.classes[0], judged) if judged.verdict in verdict.SAID else ()
     words = list(clean.told)
     if missing or best.effects:

@@ -8,6 +8,10 @@ covariance C1. So in a block
 
 a the size of what such a disturbance moves, with the poles of the rig; C0 and C1 by expectation
 maximisation (Dempster, Laird and Rubin 1977, J. R. Stat. Soc. B 39).
+
+Sensors wander, with a power that falls by f^2. Where a block is wide beside its frequency, as the
+lowest ones of a short record are, each sensor's power in it is 1 + g/f^2 times C0 and C1, and the
+block is cut into narrow ones with that.
 """
 
 from __future__ import annotations
@@ -26,6 +30,9 @@ FREEDOM = 12.0
 NARROWEST = 0.1  # of its frequency, a block's width at least: sensors' own noise is smooth
 TURNS = 40  # of the maximisation: C1 is then within a few per cent of its end
 SEEN = 0.02  # of C0's power, less than which a disturbance adds nothing that counts
+
+WIDE = 1.5  # highest over lowest frequency of a block from which 1/f^2 shows beside a constant
+RED_TURNS = 100  # of the fit of 1/f^2: g is then within a few per cent of its end
 
 LITTLE = 0.1  # of a line's freedom: one with less says nothing by itself
 
@@ -59,10 +66,17 @@ class Noise:
         # What is left at the end is too little for a block of its own.
         ends = [*starts[:-1], f.size] if len(starts) > 1 else [0, f.size]
         power = shape(f)
-        each = [_fitted(left[a:b], free[a:b], power[a:b]) for a, b in pairwise(ends)]
-        edges = np.array([f[i] for i in ends[1:-1]])
+        lows, each = [], []
+        for a, b in pairwise(ends):
+            first, red = lows_of(f[a:b]), _red(f[a:b], left[a:b], free[a:b], power[a:b])
+            louder = np.sqrt(1 + red / f[a:b, None] ** 2)
+            C0, C1 = _fitted(left[a:b] / louder, free[a:b], power[a:b])
+            middle = np.sqrt(first * np.append(first[1:], f[b - 1]))
+            for low, scale in zip(first, np.sqrt(1 + red / middle[:, None] ** 2), strict=True):
+                lows.append(low)
+                each.append((scale[:, None] * C0 * scale, scale[:, None] * C1 * scale))
         own, pushed = (np.stack(C) for C in zip(*each, strict=True))
-        return cls(edges, own, pushed, shape)
+        return cls(np.array(lows[1:]), own, pushed, shape)
 
     def ranges(self, f: Float) -> list[tuple[int, int]]:
         """Where the lines f (n,), increasing, of each block stand."""
@@ -101,6 +115,32 @@ class Noise:
         C = self.covariance(f)
         plain = (np.linalg.cholesky(C) @ white[:, :, None])[:, :, 0]
         return np.asarray(np.abs(plain) ** 2 / np.diagonal(C, axis1=1, axis2=2).real)
+
+
+def lows_of(f: Float) -> Float:
+    """Hz at which the narrow blocks begin into which the lines f (n,) of one block are cut."""
+    wide = f[-1] / f[0]
+    parts = int(np.ceil(np.log(wide) / np.log(1 + NARROWEST))) if wide > WIDE else 1
+    marks = f[0] * wide ** (np.arange(parts) / parts)
+    # Each begins with a line of its own.
+    return np.asarray(f[np.unique(np.searchsorted(f, marks * (1 - 1e-9)))])
+
+
+def _red(f: Float, left: Complex, free: Float, power: Float) -> Float:
+    """(q,) g in Hz^2 of each sensor: its power in a block is 1 + g/f^2 times a constant, beside
+    what disturbs the rig. By multiplicative steps of Whittle's likelihood (Fevotte, Bertin and
+    Durrieu 2009, Neural Comput. 21, eq. 2.11, to the power 1/2 for it to grow at every step)."""
+    some = free > LITTLE
+    if f[-1] / f[0] <= WIDE or np.count_nonzero(some) <= 2 * left.shape[1]:
+        return np.zeros(left.shape[1])
+    w = free[some]
+    shapes = np.stack([np.ones(w.size), power[some], (f[0] / f[some]) ** 2])
+    P = (np.abs(left[some]) ** 2 / w[:, None]).T
+    size = np.repeat(np.mean(P, axis=1)[:, None], len(shapes), axis=1)
+    for _ in range(RED_TURNS):
+        S = size @ shapes
+        size = size * np.sqrt(((w * P / S**2) @ shapes.T) / ((w / S) @ shapes.T))
+    return np.asarray(size[:, 2] / size[:, 0] * f[0] ** 2)
 
 
 def _fitted(left: Complex, free: Float, power: Float) -> tuple[Complex, Complex]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -60,25 +60,34 @@ class Wiring:
     kp: float
 
 
-def wiring(recordings: Sequence[Recording], rig: Rig) -> Wiring:
-    """The columns of all recordings that the rig file knows.
+def wiring(
+    recordings: Sequence[Recording], rig: Rig, sensors: Collection[str] | None = None
+) -> Wiring:
+    """The columns of all recordings that the rig file knows, of `sensors` alone if given.
 
-    Raises EstimateError where they have no sensor or no command in common.
+    Raises EstimateError where they have no sensor or no command in common, or where the loop is
+    closed around a sensor that is left out.
     """
     known = [s.name for s in rig.sensor]
     common = set.intersection(*({c.name for c in r.channels} for r in recordings))
-    sensors = tuple(n for n in known if n in common)
+    asked = common if sensors is None else common & set(sensors)
+    found = tuple(n for n in known if n in asked)
     command = next((a.name for a in rig.actuator if a.name in common), "")
-    if not sensors or not command:
+    if not found or not command:
         raise EstimateError("the recordings have no command and no sensor of the rig in common")
     centring = rig.centring
-    if centring is None or centring.sensor not in sensors or rig.feedback:
-        return Wiring(command, sensors, "", 0.0)
-    return Wiring(command, sensors, centring.sensor, centring.kp)
+    if centring is None or centring.sensor not in common or rig.feedback:
+        return Wiring(command, found, "", 0.0)
+    if centring.sensor not in found:
+        raise EstimateError(f"the loop is closed around {centring.sensor}, which is left out")
+    return Wiring(command, found, centring.sensor, centring.kp)
 
 
-def pieces_of(recordings: Sequence[Recording], rig: Rig, wired: Wiring) -> list[Piece]:
-    """Every segment as a piece, those with proportional inputs as one.
+def pieces_of(
+    recordings: Sequence[Recording], rig: Rig, wired: Wiring, without: Collection[str] = ()
+) -> list[Piece]:
+    """Every segment as a piece, those with proportional inputs as one. without : places of
+    segments to leave out, as `Recording.place` gives them.
 
     The input of the loop is v + kp theta as they were recorded: it holds the reference, the
     rounding and the clipping of the command, and nothing of the sensors' noise.
@@ -94,6 +103,8 @@ def pieces_of(recordings: Sequence[Recording], rig: Rig, wired: Wiring) -> list[
         if wired.kp:
             r += wired.kp * values[:, 1 + wired.sensors.index(wired.centring)]
         for segment in segments_of(recording):
+            if recording.place(segment) in without:
+                continue
             found += _cut(recording, segment, r, values[:, 1:], whole)
     return _joined(_joined(found, levels=False), levels=True)
 
@@ -113,7 +124,7 @@ def _cut(
             continue
         history = min(low - start, high - low)
         moving = start > 0 and history < high - low
-        name = f"{recording.source}, {segment.name}" if recording.source else segment.name
+        name = recording.place(segment)
         part = r[low - history : high]
         level = (segment.level, segment.unit)
         out.append(Piece(name, part, z[low:high], history, (level,), moving))

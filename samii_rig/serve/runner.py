@@ -183,7 +183,7 @@ class Runner:
         from samii_rig.serve.analyst import said
 
         with suppress(SamiiRigError):
-            found = diagnose(outcome.responses, setup.rig)
+            found = diagnose(outcome.responses, setup.rig, runs=[outcome.recording])
             set_diagnosis(self.path, {**found.plain(), "lines": list(found.lines())})
             told = {"next_toml": following(found.experiment, text), "final": True}
             self.job.tell(DIAGNOSIS, {**said(found), **told})

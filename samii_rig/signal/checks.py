@@ -72,7 +72,7 @@ def gap_finding(
     total = sum(n for _, n, _ in found)
     where = f"at sample {segment.start + first}"
     more = f"; {total} in {len(found)} places in all" if len(found) > 1 else ""
-    message = f"{_place(cut, segment)}: {lost} samples{what} missing {where}{more}"
+    message = f"{cut.place(segment)}: {lost} samples{what} missing {where}{more}"
     return Finding("gap", "error", message, channel=channel, segment=segment.name)
 
 
@@ -80,7 +80,7 @@ def timing(cut: Recording, segment: Segment) -> list[Finding]:
     """Time that stands still or runs backwards (error), jitter or a wrong rate (warning)."""
     if len(cut) < 3:
         return []
-    place = _place(cut, segment)
+    place = cut.place(segment)
     step = np.diff(cut.time)
     if np.any(bad := (step <= 0) | (np.diff(cut.sequence) <= 0)):
         i = int(np.flatnonzero(bad)[0])
@@ -113,7 +113,7 @@ def clipping(cut: Recording, segment: Segment, selection: Selection) -> list[Fin
         flagged = (flags & (Quality.CLIPPED | Quality.LIMITED)).astype(bool)
         if not flagged.any() and (most := _beyond(x, channel)):
             message = (
-                f"{_place(cut, segment)}: {channel.name} reads {most:.4g} {channel.unit}, which "
+                f"{cut.place(segment)}: {channel.name} reads {most:.4g} {channel.unit}, which "
                 f"is outside its range of {channel.low:g} to {channel.high:g}: another unit, or "
                 "another channel"
             )
@@ -127,7 +127,7 @@ def clipping(cut: Recording, segment: Segment, selection: Selection) -> list[Fin
             first = int(cut.sequence[int(np.flatnonzero(at_end)[0])])
             sensor = channel.role == "sensor"
             message = (
-                f"{_place(cut, segment)}: {channel.name} is {how} in {n} samples, first at {first}"
+                f"{cut.place(segment)}: {channel.name} is {how} in {n} samples, first at {first}"
             )
             out.append(
                 Finding(
@@ -156,7 +156,7 @@ def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Findin
     for channel in selection.outputs:
         x = cut.values[:, cut.column(channel.name)]
         still = np.diff(x) == 0
-        place = f"{_place(cut, segment)}: {channel.name}"
+        place = f"{cut.place(segment)}: {channel.name}"
         if still.all():
             message = f"{place} never changes while {selection.input.name} moves"
             out.append(Finding("stuck", "error", message, channel.name, segment.name))
@@ -251,10 +251,6 @@ def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Half-open ranges in which `flags` is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def _place(cut: Recording, segment: Segment) -> str:
-    return f"{cut.source}, {segment.name}" if cut.source else segment.name
 
 
 def _beyond(x: Float, channel: Channel) -> float:

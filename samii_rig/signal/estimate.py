@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from samii_rig.errors import EstimateError, InputError, one_of
 from samii_rig.signal import local, periodic, repeats, stepped, welch
 from samii_rig.signal.choose import Method, at_rest, choose, drop_foreign, drop_stuck
+from samii_rig.signal.columns import aligned
 from samii_rig.signal.distortion import Distortion, distortion
 from samii_rig.signal.gather import Gaps, gather
 from samii_rig.signal.groups import Group, Piece
@@ -91,6 +92,8 @@ def estimate(
     out: list[FrequencyResponse] = []
     failed: list[EstimateError] = []
     skews = skews_of(recordings)
+    moved = [aligned(r) for r in recordings]
+    recordings = [r for r, _ in moved]
     if method in ("auto", "periodic"):
         sines, recordings = stepped.split(recordings)
         out, failed = stepped.estimate_stepped(
@@ -123,7 +126,8 @@ def estimate(
     if not out:
         raise failed[0]
     lost = tuple(Finding("repeat", "error", f"not estimated: {error}") for error in failed)
-    out[0] = replace(out[0], findings=(*out[0].findings, *lost))
+    shifted = tuple(finding for _, finding in moved if finding)
+    out[0] = replace(out[0], findings=(*out[0].findings, *shifted, *lost))
     return tuple(with_skew(response, skews) for response in out)
 
 

@@ -20,6 +20,7 @@ from samii_rig.signal.groups import (
     segments_of,
     select,
 )
+from samii_rig.signal.quantisation import coarse
 from samii_rig.types import Finding, Quality, Recording, Segment
 
 Gaps = Literal["refuse", "exclude", "model"]
@@ -57,7 +58,7 @@ def gather(
         if remark and remark not in group.findings:
             group.findings.append(remark)
         group.findings += seen.found
-        name = f"{recording.source}, {segment.name}" if recording.source else segment.name
+        name = recording.place(segment)
         z = cut.values[:, [cut.column(n) for n in own.names]]
         kept, breaks = _whole_rows(cut, seen.names)
         measured = np.ptp(z[kept][:, 1:]) > 0
@@ -196,7 +197,7 @@ def _examine(
     stand = checks.stuck(cut, segment, selection)
     frozen = [f for f in stand if f.severity == "error" and "never changes" not in f.message]
     clipped = checks.clipping(cut, segment, selection)
-    found += stand + clipped
+    found += stand + clipped + coarse(cut, segment, selection)
     spoilt = {f.channel for f in (*frozen, *clipped) if f.severity == "error"}
     return looked(not spoilt, spoilt)
 

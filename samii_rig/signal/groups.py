@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from samii_rig.errors import EstimateError, InputError, one_of
-from samii_rig.rig.load import tables
+from samii_rig.signal.columns import centring_of
 from samii_rig.types import Channel, Finding, Float, Recording, Segment
 
 # Correlation of two references above which they are the same experiment repeated; a lost
@@ -157,8 +157,9 @@ def reference_of(
     units = {n: cut.channels[cut.column(n)].unit for n in used}
     direct = [n for n in used if units[n] == selection.input.unit]
     angle = [n for n in used if units[n] != selection.input.unit]
-    kp = _centring_gain(cut)
-    if len(direct) == 1 and len(angle) == 1 and kp is not None:
+    centring = centring_of(cut)
+    if len(direct) == 1 and len(angle) == 1 and centring is not None:
+        _, kp = centring
         r = _column(cut, direct[0]) + kp * _column(cut, angle[0])
         return r, f"{direct[0]} + {kp:g} {angle[0]}", None
     raise InputError(where, "reference", used, "one reference column that is in use, by name")
@@ -203,12 +204,3 @@ def _alike(a: Float, b: Float) -> bool:
 
 def _column(recording: Recording, name: str) -> Float:
     return recording.values[:, recording.column(name)]
-
-
-def _centring_gain(recording: Recording) -> float | None:
-    """kp of the rig file that the recording carries, None if it carries none."""
-    try:
-        gain = tables(recording.rig_toml, "rig file")["centring"]["kp"]
-    except (InputError, KeyError, TypeError):
-        return None
-    return float(gain) if isinstance(gain, int | float) else None

@@ -1,4 +1,4 @@
-"""Rounding errors that repeats of one deterministic signal do not show."""
+"""Rounding errors: those that repeats do not show, and those that follow the motion."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from samii_rig.signal.groups import Group, Piece
-from samii_rig.types import Float
+from samii_rig.signal.groups import Group, Piece, Selection
+from samii_rig.types import Channel, Finding, Float, Recording, Segment
 
 # Distinct values at most of a signal whose resolution is inferred from its steps.
 COARSE_VALUES = 1000
+# Steps of its converter by which a signal moves at least, root mean square. A normal signal of one
+# step is rounded to an error that knows nothing of it (to 5e-9, Widrow and Kollar 2008, 6.2); of
+# half a step 1.4 % of it is lost, of a third a fifth, and of a sine below half a step all.
+LEAST_STEPS = 1.0
 
 
 def floor_of(group: Group, pieces: Sequence[Piece]) -> tuple[Float, dict[int, str]]:
@@ -23,7 +27,7 @@ def floor_of(group: Group, pieces: Sequence[Piece]) -> tuple[Float, dict[int, st
     messages = {}
     for i, channel in enumerate(group.selection.outputs):
         x = pieces[0].z[:, i + 1]
-        step = channel.resolution or _step(x)
+        step = step_of(channel, x)
         moving = np.flatnonzero(np.diff(x))
         if step == 0 or moving.size == 0:
             continue
@@ -34,6 +38,28 @@ def floor_of(group: Group, pieces: Sequence[Piece]) -> tuple[Float, dict[int, st
             f"{channel.unit} makes (step^2/12)"
         )
     return floor, messages
+
+
+def step_of(channel: Channel, x: Float) -> float:
+    """The step of a channel with values x (n,): as stated, or as they show it; 0 if they do not."""
+    return channel.resolution or _step(x)
+
+
+def coarse(cut: Recording, segment: Segment, selection: Selection) -> list[Finding]:
+    """Outputs that move by less than a step: their rounding follows the motion, as no noise does,
+    and a response that is estimated from them is not the rig's."""
+    out = []
+    for channel in selection.outputs:
+        x = cut.values[:, cut.column(channel.name)]
+        x = x[np.isfinite(x)]
+        step, moved = step_of(channel, x), float(np.std(x)) if x.size else 0.0
+        if 0 < moved < LEAST_STEPS * step:
+            text = (
+                f"{cut.place(segment)}: {channel.name} moves by {moved / step:.2g} of its step of "
+                f"{step:.3g} {channel.unit} (root mean square), so its rounding hides the response"
+            )
+            out.append(Finding("resolution", "warning", text, channel.name, segment.name))
+    return out
 
 
 def _step(x: Float) -> float:

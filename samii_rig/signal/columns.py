@@ -1,0 +1,109 @@
+"""Columns that a logger shifted by whole samples against each other.
+
+Where the loop's law v[k] = u[k] + kp (theta_ref[k] - theta[k]) is known, u, v and theta of one
+sample fulfil it to the rounding. If they do so only with theta[k + m], what was measured stands m
+rows behind what was sent: each row is read at another time than the one before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from samii_rig.errors import InputError
+from samii_rig.rig.load import tables
+from samii_rig.types import Finding, Float, Int, Recording
+
+FARTHEST = 5  # samples; a logger that is later has another fault
+# Of what no shift leaves of the law, what the right one leaves at most: a command that is measured
+# keeps a few per cent. One that is rounded keeps a quarter of its step in the median, and a shift
+# that is seen above that leaves a fifth more.
+LEFT, ROUNDED, SEEN = 0.2, 0.3, 1.2
+LOOKED_AT = 1 << 14  # samples about the largest reference: thousands tell a shift, millions cost
+SENT = ("reference", "command")  # roles of columns that are sent, not measured
+
+
+def centring_of(recording: Recording) -> tuple[str, float] | None:
+    """Sensor and kp of the centring in the rig file that a recording carries, None without one."""
+    try:
+        centring: Any = tables(recording.rig_toml, "rig file")["centring"]
+        sensor, kp = centring["sensor"], centring["kp"]
+    except (InputError, KeyError, TypeError):
+        return None
+    return (str(sensor), float(kp)) if isinstance(kp, int | float) and kp > 0 else None
+
+
+def shift_of(recording: Recording) -> int:
+    """Samples by which what was measured stands behind what was sent; 0 where the law of the loop
+    does not tell."""
+    centring = centring_of(recording)
+    names = {c.name: c for c in recording.channels}
+    command, references = recording.names("command"), recording.names("reference")
+    if centring is None or centring[0] not in names or len(command) != 1 or not references:
+        return 0
+    sensor, kp = centring
+    around = _about_the_largest(recording, references)
+    if around.stop - around.start <= 2 * FARTHEST:
+        return 0
+
+    def column(name: str) -> Float:
+        return np.asarray(recording.values[around, recording.column(name)], np.float64)
+
+    scale = {n: 1.0 if names[n].unit == names[command[0]].unit else kp for n in references}
+    r = sum((scale[n] * column(n) for n in references), np.zeros(around.stop - around.start))
+    theta, rest = column(sensor), column(command[0]) - r
+    inside = slice(FARTHEST, theta.size - FARTHEST)
+    shifts = range(-FARTHEST, FARTHEST + 1)
+    off = [float(np.nanmedian(np.abs(rest + kp * np.roll(theta, -m))[inside])) for m in shifts]
+    if not np.isfinite(off).all():
+        return 0
+    best, none = int(np.argmin(off)), off[FARTHEST]
+    exact = off[best] <= ROUNDED * names[command[0]].resolution and none > SEEN * off[best]
+    return shifts[best] if exact or off[best] < LEFT * none else 0
+
+
+def aligned(recording: Recording) -> tuple[Recording, Finding | None]:
+    """A recording whose rows hold what was sent and measured at one time, and what was done."""
+    m = shift_of(recording)
+    if m == 0:
+        return recording, None
+    sequence = recording.sequence
+    there = np.searchsorted(sequence, sequence + m)
+    kept = np.flatnonzero((there < sequence.size) & (there >= 0))
+    kept = kept[sequence[there[kept]] == sequence[kept] + m]
+    measured = [i for i, c in enumerate(recording.channels) if c.role not in SENT]
+    values, quality = recording.values[kept].copy(), recording.quality[kept].copy()
+    values[:, measured] = recording.values[np.ix_(there[kept], measured)]
+    quality[:, measured] = recording.quality[np.ix_(there[kept], measured)]
+    moved = replace(
+        recording,
+        time=recording.time[kept],
+        sequence=sequence[kept],
+        values=values,
+        quality=quality,
+        segments=tuple(_within(recording, sequence[kept])),
+    )
+    late = f"{abs(m)} sample{'s' * (abs(m) > 1)} {'later' if m > 0 else 'earlier'}"
+    text = (
+        f"{recording.source or 'recording'}: by the loop's own law what was measured stands {late} "
+        "than what was sent; set right"
+    )
+    return moved, Finding("timing", "warning", text)
+
+
+def _about_the_largest(recording: Recording, references: tuple[str, ...]) -> slice:
+    columns = [recording.column(n) for n in references]
+    size = np.max(np.abs(np.nan_to_num(recording.values[:, columns])), axis=1, initial=0.0)
+    middle = int(np.argmax(size)) if size.size and size.max() > 0 else 0
+    first = max(0, min(middle - LOOKED_AT // 2, size.size - LOOKED_AT))
+    return slice(first, min(first + LOOKED_AT, size.size) if size.size and size.max() > 0 else 0)
+
+
+def _within(recording: Recording, sequence: Int) -> list[Any]:
+    """The segments, without samples at the ends that no row holds any more."""
+    if not sequence.size:
+        return []
+    low, high = int(sequence[0]), int(sequence[-1]) + 1
+    return [replace(s, start=max(s.start, low), stop=min(s.stop, high)) for s in recording.segments]

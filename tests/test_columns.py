@@ -1,0 +1,111 @@
+"""Columns that a logger shifted: found by the loop's own law, set right, and told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from samii_rig.signal.columns import FARTHEST, aligned, shift_of
+from samii_rig.signal.estimate import estimate
+from samii_rig.types import Channel, Recording, Segment
+
+N, RATE, KP, STEP = 4000, 500.0, 4.0, 1e-3
+RIG_TOML = f'[centring]\nsensor = "theta"\nkp = {KP}\n'
+
+
+def loop(resolution: float = STEP, seed: int = 1, rig_toml: str = RIG_TOML) -> Recording:
+    """v = u - kp theta, rounded, of a slow joint with a noisy encoder."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(N) / RATE
+    u = np.sin(2 * np.pi * (0.5 + 2.0 * t) * t)
+    theta = np.cumsum(u) * 2e-3 + 1e-4 * rng.standard_normal(N)
+    v = u - KP * theta
+    if resolution:
+        v = np.rint(v / resolution) * resolution
+    a = np.gradient(theta) + 1e-5 * rng.standard_normal(N)
+    channels = (
+        Channel("u", "V", "reference"),
+        Channel("v", "V", "command", -10.0, 10.0, resolution),
+        Channel("theta", "rad", "sensor"),
+        Channel("a", "m/s^2", "sensor"),
+    )
+    values = np.column_stack([u, v, theta, a])
+    return Recording(
+        channels, RATE, np.arange(N) * 2_000_000, np.arange(N), values,
+        np.zeros(values.shape, np.uint8), (Segment("sweep", "single", 0, N, 1.0, "V", 0),),
+        rig_toml=rig_toml, source="run.mcap",
+    )  # fmt: skip
+
+
+def late(recording: Recording, m: int) -> Recording:
+    """What was measured m rows later, without the rows that then hold nothing."""
+    values = recording.values.copy()
+    values[:, 2:] = np.roll(values[:, 2:], m, axis=0)
+    return rows(replace(recording, values=values), slice(max(m, 0), N + min(m, 0)))
+
+
+def rows(recording: Recording, kept: slice | np.ndarray) -> Recording:
+    return replace(
+        recording,
+        time=recording.time[kept],
+        sequence=recording.sequence[kept],
+        values=recording.values[kept],
+        quality=recording.quality[kept],
+    )
+
+
+@pytest.mark.parametrize("m", [-FARTHEST, -2, -1, 1, 3, FARTHEST])
+def test_columns_that_stand_late_are_set_right(m: int):
+    whole = loop()
+    found, finding = aligned(late(whole, m))
+    assert finding is not None
+    assert f"{abs(m)} sample" in finding.message
+    assert "run.mcap" in finding.message
+    np.testing.assert_array_equal(found.values, whole.values[found.sequence])
+    assert len(found) >= N - 2 * abs(m)
+
+
+def test_rows_beside_a_gap_are_given_up_and_no_other():
+    whole = loop()
+    kept = np.r_[0:1500, 1600:N]
+    found, _ = aligned(rows(late(whole, 3), kept[kept < N - 3]))
+    np.testing.assert_array_equal(found.values, whole.values[found.sequence])
+    assert len(found) >= kept.size - 12
+
+
+def test_a_recording_in_order_is_left_as_it_is():
+    whole = loop()
+    assert aligned(whole) == (whole, None)
+
+
+@pytest.mark.parametrize(
+    "unknown",
+    [
+        late(loop(rig_toml=""), 2),
+        late(loop(rig_toml="[centring"), 2),
+        replace(
+            late(loop(), 2), channels=tuple(replace(c, role="sensor") for c in loop().channels)
+        ),
+        rows(late(loop(), 2), slice(0, 6)),
+    ],
+)
+def test_where_the_law_is_not_known_nothing_is_moved(unknown: Recording):
+    assert shift_of(unknown) == 0
+
+
+def test_a_measured_command_shows_a_shift_too():
+    rng = np.random.default_rng(3)
+    run = loop(0.0)
+    values = run.values.copy()
+    values[:, 1] += 1e-4 * rng.standard_normal(N)
+    assert shift_of(late(replace(run, values=values), 2)) == 2
+
+
+def test_the_estimate_is_that_of_the_columns_in_order_and_says_so():
+    (right,) = estimate([loop()])
+    (found,) = estimate([late(loop(), 2)])
+    assert any(f.kind == "timing" and "set right" in f.message for f in found.findings)
+    shared = np.interp(right.frequency, found.frequency, np.angle(found.H[:, 0, 0]))
+    np.testing.assert_allclose(shared, np.angle(right.H[:, 0, 0]), atol=0.02)

@@ -1,0 +1,41 @@
+"""What channels do that is no physics: an input that was measured, not held."""
+
+from __future__ import annotations
+
+import numpy as np
+from identify_kit import noiseless, samii
+
+from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.model import Model, grid
+from samii_rig.identify.bootstrap import redraw
+from samii_rig.model.sampled import sensors_at
+from samii_rig.model.tmm import Chain
+
+RIG = samii()
+BAND = (0.5, 40.0)
+LINES = np.geomspace(*BAND, 160)
+ALL = table(RIG, *BAND)
+(NOT_HELD,) = (e for e in ALL if e.name == ("input_not_held", "v_2"))
+SENSORS = np.arange(len(RIG.sensor))
+
+
+def test_an_input_that_is_not_held_has_the_response_of_the_chain_itself():
+    model = Model(RIG, (NOT_HELD,))
+    at = grid(RIG, LINES, SENSORS, np.zeros(SENSORS.size, np.int64))
+    found = model.response(np.zeros(model.n), at)
+    chain = Chain(RIG).response(LINES)[:, :, 0]
+    plain = chain * sensors_at(RIG.sensor, 2j * np.pi * LINES)
+    size = np.abs(plain).max(axis=0)
+    # What is left are the aliases far above, which the grid holds as they are of a held input.
+    assert np.max(np.abs(found - plain) / size) < 1e-3
+
+
+def test_it_is_told_and_no_physics_is_named():
+    model = Model(RIG, (NOT_HELD,))
+    at = grid(RIG, LINES, SENSORS, np.zeros(SENSORS.size, np.int64))
+    exact = model.response(np.zeros(model.n), at)[:, :, None]
+    measured = redraw(noiseless(RIG, LINES), exact, np.random.default_rng(3), 10)
+    found = diagnose([measured], RIG)
+    assert found.verdict == "no_mismatch"
+    assert any("v_2 was not held between samples" in words for words in found.not_physics)
+    assert not found.causes
