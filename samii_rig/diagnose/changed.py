@@ -22,7 +22,9 @@ from samii_rig.diagnose.rigfile import explained
 from samii_rig.diagnose.stages import Case, Progress
 from samii_rig.diagnose.states import Both, StatesSearch
 from samii_rig.errors import EstimateError
-from samii_rig.rig.schema import Parameter, RelativeAngle, Rig
+from samii_rig.likelihood.reduce import Records
+from samii_rig.rig.elements import Branch, flattened, parameters
+from samii_rig.rig.schema import RelativeAngle, Rig
 from samii_rig.types import FrequencyResponse, Recording
 
 COMMON = "common_"  # of the names of what both states have beside the rig file
@@ -73,7 +75,7 @@ def changed(
         progress=lambda stage: progress(f"before: {stage}"),
     )
     put_in = found.verdict != "no_mismatch" and found.rig is not None
-    common = _common(rig, found.rig) if put_in and found.rig else rig
+    common = common_rig(rig, found.rig) if put_in and found.rig else rig
     progress("both states")
     first = case_of(before.responses, common, band, effects, before.runs)
     second = case_of(
@@ -122,7 +124,7 @@ def _both(first: Case, second: Case, band: Band | None) -> tuple[Both, RecordSea
     return Both(after, before, alike), start
 
 
-def _within(records: Any, band: Band) -> Any:
+def _within(records: Records, band: Band) -> Records:
     """Records on the lines within a band alone."""
     low, high = band
     own = tuple((max(a, low), min(b, high)) for a, b in records.bands)
@@ -131,28 +133,29 @@ def _within(records: Any, band: Band) -> Any:
     return replace(records, bands=own)
 
 
-def _common(rig: Rig, found: Rig) -> Rig:
+def common_rig(rig: Rig, found: Rig) -> Rig:
     """The rig with what the state before was found to have: its parameters are free, those of the
     rig file keep their tolerances."""
-    tolerance = {
-        (e.name, symbol): p.tolerance
-        for e in rig.element
-        for symbol, p in iter(e)
-        if isinstance(p, Parameter)
-    }
-    own = {e.name for e in rig.element}
-    names = {e.name: e.name.replace(PREFIX, COMMON, 1) for e in found.element if e.name not in own}
+    own = {e.name: e for e in flattened(rig.element)}
+
+    def renamed(name: str) -> str:
+        return name if name in own else name.replace(PREFIX, COMMON, 1)
 
     def freed(element: Any) -> Any:
-        update: dict[str, Any] = {"name": names.get(element.name, element.name)}
-        for symbol, p in iter(element):
-            if isinstance(p, Parameter):
-                t = tolerance.get((element.name, symbol), FREE)
-                update[symbol] = p.model_copy(update={"tolerance": t})
+        old = parameters(own[element.name]) if element.name in own else {}
+        update: dict[str, Any] = {
+            symbol: p.model_copy(
+                update={"tolerance": old[symbol].tolerance if symbol in old else FREE}
+            )
+            for symbol, p in parameters(element).items()
+        }
+        update["name"] = renamed(element.name)
+        if isinstance(element, Branch):
+            update["element"] = tuple(freed(e) for e in element.element)
         return element.model_copy(update=update)
 
     sensors = tuple(
-        s.model_copy(update={"across": tuple(names.get(n, n) for n in s.across)})
+        s.model_copy(update={"across": tuple(renamed(n) for n in s.across)})
         if isinstance(s, RelativeAngle)
         else s
         for s in found.sensor

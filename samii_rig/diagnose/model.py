@@ -12,6 +12,7 @@ from samii_rig.diagnose.causal import CausalChain
 from samii_rig.diagnose.effect import Effect, Key
 from samii_rig.model.sampled import hold_at, sampled_response, sensors_at
 from samii_rig.model.tmm import Chain
+from samii_rig.rig.elements import flattened
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.types import Complex, Float, Int
 
@@ -154,7 +155,7 @@ class Model:
             built = effect.build(built)
         self.built = built
         self.chain = self.chain_of(built)
-        known = {(e.name, s): p for e in rig.element for s, p in parameters(e).items()}
+        known = {(e.name, s): p for e in flattened(rig.element) for s, p in parameters(e).items()}
         have = set(self.chain.parameters)
         self.keys: tuple[Key, ...] = tuple(
             k for k, p in known.items() if p.tolerance > 0 and p.value != 0 and k in have
