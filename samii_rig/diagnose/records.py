@@ -147,10 +147,12 @@ class Whole:
 
         axis = np.geomspace(*self.records.band, AXIS)
         scale = np.median(self._moved(fitted, axis), axis=1)
+        moves = scale > 0
 
         def at(f: Float) -> Float:
             once, which = np.unique(f, return_inverse=True)
-            return np.asarray((np.mean(self._moved(fitted, once).T / scale, axis=1))[which])
+            power = self._moved(fitted, once)[moves].T / scale[moves]
+            return np.asarray(np.mean(power, axis=1)[which])
 
         return at
 
@@ -163,9 +165,12 @@ class Whole:
             try:
                 model = Model(self.rig, (*fitted.model.effects, effect))
                 known = moved(fitted.model, fitted.x, model)
-                each.append(np.abs(place_of(model, known, effect, there, h).c) ** 2)
+                with np.errstate(all="ignore"):
+                    own = np.abs(place_of(model, known, effect, there, h).c) ** 2
             except SamiiRigError:
                 continue
+            # At a place that a brace holds nothing moves, and what rounding leaves says nothing.
+            each.append(np.where(np.isfinite(own), own, 0.0))
         return np.stack(each)
 
     def about(self, fitted: Fitted, at: Float | None = None) -> Reduced:
