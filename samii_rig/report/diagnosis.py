@@ -229,15 +229,18 @@ def _fits(
     causes = words.answer(found)
     after = curve(found.rig, caused, responses) if causes and found.rig else None
     curves = [Curves.of(r) for r in responses]
-    out = []
+    names, sets, said = [], [], []
     for i, y in enumerate(responses[0].outputs):
         for j, u in enumerate(responses[0].inputs):
             if y.name not in before.outputs or u.name not in before.inputs:
                 continue
-            figure = figures.before_after(curves, i, j, before, after)
-            caption = _improved(responses, before, after, i, j)
-            out.append(Plot(f"fit-{i}-{j}", f"{y.name}/{u.name}", caption, figure))
-    return tuple(out)
+            names.append(f"{y.name}/{u.name}")
+            sets.append({"name": names[-1], **figures.before_after(curves, i, j, before, after)})
+            said.append(f"{names[-1]} {_improved(responses, before, after, i, j)}".strip())
+    if not sets:
+        return ()
+    caption = "; ".join(said)
+    return (Plot("fit", "Responses", caption, {"sets": sets}, tuple(names), "Response"),)
 
 
 def _improved(

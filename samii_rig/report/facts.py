@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from samii_rig.record.events import Event
-from samii_rig.report.compare import Comparison, percent, pretty, telling
+from samii_rig.report.compare import Comparison, percent, pretty
 from samii_rig.report.verdicts import counted, duration, without_folders
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
@@ -51,19 +52,29 @@ def subtitle(recordings: Sequence[Recording], rig: Rig | None) -> str:
     return " \u00b7 ".join(parts)
 
 
-def headline(output: str, input: str, comparisons: Sequence[Comparison]) -> str:
-    """What is said above the first picture of one output."""
-    top = telling(comparisons).get((output, input))
-    if top is None:
-        return "measured gain with its 90 % band"
-    if top.agrees:
-        return "model and measurement differ by no more than the noise"
-    phase = round(top.phase_deg)
-    return (
-        f"model {top.gain:.3g} \u00d7 the measured gain, phase {phase:+d}\u00b0 in the "
-        f"median at {top.level:g} {top.level_unit}; shaded where the difference is more than noise "
-        f"({top.low_hz:.3g}\u2013{top.high_hz:.3g} Hz compared)"
-    )
+def comparison_rows(comparisons: Sequence[Comparison]) -> list[dict[str, str]]:
+    """Model over measurement, one row for each output, input and level."""
+    return [
+        {
+            "response": f"{c.output}/{c.input}",
+            "level": f"{c.level:g} {c.level_unit}",
+            "band": f"{c.low_hz:.3g}\u2013{c.high_hz:.3g} Hz",
+            "gain": f"{c.gain:.3f}",
+            "phase": f"{round(c.phase_deg, 1) + 0.0:+.1f}\u00b0",  # no minus before a zero
+            "outside": percent(c.outside),
+            "differs": "within the noise" if c.first_hz is None else f"from {c.first_hz:.3g} Hz on",
+            "mark": "good" if c.agrees else "warning",
+        }
+        for c in comparisons
+    ]
+
+
+def diagnose_command(recordings: Sequence[Recording], comparisons: Sequence[Comparison]) -> str:
+    """The command that says what the model leaves out, "" where model and measurement agree."""
+    sources = [r.source for r in recordings if r.source]
+    if not sources or all(c.agrees for c in comparisons):
+        return ""
+    return f"samii-rig diagnose {shlex.join(sources)}"
 
 
 def limit_rows(recordings: Sequence[Recording], rig: Rig) -> list[dict[str, object]]:

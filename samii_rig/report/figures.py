@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MultipleLocator, NullFo
 from samii_rig.errors import InputError
 from samii_rig.record.export import replacing
 from samii_rig.report.compare import ModelCurve
-from samii_rig.report.plots import Curves, unit
+from samii_rig.report.plots import Curves, lines_of, unit
 from samii_rig.types import FrequencyResponse
 
 SUFFIXES = (".png", ".svg", ".pdf")
@@ -25,6 +26,8 @@ _COLUMN_INCH = 3.5  # one column of a two-column page
 _ROW_INCH = 3.6
 _LEFT_INCH, _BOTTOM_INCH, _TOP_INCH = 0.7, 0.48, 0.28
 _DPI = 300
+_BINS = 180  # of log-frequency, two points each: 100 a inch of a column
+_DIGITS = re.compile(r"(\.\d\d)\d+")  # of a path: a hundredth of a point is no ink
 _NOISE_PART = 0.004  # of the lines may lie below the gain axis
 
 
@@ -95,18 +98,22 @@ def save_figure(path: Path | str, figure: Figure) -> Path:
     ):
         dated = {"Date": None} if path.suffix.lower() == ".svg" else None
         figure.savefig(part, format=path.suffix[1:].lower(), dpi=_DPI, metadata=dated)
+        if dated:
+            text = part.read_text(encoding="utf-8")
+            short = re.sub(r' d="[^"]*"', lambda m: _DIGITS.sub(r"\1", m[0]), text)
+            part.write_text(short, encoding="utf-8")
     return path
 
 
 def _draw(gain: Axes, angle: Axes, c: Curves, i: int, colour: str) -> None:
-    r = c.response
-    f, size = r.frequency, np.abs(r.H[:, i, 0])
+    r, at = c.response, lines_of(c.response, i, 0, _BINS)
+    f, size = r.frequency[at], np.abs(r.H[at, i, 0])
     name = f"{r.level:g} {r.level_unit}" if np.isfinite(r.level) else "measured"
-    low = np.maximum(c.low[:, i, 0], 0.1 * size)  # zero is nowhere on a logarithmic axis
-    gain.fill_between(f, low, c.high[:, i, 0], color=colour, alpha=0.25, lw=0)
+    low = np.maximum(c.low[at, i, 0], 0.1 * size)  # zero is nowhere on a logarithmic axis
+    gain.fill_between(f, low, c.high[at, i, 0], color=colour, alpha=0.25, lw=0)
     gain.plot(f, size, color=colour, lw=0.9, label=name)
-    half = np.where(c.half[:, i, 0] < 180.0, c.half[:, i, 0], np.nan)
-    turn = c.angle[:, i, 0]
+    half = np.where(c.half[at, i, 0] < 180.0, c.half[at, i, 0], np.nan)
+    turn = c.angle[at, i, 0]
     angle.fill_between(f, turn - half, turn + half, color=colour, alpha=0.25, lw=0)
     angle.plot(f, turn, color=colour, lw=0.9)
 

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from samii_rig.errors import InputError
 from samii_rig.record.events import Event
 from samii_rig.report import facts, plots, series
-from samii_rig.report.compare import ModelCurve, compare, pretty
+from samii_rig.report.compare import Comparison, ModelCurve, compare, pretty
 from samii_rig.report.drawing import draw
 from samii_rig.report.modes import Modes, modes_of_all, rows, sentences
 from samii_rig.report.modes_drawing import motions
@@ -89,23 +89,9 @@ def render(
     comparisons = (
         [] if model is None else [c for r in responses for c in compare(r, model, band_hz)]
     )
-    headlines, bodes, ratios = [], [], []
-    if responses:
-        first = responses[0]
-        curves = [plots.Curves.of(r) for r in responses]
-        for i, y in enumerate(first.outputs):
-            for j, u in enumerate(first.inputs):
-                name, id_ = f"{y.name}/{u.name}", f"{i}-{j}"
-                figure = plots.headline(curves, i, j, model, comparisons, modes)
-                said = facts.headline(y.name, u.name, comparisons)
-                headlines.append(Plot(f"head-{id_}", name, said, figure))
-                said = plots.distortion_caption(responses)
-                bodes.append(Plot(f"bode-{id_}", name, said, plots.bode(curves, i, j, model)))
-                if any((c.output, c.input) == (y.name, u.name) for c in comparisons) and model:
-                    figure = plots.ratio(curves, i, j, model)
-                    ratios.append(Plot(f"ratio-{id_}", name, "dashed: agreement", figure))
+    bode = _bode(responses, model, comparisons, modes)
     time, spectrum = _recorded(recordings, spectrogram_channel)
-    plots_ = [p for p in (*headlines, *bodes, *ratios, time, spectrum) if p]
+    plots_ = [p for p in (bode, time, spectrum) if p]
     return page_text(
         "page.html.j2",
         [*(diagnosis.plots if diagnosis else ()), *plots_],
@@ -113,10 +99,9 @@ def render(
         title=title or facts.title(recordings, rig),
         subtitle=facts.subtitle(recordings, rig),
         verdicts=verdicts(recordings, responses, comparisons),
-        headlines=headlines,
-        bode=bodes,
-        ratios=ratios,
-        comparisons=comparisons,
+        bode=bode,
+        comparisons=facts.comparison_rows(comparisons),
+        command=facts.diagnose_command(recordings, comparisons) if diagnosis is None else "",
         modes=rows(modes),
         modes_said=sentences(modes),
         modes_held=any(m.known for m in modes),
@@ -133,6 +118,38 @@ def render(
         findings=facts.finding_rows(responses),
         files=facts.files(recordings),
         metadata=facts.metadata(recordings),
+    )
+
+
+BODE, RATIO = "Gain, phase, coherence", "Model over measurement"
+
+
+def _bode(
+    responses: Sequence[FrequencyResponse],
+    model: ModelCurve | None,
+    comparisons: Sequence[Comparison],
+    modes: Sequence[Modes],
+) -> Plot | None:
+    """One panel for all responses: which of them, and how it is shown, are its switches."""
+    if not responses:
+        return None
+    first, curves = responses[0], [plots.Curves.of(r) for r in responses]
+    compared = {(c.output, c.input) for c in comparisons}
+    views = (BODE, RATIO) if compared else (BODE,)
+    names, sets = [], []
+    for i, y in enumerate(first.outputs):
+        for j, u in enumerate(first.inputs):
+            names.append(f"{y.name}/{u.name}")
+            figures = [plots.bode(curves, i, j, model, comparisons, modes)]
+            if len(views) > 1:
+                held = model is not None and (y.name, u.name) in compared
+                figures.append(plots.ratio(curves, i, j, model) if held and model else figures[0])
+            sets += [{"name": names[-1], **f} for f in figures]
+    said = ["the bands hold the true value of each line with 90 % probability"]
+    said += ["shaded: the model differs by more than noise"] if compared else []
+    said += [d] if (d := plots.distortion_caption(responses)) else []
+    return Plot(
+        "bode", "Responses", "; ".join(said), {"sets": sets}, tuple(names), "Response", views
     )
 
 

@@ -24,7 +24,7 @@ from samii_rig.report.modes import Modes
 from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_width
 from samii_rig.types import Channel, Float, FrequencyResponse, Int
 
-_BINS = 1200  # of log-frequency; more than the pixels of a wide screen
+_BINS = 280  # of log-frequency, two points each: the pixels of the panel
 _NOISE_PART = 0.004  # of the lines may lie outside a gain axis
 DEGREES = "%{y:.1f}\u00b0"
 _LABELS = 4  # more would stand on each other
@@ -46,34 +46,6 @@ class Curves:
         gain = magnitude_interval(response, BAND)
         half = phase_half_width(response, BAND)
         return cls(response, gain.low, gain.high, phase(response), half)
-
-
-def headline(
-    curves: Sequence[Curves],
-    output: int,
-    input: int,
-    model: ModelCurve | None,
-    comparisons: Sequence[Comparison],
-    modes: Sequence[Modes] = (),
-) -> Figure:
-    """Gain of one output, its bands and the model's curve, differences shaded, the modes of the
-    last response named: one look."""
-    responses = [c.response for c in curves]
-    y, u = responses[0].outputs[output], responses[0].inputs[input]
-    figure = stacked(1, [f"{y.name}/{u.name} [{unit(y, u)}]"], 330)
-    log_scale(figure["layout"]["yaxis"])
-    for k, c in enumerate(curves):
-        gain_curve(figure, c, k, output, input)
-    curve = np.empty(0)
-    if model is not None:
-        curve = model_gain(figure, responses, model, y.name, u.name)
-    frame(figure, responses)
-    fit_gain(figure, responses, output, input, curve)
-    worst = telling(comparisons).get((y.name, u.name))
-    if worst is not None:
-        figure["layout"]["shapes"] = [shade(span) for span in worst.spans_hz]
-    figure["layout"]["annotations"] = _mode_labels(responses[-1], output, input, modes)
-    return figure
 
 
 def _mode_labels(
@@ -109,9 +81,12 @@ def bode(
     output: int,
     input: int,
     model: ModelCurve | None,
+    comparisons: Sequence[Comparison] = (),
+    modes: Sequence[Modes] = (),
 ) -> Figure:
     """Gain, phase and coherence of one entry of H, every level with its 90 % band; below them
-    even and odd distortion where the excitation shows them."""
+    even and odd distortion where the excitation shows them. Where the model differs by more than
+    noise is shaded, and the modes of the last response are named."""
     responses = [c.response for c in curves]
     y, u = responses[0].outputs[output], responses[0].inputs[input]
     titles = [f"gain [{unit(y, u)}]", "phase [\u00b0]", "coherence"]
@@ -142,6 +117,10 @@ def bode(
         line(figure, f, angle, name, "y2", None, legend=False, hover=DEGREES)
     frame(figure, responses)
     fit_gain(figure, responses, output, input, curve)
+    worst = telling(comparisons).get((y.name, u.name))
+    if worst is not None:
+        figure["layout"]["shapes"] = [shade(span) for span in worst.spans_hz]
+    figure["layout"]["annotations"] = _mode_labels(responses[-1], output, input, modes)
     return figure
 
 
@@ -300,16 +279,16 @@ def label(r: FrequencyResponse) -> str:
     return f"{r.level:g} {r.level_unit}" if np.isfinite(r.level) else "measured"
 
 
-def lines_of(r: FrequencyResponse, i: int, j: int) -> Int:
-    """Indices of the lines to draw: all, or the extremes in each bin of log-frequency."""
+def lines_of(r: FrequencyResponse, i: int, j: int, bins_: int = _BINS) -> Int:
+    """Indices of the lines to draw: all, or the extremes in each of `bins_` of log-frequency."""
     f, gain = r.frequency, np.abs(r.H[:, i, j])
     usable = np.flatnonzero((f > 0) & np.isfinite(gain))
-    if len(usable) <= 2 * _BINS:
+    if len(usable) <= 2 * bins_:
         return usable
     x = np.log(f[usable])
-    bins = np.minimum(((x - x[0]) / (x[-1] - x[0]) * _BINS).astype(np.int64), _BINS - 1)
+    bins = np.minimum(((x - x[0]) / (x[-1] - x[0]) * bins_).astype(np.int64), bins_ - 1)
     order = np.lexsort((gain[usable], bins))
-    ends = np.flatnonzero(np.diff(bins[order], prepend=-1, append=_BINS))
+    ends = np.flatnonzero(np.diff(bins[order], prepend=-1, append=bins_))
     chosen = np.concatenate([order[ends[:-1]], order[ends[1:] - 1]])
     return np.unique(usable[chosen])
 

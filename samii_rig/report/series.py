@@ -14,9 +14,9 @@ from samii_rig.report.compare import pretty
 from samii_rig.report.decimate import thin
 from samii_rig.types import Float, Recording
 
-_POINTS = 250_000  # of all time series of a page, 11 bytes each
+_POINTS = 50_000  # of all time series of a page, 5 bytes each
 _PIXELS = 1200  # of one curve at most, and
-_FEWEST = 150  # at least, however many segments there are
+_FEWEST = 100  # at least, however many segments there are
 _WINDOWS_PER_SERIES = 240  # time resolution of the spectrogram
 _DEPTH_DB = 80.0  # below the loudest spot; less than that is noise of the converter
 _ROW = 118  # px

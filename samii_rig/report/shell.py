@@ -20,25 +20,31 @@ from markupsafe import Markup
 
 from samii_rig.errors import InputError
 from samii_rig.record.export import replacing
-from samii_rig.report.canvas import Figure
+from samii_rig.report.canvas import Figure, halved
 
 _WORDS = {"good": "good", "note": "note", "warning": "look", "bad": "attention"}
 
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """One figure of the page and what is said above it."""
+    """One figure of the page and what is said above it.
+
+    options : names of its sets, for a select; chosen : what they are. views : of each option
+    there are so many sets, one after the other, for a second select.
+    """
 
     id: str
     title: str
     caption: str
     figure: Figure
     options: tuple[str, ...] = ()
+    chosen: str = "Segment"
+    views: tuple[str, ...] = ()
 
     @property
     def json(self) -> Markup:
         """The figure as JSON that cannot end its script element."""
-        text = json.dumps(self.figure, separators=(",", ":"), allow_nan=False)
+        text = json.dumps(halved(self.figure), separators=(",", ":"), allow_nan=False)
         return Markup(text.replace("<", "\\u003c"))
 
 
@@ -105,7 +111,6 @@ def _asset(name: str) -> str:
 
 @cache
 def _plotly() -> str:
-    """plotly.js, once. Its line ends are made the ones that a browser hashes."""
-    from plotly.offline import get_plotlyjs
-
-    return str(get_plotlyjs()).replace("\r\n", "\n").replace("\r", "\n")
+    """The part of plotly.js with lines, points and heat maps: a third of the whole. Its line ends
+    are made the ones that a browser hashes."""
+    return _asset("plotly-cartesian.min.js").replace("\r\n", "\n").replace("\r", "\n")

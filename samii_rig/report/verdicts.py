@@ -128,7 +128,12 @@ def _model(comparisons: Sequence[Comparison]) -> list[Verdict]:
         return [Verdict("good", "The model agrees with the measurement", text)]
     near = all(abs(c.gain - 1) < _GAIN_NEAR and abs(c.phase_deg) < _PHASE_NEAR for c in comparisons)
     title = "The model is close, but differs" if near else "The model differs from the measurement"
-    text = " ".join(c.sentence() for c in telling(comparisons).values())
+    shown = list(telling(comparisons).values())
+    # The one that is furthest off; every one is in the table.
+    text = max(shown, key=lambda c: (not c.agrees, c.outside, abs(np.log(c.gain)))).sentence()
+    differ = sum(not c.agrees for c in shown)
+    if len(shown) > 1:
+        text += f" {differ} of {len(shown)} responses differ."
     return [Verdict("warning" if near else "bad", title, text)]
 
 

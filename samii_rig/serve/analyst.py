@@ -248,6 +248,7 @@ def curves(r: FrequencyResponse) -> dict[str, Any]:
             "high": _short(inside.high[at, i, j]),
             "phase": _short(angle[at, i, j]),
             "half": _short(half[at, i, j]),
+            "coherence": _short(r.coherence[at, i]),
         }
         for i, y in enumerate(r.outputs)
         for j, u in enumerate(r.inputs)

@@ -10,6 +10,17 @@ from samii_rig.run.setups import Setup, setups_of
 from samii_rig.serve.job import EXPERIMENT, RIG, Job
 
 
+def averages(plan: Plan, segment: int) -> tuple[int, int]:
+    """How many segments like the one that goes on are whole, and how many the plan has.
+
+    segment : the number of the one that goes on, from 1. Alike are those that are averaged
+    together: of one kind and level.
+    """
+    alike = [(s.kind, s.level, s.unit) for s in plan.segments]
+    now = alike[segment - 1]
+    return alike[: segment - 1].count(now), alike.count(now)
+
+
 def planned(job: Job) -> tuple[Setup, str, Plan]:
     """The rig as the run needs it, the experiment's text and its plan; InputError if they are
     wrong."""

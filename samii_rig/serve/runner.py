@@ -33,7 +33,7 @@ from samii_rig.run.setups import Setup
 from samii_rig.serve.following import following
 from samii_rig.serve.job import DIAGNOSIS, LOST_AFTER, Job, JobState
 from samii_rig.serve.live import LiveWriter, live_folder
-from samii_rig.serve.planned import planned
+from samii_rig.serve.planned import averages, planned
 from samii_rig.types import SampleBlock, StopRecord
 
 
@@ -95,8 +95,10 @@ class Runner:
 
         def progress(now: Progress) -> None:
             if self.live is not None:
+                done, of = averages(plan, now.segment)
                 # JSON says neither "not a number" nor "infinite".
                 about = {"duration": plan.duration, "broadband": math.isinf(now.frequency)}
+                about |= {"averages": done, "of_averages": of}
                 self.live.progress({**_numbers(asdict(now)), **about})
                 self._end_at_rest(now)
 

@@ -19,10 +19,28 @@
     if (!level) return scheme[token.slice(1)];
     return scheme.level[Number(level[1])] + (level[2] ? "38" : "");
   };
+  // Arrays come as 16 bit steps of their range, see canvas.py; a shape makes rows of them.
+  const restored = ({ q, from, to, log, shape }) => {
+    const bytes = Uint8Array.from(atob(q), (c) => c.charCodeAt(0));
+    const values = Float32Array.from(new Uint16Array(bytes.buffer), (step) => {
+      const v = from + (step / 65534) * (to - from);
+      return step === 65535 ? NaN : log ? Math.exp(v) : v;
+    });
+    if (!shape) return values;
+    const [rows, columns] = shape.split(",").map(Number);
+    return Array.from({ length: rows }, (_, r) => values.subarray(r * columns, (r + 1) * columns));
+  };
+  const unpacked = (node) => {
+    if (Array.isArray(node)) return node.map(unpacked);
+    if (!node || typeof node !== "object") return node;
+    if (typeof node.q === "string") return restored(node);
+    return Object.fromEntries(Object.entries(node).map(([k, v]) => [k, unpacked(v)]));
+  };
   // A fresh copy of a description with the scheme's colours in it: plotly changes what it is given.
   const coloured = (node, scheme) => {
     if (typeof node === "string") return node.startsWith("@") ? colour(scheme, node) : node;
     if (Array.isArray(node)) return node.map((item) => coloured(item, scheme));
+    if (ArrayBuffer.isView(node)) return node;
     if (node && typeof node === "object") {
       return Object.fromEntries(Object.entries(node).map(([k, v]) => [k, coloured(v, scheme)]));
     }
@@ -35,19 +53,36 @@
   };
   const plots = [...document.querySelectorAll(".plot")].map((div) => ({
     div,
-    figure: JSON.parse(document.getElementById(div.dataset.figure).textContent),
+    figure: unpacked(JSON.parse(document.getElementById(div.dataset.figure).textContent)),
     select: document.getElementById(div.dataset.select || ""),
+    view: document.getElementById((div.dataset.select || "").replace("select-", "view-")),
   }));
-  const draw = ({ div, figure, select }) => {
-    const scheme = query.matches ? schemes.dark : schemes.light;
-    const data = select ? figure.sets[select.selectedIndex].data : figure.data;
-    return Plotly.react(div, coloured(data, scheme), coloured(figure.layout, scheme), config);
+  // The set that the switches choose; its views stand one after the other.
+  const chosen = ({ figure, select, view }) => {
+    if (!select) return figure;
+    const views = view ? view.options.length : 1;
+    const set = figure.sets[select.selectedIndex * views + (view ? view.selectedIndex : 0)];
+    return { data: set.data, layout: set.layout || figure.layout };
+  };
+  const PAPER = 640; // px: what an A4 page has between its margins
+  let paper = false;
+  const draw = (plot) => {
+    const scheme = query.matches && !paper ? schemes.dark : schemes.light;
+    const { data, layout } = chosen(plot);
+    const placed = coloured(layout, scheme);
+    // As tall as what it shows now.
+    plot.div.style.height = `${layout.height}px`;
+    if (paper) placed.width = PAPER;
+    // Beside a narrow page's curves their axes are short of words.
+    else if (innerWidth < 600) placed.margin = { ...placed.margin, l: 48, r: 6 };
+    return Plotly.react(plot.div, coloured(data, scheme), placed, config);
   };
   // The ticks written out suit the whole band; a closer look takes plotly's own.
-  const ticks = ({ div, figure }) => {
-    const axes = Object.keys(figure.layout).filter((k) => figure.layout[k].tickmode === "array");
+  const ticks = (plot) => {
+    const { div } = plot;
     div.on("plotly_relayout", (change) => {
-      const update = {};
+      const update = {}, { layout } = chosen(plot);
+      const axes = Object.keys(layout).filter((k) => layout[k].tickmode === "array");
       for (const axis of axes) {
         if (`${axis}.range[0]` in change) update[`${axis}.tickmode`] = "auto";
         if (`${axis}.autorange` in change) update[`${axis}.tickmode`] = "array";
@@ -58,7 +93,8 @@
   for (const plot of plots) {
     draw(plot);
     ticks(plot);
-    const { select, div } = plot;
+    const { select, view, div } = plot;
+    if (view) view.addEventListener("change", () => draw(plot));
     if (!select) continue;
     select.addEventListener("change", () => draw(plot));
     for (const button of div.parentElement.querySelectorAll("button[data-step]")) {
@@ -70,4 +106,6 @@
     }
   }
   query.addEventListener("change", () => plots.forEach(draw));
+  addEventListener("beforeprint", () => { paper = true; plots.forEach(draw); });
+  addEventListener("afterprint", () => { paper = false; plots.forEach(draw); });
 })();

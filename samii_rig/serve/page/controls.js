@@ -1,7 +1,10 @@
 // The scope's controls: channels, span, pause, trigger and cursors, all from the keyboard too.
 
+import { remembered } from "/page/kept.js";
+
 export function controls($, put, scope) {
-  $("span").onchange = () => { scope.span = Number($("span").value); scope.arm(); };
+  remembered($("span"), "span", () => { scope.span = Number($("span").value); scope.arm(); });
+  remembered($("scale"), "scale", () => { scope.toLimits = $("scale").value === "limits"; });
   $("pause").onclick = () => {
     scope.pause(!scope.paused);
     $("pause").setAttribute("aria-pressed", scope.paused);

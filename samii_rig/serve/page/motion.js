@@ -6,6 +6,7 @@ const KEPT = 3000; // samples
 const FACTORS = [1, 2, 5];
 const ROOM = 0.38; // of the height, for the largest displacement
 const HOLD = 0.995; // a frame, of the largest displacement seen
+const SMALL = 420; // px, too narrow for words
 const STALE = 1.0; // s without a sample
 
 // s/(s + c)^3: the double integral of an acceleration without its offset.
@@ -113,7 +114,7 @@ export class Motion {
     });
     g.globalAlpha = 1;
     const angles = there && !stale ? about.sensors.map((name, k) => (about.accelerations[k] ? "" : `${name} ${this.milli(there.y[k])}`)).filter(Boolean).join(", ") : "";
-    const text = stale ? `Not moving: ${stale}.` : `${paused ? "Paused. " : ""}Displacements × ${this.factor}. ${angles}`;
+    const text = stale ? `Not moving: ${stale}.` : `${paused ? "Paused. " : ""}${w < SMALL ? "" : "Displacements "}× ${this.factor}${w < SMALL ? "" : `. ${angles}`}`;
     g.font = "600 14px system-ui, sans-serif"; g.textAlign = "right"; g.fillStyle = ink(stale && stale !== "no run" ? "--bad" : "--muted");
     g.fillText(text, w - 16, 18);
     // To who does not see it, when it changes and not at every frame.

@@ -1,6 +1,7 @@
 // The live scope: up to four channels, free running or from a trigger, with two cursors. Missing
 // samples are gaps, and a connection that is lost covers the picture: what is old never looks live.
 
+import { grid, range } from "/page/grid.js";
 import { Samples } from "/page/samples.js";
 
 const EASE = 0.12; // of what is missing, a frame: blocks come four times a second
@@ -12,11 +13,13 @@ export class Scope {
   constructor(canvas, said) {
     Object.assign(this, { canvas, said, channels: [], shown: [], span: 5, paused: false, live: false, why: "" });
     this.trigger = { mode: "off", lane: 0, level: 0, rising: true };
+    this.about = {}; // of each channel by name: its resolution and its limit
+    this.toLimits = false;
     this.cursors = null; // two parts of the width, or none
     this.samples = new Samples();
     this.inks = {};
     this.clear();
-    setInterval(() => { this.inks = {}; }, 500); // dark and light may change
+    addEventListener("colours", () => { this.inks = {}; });
     const draw = () => { if (canvas.isConnected) { this.draw(); requestAnimationFrame(draw); } };
     requestAnimationFrame(draw);
   }
@@ -167,12 +170,10 @@ export class Scope {
       });
     }
     if (!(high >= low)) return;
-    if (high === low) { high += 1e-6 + Math.abs(high) * 0.01; low -= 1e-6 + Math.abs(low) * 0.01; }
-    if (h > 64) {
-      g.fillText(high.toPrecision(2), x - 8, y + 48);
-      g.fillText(low.toPrecision(2), x - 8, y + h - 2);
-    }
+    const about = this.about[channel?.name];
+    [low, high] = range(low, high, about, this.toLimits);
     const py = (v) => y + 3 + (h - 6) * (1 - (v - low) / (high - low));
+    grid(g, { x, y, w, h }, low, high, py, about, ink);
     g.save(); g.beginPath(); g.rect(x, y, w, h); g.clip();
     const { mode, lane: on, level } = this.trigger;
     if (mode !== "off" && on === lane) {

@@ -1,18 +1,13 @@
 // What is known of the run while it goes on: its frequency responses and its diagnosis.
 
-import { plotResponses } from "/page/frf.js";
-
 const part = (p) => (p > 0.9995 ? "over 99.9 %" : p < 0.0005 ? "under 0.1 %" : `${(100 * p).toFixed(1)} %`);
 const ago = (s) => (s < 90 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
 const hz = (f) => f.toPrecision(2);
 
 export class SoFar {
-  // $ : element by id. ask : the service. put : append an element.
-  constructor($, ask, put) {
-    Object.assign(this, { $, ask, put, data: null, seen: "", job: "", busy: false });
-    $("frf-level").onchange = $("frf-show").onchange = () => this.draw();
-    addEventListener("resize", () => this.draw());
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
+  // $ : element by id. ask : the service. put : append an element. panel : draws the responses.
+  constructor($, ask, put, panel) {
+    Object.assign(this, { $, ask, put, panel, data: null, seen: "", job: "", busy: false });
   }
 
   async show(state) {
@@ -32,31 +27,18 @@ export class SoFar {
       this.seen = seen;
     } catch { this.seen = seen; } finally { this.busy = false; }
     this.about(run);
-    this.draw();
   }
 
   about(run) {
     const { $, data } = this;
-    $("frf-section").hidden = !data;
+    this.panel.set(data, Boolean(run));
     if (!data) return;
-    const was = $("frf-level").value;
-    $("frf-level").replaceChildren();
-    this.put($("frf-level"), "option", "newest").value = "";
-    data.responses.forEach((r, k) => { this.put($("frf-level"), "option", `${r.level} ${r.unit}`).value = k; });
-    if ([...$("frf-level").options].some((o) => o.value === was)) $("frf-level").value = was;
     const said = data.responses.map((r) => `${r.level} ${r.unit}: ${hz(r.low_hz)} to ${hz(r.high_hz)} Hz, ${
       r.going_on ? "goes on" : `${r.n} ${r.n > 1 ? "repeats" : "sweep"}`}`).join("; ");
     const of = `${data.done} of ${data.of} segments whole`;
     $("frf-about").textContent = `${run ? "" : "Last run. "}${of}. ${said || "Nothing measured yet"}.${
       data.trouble ? ` The newest part: ${data.trouble}.` : ""}`;
     $("frf").setAttribute("aria-label", `Frequency responses over the model. ${$("frf-about").textContent}`);
-  }
-
-  draw() {
-    const { $, data } = this;
-    if (!data || $("frf-section").hidden) return;
-    const chosen = $("frf-level").value === "" ? data.responses.length - 1 : Number($("frf-level").value);
-    plotResponses($("frf"), data, chosen, $("frf-show").value);
   }
 
   diagnosis({ diagnosis: d, failed }, run) {

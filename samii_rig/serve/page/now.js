@@ -1,0 +1,50 @@
+// What is now, in words: the run that goes on, how the last one ended, and who ended it.
+
+// The verdicts of a diagnosis, for who has not read its manual.
+export const VERDICTS = {
+  no_mismatch: "nothing is missing", named: "cause named", ambiguous: "several causes fit", unknown: "mismatch, cause unknown",
+};
+export const MOVES = ["starting", "running"];
+const PHASES = { starting: "starting; predicted once more, nothing moves yet" };
+const ENDS = { completed: "completed", stopped: "stopped", tripped: "stopped by a limit", failed: "FAILED" };
+const OUTPUT = { true: "The output is at zero.", false: "THE OUTPUT WAS NOT SEEN AT ZERO: use the emergency stop at the rig." };
+
+export function clock(s) {
+  if (!(s >= 0 && s < Infinity)) return "–";
+  const m = Math.floor(s / 60);
+  return m ? `${m} min ${String(Math.floor(s % 60)).padStart(2, "0")} s` : `${Math.ceil(s)} s`;
+}
+
+// How a run ended, who ended it, and that the output is at zero.
+export function ended(l) {
+  const at = new Date(l.ended || l.time), today = at.toDateString() === new Date().toDateString();
+  const when = today ? at.toLocaleTimeString() : at.toLocaleString();
+  if (l.phase === "refused" && !l.status) return `${l.experiment}: did not start, ${when}: ${l.error}. Nothing moved.`;
+  if (l.phase === "died") {
+    const output = l.reason.startsWith("stopped") ? "Nothing moved." : "The device's own deadman drops the output: look at the rig.";
+    return `${l.experiment}: ${l.reason}, ${when}. ${l.at_zero ? OUTPUT.true : output}`;
+  }
+  const by = l.reason.startsWith("stop asked by ") ? ` by ${l.reason.slice(14)}` : "";
+  const why = by || l.status === "completed" ? "" : `: ${l.early || (l.status === "failed" && l.error) || l.reason}`;
+  return `${l.experiment}: ${ENDS[l.status] ?? l.status}${by}, ${when}${why}. ${OUTPUT[l.at_zero] ?? ""}`;
+}
+
+// The line of a state.
+export function line(s) {
+  const r = s.running, moves = MOVES.includes(r?.phase), p = moves ? r.progress : {};
+  if (moves && p.segment && r.phase === "running") return `${r.experiment}: ${p.name}, segment ${p.segment} of ${p.n_segments}`;
+  if (moves) return `${r.experiment}: ${PHASES[r.phase] ?? r.phase}`;
+  if (r) return `${ended(r)} Being estimated and diagnosed.`;
+  return `${s.fault ? `FAULT: ${s.fault.reason}. ` : ""}${s.last ? ended(s.last) : s.fault ? "" : "No run."}`;
+}
+
+// What stands below it while samples come.
+export function facts(p, s) {
+  return p.segment ? {
+    "Run left": clock(p.time_left / s.pace), "Queue left": clock(s.time_left_s / s.pace),
+    Level: `${p.level} ${p.unit}`, Frequency: p.broadband ? "whole band" : p.frequency ? `${p.frequency.toFixed(2)} Hz` : "at rest",
+    "Nearest limit now": p.channel ? `${p.channel}, ${(100 * p.margin).toFixed(0)} % left` : "–",
+    "Nearest in this run": `${p.worst_channel}, ${(100 * p.worst_margin).toFixed(0)} % left`,
+    "Late samples": p.late_ticks, "Missing samples": p.missing_samples,
+  } : {};
+}
