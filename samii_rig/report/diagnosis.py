@@ -160,7 +160,8 @@ def _chain_caption(found: Diagnosis, marked: dict[str, Suspect]) -> str:
         return "No part of the chain is suspect."
     if not marked:
         return "The data do not tell which part is suspect."
-    text = "Marked: how probable it is that something is missing at each part."
+    what = "changed" if found.before else "is missing"
+    text = f"Marked: how probable it is that something {what} at each part."
     if any(s.label == OR_HERE for s in marked.values()):
         text += " \u201cOr here\u201d: another place of the same cause to these data."
     return text

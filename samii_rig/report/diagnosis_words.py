@@ -222,7 +222,13 @@ def _verdict(found: Diagnosis) -> tuple[Mark, str, str]:
 def _verdict_of_two(found: Diagnosis, before: Before, parts: str) -> tuple[Mark, str, str]:
     """As `_verdict`, of what changed between two states."""
     each = zip(("Before", "after"), before.recordings, strict=True)
-    states = "; ".join(f"{name}: {listed([Path(p).name for p in own])}" for name, own in each)
+    files = [Path(p).name for own in before.recordings for p in own]
+    # Files of one name are told by their folders.
+    parts_shown = 1 if len(set(files)) == len(files) else 2
+    states = "; ".join(
+        f"{name}: {listed(['/'.join(Path(p).parts[-parts_shown:]) for p in own])}"
+        for name, own in each
+    )
     states = f"{states}."
     match found.verdict:
         case "no_mismatch":
@@ -259,7 +265,11 @@ def _facts(found: Diagnosis) -> list[tuple[str, str, str]]:
     sure = min(c.probability for c in found.causes)
     g = found.gap
     return [
-        ("Probability", percent(sure), "that this is what is missing"),
+        (
+            "Probability",
+            percent(sure),
+            f"that this is what {'changed' if found.before else 'is missing'}",
+        ),
         (
             "Gap closed",
             f"{100 * g.value:.3g} %",
