@@ -27,13 +27,21 @@ from samii_rig.errors import DeviceError, InputError
 from samii_rig.model.feedback import sections
 from samii_rig.model.realise import Realisation, realise
 from samii_rig.model.sampled import filter_response
-from samii_rig.rig.schema import SOURCES, AngularVelocitySource2, Feedback, Rig
+from samii_rig.rig.schema import (
+    SOURCES,
+    AccelerationSource,
+    AngularVelocitySource2,
+    DisplacementSource,
+    Feedback,
+    Rig,
+)
 from samii_rig.run.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.types import Channel, Flags, Float, Int, SampleBlock
 from sim import kernel
 from sim.plant import tabulate
 from sim.settings import SimSettings, read_settings
 
+SECOND_ORDER = (AngularVelocitySource2, DisplacementSource, AccelerationSource)
 NEVER = np.iinfo(np.int64).max  # a sample that does not come
 CHUNK = 4096  # samples in one call of the inner loop, so that memory stays bounded
 NS = 1_000_000_000
@@ -323,7 +331,7 @@ def drive(rig: Rig, settings: SimSettings) -> kernel.Drive:
     # The disturbance passes the source's lag; a source without a first-order one lets it through.
     sources = [e for e in rig.element if isinstance(e, SOURCES)]
     own = next(e for e in sources if e.input == rig.actuator[0].name)
-    lag = None if isinstance(own, AngularVelocitySource2) else own.p
+    lag = None if isinstance(own, SECOND_ORDER) else own.p
     p = lag.value if lag else np.inf
     return kernel.Drive(
         # White noise: its mean over `inner` steps has this rms.

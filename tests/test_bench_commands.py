@@ -16,6 +16,7 @@ from wire_kit import Wire
 from samii_rig.cli.app import app
 from samii_rig.errors import DeviceError, GateError, InputError
 from samii_rig.rig.load import load_rig
+from samii_rig.run import protections
 from samii_rig.run.calibrate import (
     Wiring,
     null_volts,
@@ -26,6 +27,7 @@ from samii_rig.run.calibrate import (
     wiring,
 )
 from samii_rig.run.latch import Latch
+from samii_rig.run.protections import own_protections
 
 TRIES = 4  # of a move in real time; a loaded machine may be later than a deadman allows
 
@@ -139,6 +141,44 @@ def test_doctor_finds_a_well_rig_well_and_names_what_is_not(wire, rig, tmp_path)
     assert checks["a_1"]["verdict"] == "look"
     assert "too quiet" in checks["a_1"]["remedy"]
     assert checks["disk"]["verdict"] in ("good", "look")
+
+
+def protected(wire, rig, **answers: str) -> dict:
+    """What `doctor --protections` finds, where the person does what `answers` has."""
+    asked = []
+
+    def ask(what: str) -> None:
+        asked.append(what)
+        for word, command in answers.items():
+            if word in what:
+                wire.tell(command)
+
+    checks = {c.what: c for c in own_protections(load_rig(rig)[0], ask)}
+    assert len(asked) == sum(c in checks for c in ("emergency", "cleared", "reset"))
+    return checks
+
+
+def test_doctor_tries_the_devices_own_protections(wire, rig):
+    found = protected(wire, rig, open="emergency 1", close="emergency 0", press="reboot")
+    assert {name: c.verdict for name, c in found.items()} == dict.fromkeys(
+        ("deadman", "emergency", "cleared", "reset"), "good"
+    ), found
+    assert "after the only reference, 50 are declared" in found["deadman"].found
+    assert "the emergency input" in found["emergency"].found
+    history = wire.history()
+    assert (history["most"], history["v"]) == (0, 0)
+
+
+def test_doctor_says_which_protection_did_not_act(wire, rig, monkeypatch):
+    monkeypatch.setattr(protections, "WITHIN", 0.5)
+    found = protected(wire, rig)
+    assert found["deadman"].verdict == "good"
+    assert found["emergency"].verdict == "bad"
+    assert "wire a contact" in found["emergency"].remedy
+    assert found["reset"].verdict == "look"
+    held = protections._output
+    monkeypatch.setattr(protections, "_output", lambda r, b: (held(r, b)[0], held(r, b)[1] & False))
+    assert protected(wire, rig)["deadman"].remedy == "do not connect a valve to this device"
 
 
 def test_doctor_sees_the_sign_of_the_encoder(wire, rig, tmp_path):

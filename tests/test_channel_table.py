@@ -16,8 +16,8 @@ from samii_rig.record.channel_table import load_channels
 from samii_rig.record.importer import import_file
 from samii_rig.record.maps import ImportMap
 from samii_rig.record.reader import read_recording
-from samii_rig.record.units import factor
 from samii_rig.rig.load import parse
+from samii_rig.units import factor
 
 MAP = """
 name = "lab"

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from board_kit import NODES, options
 from fault_host import plan_of
 from faults_kit import PATIENCE, STATES, Held, held, null_of
 from wire_kit import Wire
@@ -25,9 +26,9 @@ RUNNING = ("running",)
 BOTH = ("armed", "running")
 
 
-@pytest.fixture(scope="module")
-def shared() -> Iterator[Wire]:
-    w = Wire("--seed", "7")
+@pytest.fixture(scope="module", params=NODES)
+def shared(request: pytest.FixtureRequest) -> Iterator[Wire]:
+    w = Wire("--seed", "7", *options(request.param))
     yield w
     w.close()
 
@@ -66,8 +67,15 @@ SEEN = table(
 )
 
 
+def can(wire: Wire, told: str) -> None:
+    """Skip what the image cannot be told."""
+    if wire.image and told.startswith("stray"):
+        pytest.skip("a board reads its converter back and resets: tests/test_board_chip.py")
+
+
 @pytest.mark.parametrize(("state", "told", "said", "samples"), SEEN)
 def test_a_fault_ends_at_null_and_is_latched(wire, state, told, said, samples):
+    can(wire, told)
     with held(wire, state) as host:
         wire.tell(told)
         host.on(3.0)
@@ -117,6 +125,7 @@ def _no_re_arm(wire: Wire, host: Held, before: dict) -> None:
     ],
 )
 def test_in_safe_a_fault_moves_nothing_and_arming_is_refused(wire, told, said):
+    can(wire, told)
     with held(wire, "safe") as host:
         wire.tell(told)
         host.on(0.3)

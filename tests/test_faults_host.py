@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from board_kit import NODES, options
 from faults_kit import PATIENCE, STATES, Hosts, null_of
 from wire_kit import Wire
 
@@ -27,9 +28,9 @@ LATE_TRIES = 12
 FAIR_TRIES = 3  # that fail make the test fail
 
 
-@pytest.fixture(scope="module")
-def shared() -> Iterator[Wire]:
-    w = Wire("--seed", "11")
+@pytest.fixture(scope="module", params=NODES)
+def shared(request: pytest.FixtureRequest) -> Iterator[Wire]:
+    w = Wire("--seed", "11", *options(request.param))
     yield w
     w.close()
 

@@ -83,7 +83,7 @@ def test_samii_carries_table_ii_of_paper_1() -> None:
             'kind = "gyroscope"',
             r"sensor\[theta_2\].kind is 'gyroscope'; expected one of relative_angle, ",
         ),
-        ('unit = "m/s^2"\nnoise', 'unit = "g"\nnoise', r"a_0.*unit: is 'g'.*'m/s\^2'"),
+        ('unit = "m/s^2"\nnoise', 'unit = "kg"\nnoise', r"a_0.*unit: is 'kg'.*'m/s\^2'"),
         ('channel = "theta_2"', 'channel = "theta_9"', r"limit on 'theta_9'.*no such channel"),
         ("max = 0.35", "max = 0.0", r"limit.*max is 0.0.*greater than 0"),
         ("low = -1.5", "low = 2.0", r"theta_2.*low 2, high 1.5; expected low below high"),

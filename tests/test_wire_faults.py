@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from board_kit import NODES, options
 from wire_kit import Wire, until
 
 from samii_rig.errors import DeviceError, InputError
@@ -48,9 +49,9 @@ while True:
 """
 
 
-@pytest.fixture(scope="module")
-def shared() -> Iterator[Wire]:
-    w = Wire("--seed", "5")
+@pytest.fixture(scope="module", params=NODES)
+def shared(request: pytest.FixtureRequest) -> Iterator[Wire]:
+    w = Wire("--seed", "5", *options(request.param))
     yield w
     w.close()
 

@@ -3,6 +3,8 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
+from board_kit import NODES, options
 from experiment_kit import SHORT
 from wire_kit import Wire, slow_deadman
 
@@ -17,11 +19,12 @@ def done(rig: Rig, plan: Plan, path: Path, settings: dict[str, object]) -> Outco
     return carry_out(rig, "", "", plan, predict(plan, rig), path, settings=settings)
 
 
-def test_the_response_over_the_wire_is_that_of_the_rig_in_this_process(tmp_path):
+@pytest.mark.parametrize("node", NODES)
+def test_the_response_over_the_wire_is_that_of_the_rig_in_this_process(tmp_path, node):
     file = slow_deadman(tmp_path)
     rig = load_rig(str(file))[0]
     plan = SHORT.plan(rig)
-    wire = Wire("--seed", "3", rig=str(file))
+    wire = Wire("--seed", "3", *options(node), rig=str(file))
     try:
         wire.rest()
         wired = done(wire.rig, plan, tmp_path / "wire.mcap", {})

@@ -38,9 +38,11 @@ class Counted:
     wrong: int = 0
 
 
-def node(rng: random.Random, frames: int) -> Counted:
-    """A node's batches of samples."""
-    board, decoder = Node(CONFIG, 3), Decoder()
+def node(rng: random.Random, frames: int, board: Node | None = None) -> Counted:
+    """A node's batches of samples, of the simulated one if no other is given."""
+    board, decoder = board or Node(CONFIG, 3), Decoder()
+    for _ in range(CONFIG.batch):
+        board.take(0, (0,), (0, 0, 0), False)
     list(decoder.feed(board.transmit()))
     truth: dict[int, tuple[int, bytes]] = {}
     newest = -1

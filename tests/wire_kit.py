@@ -24,6 +24,7 @@ class Wire:
     program, driver = "sim.wire", "serial_node"
 
     def __init__(self, *options: str, rig: str = "samii") -> None:
+        self.image = "--image" in options  # the node is the firmware's image in an emulator
         self.process = subprocess.Popen(
             [sys.executable, "-m", self.program, "--rig", rig, *options],
             stdin=subprocess.PIPE,

@@ -77,11 +77,20 @@ def doctor(
     move: Annotated[
         bool, typer.Option("--move", help="Push the joint a little to see the encoder's sign.")
     ] = False,
+    protections: Annotated[
+        bool,
+        typer.Option(
+            "--protections",
+            help="Try the device's deadman, emergency input and reset, the valve unplugged.",
+        ),
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Look at machine, disk, device and sensors; say the remedy of what is wrong.
 
-    Exit code 6 if anything is bad. With --move the joint turns a little, through the gate.
+    Exit code 6 if anything is bad. With --move the joint turns a little, through the gate. With
+    --protections the output stays at null, but the device's supply line goes on for its deadman's
+    time; a person is asked to open the emergency input and to reset the device.
 
     Example: samii-rig doctor --rig my_rig.toml --move
     """
@@ -97,7 +106,12 @@ def doctor(
         check_folder("--out", out)
     the_rig, text = load_rig(rig)
     checks = []
-    for check in examine(the_rig, text, out, move=move):
+
+    def ask(what: str) -> None:
+        typer.echo(f"->    {what}", err=json)
+
+    asks = ask if protections else None
+    for check in examine(the_rig, text, out, move=move, protections=asks):
         checks.append(check)
         if not json:
             typer.echo(

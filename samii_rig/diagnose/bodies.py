@@ -17,6 +17,7 @@ from samii_rig.rig.schema import (
     LINES,
     Rig,
     RigidLink,
+    Rod,
     TorsionalSpring,
     TranslationalSpring,
 )
@@ -140,6 +141,8 @@ def _links(rig: Rig, where: Places) -> Iterator[Effect]:
 
 def _beams(rig: Rig, where: Places) -> Iterator[Effect]:
     for e in rig.element:
+        if isinstance(e, Rod):
+            yield from _properties(e.name, ("EA", "mu"))
         if not isinstance(e, BEAMS):
             continue
         eta = (e.name, "eta")
@@ -156,17 +159,22 @@ def _beams(rig: Rig, where: Places) -> Iterator[Effect]:
             causal=(e.name, middle(where) / (2 * math.pi)),
             rough=LOSS_WANDERS,
         )
-        for symbol in ("EI", "mu"):
-            key = (e.name, symbol)
+        yield from _properties(e.name, ("EI", "mu"))
 
-            def scaled(x: Float, nominal: Values, key: Key = key) -> dict[Key, float]:
-                return {key: nominal[key] * float(x[0])}
 
-            yield Effect(
-                physics="beam_property",
-                site=e.name,
-                unknowns=(Unknown(f"{symbol} ratio", "1", 0.2, 5.0, (0.5, 0.75, 1.0, 1.35, 2.0)),),
-                parameters=scaled,
-                touches=(key,),
-                variant=symbol,
-            )
+def _properties(name: str, symbols: tuple[str, ...]) -> Iterator[Effect]:
+    """A beam or rod that is not of the stated stiffness or mass."""
+    for symbol in symbols:
+        key = (name, symbol)
+
+        def scaled(x: Float, nominal: Values, key: Key = key) -> dict[Key, float]:
+            return {key: nominal[key] * float(x[0])}
+
+        yield Effect(
+            physics="beam_property",
+            site=name,
+            unknowns=(Unknown(f"{symbol} ratio", "1", 0.2, 5.0, (0.5, 0.75, 1.0, 1.35, 2.0)),),
+            parameters=scaled,
+            touches=(key,),
+            variant=symbol,
+        )

@@ -61,5 +61,7 @@ def place_of(
     k = np.argmax(np.abs(g[0]), axis=1)[:, None]
     g0, g1 = (np.take_along_axis(one, k, 1)[:, 0] for one in g)
     R = np.divide(g0, g1, out=np.ones_like(g0), where=g1 != 0)
-    c = (R - 1) / (R * xs[0] - xs[1])
+    # Where nothing moves both are rounding, and c is none.
+    below = R * xs[0] - xs[1]
+    c = np.divide(R - 1, below, out=np.zeros_like(R), where=below != 0)
     return Place(g[0] * (1 - c * xs[0])[:, None], np.asarray(c))

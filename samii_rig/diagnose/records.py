@@ -88,7 +88,9 @@ class Whole:
         pieces = tuple(pieces_of(runs, rig, wired, without))
         if not pieces:
             raise EstimateError("no segment is sound")
-        bands = tuple(band or excited(piece, rig.rate_hz) for piece in pieces)
+        driven = [(p, b) for p, b in zip(pieces, excited(pieces, rig.rate_hz), strict=True) if b]
+        pieces = tuple(p for p, _ in driven)
+        bands = tuple(band or (float(b[0]), float(b[1])) for _, b in driven)
         ports = tuple(e for e in table if e.physics in FORCED and e.jump and not e.jump.fixed)
         return cls(rig, Records(pieces, rig.rate_hz, bands), wired, ports, tuple(without.items()))
 
@@ -184,13 +186,19 @@ class Whole:
         return left_by(self.records, self.response(fitted), noise, self._loop, part)
 
 
-def excited(piece: Piece, rate_hz: float) -> tuple[float, float]:
-    """Hz, the band in which a piece's input has more than a small part of its density."""
-    R = np.abs(np.fft.rfft(piece.r)) / math.sqrt(piece.r.size)
-    f = np.arange(R.size) * (rate_hz / piece.r.size)
+def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float] | None]:
+    """Hz, of each piece the band in which its input has more than a small part of the largest
+    density of all; None for one that nothing drives: what is left of a sweep behind a gap."""
+    spectra = [np.abs(np.fft.rfft(p.r)) / math.sqrt(p.r.size) for p in pieces]
     # The offset's line, and the one that it leaks to, are no excitation.
-    on = np.flatnonzero(R[2:] > EXCITED * np.max(R[2:])) + 2
-    return float(f[on[0]]) / WIDER, min(WIDER * float(f[on[-1]]), HIGHEST * rate_hz)
+    least = EXCITED * max(float(np.max(R[2:])) for R in spectra)
+    out: list[tuple[float, float] | None] = []
+    for piece, R in zip(pieces, spectra, strict=True):
+        f = np.arange(R.size) * (rate_hz / piece.r.size)
+        on = np.flatnonzero(R[2:] > least) + 2
+        highest = HIGHEST * rate_hz
+        out.append((f[on[0]] / WIDER, min(WIDER * f[on[-1]], highest)) if on.size else None)
+    return out
 
 
 def _named_in(messages: Sequence[str], places: Iterable[str]) -> dict[str, str]:

@@ -260,7 +260,8 @@ def _site(rig: Rig, row: Point, names: tuple[str, ...]) -> tuple[str, tuple[str,
     def joint(name: str) -> bool:
         return isinstance(kinds[name], JOINTS)
 
-    bodily = row.law == "mass"
+    # What holds a chain of masses to the ground holds a mass, as a person would say it.
+    bodily = row.law == "mass" or (rig.motion == "axial" and row.jump == "V")
     ranked = sorted(names, key=lambda n: joint(n) if bodily else not joint(n))
     return ranked[0], tuple(ranked[1:])
 

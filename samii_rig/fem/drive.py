@@ -7,7 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.errors import InputError
-from samii_rig.rig.schema import AngularVelocitySource, AngularVelocitySource2, Source
+from samii_rig.rig.schema import (
+    AccelerationSource,
+    AngularVelocitySource,
+    AngularVelocitySource2,
+    DisplacementSource,
+    Source,
+    VelocitySource,
+)
 from samii_rig.types import Float
 
 
@@ -74,12 +81,16 @@ class Load:
 def law(e: Source) -> Law:
     """The law of a source of the rig file."""
     match e:
-        case AngularVelocitySource():
+        case AngularVelocitySource() | VelocitySource():
             return Law(e.K.value * e.p.value, (1.0, e.p.value, 0.0), e.tau.value)
         case AngularVelocitySource2():
             omega = e.omega.value
             falling = (1.0, 2 * e.zeta.value * omega, omega**2, 0.0)
             return Law(e.K.value * omega**2, falling, e.tau.value)
+        case DisplacementSource() | AccelerationSource():
+            omega = e.omega.value
+            gain = e.K.value * (omega**2 if isinstance(e, DisplacementSource) else 1.0)
+            return Law(gain, (1.0, 2 * e.zeta.value * omega, omega**2), e.tau.value)
         case _ if e.p is None:
             return Law(e.K.value, (1.0,), e.tau.value)
         case _:

@@ -33,9 +33,10 @@ class Mechanism:
     G : (n_q, n_q) velocity feedback, g_v at each joint that has it.
     Phi : (n_c, n_q) what joins the parts; `locks` are held beside: {element: coordinate}.
     joints : coordinate of every joint by element name.
-    angle, acceleration : (n_sensor, n_q) rows on q and q''; zero for a sensor of another kind,
-        but for gravity on a tilted accelerometer's angle.
-    moment : (sensor, row of Phi) of every moment sensor at a joint that can carry one.
+    angle, velocity, acceleration : (n_sensor, n_q) rows on q, q' and q''; zero for a sensor of
+        another kind, but for gravity on a tilted accelerometer's angle.
+    moment : (sensor, row of Phi, factor) of every moment, force or pressure sensor at a joint that
+        can carry one.
     """
 
     M: csc_array
@@ -50,6 +51,7 @@ class Mechanism:
     feedback: tuple[Feedback, ...]
     loads: tuple[Load, ...]
     angle: csc_array
+    velocity: csc_array
     acceleration: csc_array
-    moment: tuple[tuple[int, int], ...]
+    moment: tuple[tuple[int, int, float], ...]
     places: Places

@@ -124,9 +124,9 @@ class Fem:
                     complex(at),
                     "no pole, and no part without mass and stiffness",
                 ) from error
-            H[i] = m.angle @ x[:n] + at**2 * (m.acceleration @ x[:n])
-            for sensor, row in m.moment:
-                H[i, sensor] = unit * x[n + row]
+            H[i] = m.angle @ x[:n] + at * (m.velocity @ x[:n]) + at**2 * (m.acceleration @ x[:n])
+            for sensor, row, factor in m.moment:
+                H[i, sensor] = factor * unit * x[n + row]
         return H
 
     def basis(self, also: Collection[int] = ()) -> modal.Basis:

@@ -167,15 +167,14 @@ def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced
             rig.name, "flexible", flexible, "fewer modes: these leave a joint without inertia"
         )
 
-    position, acceleration = m.angle @ phi, m.acceleration @ phi
-    velocity = np.zeros_like(position)
+    position, velocity, acceleration = m.angle @ phi, m.velocity @ phi, m.acceleration @ phi
     carried = np.zeros((len(position), len(m.loads)))
     at_loads = [load.coordinate for load in m.loads]
-    for sensor, row in m.moment:
+    for sensor, row, factor in m.moment:
         # By reciprocity the multiplier that holds the load r is v^T r, v the static shape of a
         # unit gap at that constraint; r are the loads and the forces of inertia and damping, so
         # that the moment has the static part of all modes left out.
-        v, reaction = static.unit(row)
+        v, reaction = (factor * x for x in static.unit(row))
         position[sensor, : len(joints)] = [reaction[static.lock(j)] for j in joints]
         velocity[sensor] = -v @ (fem.C @ phi)
         acceleration[sensor] = -v @ (m.M @ phi)

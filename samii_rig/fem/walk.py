@@ -7,7 +7,7 @@ the rows that give w and theta where it stands; the next part is joined there by
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,38 +15,51 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array, csc_array
 
 from samii_rig.errors import InputError
-from samii_rig.fem import hermite
+from samii_rig.fem import hermite, lagrange
 from samii_rig.fem.drive import Feedback, Load, Prescribed, law
 from samii_rig.fem.mechanism import Mechanism, Places
+from samii_rig.rig.axial import turning
 from samii_rig.rig.elements import End
 from samii_rig.rig.schema import (
+    MOTION_SOURCES,
     AbsoluteAngle,
     Acceleration,
+    AccelerationSource,
     AngularVelocitySource,
     AngularVelocitySource2,
     Beam,
     Branch,
+    Cylinder,
+    Displacement,
+    DisplacementSource,
     Element,
+    Force,
     ForceSource,
+    Gear,
     GravityStiffness,
     LumpedLine,
     LumpedMass,
     Moment,
     OilColumn,
+    Pressure,
     RelativeAngle,
     Rig,
     RigidLink,
+    Rod,
     Sensor,
+    Spindle,
     TimoshenkoBeam,
     TorqueSource,
     TorsionalGroundSpring,
     TorsionalSpring,
     TranslationalGroundSpring,
     TranslationalSpring,
+    Velocity,
+    VelocitySource,
 )
 from samii_rig.types import Float
+from samii_rig.units import STANDARD_GRAVITY
 
-G_EARTH = 9.80665  # m/s^2, standard gravity
 Row = dict[int, float]  # a linear function of the coordinates: coefficient by coordinate
 
 
@@ -69,15 +82,21 @@ class _Entries:
 
 
 class Walk:
-    """Goes from base to tip; `w` and `theta` are the motion at the place reached, `x` m on."""
+    """Goes from base to tip; `w` and `theta` are the motion at the place reached, `x` m on.
+
+    Of a chain that moves along itself theta is nowhere anything.
+    """
 
     def __init__(self, rig: Rig, elements: int) -> None:
         self._rig, self._n_beam = rig, elements
         self._n = 0  # coordinates so far
         self._M, self._C, self._H, self._K, self._G = (_Entries() for _ in range(5))
         self._constraints: list[Row] = []
-        self._waiting: list[str] = []  # elements since the last joining constraint
+        self._waiting: list[str] = []  # elements since rotations were last joined
         self._moment: dict[str, int] = {}
+        self._pulling: list[str] = []  # elements since displacements were last joined
+        self._force: dict[str, int] = {}
+        self._moved: dict[str, Row] = {}  # displacement after each element
         self._span: dict[str, tuple[Row, Row]] = {}  # rotation before and after each element
         self._nodes: dict[str, int] = {}  # first coordinate of each beam and body
         self._locks: dict[str, int] = {}
@@ -92,9 +111,10 @@ class Walk:
 
     def base(self) -> None:
         """Fix the base as the rig file says."""
-        if self._rig.base == "free":
+        turns = self._rig.motion == "lateral" or bool(turning(self._rig))
+        if self._rig.base == "free" and not turning(self._rig):
             self.w = self._new()
-        if self._rig.base != "clamped":
+        if self._rig.base != "clamped" and turns:
             self.theta = self._new()
         self._place("")
 
@@ -113,6 +133,16 @@ class Walk:
                 self._body(e.L.value, e.r.value, e.m.value, e.I.value, e.name)
             case LumpedMass():
                 self._body(0.0, 0.0, e.m.value, e.I.value, e.name)
+            case Rod():
+                self._rod(e)
+            case Cylinder():
+                self._cylinder(e)
+            case Gear():
+                node = self._point(e.name)
+                self.theta = {node + 1: 1 / e.n.value}
+            case Spindle():
+                node = self._point(e.name)
+                self.w, self.theta = {node + 1: e.lead.value}, {}
             case TorsionalSpring():
                 j = self._joint(e.name)
                 if e.name in rigid:
@@ -136,6 +166,8 @@ class Walk:
                 self._spring(self._point(e.name), e.k.value, e.c.value)
             case AngularVelocitySource() | AngularVelocitySource2():
                 self._source(e, (feedback or {}).get(e.name))
+            case DisplacementSource() | VelocitySource() | AccelerationSource():
+                self._motion_source(e)
             case TorqueSource():
                 self._load(e, self._point(e.name) + 1)
             case ForceSource():
@@ -146,7 +178,9 @@ class Walk:
                 expected = "an element with a finite number of coordinates"
                 raise InputError(self._rig.name, e.name, e.kind, expected)
         self._waiting.append(e.name)
+        self._pulling.append(e.name)
         self._span[e.name] = before, self.theta
+        self._moved[e.name] = self.w
         self._place(e.name)
 
     def _beam(self, e: Beam | TimoshenkoBeam) -> None:
@@ -169,6 +203,35 @@ class Walk:
                 self._place(e.name)
         self.x += h
         self.w, self.theta = {first + 2 * n: 1.0}, {first + 2 * n + 1: 1.0}
+
+    def _rod(self, e: Rod) -> None:
+        n, h, step = self._n_beam, e.L.value / self._n_beam, lagrange.NODES - 1
+        first = self._n
+        self._n += step * n + 1
+        self._join_displacement({first: 1.0})
+        k, m = lagrange.stiffness(e.EA.value, h), lagrange.consistent_mass(e.mu.value, h)
+        for i in range(n):
+            at = list(range(first + step * i, first + step * (i + 1) + 1))
+            self._K.add(at, k)
+            self._M.add(at, m)
+            self._C.add(at, e.tau.value * k)
+        self.x += e.L.value
+        self.w = {first + step * n: 1.0}
+
+    def _cylinder(self, e: Cylinder) -> None:
+        """The oil as springs and a damper: k_0 beside k_1 in series with c_1, which the leak is."""
+        a, b, V, W, B = (p.value for p in (e.A_1, e.A_2, e.V_1, e.V_2, e.B))
+        oil, slipping = self._n, self._n + 1
+        self.w = {**self.w, **self._new()}
+        S0, S1 = 1 / V + 1 / W, a / V + b / W
+        k_0, k_1 = B * (a - b) ** 2 / (V * W) / S0, B * S1**2 / S0
+        if e.leak.value == 0:
+            self._spring(oil, k_0 + k_1)
+            return
+        self._n += 1
+        self._spring(oil, k_0)
+        self._K.add([oil, slipping], [[k_1, -k_1], [-k_1, k_1]])
+        self._C.add([slipping], k_1 / (B * e.leak.value * S0))
 
     def _body(self, L: float, r: float, m: float, I: float, name: str) -> None:  # noqa: E741
         first = self._nodes[name] = self._n
@@ -209,6 +272,11 @@ class Walk:
             self._G.add([j], g_v)
             self._feedback.append(Feedback(e.name, j, column, g_v * g_a))
 
+    def _motion_source(self, e: DisplacementSource | VelocitySource | AccelerationSource) -> None:
+        j = self._joints[e.name] = self._locks[e.name] = self._n
+        self.w = {**self.w, **self._new()}
+        self._sources.append(Prescribed(e.name, j, self._column(e.input), law(e)))
+
     def _load(self, e: TorqueSource | ForceSource, coordinate: int) -> None:
         self._loads.append(Load(e.name, coordinate, self._column(e.input), law(e)))
 
@@ -217,18 +285,18 @@ class Walk:
 
     def _branch(self, e: Branch, rigid: Collection[str]) -> None:
         self._point(e.name)
-        here = self.w, self.theta, self.x, self._waiting
-        self._waiting = []  # no sensor stands on a branch
+        here = self.w, self.theta, self.x, self._waiting, self._pulling
+        self._waiting, self._pulling = [], []  # no sensor stands on a branch
         for part in e.element:
             self.over(part, rigid)
         self.tip(e.tip)
-        self.w, self.theta, self.x, self._waiting = here
+        self.w, self.theta, self.x, self._waiting, self._pulling = here
 
     def tip(self, end: End) -> None:
         """Fix the end reached as the rig file says."""
         if end != "free":
-            self._constraints.append(_minus({}, self.w))
-        if end == "clamped":
+            self._join_displacement({})
+        if end == "clamped" and self._rig.motion == "lateral":
             self._join_rotation({})
 
     def mechanism(self) -> Mechanism:
@@ -248,14 +316,18 @@ class Walk:
             tuple(self._feedback),
             tuple(self._loads),
             _stack([self._angle(s) for s in sensors], n),
+            _stack([self._speed(s) for s in sensors], n),
             _stack([self._acceleration(s) for s in sensors], n),
-            tuple(
-                (i, self._moment[s.after])
-                for i, s in enumerate(sensors)
-                if isinstance(s, Moment) and s.after in self._moment
-            ),
+            tuple(self._multipliers(sensors)),
             Places(np.array(x), element, _stack(w, n), _stack(theta, n)),
         )
+
+    def _multipliers(self, sensors: tuple[Sensor, ...]) -> Iterator[tuple[int, int, float]]:
+        for i, s in enumerate(sensors):
+            if isinstance(s, Moment | Force | Pressure):
+                rows = self._moment if isinstance(s, Moment) else self._force
+                if s.after in rows:
+                    yield i, rows[s.after], -1 / s.area if isinstance(s, Pressure) else 1.0
 
     def _new(self) -> Row:
         self._n += 1
@@ -268,8 +340,14 @@ class Walk:
 
     def _join(self, node: int, offset: float = 0.0) -> None:
         """Put the point `offset` m beside a node where the walk stands."""
-        self._constraints.append(_minus({node: 1.0, node + 1: offset}, self.w))
+        self._join_displacement({node: 1.0, node + 1: offset})
         self._join_rotation({node + 1: 1.0})
+
+    def _join_displacement(self, w: Row) -> None:
+        # What crosses this constraint is the tension after all elements since the last one.
+        self._force.update(dict.fromkeys(self._pulling, len(self._constraints)))
+        self._pulling.clear()
+        self._constraints.append(_minus(w, self.w))
 
     def _join_rotation(self, theta: Row) -> None:
         # What crosses this constraint is the moment after all elements since the last one.
@@ -285,15 +363,31 @@ class Walk:
             case AbsoluteAngle():
                 return self._span[sensor.after][1]
             case Acceleration():
-                theta = self._along(sensor, hermite.rotation, {1: 1.0})
-                return {i: sensor.tilt * G_EARTH * x for i, x in theta.items() if sensor.tilt}
+                if self._has_no_extent(sensor):
+                    theta = self._span[sensor.on][1]
+                else:
+                    theta = self._along(sensor, hermite.rotation, {1: 1.0})
+                return {
+                    i: sensor.tilt * STANDARD_GRAVITY * x for i, x in theta.items() if sensor.tilt
+                }
             case RelativeAngle():
                 return _minus(self._span[sensor.across[-1]][1], self._span[sensor.across[0]][0])
+            case Displacement():
+                return self._way(sensor)
         return {}
+
+    def _speed(self, sensor: Sensor) -> Row:
+        return self._way(sensor) if isinstance(sensor, Velocity) else {}
+
+    def _way(self, sensor: Displacement | Velocity) -> Row:
+        against = {} if sensor.against is None else self._moved[sensor.against]
+        return _minus(self._moved[sensor.after], against)
 
     def _acceleration(self, sensor: Sensor) -> Row:
         if not isinstance(sensor, Acceleration):
             return {}
+        if self._has_no_extent(sensor):
+            return self._moved[sensor.on]
         host = self._host(sensor)
         arm = sensor.position - host.r.value if isinstance(host, RigidLink) else 0.0
         return self._along(sensor, hermite.shape, {0: 1.0, 1: arm})
@@ -309,6 +403,10 @@ class Walk:
         i = min(int(sensor.position / h), self._n_beam - 1)
         values = on_beam(sensor.position - i * h, h, _shear(host, h)).tolist()
         return {first + 2 * i + a: value for a, value in enumerate(values)}
+
+    def _has_no_extent(self, sensor: Acceleration) -> bool:
+        host = next(e for e in self._rig.element if e.name == sensor.on)
+        return isinstance(host, (LumpedMass, *MOTION_SOURCES))
 
     def _host(self, sensor: Acceleration) -> Beam | TimoshenkoBeam | RigidLink:
         host = next(e for e in self._rig.element if e.name == sensor.on)

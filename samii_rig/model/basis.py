@@ -11,6 +11,7 @@ from samii_rig.model.registers import (
     EXCHANGE,
     FLAG,
     FREE_END,
+    GUIDED,
     HUGE,
     SCALE,
     THETA2,
@@ -26,10 +27,11 @@ _PAIRS = ((X, X + 8), (X + 2, THETA2), (X + 4, X + 10), (X + 6, X + 12), (B, B +
 
 @part
 def boundary(W: Float, kind: int) -> None:
-    """The two columns of an end: w = theta = 0 clamped, w = M = 0 pinned, M = V = 0 free."""
+    """The two columns of an end: w = theta = 0 clamped, w = M = 0 pinned, M = V = 0 free,
+    theta = V = 0 guided."""
     # The sign makes det[column 1, column 2] that of (w, theta) in this order.
-    one = X + 4 if kind == CLAMPED else X + 2
-    two, value = (X + 8, -1.0) if kind == FREE_END else (X + 12, 1.0)
+    one = X + 4 if kind in (CLAMPED, GUIDED) else X + 2
+    two, value = (X + 8, -1.0) if kind in (FREE_END, GUIDED) else (X + 12, 1.0)
     for i in range(X_ROWS * LANES):
         W[X * LANES + i] = 0.0
     for i in range(LANES):

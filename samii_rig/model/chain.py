@@ -19,6 +19,7 @@ from samii_rig.model.registers import (
     BEAM_KIND,
     CLAMPED,
     FREE_END,
+    GUIDED,
     HINGE,
     IDENTITY,
     JUMP,
@@ -30,6 +31,7 @@ from samii_rig.model.registers import (
     System,
 )
 from samii_rig.model.sensing import source_feed, terms
+from samii_rig.rig.axial import turning
 from samii_rig.rig.schema import (
     BEAMS,
     LINES,
@@ -38,9 +40,12 @@ from samii_rig.rig.schema import (
     Beam,
     Branch,
     Element,
+    Gear,
     LumpedMass,
     Rig,
     RigidLink,
+    Rod,
+    Spindle,
     TimoshenkoBeam,
     TorsionalSpring,
     parameters,
@@ -48,6 +53,11 @@ from samii_rig.rig.schema import (
 from samii_rig.types import Float, Int
 
 ENDS = {"free": FREE_END, "pinned": PINNED, "clamped": CLAMPED}
+# Of a chain that moves along itself theta is free at the base, held at the tip and so 0; of one
+# that turns first and slides behind its spindle, w is free at the base in its place.
+AXIAL_BASE = {"free": FREE_END, "clamped": PINNED}
+TURNING_BASE = {"free": FREE_END, "clamped": GUIDED}
+AXIAL_TIP = {"free": GUIDED, "clamped": CLAMPED}
 WIDTH = 7  # the most parameters that an element has
 L_OF_BEAM = 2  # place of L among the beams' parameters
 SOURCE_WIDTH = 4 + 6  # the most parameters of a source and of a hydraulic line behind it
@@ -116,7 +126,7 @@ def _kind(element: Element) -> int:
     match element:
         case Beam():
             return BEAM_KIND
-        case TimoshenkoBeam() | Branch():
+        case TimoshenkoBeam() | Branch() | Rod() | Gear() | Spindle():
             return WAVES
         case RigidLink() | LumpedMass():
             return LINK
@@ -190,7 +200,7 @@ class _Parts:
             self.keys += inner.parameters
             self.values += list(inner.values)
             self.branches.append((len(self.op), inner, first))
-        length = element.L.value if isinstance(element, (*BEAMS, RigidLink)) else 0.0
+        length = element.L.value if isinstance(element, (*BEAMS, RigidLink, Rod)) else 0.0
         inside = self.cuts.get(element.name, ())
         for start, stop in pairwise([0.0, *inside, length]):
             slot, fixed = index + [-1] * (WIDTH - len(index)), [0.0] * WIDTH
@@ -238,17 +248,21 @@ def compile_chain(rig: Rig, extra: Mapping[str, Sequence[float]] | None = None) 
     for element in rig.element:
         parts.add(element)
     term, term_c = terms(rig, parts.places)
-    ends = {(e.name, e.L.value) for e in rig.element if isinstance(e, BEAMS)}
+    beam_ends = {(e.name, e.L.value) for e in rig.element if isinstance(e, BEAMS)}
     at_end = tuple(
         (i, parts.places.index((sensor.on, sensor.position)), parts.keys.index((sensor.on, "L")))
         for i, sensor in enumerate(rig.sensor)
-        if isinstance(sensor, Acceleration) and (sensor.on, sensor.position) in ends
+        if isinstance(sensor, Acceleration) and (sensor.on, sensor.position) in beam_ends
     )
     parts.rigid.update(index for _, _, index in at_end)
     dual = np.array([SOURCE_LAWS[kind].dual for kind in parts.sources]).reshape(-1, 4)
+    ends = ENDS[rig.base], ENDS[rig.tip]
+    if rig.motion == "axial":
+        base = TURNING_BASE if turning(rig) else AXIAL_BASE
+        ends = base[rig.base], AXIAL_TIP[rig.tip]
     return _assemble(
         parts,
-        (rig.base, rig.tip),
+        ends,
         np.array(parts.source),
         dual,
         source_feed(rig),
@@ -269,7 +283,7 @@ def compile_branch(branch: Branch) -> CompiledChain:
     term_c = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
     at_root = np.array([[0, 0], [0, 1]])
     return _assemble(
-        parts, ("clamped", branch.tip), at_root, dual, np.zeros((2, 2)), term, term_c, ()
+        parts, (CLAMPED, ENDS[branch.tip]), at_root, dual, np.zeros((2, 2)), term, term_c, ()
     )
 
 
@@ -279,7 +293,7 @@ def _where(kinds: Int, wanted: tuple[int, ...]) -> tuple[int, ...]:
 
 def _assemble(
     parts: _Parts,
-    ends: tuple[str, str],
+    ends: tuple[int, int],
     source: Int,
     dual: Float,
     feed: Float,
@@ -307,7 +321,7 @@ def _assemble(
             kinds=kinds,
             pars=padded[slots] + fixed,
             place=np.ascontiguousarray(op[:, 1:]),
-            ends=np.array([ENDS[end] for end in ends], dtype=np.int64),
+            ends=np.array(ends, dtype=np.int64),
             source=np.array(source, dtype=np.int64).reshape(-1, 2),
             source_c=np.column_stack([dual, gain]),
             feed=feed,

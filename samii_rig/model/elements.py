@@ -16,14 +16,19 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from samii_rig.model.laws import POINTS, SOURCE_LAWS
+from samii_rig.model.transformer import plain
 from samii_rig.rig.schema import (
+    MOTION_SOURCES,
     SOURCES,
     Beam,
     Branch,
     Element,
     ForceSource,
+    Gear,
     LumpedMass,
     RigidLink,
+    Rod,
+    Spindle,
     TimoshenkoBeam,
     TorqueSource,
     TorsionalSpring,
@@ -137,6 +142,18 @@ def timoshenko_matrix(
     return U
 
 
+def rod_matrix(s: Complex, EA: float, mu: float, L: float, tau: float = 0.0) -> Complex:
+    """Rod along itself, w' = -V/(EA (1 + s tau)), V' = -mu s^2 w, shape (..., 5, 5)."""
+    s = np.asarray(s, dtype=complex)
+    stiffness = EA * (1 + s * tau)
+    lam = np.sqrt(mu * s**2 / stiffness)
+    U = _identity(s)
+    U[..., 0, 0] = U[..., 3, 3] = np.cosh(lam * L)
+    U[..., 0, 3] = -np.sinh(lam * L) / (stiffness * lam)
+    U[..., 3, 0] = -np.sinh(lam * L) * stiffness * lam
+    return U
+
+
 # Rows and columns of the pairs of `laws`, and the rows and signs of the sources' jumps.
 _PLACES = ((1, 2), (0, 3), (2, 1), (3, 0))
 
@@ -180,6 +197,12 @@ def matrix(element: Element, s: Complex) -> Complex:
             return rigid_link_matrix(s, 0.0, 0.0, **p)
         case TorsionalSpring():
             return torsional_spring_matrix(s, **p)
+        case Rod():
+            return rod_matrix(s, **p)
+        case Gear() | Spindle():
+            U = _identity(np.asarray(s, dtype=complex))
+            U[..., :4, :4] = plain(element.kind, *p.values())
+            return U
         case Branch():
             return branch_matrix(element, s)
     if not isinstance(element, SOURCES):
@@ -190,6 +213,7 @@ def matrix(element: Element, s: Complex) -> Complex:
         values.insert(1, np.inf)
     jump = SOURCE_LAWS[element.kind].value(s.ravel(), np.array(values)).reshape(s.shape)
     row, sign = {"torque_source": (2, -1.0), "force_source": (3, 1.0)}.get(element.kind, (1, 1.0))
+    row = 0 if isinstance(element, MOTION_SOURCES) else row
     U = _identity(s)
     U[..., row, 4] = sign * element.K.value * jump
     return U

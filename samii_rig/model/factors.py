@@ -5,15 +5,18 @@ All of it is computed here with numpy, once for all s of a call, and given to th
 
 from __future__ import annotations
 
+from types import ModuleType
+
 import numpy as np
 
-from samii_rig.model import respond, timoshenko
+from samii_rig.model import respond, rod, timoshenko, transformer
 from samii_rig.model.chain import LINE_AT, SOURCE_WIDTH, WIDTH, CompiledChain
 from samii_rig.model.laws import LINE_FILTERS, POINTS, SOURCE_LAWS
 from samii_rig.model.registers import Factors
 from samii_rig.types import Complex, Float
 
 _TURN = np.array([1.0, -1.0, 1.0, -1.0])  # theta and V of a mirrored chain
+TRANSFORMERS = ("gear", "spindle")
 
 
 def bind(c: CompiledChain, s: Complex, slopes: bool = False) -> Factors:
@@ -65,9 +68,16 @@ def _matrices(c: CompiledChain, s: Complex) -> Complex:
     for row, e in enumerate(c.waves):
         if e in branches:
             out[row] = _branch_matrix(impedance(branches[e], s))
+        elif c.kinds[e] in TRANSFORMERS:
+            out[row] = transformer.matrix(c.kinds[e], s, c.system.pars[e])
         else:
-            out[row] = timoshenko.matrix(s, c.system.pars[e])
+            out[row] = _law(c.kinds[e]).matrix(s, c.system.pars[e])
     return out
+
+
+def _law(kind: str) -> ModuleType:
+    """The module with matrix, scaling and gradient of an element of waves."""
+    return rod if kind == "rod" else timoshenko
 
 
 def impedance(inner: CompiledChain, s: Complex) -> Complex:
@@ -113,8 +123,10 @@ def add_waves(
             continue
         if e in branches:
             by = _branch_gradient(inner, s, z[row], zh[row])
+        elif c.kinds[e] in TRANSFORMERS:
+            by = transformer.gradient(c.kinds[e], x.pars[e], z[row], zh[row])
         else:
-            by = timoshenko.gradient(s, x.pars[e], z[row], zh[row])
+            by = _law(c.kinds[e]).gradient(s, x.pars[e], z[row], zh[row])
         for m in np.flatnonzero((to >= 0) & (slots >= 0)):
             for source, (_, actuator) in enumerate(x.source):
                 dH[:, :, actuator, to[m]] += x.source_c[source, 4] * by[m, :, :, source]
@@ -167,8 +179,8 @@ def characteristic(c: CompiledChain, s: Complex, clear: bool) -> tuple[Complex, 
     respond.characteristic(c.system, bind(c, s), s, mantissa, log)
     branches = {e for e, _, _ in c.branches}
     for e in c.waves:
-        if e not in branches:
-            factor, more = timoshenko.scaling(s, c.system.pars[e])
+        if e not in branches and c.kinds[e] not in TRANSFORMERS:
+            factor, more = _law(c.kinds[e]).scaling(s, c.system.pars[e])
             mantissa, log = mantissa * factor, log + more
     if not clear:
         return mantissa, log

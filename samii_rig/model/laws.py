@@ -91,6 +91,58 @@ def _oil_slopes(s: Complex, p: Float) -> Complex:
     return np.stack([np.full_like(s, -2 * C_h / D**3), np.full_like(s, 1 / D**2)])
 
 
+@dataclass(frozen=True, slots=True)
+class _Chambers:
+    """1/k = N/D of a `schema.Cylinder` at each s, p = (A_1, A_2, V_1, V_2, B, leak):
+    N = s + g S_0, D = B (S_2 s + g d^2/(V_1 V_2)), d = A_1 - A_2, g = B leak."""
+
+    s: Complex
+    p: Float
+
+    def parts(self) -> tuple[Complex, Complex]:
+        """N and D; without a leak 1 and B S_2, as s is in both."""
+        a, b, V, W, B, leak = self.p[:6]
+        S2 = a**2 / V + b**2 / W
+        if leak == 0:
+            return np.ones_like(self.s), np.full_like(self.s, B * S2)
+        g = B * leak
+        return self.s + g * (1 / V + 1 / W), B * (S2 * self.s + g * (a - b) ** 2 / (V * W))
+
+    def slopes(self) -> Complex:
+        """(6, n) of N/D."""
+        a, b, V, W, B, leak = self.p[:6]
+        s, g, d = self.s, B * leak, a - b
+        S0, S2 = 1 / V + 1 / W, a**2 / V + b**2 / W
+        N, E = s + g * S0, S2 * s + g * d**2 / (V * W)  # D = B E
+        zero = np.zeros_like(s)
+        one = np.ones_like(s)
+        dN = np.stack([zero, zero, -g / V**2 * one, -g / W**2 * one, leak * S0 * one, B * S0 * one])
+        far = d**2 / (V * W)
+        dE = np.stack(
+            [
+                2 * a / V * s + 2 * g * d / (V * W),
+                2 * b / W * s - 2 * g * d / (V * W),
+                -((a / V) ** 2) * s - g * far / V,
+                -((b / W) ** 2) * s - g * far / W,
+                leak * far * one,
+                B * far * one,
+            ]
+        )
+        out = _inverse(B * E) * (dN - N * _inverse(E) * dE)
+        out[4] -= N * _inverse(B * E) / B
+        return np.asarray(out)
+
+
+def _chambers(s: Complex, p: Float) -> Complex:
+    N, D = _Chambers(s, p).parts()
+    return np.asarray(-N * _inverse(D))
+
+
+def _clear_chambers(s: Complex, p: Float) -> Clearing:
+    _, D = _Chambers(s, p).parts()
+    return D / (p[4] * (p[0] ** 2 / p[2] + p[1] ** 2 / p[3])), 0.0
+
+
 def _constant(s: Complex, p: Float) -> Complex:
     return np.full_like(s, p[0])
 
@@ -229,19 +281,17 @@ LINE_FILTERS = {
     "lumped_line": (_lump_filter, _lump_filter_relative),
 }
 
+_ACROSS = Law(
+    W_V, lambda s, p: -_compliance(s, p), lambda s, p: -_compliance_slopes(s, p), _clear_spring
+)
+_TO_GROUND = Law(V_W, lambda s, p: -_impedance(s, p), lambda s, p: -_impedance_slopes(s, p))
 # By kind of element, parameters in the order of its class.
 POINTS: dict[str, Law] = {
     "torsional_spring": Law(THETA_M, _compliance, _compliance_slopes, _clear_spring),
-    "translational_spring": Law(
-        W_V,
-        lambda s, p: -_compliance(s, p),
-        lambda s, p: -_compliance_slopes(s, p),
-        _clear_spring,
-    ),
+    **dict.fromkeys(("translational_spring", "spring", "damper"), _ACROSS),
     "torsional_ground_spring": Law(M_THETA, _impedance, _impedance_slopes),
-    "translational_ground_spring": Law(
-        V_W, lambda s, p: -_impedance(s, p), lambda s, p: -_impedance_slopes(s, p)
-    ),
+    **dict.fromkeys(("translational_ground_spring", "ground_spring", "ground_damper"), _TO_GROUND),
+    "cylinder": Law(W_V, _chambers, lambda s, p: -_Chambers(s, p).slopes(), _clear_chambers),
     "gravity_stiffness": Law(M_THETA, _constant, _constant_slopes),
     "oil_column": Law(THETA_M, _oil, _oil_slopes),
     "hydraulic_line": Law(THETA_M, _line, _line_slopes, _clear_line),
@@ -290,10 +340,37 @@ def _effort_relative(s: Complex, p: Float) -> Complex:
     return np.stack([np.ones_like(s), K * s / p[1] ** 2 / (1 + s / p[1]), -K * s])
 
 
+def _second_at_rest(s: Complex, p: Float) -> Complex:
+    """omega^2/(s^2 + 2 zeta omega s + omega^2): p = K, omega, zeta, tau."""
+    return np.asarray(p[1] ** 2 * _table(s, p))
+
+
+def _second_at_rest_relative(s: Complex, p: Float) -> Complex:
+    K, w = p[0], p[1]
+    relative = _table_relative(s, p)
+    relative[1] += 2 * K / w
+    return relative
+
+
+def _table(s: Complex, p: Float) -> Complex:
+    """1/(s^2 + 2 zeta omega s + omega^2): p = K, omega, zeta, tau."""
+    return np.asarray(_inverse(s**2 + 2 * p[2] * p[1] * s + p[1] ** 2) * _late(s, p[3]))
+
+
+def _table_relative(s: Complex, p: Float) -> Complex:
+    K, w, zeta = p[0], p[1], p[2]
+    N = s**2 + 2 * zeta * w * s + w**2
+    return np.stack([np.ones_like(s), -K * (2 * zeta * s + 2 * w) / N, -2 * K * w * s / N, -K * s])
+
+
 _ANGLE = (0.0, 0.0, -1.0, 0.0)  # theta jumps by +1
+_WAY = (0.0, 0.0, 0.0, 1.0)  # w jumps by +1
 SOURCE_LAWS: dict[str, SourceLaw] = {
     "angular_velocity_source": SourceLaw(_ANGLE, _first, _first_relative),
     "angular_velocity_source_2": SourceLaw(_ANGLE, _second, _second_relative),
     "torque_source": SourceLaw((0.0, -1.0, 0.0, 0.0), _effort, _effort_relative),  # M by -1
     "force_source": SourceLaw((-1.0, 0.0, 0.0, 0.0), _effort, _effort_relative),  # V by +1
+    "displacement_source": SourceLaw(_WAY, _second_at_rest, _second_at_rest_relative),
+    "velocity_source": SourceLaw(_WAY, _first, _first_relative),
+    "acceleration_source": SourceLaw(_WAY, _table, _table_relative),
 }

@@ -33,12 +33,16 @@ from samii_rig.model.sampled import (
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import (
     BEAMS,
+    AccelerationSource,
     AngularVelocitySource,
     AngularVelocitySource2,
+    DisplacementSource,
     ForceSource,
     Rig,
+    Rod,
     SensorBase,
     TorqueSource,
+    VelocitySource,
     flattened,
 )
 from samii_rig.types import Complex, Float
@@ -181,7 +185,7 @@ def search_region(rig: Rig, band_hz: float) -> Region:
     wanted: list[tuple[float, float]] = []
     relaxed = relaxed_beams(rig, LOSS_LOW * rig.rate_hz, 0.5 * rig.rate_hz)
     for e in flattened(rig.element):
-        if not isinstance(e, BEAMS):
+        if not isinstance(e, (*BEAMS, Rod)):
             continue
         if e.name in relaxed:
             wanted += relaxed[e.name].holes()
@@ -215,15 +219,20 @@ def source_poles(rig: Rig) -> list[complex]:
     out: list[complex] = []
     for e in rig.element:
         match e:
-            case AngularVelocitySource():
+            case AngularVelocitySource() | VelocitySource():
                 out += [0j, complex(-e.p.value)]
             case AngularVelocitySource2():
-                w, zeta = e.omega.value, e.zeta.value
-                roots = np.roots([1.0, 2 * zeta * w, w**2])
-                out += [0j, *(complex(x) for x in roots if x.imag >= 0)]
+                out += [0j, *_second_order(e.omega.value, e.zeta.value)]
+            case DisplacementSource() | AccelerationSource():
+                out += _second_order(e.omega.value, e.zeta.value)
             case TorqueSource() | ForceSource():
                 out += [complex(-e.p.value)] if e.p else []
     return out
+
+
+def _second_order(omega: float, zeta: float) -> list[complex]:
+    roots = np.roots([1.0, 2 * zeta * omega, omega**2])
+    return [complex(x) for x in roots if x.imag >= 0]
 
 
 def _apart(sensor: SensorBase, poles: Complex) -> SensorBase:

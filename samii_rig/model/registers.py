@@ -44,8 +44,8 @@ RESULT = FREE + 44  # up to five complex results
 K = FREE + 54  # scratch, then ten complex integrals of a short beam
 ROWS = FREE + 76
 
-# Factors of a sensor's terms: 1, s^2, the compliance of a spring or hinge.
-ONE, ACCELERATION, COMPLIANCE = 0, 1, 2
+# Factors of a sensor's terms: 1, s^2, the compliance of a spring or hinge, s.
+ONE, ACCELERATION, COMPLIANCE, VELOCITY = 0, 1, 2, 3
 
 # Columns change places when column 2 has a pivot more than 100 times that of column 1:
 # seldom, and then at most two digits are lost (threshold pivoting, as in sparse LU).
@@ -55,7 +55,7 @@ HUGE = 1e60  # columns are rescaled when the square of a pivot leaves 1/HUGE to 
 # From SPRING on an element changes the basis. A JUMP has one of the pairs of `laws` but
 # THETA_M, which is a HINGE; WAVES is any 4x4 matrix in the form of `timoshenko`.
 IDENTITY, LINK, SPRING, HINGE, JUMP, BEAM_KIND, WAVES = 0, 1, 2, 3, 4, 5, 6
-FREE_END, PINNED, CLAMPED = 0, 1, 2
+FREE_END, PINNED, CLAMPED, GUIDED = 0, 1, 2, 3
 THETA_M, W_V, M_THETA, V_W = 0, 1, 2, 3  # (state that jumps, state that makes it jump)
 
 Flag = NDArray[np.bool_]

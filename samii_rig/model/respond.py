@@ -23,6 +23,7 @@ from samii_rig.model.registers import (
     CLAMPED,
     DECAY,
     FACTOR,
+    GUIDED,
     IDENTITY,
     PHASE,
     PINNED,
@@ -219,6 +220,8 @@ def _characteristic(x: System, k: Work, start: int, n: int, mantissa: Complex, l
             D = get(X, 0, i) * 0.0 - get(X, 8, i) * get(X, 2, i)
         elif x.ends[1] == PINNED:
             D = get(X, 0, i) * get(X, 10, i) - get(X, 8, i) * get(X, 4, i)
+        elif x.ends[1] == GUIDED:
+            D = get(X, 2, i) * get(X, 12, i)
         else:
             D = get(X, 4, i) * get(X, 12, i) - get(X, 10, i) * get(X, 6, i)
         mantissa[start + i], log[start + i] = D, 0.0

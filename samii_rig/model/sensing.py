@@ -7,20 +7,25 @@ from collections.abc import Sequence
 import numpy as np
 
 from samii_rig.model.laws import POINTS
-from samii_rig.model.registers import ACCELERATION, COMPLIANCE, ONE, THETA_M
+from samii_rig.model.registers import ACCELERATION, COMPLIANCE, ONE, THETA_M, VELOCITY
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     BEAMS,
     SOURCES,
     AbsoluteAngle,
     Acceleration,
+    Displacement,
+    Force,
+    Gear,
     Moment,
+    Pressure,
     RelativeAngle,
     Rig,
+    RigidLink,
+    Velocity,
 )
 from samii_rig.types import Float, Int
-
-STANDARD_GRAVITY = 9.80665  # m/s^2
+from samii_rig.units import STANDARD_GRAVITY
 
 
 def source_feed(rig: Rig) -> Float:
@@ -52,11 +57,12 @@ def terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Int, Float]:
         w: float = 0.0,
         theta: float = 0.0,
         M: float = 0.0,
+        V: float = 0.0,
         factor: int = ONE,
         spring: int = -1,
     ) -> None:
         term.append((i, port, factor, spring))
-        term_c.append((w, theta, M, 0.0))
+        term_c.append((w, theta, M, V))
 
     for i, sensor in enumerate(rig.sensor):
         match sensor:
@@ -68,19 +74,30 @@ def terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Int, Float]:
                     law = POINTS.get(element.kind)
                     if law and law.pair == THETA_M:
                         add(i, before[name], M=1.0, factor=COMPLIANCE, spring=before[name])
-                    elif isinstance(element, BEAMS):
+                    elif isinstance(element, (*BEAMS, Gear)):
                         add(i, behind[name], theta=1.0)
                         add(i, before[name], theta=-1.0)
             case AbsoluteAngle():
                 add(i, behind[sensor.after], theta=1.0)
             case Moment():
                 add(i, behind[sensor.after], M=1.0)
+            case Displacement() | Velocity():
+                factor = VELOCITY if isinstance(sensor, Velocity) else ONE
+                add(i, behind[sensor.after], w=1.0, factor=factor)
+                if sensor.against is not None:
+                    add(i, behind[sensor.against], w=-1.0, factor=factor)
+            case Force():
+                add(i, behind[sensor.after], V=-1.0)
+            case Pressure():
+                add(i, behind[sensor.after], V=1.0 / sensor.area)
             case Acceleration():
                 port, arm = before[sensor.on], sensor.position
                 if isinstance(elements[sensor.on], BEAMS):
                     arm = 0.0
                     if sensor.position > 0:
                         port = places.index((sensor.on, sensor.position))
+                elif not isinstance(elements[sensor.on], RigidLink):
+                    port = behind[sensor.on]  # a table moves what is behind it
                 add(i, port, w=1.0, theta=arm, factor=ACCELERATION)
                 if sensor.tilt:
                     add(i, port, theta=sensor.tilt * STANDARD_GRAVITY)

@@ -27,12 +27,17 @@ from samii_rig.rig.elements import BEAMS
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     Acceleration,
+    Displacement,
     Element,
+    Force,
     Moment,
+    Pressure,
     RelativeAngle,
     Rig,
     RigidLink,
+    Rod,
     Sensor,
+    Velocity,
 )
 from samii_rig.types import Complex, Float
 
@@ -221,7 +226,7 @@ def _x(rig: Rig, places: Sequence[tuple[str, float]]) -> Float:
 
 
 def _length(element: Element) -> float:
-    return element.L.value if isinstance(element, (RigidLink, *BEAMS)) else 0.0
+    return element.L.value if isinstance(element, (RigidLink, Rod, *BEAMS)) else 0.0
 
 
 def _slope_changes(rig: Rig, ports: Sequence[int], state: Complex) -> dict[str, complex]:
@@ -253,8 +258,19 @@ def _reading(
             at = order.index(sensor.on)
             if isinstance(rig.element[at], RigidLink):
                 w = state[ports[at], 0] + sensor.position * state[ports[at], 1]
-            elif sensor.position == 0:
+            elif sensor.position == 0 and isinstance(rig.element[at], BEAMS):
                 w = state[ports[at], 0]
+            elif sensor.position == 0:
+                w = state[ports[at + 1], 0]
             else:
                 w = state[places.index((sensor.on, sensor.position)), 0]
             return complex(s**2 * w)
+        case Displacement() | Velocity():
+            w = state[ports[order.index(sensor.after) + 1], 0]
+            if sensor.against is not None:
+                w -= state[ports[order.index(sensor.against) + 1], 0]
+            return complex(s * w if isinstance(sensor, Velocity) else w)
+        case Force():
+            return complex(-state[ports[order.index(sensor.after) + 1], 3])
+        case Pressure():
+            return complex(state[ports[order.index(sensor.after) + 1], 3] / sensor.area)

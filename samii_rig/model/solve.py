@@ -10,7 +10,7 @@ A sensor that reads c^T z is dual to the jump e with w(x, e) = -c^T x: by recipr
 chain's answer zh to that jump gives the sensor's answer to any jump d elsewhere,
 y = -w(zh, d). So one more solution of the same chain a sensor yields all gradients.
 
-`terms` of a sensor are products of a factor (1, s^2 or a spring's compliance) and c^T z at a
+`terms` of a sensor are products of a factor (1, s, s^2 or a spring's compliance) and c^T z at a
 port. At a port with a jump, z is the value upstream of it.
 """
 
@@ -29,6 +29,7 @@ from samii_rig.model.registers import (
     RHO,
     SCALE,
     SPRING,
+    VELOCITY,
     B,
     Factors,
     Flag,
@@ -51,11 +52,14 @@ def set_factor(W: Float, values: Complex, start: int) -> None:
 
 @part
 def set_term_factor(x: System, jump: Complex, W: Float, t: int, start: int) -> None:
-    """FACTOR of term t: 1, s^2 or the compliance of a spring or hinge."""
+    """FACTOR of term t: 1, s, s^2 or the compliance of a spring or hinge."""
     kind, spring = x.term[t, 2], x.term[t, 3]
     if kind == ACCELERATION:
         for i in range(LANES):
             put(W, FACTOR, i, get(W, S + 2, i))
+    elif kind == VELOCITY:
+        for i in range(LANES):
+            put(W, FACTOR, i, get(W, S, i))
     elif kind == COMPLIANCE and x.kinds[spring] == HINGE:
         set_factor(W, jump[x.place[spring, 1]], start)
     elif kind == COMPLIANCE:

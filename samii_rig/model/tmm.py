@@ -23,7 +23,6 @@ from samii_rig.errors import InputError
 from samii_rig.model import respond, timoshenko
 from samii_rig.model.chain import L_OF_BEAM, compile_chain
 from samii_rig.model.factors import bind, characteristic, differentiate
-from samii_rig.model.sensing import STANDARD_GRAVITY
 from samii_rig.rig.elements import contradiction, quantities
 from samii_rig.rig.schema import (
     Acceleration,
@@ -35,6 +34,7 @@ from samii_rig.rig.schema import (
     parameters,
 )
 from samii_rig.types import Complex, Float
+from samii_rig.units import STANDARD_GRAVITY
 
 State = Literal["w", "theta", "M", "V"]
 

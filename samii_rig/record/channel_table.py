@@ -18,7 +18,7 @@ from pathlib import Path
 from samii_rig.errors import InputError
 from samii_rig.files import open_file, reason
 from samii_rig.record.maps import ColumnMap, ImportMap
-from samii_rig.record.units import factor, quantity
+from samii_rig.units import factor, quantity
 
 MAX_BYTES = 1 << 20  # a row has a hundred bytes
 _FIELDS = {

@@ -11,11 +11,19 @@ from html import escape
 
 from samii_rig.report.compare import pretty
 from samii_rig.rig.elements import (
+    MOTION_SOURCES,
     SOURCES,
     Beam,
+    Cylinder,
     Element,
+    ForceSource,
+    Gear,
     GravityStiffness,
+    LumpedMass,
+    Parameter,
     RigidLink,
+    Rod,
+    Spindle,
     TimoshenkoBeam,
     TorsionalGroundSpring,
     TorsionalSpring,
@@ -23,11 +31,22 @@ from samii_rig.rig.elements import (
     TranslationalSpring,
     parameters,
 )
-from samii_rig.rig.schema import AbsoluteAngle, Acceleration, Moment, RelativeAngle, Rig
+from samii_rig.rig.schema import (
+    AbsoluteAngle,
+    Acceleration,
+    Displacement,
+    Force,
+    Moment,
+    Pressure,
+    RelativeAngle,
+    Rig,
+    Velocity,
+)
 
 # All in user units of the drawing, about a pixel.
 _BEAM, _LINK, _SPRING, _SOURCE, _OTHER = 190.0, 96.0, 44.0, 56.0, 70.0  # widths
 _DROP = 34.0  # from the chain down to the ground beside it
+_POT = "v9m-6 0h12m-16 -4v14h20v-14m-10 14"  # a dashpot, 24 high, as a spring's turns are
 _SERIES = (TorsionalSpring, TranslationalSpring)
 _TO_GROUND = (TorsionalGroundSpring, TranslationalGroundSpring, GravityStiffness)
 _MARGIN = 64.0
@@ -62,7 +81,7 @@ def draw(rig: Rig, suspects: Mapping[str, Suspect] | None = None) -> str:
         if element.name in suspects:
             shapes.insert(0, _halo(suspects[element.name], x, end))
             shapes.append(_suspicion(suspects[element.name], (x + end) / 2, row))
-        shapes.append(_element(element, x, end))
+        shapes.append(_element(element, x, end, rig.motion == "axial"))
         shapes.append(_label(element, (x + end) / 2, row))
         x = end
     width = x + _MARGIN
@@ -82,7 +101,7 @@ def draw(rig: Rig, suspects: Mapping[str, Suspect] | None = None) -> str:
 
 def _width(element: Element) -> float:
     match element:
-        case Beam() | TimoshenkoBeam():
+        case Beam() | TimoshenkoBeam() | Rod():
             return _BEAM
         case RigidLink():
             return _LINK
@@ -91,10 +110,10 @@ def _width(element: Element) -> float:
     return _SOURCE if isinstance(element, SOURCES) else _OTHER
 
 
-def _element(element: Element, a: float, b: float) -> str:
+def _element(element: Element, a: float, b: float, along: bool) -> str:
     y, middle = _AXIS, (a + b) / 2
     match element:
-        case Beam() | TimoshenkoBeam():
+        case Beam() | TimoshenkoBeam() | Rod():
             return f'<rect class="beam" x="{a:.1f}" y="{y - 4}" width="{b - a:.1f}" height="8"/>'
         case RigidLink():
             span = element.L.value
@@ -104,6 +123,8 @@ def _element(element: Element, a: float, b: float) -> str:
                 f'height="{2 * _HALF}" rx="7"/>'
                 f'<circle class="centre" cx="{at:.1f}" cy="{y}" r="3.5"/>'
             )
+        case TranslationalSpring() if element.k.value == 0:
+            return _dashpot(a, b)
         case TorsionalSpring() | TranslationalSpring():
             steps = 6
             w = (b - a - 12) / steps
@@ -112,25 +133,52 @@ def _element(element: Element, a: float, b: float) -> str:
                 for k in range(steps)
             )
             return f'<path class="spring" d="{path}h6"/>'
-    along = f'<path class="spring" d="M{a:.1f} {y}H{b:.1f}"/>'
+    line = f'<path class="spring" d="M{a:.1f} {y}H{b:.1f}"/>'
     if isinstance(element, SOURCES):
         up = y + 17
+        if isinstance(element, (ForceSource, *MOTION_SOURCES)):
+            arrow = f"M{middle:.1f} {y + 9}v-18m-5 5l5 -5l5 5"
+            if along:
+                arrow = f"M{middle - 9:.1f} {y}h18m-5 -5l5 5l-5 5"
+            return (
+                f'{line}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
+                f'<path class="arrow" d="{arrow}"/>'
+            )
         return (
-            f'{along}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
+            f'{line}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
             f'<path class="arrow" d="M{middle - 8:.1f} {up - 12:.1f}a10 10 0 1 1 15 0'
             f'm-5 -1l5 1l1 -6"/>'
         )
     if isinstance(element, _TO_GROUND):
+        damps = not isinstance(element, GravityStiffness) and element.k.value == 0
         turns = "".join(
             f"l{7 if k % 2 == 0 else -7} 3l{-7 if k % 2 == 0 else 7} 3" for k in range(4)
         )
         hatch = "".join(f"M{middle - 14 + 7 * k:.1f} {y + _DROP}l-5 5" for k in range(5))
         return (
-            f'{along}<path class="spring" d="M{middle:.1f} {y}v5{turns}v5"/>'
+            f'{line}<path class="spring" d="M{middle:.1f} {y}v5{_POT if damps else turns}v5"/>'
             f'<path class="ground" d="M{middle - 16:.1f} {y + _DROP}h32{hatch}"/>'
         )
+    if isinstance(element, Gear):
+        return (
+            f'{line}<circle class="link" cx="{middle - 11:.1f}" cy="{y}" r="10"/>'
+            f'<circle class="link" cx="{middle + 16:.1f}" cy="{y}" r="17"/>'
+        )
+    if isinstance(element, Cylinder):
+        piston = f"M{middle - 6:.1f} {y - _HALF}v{2 * _HALF}m5 0v{-2 * _HALF}"
+        return (
+            f'<rect class="link" x="{a + 4:.1f}" y="{y - _HALF}" width="{b - a - 18:.1f}" '
+            f'height="{2 * _HALF}"/><path class="spring" d="M{a:.1f} {y}h4{piston}'
+            f'M{middle - 1:.1f} {y}H{b:.1f}"/>'
+        )
+    if isinstance(element, Spindle):
+        thread = "".join(f"M{a + 10 + 8 * k:.1f} {y + _HALF}l8 {-2 * _HALF}" for k in range(6))
+        return (
+            f'{line}<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
+            f'height="{2 * _HALF}"/><path class="spring" d="{thread}"/>'
+        )
     return (
-        f'{along}<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
+        f'{line}<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
         f'height="{2 * _HALF}"/>'
     )
 
@@ -138,17 +186,23 @@ def _element(element: Element, a: float, b: float) -> str:
 def _label(element: Element, x: float, y: float) -> str:
     match element:
         case Beam() | TimoshenkoBeam():
-            detail = f"EI {_si(element.EI.value, pretty('N m^2'))}, {element.L.value:.3g} m"
+            detail = f"EI {_value(element.EI)}, {_value(element.L)}"
+        case Rod():
+            detail = f"EA {_value(element.EA)}, {_value(element.L)}"
         case RigidLink():
-            detail = f"{element.m.value:.3g} kg, {element.L.value:.3g} m"
+            detail = f"{_value(element.m)}, {_value(element.L)}"
+        case LumpedMass():
+            told = [p for p in (element.m, element.I) if p.value > 0]
+            detail = ", ".join(_value(p) for p in told)
         case _ if isinstance(element, SOURCES):
             detail = f"input {element.input}"
         case _:
             found = parameters(element)
             detail = element.kind.replace("_", " ")
-            if found:
-                symbol, p = next(iter(found.items()))
-                detail = f"{symbol} {_si(p.value, pretty(p.unit))}"
+            first = next(((symbol, p) for symbol, p in found.items() if p.value != 0), None)
+            if first:
+                symbol, p = first
+                detail = f"{symbol} {_value(p)}"
     top = _AXIS + (_DROP + 8 if isinstance(element, _TO_GROUND) else 22)
     leader = f'<path class="leader" d="M{x:.1f} {top}V{y - 15:.1f}"/>' if top < y - 15 else ""
     return (
@@ -193,7 +247,10 @@ def _sensors(
         match sensor:
             case RelativeAngle():
                 span = spans[sensor.across[0]][0], spans[sensor.across[-1]][1]
-            case AbsoluteAngle() | Moment():
+            case Displacement() | Velocity() if sensor.against is not None:
+                one, other = spans[sensor.against][1], spans[sensor.after][1]
+                span = min(one, other), max(one, other)
+            case AbsoluteAngle() | Moment() | Displacement() | Velocity() | Force() | Pressure():
                 span = (spans[sensor.after][1],) * 2
             case Acceleration():
                 a, b = spans[sensor.on]
@@ -217,6 +274,23 @@ def _sensors(
             f'<text class="sensorname{style}" x="{x:.1f}" y="{row:.1f}">{escape(text)}</text>'
         )
     return out
+
+
+def _dashpot(a: float, b: float) -> str:
+    """A pot open to the left and the piston in it."""
+    y, m = _AXIS, (a + b) / 2
+    return (
+        f'<path class="spring" d="M{a:.1f} {y}H{m:.1f}m0 -7v14'
+        f'M{m - 8:.1f} {y - 10}H{m + 9:.1f}v20H{m - 8:.1f}M{m + 9:.1f} {y}H{b:.1f}"/>'
+    )
+
+
+def _value(p: Parameter) -> str:
+    """A parameter as the file writes it; in the SI with a prefix of thousands."""
+    value, unit = p.shown()
+    if unit == "1":
+        return f"{value:.4g}"
+    return f"{value:.4g} {pretty(unit)}" if p.written else _si(value, pretty(unit))
 
 
 def _si(value: float, unit: str) -> str:

@@ -3,97 +3,55 @@
 Every physical parameter carries its unit, its tolerance and where the number came from.
 The state vector along the chain is z = [w, theta, M, V, 1] (paper 2, eq. 8), its sign
 convention w' = theta, theta' = M/EI, M' = V, V' = -mu s^2 w (paper 1, eq. 1-5, where the
-first state is written -w).
+first state is written -w). Of a chain that moves along itself, `motion = "axial"`, w is the
+displacement along it and -V the force of tension; theta and M rest.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from functools import cache
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, Field
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+from samii_rig.rig.base import (
+    ElementBase,
+    Finite,
+    Name,
+    NonNegative,
+    Parameter,
+    Positive,
+    Quantity,
+    Rule,
+    Strict,
+    contradiction,
+    converted,
+    not_negative,
+    not_zero,
+    parameters,
+    positive,
+    quantities,
+    some_mass,
+    some_stiffness,
+    zero,
+)
+
+__all__ = [
+    "Finite",
+    "Name",
+    "NonNegative",
+    "Parameter",
+    "Positive",
+    "Quantity",
+    "Strict",
+    "contradiction",
+    "converted",
+    "parameters",
+    "quantities",
+]
+
 End = Literal["clamped", "pinned", "free"]
-
-
-class Strict(BaseModel):
-    """A table of the rig file: unknown keys are errors, values cannot be changed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="constants")
-
-
-class Parameter(Strict):
-    """A physical parameter.
-
-    tolerance : relative standard deviation of `value` as a prior, 0 for exact.
-    source : where the number came from, e.g. "[published] paper 1, Table II".
-    """
-
-    value: Finite
-    unit: str
-    tolerance: NonNegative = 0.0
-    source: str = Field(min_length=1)
-
-
-@dataclass(frozen=True, slots=True)
-class Quantity:
-    """What a parameter must be: its unit, and the sign of its value."""
-
-    unit: str
-    sign: Literal["positive", "not negative", "any"]
-
-    def refusal(self, value: float) -> str | None:
-        """Why `value` is not allowed, as a statement with what would be; None if it is."""
-        if not math.isfinite(value):
-            return f"value {value:g} {self.unit}; expected a finite number"
-        if self.sign == "positive" and value <= 0:
-            return f"value {value:g} {self.unit}; expected more than 0"
-        if self.sign == "not negative" and value < 0:
-            return f"value {value:g} {self.unit}; expected 0 or more"
-        return None
-
-    def __call__(self, parameter: Parameter | None) -> Parameter | None:
-        """The parameter itself; ValueError if it is not allowed."""
-        if parameter is None:
-            return None
-        if parameter.unit != self.unit:
-            raise ValueError(f"unit {parameter.unit!r}; expected {self.unit!r}")
-        refusal = self.refusal(parameter.value)
-        if refusal:
-            raise ValueError(refusal)
-        return parameter
-
-
-def _positive(unit: str) -> AfterValidator:
-    return AfterValidator(Quantity(unit, "positive"))
-
-
-def _not_negative(unit: str) -> AfterValidator:
-    return AfterValidator(Quantity(unit, "not negative"))
-
-
-def _zero(unit: str) -> Parameter:
-    return Parameter(value=0.0, unit=unit, source="absent from the rig file: none")
-
-
-class ElementBase(Strict):
-    """What every element has."""
-
-    name: Name
-
-    @model_validator(mode="after")
-    def _consistent(self) -> Self:
-        wrong = contradiction(type(self), {k: p.value for k, p in parameters(self).items()})
-        if wrong:
-            raise ValueError(wrong)
-        return self
+Motion = Literal["lateral", "axial"]
 
 
 class Beam(ElementBase):
@@ -105,11 +63,11 @@ class Beam(ElementBase):
     """
 
     kind: Literal["beam"]
-    EI: Annotated[Parameter, _positive("N m^2")]
-    mu: Annotated[Parameter, _positive("kg/m")]
-    L: Annotated[Parameter, _positive("m")]
-    eta: Annotated[Parameter, _not_negative("1")] = _zero("1")
-    tau: Annotated[Parameter, _not_negative("s")] = _zero("s")
+    EI: Annotated[Parameter, positive("N m^2")]
+    mu: Annotated[Parameter, positive("kg/m")]
+    L: Annotated[Parameter, positive("m")]
+    eta: Annotated[Parameter, not_negative("1")] = zero("1")
+    tau: Annotated[Parameter, not_negative("s")] = zero("s")
 
 
 class TimoshenkoBeam(ElementBase):
@@ -120,32 +78,66 @@ class TimoshenkoBeam(ElementBase):
     """
 
     kind: Literal["timoshenko_beam"]
-    EI: Annotated[Parameter, _positive("N m^2")]
-    mu: Annotated[Parameter, _positive("kg/m")]
-    L: Annotated[Parameter, _positive("m")]
-    eta: Annotated[Parameter, _not_negative("1")] = _zero("1")
-    tau: Annotated[Parameter, _not_negative("s")] = _zero("s")
-    GA: Annotated[Parameter, _positive("N")]
-    J: Annotated[Parameter, _not_negative("kg m")]
+    EI: Annotated[Parameter, positive("N m^2")]
+    mu: Annotated[Parameter, positive("kg/m")]
+    L: Annotated[Parameter, positive("m")]
+    eta: Annotated[Parameter, not_negative("1")] = zero("1")
+    tau: Annotated[Parameter, not_negative("s")] = zero("s")
+    GA: Annotated[Parameter, positive("N")]
+    J: Annotated[Parameter, not_negative("kg m")]
 
 
 class RigidLink(ElementBase):
     """Rigid body: length L, centre of gravity r from its upstream joint, mass m,
     second moment of inertia I about the centre of gravity."""
 
+    rule: ClassVar[Rule | None] = some_mass
+
     kind: Literal["rigid_link"]
-    L: Annotated[Parameter, _not_negative("m")]
-    r: Annotated[Parameter, _not_negative("m")]
-    m: Annotated[Parameter, _not_negative("kg")]
-    I: Annotated[Parameter, _not_negative("kg m^2")]  # noqa: E741 the papers' symbol
+    L: Annotated[Parameter, not_negative("m")]
+    r: Annotated[Parameter, not_negative("m")]
+    m: Annotated[Parameter, not_negative("kg")]
+    I: Annotated[Parameter, not_negative("kg m^2")]  # noqa: E741 the papers' symbol
 
 
 class LumpedMass(ElementBase):
     """Mass and second moment of inertia at a point: V+ = V- - m s^2 w, M+ = M- + I s^2 theta."""
 
-    kind: Literal["lumped_mass"]
-    m: Annotated[Parameter, _not_negative("kg")]
-    I: Annotated[Parameter, _not_negative("kg m^2")] = _zero("kg m^2")  # noqa: E741
+    kind: Literal["lumped_mass", "mass"]
+    m: Annotated[Parameter, not_negative("kg")]
+    I: Annotated[Parameter, not_negative("kg m^2")] = zero("kg m^2")  # noqa: E741
+
+
+class Inertia(LumpedMass):
+    """A lumped mass that only turns: a rotor, a flywheel, a pulley."""
+
+    kind: Literal["inertia"]  # type: ignore[assignment]
+    m: Annotated[Parameter, not_negative("kg")] = zero("kg")
+    I: Annotated[Parameter, positive("kg m^2")]  # noqa: E741
+
+
+class Gear(ElementBase):
+    """A gear or belt drive without play: theta+ = theta-/n, M+ = n M-.
+
+    n is how often the base's side turns for one turn behind it; negative for the other sense.
+    """
+
+    rule: ClassVar[Rule | None] = not_zero("n")
+
+    kind: Literal["gear"]
+    n: Annotated[Parameter, AfterValidator(Quantity("1", "any"))]
+
+
+class Spindle(ElementBase):
+    """From rotation to translation, a screw or a rack: w+ = lead theta-, V+ = -M-/lead.
+
+    Before it an axial chain turns, behind it it slides; what turned stays behind.
+    """
+
+    rule: ClassVar[Rule | None] = not_zero("lead")
+
+    kind: Literal["spindle"]
+    lead: Annotated[Parameter, AfterValidator(Quantity("m/rad", "any"))]
 
 
 class TorsionalSpring(ElementBase):
@@ -155,33 +147,40 @@ class TorsionalSpring(ElementBase):
     with intrinsic velocity feedback, c = g_v (paper 1, eq. 18 and section V-A).
     """
 
+    rule: ClassVar[Rule | None] = some_stiffness
+
     kind: Literal["torsional_spring"]
-    k: Annotated[Parameter, _not_negative("N m/rad")]
-    c: Annotated[Parameter, _not_negative("N m s/rad")] = _zero("N m s/rad")
+    k: Annotated[Parameter, not_negative("N m/rad")]
+    c: Annotated[Parameter, not_negative("N m s/rad")] = zero("N m s/rad")
 
 
 class TranslationalSpring(ElementBase):
-    """Spring and damper across the chain: w+ = w- - V/(c s + k); the shear force is -V."""
+    """Spring and damper across the chain: w+ = w- - V/(c s + k); the shear force is -V.
 
-    kind: Literal["translational_spring"]
-    k: Annotated[Parameter, _not_negative("N/m")]
-    c: Annotated[Parameter, _not_negative("N s/m")] = _zero("N s/m")
+    Of an axial chain the spring or damper between two parts, -V its tension.
+    """
+
+    rule: ClassVar[Rule | None] = some_stiffness
+
+    kind: Literal["translational_spring", "spring", "damper"]
+    k: Annotated[Parameter, not_negative("N/m")] = zero("N/m")
+    c: Annotated[Parameter, not_negative("N s/m")] = zero("N s/m")
 
 
 class TorsionalGroundSpring(ElementBase):
     """Torsional spring and damper to the ground: M+ = M- + (c s + k) theta."""
 
     kind: Literal["torsional_ground_spring"]
-    k: Annotated[Parameter, _not_negative("N m/rad")]
-    c: Annotated[Parameter, _not_negative("N m s/rad")] = _zero("N m s/rad")
+    k: Annotated[Parameter, not_negative("N m/rad")]
+    c: Annotated[Parameter, not_negative("N m s/rad")] = zero("N m s/rad")
 
 
 class TranslationalGroundSpring(ElementBase):
     """Spring and damper to the ground: V+ = V- - (c s + k) w."""
 
-    kind: Literal["translational_ground_spring"]
-    k: Annotated[Parameter, _not_negative("N/m")]
-    c: Annotated[Parameter, _not_negative("N s/m")] = _zero("N s/m")
+    kind: Literal["translational_ground_spring", "ground_spring", "ground_damper"]
+    k: Annotated[Parameter, not_negative("N/m")] = zero("N/m")
+    c: Annotated[Parameter, not_negative("N s/m")] = zero("N s/m")
 
 
 class GravityStiffness(ElementBase):
@@ -192,6 +191,19 @@ class GravityStiffness(ElementBase):
     k: Annotated[Parameter, AfterValidator(Quantity("N m/rad", "any"))]
 
 
+class Rod(ElementBase):
+    """A rod that is stretched along itself, with waves in it: w' = -V/EA, V' = -mu s^2 w.
+
+    Its complex stiffness is EA (1 + s tau), tau a viscous (Kelvin-Voigt) damping time.
+    """
+
+    kind: Literal["rod"]
+    EA: Annotated[Parameter, positive("N")]
+    mu: Annotated[Parameter, positive("kg/m")]
+    L: Annotated[Parameter, positive("m")]
+    tau: Annotated[Parameter, not_negative("s")] = zero("s")
+
+
 class OilColumn(ElementBase):
     """Compressible oil between valve and vane: theta+ = theta- + M C_h/D^2.
 
@@ -199,8 +211,28 @@ class OilColumn(ElementBase):
     """
 
     kind: Literal["oil_column"]
-    D: Annotated[Parameter, _positive("m^3/rad")]
-    C_h: Annotated[Parameter, _not_negative("m^3/Pa")]
+    D: Annotated[Parameter, positive("m^3/rad")]
+    C_h: Annotated[Parameter, not_negative("m^3/Pa")]
+
+
+class Cylinder(ElementBase):
+    """The oil in a cylinder's two chambers, which gives way: w+ = w- - V/k(s).
+
+    It stands behind the velocity source that the valve's flow makes, K = flow gain/A_1, flows
+    in and out as A_1 to A_2. A_1, A_2 piston areas, V_1, V_2 volumes at the working point with
+    the pipes, B bulk modulus, leak between the chambers as flow a pressure. With
+    S_k = A_1^k/V_1 + A_2^k/V_2 and g = B leak,
+    k(s) = B (S_2 s + g (S_2 S_0 - S_1^2))/(s + g S_0) (Merritt, Hydraulic Control Systems, 6-1,
+    for both chambers apart).
+    """
+
+    kind: Literal["cylinder"]
+    A_1: Annotated[Parameter, positive("m^2")]
+    A_2: Annotated[Parameter, positive("m^2")]
+    V_1: Annotated[Parameter, positive("m^3")]
+    V_2: Annotated[Parameter, positive("m^3")]
+    B: Annotated[Parameter, positive("Pa")]
+    leak: Annotated[Parameter, not_negative("m^3/(s Pa)")] = zero("m^3/(s Pa)")
 
 
 class HydraulicLine(ElementBase):
@@ -214,12 +246,12 @@ class HydraulicLine(ElementBase):
 
     kind: Literal["hydraulic_line"]
     source: Name
-    D: Annotated[Parameter, _positive("m^3/rad")]
-    L: Annotated[Parameter, _positive("m")]
-    A: Annotated[Parameter, _positive("m^2")]
-    rho: Annotated[Parameter, _positive("kg/m^3")]
-    B: Annotated[Parameter, _positive("Pa")]
-    R: Annotated[Parameter, _not_negative("Pa s/m^4")] = _zero("Pa s/m^4")
+    D: Annotated[Parameter, positive("m^3/rad")]
+    L: Annotated[Parameter, positive("m")]
+    A: Annotated[Parameter, positive("m^2")]
+    rho: Annotated[Parameter, positive("kg/m^3")]
+    B: Annotated[Parameter, positive("Pa")]
+    R: Annotated[Parameter, not_negative("Pa s/m^4")] = zero("Pa s/m^4")
 
 
 class LumpedLine(ElementBase):
@@ -233,10 +265,10 @@ class LumpedLine(ElementBase):
 
     kind: Literal["lumped_line"]
     source: Name
-    D: Annotated[Parameter, _positive("m^3/rad")]
-    C_h: Annotated[Parameter, _positive("m^3/Pa")]
-    omega: Annotated[Parameter, _positive("rad/s")]
-    zeta: Annotated[Parameter, _not_negative("1")]
+    D: Annotated[Parameter, positive("m^3/rad")]
+    C_h: Annotated[Parameter, positive("m^3/Pa")]
+    omega: Annotated[Parameter, positive("rad/s")]
+    zeta: Annotated[Parameter, not_negative("1")]
 
 
 class AngularVelocitySource(ElementBase):
@@ -249,8 +281,8 @@ class AngularVelocitySource(ElementBase):
     kind: Literal["angular_velocity_source"]
     input: Name
     K: Parameter
-    p: Annotated[Parameter, _positive("rad/s")]
-    tau: Annotated[Parameter, _not_negative("s")] = _zero("s")
+    p: Annotated[Parameter, positive("rad/s")]
+    tau: Annotated[Parameter, not_negative("s")] = zero("s")
 
 
 class AngularVelocitySource2(ElementBase):
@@ -260,9 +292,9 @@ class AngularVelocitySource2(ElementBase):
     kind: Literal["angular_velocity_source_2"]
     input: Name
     K: Parameter
-    omega: Annotated[Parameter, _positive("rad/s")]
-    zeta: Annotated[Parameter, _positive("1")]
-    tau: Annotated[Parameter, _not_negative("s")] = _zero("s")
+    omega: Annotated[Parameter, positive("rad/s")]
+    zeta: Annotated[Parameter, positive("1")]
+    tau: Annotated[Parameter, not_negative("s")] = zero("s")
 
 
 class TorqueSource(ElementBase):
@@ -276,21 +308,65 @@ class TorqueSource(ElementBase):
     kind: Literal["torque_source"]
     input: Name
     K: Parameter
-    p: Annotated[Parameter | None, _positive("rad/s")] = None
-    tau: Annotated[Parameter, _not_negative("s")] = _zero("s")
+    p: Annotated[Parameter | None, positive("rad/s")] = None
+    tau: Annotated[Parameter, not_negative("s")] = zero("s")
 
 
 class ForceSource(ElementBase):
-    """Lateral force K v exp(-s tau)/(1 + s/p) on the chain, positive as w: V+ = V- + force.
+    """Force K v exp(-s tau)/(1 + s/p) on the chain, positive as w: V+ = V- + force.
 
-    It reacts against the ground (a shaker). The unit of K is "N/V" for volts.
+    It reacts against the ground (a shaker). Between two parts there are two of them on one input,
+    -K on the one and K on the other. The unit of K is "N/V" for volts.
     """
 
     kind: Literal["force_source"]
     input: Name
     K: Parameter
-    p: Annotated[Parameter | None, _positive("rad/s")] = None
-    tau: Annotated[Parameter, _not_negative("s")] = _zero("s")
+    p: Annotated[Parameter | None, positive("rad/s")] = None
+    tau: Annotated[Parameter, not_negative("s")] = zero("s")
+
+
+class DisplacementSource(ElementBase):
+    """Prescribed displacement (a testing machine):
+    w+ = w- + K omega^2 v exp(-s tau)/(s^2 + 2 zeta omega s + omega^2).
+
+    It moves what follows against what comes before, whatever force that takes; omega and zeta
+    are those of its own control. The unit of K is "m/V" for volts.
+    """
+
+    kind: Literal["displacement_source"]
+    input: Name
+    K: Parameter
+    omega: Annotated[Parameter, positive("rad/s")]
+    zeta: Annotated[Parameter, positive("1")]
+    tau: Annotated[Parameter, not_negative("s")] = zero("s")
+
+
+class VelocitySource(ElementBase):
+    """Prescribed velocity with a first-order lag (a spindle, a cylinder on its valve):
+    w+ = w- + K p v exp(-s tau)/(s (s + p)). The unit of K is "m/(s V)" for volts."""
+
+    kind: Literal["velocity_source"]
+    input: Name
+    K: Parameter
+    p: Annotated[Parameter, positive("rad/s")]
+    tau: Annotated[Parameter, not_negative("s")] = zero("s")
+
+
+class AccelerationSource(ElementBase):
+    """A shaker's table, its acceleration K v above its suspension's natural frequency:
+    w+ = w- + K v exp(-s tau)/(s^2 + 2 zeta omega s + omega^2).
+
+    No table keeps an acceleration for ever, so omega and zeta are its own. The unit of K is
+    "m/(s^2 V)" for volts.
+    """
+
+    kind: Literal["acceleration_source"]
+    input: Name
+    K: Parameter
+    omega: Annotated[Parameter, positive("rad/s")]
+    zeta: Annotated[Parameter, positive("1")]
+    tau: Annotated[Parameter, not_negative("s")] = zero("s")
 
 
 Passive = Annotated[
@@ -298,12 +374,15 @@ Passive = Annotated[
     | TimoshenkoBeam
     | RigidLink
     | LumpedMass
+    | Inertia
     | TorsionalSpring
     | TranslationalSpring
     | TorsionalGroundSpring
     | TranslationalGroundSpring
     | GravityStiffness
-    | OilColumn,
+    | Rod
+    | OilColumn
+    | Cylinder,
     Field(discriminator="kind"),
 ]
 
@@ -319,69 +398,91 @@ class Branch(ElementBase):
     tip: End = "free"
 
 
-Source = AngularVelocitySource | AngularVelocitySource2 | TorqueSource | ForceSource
-SOURCES = (AngularVelocitySource, AngularVelocitySource2, TorqueSource, ForceSource)
+Source = (
+    AngularVelocitySource
+    | AngularVelocitySource2
+    | TorqueSource
+    | ForceSource
+    | DisplacementSource
+    | VelocitySource
+    | AccelerationSource
+)
 ANGLE_SOURCES = (AngularVelocitySource, AngularVelocitySource2)
+MOTION_SOURCES = (DisplacementSource, VelocitySource, AccelerationSource)  # prescribe w
+SOURCES = (*ANGLE_SOURCES, TorqueSource, ForceSource, *MOTION_SOURCES)
 BEAMS = (Beam, TimoshenkoBeam)
 LINES = (HydraulicLine, LumpedLine)
+TRANSFORMERS = (Gear, Spindle)
 
 Element = Annotated[
     Beam
     | TimoshenkoBeam
     | RigidLink
     | LumpedMass
+    | Inertia
+    | Gear
+    | Spindle
     | TorsionalSpring
     | TranslationalSpring
     | TorsionalGroundSpring
     | TranslationalGroundSpring
     | GravityStiffness
+    | Rod
     | OilColumn
+    | Cylinder
     | HydraulicLine
     | LumpedLine
     | Branch
     | AngularVelocitySource
     | AngularVelocitySource2
     | TorqueSource
-    | ForceSource,
+    | ForceSource
+    | DisplacementSource
+    | VelocitySource
+    | AccelerationSource,
     Field(discriminator="kind"),
 ]
 
+# What a chain along itself is made of.
+AXIAL = (
+    LumpedMass,
+    TranslationalSpring,
+    TranslationalGroundSpring,
+    Rod,
+    Cylinder,
+    Branch,
+    ForceSource,
+    *MOTION_SOURCES,
+)
 
-def _some_stiffness(v: Mapping[str, float]) -> str | None:
-    return "k and c are both 0; expected one above 0" if v["k"] == 0 and v["c"] == 0 else None
-
-
-def _some_mass(v: Mapping[str, float]) -> str | None:
-    return "I without m; expected a mass above 0" if v["m"] == 0 and v["I"] > 0 else None
-
-
-_RULES: dict[type[BaseModel], Callable[[Mapping[str, float]], str | None]] = {
-    TorsionalSpring: _some_stiffness,
-    TranslationalSpring: _some_stiffness,
-    RigidLink: _some_mass,
-}
-
-
-def contradiction(kind: type[BaseModel], values: Mapping[str, float]) -> str | None:
-    """What is wrong with an element's `values` (by symbol) together; None if nothing is."""
-    rule = _RULES.get(kind)
-    return rule(values) if rule else None
-
-
-@cache
-def quantities(kind: type[BaseModel]) -> dict[str, Quantity]:
-    """What each parameter of a kind of element must be, by symbol."""
-    out: dict[str, Quantity] = {}
-    for symbol, field in kind.model_fields.items():
-        for item in field.metadata:
-            if isinstance(item, AfterValidator) and isinstance(item.func, Quantity):
-                out[symbol] = item.func
-    return out
+# What may stand before its spindle.
+TURNING = (
+    LumpedMass,
+    TorsionalSpring,
+    TorsionalGroundSpring,
+    GravityStiffness,
+    OilColumn,
+    Gear,
+    *LINES,
+    *ANGLE_SOURCES,
+    TorqueSource,
+)
 
 
-def parameters(element: BaseModel) -> dict[str, Parameter]:
-    """The element's physical parameters by symbol, in the order of its class."""
-    return {k: v for k, v in iter(element) if isinstance(v, Parameter)}
+def input_unit(kind: str, unit: str) -> str:
+    """Unit of K of a source of this kind with an input in `unit`."""
+    match kind:
+        case "torque_source":
+            return f"N m/{unit}"
+        case "force_source":
+            return f"N/{unit}"
+        case "displacement_source":
+            return f"m/{unit}"
+        case "velocity_source":
+            return f"m/(s {unit})"
+        case "acceleration_source":
+            return f"m/(s^2 {unit})"
+    return f"rad/(s {unit})"
 
 
 def flattened(elements: tuple[Any, ...]) -> Iterator[Any]:

@@ -10,32 +10,42 @@ from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from samii_rig.rig.axial import check_motion
+from samii_rig.rig.conversion import in_si
 from samii_rig.rig.elements import (
     ANGLE_SOURCES,
     BEAMS,
     LINES,
+    MOTION_SOURCES,
     SOURCES,
+    AccelerationSource,
     AngularVelocitySource,
     AngularVelocitySource2,
     Beam,
     Branch,
+    Cylinder,
+    DisplacementSource,
     Element,
     End,
     Finite,
     ForceSource,
+    Gear,
     GravityStiffness,
     HydraulicLine,
     LumpedLine,
     LumpedMass,
+    Motion,
     Name,
     NonNegative,
     OilColumn,
     Parameter,
     Positive,
     RigidLink,
+    Rod,
     Source,
+    Spindle,
     Strict,
     TimoshenkoBeam,
     TorqueSource,
@@ -43,17 +53,35 @@ from samii_rig.rig.elements import (
     TorsionalSpring,
     TranslationalGroundSpring,
     TranslationalSpring,
+    VelocitySource,
     flattened,
+    input_unit,
     parameters,
+)
+from samii_rig.rig.sensors import (
+    AbsoluteAngle,
+    Acceleration,
+    AntiAlias,
+    Displacement,
+    Force,
+    Moment,
+    Pressure,
+    RelativeAngle,
+    Sensor,
+    SensorBase,
+    Velocity,
+    places,
 )
 
 __all__ = [
     "ANGLE_SOURCES",
     "BEAMS",
     "LINES",
+    "MOTION_SOURCES",
     "SOURCES",
     "AbsoluteAngle",
     "Acceleration",
+    "AccelerationSource",
     "ActuatorSpec",
     "Agreement",
     "AngularVelocitySource",
@@ -62,11 +90,16 @@ __all__ = [
     "Beam",
     "Branch",
     "Centring",
+    "Cylinder",
     "Device",
+    "Displacement",
+    "DisplacementSource",
     "Element",
     "Feedback",
     "Finite",
+    "Force",
     "ForceSource",
+    "Gear",
     "GravityStiffness",
     "HydraulicLine",
     "Limit",
@@ -79,13 +112,16 @@ __all__ = [
     "OilColumn",
     "Parameter",
     "Positive",
+    "Pressure",
     "RelativeAngle",
     "Rig",
     "RigidLink",
+    "Rod",
     "Sensor",
     "SensorBase",
     "Service",
     "Source",
+    "Spindle",
     "Strict",
     "TimoshenkoBeam",
     "TorqueSource",
@@ -93,106 +129,11 @@ __all__ = [
     "TorsionalSpring",
     "TranslationalGroundSpring",
     "TranslationalSpring",
+    "Velocity",
+    "VelocitySource",
     "flattened",
     "parameters",
     "places",
-]
-
-
-class AntiAlias(Strict):
-    """Analogue low-pass before the converter: a Butterworth of this order and corner."""
-
-    order: Annotated[int, Field(ge=1, le=8)]
-    corner_hz: Positive
-
-
-class SensorBase(Strict):
-    """What every sensor has beside its place on the chain.
-
-    noise_rms : white noise of the converted samples, in `unit`.
-    resolution : one step of the converter, in `unit`; 0 for none.
-    offset : constant error in `unit`.
-    low, high : ends of the converter's range in `unit`.
-    highpass_hz : corner of a first-order high-pass (a piezo's), 0 for none.
-    gain : what the channel shows over what is there, 1 for a true calibration.
-    lag : s, time constant of a first-order low-pass in the sensor's chain, 0 for none.
-    delay : s from the instant of sampling as stamped back to the value's own time.
-    stale_after : s without a new sample after which the channel is stale.
-    """
-
-    name: Name
-    unit: str
-    noise_rms: NonNegative = 0.0
-    resolution: NonNegative = 0.0
-    offset: Finite = 0.0
-    low: float = -math.inf
-    high: float = math.inf
-    highpass_hz: NonNegative = 0.0
-    antialias: AntiAlias | None = None
-    gain: Finite = 1.0
-    lag: NonNegative = 0.0
-    delay: NonNegative = 0.0
-    stale_after: Positive = 0.05
-    calibration: str = Field(default="", description="how unit and scale are known")
-
-    @model_validator(mode="after")
-    def _range(self) -> Self:
-        if not self.low < self.high:
-            raise ValueError(f"low {self.low:g}, high {self.high:g}; expected low below high")
-        return self
-
-
-def _unit(expected: str) -> AfterValidator:
-    def check(unit: str) -> str:
-        if unit != expected:
-            raise ValueError(f"is {unit!r}; expected {expected!r}")
-        return unit
-
-    return AfterValidator(check)
-
-
-class RelativeAngle(SensorBase):
-    """Rotation after the last minus rotation before the first of the elements named.
-
-    `across = ["source"]` is an encoder collocated with the actuator,
-    `across = ["source", "spring"]` one that sees the joint's spring too (paper 2, eq. 11).
-    """
-
-    kind: Literal["relative_angle"]
-    across: Annotated[tuple[Name, ...], Field(min_length=1)]
-    unit: Annotated[str, _unit("rad")]
-
-
-class AbsoluteAngle(SensorBase):
-    """Rotation after the element named, against the ground."""
-
-    kind: Literal["absolute_angle"]
-    after: Name
-    unit: Annotated[str, _unit("rad")]
-
-
-class Acceleration(SensorBase):
-    """Lateral acceleration s^2 w + tilt g theta at `position` metres from the upstream end of
-    a rigid link or beam; tilt is 1 for a sensor that turns with it in the vertical plane and
-    reads gravity as an acceleration towards positive w, -1 the other way round."""
-
-    kind: Literal["acceleration"]
-    on: Name
-    position: NonNegative
-    tilt: Finite = 0.0
-    unit: Annotated[str, _unit("m/s^2")]
-
-
-class Moment(SensorBase):
-    """Internal moment M after the element named."""
-
-    kind: Literal["moment"]
-    after: Name
-    unit: Annotated[str, _unit("N m")]
-
-
-Sensor = Annotated[
-    RelativeAngle | AbsoluteAngle | Acceleration | Moment, Field(discriminator="kind")
 ]
 
 
@@ -397,23 +338,20 @@ def _driven(e: Source, inputs: dict[str, ActuatorSpec]) -> None:
         raise ValueError(
             f"element {e.name}: input {e.input!r} is no actuator; expected one of {sorted(inputs)}"
         )
-    unit = inputs[e.input].unit
-    match e:
-        case TorqueSource():
-            expected = f"N m/{unit}"
-        case ForceSource():
-            expected = f"N/{unit}"
-        case _:
-            expected = f"rad/(s {unit})"
+    expected = input_unit(e.kind, inputs[e.input].unit)
     if e.K.unit != expected:
         raise ValueError(f"element {e.name}: K has unit {e.K.unit!r}; expected {expected!r}")
 
 
 class Rig(Strict):
-    """A rig file. Elements stand in the order base to tip."""
+    """A rig file. Elements stand in the order base to tip.
+
+    motion : "lateral" for a chain that bends and turns, "axial" for one that moves along itself.
+    """
 
     name: str = Field(min_length=1)
     description: str = ""
+    motion: Motion = "lateral"
     base: End
     tip: End
     rate_hz: Positive
@@ -428,6 +366,11 @@ class Rig(Strict):
     device: Device = Device()
     service: Service = Service()
 
+    @model_validator(mode="before")
+    @classmethod
+    def _units(cls, data: Any) -> Any:
+        return in_si(data)
+
     @field_validator("element", "sensor", "actuator", "monitor", "feedback")
     @classmethod
     def _unique(cls, items: tuple[Any, ...]) -> tuple[Any, ...]:
@@ -440,6 +383,7 @@ class Rig(Strict):
         order = [e.name for e in self.element]
         inputs = {a.name: a for a in self.actuator}
         _unlike([e.name for e in flattened(self.element)])
+        check_motion(self)
         for before, e in zip((None, *self.element), self.element, strict=False):
             if isinstance(e, SOURCES):
                 _driven(e, inputs)
@@ -478,14 +422,16 @@ class Rig(Strict):
                         )
             if isinstance(s, Acceleration):
                 host = elements[s.on]
-                if not isinstance(host, Beam | TimoshenkoBeam | RigidLink):
+                if not isinstance(host, (*BEAMS, RigidLink, LumpedMass, *MOTION_SOURCES)):
                     raise ValueError(
-                        f"sensor {s.name}: {s.on} has no extent; expected a link or beam"
+                        f"sensor {s.name}: {s.on} has no extent; expected a link or beam, a mass "
+                        "or a table"
                     )
-                if s.position > host.L.value:
+                length = host.L.value if isinstance(host, (*BEAMS, RigidLink)) else 0.0
+                if s.position > length:
                     raise ValueError(
                         f"sensor {s.name}: position {s.position:g} m lies beyond {s.on}; "
-                        f"expected at most {host.L.value:g} m"
+                        f"expected at most {length:g} m"
                     )
         units = self.units()
         clash = set(inputs) & {s.name for s in self.sensor}
@@ -551,15 +497,3 @@ class Rig(Strict):
     def limits_on(self, channel: str) -> Iterator[Limit]:
         """The limits on one channel."""
         return (limit for limit in self.limit if limit.channel == channel)
-
-
-def places(sensor: SensorBase) -> tuple[str, ...]:
-    """Names of the elements that a sensor's place refers to."""
-    match sensor:
-        case RelativeAngle():
-            return sensor.across
-        case AbsoluteAngle() | Moment():
-            return (sensor.after,)
-        case Acceleration():
-            return (sensor.on,)
-    raise TypeError(type(sensor))

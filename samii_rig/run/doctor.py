@@ -6,18 +6,18 @@ import contextlib
 import os
 import shutil
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from samii_rig.errors import GateError, SamiiRigError
 from samii_rig.rig.schema import Rig
+from samii_rig.run.check import Check
 from samii_rig.run.latch import Latch
 from samii_rig.run.limits import gate_limits
 from samii_rig.run.priority import prioritised
+from samii_rig.run.protections import own_protections
 from samii_rig.run.protocols import OpenRig
 from samii_rig.run.session import (
     PULSE,
@@ -39,21 +39,15 @@ FREE = 1 << 30  # bytes
 NOISE = 3.0  # times the rig file's that a sensor at rest may show, or less than one of it
 MOVED = (0.3, 3.0)  # of the predicted travel of the pulse
 
-Verdict = Literal["good", "look", "bad"]
 
+def examine(
+    rig: Rig, rig_toml: str, folder: Path, *, move: bool, protections: Callable[[str], None] | None
+) -> Iterator[Check]:
+    """All checks, as they are made; `move` pushes the joint a little to see the encoder's sign.
 
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One thing that was looked at; `remedy` is "" where nothing is to be done."""
-
-    what: str
-    verdict: Verdict
-    found: str
-    remedy: str = ""
-
-
-def examine(rig: Rig, rig_toml: str, folder: Path, *, move: bool) -> Iterator[Check]:
-    """All checks, as they are made; `move` pushes the joint a little to see the encoder's sign."""
+    protections : tells the person what to do, while the device's own ways to null are tried; None
+        where they are not.
+    """
     yield _machine()
     yield _disk(folder)
     yield from _latency_timers(rig)
@@ -68,16 +62,12 @@ def examine(rig: Rig, rig_toml: str, folder: Path, *, move: bool) -> Iterator[Ch
             yield Check("device", "good", device.description)
             yield from _samples(rig, device)
     except (SamiiRigError, GateError) as error:
-        yield Check("device", "bad", *_split(str(error)))
+        yield Check.failed("device", error)
         return
+    if protections:
+        yield from own_protections(rig, protections)
     if move:
         yield _sign(rig, rig_toml, folder)
-
-
-def _split(line: str) -> tuple[str, str]:
-    """What was found and, after the last semicolon, what to do."""
-    found, _, remedy = line.rpartition("; ")
-    return (found, remedy) if found else (line, "see docs/drivers.md")
 
 
 def _machine() -> Check:
@@ -207,7 +197,7 @@ def _sign(rig: Rig, rig_toml: str, folder: Path) -> Check:
     try:
         move = pulse(rig, rig_toml, folder)
     except SamiiRigError as error:
-        return Check(what, "bad", *_split(str(error)))
+        return Check.failed(what, error)
     turned = move.after - move.before
     found = f"{sensor} turned by {turned:.2g} {move.unit}, predicted {expected:.2g}"
     if move.stop.status != "completed":

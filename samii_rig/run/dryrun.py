@@ -23,7 +23,17 @@ from samii_rig.errors import InputError, LimitError
 from samii_rig.model.loops import Loops, loops_of
 from samii_rig.model.sampled import filter_response
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.schema import ANGLE_SOURCES, SOURCES, GravityStiffness, Moment, Rig, flattened
+from samii_rig.rig.schema import (
+    ANGLE_SOURCES,
+    MOTION_SOURCES,
+    SOURCES,
+    Force,
+    ForceSource,
+    GravityStiffness,
+    Moment,
+    Rig,
+    flattened,
+)
 from samii_rig.run.dwell import ways
 from samii_rig.run.expected import BandError, expected_errors
 from samii_rig.run.limits import find_actuator, gate_limits
@@ -51,7 +61,7 @@ class DryRun:
 
     duration, shortest : s, with every dwell in full and as short as it may be.
     channels, units : of `peaks` : (n_segment, n_channel), largest |value| of the command v,
-    of each sensor and of the moment at each actuated joint, in the segment.
+    of each sensor and of the moment or force at each actuated joint, in the segment.
     margins : worst first.
     """
 
@@ -170,15 +180,26 @@ def _loops(rig: Rig, plan: Plan) -> Loops:
     return replace(loops_of(rig, plan.actuator), actuator=0, theta=theta, kp=plan.kp)
 
 
-def _joint_moments(rig: Rig, actuator: str) -> tuple[Moment, ...]:
+def _joint_moments(rig: Rig, actuator: str) -> tuple[Moment | Force, ...]:
     """A perfect moment sensor at each source that the actuator drives: M, which an angular
-    velocity source passes on; of a torque or a force what the chain towards the base carries."""
-    out = []
+    velocity source passes on; of a torque or a force what the chain towards the base carries.
+    Of a source along w, and in an axial chain, the force in place of the moment."""
+    out: list[Moment | Force] = []
     for before, e in zip((None, *rig.element), rig.element, strict=False):
-        name = f"M_{e.name}"[:40]
-        if isinstance(e, SOURCES) and e.input == actuator and name not in rig.units():
-            at = e if before is None or isinstance(e, ANGLE_SOURCES) else before
-            out.append(Moment(kind="moment", name=name, unit="N m", after=at.name))
+        if not isinstance(e, SOURCES) or e.input != actuator:
+            continue
+        pulls = isinstance(e, MOTION_SOURCES) or (
+            rig.motion == "axial" and isinstance(e, ForceSource)
+        )
+        name = f"{'F' if pulls else 'M'}_{e.name}"[:40]
+        passes = isinstance(e, (*ANGLE_SOURCES, *MOTION_SOURCES))
+        at = (e if before is None or passes else before).name
+        if name in rig.units():
+            continue
+        if pulls:
+            out.append(Force(kind="force", name=name, unit="N", after=at))
+        else:
+            out.append(Moment(kind="moment", name=name, unit="N m", after=at))
     return tuple(out)
 
 

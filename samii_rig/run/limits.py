@@ -9,13 +9,19 @@ from samii_rig.errors import InputError
 from samii_rig.model.feedback import reach
 from samii_rig.rig import schema
 from samii_rig.rig.schema import (
-    ANGLE_SOURCES,
     AbsoluteAngle,
     ActuatorSpec,
+    AngularVelocitySource,
+    AngularVelocitySource2,
+    Displacement,
     Feedback,
+    Gear,
     RelativeAngle,
     Rig,
     Sensor,
+    Spindle,
+    TranslationalGroundSpring,
+    VelocitySource,
 )
 from samii_rig.run.agreement import Agreement
 from samii_rig.run.protocols import DeviceLoop
@@ -268,7 +274,8 @@ def _refuse_blind(
     where, follows = f"sensor[{sensor.name}]", _angle_gain(rig, actuator.name, sensor) != 0.0
     if centring and not follows:
         expected = (
-            f"an angle that {actuator.name} turns through an angular velocity source, or kp = 0: "
+            f"an angle that {actuator.name} turns through an angular velocity source, or a "
+            "displacement through a velocity source, or kp = 0: "
             "the gate sees no other one stand still in time"
         )
         raise InputError(
@@ -283,21 +290,39 @@ def _refuse_blind(
 
 
 def _angle_gain(rig: Rig, actuator: str, sensor: Sensor) -> float:
-    """Low-frequency rad/s of the sensor per unit of the actuator; 0 if the angle does not
-    follow it: slowly turned, springs and beams of a clamped chain turn along. A torque or a
-    force turns nothing at a known speed."""
-    order = [e.name for e in rig.element]
-    if isinstance(sensor, RelativeAngle):
-        seen = set(sensor.across)
-    elif isinstance(sensor, AbsoluteAngle) and rig.base == "clamped":
-        seen = set(order[: order.index(sensor.after) + 1])
-    else:
-        return 0.0
-    return sum(
-        e.K.value
-        for e in rig.element
-        if isinstance(e, ANGLE_SOURCES) and e.input == actuator and e.name in seen
-    )
+    """Low-frequency rad/s or m/s of the sensor per unit of the actuator; 0 if it does not
+    follow it: slowly turned or pushed, springs and beams of a clamped chain go along. A torque or a
+    force moves nothing at a known speed."""
+    held = any(isinstance(e, TranslationalGroundSpring) and e.k.value > 0 for e in rig.element)
+    speed = _speeds(rig, actuator)
+    clamped = rig.base == "clamped"
+    match sensor:
+        case RelativeAngle():
+            before = rig.element[: [e.name for e in rig.element].index(sensor.across[0])]
+            return speed[sensor.across[-1]] - (speed[before[-1].name] if before else 0.0)
+        case AbsoluteAngle() if clamped:
+            return speed[sensor.after]
+        # What is held behind a velocity source gives way at no known speed.
+        case Displacement() if not held and rig.tip == "free":
+            if sensor.against is not None:
+                return speed[sensor.after] - speed[sensor.against]
+            return speed[sensor.after] if clamped else 0.0
+    return 0.0
+
+
+def _speeds(rig: Rig, actuator: str) -> dict[str, float]:
+    """The same behind each element, against the base."""
+    out, speed = {}, 0.0
+    for e in rig.element:
+        match e:
+            case AngularVelocitySource() | AngularVelocitySource2() | VelocitySource():
+                speed += e.K.value if e.input == actuator else 0.0
+            case Gear():
+                speed /= e.n.value
+            case Spindle():
+                speed *= e.lead.value
+        out[e.name] = speed
+    return out
 
 
 def _channel(

@@ -16,7 +16,14 @@ from samii_rig.errors import SamiiRigError
 from samii_rig.model.sampled import sensor_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.elements import BEAMS, RigidLink
-from samii_rig.rig.schema import AbsoluteAngle, Acceleration, RelativeAngle, Rig, Sensor
+from samii_rig.rig.schema import (
+    AbsoluteAngle,
+    Acceleration,
+    Displacement,
+    RelativeAngle,
+    Rig,
+    Sensor,
+)
 from samii_rig.types import Complex, Float
 
 LOWEST, HIGHEST, POINTS = 0.3, 0.1, 240  # Hz, of the sample rate, and frequencies between
@@ -45,7 +52,10 @@ class Motion:
 
 
 def motion(rig: Rig) -> Motion | None:
-    """None for a rig whose sensors show no motion, or whose model gives none."""
+    """None for a rig whose sensors show no motion, or whose model gives none; and for a chain
+    that moves along itself, which has no line to bend."""
+    if rig.motion == "axial":
+        return None
     at = [i for i, s in enumerate(rig.sensor) if _shows(s)]
     if not at:
         return None
@@ -95,7 +105,7 @@ def _shows(sensor: Sensor) -> bool:
     if isinstance(sensor, Acceleration):
         # One that reads gravity as it turns cannot be integrated.
         return sensor.tilt == 0.0
-    return isinstance(sensor, RelativeAngle | AbsoluteAngle)
+    return isinstance(sensor, RelativeAngle | AbsoluteAngle | Displacement)
 
 
 def _reach(rig: Rig) -> dict[str, float]:

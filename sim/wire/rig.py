@@ -14,8 +14,9 @@ Commands, one a line, on standard input or in a script (each with its time in s 
     offset NAME COUNTS   a sensor or monitor reads so much more from now on
     drift NAME COUNTS    it reads so much more every second
     freeze NAME 0|1      it repeats one value, or no longer
-    supply 0|1       the node's supply line is broken, or works again
-    stray COUNTS     the converter holds so much more than the node puts out
+    supply 0|1       the node's supply line is broken, or works again (no image has that)
+    stray COUNTS     the converter holds so much more than the node puts out (no image has that)
+    image WHAT       of a node that is an image: it hangs, faults, ... (sim/wire/emulator.py)
     history          one line of JSON: what the output did
     quit
 """
@@ -40,6 +41,8 @@ import numpy as np
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Rig
 from sim.settings import SimSettings
+from sim.wire.emulator import WRONG, Emulator
+from sim.wire.image import ImageNode
 from sim.wire.line import FAULTS, Line
 from sim.wire.node import Node
 from sim.wire.plant import Board, Plant, board
@@ -54,7 +57,13 @@ class WireRig:
     """Plant, node and port; `run` paces them."""
 
     def __init__(
-        self, rig: Rig, settings: SimSettings, link: Path | None, *, supply: bool = False
+        self,
+        rig: Rig,
+        settings: SimSettings,
+        link: Path | None,
+        *,
+        supply: bool = False,
+        image: Path | None = None,
     ) -> None:
         self.board: Board = board(self._wired(rig))
         if supply:
@@ -72,7 +81,8 @@ class WireRig:
             null=self.board.null,
             max_jump=round(MAX_JUMP * abs(first.counts_per_unit)),
         )
-        self._node = Node(self._config, 1)
+        self._emulator = Emulator(image) if image else None
+        self._node = self._booted(1, 0)
         self.pace = 1.0  # of real time in one second of the node's clock
         self._due = 0  # ns, host's time at which the newest sample was due
         self._late = 0  # ns by which the latest sample was late
@@ -122,6 +132,8 @@ class WireRig:
     def close(self) -> None:
         """The port vanishes for good."""
         self.unplug()
+        if self._emulator is not None:
+            self._emulator.close()
 
     # Time
 
@@ -158,6 +170,11 @@ class WireRig:
                 if not self.obey(waiting.pop(0)[1]):
                     return
             self._transmit()
+
+    def _booted(self, boot: int, sample: int) -> Node:
+        if self._emulator is None:
+            return Node(self._config, boot, sample)
+        return ImageNode(self._emulator, self._config, boot, sample)
 
     def _wired(self, rig: Rig) -> Rig:
         """The rig as the node's board sees it."""
@@ -245,7 +262,7 @@ class WireRig:
                     self.say(self.hello())
                 case ["reboot" | "rest" as what, *start] if len(start) <= 2:
                     sample, self._clock = [*map(int, start), 0, 0][:2] if start else (0, 0)
-                    self._node = Node(self._config, self._node.boot % 0xFFFF + 1, sample)
+                    self._node = self._booted(self._node.boot % 0xFFFF + 1, sample)
                     self._taken = 0
                     if what == "rest":
                         self._emergency, self._jump, self._rails = False, 0, set()
@@ -269,10 +286,12 @@ class WireRig:
                     self._frozen.pop(name, None)
                     if int(level):
                         self._frozen[name] = None
-                case ["supply", level]:
+                case ["supply", level] if self._emulator is None:
                     self._relay = bool(int(level))
-                case ["stray", counts]:
+                case ["stray", counts] if self._emulator is None:
                     self._stray = int(counts)
+                case ["image", what] if isinstance(self._node, ImageNode) and what in WRONG:
+                    self._node.wrong(what)
                 case ["history"]:
                     self.say(self.history())
                 case _:

@@ -1,0 +1,169 @@
+"""The sensors of a rig file: kinds, places, what each one's chain does to the signal."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from samii_rig.rig.base import Finite, Name, NonNegative, Positive, Strict
+
+
+class AntiAlias(Strict):
+    """Analogue low-pass before the converter: a Butterworth of this order and corner."""
+
+    order: Annotated[int, Field(ge=1, le=8)]
+    corner_hz: Positive
+
+
+class SensorBase(Strict):
+    """What every sensor has beside its place on the chain.
+
+    noise_rms : white noise of the converted samples, in `unit`.
+    resolution : one step of the converter, in `unit`; 0 for none.
+    offset : constant error in `unit`.
+    low, high : ends of the converter's range in `unit`.
+    highpass_hz : corner of a first-order high-pass (a piezo's), 0 for none.
+    gain : what the channel shows over what is there, 1 for a true calibration.
+    lag : s, time constant of a first-order low-pass in the sensor's chain, 0 for none.
+    delay : s from the instant of sampling as stamped back to the value's own time.
+    stale_after : s without a new sample after which the channel is stale.
+    """
+
+    name: Name
+    unit: str
+    noise_rms: NonNegative = 0.0
+    resolution: NonNegative = 0.0
+    offset: Finite = 0.0
+    low: float = -math.inf
+    high: float = math.inf
+    highpass_hz: NonNegative = 0.0
+    antialias: AntiAlias | None = None
+    gain: Finite = 1.0
+    lag: NonNegative = 0.0
+    delay: NonNegative = 0.0
+    stale_after: Positive = 0.05
+    calibration: str = Field(default="", description="how unit and scale are known")
+
+    @model_validator(mode="after")
+    def _range(self) -> Self:
+        if not self.low < self.high:
+            raise ValueError(f"low {self.low:g}, high {self.high:g}; expected low below high")
+        return self
+
+
+def _unit(expected: str) -> AfterValidator:
+    def check(unit: str) -> str:
+        if unit != expected:
+            raise ValueError(f"is {unit!r}; expected {expected!r}")
+        return unit
+
+    return AfterValidator(check)
+
+
+class RelativeAngle(SensorBase):
+    """Rotation after the last minus rotation before the first of the elements named.
+
+    `across = ["source"]` is an encoder collocated with the actuator,
+    `across = ["source", "spring"]` one that sees the joint's spring too (paper 2, eq. 11).
+    """
+
+    kind: Literal["relative_angle"]
+    across: Annotated[tuple[Name, ...], Field(min_length=1)]
+    unit: Annotated[str, _unit("rad")]
+
+
+class AbsoluteAngle(SensorBase):
+    """Rotation after the element named, against the ground."""
+
+    kind: Literal["absolute_angle"]
+    after: Name
+    unit: Annotated[str, _unit("rad")]
+
+
+class Acceleration(SensorBase):
+    """Acceleration s^2 w + tilt g theta at `position` metres from the upstream end of a rigid
+    link or beam, or of a mass or a table, which have no extent; tilt is 1 for a sensor that turns
+    with it in the vertical plane and reads gravity as an acceleration towards positive w, -1 the
+    other way round."""
+
+    kind: Literal["acceleration"]
+    on: Name
+    position: NonNegative = 0.0
+    tilt: Finite = 0.0
+    unit: Annotated[str, _unit("m/s^2")]
+
+
+class Moment(SensorBase):
+    """Internal moment M after the element named."""
+
+    kind: Literal["moment"]
+    after: Name
+    unit: Annotated[str, _unit("N m")]
+
+
+class Displacement(SensorBase):
+    """Displacement w behind the element `after`, less that behind `against`; without `against`
+    it is one against the ground."""
+
+    kind: Literal["displacement"]
+    after: Name
+    against: Name | None = None
+    unit: Annotated[str, _unit("m")]
+
+
+class Velocity(SensorBase):
+    """Velocity s w of the same places as `Displacement`."""
+
+    kind: Literal["velocity"]
+    after: Name
+    against: Name | None = None
+    unit: Annotated[str, _unit("m/s")]
+
+
+class Force(SensorBase):
+    """A load cell behind the element `after`: -V, which of an axial chain is tension."""
+
+    kind: Literal["force"]
+    after: Name
+    unit: Annotated[str, _unit("N")]
+
+
+class Pressure(SensorBase):
+    """The load pressure behind the element `after`, a cylinder: its push V over `area`, m^2.
+
+    Of chambers with pressures p_1 and p_2 it is (A_1 p_1 - A_2 p_2)/area.
+    """
+
+    kind: Literal["pressure"]
+    after: Name
+    area: Positive
+    unit: Annotated[str, _unit("Pa")]
+
+
+Sensor = Annotated[
+    RelativeAngle
+    | AbsoluteAngle
+    | Acceleration
+    | Moment
+    | Displacement
+    | Velocity
+    | Force
+    | Pressure,
+    Field(discriminator="kind"),
+]
+
+
+def places(sensor: SensorBase) -> tuple[str, ...]:
+    """Names of the elements that a sensor's place refers to."""
+    match sensor:
+        case RelativeAngle():
+            return sensor.across
+        case AbsoluteAngle() | Moment() | Force() | Pressure():
+            return (sensor.after,)
+        case Displacement() | Velocity():
+            return (sensor.after,) if sensor.against is None else (sensor.after, sensor.against)
+        case Acceleration():
+            return (sensor.on,)
+    raise TypeError(type(sensor))
