@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
+from typer.core import TyperCommand
 
 from samii_rig.cli.common import (
     JsonOption,
-    Logs,
     SchedulerOption,
     WorkersOption,
     rig_of,
@@ -25,6 +25,7 @@ from samii_rig.cli.estimate import (
     estimated,
     read_all,
 )
+from samii_rig.errors import InputError
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -36,9 +37,43 @@ if TYPE_CHECKING:
     from samii_rig.signal.gather import Gaps
 
 
+class Spread(TyperCommand):
+    """A command whose --before and --after take all words up to the next option."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """As of `click.Command`."""
+        out: list[str] = []
+        option = ""
+        for word in args:
+            if word.startswith("-"):
+                option = word if word in ("--before", "--after") else ""
+                out.append(word)
+            elif option and out[-1] != option:
+                out += [option, word]
+            else:
+                out.append(word)
+        return super().parse_args(ctx, out)
+
+
 def diagnose(
-    logs: Logs,
+    logs: Annotated[
+        list[Path] | None, typer.Argument(help="Recordings (.mcap).", show_default=False)
+    ] = None,
     rig: RigOverride = None,
+    before: Annotated[
+        list[Path] | None,
+        typer.Option(help="Recordings of the state before a change, one or more."),
+    ] = None,
+    after: Annotated[
+        list[Path] | None, typer.Option(help="Recordings of the state after it, one or more.")
+    ] = None,
+    known: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="ELEMENT.PARAMETER=VALUE of the rig file, known and exact; with --before, of the "
+            "state after. May be repeated."
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -62,7 +97,8 @@ def diagnose(
 ) -> None:
     """Locate what differs between rig file and recordings, name it, model it, show the gain.
 
-    Says which explanations the data do not tell apart, and which experiment would.
+    Says which explanations the data do not tell apart, and which experiment would. With --before
+    and --after: what changed between two states of the rig.
 
     Example: samii-rig diagnose runs/*.mcap --rig samii --out diagnosis
     """
@@ -70,10 +106,9 @@ def diagnose(
 
     check_rig(rig)
     check_choice("--gaps", gaps, GAPS)
+    logs, earlier = _states(logs or [], before or [], after or [], each=each, known=bool(known))
     if not each:
-        check_logs(logs)
-
-    from dataclasses import replace
+        check_logs([*earlier, *logs])
 
     from rich.console import Console
 
@@ -99,26 +134,68 @@ def diagnose(
         if json:
             say_json({"recordings": said})
         return
+    _together(logs, earlier, rig, tuple(known or ()), (output, gaps, band), out, json=json)
 
+
+def _states(
+    logs: list[Path], before: list[Path], after: list[Path], *, each: bool, known: bool
+) -> tuple[list[Path], list[Path]]:
+    """The recordings to be explained, and those of the state before, none if there is one state."""
+    if bool(before) != bool(after):
+        given, other = ("--before", "--after") if before else ("--after", "--before")
+        raise InputError(given, "", str((before or after)[0]), f"{other} with recordings beside it")
+    if before and logs:
+        raise InputError("LOGS", "", str(logs[0]), "recordings of --before and --after alone")
+    if each and (before or known):
+        raise InputError("--each", "", True, "neither --before, --after nor --known beside it")
+    if not (logs or after):
+        none = "missing; expected recordings (.mcap), or --before and --after with theirs"
+        raise InputError.saying("LOGS", "", none)
+    twice = {p.resolve() for p in before} & {p.resolve() for p in after}
+    if twice:
+        raise InputError("--after", "", str(min(twice)), "other recordings than --before")
+    return logs or after, before
+
+
+def _together(
+    logs: list[Path],
+    earlier: list[Path],
+    rig: str | None,
+    known: tuple[str, ...],
+    how: tuple[list[str] | None, str, tuple[float, float] | None],
+    out: Path | None,
+    *,
+    json: bool,
+) -> None:
+    """One diagnosis of all recordings, said, kept and written. earlier : of the state before."""
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from samii_rig.diagnose.changed import State, changed
     from samii_rig.diagnose.diagnose import diagnose as found_by
+    from samii_rig.diagnose.known import stated, with_known
     from samii_rig.report.summary import working
 
-    recordings = read_all(logs)
-    held = rig_of(recordings, rig)
+    output, gaps, band = how
+    values = stated(known)
+    first, second = read_all(earlier), read_all(logs)
+    held = rig_of([*first, *second], rig)
     if held is None:
         raise without_rig()
+    own_rig = with_known(held[0], values)
     console = Console(highlight=False)
     with working(console, "diagnosis", quiet=json) as say:
         say("frequency responses")
-        responses = estimated(recordings, None, output, "auto", gaps, band)
-        found = found_by(
-            responses,
-            held[0],
-            band=band,
-            progress=say,
-            runs=recordings,
-        )
-    own = all(r.rig_toml in ("", held[1]) for r in recordings)
+        responses = estimated(second, None, output, "auto", gaps, band)
+        if first:
+            of_first = estimated(first, None, output, "auto", gaps, band)
+            states = State(of_first, first), State(responses, second)
+            found = changed(*states, held[0], known=values, band=band, progress=say)
+        else:
+            found = found_by(responses, own_rig, band=band, progress=say, runs=second)
+    # A change is no diagnosis of either state's recordings, nor is one of another rig.
+    own = not first and not known and all(r.rig_toml in ("", held[1]) for r in second)
     if own:
         keep_diagnosis(logs, found)
     page = None
@@ -130,8 +207,8 @@ def diagnose(
             out / "diagnosis.html",
             found,
             responses,
-            held[0],
-            recordings=recordings,
+            own_rig,
+            recordings=[*first, *second],
             band_hz=band or (0.0, float("inf")),
         )
     if json:
@@ -143,7 +220,7 @@ def diagnose(
         console.print(f"written  {found.model}", soft_wrap=True)
     if page:
         console.print(f"page     {page}", soft_wrap=True)
-    if not own:
+    if not (own or first or known):
         console.print("not kept with the recordings: they carry another rig file", soft_wrap=True)
 
 
@@ -172,7 +249,6 @@ def _each(
     import json
 
     from samii_rig.diagnose.batch import each
-    from samii_rig.errors import InputError
 
     logs = [log for p in given for log in (sorted(p.rglob("*.mcap")) if p.is_dir() else [p])]
     if not logs:
@@ -199,7 +275,6 @@ def _write(folder: Path, found: Diagnosis) -> str:
     from dataclasses import replace
 
     from samii_rig.diagnose.rigfile import toml
-    from samii_rig.errors import InputError
     from samii_rig.files import make_folder
 
     make_folder("--out", folder)

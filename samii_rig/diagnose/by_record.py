@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from samii_rig.diagnose import judge as verdict
 from samii_rig.diagnose.by_line import at_first, settled
@@ -10,7 +10,7 @@ from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.nonlinear import compete
 from samii_rig.diagnose.nonlinear_search import ForceSearch, compete_on_records
 from samii_rig.diagnose.records import TURN, RecordSearch, Whole
-from samii_rig.diagnose.result import Diagnosis
+from samii_rig.diagnose.result import Band, Diagnosis, Gap
 from samii_rig.diagnose.stages import Case, Progress, Shown, told
 from samii_rig.errors import EstimateError, SamiiRigError
 
@@ -33,48 +33,92 @@ def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | N
 
 def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis | None:
     """What whole records say; None where levels differ grossly and no force is found by which."""
-    nominal = search.nominal.fitted
-    first, bands = search.ratio(nominal), search.bands(nominal)
+    first, bands = _at_first(search)
     progress("what is missing")
     # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
     search.run(briefly=True)
     progress("amplitude levels")
-    linear, forced = search, forces_on(search)
-    if case.search.lines.torn():
-        if forced is None:
-            return None
-    elif forced is None or not forced.is_enough():
+    torn = case.search.lines.torn()
+    forced = forces_on(search)
+    if torn and forced is None:
+        return None
+    if not torn and (forced is None or not forced.is_enough()):
         search.run()
         forced = None if forced is None else forces_on(search)
     progress("what cannot be told apart")
-    if forced is not None:
-        search = forced
-        first, bands = search.ratio(search.nominal.fitted), search.bands(search.nominal.fitted)
+    if forced is None:
+        looked = _consistent(search, _looked(search))
+    else:
+        first, bands = _at_first(forced)
+        looked = _looked(forced)
+    if looked.judged.verdict == "unknown":
+        if torn:
+            return None
+        if (found := on_levels(case, search, progress)) is not None:
+            return found
+    return _answer(case, forced or search, first, bands, looked)
+
+
+def by_samples(
+    case: Case,
+    search: RecordSearch,
+    first: float,
+    bands: tuple[Band, ...],
+    progress: Progress,
+) -> Diagnosis:
+    """The answer, once all linear explanations of the records were tried. first, bands : what the
+    refitted nominal model left before, in all and by band."""
+    progress("what cannot be told apart")
+    return _answer(case, search, first, bands, _consistent(search, _looked(search)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Looked:
+    """What was judged, with chi-square per degree of freedom on the lines kept apart by the nominal
+    model and with the causes, the gap closed there, and what else there is to say."""
+
+    judged: Judgement
+    plain: float
+    after: float
+    gap: Gap
+    said: tuple[str, ...] = ()
+
+
+def _looked(search: RecordSearch) -> _Looked:
     judged = verdict.judge(search)
-    nominal, best = search.nominal.fitted, judged.best
-    plain, after, gap = search.shown(nominal, best.fitted)
-    if any(e.quasi is not None for e in best.effects) and gap.low > 0:
+    plain, after, gap = search.shown(search.nominal.fitted, judged.best.fitted)
+    if any(e.quasi is not None for e in judged.best.effects) and gap.low > 0:
         # Computed in time, and seen on lines that it was not fitted to.
         judged = verdict.confirmed(judged)
     judged = verdict.shown(judged, gap, judged.evidence.drop / (TURN - 1))
-    judged, said = (judged, ()) if forced is not None else _consistent(search, judged)
-    if judged.verdict == "unknown":
-        if case.search.lines.torn():
-            return None
-        if (found := on_levels(case, linear, progress)) is not None:
-            return found
+    return _Looked(judged, plain, after, gap)
+
+
+def _at_first(search: RecordSearch) -> tuple[float, tuple[Band, ...]]:
+    """What the refitted nominal model leaves, in all and by band."""
+    return search.ratio(search.nominal.fitted), search.bands(search.nominal.fitted)
+
+
+def _answer(
+    case: Case,
+    search: RecordSearch,
+    first: float,
+    bands: tuple[Band, ...],
+    looked: _Looked,
+) -> Diagnosis:
+    nominal, best = search.nominal.fitted, looked.judged.best
     shown = Shown(
         first=first,
         threshold=verdict.threshold(search.spread),
         bands=bands,
-        nominal=(search.ratio(nominal), plain),
-        with_causes=(search.ratio(best.fitted), after),
-        gap=gap,
+        nominal=(search.ratio(nominal), looked.plain),
+        with_causes=(search.ratio(best.fitted), looked.after),
+        gap=looked.gap,
         used=search.used(),
     )
     of_lines = case.clean.of_lines
     clean = replace(case.clean, told=tuple(w for w in case.clean.told if w not in of_lines))
-    return told(replace(case, clean=clean), search, judged, shown, said)
+    return told(replace(case, clean=clean), search, looked.judged, shown, looked.said)
 
 
 def forces_on(search: RecordSearch) -> ForceSearch | None:
@@ -98,16 +142,17 @@ def on_levels(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis
     return settled(case, before, progress)
 
 
-def _consistent(search: RecordSearch, judged: Judgement) -> tuple[Judgement, tuple[str, ...]]:
+def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
     """The same, but where no linear response explains all records something is missing; and that in
     words."""
     left, sd = search.inconsistent()
     if left < 1 + MORE * sd:
-        return judged, ()
+        return looked
     said = (
         f"the records disagree: chi-square per degree of freedom {left:.3g} of what no linear "
         "model can explain, so something depends on amplitude or changed between runs",
     )
+    judged = looked.judged
     if judged.verdict == "no_mismatch":
-        return replace(judged, verdict="unknown"), said
-    return judged, said
+        judged = replace(judged, verdict="unknown")
+    return replace(looked, judged=judged, said=said)

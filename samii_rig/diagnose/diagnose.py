@@ -27,10 +27,11 @@ from samii_rig.types import FrequencyResponse, Recording
 TWIN_POINTS = 40
 
 
-def table(rig: Rig, low_hz: float, high_hz: float) -> list[Effect]:
-    """All effects that the table knows on this rig, structural twins as one."""
+def table(rig: Rig, low_hz: float, high_hz: float, *, signed: bool = False) -> list[Effect]:
+    """All effects that the table knows on this rig, structural twins as one. signed : with what a
+    rig has less of, see `vocabulary.hypotheses`."""
     f = np.geomspace(low_hz, high_hz, TWIN_POINTS)
-    return without_twins(rig, hypotheses(rig, low_hz, high_hz), f)
+    return without_twins(rig, hypotheses(rig, low_hz, high_hz, signed=signed), f)
 
 
 def diagnose(
@@ -56,15 +57,30 @@ def diagnose(
     Raises InputError and EstimateError as `samii_rig.identify.data.collect` does.
     """
     progress("nominal model")
+    case = case_of(responses, rig, band, effects, runs)
+    search = on_records(case, band)
+    found = by_records(case, search, progress) if search is not None else None
+    return by_lines(case, progress) if found is None else found
+
+
+def case_of(
+    responses: Sequence[FrequencyResponse],
+    rig: Rig,
+    band: tuple[float, float] | None,
+    effects: Sequence[Effect] | None,
+    runs: Sequence[Recording],
+    *,
+    signed: bool = False,
+) -> Case:
+    """What is to be explained, the nominal model refitted; arguments as of `diagnose`, `signed` as
+    of `table`."""
     clean = findings.sound(responses, rig, band)
     sound = usable(clean.responses)
     lines = measured(sound, rig, band)
     seen, decide, show = lines.splits()
     at = grid(rig, lines.frequency, lines.sensor, lines.actuator)
     if effects is None:
-        effects = table(rig, float(lines.frequency[0]), float(lines.frequency[-1]))
+        low, high = float(lines.frequency[0]), float(lines.frequency[-1])
+        effects = table(rig, low, high, signed=signed)
     by_line = Search(rig, seen, at, clean.competing(effects))
-    case = Case(clean, sound, runs, lines, by_line, decide, show)
-    by_record = on_records(case, band)
-    found = by_records(case, by_record, progress) if by_record is not None else None
-    return by_lines(case, progress) if found is None else found
+    return Case(clean, sound, runs, lines, by_line, decide, show)

@@ -162,10 +162,14 @@ class Explanations:
         key = tuple(e.key for e in effects)
         if key not in self._models:
             try:
-                self._models[key] = model_of(self.rig, effects)
+                self._models[key] = self.made(effects)
             except SamiiRigError:
                 self._models[key] = None
         return self._models[key]
+
+    def made(self, effects: tuple[Effect, ...]) -> Model:
+        """The model with these effects. Raises SamiiRigError."""
+        return model_of(self.rig, effects)
 
     def refitted(
         self,

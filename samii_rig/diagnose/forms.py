@@ -67,12 +67,13 @@ class Lines:
 class Dense:
     """Of residuals r + K (Re phi, Im phi) that are not one frequency's each.
 
-    K : (p, 2 n) and r (p,), directions projected out.
+    K : (p, 2 n) and r (p,), directions projected out. on : of all frequencies, the n that count.
     """
 
     K: Float
     r: Float
     more: float
+    on: slice
 
     def cost(self, phi: Complex) -> Float:
         """As of `Form`."""
@@ -89,6 +90,7 @@ class Dense:
         return np.asarray(g), np.asarray(along @ along.swapaxes(1, 2))
 
     def _moved(self, phi: Complex) -> Float:
+        phi = phi[:, self.on]
         return np.asarray(np.concatenate([phi.real, phi.imag], axis=1) @ self.K.T)
 
 

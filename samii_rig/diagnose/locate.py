@@ -56,7 +56,7 @@ class Located:
 def moebius(rig_model: Model, effect: Effect, problem: Problem, x: Float) -> tuple[Complex, Place]:
     """a (n, q), and the place of an effect with a jump, about a model at x."""
     a = rig_model.response(x, problem.at)
-    trial = Model(rig_model.rig, (*rig_model.effects, effect))
+    trial = rig_model.having((*rig_model.effects, effect))
     fixed = tuple(u.starts[0] for u in effect.unknowns[_free(effect) :])
     return a, place_of(trial, x, effect, problem.at, a, fixed)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +12,7 @@ from samii_rig.diagnose.causal import CausalChain
 from samii_rig.diagnose.effect import Effect, Key
 from samii_rig.model.sampled import hold_at, sampled_response, sensors_at
 from samii_rig.model.tmm import Chain
+from samii_rig.rig.elements import flattened
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.types import Complex, Float, Int
 
@@ -52,6 +53,7 @@ class Grid:
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
     folded : (order, n, q) of these the ones of `ORDERS`, or none. rate_hz : of the samples.
     sensor, actuator : (q,) entries. loop : closed around them, if responses are to the reference.
+    sigma : of all, or (n,) of each.
     """
 
     frequency: Float
@@ -61,8 +63,13 @@ class Grid:
     rate_hz: float
     sensor: Int
     actuator: Int
-    sigma: float = field(default=0.0, kw_only=True)
+    sigma: float | Float = field(default=0.0, kw_only=True)
     loop: Loop | None = field(default=None, kw_only=True)
+
+    @property
+    def changed(self) -> slice:
+        """The rows on which further effects act."""
+        return slice(None)
 
     @property
     def s(self) -> Complex:
@@ -148,7 +155,7 @@ class Model:
             built = effect.build(built)
         self.built = built
         self.chain = self.chain_of(built)
-        known = {(e.name, s): p for e in rig.element for s, p in parameters(e).items()}
+        known = {(e.name, s): p for e in flattened(rig.element) for s, p in parameters(e).items()}
         have = set(self.chain.parameters)
         self.keys: tuple[Key, ...] = tuple(
             k for k, p in known.items() if p.tolerance > 0 and p.value != 0 and k in have
@@ -162,6 +169,14 @@ class Model:
         self.prior[:n] = [known[k].tolerance for k in self.keys]
         self.lower = np.concatenate([-6 * self.prior[:n], [math.log(u.low) for u in unknowns]])
         self.upper = np.concatenate([6 * self.prior[:n], [math.log(u.high) for u in unknowns]])
+
+    def having(self, effects: Sequence[Effect]) -> Model:
+        """The same rig with other effects; nominal parameters keep their place in x."""
+        return Model(self.rig, effects)
+
+    def under(self, change: Callable[[Rig], Rig]) -> Model:
+        """The same effects in a rig that was changed."""
+        return Model(change(self.rig), self.effects)
 
     def chain_of(self, rig: Rig) -> Chain | CausalChain:
         """The chain of a rig, as the effects have it."""

@@ -101,7 +101,8 @@ class ForceSearch(RecordSearch):
     """As `RecordSearch`, on the complete likelihood, with every level by itself."""
 
     def __init__(self, linear: RecordSearch) -> None:
-        whole = linear.whole.by_level()
+        assert isinstance(linear.whole, Whole)  # of one state
+        self.levels = whole = linear.whole.by_level()
         self._chains = Chains()
         self.linear = linear
         actuator = int(linear.grid.actuator[0])
@@ -127,9 +128,8 @@ class ForceSearch(RecordSearch):
 
     def _about(self, fitted: Fitted) -> None:
         self._chains.renew()
-        self.problem = ForceProblem.near(self.whole, fitted, self.by_line.problem, self._chains)
-        f = self.reduced.frequency
-        between = self.whole.grid((f[:-1] + f[1:]) / 2, self.reduced.sigma, fitted)
+        self.problem = ForceProblem.near(self.levels, fitted, self.by_line.problem, self._chains)
+        between = self.levels.between(self.reduced, fitted)
         self._between = between, fitted.model.response(fitted.x, between)
 
     def refitted_from(
@@ -250,7 +250,7 @@ class ForceSearch(RecordSearch):
         """As of `RecordSearch`."""
         if not isinstance(fitted.model, LevelModel):
             return super().left(fitted, shown=shown)
-        rest = Moved(self.whole, self._chains).without(fitted)
+        rest = Moved(self.levels, self._chains).without(fitted)
         return rest.left(fitted, self.reduced, shown=shown)
 
     def beside(self, best: Explanation) -> tuple[Explanations, Explanation]:

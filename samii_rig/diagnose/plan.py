@@ -10,7 +10,7 @@ import numpy as np
 from samii_rig.diagnose import insert
 from samii_rig.diagnose.explanations import Explanation
 from samii_rig.diagnose.judge import Judgement
-from samii_rig.diagnose.model import Grid, Model
+from samii_rig.diagnose.model import Grid
 from samii_rig.diagnose.refit import Problem
 from samii_rig.diagnose.search import Search
 from samii_rig.errors import SamiiRigError
@@ -195,7 +195,7 @@ def _separation(a: Explanation, b: Explanation, change: Change, f: Float, search
 def _elsewhere(e: Explanation, change: Change, f: Float) -> tuple[Complex, Complex]:
     """Response and its derivatives of an explanation under an experiment, hold and filters on."""
     model = e.fitted.model
-    there = Model(change(model.rig), model.effects)
+    there = model.under(change)
     rig = there.rig
     hold = np.stack([hold_response(f, rig.rate_hz, x.delay) for x in rig.actuator], axis=1)
     n_s, n_a = len(rig.sensor), len(rig.actuator)

@@ -11,6 +11,8 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,6 +122,19 @@ class Whole:
         chain = fitted.model.plain(fitted.x)
         return grid(self.rig, frequency, self.sensor, actuator, chain, sigma, self.loop)
 
+    def nodes(self, found: Reduced, fitted: Fitted) -> Grid:
+        """The nodes of a likelihood."""
+        return self.grid(found.frequency, found.sigma, fitted)
+
+    def between(self, found: Reduced, fitted: Fitted) -> Grid:
+        """What is between them."""
+        return self.grid(found.between, found.sigma, fitted)
+
+    @property
+    def lines(self) -> int:
+        """Lines of the records that take part."""
+        return self.records.count
+
     def response(self, fitted: Fitted) -> Response:
         """Of a fit, at any s of one contour."""
 
@@ -138,10 +153,12 @@ class Whole:
 
         axis = np.geomspace(*self.records.band, AXIS)
         scale = np.median(self._moved(fitted, axis), axis=1)
+        moves = scale > 0  # what a brace holds does not
 
         def at(f: Float) -> Float:
             once, which = np.unique(f, return_inverse=True)
-            return np.asarray((np.mean(self._moved(fitted, once).T / scale, axis=1))[which])
+            power = self._moved(fitted, once)[moves].T / scale[moves]
+            return np.asarray(np.mean(power, axis=1)[which])
 
         return at
 
@@ -159,10 +176,10 @@ class Whole:
                 continue
         return np.stack(each)
 
-    def about(self, fitted: Fitted) -> Reduced:
-        """The likelihood near a fit, on the lines that are fitted."""
+    def about(self, fitted: Fitted, at: Float | None = None) -> Reduced:
+        """The likelihood near a fit, on the lines that are fitted. at : Hz of its nodes."""
         shape = self.disturbed(fitted)
-        return reduced(self.records, self.response(fitted), shape, self._loop, _fitted)
+        return reduced(self.records, self.response(fitted), shape, self._loop, _fitted, at)
 
     def complete(self, fitted: Fitted) -> Complete:
         """The same, with what no linear model explains."""
@@ -216,6 +233,46 @@ def _shown(k: Int) -> NDArray[np.bool_]:
     return np.asarray(k % TURN == SHOW)
 
 
+class Recorded(Protocol):
+    """Records as a search needs them: of one state of a rig, or of two."""
+
+    @property
+    def wired(self) -> Wiring:
+        """Which columns are read."""
+        ...
+
+    @property
+    def sensor(self) -> Int:
+        """(q,) indices into the rig's sensors."""
+        ...
+
+    @property
+    def lines(self) -> int:
+        """Lines of the records that take part."""
+        ...
+
+    @property
+    def left_out(self) -> tuple[tuple[str, str], ...]:
+        """Records that do not, and why."""
+        ...
+
+    def about(self, fitted: Fitted) -> Reduced:
+        """The likelihood near a fit, on the lines that are fitted."""
+        ...
+
+    def nodes(self, found: Reduced, fitted: Fitted) -> Grid:
+        """The nodes of a likelihood."""
+        ...
+
+    def between(self, found: Reduced, fitted: Fitted) -> Grid:
+        """What is between them."""
+        ...
+
+    def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
+        """What a fit leaves, line by line."""
+        ...
+
+
 @dataclass(frozen=True)
 class RecordProblem(Problem):
     """The likelihood of whole records near a reference. at : the nodes of its contour.
@@ -227,10 +284,10 @@ class RecordProblem(Problem):
     reduced: Reduced = field(kw_only=True)
 
     @classmethod
-    def about(cls, whole: Whole, fitted: Fitted, by_line: Problem) -> RecordProblem:
+    def about(cls, whole: Recorded, fitted: Fitted, by_line: Problem) -> RecordProblem:
         """About a fit."""
         found = whole.about(fitted)
-        at = whole.grid(found.frequency, found.sigma, fitted)
+        at = whole.nodes(found, fitted)
         return cls(by_line.data, by_line.root, at, by_line=by_line, reduced=found)
 
     @property
@@ -258,32 +315,35 @@ class RecordProblem(Problem):
 
     def form(self, b: Complex, left: Float, directions: Float) -> Form:
         """As of `Problem`."""
-        F = self.reduced.factor
-        p = F.shape[0]
-        parts = F.reshape(p, -1, b.shape[0])
-        by_one, by_j = (np.stack([x.real, x.imag], axis=1) for x in (b.T, 1j * b.T))
-        K = np.concatenate(
-            [np.einsum("pcn,cn->pn", parts, x.reshape(-1, b.shape[0])) for x in (by_one, by_j)],
-            axis=1,
-        )
+        p, on = self.reduced.factor.shape[0], self.at.changed
+        by_one, by_j = (np.concatenate([x.real, x.imag], axis=1) for x in (b[on], 1j * b[on]))
+        moved = self._by_node @ np.stack([by_one, by_j], axis=2)
+        K = np.concatenate([moved[:, :, 0].T, moved[:, :, 1].T], axis=1)
         Q = directions[:p]
         r = left - directions @ (directions.T @ left)
         # Rows of the priors are moved by the projection too: kept as the projection's own part.
         turn = Q.T @ K
         K_left = np.concatenate([K - Q @ turn, -directions[p:] @ turn])
-        return forms.Dense(K_left, r, 0.0)
+        return forms.Dense(K_left, r, 0.0, on)
+
+    @cached_property
+    def _by_node(self) -> Float:
+        """(n, p, 2 q) the factor, of the nodes that a part changes: real parts of all sensors, then
+        imaginary ones."""
+        F = self.reduced.factor[..., self.at.changed]
+        return np.ascontiguousarray(F.transpose(3, 0, 2, 1)).reshape(F.shape[3], F.shape[0], -1)
 
 
 class RecordSearch(Search):
     """As `Search`, on whole records."""
 
-    def __init__(self, whole: Whole, by_line: Search) -> None:
+    def __init__(self, whole: Recorded, by_line: Search) -> None:
         self.whole, self.by_line = whole, by_line
         super().__init__(by_line.rig, by_line.lines, by_line.grid, by_line.table)
 
     def __post_init__(self) -> None:
         self.use(self.table)
-        fitted = self.by_line.nominal.fitted
+        fitted = self.first()
         self._about(fitted)
         for _ in range(MOST_MADE):
             fitted = refit(fitted.model, self.problem, fitted.x)
@@ -294,11 +354,14 @@ class RecordSearch(Search):
             fitted = refit(fitted.model, self.problem, fitted.x)
         self.keep((), fitted)
 
+    def first(self) -> Fitted:
+        """Where the nominal model starts."""
+        return self.by_line.nominal.fitted
+
     def _about(self, fitted: Fitted) -> None:
         """The likelihood anew, about a fit."""
         self.problem = RecordProblem.about(self.whole, fitted, self.by_line.problem)
-        f = self.reduced.frequency
-        between = self.whole.grid((f[:-1] + f[1:]) / 2, self.reduced.sigma, fitted)
+        between = self.whole.between(self.reduced, fitted)
         self._between = between, fitted.model.response(fitted.x, between)
 
     def _stands(self, fitted: Fitted) -> bool:
@@ -306,14 +369,7 @@ class RecordSearch(Search):
         between, reference = self._between
         d = fitted.model.response(fitted.x, self.problem.at) - self.reduced.reference
         middle = fitted.model.response(fitted.x, between) - reference
-        off = middle - (d[:-1] + d[1:]) / 2
-        f = self.reduced.frequency
-        # Nodes on neighbouring lines of the contour have nothing between them.
-        off[np.diff(f) < 1.5 * (f[1:] - f[:-1]).min()] = 0.0
-        at_nodes = np.zeros_like(d)
-        at_nodes[:-1] += off / 2
-        at_nodes[1:] += off / 2
-        return float(np.linalg.norm(self.reduced.slopes(at_nodes[:, :, None]))) < BETWEEN
+        return self.reduced.bent(d, middle) < BETWEEN
 
     @property
     def reduced(self) -> Reduced:
@@ -396,8 +452,7 @@ class RecordSearch(Search):
 
     def used(self) -> Used:
         """Lines of the whole records, those kept apart too; all that were excited take part."""
-        lines = sum(self.whole.records.lines(p).k.size for p in self.whole.records.pieces)
-        return Used(lines, lines, self.whole.left_out)
+        return Used(self.whole.lines, self.whole.lines, self.whole.left_out)
 
     def shown(self, before: Fitted, after: Fitted) -> tuple[float, float, Gap]:
         """On the lines kept apart: chi-square per degree of freedom of both, and the gap closed."""

@@ -143,6 +143,50 @@ class Used:
 
 
 @dataclass(frozen=True, slots=True)
+class Before:
+    """What is in both of two states, by the state before.
+
+    verdict, causes : of its own diagnosis. discrepancy : whether it holds what the table does not
+    explain; the state after was then taken to hold the same.
+    recordings : of each state, before and after. rig : with the parameters that serve both states
+    best if nothing changed.
+    """
+
+    verdict: Verdict
+    causes: tuple[Cause, ...] = ()
+    discrepancy: bool = False
+    recordings: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    rig: Rig | None = None
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return {
+            "verdict": self.verdict,
+            "causes": [c.plain() for c in self.causes],
+            "discrepancy": self.discrepancy,
+            "recordings": list(self.recordings[0]),
+            "after": list(self.recordings[1]),
+        }
+
+    def told(self) -> tuple[str, ...]:
+        """In words."""
+        if self.discrepancy:
+            return (
+                "the state before holds something that the table does not name: it is taken to be "
+                "the same in both states, and only what their responses differ by is explained",
+            )
+        if self.causes:
+            named = " and ".join(_said(c) for c in self.causes)
+            return (f"both states have, beside the rig file: {named}",)
+        if self.verdict == "unknown":
+            return (
+                "both states have something beside the rig file that is not named for sure; what "
+                "fits it stands in the model of both",
+            )
+        return ()
+
+
+@dataclass(frozen=True, slots=True)
 class Trace:
     """x(w) of a place, free of any law: the part that is missing there, by itself.
 
@@ -171,6 +215,7 @@ class Diagnosis:
     evidence : what the probability of the answer rests on (`stated.Evidence`), whether something
         `beyond` the table was found instead, and the causes of the most probable explanation,
         whether they are told or not.
+    before : of two states, what both have; the causes are then what changed between them.
     moved : the largest first. sigma : root of the chi-square that the causes explain. gain : noise
         units by which the next experiment would tell the rivals apart; None where none was found.
     """
@@ -199,6 +244,7 @@ class Diagnosis:
     used: Used = Used(0, 0)
     sigma: float = 0.0
     gain: float | None = None
+    before: Before | None = None
 
     def plain(self) -> dict[str, Any]:
         """The contract of `samii-rig diagnose --json`."""
@@ -236,7 +282,7 @@ class Diagnosis:
                 "gain": self.gain,
             },
             "model": self.model,
-        }
+        } | ({"before": self.before.plain()} if self.before else {})
 
     def lines(self) -> tuple[str, ...]:
         """Three lines for a person: what, how sure and how much better, what next."""
@@ -276,28 +322,42 @@ class Diagnosis:
         return card("Diagnosis", facts, head, rows)
 
     def _what(self) -> str:
+        two = self.before is not None
         match self.verdict:
             case "no_mismatch":
+                what = (
+                    "Nothing changed: one set of parameters fits both states"
+                    if two
+                    else "Nothing is missing: the model fits"
+                )
                 return (
-                    f"Nothing is missing: the model fits to the noise (chi-square per degree of "
+                    f"{what} to the noise (chi-square per degree of "
                     f"freedom {self.chi2_per_dof:.3f}, threshold {self.threshold:.3f})."
                 )
             case "unknown":
                 site, p = self.sites[0] if self.sites else ("", 0.0)
                 place = f" It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
-                return f"Something is missing that the table does not name for sure.{place}"
+                what = "Something changed" if two else "Something is missing"
+                return f"{what} that the table does not name for sure.{place}"
         named = " and ".join(_said(c) for c in self.causes)
+        what = "Changed" if two else "Left out"
         if self.verdict == "named":
-            return f"Left out: {named}."
-        return f"Most likely left out: {named}; the data do not settle it."
+            return f"{what}: {named}."
+        return f"Most likely {what.lower()}: {named}; the data do not settle it."
 
     def _how_well(self) -> str:
         before, after = self.nominal[1], self.with_causes[1]
+        on = "on lines kept apart"
+        if self.before is not None:
+            what = (
+                "that were fitted" if self.before.discrepancy else "of the state after kept apart"
+            )
+            on = f"on lines {what}"
         if not self.causes:
-            return f"On lines kept apart the refitted model has {before:.3g} of the noise's power."
+            return f"{sentence(on)[:-1]} the refitted model has {before:.3g} of the noise's power."
         sure = min(c.probability for c in self.causes)
         return (
-            f"Probability {percent(sure)}; on lines kept apart chi-square per degree of freedom "
+            f"Probability {percent(sure)}; {on} chi-square per degree of freedom "
             f"falls from {before:.3g} to {after:.3g}, {self.gap.value:.0%} of the gap to the noise "
             f"({self.gap.low:.0%} to {self.gap.high:.0%})."
         )

@@ -115,7 +115,8 @@ class Screen:
         on = model.entries(effect, at)
         plain = self.base.model.response(self.base.x, replace(at, loop=None)) - at.aliases
         b = np.zeros_like(plain)
-        b[:, on] = plain[:, on]
+        rows = at.changed
+        b[rows, on] = plain[rows, on]
         c = np.zeros(len(b), complex)
         if at.loop is not None:
             b, c = at.loop.part(plain, b)

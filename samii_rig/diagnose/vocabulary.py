@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from samii_rig.diagnose import bodies, channels, insert
+from samii_rig.diagnose import bodies, channels, insert, less
 from samii_rig.diagnose.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.insert import DISPLACEMENT, VOLUME
 from samii_rig.diagnose.scales import PAIRS, REACH, Places, middle, places, spread
@@ -90,8 +90,12 @@ POINTS: tuple[Point, ...] = (
 REPORTED = {"velocity_feedback": {"c": "g_v"}, "added_inertia": {"I": "J"}}
 
 
-def hypotheses(rig: Rig, low_hz: float, high_hz: float) -> list[Effect]:
-    """Every single effect that the table knows on this rig; ranges are those of the band."""
+def hypotheses(rig: Rig, low_hz: float, high_hz: float, *, signed: bool = False) -> list[Effect]:
+    """Every single effect that the table knows on this rig; ranges are those of the band.
+
+    signed : with what is taken away, or less than the rig file has: what may change between two
+    states.
+    """
     where = places(rig, low_hz, high_hz)
     out: list[Effect] = []
     for row in POINTS:
@@ -99,6 +103,7 @@ def hypotheses(rig: Rig, low_hz: float, high_hz: float) -> list[Effect]:
             out += _point(rig, where, row, port)
     out += _oscillators(rig, where)
     out += bodies.effects(rig, where)
+    out += less.effects(rig) if signed else ()
     out += channels.effects(rig, low_hz, high_hz)
     return out + list(plugged(rig, low_hz, high_hz))
 

@@ -76,17 +76,36 @@ class Reduced:
         flat = np.stack([dh.real, dh.imag]).transpose(2, 0, 1, 3).reshape(2 * q * b, p)
         return np.asarray(self.factor.reshape(-1, 2 * q * b) @ flat)
 
+    @property
+    def between(self) -> Float:
+        """(b - 1,) Hz, in the middle between nodes."""
+        return np.asarray((self.frequency[:-1] + self.frequency[1:]) / 2)
+
+    def bent(self, d: Complex, middle: Complex) -> float:
+        """Noise units by which a change d (b, q) is off that is taken for linear between nodes, and
+        is `middle` (b - 1, q) there."""
+        off = middle - (d[:-1] + d[1:]) / 2
+        gap = np.diff(self.frequency)
+        # Nodes on neighbouring lines of the contour have nothing between them.
+        off[gap < 1.5 * gap.min()] = 0.0
+        at_nodes = np.zeros_like(d)
+        at_nodes[:-1] += off / 2
+        at_nodes[1:] += off / 2
+        return float(np.linalg.norm(self.slopes(at_nodes[:, :, None])))
+
 
 @dataclass(frozen=True)
 class Records:
     """All pieces, on common contours.
 
-    bands : Hz, of the lines of each that take part.
+    bands : Hz, of the lines of each that take part. least : samples for which the contours are long
+    enough at least, so that those of other records are the same.
     """
 
     pieces: tuple[Piece, ...]
     rate_hz: float
     bands: tuple[tuple[float, float], ...]
+    least: int = 0
 
     @property
     def band(self) -> tuple[float, float]:
@@ -96,7 +115,12 @@ class Records:
     @property
     def longest(self) -> int:
         """Samples, input before the piece included."""
-        return max(p.r.size for p in self.pieces)
+        return max(self.least, *(p.r.size for p in self.pieces))
+
+    @property
+    def count(self) -> int:
+        """Lines of all pieces."""
+        return sum(self.lines(piece).k.size for piece in self.pieces)
 
     def exact(self) -> Contour:
         """The contour of predictions."""
@@ -208,14 +232,15 @@ def reduced(
     shape: Shape,
     loop: tuple[float, int] | None = None,
     part: Callable[[Int], NDArray[np.bool_]] | None = None,
+    at: Float | None = None,
 ) -> Reduced:
     """The likelihood of all models near a reference.
 
     shape : of what disturbs the rig, along frequency.
     loop : kp and sensor of the loop that `response` has closed. part : which lines of a piece
-    count, by their number.
+    count, by their number. at : Hz of the nodes; None for as dense as the reference turns.
     """
-    return formed(records, response, shape, loop, part)[0]
+    return formed(records, response, shape, loop, part, at)[0]
 
 
 def formed(
@@ -224,12 +249,16 @@ def formed(
     shape: Shape,
     loop: tuple[float, int] | None = None,
     part: Callable[[Int], NDArray[np.bool_]] | None = None,
+    at: Float | None = None,
 ) -> tuple[Reduced, Rows]:
     """As `reduced`, and the lines that it was made of."""
     smooth, exact = records.smooth(), records.exact()
     H, S = response(exact.s), response(smooth.s)
-    inside = (smooth.frequency > records.band[0]) & (smooth.frequency < records.band[1])
-    nodes = nodes_of(smooth, S / np.median(np.abs(S[inside]), axis=0), records.band)
+    if at is None:
+        inside = (smooth.frequency > records.band[0]) & (smooth.frequency < records.band[1])
+        nodes = nodes_of(smooth, S / np.median(np.abs(S[inside]), axis=0), records.band)
+    else:
+        nodes = np.rint(at * (smooth.samples / smooth.rate_hz)).astype(np.int64)
     rows = _rows(records, smooth, nodes, H, loop)
     left, free = _residual(rows)
     power = Noise.of(
@@ -239,10 +268,9 @@ def formed(
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
     rows = rows.take(np.flatnonzero(counted))
     form = _quadratic(rows, power, S[nodes])
-    at = smooth.frequency[nodes]
     count = 2.0 * rows.e.shape[1] * int(counted.sum()) - form.nuisances
     made = Reduced(
-        frequency=at,
+        frequency=smooth.frequency[nodes],
         sigma=smooth.sigma,
         reference=S[nodes],
         factor=form.factor,

@@ -42,6 +42,7 @@ class Section:
     places: tuple[Plot, ...]
     no_places: str
     fits: tuple[Plot, ...]
+    compared: str
     rivals: list[dict[str, str]]
     fit_rows: list[tuple[str, str, str]]
     bands: words.Table
@@ -50,6 +51,7 @@ class Section:
     why: str
     experiment: str
     model: str
+    two: bool = False
 
     @property
     def plots(self) -> tuple[Plot, ...]:
@@ -82,7 +84,7 @@ def write_diagnosis(
     page = page_text(
         "diagnosis_page.html.j2",
         found.plots,
-        title=title or f"{rig.name}: what the model leaves out",
+        title=title or f"{rig.name}: {words.subject(diagnosis)}",
         subtitle=facts.subtitle(recordings, rig),
         diagnosis=found,
     )
@@ -105,6 +107,7 @@ def section(
         places=places,
         no_places=_no_places(diagnosis, places),
         fits=_fits(diagnosis, responses, rig, band_hz),
+        compared=words.compared(diagnosis),
         rivals=words.rivals(diagnosis),
         fit_rows=words.fit_rows(diagnosis),
         bands=words.band_table(diagnosis.bands, diagnosis.threshold),
@@ -113,6 +116,7 @@ def section(
         why=diagnosis.why,
         experiment=diagnosis.experiment,
         model=Path(diagnosis.model).name,
+        two=diagnosis.before is not None,
     )
 
 
@@ -156,7 +160,8 @@ def _chain_caption(found: Diagnosis, marked: dict[str, Suspect]) -> str:
         return "No part of the chain is suspect."
     if not marked:
         return "The data do not tell which part is suspect."
-    text = "Marked: how probable it is that something is missing at each part."
+    what = "changed" if found.before else "is missing"
+    text = f"Marked: how probable it is that something {what} at each part."
     if any(s.label == OR_HERE for s in marked.values()):
         text += " \u201cOr here\u201d: another place of the same cause to these data."
     return text
@@ -217,10 +222,13 @@ def _fits(
     found: Diagnosis, responses: Sequence[FrequencyResponse], rig: Rig, band_hz: Band
 ) -> tuple[Plot, ...]:
     limits = None if band_hz == (0.0, np.inf) else band_hz
-    nominal = refitted_nominal(rig, responses, limits)
-    before = curve(nominal, "refitted nominal model", responses)
+    plain, caused = words.models(found)
+    if found.before is not None and found.before.rig is not None:
+        before = curve(found.before.rig, plain, responses)
+    else:
+        before = curve(refitted_nominal(rig, responses, limits), plain, responses)
     causes = words.answer(found)
-    after = curve(found.rig, "with the causes", responses) if causes and found.rig else None
+    after = curve(found.rig, caused, responses) if causes and found.rig else None
     curves = [Curves.of(r) for r in responses]
     names, sets, said = [], [], []
     for i, y in enumerate(responses[0].outputs):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from samii_rig.diagnose.result import (
     HIDING,
     LIKELY,
     Band,
+    Before,
     Cause,
     Diagnosis,
     Trace,
@@ -32,6 +34,7 @@ PLAIN = {
     "viscous_damping": "a damper",
     "structural_damping": "the beam's own damping",
     "beam_property": "a beam other than given",
+    "joint_stiffness": "a joint softer or stiffer than it was",
     "attached_oscillator": "something that hangs on and resonates",
     "actuator_lag": "a lag of the drive",
     "valve_dynamics": "a valve of second order",
@@ -99,6 +102,37 @@ def answer(found: Diagnosis) -> tuple[Cause, ...]:
     return found.causes if found.verdict in ("named", "ambiguous") else ()
 
 
+def models(found: Diagnosis) -> tuple[str, str]:
+    """What the model without the causes is called, and that with them."""
+    if found.before is not None:
+        return "nothing changed", "with the change"
+    return "refitted nominal model", "with the causes"
+
+
+def compared(found: Diagnosis) -> str:
+    """What the figures of the fits show."""
+    two = found.before is not None
+    measured = "Measured with 90 % bands"
+    if two:
+        measured = "The state after, measured with 90 % bands"
+    plain = (
+        "the model with parameters that serve both states"
+        if two
+        else "the nominal model with its uncertain parameters refitted"
+    )
+    causes = f", and the model {models(found)[1]}" if answer(found) else ""
+    return (
+        f"{measured}, {plain}{causes}. Lowest panel: how far each is from the measurement, in "
+        "standard deviations; 1 is what noise leaves."
+    )
+
+
+def subject(found: Diagnosis) -> str:
+    """What a page of it is about."""
+    two = found.before is not None
+    return "what changed between two states" if two else "what the model leaves out"
+
+
 def suspects(found: Diagnosis) -> dict[str, float]:
     """Probability of each site, the most suspect first."""
     return {site: p for site, p in found.sites if p >= FAINT}
@@ -160,6 +194,8 @@ def _digits(x: float) -> str:
 
 def _verdict(found: Diagnosis) -> tuple[Mark, str, str]:
     parts = _together(found.causes)
+    if found.before is not None:
+        return _verdict_of_two(found, found.before, parts)
     match found.verdict:
         case "no_mismatch":
             if found.not_physics:
@@ -183,6 +219,33 @@ def _verdict(found: Diagnosis) -> tuple[Mark, str, str]:
     return "bad", "Something is missing that has no name here", text
 
 
+def _verdict_of_two(found: Diagnosis, before: Before, parts: str) -> tuple[Mark, str, str]:
+    """As `_verdict`, of what changed between two states."""
+    each = zip(("Before", "after"), before.recordings, strict=True)
+    files = [Path(p).name for own in before.recordings for p in own]
+    # Files of one name are told by their folders.
+    parts_shown = 1 if len(set(files)) == len(files) else 2
+    states = "; ".join(
+        f"{name}: {listed(['/'.join(Path(p).parts[-parts_shown:]) for p in own])}"
+        for name, own in each
+    )
+    states = f"{states}."
+    match found.verdict:
+        case "no_mismatch":
+            text = "What the two states differ by is no more than the noise."
+            return "good", "Nothing changed between the two states", f"{text} {states}"
+        case "named":
+            return "good", f"Changed: {parts}", states
+        case "ambiguous":
+            text = "The data do not settle it: see what else it may be, and what would tell."
+            return "warning", f"Most likely changed: {parts}", f"{text} {states}"
+    places = suspects(found)
+    site, p = next(iter(places.items()), ("", 0.0))
+    where = f"It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
+    text = f"No entry of the table of physics explains it. {where} {states}"
+    return "bad", "Something changed that has no name here", text
+
+
 def _together(causes: Sequence[Cause]) -> str:
     """All causes; those of one kind with their sites together."""
     sites: dict[str, list[str]] = {}
@@ -202,7 +265,11 @@ def _facts(found: Diagnosis) -> list[tuple[str, str, str]]:
     sure = min(c.probability for c in found.causes)
     g = found.gap
     return [
-        ("Probability", percent(sure), "that this is what is missing"),
+        (
+            "Probability",
+            percent(sure),
+            f"that this is what {'changed' if found.before else 'is missing'}",
+        ),
         (
             "Gap closed",
             f"{100 * g.value:.3g} %",
@@ -211,7 +278,7 @@ def _facts(found: Diagnosis) -> list[tuple[str, str, str]]:
         (
             "Chi-square per degree of freedom",
             f"{ratio(before)} \u2192 {ratio(after)}",
-            "refitted nominal model \u2192 with the causes; noise leaves 1",
+            " \u2192 ".join(models(found)) + "; noise leaves 1",
         ),
     ]
 
@@ -229,9 +296,10 @@ def _mended(found: Diagnosis) -> bool:
 
 def fit_rows(found: Diagnosis) -> list[tuple[str, str, str]]:
     """(model, on lines fitted, on lines kept apart): chi-square per degree of freedom."""
-    rows = [("refitted nominal model", found.nominal)]
+    plain, caused = models(found)
+    rows = [(plain, found.nominal)]
     if answer(found):
-        rows.append(("with the causes", found.with_causes))
+        rows.append((caused, found.with_causes))
     elif found.causes:
         rows.append(("with the best of the table", found.with_causes))
     elif _mended(found):

@@ -83,7 +83,11 @@ def tables(text: str, where: str) -> dict[str, Any]:
 
 def parse(model: type[Model], text: str, where: str) -> Model:
     """`text` (TOML) as `model`; InputError names `where`, the field and what would be right."""
-    data = tables(text, where)
+    return checked(model, tables(text, where), where)
+
+
+def checked(model: type[Model], data: dict[str, Any], where: str) -> Model:
+    """Plain data as `model`; errors as of `parse`."""
     try:
         return model.model_validate(data)
     except ValidationError as error:

@@ -180,6 +180,13 @@ class Refit:
         moved: Float = np.linalg.solve(N + np.eye(self.n), g).astype(np.float64)
         return _left(total - float(g @ moved), moved)
 
+    def between(self, records: Records, before: Sequence[Float]) -> float:
+        """Sigma of what differs from `before`, samples at unit level, where the unknowns are held
+        by records of both; by the derivatives at the start."""
+        N, g, total = self._normal(records, before, self.J)
+        less = float(g @ np.linalg.solve(2 * N + np.eye(self.n), g))
+        return float(np.sqrt(max(total - less, 0.0)))
+
     def left(self, records: Records, start: Float | None = None) -> Left:
         """What a refit leaves, by Gauss-Newton from `start`.
 

@@ -105,13 +105,13 @@ def make(kind: str, seed: int, out: Path, rig_toml: str, style: tuple[str, ...] 
     rngs = [np.random.default_rng([seed, KINDS.index(kind), k]) for k in range(5)]
     beyond = str(rngs[2].choice(list(OUTSIDE))) if kind == "outside" else ""
     runs = beyond == "run_to_run_stiffness"
-    scene = _scene(rngs[0], rngs[1], parse(Rig, rig_toml, "rig file"), style, runs=runs)
+    scene = scene_of(rngs[0], rngs[1], parse(Rig, rig_toml, "rig file"), style, runs=runs)
     refit = None if kind == "nothing" else nominal_refit(scene)
     found = [] if refit is None else _concealed(rngs[2], kind, scene, refit, beyond)
     folder.mkdir(parents=True)
     (folder / "rig.toml").write_text(scene.rig_toml, encoding="utf-8")
     faults = [
-        _file(folder, i, scene, found, rngs[3], rngs[4]) for i in range(len(scene.style.files))
+        file_of(folder, i, scene, found, rngs[3], rngs[4]) for i in range(len(scene.style.files))
     ]
     truth = out / "truth"
     truth.mkdir(exist_ok=True)
@@ -131,9 +131,10 @@ def _built(rig: Rig, about: Nominal, drawn: Float, moved: Float) -> Setup:
     return setup_of(rig, values)
 
 
-def _scene(
+def scene_of(
     rng: Rng, disturb: Rng, rig: Rig, forced: tuple[str, ...], *, runs: bool = False
 ) -> Scene:
+    """A rig with its nominal parameters, style and noise drawn."""
     style = styles.draw(rng, forced, rig.rate_hz, runs=runs)
     measured = "measured" in style.options
     shown = style.rate_hz / style.every if measured else style.rate_hz
@@ -385,9 +386,10 @@ def _rivals(scene: Scene, refit: Refit | None, effect: Concealed) -> list[dict[s
     return out
 
 
-def _file(
+def file_of(
     folder: Path, i: int, scene: Scene, found: list[Concealed], rng: Rng, logger: Rng
 ) -> record.Faults:
+    """Record file i of a style, with the effects `found`."""
     style, setup = scene.style, scene.setup
     for effect in found:
         setup = effect.draft.put_in(setup, effect.strength, i)

@@ -1,0 +1,165 @@
+"""`changed`: what differs between two states of a rig, a part added, worn, taken off or moved.
+
+found = changed(State(estimate(a), a), State(estimate(b), b), rig)
+found.verdict, found.causes, found.before, found.lines()
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from samii_rig.diagnose.by_record import by_samples
+from samii_rig.diagnose.diagnose import case_of, diagnose
+from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.insert import PREFIX
+from samii_rig.diagnose.judge import threshold
+from samii_rig.diagnose.known import with_known
+from samii_rig.diagnose.records import RecordSearch, Whole
+from samii_rig.diagnose.result import Before, Diagnosis
+from samii_rig.diagnose.rigfile import explained
+from samii_rig.diagnose.stages import Case, Progress
+from samii_rig.diagnose.states import Both, StatesSearch
+from samii_rig.errors import EstimateError
+from samii_rig.likelihood.reduce import Records
+from samii_rig.rig.elements import Branch, flattened, parameters
+from samii_rig.rig.schema import RelativeAngle, Rig
+from samii_rig.types import FrequencyResponse, Recording
+
+COMMON = "common_"  # of the names of what both states have beside the rig file
+FREE = 1.0  # tolerance of what the state before was found to have: a factor of e, as good as none
+
+Band = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """One state of a rig: its recordings and their responses, by `samii_rig.signal.estimate`."""
+
+    responses: Sequence[FrequencyResponse]
+    runs: Sequence[Recording]
+
+
+def changed(
+    before: State,
+    after: State,
+    rig: Rig,
+    *,
+    known: Mapping[str, float] | None = None,
+    band: Band | None = None,
+    effects: Sequence[Effect] | None = None,
+    progress: Progress = lambda _stage: None,
+) -> Diagnosis:
+    """What changed from `before` to `after`, nominal parameters the same in both.
+
+    Parameters
+    ----------
+    known : parameters of the rig file, by "element.parameter" and in its units, that are known to
+        have these values after.
+    band : Hz, where the model is held against both.
+    effects : the table of hypotheses, of what both states have and of what changed; None for the
+        whole vocabulary.
+    progress : is told each stage as it begins.
+
+    Raises InputError as `known.with_known` does; InputError and EstimateError as `diagnose` does;
+    EstimateError where the recordings of a state cannot be used whole.
+    """
+    with_known(rig, known or {})  # what is wrong is said before the work
+    found = diagnose(
+        before.responses,
+        rig,
+        band=band,
+        effects=effects,
+        runs=before.runs,
+        progress=lambda stage: progress(f"before: {stage}"),
+    )
+    put_in = found.verdict != "no_mismatch" and found.rig is not None
+    common = common_rig(rig, found.rig) if put_in and found.rig else rig
+    progress("both states")
+    first = case_of(before.responses, common, band, effects, before.runs)
+    second = case_of(
+        after.responses, with_known(common, known or {}), band, effects, after.runs, signed=True
+    )
+    both, start = _both(first, second, band)
+    search = StatesSearch(both, second.search, start.nominal.fitted)
+    nominal = search.nominal.fitted
+    at_first, bands = search.ratio(nominal), search.bands(nominal)
+    progress("what changed")
+    search.run()
+    answer = by_samples(second, search, at_first, bands, progress)
+    beside = Before(
+        found.verdict,
+        found.causes if put_in else (),
+        both.alike,
+        (_named(before), _named(after)),
+        explained(search.nominal.fitted),
+    )
+    return replace(answer, before=beside, not_physics=(*beside.told(), *answer.not_physics))
+
+
+def _named(state: State) -> tuple[str, ...]:
+    return tuple(r.source for r in state.runs if r.source)
+
+
+def _both(first: Case, second: Case, band: Band | None) -> tuple[Both, RecordSearch]:
+    """The records of both states, and the search on those before."""
+    common = [name for name in first.clean.sensors if name in second.clean.sensors]
+    wholes = []
+    for name, case in (("before", first), ("after", second)):
+        clean = case.clean
+        if case.search.lines.torn() or clean.mended or clean.doubt:
+            why = (*clean.told, "they depend on the level as no linear rig does")[0]
+            raise EstimateError(f"the recordings {name} cannot be compared sample by sample: {why}")
+        search = case.search
+        wholes.append(Whole.of(case.runs, search.rig, band, search.table, common, clean.samples))
+    if wholes[0].wired != wholes[1].wired:
+        raise EstimateError("the two states have no command and no sensor in common")
+    longest = max(w.records.longest for w in wholes)
+    before, after = (replace(w, records=replace(w.records, least=longest)) for w in wholes)
+    start = RecordSearch(before, first.search)
+    alike = start.ratio(start.nominal.fitted) > threshold(start.spread)
+    if alike:
+        after = replace(after, records=_within(after.records, before.records.band))
+    return Both(after, before, alike), start
+
+
+def _within(records: Records, band: Band) -> Records:
+    """Records on the lines within a band alone."""
+    low, high = band
+    own = tuple((max(a, low), min(b, high)) for a, b in records.bands)
+    if any(a >= b for a, b in own):
+        raise EstimateError("the two states were not excited at the same frequencies")
+    return replace(records, bands=own)
+
+
+def common_rig(rig: Rig, found: Rig) -> Rig:
+    """The rig with what the state before was found to have: its parameters are free, those of the
+    rig file keep their tolerances."""
+    own = {e.name: e for e in flattened(rig.element)}
+
+    def renamed(name: str) -> str:
+        return name if name in own else name.replace(PREFIX, COMMON, 1)
+
+    def freed(element: Any) -> Any:
+        old = parameters(own[element.name]) if element.name in own else {}
+        update: dict[str, Any] = {
+            symbol: p.model_copy(
+                update={"tolerance": old[symbol].tolerance if symbol in old else FREE}
+            )
+            for symbol, p in parameters(element).items()
+        }
+        update["name"] = renamed(element.name)
+        if isinstance(element, Branch):
+            update["element"] = tuple(freed(e) for e in element.element)
+        return element.model_copy(update=update)
+
+    sensors = tuple(
+        s.model_copy(update={"across": tuple(renamed(n) for n in s.across)})
+        if isinstance(s, RelativeAngle)
+        else s
+        for s in found.sensor
+    )
+    return found.model_copy(
+        update={"element": tuple(freed(e) for e in found.element), "sensor": sensors}
+    )
