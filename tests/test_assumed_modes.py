@@ -268,7 +268,7 @@ STYLE = ("clean", "single")
 def scene() -> trial.Scene:
     rngs = [np.random.default_rng([5, k]) for k in range(2)]
     rig = parse(Rig, load_rig("samii")[1], "samii")
-    return trial._scene(rngs[0], rngs[1], rig, STYLE)
+    return trial.scene_of(rngs[0], rngs[1], rig, STYLE)
 
 
 def test_the_predictor_makes_all_noise_white(scene: trial.Scene) -> None:
@@ -378,7 +378,7 @@ def test_the_truth_explains_the_record_and_the_rig_file_does_not(tmp_path: Path)
     seed = 3
     folder = make("one", seed, tmp_path, _samii(), STYLE)
     rngs = [np.random.default_rng([seed, trial.KINDS.index("one"), k]) for k in range(3)]
-    scene = trial._scene(rngs[0], rngs[1], parse(Rig, _samii(), "samii"), STYLE)
+    scene = trial.scene_of(rngs[0], rngs[1], parse(Rig, _samii(), "samii"), STYLE)
     (hidden,) = trial._concealed(rngs[2], "one", scene, trial.nominal_refit(scene))
     run = read_recording(folder / "run_01.mcap")
     y = run.values[:, -4:] - scene.noise.offset
@@ -517,7 +517,7 @@ def test_every_force_finds_its_size(name: str) -> None:
     rngs = [np.random.default_rng([9, k]) for k in range(3)]
     rig, _ = load_rig("samii_torque_vertical")
     runs = name == "run_to_run_stiffness"
-    scene = trial._scene(rngs[0], rngs[1], rig, ("clean", "cut"), runs=runs)
+    scene = trial.scene_of(rngs[0], rngs[1], rig, ("clean", "cut"), runs=runs)
     draft = {**forces.FORCES, **outside.OUTSIDE}[name](rngs[2], scene.setup, trial._swing(scene))
     found = trial._solved(scene, trial.nominal_refit(scene), draft, 30.0)
     assert found is not None
@@ -532,7 +532,7 @@ def test_what_is_outside_the_table_is_told_as_that(tmp_path: Path) -> None:
 
 def test_what_is_late_by_little_has_rivals_and_by_much_has_none() -> None:
     rngs = [np.random.default_rng([4, k]) for k in range(3)]
-    scene = trial._scene(rngs[0], rngs[1], load_rig("samii_torque_vertical")[0], ("clean", "cut"))
+    scene = trial.scene_of(rngs[0], rngs[1], load_rig("samii_torque_vertical")[0], ("clean", "cut"))
     refit = trial.nominal_refit(scene)
     draft = effects.lag(rngs[2], scene.setup)
     left = {}
