@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from samii_rig.errors import InputError
+    from samii_rig.record.reader import SavedResponses
     from samii_rig.report.compare import ModelCurve
     from samii_rig.rig.schema import Rig
     from samii_rig.types import FrequencyResponse, Recording
@@ -72,7 +73,9 @@ def say_json(data: dict[str, Any]) -> None:
     sys.stdout.write("\n")
 
 
-def rig_of(recordings: Sequence[Recording], option: str | None) -> tuple[Rig, str] | None:
+def rig_of(
+    recordings: Sequence[Recording | SavedResponses], option: str | None
+) -> tuple[Rig, str] | None:
     """The rig to hold against recordings: the one asked for, else the one they carry."""
     from samii_rig.rig.load import load_rig, parse
     from samii_rig.rig.schema import Rig

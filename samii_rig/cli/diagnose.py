@@ -34,7 +34,9 @@ if TYPE_CHECKING:
 
     from samii_rig.diagnose.batch import How
     from samii_rig.diagnose.result import Diagnosis
+    from samii_rig.record.reader import SavedResponses
     from samii_rig.signal.gather import Gaps
+    from samii_rig.types import FrequencyResponse
 
 
 class Spread(TyperCommand):
@@ -57,7 +59,10 @@ class Spread(TyperCommand):
 
 def diagnose(
     logs: Annotated[
-        list[Path] | None, typer.Argument(help="Recordings (.mcap).", show_default=False)
+        list[Path] | None,
+        typer.Argument(
+            help="Recordings (.mcap), or responses that frf --save kept.", show_default=False
+        ),
     ] = None,
     rig: RigOverride = None,
     before: Annotated[
@@ -179,15 +184,20 @@ def _together(
 
     output, gaps, band = how
     values = stated(known)
-    first, second = read_all(earlier), read_all(logs)
-    held = rig_of([*first, *second], rig)
+    saved = _saved([*earlier, *logs], two=bool(earlier))
+    first, second = ([], []) if saved else (read_all(earlier), read_all(logs))
+    held = rig_of(saved or [*first, *second], rig)
     if held is None:
         raise without_rig()
     own_rig = with_known(held[0], values)
     console = Console(highlight=False)
     with working(console, "diagnosis", quiet=json) as say:
         say("frequency responses")
-        responses = estimated(second, None, output, "auto", gaps, band)
+        responses = (
+            tuple(r for file in saved for r in chosen(file, output))
+            if saved
+            else estimated(second, None, output, "auto", gaps, band)
+        )
         if first:
             of_first = estimated(first, None, output, "auto", gaps, band)
             states = State(of_first, first), State(responses, second)
@@ -195,7 +205,7 @@ def _together(
         else:
             found = found_by(responses, own_rig, band=band, progress=say, runs=second)
     # A change is no diagnosis of either state's recordings, nor is one of another rig.
-    own = not first and not known and all(r.rig_toml in ("", held[1]) for r in second)
+    own = not (first or known or saved) and all(r.rig_toml in ("", held[1]) for r in second)
     if own:
         keep_diagnosis(logs, found)
     page = None
@@ -220,8 +230,39 @@ def _together(
         console.print(f"written  {found.model}", soft_wrap=True)
     if page:
         console.print(f"page     {page}", soft_wrap=True)
-    if not (own or first or known):
+    if not (own or first or known or saved):
         console.print("not kept with the recordings: they carry another rig file", soft_wrap=True)
+
+
+def _saved(logs: list[Path], *, two: bool) -> list[SavedResponses]:
+    """What `frf --save` kept, if that is what the files are. two : states are asked for."""
+    from samii_rig.record.reader import read_saved_responses
+
+    every = [read_saved_responses(path) for path in logs]
+    saved = [file for file in every if file is not None]
+    if saved and (two or len(saved) < len(every)):
+        what = "recordings: two states are compared by their samples" if two else (
+            "recordings alone, or files of `frf --save` alone"
+        )  # fmt: skip
+        raise InputError("LOGS", "", saved[0].source, what)
+    return saved
+
+
+def chosen(file: SavedResponses, output: list[str] | None) -> tuple[FrequencyResponse, ...]:
+    """Saved responses of the outputs that are asked for; InputError names one that is not there."""
+    from samii_rig.diagnose.wiring import outputs_of
+    from samii_rig.errors import one_of
+
+    if output is None:
+        return file.responses
+    out = []
+    for r in file.responses:
+        names = [c.name for c in r.outputs]
+        for name in output:
+            if name not in names:
+                raise InputError(file.source, "--output", name, one_of(name, names))
+        out.append(outputs_of(r, [names.index(n) for n in output]))
+    return tuple(out)
 
 
 def keep_diagnosis(logs: list[Path], found: Diagnosis) -> None:

@@ -114,7 +114,9 @@ def frf(
         targets = _one_a_level(path, responses)
         written += [export_response(t, r) for t, r in zip(targets, responses, strict=True)]
     if save:
-        save_frequency_responses(save, responses, logs)
+        carried = {r.rig_toml for r in recordings}
+        rig_toml = carried.pop() if len(carried) == 1 else ""
+        save_frequency_responses(save, responses, logs, rig_toml=rig_toml)
         written.append(save)
     if json:
         say_json(

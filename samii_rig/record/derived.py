@@ -28,10 +28,12 @@ def save_frequency_responses(
     responses: Sequence[FrequencyResponse],
     sources: Iterable[Path],
     metadata: dict[str, str] | None = None,
+    rig_toml: str = "",
 ) -> None:
     """Write results into an MCAP file of their own, without samples.
 
     sources : the recordings that they were estimated from; their names and hashes go in.
+    rig_toml : the rig file that these carry.
     RecordingError if there is nothing to write, a source cannot be read, or `path` exists.
     """
     if not responses:
@@ -43,6 +45,7 @@ def save_frequency_responses(
         (),
         responses[0].rate_hz,
         metadata={**(metadata or {}), **hashes},
+        rig_toml=rig_toml,
         keep_partial=False,
     ) as writer:
         for item in responses:

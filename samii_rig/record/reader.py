@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,18 @@ from samii_rig.types import FrequencyResponse, Recording, StopRecord
 
 THREADS = min(4, os.cpu_count() or 1)
 _Records = np.ndarray[Any, np.dtype[np.void]]
+
+
+@dataclass(frozen=True, slots=True)
+class SavedResponses:
+    """Responses kept without their recordings, with all that the estimate said of them.
+
+    source : the file. rig_toml : the rig file that the recordings carried, "" without one.
+    """
+
+    source: str
+    responses: tuple[FrequencyResponse, ...]
+    rig_toml: str
 
 
 def read_recording(path: Path, *, partial: bool = False) -> Recording:
@@ -78,6 +90,16 @@ def read_frequency_responses(path: Path, *, partial: bool = False) -> list[Frequ
     """The frequency responses logged in a recording, or in a file derived from some."""
     with _contents(path, partial=partial) as (data, contents):
         return decoded(data, contents, layout.RESPONSES, response.decode)
+
+
+def read_saved_responses(path: Path) -> SavedResponses | None:
+    """The responses of a file that holds nothing else (`frf --save`); None for a recording."""
+    with _contents(path, partial=False) as (data, contents):
+        if contents.channel_id(layout.SAMPLES) is not None:
+            return None
+        found = decoded(data, contents, layout.RESPONSES, response.decode)
+        rig_toml = _text(data, contents, layout.RIG_FILE)
+    return SavedResponses(str(path), tuple(found), rig_toml) if found else None
 
 
 def read_events(path: Path, *, partial: bool = False) -> list[Event]:
