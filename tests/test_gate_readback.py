@@ -263,7 +263,7 @@ def test_a_rig_with_monitors_holds_its_devices_to_them():
         ("usual = 70.0", "usual = 200.0", "expected them to rise"),
         ("min = 50.0", "min = 120.0", "expected min below max"),
         ('name = "p_supply"', 'name = "theta"', "has that name"),
-        ('unit = "bar"\nmin', 'unit = "Pa"\nmin', "expected 'bar'"),
+        ('unit = "bar"\nmin', 'unit = "mm"\nmin', "expected 'bar'"),
         ('channel = "p_supply"\nunit = "bar"', 'channel = "theta"\nunit = "rad"', "only a monitor"),
     ],
 )

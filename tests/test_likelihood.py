@@ -198,6 +198,36 @@ def test_records_of_proportional_inputs_are_one_with_the_noise_of_one():
         assert np.std(other.z) == pytest.approx(1e-3, rel=0.05)
 
 
+def test_bursts_in_a_row_are_predicted_however_long_the_rig_rings():
+    """A mode that rings for a minute, under a burst every 5 s: a piece knows the burst before its
+    own, and not those before that."""
+    n, bursts, sd = 1000, 8, 0.02
+    u = np.tile(np.concatenate([sweep(800), np.zeros(200)]), bursts)
+    mode = poles(4.0, 0.002)
+    y = from_rest(u, mode) + sd * np.random.default_rng(6).standard_normal((u.size, 2))
+    run = Recording(
+        (Channel("v_2", "V", "command"), Channel("theta_2", "rad"), Channel("a_0", "m/s^2")),
+        RATE,
+        np.arange(u.size),
+        np.arange(u.size),
+        np.column_stack([u, y]),
+        np.zeros((u.size, 3), np.int64),
+        tuple(
+            Segment(f"burst_{i}", "burst", i * n, (i + 1) * n, 1.0, "V", i) for i in range(bursts)
+        ),
+    )
+    wired = replace(wiring([run], SAMII), kp=0.0)
+    found = pieces_of([run], SAMII, wired)
+    assert [(p.moving, len(p.repeats)) for p in found] == [(False, 0), (False, 0), (True, 5)]
+    records = Records(tuple(found), RATE, ((0.8, 15.0),) * 3)
+    form = reduced(records, lambda s: response(s, mode), flat)
+    assert float(form.target @ form.target) / form.known == pytest.approx(1.0, abs=0.25)
+    left = left_by(records, lambda s: response(s, mode), form)
+    assert float(np.mean(left.chi2)) == pytest.approx(4.0, rel=0.15)
+    power = np.trace(form.noise.covariance(np.arange(2.0, 13.0)), axis1=1, axis2=2).real
+    assert np.mean(power) == pytest.approx(2 * sd**2, rel=0.15)
+
+
 def test_a_gap_and_a_missing_sample_begin_a_piece_that_moves():
     run = recording()
     run.quality[700:720, 2] = Quality.MISSING

@@ -150,7 +150,9 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         room,
         "table",
-        lambda *a: [e for e in table(*a) if ("torsional_compliance", "joint_1") in e.names],
+        lambda *a, **more: [
+            e for e in table(*a, **more) if ("torsional_compliance", "joint_1") in e.names
+        ],
     )
 
 

@@ -199,6 +199,7 @@ class ForceSearch(RecordSearch):
         (unknown,) = effect.unknowns
         left = [look.left_by() for look in looks]
         tried: list[tuple[float, float, float]] = []
+        may = 0.0
         most = np.full(len(looks), -math.inf)
         starts = self._starts(effect)
         for turn in range(1 + CLOSER):
@@ -208,10 +209,15 @@ class ForceSearch(RecordSearch):
                 except SamiiRigError:
                     return None
                 gains = [_gained(g, look, r) for look, r in zip(looks, left, strict=True)]
-                tried.append((*max(gains), p))
-                most = np.maximum(most, [gain for gain, _ in gains])
+                gain, times, best = max(gains)
+                tried.append((gain, times, p))
+                may = max(may, best)
+                most = np.maximum(most, [gain for gain, _, _ in gains])
             gain, times, p = max(tried)
-            if turn == CLOSER or not math.isfinite(times) or times <= 0:
+            # One that is far from what counts is not looked at closer: its shape hardly changes.
+            if turn == CLOSER or may < ENOUGH * self.worth or not math.isfinite(times):
+                break
+            if times <= 0:
                 break
             starts = [self._scaled(model, p, times)]
             starts = [min(max(x, unknown.low), unknown.high) for x in starts]
@@ -273,16 +279,16 @@ class ForceSearch(RecordSearch):
         return self.problem
 
 
-def _gained(g: Float, look: Screen, left: Float) -> tuple[float, float]:
-    """Fall of chi-square with a change g of what is predicted, and how many times as large it would
-    be at its best."""
+def _gained(g: Float, look: Screen, left: Float) -> tuple[float, float, float]:
+    """Fall of chi-square with a change g of what is predicted, how many times as large it would be
+    at its best, and the fall there."""
     Q = look.directions[: g.size]
     through = Q.T @ g
     power = float(g @ g - through @ through)
     along = -float(g @ left[: g.size])
     if not power > 0 or not math.isfinite(power):
-        return -math.inf, math.nan
-    return 2 * along - power, along / power
+        return -math.inf, math.nan, 0.0
+    return 2 * along - power, along / power, max(along, 0.0) * along / power
 
 
 def compete_on_records(linear: RecordSearch) -> ForceSearch | None:

@@ -15,8 +15,9 @@ from samii_rig.types import Complex, Float, Int
 
 WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
 # Samples before a piece at which an unknown input may have acted: three to an octave, so that
-# what is left of the motion of every mode is a sum of their answers.
-AN_OCTAVE = 3.0
+# what is left of the motion of every mode is a sum of their answers. Behind inputs that are known
+# only what rings longest is left, of few modes: one to an octave.
+AN_OCTAVE, BEHIND = 3.0, 1.0
 NEW = 1e-5  # of the largest, a direction in which past inputs still differ
 
 
@@ -50,15 +51,18 @@ def offsets(
 
 
 def past(piece: Piece, k: Int, H: Complex, contour: Contour) -> Complex:
-    """(n_lines, q, m) of motion from before the first sample: answers to inputs that acted then."""
-    longest = len(piece.z)
-    lags = np.unique(np.rint(2 ** np.arange(0, np.log2(longest), 1 / AN_OCTAVE)).astype(np.int64))
+    """(n_lines, q, m) of motion from before the first input that is known: answers to inputs that
+    acted then."""
+    known = piece.history + len(piece.z)
+    longest = min(len(piece.z), contour.samples - known)
+    dense = BEHIND if piece.history else AN_OCTAVE
+    lags = np.unique(np.rint(2 ** np.arange(0, np.log2(longest), 1 / dense)).astype(np.int64))
     spectra = []
     for lag in lags:
         impulse = np.zeros(lag)
         impulse[0] = 1.0
-        y = contour.record(H * contour.damped(impulse)[:, None], int(lag) + len(piece.z))
-        spectra.append(np.fft.rfft(y[lag:], axis=0)[k])
+        y = contour.record(H * contour.damped(impulse)[:, None], int(lag) + known)
+        spectra.append(np.fft.rfft(y[lag + piece.history :], axis=0)[k])
     return _independent(np.stack(spectra, axis=2))
 
 

@@ -149,7 +149,8 @@ def _cut(
         if high - low < LEAST_SAMPLES or not whole[low]:
             continue
         history = min(low - start, high - low)
-        moving = start > 0 and history < high - low
+        # Whatever came before the history may still ring.
+        moving = low > history
         name = recording.place(segment)
         part = r[low - history : high]
         level = (segment.level, segment.unit)
@@ -173,7 +174,8 @@ def _joined(pieces: list[Piece], *, levels: bool) -> list[Piece]:
 
 
 def _proportional(one: Piece, other: Piece, *, levels: bool) -> bool:
-    if (one.r.size, one.history) != (other.r.size, other.history) or one.moving or other.moving:
+    alike = (one.r.size, one.history, one.moving) == (other.r.size, other.history, other.moving)
+    if not alike:
         return False
     if not levels and one.levels != other.levels:
         return False
