@@ -72,6 +72,7 @@ def test_a_campaign_on_a_cluster_says_what_it_says_here(tmp_path: Path, schedule
     assert answers(here) == answers(there)
 
 
+@pytest.mark.slow  # three diagnoses twice over; a study below crosses the same wire
 def test_a_folder_is_diagnosed_on_a_cluster_as_it_is_here(tmp_path: Path, scheduler: str) -> None:
     sweep = tmp_path / "sweep.toml"
     sweep.write_text(SWEEP)

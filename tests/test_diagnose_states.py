@@ -59,6 +59,7 @@ def test_a_joint_that_became_softer_is_named_though_nominal_parameters_are_off(p
     assert parameters(joint)["k"].tolerance > 0.05
 
 
+@pytest.mark.slow  # two whole diagnoses
 def test_what_both_states_have_beside_the_rig_file_is_no_change(tmp_path):
     off = mass("link_3_6", -0.1, 0.3)
     before, after = recorded(0, STRANGE), recorded(1, STRANGE, off)
@@ -98,6 +99,7 @@ def test_a_change_that_is_stated_is_not_looked_for(plain):
     assert found.verdict == "no_mismatch"
 
 
+@pytest.mark.slow  # two whole diagnoses
 def test_what_no_table_explains_in_both_states_is_told_and_not_named():
     """With masses alone in the table a delay in both states has no name; a change still has."""
     before, after = recorded(0, STRANGE), recorded(1, STRANGE, mass("link_1", 0.1, 0.19))
