@@ -65,6 +65,7 @@ def test_a_scheduler_that_does_not_answer_costs_one_line() -> None:
         pass
 
 
+@pytest.mark.slow  # a whole trial, made, diagnosed and scored
 def test_a_trial_goes_the_whole_way_and_only_once(tmp_path: Path) -> None:
     one = campaign.Campaign(tmp_path, load_rig("samii")[1], keep=True)
     todo = campaign.jobs({"nothing": 1}, seed=3)
