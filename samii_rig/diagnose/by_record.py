@@ -1,4 +1,4 @@
-"""The diagnosis of whole records: linear physics by every sample, forces by the levels' lines."""
+"""The diagnosis of whole records: by every sample; by levels of lines what stays unknown."""
 
 from __future__ import annotations
 
@@ -8,13 +8,12 @@ from samii_rig.diagnose import judge as verdict
 from samii_rig.diagnose.by_line import at_first, settled
 from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.nonlinear import compete
-from samii_rig.diagnose.nonlinear_search import ForceSearch, compete_on_records
+from samii_rig.diagnose.nonlinear_search import RIVALS, ForceSearch, compete_on_records
 from samii_rig.diagnose.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.result import Band, Diagnosis, Gap
 from samii_rig.diagnose.stages import Case, Progress, Shown, told
 from samii_rig.errors import EstimateError, SamiiRigError
 
-RIVALS = 4  # explanations of the records that forces must beat
 MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 
 

@@ -456,7 +456,8 @@ class RecordSearch(Search):
 
     def shown(self, before: Fitted, after: Fitted) -> tuple[float, float, Gap]:
         """On the lines kept apart: chi-square per degree of freedom of both, and the gap closed."""
-        a, b = (self.left(x, shown=True).chi2 for x in (before, after))
+        a = self.left(before, shown=True).chi2
+        b = a if after is before else self.left(after, shown=True).chi2
         floor = np.full(a.size, 2.0 * self.whole.sensor.size)
         mean = float(np.sum(floor))
         return float(np.sum(a)) / mean, float(np.sum(b)) / mean, gap_of(a, b, floor)

@@ -71,7 +71,7 @@ def aligned(recording: Recording) -> tuple[Recording, Finding | None]:
         return recording, None
     sequence = recording.sequence
     there = np.searchsorted(sequence, sequence + m)
-    kept = np.flatnonzero((there < sequence.size) & (there >= 0))
+    kept = np.flatnonzero(there < sequence.size)
     kept = kept[sequence[there[kept]] == sequence[kept] + m]
     measured = [i for i, c in enumerate(recording.channels) if c.role not in SENT]
     values, quality = recording.values[kept].copy(), recording.quality[kept].copy()
