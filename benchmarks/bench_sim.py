@@ -15,10 +15,10 @@ import time
 import numpy as np
 from scipy.signal import cont2discrete, dlsim
 
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.model.realise import realise
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.load import load_rig
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 from sim.rig import open_rig
 
 TICK = 0.02  # s

@@ -35,6 +35,7 @@ from fault_host import VOLTS, plan_of
 from faults_kit import PATIENCE, Hosts
 from wire_kit import Wire
 
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import SamiiRigError
 from samii_rig.record.appender import Appender
 from samii_rig.record.reader import read_recording
@@ -46,8 +47,8 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run import campaign
 from samii_rig.run.campaign import Outcome
 from samii_rig.run.dryrun import DryRun, predict
-from samii_rig.run.latch import Latch
-from samii_rig.run.protocols import OpenRig, Plan
+from samii_rig.run.plan import Plan
+from samii_rig.safety.latch import Latch
 from samii_rig.types import Float, Int, SampleBlock
 
 WARM = 5  # runs until memory counts

@@ -232,7 +232,7 @@ class Mutation:
             took[item] = time.process_time() - start
         orders: dict[str, list[pytest.Item]] = {}
         for name, place, make in self.chosen:
-            module = importlib.import_module(f"samii_rig.run.{name}")
+            module = importlib.import_module(f"samii_rig.safety.{name}")
             if name not in orders:
                 own = {file(test) for test in FIRST[name]}
                 # Most mutants fall to a fast test of their own files.
@@ -253,7 +253,7 @@ class Mutation:
 
 
 def source(name: str) -> str:
-    return (ROOT / "samii_rig" / "run" / f"{name}.py").read_text()
+    return (ROOT / "samii_rig" / "safety" / f"{name}.py").read_text()
 
 
 def every(name: str, after: int) -> Iterator[Mutant]:

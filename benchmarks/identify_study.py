@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from experiments.swept_sine import SweptSine
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.identify.actuator import (
     actuated_joint,
     choice,
@@ -42,7 +43,6 @@ from samii_rig.model.sampled import sampled_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import FrequencyResponse, Recording, Segment
 from sim.rig import open_rig

@@ -16,11 +16,11 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.errors import DeviceError, InputError, RecordingError
 from samii_rig.record.reader import read_events, read_recording
 from samii_rig.rig.schema import Rig, Strict
 from samii_rig.rig.settings import checked, wrong
-from samii_rig.run.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.types import Recording, SampleBlock
 
 NS = 1_000_000_000

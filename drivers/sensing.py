@@ -6,8 +6,8 @@ from collections import deque
 
 import numpy as np
 
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.errors import DeviceError
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 from samii_rig.types import Int
 
 

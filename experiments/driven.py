@@ -9,8 +9,8 @@ from pydantic import Field, field_validator
 
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Finite, Name, Rig, Strict
-from samii_rig.run.limits import find_actuator
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
+from samii_rig.safety.limits import find_actuator
 from samii_rig.signal.excitation import Interpolation
 from samii_rig.types import Float
 

@@ -10,7 +10,7 @@ from pydantic import Field
 from experiments.driven import HIGHEST, Driven
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Positive, Rig
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
 
 
 class Step(Driven):

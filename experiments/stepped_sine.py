@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from experiments.driven import Driven
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Name, NonNegative, Positive, Rig
-from samii_rig.run.protocols import Dwell, Plan, PlannedSegment
+from samii_rig.run.plan import Dwell, Plan, PlannedSegment
 from samii_rig.signal.excitation import schedule_factor
 from samii_rig.types import Float
 

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from experiments.driven import Driven
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import NonNegative, Positive, Rig
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.signal.excitation import Sweep, swept_sine
 
 

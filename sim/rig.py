@@ -23,6 +23,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.model.feedback import sections
 from samii_rig.model.realise import Realisation, realise
@@ -35,7 +36,6 @@ from samii_rig.rig.schema import (
     Feedback,
     Rig,
 )
-from samii_rig.run.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.types import Channel, Flags, Float, Int, SampleBlock
 from sim import kernel
 from sim.plant import tabulate

@@ -6,7 +6,7 @@ import numpy as np
 from fake_device import RATE, fake_rig
 
 from samii_rig.run.dryrun import predict
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.signal.excitation import swept_sine
 
 RIG = fake_rig()

@@ -24,11 +24,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from samii_rig.devices.protocols import Actuator, Clock, CommandBlock, DeviceLoop, OpenRig, Sensor
 from samii_rig.errors import DeviceError
 from samii_rig.model.feedback import sections
 from samii_rig.rig.schema import Feedback, Rig
-from samii_rig.run.limits import GateLimits, gate_limits
-from samii_rig.run.protocols import Actuator, Clock, CommandBlock, DeviceLoop, OpenRig, Sensor
+from samii_rig.safety.limits import GateLimits, gate_limits
 from samii_rig.types import Float, Quality, SampleBlock
 
 AHEAD = 0.15  # s between a reference and its first sample; a loaded machine may be late

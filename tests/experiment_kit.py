@@ -13,7 +13,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import Outcome, carry_out
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
-from samii_rig.run.protocols import Experiment
+from samii_rig.run.plan import Experiment
 from samii_rig.signal.statistics import imag_interval, real_interval
 from samii_rig.types import FrequencyResponse
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
-from samii_rig.run.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.types import Channel, Quality, SampleBlock
 
 RATE, K = 500.0, 0.5

@@ -16,14 +16,14 @@ from pathlib import Path
 
 import numpy as np
 
+from samii_rig.devices.opening import open_device
 from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
-from samii_rig.run.devices import open_device
 from samii_rig.run.dryrun import DryRun, predict
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import _Run
 from samii_rig.run.pace import LoopSettings
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
 
 EXIT = {"completed": 0, "stopped": 130, "tripped": 5, "failed": 6}
 VOLTS, HZ = 0.5, 5.0

@@ -16,10 +16,10 @@ from wire_kit import Wire
 
 from samii_rig.run.ending import attempt
 from samii_rig.run.interrupts import Interrupts
-from samii_rig.run.judgement import State
 from samii_rig.run.loop import _Run
 from samii_rig.run.pace import LoopSettings
-from samii_rig.run.protocols import Plan
+from samii_rig.run.plan import Plan
+from samii_rig.safety.judgement import State
 
 STATES = ("safe", "armed", "running")
 PATIENCE = 25  # samples in the deadman's 50 ms

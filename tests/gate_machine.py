@@ -12,12 +12,13 @@ from fake_device import RATE, FakeDevice, fake_rig
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
+from samii_rig.devices.protocols import CommandBlock
 from samii_rig.errors import DeviceError, GateError, RecordingError
 from samii_rig.run.interrupts import Interrupts
-from samii_rig.run.judgement import State
 from samii_rig.run.loop import _Run
 from samii_rig.run.pace import LoopSettings
-from samii_rig.run.protocols import CommandBlock, Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
+from samii_rig.safety.judgement import State
 from samii_rig.types import Quality, SampleBlock
 
 RIG = fake_rig()

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from experiments.swept_sine import SweptSine
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.rig.schema import Rig
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 from samii_rig.types import Recording, Segment
 from sim.rig import open_rig
 

@@ -26,8 +26,8 @@ from samii_rig.run.calibrate import (
     two_points,
     wiring,
 )
-from samii_rig.run.latch import Latch
 from samii_rig.run.protections import own_protections
+from samii_rig.safety.latch import Latch
 
 TRIES = 4  # of a move in real time; a loaded machine may be later than a deadman allows
 

@@ -11,8 +11,8 @@ import pytest
 from board_kit import options
 from wire_kit import Wire
 
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.errors import DeviceError
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 
 
 @pytest.fixture(scope="module")

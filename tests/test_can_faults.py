@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from can_kit import CanWire, moment_rig, patient, until
 
+from samii_rig.devices.opening import open_device
+from samii_rig.devices.protocols import CommandBlock, OpenRig
 from samii_rig.errors import DeviceError, GateError, InputError
 from samii_rig.rig.schema import Device, Rig
-from samii_rig.run.devices import open_device
-from samii_rig.run.gate import Gate, GateEvent
-from samii_rig.run.judgement import State
-from samii_rig.run.limits import gate_limits
-from samii_rig.run.protocols import CommandBlock, OpenRig
+from samii_rig.safety.gate import Gate, GateEvent
+from samii_rig.safety.judgement import State
+from samii_rig.safety.limits import gate_limits
 from samii_rig.types import Quality
 
 AGE = 0.3  # s, the sensors' limit here: a loaded machine is late by less

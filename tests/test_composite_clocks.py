@@ -9,11 +9,11 @@ import pytest
 
 from drivers.composite import rig as composite
 from drivers.sensing import NoOutput
+from samii_rig.devices.clock import MonotonicClock
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Device
-from samii_rig.run.clock import MonotonicClock
-from samii_rig.run.protocols import OpenRig
 from samii_rig.types import Channel, Quality, SampleBlock
 
 FLOOR = (2e-4, 1.2e-3)  # s, shortest way of a sample, somewhere in between

@@ -6,8 +6,8 @@ import pytest
 from can_kit import CanWire, moment_rig, patient
 from contract import DeviceContract
 
-from samii_rig.run.devices import open_device
-from samii_rig.run.protocols import OpenRig
+from samii_rig.devices.opening import open_device
+from samii_rig.devices.protocols import OpenRig
 
 
 @pytest.fixture(scope="class")

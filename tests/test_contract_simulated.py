@@ -2,9 +2,9 @@
 
 from contract import DeviceContract
 
+from samii_rig.devices.opening import open_device
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.rig.load import load_rig
-from samii_rig.run.devices import open_device
-from samii_rig.run.protocols import OpenRig
 
 
 class TestSimulatedSamii(DeviceContract):

@@ -19,7 +19,7 @@ from samii_rig.rig.schema import Limit, Rig
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
 from samii_rig.run.loop import run
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.signal.excitation import swept_sine
 from sim.rig import open_rig
 

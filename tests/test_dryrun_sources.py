@@ -13,9 +13,9 @@ from samii_rig.errors import InputError, LimitError
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Feedback, Limit, Rig
 from samii_rig.run.dryrun import predict
-from samii_rig.run.limits import gate_limits
 from samii_rig.run.loop import run
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
+from samii_rig.safety.limits import gate_limits
 from samii_rig.signal.excitation import swept_sine
 from sim.rig import open_rig
 

@@ -16,7 +16,7 @@ from wire_kit import Wire
 from samii_rig.errors import DeviceError
 from samii_rig.run import campaign
 from samii_rig.run.dryrun import DryRun, predict
-from samii_rig.run.protocols import Plan
+from samii_rig.run.plan import Plan
 
 STUDY = Path(__file__).resolve().parent.parent / "benchmarks" / "endurance.py"
 SPEC = importlib.util.spec_from_file_location("endurance", STUDY)

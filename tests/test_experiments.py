@@ -15,7 +15,7 @@ from samii_rig.errors import InputError
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.run import catalogue, experiments
 from samii_rig.run.experiments import fitting, load_experiment, shipped
-from samii_rig.run.protocols import Experiment
+from samii_rig.run.plan import Experiment
 
 RIG = fake_rig()
 GOOD = {

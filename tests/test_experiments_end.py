@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_loop import Memory, after
 
+from samii_rig.devices.opening import open_device
 from samii_rig.rig.load import load_rig
-from samii_rig.run.devices import open_device
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
 from samii_rig.run.loop import run

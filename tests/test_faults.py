@@ -17,9 +17,9 @@ from fault_host import plan_of
 from faults_kit import PATIENCE, STATES, Held, held, null_of
 from wire_kit import Wire
 
+from samii_rig.devices.protocols import CommandBlock
 from samii_rig.errors import DeviceError, GateError
-from samii_rig.run.judgement import State
-from samii_rig.run.protocols import CommandBlock
+from samii_rig.safety.judgement import State
 
 BY_NODE = 1  # samples from the fault to null, where the node itself measures it
 RUNNING = ("running",)

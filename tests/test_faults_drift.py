@@ -10,7 +10,7 @@ from test_gate_agreement import ONE, SAMII, TWO
 from wire_kit import Wire
 
 from samii_rig.errors import GateError
-from samii_rig.run.judgement import State
+from samii_rig.safety.judgement import State
 
 # Which agreement, counts a second that theta_2 drifts, samples until it is as far away: 0.02 rad at
 # 0.031 rad/s, and 0.03 rad at 0.15 rad/s, of which 2 s are remembered.

@@ -21,8 +21,8 @@ from wire_kit import Wire
 from samii_rig.errors import DeviceError, GateError
 from samii_rig.record.reader import read_events, read_recording
 from samii_rig.record.recover import recover
-from samii_rig.run.latch import Latch
 from samii_rig.run.priority import PRIORITY
+from samii_rig.safety.latch import Latch
 
 LATE_TRIES = 12
 FAIR_TRIES = 3  # that fail make the test fail

@@ -10,8 +10,8 @@ import pytest
 from faults_kit import STATES, held, null_of
 from wire_kit import Wire, until
 
-from samii_rig.run.judgement import State
 from samii_rig.run.session import listen
+from samii_rig.safety.judgement import State
 
 STRAY = "stray 500"  # counts: 0.15 V, which turn the joint at 0.076 rad/s
 

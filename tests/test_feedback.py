@@ -16,18 +16,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import signal
 
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.errors import DeviceError, InputError, LimitError
 from samii_rig.model.feedback import analogue, digital, reach, sections, state_space
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Feedback, Rig
 from samii_rig.run.dryrun import predict
-from samii_rig.run.judgement import command_violation
-from samii_rig.run.latest import Latest
-from samii_rig.run.limits import gate_limits
 from samii_rig.run.loop import run
-from samii_rig.run.protocols import CommandBlock, DeviceLoop, Plan, PlannedSegment
-from samii_rig.run.readback import Sent
+from samii_rig.run.plan import Plan, PlannedSegment
+from samii_rig.safety.judgement import command_violation
+from samii_rig.safety.latest import Latest
+from samii_rig.safety.limits import gate_limits
+from samii_rig.safety.readback import Sent
 from samii_rig.signal.estimate import estimate
 from samii_rig.signal.excitation import swept_sine
 from samii_rig.types import Quality, Recording

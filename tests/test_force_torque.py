@@ -17,10 +17,10 @@ from drivers.force_torque import bus as bus_module
 from drivers.force_torque.device import ForceTorqueRig, check_matrix, open_rig
 from drivers.force_torque.frames import AXES, MATRIX, NEEDED, Frames
 from drivers.force_torque.reader import Reader
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Monitor
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 from samii_rig.types import Quality
 from sim.wire.can_sensor import Sensor, calibration
 

@@ -12,11 +12,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from samii_rig.devices.protocols import CommandBlock
 from samii_rig.errors import GateError
-from samii_rig.run.gate import Gate
-from samii_rig.run.judgement import State
-from samii_rig.run.limits import gate_limits
-from samii_rig.run.protocols import CommandBlock
+from samii_rig.safety.gate import Gate
+from samii_rig.safety.judgement import State
+from samii_rig.safety.limits import gate_limits
 from samii_rig.types import Channel, Quality
 
 LIMITS = gate_limits(fake_rig(), "v", 4.0, "theta")

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from samii_rig.errors import GateError, InputError
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
-from samii_rig.run.agreement import Agreement, Followed, apart
-from samii_rig.run.gate import Gate
-from samii_rig.run.judgement import State, violation
-from samii_rig.run.latest import Latest
-from samii_rig.run.limits import GateLimits, gate_limits
+from samii_rig.safety.agreement import Agreement, Followed, apart
+from samii_rig.safety.gate import Gate
+from samii_rig.safety.judgement import State, violation
+from samii_rig.safety.latest import Latest
+from samii_rig.safety.limits import GateLimits, gate_limits
 from samii_rig.types import Channel, Quality, SampleBlock
 
 RATE = 500.0

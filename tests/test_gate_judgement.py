@@ -11,8 +11,9 @@ from fake_device import FakeDevice, fake_rig
 from hypothesis import given
 from hypothesis import strategies as st
 
+from samii_rig.devices.protocols import CommandBlock
 from samii_rig.rig.schema import Feedback
-from samii_rig.run.judgement import (
+from samii_rig.safety.judgement import (
     Act,
     Arm,
     Check,
@@ -25,9 +26,8 @@ from samii_rig.run.judgement import (
     decide,
     violation,
 )
-from samii_rig.run.latest import NEVER, Latest, observe
-from samii_rig.run.limits import gate_limits
-from samii_rig.run.protocols import CommandBlock
+from samii_rig.safety.latest import NEVER, Latest, observe
+from samii_rig.safety.limits import gate_limits
 from samii_rig.types import Quality, SampleBlock
 
 LIMITS = gate_limits(fake_rig(), "v", 4.0, "theta")

@@ -18,9 +18,9 @@ from samii_rig.errors import DeviceError, GateError, InputError
 from samii_rig.run import campaign
 from samii_rig.run.dryrun import predict
 from samii_rig.run.heartbeat import Pipe
-from samii_rig.run.latch import Latch, state_folder
 from samii_rig.run.loop import run
 from samii_rig.run.pace import LoopSettings
+from samii_rig.safety.latch import Latch, state_folder
 
 RIG = fake_rig()
 
@@ -104,7 +104,7 @@ def test_the_folder_is_the_users(monkeypatch, tmp_path):
 
 HOLDER = """
 import sys, time
-from samii_rig.run.latch import Latch
+from samii_rig.safety.latch import Latch
 from fake_device import FakeDevice
 device = FakeDevice().open()
 device.metadata.clear()

@@ -9,12 +9,13 @@ import pytest
 from fake_device import fake_rig
 from test_gate import LIMITS, Bench
 
+from samii_rig.devices.protocols import CommandBlock
 from samii_rig.errors import GateError, LimitError
 from samii_rig.rig.schema import Feedback, Limit
 from samii_rig.run import campaign
 from samii_rig.run.dryrun import predict
-from samii_rig.run.limits import gate_limits
-from samii_rig.run.protocols import CommandBlock, Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
+from samii_rig.safety.limits import gate_limits
 from samii_rig.types import Quality
 
 RIG = fake_rig()

@@ -12,18 +12,28 @@ GateAndLoop.TestCase.settings = settings(max_examples=120, stateful_step_count=2
 TestGateAndLoop = GateAndLoop.TestCase
 
 GATE = ("gate", "judgement", "latest", "readback")
-FOREIGN = ("signal", "record", "identify", "diagnose", "control", "report", "papers", "prove")
+FOREIGN = (
+    "signal",
+    "record",
+    "identify",
+    "diagnose",
+    "control",
+    "report",
+    "papers",
+    "prove",
+    "run",
+)
 
 
 def test_the_gate_depends_on_no_experiment_estimator_or_service():
-    names = ", ".join(f"samii_rig.run.{name}" for name in GATE)
+    names = ", ".join(f"samii_rig.safety.{name}" for name in GATE)
     loaded = subprocess.run(
         [sys.executable, "-c", f"import {names}, sys; print(*sys.modules, sep='\\n')"],
         capture_output=True,
         text=True,
         check=True,
     ).stdout.splitlines()
-    assert "samii_rig.run.gate" in loaded
+    assert "samii_rig.safety.gate" in loaded
     foreign = [f"samii_rig.{room}" for room in FOREIGN]
-    foreign += ["experiments", "drivers", "sim", "samii_rig.run.loop", "samii_rig.run.campaign"]
+    foreign += ["experiments", "drivers", "sim"]
     assert not [m for m in loaded if any(m == f or m.startswith(f"{f}.") for f in foreign)]

@@ -10,14 +10,14 @@ import pytest
 from fake_device import FakeDevice, fake_rig
 from test_gate import LIMITS, Bench
 
+from samii_rig.devices.protocols import CommandBlock
 from samii_rig.errors import GateError, InputError
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
-from samii_rig.run.judgement import State, violation
-from samii_rig.run.latest import Latest, observe
-from samii_rig.run.limits import gate_limits
-from samii_rig.run.protocols import CommandBlock
-from samii_rig.run.readback import Places, Sent, stray
+from samii_rig.safety.judgement import State, violation
+from samii_rig.safety.latest import Latest, observe
+from samii_rig.safety.limits import gate_limits
+from samii_rig.safety.readback import Places, Sent, stray
 from samii_rig.types import Channel, Quality, SampleBlock
 
 KP = 4.0
@@ -275,7 +275,7 @@ def test_limits_that_contradict_are_one_line(old, new, said):
 
 
 def test_the_simulated_rig_shows_a_monitors_usual_value():
-    from samii_rig.run.devices import open_device
+    from samii_rig.devices.opening import open_device
 
     device = open_device(monitored(), {"seed": 1})
     device.clock.sleep(0.1)

@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_gate_judgement import FINE, LIMITS, command, seen, with_feedback
 
-from samii_rig.run.judgement import command_violation
-from samii_rig.run.latest import Latest
-from samii_rig.run.protocols import CommandBlock
-from samii_rig.run.readback import Sent, travel
+from samii_rig.devices.protocols import CommandBlock
+from samii_rig.safety.judgement import command_violation
+from samii_rig.safety.latest import Latest
+from samii_rig.safety.readback import Sent, travel
 
 NOTHING = Sent()
 # A joint that may turn as far as it likes: what is left are the limits on the output.

@@ -10,11 +10,11 @@ import pytest
 
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Limit, Rig
-from samii_rig.run.judgement import violation
-from samii_rig.run.latest import Latest, observe
-from samii_rig.run.limits import GateLimits, Stuck, gate_limits
 from samii_rig.run.loop import run
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
+from samii_rig.safety.judgement import violation
+from samii_rig.safety.latest import Latest, observe
+from samii_rig.safety.limits import GateLimits, Stuck, gate_limits
 from samii_rig.signal.excitation import swept_sine
 from samii_rig.types import Channel, Quality, SampleBlock
 from sim.rig import open_rig

@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 from fake_device import RATE, FakeDevice, fake_rig
 
+from samii_rig.devices.clock import MonotonicClock
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, GateError, InputError
-from samii_rig.run.clock import MonotonicClock
 from samii_rig.run.dwell import Reference
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import run
 from samii_rig.run.pace import LoopSettings
-from samii_rig.run.protocols import OpenRig, Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.run.session import Move
 from samii_rig.run.sink import Collector, QueuedSink, recorded_channels
 from samii_rig.signal.excitation import swept_sine

@@ -12,11 +12,11 @@ from fake_device import FakeDevice
 from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
+from samii_rig.devices.protocols import CommandBlock
 from samii_rig.errors import DeviceError, EstimateError, GateError, InputError
 from samii_rig.record.reader import read_recording
 from samii_rig.run import campaign
 from samii_rig.run.campaign import Outcome, carry_out
-from samii_rig.run.protocols import CommandBlock
 from samii_rig.types import Channel
 
 

@@ -19,7 +19,7 @@ from samii_rig.run.dryrun import predict
 from samii_rig.run.dwell import MIXED, Reference, Watch, check_segments, ways
 from samii_rig.run.loop import run
 from samii_rig.run.pace import LoopSettings
-from samii_rig.run.protocols import Dwell, Plan, PlannedSegment
+from samii_rig.run.plan import Dwell, Plan, PlannedSegment
 from samii_rig.types import Quality, SampleBlock
 from sim.rig import open_rig
 

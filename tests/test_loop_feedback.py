@@ -12,14 +12,14 @@ from fake_device import FakeDevice, fake_rig
 from test_feedback import BAND, LOOP, Memory, V, plan_for, rig_with
 from test_loop import plan as fake_plan
 
+from samii_rig.devices.protocols import DeviceLoop, OpenRig
 from samii_rig.errors import DeviceError, LimitError
 from samii_rig.rig.schema import Feedback
 from samii_rig.run.dryrun import predict
-from samii_rig.run.judgement import violation
-from samii_rig.run.latest import Latest
-from samii_rig.run.limits import gate_limits
 from samii_rig.run.loop import run
-from samii_rig.run.protocols import DeviceLoop, OpenRig
+from samii_rig.safety.judgement import violation
+from samii_rig.safety.latest import Latest
+from samii_rig.safety.limits import gate_limits
 from samii_rig.types import Quality
 from sim.rig import open_rig
 

@@ -19,7 +19,7 @@ from samii_rig.errors import DeviceError, GateError
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.schema import Rig
 from samii_rig.run import campaign, experiments
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.run.setups import Conclusion, Setup
 from samii_rig.signal.excitation import swept_sine
 
@@ -76,7 +76,7 @@ class Bench:
         self.devices.append(device)
         bench = self
 
-        from samii_rig.run.protocols import OpenRig
+        from samii_rig.devices.protocols import OpenRig
 
         class Closing(OpenRig):
             def close(self) -> None:

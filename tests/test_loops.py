@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.model.feedback import state_space
 from samii_rig.model.loops import (
     closed_loop_poles,
@@ -21,7 +22,6 @@ from samii_rig.model.realise import realise
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Feedback
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 from sim.rig import open_rig
 
 SAMII = load_rig("samii")[0]

@@ -8,10 +8,10 @@ from ni_kit import installed
 from wire_kit import until
 
 from drivers.ni_daq import NiRig, open_rig
+from samii_rig.devices.protocols import CommandBlock
+from samii_rig.devices.timebase import ClockModel, Timed
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.load import load_rig
-from samii_rig.run.protocols import CommandBlock
-from samii_rig.run.timebase import ClockModel, Timed
 from samii_rig.types import Quality
 
 SETTINGS = {

@@ -9,11 +9,11 @@ from ni_kit import installed
 from wire_kit import until
 
 from drivers.ni_daq import open_rig
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.errors import DeviceError, GateError, InputError
 from samii_rig.rig.load import load_rig
-from samii_rig.run.gate import Gate
-from samii_rig.run.limits import gate_limits
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
+from samii_rig.safety.gate import Gate
+from samii_rig.safety.limits import gate_limits
 
 DEADMAN = 0.2  # s; a loaded machine may feed late
 INTERLOCK = {
@@ -291,7 +291,7 @@ def test_whatever_ends_the_gate_ends_the_output(board, device, end, monkeypatch)
         with pytest.raises(GateError, match=r"v_2 read back is 0\.[45]\d* V away"):
             until(lambda: (tick(), False)[1])
     else:
-        monkeypatch.setattr("samii_rig.run.gate.observe", lambda *a: 1 / 0)
+        monkeypatch.setattr("samii_rig.safety.gate.observe", lambda *a: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             tick()
     assert board.out == 0.0

@@ -23,10 +23,11 @@ from pydantic import BaseModel
 
 from experiments.driven import MOST_SAMPLES
 from samii_rig.cli import main
+from samii_rig.devices import opening
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
-from samii_rig.run import devices, experiments
+from samii_rig.run import experiments
 from samii_rig.run.experiments import load_experiment, plan_of, shipped
 from samii_rig.run.plugins import checked_plan
 from samii_rig.run.setups import Conclusion, conclusion_of, setups_of
@@ -71,7 +72,7 @@ def lab(monkeypatch: pytest.MonkeyPatch) -> None:
     Own.__module__ = "lab_package"
     package.Own, package.opens = Own, opens  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "lab_package", package)
-    for room, group, what in ((experiments, "kinds", "Own"), (devices, "drivers", "opens")):
+    for room, group, what in ((experiments, "kinds", "Own"), (opening, "drivers", "opens")):
         known = getattr(room, group)()
         point = EntryPoint("own", f"lab_package:{what}", f"samii_rig.{group}")
         monkeypatch.setattr(room, group, lambda known=known, point=point: {**known, "own": point})
@@ -196,7 +197,7 @@ def test_a_driver_that_breaks_its_promise_is_named(opened: Any, words: str) -> N
     WRONG.opened = opened
     rig = RIG.model_copy(update={"device": RIG.device.model_copy(update={"driver": "own"})})
     with pytest.raises(InputError) as wrong:
-        devices.open_device(rig, {})
+        opening.open_device(rig, {})
     assert str(wrong.value).startswith("entry point own = lab_package:opens")
     assert words in str(wrong.value)
 
@@ -204,7 +205,7 @@ def test_a_driver_that_breaks_its_promise_is_named(opened: Any, words: str) -> N
 def test_a_driver_that_ends_the_program_when_closed_is_a_failed_device() -> None:
     device: Any = SimpleNamespace(close=raising(SystemExit(0)))
     with pytest.raises(DeviceError, match="did not close: SystemExit: 0"):
-        devices.close_device(device)
+        opening.close_device(device)
 
 
 NAMES = sorted(shipped())

@@ -15,9 +15,9 @@ from wire_kit import until
 
 from drivers.quadrature.device import QuadratureRig, open_rig
 from drivers.quadrature.wire import Decoder
+from samii_rig.devices.timebase import ClockModel, Timed
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.load import load_rig
-from samii_rig.run.timebase import ClockModel, Timed
 from samii_rig.types import Quality
 from sim.wire.counter import Counter
 

@@ -8,14 +8,14 @@ import pytest
 from experiment_kit import SHORT
 
 from drivers.replay import open_rig
+from samii_rig.devices.opening import open_device
+from samii_rig.devices.protocols import Actuator, Clock, CommandBlock, DeviceLoop, Sensor
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Device
 from samii_rig.run.campaign import carry_out
-from samii_rig.run.devices import open_device
 from samii_rig.run.dryrun import predict
-from samii_rig.run.protocols import Actuator, Clock, CommandBlock, DeviceLoop, Sensor
 
 RIG = load_rig("samii")[0]
 LOOP = DeviceLoop("theta_2", 4.0, 5.0, 2000.0, 0.35)

@@ -10,7 +10,7 @@ from board_kit import NODES, options
 from contract import DeviceContract
 from wire_kit import Wire, slow_deadman
 
-from samii_rig.run.protocols import OpenRig
+from samii_rig.devices.protocols import OpenRig
 
 
 @pytest.fixture(scope="class", params=NODES)

@@ -19,9 +19,9 @@ from serve_kit import Service
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from samii_rig.devices.opening import open_device
 from samii_rig.errors import RecordingError
 from samii_rig.rig.load import load_rig
-from samii_rig.run.devices import open_device
 from samii_rig.serve.access import Tokens
 from samii_rig.serve.live import LEAST_ROWS, LiveReader, LiveWriter
 from samii_rig.serve.viewers import DEPTH, HEAD, Viewer, Viewers, decimated, frame

@@ -31,7 +31,7 @@ from samii_rig.rig.load import load_rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
-from samii_rig.run.protocols import Plan
+from samii_rig.run.plan import Plan
 from samii_rig.serve.analysis import Analysis
 from samii_rig.serve.analyst import Analyst, curves, said
 from samii_rig.serve.following import following

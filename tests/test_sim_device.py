@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from samii_rig.devices.protocols import Actuator, Clock, CommandBlock, DeviceLoop, OpenRig, Sensor
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.load import load_rig
-from samii_rig.run.protocols import Actuator, Clock, CommandBlock, DeviceLoop, OpenRig, Sensor
 from samii_rig.types import Quality
 from sim.rig import open_rig
 

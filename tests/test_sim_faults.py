@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from conftest import ROOT
 
+from samii_rig.devices.opening import open_device
 from samii_rig.errors import InputError
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Device
-from samii_rig.run.devices import open_device
 from sim import faults
 from sim.settings import read_settings
 from sim.wire import faults as wire

@@ -4,10 +4,10 @@ import control
 import numpy as np
 import pytest
 
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.model.realise import realise
 from samii_rig.model.sampled import filter_response, hold_response, sampled_response
 from samii_rig.rig.load import load_rig
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 from sim.plant import tabulate
 from sim.rig import open_rig
 

@@ -15,6 +15,8 @@ from fake_device import FakeDevice, fake_rig
 from mcap.reader import make_reader
 from record_kit import CHANNELS, RATE, WALL, block, blocks, joined, response, write_run
 
+from samii_rig.devices.clock import MonotonicClock
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import InputError, RecordingError
 from samii_rig.index.entry import read_entry
 from samii_rig.record.derived import save_frequency_responses
@@ -26,9 +28,8 @@ from samii_rig.record.store import write_recording
 from samii_rig.record.verify import verify
 from samii_rig.record.writer import RunWriter
 from samii_rig.rig.load import parse
-from samii_rig.run.clock import MonotonicClock
 from samii_rig.run.loop import run
-from samii_rig.run.protocols import OpenRig, Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.run.sink import QueuedSink, Watched, recorded_channels
 from samii_rig.signal.excitation import swept_sine
 from samii_rig.types import StopRecord

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from samii_rig.run.timebase import INTERVAL, ClockModel, Timed
+from samii_rig.devices.timebase import INTERVAL, ClockModel, Timed
 
 NS = 1e9
 FRAME = 8_000_000  # ns between pairs, as a node with batches of four at 500 Hz gives them

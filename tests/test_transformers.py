@@ -17,7 +17,7 @@ from samii_rig.model.tmm import Chain
 from samii_rig.rig import elements
 from samii_rig.rig.elements import AXIAL, TURNING, input_unit, quantities
 from samii_rig.rig.schema import Rig
-from samii_rig.run.limits import gate_limits
+from samii_rig.safety.limits import gate_limits
 
 F = np.geomspace(0.3, 120.0, 30)
 KINDS = {

@@ -13,7 +13,7 @@ from samii_rig.errors import InputError
 from samii_rig.rig.conversion import in_si
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
-from samii_rig.run.limits import gate_limits
+from samii_rig.safety.limits import gate_limits
 from samii_rig.units import convert, factor, quantity
 
 TWO = load_rig("two_masses")[1]

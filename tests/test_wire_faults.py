@@ -13,9 +13,9 @@ import pytest
 from board_kit import NODES, options
 from wire_kit import Wire, until
 
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.schema import Feedback
-from samii_rig.run.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.types import Quality
 from sim.settings import SimSettings
 from sim.wire.program import read_script
@@ -29,7 +29,7 @@ import json, sys, time
 import numpy as np
 from drivers.serial_node import open_rig
 from samii_rig.rig.schema import Rig
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 
 rig = Rig.model_validate_json(sys.stdin.readline())
 device = open_rig(rig, rig.device.settings)

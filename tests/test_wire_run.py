@@ -12,7 +12,7 @@ from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Device, Rig
 from samii_rig.run.campaign import Outcome, carry_out
 from samii_rig.run.dryrun import predict
-from samii_rig.run.protocols import Plan
+from samii_rig.run.plan import Plan
 
 
 def done(rig: Rig, plan: Plan, path: Path, settings: dict[str, object]) -> Outcome:

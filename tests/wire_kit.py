@@ -10,10 +10,10 @@ from pathlib import Path
 
 from wait_kit import found
 
+from samii_rig.devices.opening import open_device
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Device, Rig
-from samii_rig.run.devices import open_device
-from samii_rig.run.protocols import OpenRig
 
 STARTED_WITHIN = 60.0  # s, with cold caches
 

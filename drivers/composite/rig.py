@@ -6,7 +6,7 @@ samples around it goes a cubic. Nothing is carried on past the newest, and nothi
 sample for which the others are late is held back for a little more than the longest gap that is
 bridged, and then goes out with theirs MISSING.
 
-Each clock is held against the host's (`samii_rig.run.timebase`); how well is in the metadata,
+Each clock is held against the host's (`samii_rig.devices.timebase`); how well is in the metadata,
 and from there in the covariance of every frequency response (`samii_rig.signal.skew`).
 """
 
@@ -22,12 +22,12 @@ from pydantic import ConfigDict, Field
 
 from drivers.composite.sensor import MAIN, Clocks, CompositeSensor, Side
 from drivers.resampling import GAP, Track
+from samii_rig.devices.opening import open_device
+from samii_rig.devices.protocols import OpenRig
+from samii_rig.devices.timebase import ClockModel, Timed
 from samii_rig.errors import DeviceError, InputError, SamiiRigError
 from samii_rig.rig.schema import Device, Name, Positive, Rig, Strict
 from samii_rig.rig.settings import TABLE, checked, wrong
-from samii_rig.run.devices import open_device
-from samii_rig.run.protocols import OpenRig
-from samii_rig.run.timebase import ClockModel, Timed
 
 AGE_PART = 0.5  # of the age at which a channel is stale, that waiting may take
 SETTLE = 3.0  # s within which the clocks must be known

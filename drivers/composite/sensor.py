@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.resampling import Track
+from samii_rig.devices.protocols import DeviceEvent, OpenRig, Reports
+from samii_rig.devices.timebase import ClockFit, ClockModel, Timed
 from samii_rig.errors import DeviceError, SamiiRigError
-from samii_rig.run.protocols import DeviceEvent, OpenRig, Reports
-from samii_rig.run.timebase import ClockFit, ClockModel, Timed
 from samii_rig.signal.skew import KEY, Skew, to_text
 from samii_rig.types import Float, Int, SampleBlock
 

@@ -19,10 +19,10 @@ from drivers.force_torque.frames import AXES, GAUGES, MATRIX, Frames
 from drivers.force_torque.reader import Reader, Reading
 from drivers.force_torque.settings import CanSettings, read_settings
 from drivers.sensing import NoOutput
+from samii_rig.devices.clock import MonotonicClock
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.schema import Rig
-from samii_rig.run.clock import MonotonicClock
-from samii_rig.run.protocols import OpenRig
 from samii_rig.types import Channel, Float, Int, Quality, SampleBlock
 
 # Largest ratio of singular values of a calibration matrix whose rows and columns were brought

@@ -19,9 +19,9 @@ import numpy as np
 
 from drivers.ni_daq.settings import NiSettings, Output
 from drivers.ni_daq.watchdog import SquareWave, Watchdog
+from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import ActuatorSpec
-from samii_rig.run.protocols import CommandBlock, DeviceLoop
 from samii_rig.types import Float
 
 BUFFER = 10.0  # s of samples that the board's buffer holds

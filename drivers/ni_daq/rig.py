@@ -13,10 +13,10 @@ from drivers.ni_daq.board import Board
 from drivers.ni_daq.output import BUFFER, AnalogueOutput, describe
 from drivers.ni_daq.settings import NiSettings, read_settings
 from drivers.sensing import NoOutput
+from samii_rig.devices.clock import MonotonicClock
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.schema import Rig
-from samii_rig.run.clock import MonotonicClock
-from samii_rig.run.protocols import OpenRig
 
 MODULES = ("constants", "types", "system", "system.watchdog")
 

@@ -19,11 +19,11 @@ from pydantic import Field
 from drivers.ports import open_port
 from drivers.quadrature.wire import HALF, VERSION, WORD, Decoder, Sample, Told, request
 from drivers.sensing import NoOutput, taken
+from samii_rig.devices.clock import MonotonicClock
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Finite, Name, NonNegative, Rig, Strict
 from samii_rig.rig.settings import checked, wrong
-from samii_rig.run.clock import MonotonicClock
-from samii_rig.run.protocols import OpenRig
 from samii_rig.types import Channel, Int, Quality, SampleBlock
 
 HELLO_WITHIN = 3.0  # s; a board that resets when its port opens needs two to boot

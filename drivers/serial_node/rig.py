@@ -28,10 +28,10 @@ from drivers.serial_node.wire import (
     reason_text,
     stream_body,
 )
+from samii_rig.devices.clock import MonotonicClock
+from samii_rig.devices.protocols import CommandBlock, DeviceEvent, DeviceLoop, OpenRig
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.schema import Rig
-from samii_rig.run.clock import MonotonicClock
-from samii_rig.run.protocols import CommandBlock, DeviceEvent, DeviceLoop, OpenRig
 from samii_rig.types import Channel, Flags, Int, Quality, SampleBlock
 
 Q16 = 1 << 16

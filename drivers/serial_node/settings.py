@@ -11,7 +11,7 @@ from drivers.serial_node.wire import OVERHEAD, Hello
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Rig, Strict
 from samii_rig.rig.settings import checked, wrong
-from samii_rig.run.limits import MAX_AHEAD
+from samii_rig.safety.limits import MAX_AHEAD
 
 SYMBOL_BITS = 10  # a byte on an asynchronous line: start, 8 data, stop
 RATE_ERROR = 1e-6  # relative difference of node's and rig's sample rate that is none

@@ -28,11 +28,11 @@ def devices(rig: RigOption = "samii", json: JsonOption = False) -> None:
 
     check_rig(rig)
 
+    from samii_rig.devices.opening import drivers
     from samii_rig.errors import SamiiRigError
     from samii_rig.rig.load import load_rig
-    from samii_rig.run.devices import drivers
-    from samii_rig.run.latch import Latch
     from samii_rig.run.session import opened
+    from samii_rig.safety.latch import Latch
 
     the_rig, _ = load_rig(rig)
     ports = _ports()
@@ -242,8 +242,8 @@ def _null(rig: Rig, text: str, where: str, seconds: float, out: Path) -> tuple[s
     from samii_rig.errors import DeviceError, InputError
     from samii_rig.record.reader import read_recording
     from samii_rig.run import calibrate as c
-    from samii_rig.run.limits import gate_limits
     from samii_rig.run.session import still
+    from samii_rig.safety.limits import gate_limits
 
     if rig.centring is None:
         raise InputError(rig.name, "centring", None, "a sensor that shows the joint standing still")
@@ -287,9 +287,9 @@ def clear_fault(
 
     check_rig(rig)
 
+    from samii_rig.devices.opening import close_device, open_device
     from samii_rig.rig.load import load_rig
-    from samii_rig.run.devices import close_device, open_device
-    from samii_rig.run.latch import Latch
+    from samii_rig.safety.latch import Latch
 
     the_rig, _ = load_rig(rig)
     latch = Latch(the_rig.name, the_rig.device.driver)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from samii_rig.report.modes import Modes
     from samii_rig.run.campaign import Outcome
     from samii_rig.run.dryrun import DryRun
-    from samii_rig.run.protocols import Plan
+    from samii_rig.run.plan import Plan
     from samii_rig.run.setups import Setup
 
 # Exit codes of a run that did not go through; the recording is whole in each case.

@@ -30,7 +30,7 @@ from samii_rig.control.plants import uncertain as draws_uncertain
 from samii_rig.errors import InputError
 from samii_rig.model.loops import Loops, loops_of
 from samii_rig.rig.schema import Acceleration, Feedback, Rig
-from samii_rig.run.limits import find_actuator, gate_limits
+from samii_rig.safety.limits import find_actuator, gate_limits
 from samii_rig.types import Float
 
 MOST_POLES = 4

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from samii_rig.devices.plugins import asked, named, wrong
 from samii_rig.diagnose import bodies, channels, insert, less
 from samii_rig.diagnose.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.insert import DISPLACEMENT, VOLUME
@@ -33,7 +34,6 @@ from samii_rig.rig.schema import (
     TranslationalGroundSpring,
     TranslationalSpring,
 )
-from samii_rig.run.plugins import asked, named, wrong
 from samii_rig.types import Complex, Float
 
 Law = Literal["spring", "softness", "column", "damper", "slip", "mass"]

@@ -24,7 +24,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
-from samii_rig.run.protocols import Experiment
+from samii_rig.run.plan import Experiment
 from samii_rig.types import Complex, FrequencyResponse
 
 SEED = 20  # of every simulated run here

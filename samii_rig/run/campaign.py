@@ -14,22 +14,22 @@ from importlib import metadata
 from pathlib import Path
 from threading import Event
 
+from samii_rig.devices.opening import close_device, open_device
 from samii_rig.errors import SamiiRigError
 from samii_rig.record.reader import read_frequency_responses, read_recording
 from samii_rig.record.writer import RunWriter
 from samii_rig.rig.schema import Rig
-from samii_rig.run.devices import close_device, open_device
 from samii_rig.run.dryrun import DryRun
 from samii_rig.run.ending import finish
 from samii_rig.run.interrupts import Interrupts
-from samii_rig.run.latch import Latch
 from samii_rig.run.loop import run
 from samii_rig.run.pace import LoopSettings
+from samii_rig.run.plan import Plan
 from samii_rig.run.priority import prioritised
 from samii_rig.run.progress import Progress
-from samii_rig.run.protocols import Plan
 from samii_rig.run.sink import Watched, recorded_channels
 from samii_rig.run.space import room_for
+from samii_rig.safety.latch import Latch
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import FrequencyResponse, Recording, SampleBlock, StopRecord
 
@@ -73,7 +73,7 @@ def carry_out(
     """Run `plan` on the rig's device into the recording `path`, estimate, close.
 
     However the run ends, the recording is whole and says how; what was measured until then
-    is estimated where it suffices. A FAULT on a real rig is latched (`samii_rig.run.latch`), and
+    is estimated where it suffices. A FAULT on a real rig is latched (`samii_rig.safety.latch`), and
     while one is, nothing is opened. alive, loop : see `samii_rig.run.loop.run`. watch : gets
     every block after it was recorded, for a display; it must neither wait nor raise. at_rest : is
     told how the run ended once nothing moves, before the estimate is made and the recording closed.

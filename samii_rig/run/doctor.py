@@ -11,14 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import GateError, SamiiRigError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.check import Check
-from samii_rig.run.latch import Latch
-from samii_rig.run.limits import gate_limits
 from samii_rig.run.priority import prioritised
 from samii_rig.run.protections import own_protections
-from samii_rig.run.protocols import OpenRig
 from samii_rig.run.session import (
     PULSE,
     PULSE_PART,
@@ -28,6 +26,8 @@ from samii_rig.run.session import (
     pulse,
     sleep_lateness,
 )
+from samii_rig.safety.latch import Latch
+from samii_rig.safety.limits import gate_limits
 
 LISTEN = 2.0  # s
 LATE = 0.01  # s that a sleep may end too late at worst

@@ -36,9 +36,9 @@ from samii_rig.rig.schema import (
 )
 from samii_rig.run.dwell import ways
 from samii_rig.run.expected import BandError, expected_errors
-from samii_rig.run.limits import find_actuator, gate_limits
 from samii_rig.run.margins import Margin, margins, worse_of
-from samii_rig.run.protocols import Plan
+from samii_rig.run.plan import Plan
+from samii_rig.safety.limits import find_actuator, gate_limits
 from samii_rig.types import Complex, Float
 
 WRAP = 1e-3  # what is left of the signal after one turn of the transform

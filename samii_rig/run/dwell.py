@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from samii_rig.errors import InputError
-from samii_rig.run.protocols import Dwell, Plan, PlannedSegment
+from samii_rig.run.plan import Dwell, Plan, PlannedSegment
 from samii_rig.signal.stepped import line
 from samii_rig.types import Channel, Complex, Int, Quality, SampleBlock
 

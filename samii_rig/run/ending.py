@@ -9,11 +9,11 @@ from typing import Literal
 
 import numpy as np
 
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, DiskError, RecordingError, SamiiRigError
 from samii_rig.record.reader import read_recording
 from samii_rig.record.writer import RunWriter
-from samii_rig.run.limits import ChannelLimit
-from samii_rig.run.protocols import OpenRig
+from samii_rig.safety.limits import ChannelLimit
 from samii_rig.types import SampleBlock, StopRecord
 
 # s after zero within which the read-back must show it: samples on their way at that moment

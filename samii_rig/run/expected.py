@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from samii_rig.rig.schema import Rig
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.signal.groups import Piece
 from samii_rig.signal.periodic import first_used
 from samii_rig.signal.spectra import comb, spectrum

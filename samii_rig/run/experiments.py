@@ -8,13 +8,14 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
+from samii_rig.devices.plugins import asked, named
 from samii_rig.errors import InputError, one_of
 from samii_rig.rig.load import parse, read_text, tables
 from samii_rig.rig.schema import Rig
 from samii_rig.run.catalogue import kinds as kinds
 from samii_rig.run.catalogue import shipped as shipped
-from samii_rig.run.plugins import asked, checked_plan, named
-from samii_rig.run.protocols import Experiment, Plan
+from samii_rig.run.plan import Experiment, Plan
+from samii_rig.run.plugins import checked_plan
 
 
 def fitting(rig: Rig) -> dict[str, Traversable]:

@@ -16,19 +16,20 @@ from threading import Event
 
 import numpy as np
 
+from samii_rig.devices.protocols import CommandBlock, OpenRig, Reports
 from samii_rig.errors import DeviceError, GateError, RecordingError, SamiiRigError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.dwell import Reference, Watch
 from samii_rig.run.ending import Status, Zero, attempt, with_troubles
-from samii_rig.run.gate import Gate, GateEvent
 from samii_rig.run.interrupts import Interrupts
-from samii_rig.run.judgement import State
-from samii_rig.run.latest import CLOCK_DRIFT
-from samii_rig.run.limits import gate_limits
 from samii_rig.run.pace import COUNTS_AS_LATE, LoopSettings, choose_ahead, choose_tick
+from samii_rig.run.plan import Plan
 from samii_rig.run.progress import Progress, nearer
-from samii_rig.run.protocols import CommandBlock, OpenRig, Plan, Reports
 from samii_rig.run.sink import Collector, QueuedSink, Sink, pair_clocks
+from samii_rig.safety.gate import Gate, GateEvent
+from samii_rig.safety.judgement import State
+from samii_rig.safety.latest import CLOCK_DRIFT
+from samii_rig.safety.limits import gate_limits
 from samii_rig.types import Quality, SampleBlock, Segment, StopRecord
 
 FIRST_SAMPLE = 1.0  # s to wait for the device's first sample

@@ -10,8 +10,8 @@ import numpy as np
 
 from samii_rig.model.feedback import reach
 from samii_rig.rig.schema import Rig, Sensor
-from samii_rig.run.limits import GateLimits
-from samii_rig.run.protocols import Plan
+from samii_rig.run.plan import Plan
+from samii_rig.safety.limits import GateLimits
 from samii_rig.types import Float
 
 SIGMAS = 5.0  # of the sensor's noise; passed once in 1.7 million samples

@@ -14,9 +14,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import InputError
-from samii_rig.run.limits import MAX_AHEAD
-from samii_rig.run.protocols import OpenRig
+from samii_rig.safety.limits import MAX_AHEAD
 
 TICK = 0.02  # s between looks at the device, where its deadman allows that
 LATE = 0.04  # s that the host may be late without any consequence

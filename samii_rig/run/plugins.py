@@ -1,65 +1,17 @@
-"""Somebody else's experiments and devices: what goes wrong in them is one line with their name.
-
-An entry point may come from any package. What it raises, or returns in place of what it promised,
-is told as wrong input, so that a command neither ends with a traceback nor, on a SystemExit, as if
-all had gone well.
-"""
+"""Somebody else's experiments: a plan that is not one is told as wrong input, field by field."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
-from importlib.metadata import EntryPoint
 from typing import get_args
 
 import numpy as np
 
-from samii_rig.errors import InputError, SamiiRigError, one_of
+from samii_rig.devices.plugins import wrong
+from samii_rig.errors import InputError, one_of
 from samii_rig.rig.schema import Rig
-from samii_rig.run.protocols import Actuator, Clock, Dwell, OpenRig, Plan, PlannedSegment, Sensor
-from samii_rig.types import Channel, Kind
-
-
-def named(point: EntryPoint) -> str:
-    """An entry point as its package declares it."""
-    return f"entry point {point.name} = {point.value}"
-
-
-@contextmanager
-def asked(who: str, what: str) -> Iterator[None]:
-    """Around a call of `what` in the code behind the entry point `who`: whatever that raises but
-    our own errors and Ctrl-C becomes an InputError."""
-    try:
-        yield
-    except (SamiiRigError, KeyboardInterrupt):
-        raise
-    except BaseException as error:
-        text = " ".join(str(error).split())
-        said = f"{type(error).__name__}: {text}" if text else type(error).__name__
-        raise InputError.saying(who, what, f"raised {said}") from error
-
-
-def wrong(who: str, what: str, value: object, expected: str) -> InputError:
-    """The code behind the entry point `who` gave `value` as `what`."""
-    return InputError(who, what, value, expected)
-
-
-def checked_device(opened: object, who: str) -> OpenRig:
-    """What a driver returned, if it is a rig whose parts are there; else InputError."""
-    if not isinstance(opened, OpenRig):
-        raise InputError.saying(who, "", f"returned {type(opened).__name__}; expected an OpenRig")
-    for part, kind in (("actuator", Actuator), ("sensor", Sensor), ("clock", Clock)):
-        found = getattr(opened, part)
-        if not isinstance(found, kind):
-            raise wrong(who, part, found, f"what has all of a {kind.__name__}")
-    channels, told = opened.sensor.channels, opened.metadata
-    if not (isinstance(channels, tuple) and all(isinstance(c, Channel) for c in channels)):
-        raise wrong(who, "sensor.channels", channels, "a tuple of Channel")
-    texts = isinstance(told, dict) and all(isinstance(x, str) for kv in told.items() for x in kv)
-    if not texts:
-        raise wrong(who, "metadata", told, "texts by name")
-    return opened
+from samii_rig.run.plan import Dwell, Plan, PlannedSegment
+from samii_rig.types import Kind
 
 
 def checked_plan(plan: object, rig: Rig, who: str) -> Plan:

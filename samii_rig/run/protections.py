@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from samii_rig.devices.protocols import CommandBlock, OpenRig, Reports
 from samii_rig.errors import DeviceError, GateError, SamiiRigError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.check import Check
-from samii_rig.run.gate import FLIGHT, Gate
-from samii_rig.run.limits import MAX_AHEAD, gate_limits
-from samii_rig.run.protocols import CommandBlock, OpenRig, Reports
 from samii_rig.run.session import listen, opened
+from samii_rig.safety.gate import FLIGHT, Gate
+from samii_rig.safety.limits import MAX_AHEAD, gate_limits
 from samii_rig.types import Quality, SampleBlock
 
 AHEAD = 0.025  # s from a reference to its first sample; half the shortest deadman there is

@@ -17,18 +17,19 @@ from pathlib import Path
 
 import numpy as np
 
+from samii_rig.devices.opening import close_device, open_device
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.files import make_folder
 from samii_rig.record.writer import RunWriter
 from samii_rig.rig.schema import Rig
-from samii_rig.run.devices import close_device, open_device
 from samii_rig.run.ending import finish
-from samii_rig.run.latch import Latch
-from samii_rig.run.limits import gate_limits
 from samii_rig.run.loop import run
+from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.run.priority import prioritised
-from samii_rig.run.protocols import OpenRig, Plan, PlannedSegment
 from samii_rig.run.sink import recorded_channels
+from samii_rig.safety.latch import Latch
+from samii_rig.safety.limits import gate_limits
 from samii_rig.types import Float, SampleBlock, StopRecord
 
 FASTEST = 0.2  # of the centring sensor's unit per s, at which a person can still step back

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
+from samii_rig.devices.plugins import asked, wrong
 from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import Outcome
 from samii_rig.run.experiments import origin
-from samii_rig.run.plugins import asked, wrong
 
 
 @dataclass(frozen=True, slots=True)

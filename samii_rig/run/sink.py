@@ -13,7 +13,7 @@ import numpy as np
 from samii_rig.errors import DeviceError, DiskError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.dwell import Reference
-from samii_rig.run.protocols import Plan
+from samii_rig.run.plan import Plan
 from samii_rig.types import Channel, Quality, SampleBlock, Segment
 
 # s that the recorder may still write after the run: a queue that is full on a disk of a few

@@ -11,7 +11,7 @@ from samii_rig.errors import DiskError
 from samii_rig.record.appender import INDEX_BYTES
 from samii_rig.record.layout import SampleLayout
 from samii_rig.rig.schema import Rig
-from samii_rig.run.protocols import Plan
+from samii_rig.run.plan import Plan
 from samii_rig.types import Channel
 
 REFERENCES = 2  # columns beside the device's own: u and theta_ref

@@ -32,7 +32,7 @@ from samii_rig.record.reader import read_events, read_recording
 from samii_rig.record.writer import PARTIAL
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
-from samii_rig.run.protocols import Plan
+from samii_rig.run.plan import Plan
 from samii_rig.serve.following import following
 from samii_rig.serve.job import RESPONSES, RIG, SO_FAR, Job
 from samii_rig.serve.live import LiveReader

@@ -124,12 +124,12 @@ def dry_run(rig_toml: str, name: str, text: str) -> dict[str, Any]:
     name : of a shipped experiment, or `text` : of its file. No path from a client is ever opened.
     refused : the line of what limit would be broken, "" if none. text : of the experiment.
     """
+    from samii_rig.devices.plugins import asked
     from samii_rig.errors import InputError, LimitError, one_of
     from samii_rig.rig.load import parse
     from samii_rig.rig.schema import Rig
     from samii_rig.run.dryrun import predict
     from samii_rig.run.experiments import load_experiment, plan_of, shipped
-    from samii_rig.run.plugins import asked
     from samii_rig.run.setups import setups_of
     from samii_rig.serve.words import prediction
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.run.experiments import load_experiment, plan_of
-from samii_rig.run.protocols import Plan
+from samii_rig.run.plan import Plan
 from samii_rig.run.setups import Setup, setups_of
 from samii_rig.serve.job import EXPERIMENT, RIG, Job
 

@@ -16,7 +16,7 @@ from fastapi import Request, WebSocket
 from samii_rig.errors import GateError, InputError, SamiiRigError
 from samii_rig.index.entry import Entry
 from samii_rig.index.store import Index
-from samii_rig.run.latch import Latch
+from samii_rig.safety.latch import Latch
 from samii_rig.serve import desk
 from samii_rig.serve.access import Person
 from samii_rig.serve.analysis import Analysis

@@ -26,10 +26,10 @@ from samii_rig.errors import GateError, SamiiRigError
 from samii_rig.index.remarks import add_note, set_diagnosis
 from samii_rig.run.campaign import Outcome, carry_out
 from samii_rig.run.dryrun import predict
-from samii_rig.run.limits import gate_limits
+from samii_rig.run.plan import Plan
 from samii_rig.run.progress import Progress
-from samii_rig.run.protocols import Plan
 from samii_rig.run.setups import Setup
+from samii_rig.safety.limits import gate_limits
 from samii_rig.serve.following import following
 from samii_rig.serve.job import DIAGNOSIS, LOST_AFTER, Job, JobState
 from samii_rig.serve.live import LiveWriter, live_folder

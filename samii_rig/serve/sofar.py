@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from samii_rig.errors import EstimateError, InputError
-from samii_rig.run.protocols import Plan, PlannedSegment
+from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.signal.choose import Method
 from samii_rig.signal.estimate import estimate
 from samii_rig.signal.spectra import period

@@ -18,12 +18,12 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
+from samii_rig.devices.opening import open_device
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.diagnose.rigfile import toml
 from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Device, Rig, Strict
 from samii_rig.rig.settings import checked
-from samii_rig.run.devices import open_device
-from samii_rig.run.protocols import OpenRig
 from sim.wire.faults import script
 from sim.wire.plant import board
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from samii_rig.run.protocols import CommandBlock
+from samii_rig.devices.protocols import CommandBlock
 from samii_rig.types import Channel, Float, Quality, SampleBlock
 
 # What says nothing of what the device reckoned with; a changed output is judged by its flag.

@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from samii_rig.devices.protocols import Actuator, CommandBlock
 from samii_rig.errors import GateError
-from samii_rig.run.agreement import Followed, apart
-from samii_rig.run.judgement import (
+from samii_rig.safety.agreement import Followed, apart
+from samii_rig.safety.judgement import (
     Act,
     Arm,
     Check,
@@ -30,10 +31,9 @@ from samii_rig.run.judgement import (
     Write,
     decide,
 )
-from samii_rig.run.latest import Latest, observe
-from samii_rig.run.limits import GateLimits
-from samii_rig.run.protocols import Actuator, CommandBlock
-from samii_rig.run.readback import Places, Sent, stray
+from samii_rig.safety.latest import Latest, observe
+from samii_rig.safety.limits import GateLimits
+from samii_rig.safety.readback import Places, Sent, stray
 from samii_rig.types import Channel, SampleBlock
 
 FLIGHT = 0.05  # s that a sample may take from the device to here
@@ -61,7 +61,7 @@ class Gate:
     Every method takes `now`, ns on the host's clock. Those that ask raise GateError when
     refused, with the output already at zero.
 
-    FAULT is latched as long as this object lives; `samii_rig.run.latch` carries it on to the
+    FAULT is latched as long as this object lives; `samii_rig.safety.latch` carries it on to the
     next run.
     """
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from importlib import metadata
 
+from samii_rig.devices.plugins import asked, checked_device, named
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, InputError, SamiiRigError, one_of
 from samii_rig.rig.schema import Rig
-from samii_rig.run.plugins import asked, checked_device, named
-from samii_rig.run.protocols import OpenRig
 
 GROUP = "samii_rig.devices"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from samii_rig.devices.protocols import DeviceLoop
 from samii_rig.errors import InputError
 from samii_rig.model.feedback import reach
 from samii_rig.rig import schema
@@ -23,8 +24,7 @@ from samii_rig.rig.schema import (
     TranslationalGroundSpring,
     VelocitySource,
 )
-from samii_rig.run.agreement import Agreement
-from samii_rig.run.protocols import DeviceLoop
+from samii_rig.safety.agreement import Agreement
 
 # How long the read-back of an actuator without a deadman may be missing, s. Such an
 # actuator is never armed, so the number only has to be defined.

@@ -15,10 +15,10 @@ from enum import Enum
 
 import numpy as np
 
-from samii_rig.run.latest import Latest
-from samii_rig.run.limits import ChannelLimit, GateLimits
-from samii_rig.run.protocols import CommandBlock
-from samii_rig.run.readback import Sent, travel
+from samii_rig.devices.protocols import CommandBlock
+from samii_rig.safety.latest import Latest
+from samii_rig.safety.limits import ChannelLimit, GateLimits
+from samii_rig.safety.readback import Sent, travel
 
 # How much beyond its limit a prediction may lead an angle: the source alone knows nothing of the
 # joint's spring, and what is measured beyond the limit trips anyway.

@@ -21,8 +21,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO
 
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, GateError, InputError
-from samii_rig.run.protocols import OpenRig
 
 if sys.platform != "win32":
     import fcntl
