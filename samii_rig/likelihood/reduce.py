@@ -32,6 +32,7 @@ WIDEST = 0.1  # nodes, apart over frequency at most
 BELOW = 2**0.5  # the same, below the band: a change of 1/s is linear between them to 3 %
 ENOUGH = 0.75  # lines over unknowns of a change, from which a piece shows its noise by itself
 RIDGES, MORE = 5, 30.0  # tries of a ridge, each so many times the one before
+CYCLES = 5  # in a record, of its lowest line: below, wandering is as large as what polynomials leave
 AT_ONCE = 4096  # lines whose products are formed together: 30 MB at 120 nodes
 SAME = 1e-9  # of the largest, power in a direction that columns do not have
 
@@ -144,7 +145,7 @@ class Records:
         n = len(piece.z)
         band = self.bands[next(i for i, p in enumerate(self.pieces) if p is piece)]
         low, high = (f * n / self.rate_hz for f in band)
-        k = np.arange(max(1, int(np.ceil(low))), min(int(high), (n - 1) // 2) + 1)
+        k = np.arange(max(CYCLES, int(np.ceil(low))), min(int(high), (n - 1) // 2) + 1)
         return Lines(k, np.asarray(k * (self.rate_hz / n), np.float64))
 
     def left(self, samples: Samples | Piece, k: Int, H: Complex, contour: Contour) -> Complex:
@@ -382,9 +383,11 @@ def _nuisances(
     k, exact = records.lines(piece).k, records.exact()
     own = [nuisance.wander(len(piece.z), k, piece.z.shape[1])]
     own += [nuisance.past(piece, k, H, exact)] if piece.moving else []
+    own += [nuisance.unread(piece, k, H, exact, loop, records.step)]
     own += [nuisance.offsets(piece, k, H, exact, loop)]
     N = np.concatenate(own, axis=2)
-    return np.asarray(N / np.linalg.norm(N, axis=(0, 1)))
+    size = np.linalg.norm(N, axis=(0, 1))
+    return np.asarray(N[:, :, size > 0] / size[size > 0])
 
 
 def _without(e: Complex, N: Complex) -> tuple[Complex, Float]:

@@ -4,7 +4,7 @@ A rounding error is white, of step^2/12, where the motion crosses steps. Two thi
 - Under an input that repeats itself the error repeats itself too, but for what noise of sd sigma
   dithers: of harmonic h of a sawtooth, 6/(pi h)^2 of its power, exp(-(2 pi h sigma/step)^2) is
   the same in all repeats (Widrow and Kollar 2008, Quantization Noise, ch. 4).
-- Where the motion stays within a step, what is read does not move, and the error is the motion.
+- Where the motion stays within few steps, what is read is not in proportion to it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,14 @@ from samii_rig.types import Complex, Float
 
 WHITE = 1 / 12  # of a step, squared
 HARMONIC = np.arange(1.0, 200.0)  # of a sawtooth: all but 0.3 % of its power
+# Steps within which a motion is not read in proportion: the describing function of a staircase
+# is within 10 % of 1 from here on.
+FEW = 3.0
 SHORT = 0.5  # s in which a motion that crosses no step is not read: some periods of the band
 ALIKE = 0.05  # of a rounding error, that repeats itself: repeats do not show it
+# Of the power of what is not read, that is left where a factor of its own was taken out: it varies
+# from none to all over the amplitudes within a step.
+LEFT = 0.25
 AROUND = 5  # lines over which the power of what is not read is the mean
 
 
@@ -71,7 +77,6 @@ def added(
 
 def _of_piece(piece: Piece, step: Float, H: Complex, exact: Contour) -> tuple[Float, Float]:
     n, q = piece.z.shape
-    count = 1 + len(piece.repeats) + len(piece.contrasts)
     frequency = np.asarray(np.fft.rfftfreq(n, 1 / exact.rate_hz), np.float64)
     power = np.zeros((frequency.size, q))
     if not np.any(step > 0):
@@ -80,15 +85,16 @@ def _of_piece(piece: Piece, step: Float, H: Complex, exact: Contour) -> tuple[Fl
     y = exact.record(H * exact.damped(piece.r)[:, None], piece.r.size)[piece.r.size - n :]
     for i in np.flatnonzero(step > 0):
         power[:, i] = WHITE * step[i] ** 2 * (1 + len(piece.repeats) * same[i])
-        still = _still(y[:, i] / math.sqrt(count), step[i], exact.rate_hz)
-        if still.any():
-            unread = np.abs(np.fft.rfft(np.where(still, y[:, i] - np.mean(y[still, i]), 0.0))) ** 2
-            power[:, i] += ndimage.uniform_filter1d(unread / n, AROUND)
+        part = within(piece, y[:, i], float(step[i]), exact.rate_hz)
+        unread = np.abs(np.fft.rfft(part)) ** 2 / n
+        power[:, i] += LEFT * ndimage.uniform_filter1d(unread, AROUND)
     return frequency, power
 
 
-def _still(y: Float, step: float, rate_hz: float) -> np.ndarray:
-    """(n,) where a motion y (n,) stays within a step."""
+def within(piece: Piece, y: Float, step: float, rate_hz: float) -> Float:
+    """(n,) what of the motion y (n,) of a sensor stays within few steps, less its mean."""
+    times = math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
     width = max(int(SHORT * rate_hz), 3)
     high, low = ndimage.maximum_filter1d(y, width), ndimage.minimum_filter1d(y, width)
-    return np.asarray(high - low < step)
+    still = high - low < FEW * step * times
+    return np.where(still, y - np.mean(y[still]), 0.0) if still.any() else np.zeros(y.size)
