@@ -84,6 +84,7 @@ class Effect:
     write : the rig as a file would have it, from the built rig and the unknowns.
     weight : prior weight against the other hypotheses.
     report : physical quantities to be reported, from the unknowns.
+    resonant : whether it acts in a narrow band that may be anywhere.
     rough : part of what it does by which its law is known to be off; 0 for one that holds.
     variant : tells effects with one name and different changes apart.
     """
@@ -103,6 +104,7 @@ class Effect:
     aliases: tuple[tuple[str, str], ...] = field(default=())
     report: Callable[[Float], Float] = lambda x: x
     rough: float = 0.0
+    resonant: bool = False
     variant: str = ""
 
     @property

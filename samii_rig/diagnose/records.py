@@ -31,7 +31,7 @@ from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.noise import Disturbances
 from samii_rig.likelihood.pieces import Piece, Wiring, joined, pieces_of, wiring
-from samii_rig.likelihood.reduce import Left, Records, Reduced, Response, left_by, reduced
+from samii_rig.likelihood.reduce import CYCLES, Left, Records, Reduced, Response, left_by, reduced
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned
 from samii_rig.signal.groups import segments_of
@@ -175,7 +175,9 @@ def _records(
 ) -> Records:
     """Those that anything drives."""
     driven = [(p, b) for p, b in zip(pieces, excited(pieces, rig.rate_hz), strict=True) if b]
-    bands = tuple(band or (float(b[0]), float(b[1])) for _, b in driven)
+    if not driven:
+        raise EstimateError("nothing drives the rig for five cycles of any line")
+    bands = tuple(band or b for _, b in driven)
     return Records(tuple(p for p, _ in driven), rig.rate_hz, bands, step)
 
 
@@ -189,8 +191,12 @@ def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float]
     for piece, R in zip(pieces, spectra, strict=True):
         f = np.arange(R.size) * (rate_hz / piece.r.size)
         on = np.flatnonzero(R[2:] > least) + 2
-        highest = HIGHEST * rate_hz
-        out.append((f[on[0]] / WIDER, min(WIDER * f[on[-1]], highest)) if on.size else None)
+        if not on.size:
+            out.append(None)
+            continue
+        lowest, highest = CYCLES * rate_hz / len(piece.z), HIGHEST * rate_hz
+        low, high = max(f[on[0]] / WIDER, lowest), min(WIDER * f[on[-1]], highest)
+        out.append((float(low), float(high)) if high - low > CYCLES * f[1] else None)
     return out
 
 
@@ -367,9 +373,15 @@ class RecordSearch(Search):
     def worth(self) -> float:
         """As of `Explanations`: with `ALARM`, noise reaches it in the best of the whole table."""
         unknowns = np.array([max(len(e.unknowns), 1) for e in self.table])
+        tries = np.ones(unknowns.size)
+        # What resonates is looked for at every line: as many tries of its mass and phase, alike at
+        # neighbouring places (a bound of the maximum of a scan; Davies 1987, Biometrika 74).
+        resonant = np.array([e.resonant for e in self.table], bool)
+        unknowns[resonant] = 2
+        tries[resonant] = 2 * self.whole.lines / max(np.count_nonzero(resonant), 1)
 
         def chance(t: float) -> float:
-            return float(np.sum(stats.chi2.sf(t, unknowns))) - ALARM
+            return float(tries @ stats.chi2.sf(t, unknowns)) - ALARM
 
         return float(optimize.brentq(chance, 1.0, HIGHEST_WORTH))
 

@@ -61,7 +61,7 @@ def unread(
     step: Float,
 ) -> Complex:
     """(n_lines, q, m) of motion that a converter hardly reads, as it stays within a step: rounding
-    scales it by a factor that nobody knows, and the loop is told so. In parts of equal power, as the
+    scales it by a factor that nobody knows, and the loop is told so. In parts of equal power: the
     factor depends on the amplitude."""
     n, q = piece.z.shape
     y = contour.record(H * contour.damped(piece.r)[:, None], piece.r.size)[piece.history :]

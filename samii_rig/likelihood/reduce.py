@@ -32,7 +32,9 @@ WIDEST = 0.1  # nodes, apart over frequency at most
 BELOW = 2**0.5  # the same, below the band: a change of 1/s is linear between them to 3 %
 ENOUGH = 0.75  # lines over unknowns of a change, from which a piece shows its noise by itself
 RIDGES, MORE = 5, 30.0  # tries of a ridge, each so many times the one before
-CYCLES = 5  # in a record, of its lowest line: below, wandering is as large as what polynomials leave
+CYCLES = (
+    5  # in a record, of its lowest line: below, wandering is as large as what polynomials leave
+)
 AT_ONCE = 4096  # lines whose products are formed together: 30 MB at 120 nodes
 SAME = 1e-9  # of the largest, power in a direction that columns do not have
 
