@@ -379,6 +379,7 @@ def _prediction(predicted: DryRun) -> dict[str, Any]:
                 "high_hz": b.high_hz,
                 "std": b.std,
                 "relative": b.relative,
+                **({"input": b.input} if b.input else {}),
             }
             for b in predicted.bands
         ],
