@@ -21,7 +21,7 @@ from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import _Run
 from samii_rig.run.pace import LoopSettings
 from samii_rig.run.plan import Output, Plan, PlannedSegment
-from samii_rig.safety.judgement import State
+from samii_rig.safety.judgement import State, violation
 from samii_rig.safety.latest import Latest
 from samii_rig.types import Quality, SampleBlock
 
@@ -344,9 +344,9 @@ class GateAndPair(GateAndLoop):
     """The same run with two outputs, of which one is at fault."""
 
     @initialize(
-        level=st.sampled_from([0.1, 1.0, 3.0, 6.0]),
-        beat=st.sampled_from([True, True, False]),
-        ticks=st.sampled_from([-1, 0, 1, 5, 20, 45]),
+        level=st.sampled_from([0.1, 0.3, 1.0, 6.0]),
+        beat=st.sampled_from([True, True, True, False]),
+        ticks=st.sampled_from([-1, 1, 5, 10, 20, 20, 45]),
         place=st.sampled_from([0, 1]),
     )
     def open(self, level: float, beat: bool, ticks: int, place: int) -> None:
@@ -360,9 +360,9 @@ class GateAndPair(GateAndLoop):
     @precondition(lambda self: self.begun and self.ended is None)
     @rule(
         level=st.sampled_from([0.0, 5.5, float("nan")]),
-        gap=st.sampled_from([0, 1, -1, 300]),
-        apart=st.sampled_from([0, 0, 1]),
-        n=st.sampled_from([1, 2, 2, 3]),
+        gap=st.sampled_from([0, 0, 0, 1, -1, 300]),
+        apart=st.sampled_from([0, 0, 0, 1]),
+        n=st.sampled_from([1, 2, 2, 2, 3]),
     )
     def something_else_writes(self, level: float, gap: int, apart: int, n: int) -> None:
         """A defect above the gate: blocks that are not the loop's, too few, or not together."""
@@ -384,3 +384,4 @@ class GateAndPair(GateAndLoop):
     def judged_well(self) -> None:
         for lane in self.job.gate._lanes:
             self.fresh(lane.latest, self.judged)
+            assert violation(lane.latest, lane.limits, self.judged) is None

@@ -10,7 +10,7 @@ from hypothesis import settings
 
 GateAndLoop.TestCase.settings = settings(max_examples=120, stateful_step_count=25, derandomize=True)
 TestGateAndLoop = GateAndLoop.TestCase
-GateAndPair.TestCase.settings = settings(max_examples=120, stateful_step_count=25, derandomize=True)
+GateAndPair.TestCase.settings = settings(max_examples=150, stateful_step_count=25, derandomize=True)
 TestGateAndPair = GateAndPair.TestCase
 
 GATE = ("gate", "judgement", "lane", "latest", "readback")
