@@ -74,6 +74,8 @@ def expected_errors(
                 sigma = math.hypot(sensor.noise_rms, sensor.resolution / math.sqrt(12))
                 std = sigma * math.sqrt(n / len(members)) / V[inside]
                 H = np.interp(f[inside], hz, size[:, i])
+                if not H.all():
+                    continue  # this input does not move it at all
                 out.append(
                     BandError(
                         sensor.name,
@@ -110,7 +112,10 @@ def _stepped(
             for i, sensor in enumerate(rig.sensor):
                 sigma = math.hypot(sensor.noise_rms, sensor.resolution / math.sqrt(12))
                 std = sigma * np.sqrt(length[inside]) / drive[inside]
-                relative = std / np.interp(at[inside], hz, size[:, i])
+                H = np.interp(at[inside], hz, size[:, i])
+                if not H.all():
+                    continue
+                relative = std / H
                 middle = float(np.median(std)), float(np.median(relative))
                 out.append(BandError(sensor.name, level, unit, low, high, *middle))
     return out
