@@ -27,7 +27,7 @@ from samii_rig.devices.protocols import CommandBlock, DeviceLoop, OpenRig
 from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Rig
 from sim import kernel
-from sim.base import SimulatedRig
+from sim.base import SimulatedRig, device_channels
 from sim.electronics import check_block, control, converters, drive, filters, references
 from sim.plant import tabulate
 from sim.settings import SimSettings, read_settings
@@ -99,6 +99,12 @@ class SimulatedDevice(SimulatedRig):
             quality,
         )
         self._keep(first, values, quality)
+
+
+def check_rig(rig: Rig, settings: Mapping[str, object]) -> None:
+    """InputError for a wrong setting, or a channel with the name of a reference."""
+    read_settings(rig, settings)
+    device_channels(rig)
 
 
 def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
