@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, replace
+from itertools import compress
 from pathlib import Path
 from typing import Any
 
@@ -213,8 +214,11 @@ def _noise(rng: Rng, setup: Setup, style: Style, control: Control) -> Noise:
     pushes = _pushes(rng, setup)
     corner = np.exp(rng.uniform(np.log(1.0), np.log(40.0), len(pushes)))
     effect = unit_effect(_loop(setup, control, pushes), corner, style.rate_hz)
+    # What nothing of this rig answers to disturbs nothing, as a floor under what only turns.
+    felt = (effect > 0).any(axis=0)
+    pushes, corner, effect = tuple(compress(pushes, felt)), corner[felt], effect[:, felt]
     share = np.exp(rng.uniform(np.log(0.3), np.log(3.0), len(pushes)))
-    rms = share / np.sqrt(len(pushes)) / (effect / floor[:, None]).max(axis=0)
+    rms = share / np.sqrt(max(1, len(pushes))) / (effect / floor[:, None]).max(axis=0)
     has = {name: float(name in style.options) for name in ("wander", "hum", "spikes")}
     draws = rng.uniform(2.0, 10.0, n_y), rng.uniform(0.0, 5.0, n_y), rng.uniform(10.0, 60.0, n_y)
     return Noise(
@@ -234,6 +238,7 @@ def _pushes(rng: Rng, setup: Setup) -> tuple[Push, ...]:
     """One to three disturbances at places where they make sense."""
     joints = [p.name for p in setup.parts if p.kind in JOINTS]
     hosts = [p for p in setup.parts if p.kind in (*EXTENDED, "lumped_mass")]
+    hosts = [p for p in hosts if p.name in setup.shifting()] or hosts
     host = hosts[int(rng.integers(len(hosts)))]
     choice = [
         Push("joint", str(rng.choice(joints))) if joints else Push("valve"),
