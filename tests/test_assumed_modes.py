@@ -30,7 +30,7 @@ from samii_rig.rig.schema import (
     TranslationalSpring,
 )
 from sim.assumed_modes import __main__ as command
-from sim.assumed_modes import effects, forces, kernel, make, outside, ritz, styles, trial
+from sim.assumed_modes import effects, forces, kernel, make, outside, ritz, size, styles, trial
 from sim.assumed_modes.noise import noise_model, whitener
 from sim.assumed_modes.parts import Attachment, Force, Part, Setup, nominal, setup_of
 from sim.assumed_modes.plant import plant
@@ -379,7 +379,8 @@ def test_the_truth_explains_the_record_and_the_rig_file_does_not(tmp_path: Path)
     folder = make("one", seed, tmp_path, _samii(), STYLE)
     rngs = [np.random.default_rng([seed, trial.KINDS.index("one"), k]) for k in range(3)]
     scene = trial.scene_of(rngs[0], rngs[1], parse(Rig, _samii(), "samii"), STYLE)
-    (hidden,) = trial._concealed(rngs[2], "one", scene, trial.nominal_refit(scene))
+    wanted = trial.Wanted("one", "", size.CLOSE)
+    (hidden,) = trial._concealed(rngs[2], wanted, scene, trial.nominal_refit(scene))
     run = read_recording(folder / "run_01.mcap")
     y = run.values[:, -4:] - scene.noise.offset
     r = run.values[:, run.column("v_2")] + scene.control.kp * y[:, 0]
@@ -415,7 +416,8 @@ def test_nothing_conceals_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("excitation", styles.EXCITATIONS)
 def test_every_excitation_keeps_within_its_budget_and_peak(excitation: str) -> None:
-    style = styles.draw(np.random.default_rng(8), ("clean", excitation), 500.0)
+    about = styles.About(500.0)
+    style = styles.draw(np.random.default_rng(8), ("clean", excitation), about)
     pieces = [p for f in style.files for p in f]
     assert style.excitation == excitation
     assert sum(len(p.r) for p in pieces) <= 1.3 * styles.BUDGET
@@ -519,7 +521,7 @@ def test_every_force_finds_its_size(name: str) -> None:
     runs = name == "run_to_run_stiffness"
     scene = trial.scene_of(rngs[0], rngs[1], rig, ("clean", "cut"), runs=runs)
     draft = {**forces.FORCES, **outside.OUTSIDE}[name](rngs[2], scene.setup, trial._swing(scene))
-    found = trial._solved(scene, trial.nominal_refit(scene), draft, 30.0)
+    found = trial._solved(scene, trial.nominal_refit(scene), draft, 30.0, size.CLOSE)
     assert found is not None
     assert found.alone.sigma == pytest.approx(30.0, rel=0.3)
 
@@ -537,7 +539,7 @@ def test_what_is_late_by_little_has_rivals_and_by_much_has_none() -> None:
     draft = effects.lag(rngs[2], scene.setup)
     left = {}
     for target in (5.0, 100.0):
-        found = trial._solved(scene, refit, draft, target)
+        found = trial._solved(scene, refit, draft, target, size.CLOSE)
         assert found is not None
         rivals = trial._rivals(scene, refit, found)
         assert {r["physics"] for r in rivals} == {"valve_dynamics", "transport_delay"}

@@ -19,6 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy.linalg import eigh
 
 from samii_rig.rig.schema import Force, Moment, Pressure
 from samii_rig.types import Float
@@ -73,14 +74,20 @@ class Mechanism:
     M, C, K : (n, n), prescribed coordinates included. free : the coordinates that move by
     themselves. sources : coordinate of each source of an angle or a displacement by name.
     cuts, gaps : coordinate of a rotation or a displacement, locked, at the place of each sensor
-    of the moment or of the force: what holds it is that. joints : coordinate of each spring by name.
+    of the moment or of the force: what holds it is that. joints : coordinate of each spring by
+    name.
     """
 
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         self._cut_after = [s.after for s in setup.sensors if isinstance(s, Moment)]
         self._gap_after = [s.after for s in setup.sensors if isinstance(s, Force | Pressure)]
-        n = 3 + len(self._cut_after) + len(self._gap_after) + sum(_coordinates(p) for p in setup.parts)
+        n = (
+            3
+            + len(self._cut_after)
+            + len(self._gap_after)
+            + sum(_coordinates(p) for p in setup.parts)
+        )
         n += sum(a.kind == "oscillator" for a in setup.attachments)
         self._n, self._used = n, 1
         self.M, self.C, self.K = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
@@ -257,6 +264,22 @@ def _coordinates(part: Part) -> int:
     if part.kind == "beam":
         return ORDER
     return int(part.kind in (*JOINTS, *ANGLE_SOURCES, *MOTION_SOURCES, "oil_column", "cylinder"))
+
+
+def first_hz(setup: Setup) -> float:
+    """The first natural frequency, Hz, sources held; 0 where nothing swings."""
+    mech = Mechanism(setup)
+    f = np.ix_(mech.free, mech.free)
+    K = mech.K[f].copy()
+    for branch in mech.maxwell:  # swings are fast beside what relaxes
+        at = np.flatnonzero(mech.free == branch.at)
+        K[at, at] += branch.k
+    try:
+        square = eigh(K, mech.M[f], eigvals_only=True)
+    except np.linalg.LinAlgError:  # a coordinate without mass
+        return 0.0
+    stiff = square[square > 1.0]  # rad^2/s^2: what only turns on has none
+    return float(np.sqrt(stiff[0])) / (2 * np.pi) if stiff.size else 0.0
 
 
 RELAX_LOW, RELAX_HIGH = 0.05, 2000.0  # Hz, band over which the loss factor is held
