@@ -30,7 +30,18 @@ from samii_rig.rig.schema import (
     TranslationalSpring,
 )
 from sim.assumed_modes import __main__ as command
-from sim.assumed_modes import effects, forces, kernel, make, outside, ritz, size, styles, trial
+from sim.assumed_modes import (
+    effects,
+    forces,
+    kernel,
+    make,
+    outside,
+    rigfile,
+    ritz,
+    size,
+    styles,
+    trial,
+)
 from sim.assumed_modes.noise import noise_model, whitener
 from sim.assumed_modes.parts import Attachment, Force, Part, Setup, nominal, setup_of
 from sim.assumed_modes.plant import plant
@@ -49,11 +60,23 @@ RIGS = (
 )
 
 
+BENCHES = (
+    "beam_on_shaker",
+    "carriage",
+    "cylinder",
+    "flexible_joint",
+    "one_mass",
+    "spindle_drive",
+    "three_masses",
+    "two_masses",
+)
+
+
 def loop_of(setup: Setup, rig: Rig) -> Loop:
-    assert rig.centring is not None
-    theta = [s.name for s in rig.sensor].index(rig.centring.sensor)
+    theta = [s.name for s in rig.sensor].index(rig.centring.sensor) if rig.centring else 0
     made = plant(setup)
-    return closed(discrete(made, timeline(setup, made, rig.rate_hz)), theta, rig.centring.kp)
+    kp = rig.centring.kp if rig.centring else 0.0
+    return closed(discrete(made, timeline(setup, made, rig.rate_hz)), theta, kp)
 
 
 def response(loop: Loop, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
@@ -82,6 +105,51 @@ def test_closed_loop_is_that_of_the_transfer_matrices(name: str, tolerance: floa
     expected = closed_response(rig, f)[:, :, 0]
     found = response(loop_of(setup_of(rig, {}), rig), f, rig.rate_hz)
     assert np.max(np.abs(found / expected - 1)) < tolerance
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_benches_that_slide_turn_and_shake_are_those_of_the_transfer_matrices(name: str) -> None:
+    rig, _ = load_rig(name)
+    f = np.geomspace(0.2, 60.0, 60)
+    expected = (closed_response if rig.centring else sampled_response)(rig, f)[:, :, 0]
+    found = response(loop_of(setup_of(rig, {}), rig), f, rig.rate_hz)
+    assert np.max(np.abs(found / expected - 1)) < 1e-5
+    # The rig file that goes with a trial is the same rig.
+    again = parse(Rig, rigfile.text(rig), name)
+    kept = (closed_response if rig.centring else sampled_response)(again, f)[:, :, 0]
+    np.testing.assert_allclose(kept, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("rig", "effect"), [
+    ("two_masses", "added_mass"), ("two_masses", "ground_spring"),
+    ("carriage", "translational_compliance"), ("spindle_drive", "torsional_compliance"),
+    ("flexible_joint", "added_inertia"), ("cylinder", "viscous_damping"),
+])  # fmt: skip
+def test_an_effect_of_a_bench_is_named_by_places_where_it_means_the_same(
+    rig: str, effect: str
+) -> None:
+    nominal_rig, _ = load_rig(rig)
+    setup = setup_of(nominal_rig, {})
+    f = np.geomspace(1.0, 60.0, 20)
+    before = response(loop_of(setup, nominal_rig), f, nominal_rig.rate_hz)
+    draft = effects.LINEAR[effect](np.random.default_rng(3), setup)
+    scale = {"translational_compliance": 1e-5, "torsional_compliance": 0.1, "ground_spring": 2e3,
+             "viscous_damping": 20.0}.get(effect, 0.02)  # fmt: skip
+    after = response(loop_of(draft.put(setup, scale), nominal_rig), f, nominal_rig.rate_hz)
+    assert np.max(np.abs(after / before - 1)) > 1e-3
+    where = setup.turning() if effect in ("torsional_compliance", "added_inertia") else (
+        setup.shifting())  # fmt: skip
+    assert draft.site in where
+    assert {site for _, site in draft.also} <= {p.name for p in setup.parts}
+
+
+def test_what_cannot_move_so_conceals_nothing() -> None:
+    masses, joint = (setup_of(load_rig(n)[0], {}) for n in ("two_masses", "flexible_joint"))
+    rng = np.random.default_rng(0)
+    for make_draft, setup in ((effects.inertia, masses), (effects.compliance, masses),
+                              (effects.mass, joint), (effects.sideways, joint)):  # fmt: skip
+        with pytest.raises(LookupError):
+            make_draft(rng, setup)
 
 
 def _parameter(value: float, unit: str) -> Parameter:

@@ -161,6 +161,15 @@ def test_sigma_kept_is_what_the_causes_explain_of_whole_records() -> None:
     assert kept([one, whole]) == [0.9]
 
 
+def test_a_refusal_is_a_miss_and_no_alarm() -> None:
+    refused = {"verdict": "refused", "sites": [], "causes": [], "fit": {}, "evidence": {}}
+    trials = [trial("one", refused, SPRING), trial("nothing", refused)]
+    found = {s.what: s for s in scores(trials)}
+    assert found["false alarms where nothing is missing"].value == 0.0
+    assert found["name right up to its class, from 10 sigma"].value == 0.0
+    assert found["refused, with a reason in one line"].value == 1.0
+
+
 def test_each_group_has_its_figures() -> None:
     right = trial("one", diagnosis("named", (*SPRING, 0.9)), SPRING)
     wrong = trial("one", diagnosis("named", (*MASS, 0.95)), SPRING)

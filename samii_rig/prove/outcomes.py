@@ -18,11 +18,11 @@ from samii_rig.errors import InputError
 from samii_rig.files import reason
 from samii_rig.prove.calibrate import places, row
 from samii_rig.prove.jobs import KINDS
-from samii_rig.prove.trial import Answer, Trial, Truth
+from samii_rig.prove.trial import REFUSED, Answer, Trial, Truth
 from samii_rig.record.export import replacing
 
 DIGITS = 5  # significant ones that are kept of a number
-KEPT = ("verdict", "causes", "sites", "mismatch", "used", "moved", "not_physics")
+KEPT = ("verdict", "why", "causes", "sites", "mismatch", "used", "moved", "not_physics")
 Outcome = Mapping[str, Any]
 
 
@@ -98,7 +98,7 @@ def evidence(outcomes: Sequence[Outcome]) -> tuple[Rows, list[str], Rows, list[s
     sites: Rows = []
     of_answers, of_sites = [], []
     for o in outcomes:
-        if "error" in o:
+        if "error" in o or o["answer"]["verdict"] == REFUSED:
             continue
         truth, group = Truth.of(o), f"{o['plant']}, {o['styles'][0]}"
         if (found := row(truth, o["answer"])) is not None:

@@ -15,6 +15,9 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+from samii_rig.errors import SamiiRigError
+from samii_rig.prove.trial import REFUSED
+
 
 def hide(folder: Path) -> None:
     """From now on nothing in this process opens a file below `folder`."""
@@ -49,6 +52,9 @@ def said(folder: Path) -> dict[str, Any]:
     start = time.process_time()
     try:
         answer = diagnose_folder(folder)
+    except SamiiRigError as error:  # it says why it has no answer: an answer as well
+        none = {"verdict": REFUSED, "causes": [], "sites": [], "fit": {}, "evidence": {}}
+        return {"answer": {**none, "why": str(error)}, "seconds": time.process_time() - start}
     except Exception as error:  # a diagnosis that breaks is a result, and ends no campaign
         where = traceback.extract_tb(error.__traceback__)[-1]
         what = f"{type(error).__name__} in {Path(where.filename).name}:{where.lineno}: {error}"

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from scipy import stats
 
-from samii_rig.prove.trial import Trial
+from samii_rig.prove.trial import REFUSED, Trial
 
 T = TypeVar("T")
 Stated = tuple[float, bool]
@@ -178,6 +178,9 @@ def scores(trials: Sequence[Trial], failed: int = 0) -> list[Score]:
         *_force_scores(trials),
         *_time_scores(trials),
         frequency(
+            "refused, with a reason in one line", [t.answer.verdict == REFUSED for t in trials]
+        ),
+        frequency(
             "no answer, the diagnosis broke",
             [True] * failed + [False] * len(trials),
             at_most(0.0),
@@ -195,7 +198,12 @@ def kept(trials: Sequence[Trial]) -> list[float]:
 def false_alarms(trials: Sequence[Trial]) -> list[bool]:
     """Of each trial that conceals nothing whether it was told otherwise."""
     some = [t for t in trials if t.truth.kind == "nothing"]
-    return [t.answer.verdict != "no_mismatch" for t in some]
+    return [detected(t) for t in some]
+
+
+def detected(t: Trial) -> bool:
+    """Whether it says that something is missing."""
+    return t.answer.verdict not in ("no_mismatch", REFUSED)
 
 
 def _size_scores(trials: Sequence[Trial]) -> list[Score]:
@@ -210,12 +218,8 @@ def _size_scores(trials: Sequence[Trial]) -> list[Score]:
         median("sigma kept, from 10 sigma", kept(trials), at_least(0.9)),
         alarms,
         upper,
-        frequency("found, 3 to 10 sigma", [_found(t) for t in small], at_least(0.5)),
+        frequency("found, 3 to 10 sigma", [detected(t) for t in small], at_least(0.5)),
     ]
-
-
-def _found(t: Trial) -> bool:
-    return t.answer.verdict != "no_mismatch"
 
 
 def _name_scores(trials: Sequence[Trial]) -> list[Score]:
@@ -364,7 +368,7 @@ def _within(trials: Sequence[Trial]) -> list[Score]:
 
 def _short(trials: Sequence[Trial]) -> list[Score]:
     return [
-        frequency("detected", [t.answer.verdict != "no_mismatch" for t in trials]),
+        frequency("detected", [detected(t) for t in trials]),
         frequency("place right", [t.place_right for t in trials]),
         frequency("name right", [t.right for t in trials]),
         frequency("confidently wrong", [confidently_wrong(t) for t in trials]),
@@ -391,6 +395,7 @@ def confusion(trials: Sequence[Trial], sigma: float = 10.0) -> dict[tuple[str, s
             # Right physics at a wrong place is no right answer.
             said = f"{said}, elsewhere" if said == hidden else said
         else:
-            said = "nothing" if t.answer.verdict == "no_mismatch" else "unknown"
+            words = {"no_mismatch": "nothing", REFUSED: REFUSED}
+            said = words.get(t.answer.verdict, "unknown")
         out[hidden, said] = out.get((hidden, said), 0) + 1
     return out

@@ -18,6 +18,7 @@ Name = tuple[str, str]
 """(physics, site), in the words of the vocabulary and of the rig file."""
 
 NAMED = ("named", "ambiguous")
+REFUSED = "refused"  # in place of a verdict: the recordings are none that a diagnosis takes
 WHOLE = "whole records"  # a truth's `size_is` where its size is of these
 ALL_BUT_TENTH = 0.9  # probability that a set of sites holds
 

@@ -25,6 +25,8 @@ class Plant:
             plant = described(parse(Rig, rig_toml, "rig file"))
         except InputError as error:
             return str(error)
+        if unread := [s.name for s in plant.sensors if s.kind == "moment"]:
+            return f"sensor {unread[0]} reads a moment, which this plant does not"
         joints = sum(p.kind == "torsional_spring" for p in plant.parts)
         if kind == "joints" and joints < 2:
             return "fewer than two joints"
