@@ -22,6 +22,7 @@ from samii_rig.prove.score import (
     frequency,
     kept,
     median,
+    parameter_errors,
     scores,
 )
 from samii_rig.prove.trial import Answer, Hidden, Trial, Truth
@@ -159,6 +160,13 @@ def test_sigma_kept_is_what_the_causes_explain_of_whole_records() -> None:
     one = trial("one", data, SPRING, size=50.0)
     whole = replace(one, truth=replace(one.truth, whole=True))
     assert kept([one, whole]) == [0.9]
+
+
+def test_a_ratio_is_held_against_the_truth_however_it_is_written() -> None:
+    data = diagnosis("named", ("beam_property", "beam", 0.9))
+    data["causes"][0]["parameters"] = {"EI ratio": {"value": 1.1, "low": 1.0, "high": 1.2}}
+    hidden = Hidden("beam_property", "beam", {"EI_ratio": 1.1})
+    assert parameter_errors([Trial(Truth("one", 1, (hidden,), 50.0), Answer.of(data))])[1] == [True]
 
 
 def test_a_refusal_is_a_miss_and_no_alarm() -> None:

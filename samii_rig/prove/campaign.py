@@ -69,7 +69,7 @@ def claim(out: Path, made: Mapping[str, Any]) -> None:
         return
     first = json.loads(file.read_text("utf-8"))
     for key in ("plants", "rigs"):
-        if first[key] != made[key]:
+        if sorted(first[key]) != sorted(made[key]):
             had = ", ".join(first[key])
             raise InputError("samii-rig prove", f"--{key[:-1]}", ", ".join(made[key]), had)
 

@@ -154,12 +154,18 @@ def parameter_errors(trials: Sequence[Trial]) -> tuple[list[float], list[bool]]:
         for effect, cause in trial.matches():
             if effect.name != cause.name:
                 continue
+            known = {_symbol(s): x for s, x in effect.parameters.items()}
             for symbol, (value, low, high) in cause.parameters.items():
-                true = effect.parameters.get(symbol)
+                true = known.get(_symbol(symbol))
                 if true:
                     errors.append(abs(value - true) / abs(true))
                     covered.append(low <= true <= high)
     return errors, covered
+
+
+def _symbol(name: str) -> str:
+    """A parameter's symbol; that of a ratio is the beam's own, whoever writes it."""
+    return name.replace("_", " ").removesuffix(" ratio")
 
 
 def above(trials: Sequence[Trial], sigma: float, *kinds: str) -> list[Trial]:
