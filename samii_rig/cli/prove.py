@@ -156,12 +156,21 @@ def _made(out: Path, order: _Order, workers: int | None, scheduler: str, quiet: 
         return carry_out(campaign, order.jobs, executor, say, until)
 
 
+# Options that say where and how fast, not which trials.
+ELSEWHERE = ("--out", "--page", "--calibrate", "--workers", "--scheduler", "--hours")
+
+
 def _command() -> str:
-    """This call, as a person would type it."""
+    """This call as a person would type it to have the same trials."""
     import shlex
     import sys
 
-    return shlex.join(["samii-rig", *sys.argv[1:]])
+    words, skip = ["samii-rig"], False
+    for word in sys.argv[1:]:
+        if not skip and word.split("=")[0] not in (*ELSEWHERE, "--keep", "--json"):
+            words.append(word)
+        skip = word in ELSEWHERE
+    return shlex.join(words)
 
 
 def _commit() -> str:

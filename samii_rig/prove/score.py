@@ -1,6 +1,6 @@
 """Scores of many trials, each a frequency or a quantile with its 90 % interval.
 
-Goals are those of the proof (docs/proof.md). A frequency's interval is Wilson's, a
+Goals are those of the proof (docs/evidence/proof.md). A frequency's interval is Wilson's, a
 median's is that of order statistics, others are from a bootstrap over trials.
 """
 
