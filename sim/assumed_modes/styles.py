@@ -83,8 +83,8 @@ class Style:
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What a style is drawn for: the rig's samples/s, its first resonance, up to twice which the
-    band may reach (Hz), and s of records at most, for which there is room within `BUDGET`."""
+    """What a style is drawn for: the rig's samples/s, its first resonance (Hz), and s of
+    records at most, for which there is room within `BUDGET`."""
 
     rate_hz: float
     first_hz: float = 0.0
@@ -103,7 +103,8 @@ def draw(rng: Rng, forced: tuple[str, ...], about: About, *, runs: bool = False)
     chosen = [x for x in OPTIONS if x in chosen or x in forced]
     rate, every = _rates(rng, about.rate_hz, tuple(chosen))
     low = float(rng.uniform(0.3, 0.8))
-    above = HIGH_HZ[0], max(HIGH_HZ[1], 2.0 * about.first_hz)
+    # A rig that has no resonance within is driven to twice its first one.
+    above = HIGH_HZ[0], HIGH_HZ[1] if about.first_hz < HIGH_HZ[1] else 2.0 * about.first_hz
     high = float(min(rng.uniform(*above), 0.4 * rate / every))
     n_levels = (
         1 if excitation == "single" else int(rng.choice([1, 2, 3, 4], p=[0.3, 0.4, 0.2, 0.1]))
