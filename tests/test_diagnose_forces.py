@@ -15,9 +15,10 @@ from samii_rig.diagnose import by_line
 from samii_rig.diagnose.by_record import on_records
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
 from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS, PLAY
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.problem import ForceProblem
-from samii_rig.diagnose.forces.screen import Looks, weakly
+from samii_rig.diagnose.forces.screen import Looks, scaled, weakly
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.way import Ways
 from samii_rig.diagnose.forces.words import distorted
@@ -34,7 +35,7 @@ from samii_rig.record.importer import import_file
 from samii_rig.record.maps import load_map
 from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Recording
+from samii_rig.types import Float, Recording
 
 # One level alone, short: every response and every search is what takes the time here.
 ONE = replace(DESIGN, levels=(1.0,), burst=18.0, high_hz=20.0)
@@ -109,8 +110,9 @@ def test_both_parts_of_the_lines_are_joined_again(nothing: list[Recording]) -> N
     want = complete.split(lines) @ parts
     joined, white = complete.joined(parts), complete.white(lines)
     got = np.einsum("nq,nqj->j", white.conj(), joined).real
-    np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-4 * np.abs(want).max())
-    assert np.sum(np.abs(white) ** 2) == pytest.approx(np.sum(complete.split(lines) ** 2), rel=1e-4)
+    np.testing.assert_allclose(got, want, rtol=1e-2)
+    # A disturbance of less than 2 % of a block's power is left out of the quadratic form alone.
+    assert np.sum(np.abs(white) ** 2) == pytest.approx(np.sum(complete.split(lines) ** 2), rel=1e-2)
 
 
 def test_a_weak_force_does_to_first_order_what_it_does_in_time(nothing: list[Recording]) -> None:
@@ -120,12 +122,26 @@ def test_a_weak_force_does_to_first_order_what_it_does_in_time(nothing: list[Rec
     hopes = weakly(search.forces, search.reach, looks)
     assert {h.effect.key for h in hopes} == {e.key for e in search.forces}
     for hope in hopes:
+        law = hope.effect.quasi.law
+        if law in (
+            PLAY,
+            HYSTERESIS,
+            FRICTION,
+        ):  # whose shape depends on the strength, or that stick
+            continue
+        share = 0.02 if law.told is None else 1.0
+        strengths = scaled(law, hope.strengths, share, search.reach.largest)
         model = search.model((hope.effect,))
         assert isinstance(model, ForceModel)
-        x = np.append(moved(nominal.model, nominal.x, model), np.log(hope.strengths))
-        own, _, _ = looks.gains(search.problem.change(model, x))
-        # What differs is second order, and harmonics above the third that fold back.
-        assert float(own[0]) == pytest.approx(float(hope.own[0]), rel=0.5), hope.effect.key
+        x = np.append(moved(nominal.model, nominal.x, model), np.log(strengths))
+        in_time = power(*looks.gains(search.problem.change(model, x))) / share**2
+        # Harmonics above the third fold back at the low rate.
+        assert in_time == pytest.approx(power(hope.own, hope.may, hope.times), rel=0.2), law.tag
+
+
+def power(own: Float, _may: Float, times: Float | float) -> float:
+    """Squared length of a change, from what it gains and how many times it should be."""
+    return float(np.ravel(own / (2 * np.asarray(times) - 1))[0])
 
 
 def forces_of(runs: list[Recording]) -> ForceSearch:

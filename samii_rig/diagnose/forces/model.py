@@ -69,6 +69,24 @@ class ForceModel(Model):
         rows = [own[self.unknowns.index(j)] if j in self.unknowns else by_scale for j in moving]
         return np.ascontiguousarray(rows, np.float64).reshape(-1, 2)
 
+    def channels(self, x: Float, s: Complex) -> tuple[Complex, dict[str, Complex]] | None:
+        """(n,) at s what the effects on channels do to the command, and to each sensor by name;
+        None where no effect is on a channel."""
+        some = [
+            (e.factor, theta)
+            for e, theta in zip(self.effects, self.parts(x), strict=True)
+            if e.factor is not None
+        ]
+        given = np.ones(s.size, complex)
+        seen: dict[str, Complex] = {}
+        for factor, theta in some:
+            F = factor.value(s, theta)[0]
+            if factor.kind == "input":
+                given = given * F
+            else:
+                seen[factor.channel] = seen.get(factor.channel, np.ones_like(F)) * F
+        return (given, seen) if some else None
+
     def response(self, x: Float, at: Grid) -> Complex:
         """(n, q) at the grid's lines; of whole records, behind these what the force adds to all."""
         h = super().response(x, at)

@@ -42,12 +42,19 @@ class Moved:
         if model.force.law.told is not None:
             return [_told(piece, model, p, seeds) for piece in self.whole.records.pieces]
         way, wired = self.ways.at(model, x), self.whole.wired
+        contour = self.whole.records.exact()
+        channels = model.channels(x, contour.s)
         out = []
         for piece in self.whole.records.pieces:
             v, times = mean_command(piece)
+            if channels is not None:
+                v = contour.record(contour.damped(v) * channels[0], v.size)
             own = []
             for e in way.force(model, v, p, seeds):
                 y = times * way.sensed.of(e)[:, self.whole.sensor]
+                for name, F in channels[1].items() if channels is not None else ():
+                    j = wired.sensors.index(name)
+                    y[:, j] = contour.record(contour.damped(y[:, j]) * F, len(y))
                 r = np.zeros(piece.r.size)
                 if wired.kp:
                     r -= wired.kp * y[:, wired.sensors.index(wired.centring)]

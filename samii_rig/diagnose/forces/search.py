@@ -44,6 +44,7 @@ LESS = 0.08  # of the largest bound, below which a force is not
 PROMISING = 0.25  # of what the best force gains, at least
 AGAIN = 3  # times that the likelihood is made anew about the best explanation
 STILL = 0.5  # standard deviations, a move from one to the next that is none
+RENEWED = 6  # times that the chain through which a force acts is renewed in between
 RIVALS = 4  # linear explanations that forces are held against
 BESIDE = 3  # linear effects that are refitted beside the best force, and the other way round
 
@@ -99,9 +100,10 @@ class ForceSearch(RecordSearch):
     def settled(self) -> bool:
         """Refit what promises most, and all that may compete again about the best of it, until
         that stands still. Whether it has a force."""
-        first, hopes = self.ranked()[0], self.hopes()
+        first = next((e for e in self.ranked() if len(e.effects) == 1), None)
+        hopes = self.hopes(self.nominal if first is None else first)
         self._try(hopes, self.nominal, 0)
-        if len(first.effects) == 1:
+        if first is not None:
             self._try(hopes, first, -1)
         self.temper()
         for _ in range(AGAIN):
@@ -111,6 +113,7 @@ class ForceSearch(RecordSearch):
             self._about(best.fitted)
             near = [e for e in self.ranked() if e.weight > best.weight - NEAR]
             self._only((*near, self.nominal))
+            self._through(self.ranked()[0])
             self.temper()
             after = self.ranked()[0]
             if after.key == best.key and after.fitted.away(best.fitted) < STILL:
@@ -129,6 +132,22 @@ class ForceSearch(RecordSearch):
                 self.worth if base.effects else 0
             ):
                 self.keep(effects, end)
+
+    def _through(self, best: Explanation) -> None:
+        """Refit it with the chain through which its force acts renewed where each refit ended,
+        until that stands still."""
+        for _ in range(RENEWED):
+            if not isinstance(best.fitted.model, ForceModel):
+                return
+            self._ways.renew()
+            end = self.refitted(best.effects, best)
+            if end is None:
+                return
+            del self.found[best.key]
+            self.keep(best.effects, end)
+            still, best = best.fitted.away(end) < STILL, self.found[best.key]
+            if still:
+                return
 
     def _either_way(self, best: Explanation) -> None:
         """Dry friction that may differ by direction, from where it did not."""
@@ -171,11 +190,11 @@ class ForceSearch(RecordSearch):
         """Whether the best explanation leaves no more than noise."""
         return self.ratio(self.ranked()[0].fitted) < threshold(self.spread)
 
-    def hopes(self) -> list[Hope]:
+    def hopes(self, other: Explanation) -> list[Hope]:
         """Every force that may explain as much as an effect must beside the nominal parameters, or
-        beside the best linear explanation, with what it gains beside both."""
+        beside another explanation, with what it gains beside both."""
         nominal = self.nominal
-        bases = {e.key: e for e in (nominal, self.ranked()[0])}.values()
+        bases = {e.key: e for e in (nominal, other)}.values()
         screens = tuple(Screen.of(self._force_problem, e.fitted) for e in bases)
         looks = Looks(self._force_problem, screens)
         hopes = weakly(self.forces, self.reach, looks)
