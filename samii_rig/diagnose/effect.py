@@ -16,7 +16,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 
 if TYPE_CHECKING:
-    from samii_rig.diagnose.nonlinear_model import Quasi
+    from samii_rig.diagnose.forces.laws import Force
 
 Key = tuple[str, str]
 Values = Mapping[Key, float]
@@ -98,7 +98,7 @@ class Effect:
     factor: Factor | None = None
     jump: Jump | None = None
     causal: tuple[str, float] | None = None
-    quasi: Quasi | None = None
+    quasi: Force | None = None
     write: Callable[[Rig, Float], Rig] = lambda rig, _x: rig
     weight: float = 1.0
     aliases: tuple[tuple[str, str], ...] = field(default=())

@@ -12,15 +12,15 @@ from rest to the record's last sample: harmonics, start and cut end are in it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 
+from samii_rig.diagnose.forces.model import ForceModel, RecordGrid
+from samii_rig.diagnose.forces.way import Ways
 from samii_rig.diagnose.model import Grid
-from samii_rig.diagnose.nonlinear_inner import Inner, Sensed
-from samii_rig.diagnose.nonlinear_levels import RecordGrid
-from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
 from samii_rig.diagnose.records import RecordProblem, Whole
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.likelihood.complete import Complete
@@ -28,80 +28,67 @@ from samii_rig.likelihood.pieces import Piece, Samples
 from samii_rig.types import Complex, Float
 
 
-@dataclass
-class Chains:
-    """The partial fractions through which forces act, kept where each was computed first: what the
-    chain's parameters change of a force is of second order, until `renew` asks for it."""
-
-    kept: dict[str, tuple[Inner, Sensed]] = field(default_factory=dict)
-    near: Complex | None = None  # poles, which are the same wherever a force acts
-
-    def at(self, model: LevelModel, x: Float) -> tuple[Inner, Sensed]:
-        """Of a model near x, whatever the strength.
-
-        Raises SamiiRigError where it has none.
-        """
-        key = " ".join((model.quasi.kind, *model.quasi.across, *(e.key for e in model.effects)))
-        if key not in self.kept:
-            self.kept[key] = Inner.sensed(model, x, self.near)
-            self.near = self.kept[key][0].structure
-        inner, sensed = self.kept[key]
-        return replace(inner, scale=model.quasi.sign * model.strength(x)[1]), sensed
-
-    def renew(self) -> None:
-        """Compute all anew, where they are asked for next."""
-        self.kept.clear()
-
-
 @dataclass(frozen=True)
 class Moved:
     """What a force does under the commands of all pieces."""
 
     whole: Whole
-    chains: Chains
+    ways: Ways
 
-    def of(self, model: LevelModel, x: Float) -> list[Samples]:
-        """Of each piece the change of its input r (history + n,) and of its sensors z (n, q)."""
-        p, _ = model.strength(x)
-        quasi, wired = model.quasi, self.whole.wired
-        pieces = self.whole.records.pieces
-        q = len(wired.sensors)
-        if quasi.kind == "command":
-            return [_told(piece, quasi, p, q) for piece in pieces]
-        inner, sensed = self.chains.at(model, x)
+    def of(self, model: ForceModel, x: Float, moving: Sequence[int] = ()) -> list[list[Samples]]:
+        """Of each piece the change of its input r (history + n,) and of its sensors z (n, q), then
+        the slopes of both by the entries `moving` of x."""
+        p, seeds = model.numbers(x), model.seeds(x, moving)
+        if model.force.law.told is not None:
+            return [_told(piece, model, p, seeds) for piece in self.whole.records.pieces]
+        way, wired = self.ways.at(model, x), self.whole.wired
+        contour = self.whole.records.exact()
+        channels = model.channels(x, contour.s)
         out = []
-        for piece in pieces:
-            v, times = _mean(piece)
-            y = times * sensed.of(inner.from_rest(v, p))[:, self.whole.sensor]
-            r = np.zeros(piece.r.size)
-            if wired.kp:
-                r -= wired.kp * y[:, wired.sensors.index(wired.centring)]
-            out.append(Samples(r, y[piece.history :]))
+        for piece in self.whole.records.pieces:
+            v, times = mean_command(piece)
+            if channels is not None:
+                v = contour.record(contour.damped(v) * channels[0], v.size)
+            own = []
+            for e in way.force(model, v, p, seeds):
+                y = times * way.sensed.of(e)[:, self.whole.sensor]
+                for name, F in channels[1].items() if channels is not None else ():
+                    j = wired.sensors.index(name)
+                    y[:, j] = contour.record(contour.damped(y[:, j]) * F, len(y))
+                r = np.zeros(piece.r.size)
+                if wired.kp:
+                    r -= wired.kp * y[:, wired.sensors.index(wired.centring)]
+                own.append(Samples(r, y[piece.history :]))
+            out.append(own)
         return out
 
     def without(self, fitted: Fitted) -> Whole:
         """The records as those of the linear part of a fit."""
-        assert isinstance(fitted.model, LevelModel)
+        assert isinstance(fitted.model, ForceModel)
         moved = self.of(fitted.model, fitted.x)
         records = self.whole.records
         pieces = tuple(
             replace(piece, r=piece.r + m.r, z=piece.z - m.z)
-            for piece, m in zip(records.pieces, moved, strict=True)
+            for piece, (m,) in zip(records.pieces, moved, strict=True)
         )
         return replace(self.whole, records=replace(records, pieces=pieces))
 
 
-def _told(piece: Piece, quasi: Quasi, p: float, q: int) -> Samples:
+def _told(piece: Piece, model: ForceModel, p: Float, seeds: Float) -> list[Samples]:
     """A force on the command alone, of every record by itself: a converter's steps fall differently
     each time."""
-    assert quasi.law is not None
-    r = np.zeros(piece.r.size)
+    told = model.force.law.told
+    assert told is not None
+    r = np.zeros((1 + len(seeds), piece.r.size))
     for command in piece.commands:
-        r += command.part * quasi.sign * quasi.law.force(command.v, p)
-    return Samples(r, np.zeros((len(piece.z), q)))
+        e, slopes = told(command.v, p)
+        r[0] += command.part * e
+        r[1:] += command.part * (slopes @ seeds.T).T
+    still = np.zeros_like(piece.z)
+    return [Samples(own, still) for own in r]
 
 
-def _mean(piece: Piece) -> tuple[Float, float]:
+def mean_command(piece: Piece) -> tuple[Float, float]:
     """The command of a piece's records, which repeat each other, and how many times the piece has
     what one of them does."""
     times = sum(c.part for c in piece.commands)
@@ -119,19 +106,19 @@ class ForceProblem(RecordProblem):
     goal: Float = field(kw_only=True)
 
     @classmethod
-    def near(cls, whole: Whole, fitted: Fitted, by_line: Problem, chains: Chains) -> ForceProblem:
+    def near(cls, whole: Whole, fitted: Fitted, by_line: Problem, ways: Ways) -> ForceProblem:
         """About a fit, with a force or without."""
-        moved = Moved(whole, chains)
-        about = moved.without(fitted) if isinstance(fitted.model, LevelModel) else whole
+        moved = Moved(whole, ways)
+        about = moved.without(fitted) if isinstance(fitted.model, ForceModel) else whole
         complete = about.complete(fitted)
-        exact = whole.records.exact()
+        records, exact = whole.records, whole.records.exact()
         S = whole.response(fitted)(exact.s)
-        order, k = complete.rows.order, [whole.records.lines(p).k for p in whole.records.pieces]
+        order, k = complete.rows.order, [records.lines(p).k for p in records.pieces]
 
-        def added(model: LevelModel, x: Float) -> Complex:
+        def added(model: ForceModel, x: Float, moving: Sequence[int]) -> Complex:
             each = [
-                -whole.records.left(Samples(m.r, -m.z), k_, S, exact)
-                for m, k_ in zip(moved.of(model, x), k, strict=True)
+                np.stack([-records.left(Samples(m.r, -m.z), k_, S, exact) for m in own], axis=2)
+                for own, k_ in zip(moved.of(model, x, moving), k, strict=True)
             ]
             return np.asarray(np.concatenate(each)[order])
 
@@ -139,8 +126,8 @@ class ForceProblem(RecordProblem):
         own: dict[str, Any] = {f.name: getattr(nodes, f.name) for f in fields(nodes)}
         at = RecordGrid(**own, added=added)
         e = complete.rows.e
-        if isinstance(fitted.model, LevelModel):
-            e = np.asarray(e + added(fitted.model, fitted.x))
+        if isinstance(fitted.model, ForceModel):
+            e = np.asarray(e + added(fitted.model, fitted.x, ())[:, :, 0])
         return cls(
             by_line.data, by_line.root, at, by_line=by_line, reduced=complete.reduced,
             complete=complete, goal=complete.split(e),
@@ -166,13 +153,13 @@ class ForceProblem(RecordProblem):
         """As of `Problem`."""
         return replace(self, goal=self.residual(h) + self.goal)
 
-    def lines_of(self, model: LevelModel, x: Float) -> Complex:
-        """(n, q) what the force of a model adds to the lines.
+    def change(self, model: ForceModel, x: Float) -> Float:
+        """What the force of a model adds to the prediction, in noise units.
 
         Raises SamiiRigError where the rig has no partial fractions at x.
         """
         assert isinstance(self.at, RecordGrid)
-        return self.at.added(model, x)
+        return self.complete.split(self.at.added(model, x, ())[:, :, 0])
 
     def without_force(self) -> RecordProblem:
         """For linear models alone, beside the force that the reference has."""
