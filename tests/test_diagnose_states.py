@@ -244,7 +244,8 @@ def test_the_command_line_tells_two_states_apart(tmp_path: Path):
 def test_what_is_taken_off_may_be_all_of_it():
     """At its largest a part is gone, and no more: whatever its tolerance, nothing is below 0."""
     braced = load_rig("samii_braced")[0]
-    gone = [e for e in hypotheses(braced, 0.5, 30.0, signed=True) if e.variant == "less"]
+    less = [e for e in hypotheses(braced, 0.5, 30.0, signed=True) if e.variant == "less"]
+    gone = [e for e in less if e.unknowns[0].unit != "1"]  # a ratio to the file's has no end
     assert {"ground_spring", "added_mass", "viscous_damping"} <= {e.physics for e in gone}
     nominal = {(e.name, s): p.value for e in braced.element for s, p in parameters(e).items()}
     for effect in gone:
@@ -254,4 +255,3 @@ def test_what_is_taken_off_may_be_all_of_it():
         assert effect.report(largest)[0] < 0
     brace = next(e for e in gone if e.name == ("ground_spring", "brace"))
     assert set(brace.parameters(np.array([2.0e7]), nominal).values()) == {0.0}
-    assert not any(e.variant == "less" for e in hypotheses(braced, 0.5, 30.0))

@@ -86,6 +86,10 @@ class Effect:
     report : physical quantities to be reported, from the unknowns.
     rough : part of what it does by which its law is known to be off; 0 for one that holds.
     variant : tells effects with one name and different changes apart.
+    position : m from the site's upstream end, if it stands at one place along it; that of an
+        effect with a position among its unknowns is None.
+    pieces : names of what it cuts its site into, beside the one that keeps the name. They are the
+        same material, whatever other effects make of it: its `parameters` are asked for last.
     """
 
     physics: str
@@ -104,6 +108,8 @@ class Effect:
     report: Callable[[Float], Float] = lambda x: x
     rough: float = 0.0
     variant: str = ""
+    position: float | None = None
+    pieces: tuple[str, ...] = ()
 
     @property
     def name(self) -> tuple[str, str]:

@@ -19,6 +19,7 @@ from samii_rig.types import Complex, Float, Int
 ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smooth between
 ORDERS = (-1, 1, -2, 2)  # aliases that a factor on a channel changes
 STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
+FARTHEST = 6.0  # tolerances that a refit moves a nominal parameter at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,8 +168,12 @@ class Model:
         self.n_nominal, self.n = n, n + len(unknowns)
         self.prior = np.full(self.n, math.inf)
         self.prior[:n] = [known[k].tolerance for k in self.keys]
-        self.lower = np.concatenate([-6 * self.prior[:n], [math.log(u.low) for u in unknowns]])
-        self.upper = np.concatenate([6 * self.prior[:n], [math.log(u.high) for u in unknowns]])
+        self.lower = np.concatenate(
+            [-FARTHEST * self.prior[:n], [math.log(u.low) for u in unknowns]]
+        )
+        self.upper = np.concatenate(
+            [FARTHEST * self.prior[:n], [math.log(u.high) for u in unknowns]]
+        )
 
     def having(self, effects: Sequence[Effect]) -> Model:
         """The same rig with other effects; nominal parameters keep their place in x."""
@@ -184,7 +189,8 @@ class Model:
         causal = dict(e.causal for e in self.effects if e.causal is not None)
         if not causal:
             return chain
-        return CausalChain(chain, tuple(causal), next(iter(causal.values())))
+        pieces = [p for e in self.effects if e.site in causal for p in e.pieces]
+        return CausalChain(chain, (*causal, *pieces), next(iter(causal.values())))
 
     def parts(self, x: Float) -> list[Float]:
         """The values of each effect's unknowns."""
@@ -205,7 +211,8 @@ class Model:
             zip(self.keys, (self._start * np.exp(x[: self.n_nominal])).tolist(), strict=True)
         )
         all_values = {**self.nominal, **moved}
-        for effect, theta in zip(self.effects, self.parts(x), strict=True):
+        pairs = zip(self.effects, self.parts(x), strict=True)
+        for effect, theta in sorted(pairs, key=lambda pair: bool(pair[0].pieces)):
             change = effect.parameters(theta, all_values)
             all_values.update(change)
             moved.update(change)

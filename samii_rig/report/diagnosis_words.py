@@ -181,8 +181,13 @@ def quantity(v: Value) -> tuple[str, str]:
             break
     unit = re.sub(r"\^(-?\d+)", lambda m: m[1].translate(_POWERS), v.unit)
     unit = "" if unit == "1" else f"\u00a0{prefix}{unit}"
-    value, low, high = (_digits(x / factor) for x in (v.value, v.low, v.high))
-    return f"{value}{unit}", f"{low} to {high}{unit}"
+    value = f"{_digits(v.value / factor)}{unit}"
+    if v.low is None and v.high is None:
+        return value, "no limit"
+    if v.low is None or v.high is None:
+        way, end = ("at most", v.high) if v.low is None else ("at least", v.low)
+        return value, f"{way} {_digits((end or 0.0) / factor)}{unit}"
+    return value, f"{_digits(v.low / factor)} to {_digits(v.high / factor)}{unit}"
 
 
 def _digits(x: float) -> str:
