@@ -11,6 +11,7 @@ import numpy as np
 from samii_rig.diagnose import insert
 from samii_rig.diagnose.along import Along, stretches
 from samii_rig.diagnose.effect import Effect, Jump, Key, Unknown, Values
+from samii_rig.diagnose.fractional import Joint
 from samii_rig.diagnose.points import ON_LINK
 from samii_rig.diagnose.scales import PAIRS, REACH, Places, middle, spread
 from samii_rig.rig.schema import (
@@ -25,6 +26,9 @@ from samii_rig.rig.schema import (
 )
 from samii_rig.types import Float
 
+# Of a fractional damper: nearer 0 it is the spring that the joint has, nearer 1 its damper.
+POWER = (0.1, 0.9)
+POWERS = (0.2, 0.35, 0.5, 0.7)
 COMPLIANCES = (1e-4, 0.01, 1.0)  # of a line's oil over the chain's own, at which a search starts
 # No material's loss is the same at all frequencies: relaxation makes it wander by some per cent.
 LOSS_WANDERS = 0.05
@@ -69,6 +73,47 @@ def _joint_dampers(rig: Rig, where: Places) -> Iterator[Effect]:
             jump=Jump(f"beside {e.name}", lambda s, x: np.asarray(s * x[:, :1])),
             variant="beside the spring",
         )
+        yield _fractional(e, tuple(w * c for c in bounds), w)
+
+
+def _fractional(
+    spring: TorsionalSpring | TranslationalSpring, forces: tuple[float, ...], w: float
+) -> Effect:
+    """A damper c s^alpha beside a spring. Its unknowns are its force over motion at w rad/s, in
+    the bounds of `forces`, and alpha: with c itself the two would hardly be told apart."""
+    low, high = forces
+    joint = Joint(spring.name, math.sqrt(low * high) / w)
+    unit = spring.k.unit.replace("/", " s^alpha/")
+
+    def told(x: Float) -> Float:
+        return np.array([x[0] / w ** x[1], x[1]])
+
+    def values(x: Float, _: Values) -> dict[Key, float]:
+        return dict(zip(joint.keys, told(x).tolist(), strict=True))
+
+    def write(rig: Rig, x: Float) -> Rig:
+        c, alpha = told(x)
+        said = (
+            f"Found beside this rig, which has no element for it: a fractional damper at "
+            f"{spring.name}, {c:.4g} {unit} with alpha = {alpha:.3g}."
+        )
+        return rig.model_copy(update={"description": f"{rig.description} {said}".strip()})
+
+    return Effect(
+        physics="fractional_damping",
+        site=spring.name,
+        unknowns=(
+            Unknown("c", unit, low, high, spread(low, high, 11)),
+            Unknown("alpha", "1", *POWER, POWERS),
+        ),
+        parameters=values,
+        fractional=joint,
+        jump=Jump(
+            f"beside {spring.name}", lambda s, x: np.asarray(x[:, :1] * (s / w) ** x[:, 1:2])
+        ),
+        report=told,
+        write=write,
+    )
 
 
 def _lines(rig: Rig, where: Places) -> Iterator[Effect]:

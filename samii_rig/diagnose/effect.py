@@ -16,6 +16,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 
 if TYPE_CHECKING:
+    from samii_rig.diagnose.fractional import Joint
     from samii_rig.diagnose.nonlinear_model import Quasi
 
 Key = tuple[str, str]
@@ -80,6 +81,7 @@ class Effect:
     factor : what it does to a channel, if that is no parameter of the rig.
     causal : (beam, Hz) whose loss factor it brings, and where the stiffness is as in the file.
     jump : its place and x(s), if it acts through one number; as `build` and `parameters` do.
+    fractional : the damper c s^alpha that it is; `parameters` sets its two.
     quasi : the nonlinear force that it is, if it is one; the first unknown is its strength.
     write : the rig as a file would have it, from the built rig and the unknowns.
     weight : prior weight against the other hypotheses.
@@ -101,6 +103,7 @@ class Effect:
     factor: Factor | None = None
     jump: Jump | None = None
     causal: tuple[str, float] | None = None
+    fractional: Joint | None = None
     quasi: Quasi | None = None
     write: Callable[[Rig, Float], Rig] = lambda rig, _x: rig
     weight: float = 1.0

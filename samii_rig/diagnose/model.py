@@ -10,6 +10,7 @@ import numpy as np
 
 from samii_rig.diagnose.causal import CausalChain
 from samii_rig.diagnose.effect import Effect, Key
+from samii_rig.diagnose.fractional import ChainLike, FractionalChain
 from samii_rig.model.sampled import hold_at, sampled_response, sensors_at
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.elements import flattened
@@ -183,14 +184,17 @@ class Model:
         """The same effects in a rig that was changed."""
         return Model(change(self.rig), self.effects)
 
-    def chain_of(self, rig: Rig) -> Chain | CausalChain:
+    def chain_of(self, rig: Rig) -> ChainLike:
         """The chain of a rig, as the effects have it."""
-        chain = Chain(rig)
+        chain: ChainLike = Chain(rig)
         causal = dict(e.causal for e in self.effects if e.causal is not None)
-        if not causal:
-            return chain
-        pieces = [p for e in self.effects if e.site in causal for p in e.pieces]
-        return CausalChain(chain, (*causal, *pieces), next(iter(causal.values())))
+        if causal:
+            pieces = [p for e in self.effects if e.site in causal for p in e.pieces]
+            middle = next(iter(causal.values()))
+            chain = CausalChain(chain.plain, (*causal, *pieces), middle)
+        for joint in (e.fractional for e in self.effects if e.fractional is not None):
+            chain = FractionalChain(chain, joint)
+        return chain
 
     def parts(self, x: Float) -> list[Float]:
         """The values of each effect's unknowns."""
@@ -219,9 +223,8 @@ class Model:
         return moved
 
     def plain(self, x: Float) -> Chain:
-        """The chain at x, a loss factor the same at all frequencies."""
-        chain = self.chain.with_values(self.values(x))
-        return chain.plain if isinstance(chain, CausalChain) else chain
+        """The chain at x, a loss factor the same at all frequencies, no fractional damper."""
+        return self.chain.with_values(self.values(x)).plain
 
     def response(self, x: Float, at: Grid) -> Complex:
         """(n, q) at the grid's frequencies."""
