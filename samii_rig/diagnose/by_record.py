@@ -23,8 +23,7 @@ def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | N
     if not case.runs or clean.mended or clean.doubt:
         return None
     try:
-        table = case.search.table
-        whole = Whole.of(case.runs, case.search.rig, band, table, clean.sensors, clean.samples)
+        whole = Whole.of(case.runs, case.search.rig, band, clean.sensors, clean.samples)
         return RecordSearch(whole, case.search)
     except EstimateError:
         return None

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from samii_rig.likelihood.noise import Shape
+from samii_rig.likelihood.noise import Disturbances
 from samii_rig.likelihood.reduce import Records, Reduced, Response, Rows, formed, orthonormal
 from samii_rig.types import Complex, Float, Int
 
@@ -43,14 +43,13 @@ class Complete:
         cls,
         records: Records,
         response: Response,
-        shape: Shape,
+        disturbances: Disturbances,
         loop: tuple[float, int] | None = None,
         part: Callable[[Int], NDArray[np.bool_]] | None = None,
     ) -> Complete:
         """As `reduced`."""
-        found, rows = formed(records, response, shape, loop, part)
-        own = np.linalg.cholesky(found.noise.covariance(rows.f))
-        root = np.sqrt(2) * np.linalg.inv(own)
+        found, rows = formed(records, response, disturbances, loop, part)
+        root = np.sqrt(2) * np.linalg.inv(found.noise.root(rows.f))
         each = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
         nuisances = tuple((on, _columns(root[on] @ rows.N[on])) for on in each)
         m = found.factor.shape[0]

@@ -37,7 +37,7 @@ def diagnose_folder(folder: Path) -> dict[str, Any]:
     logs = sorted(folder.glob("*.mcap"))
     if not logs:
         raise InputError(str(folder), "", "no recording", "a folder with .mcap files")
-    found = together(logs, How(gaps="refuse"))
+    found = together(logs, How(gaps="model"))
     return {**found.plain(), "evidence": found.evidence}
 
 
