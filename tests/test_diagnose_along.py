@@ -9,9 +9,12 @@ from elements_kit import rig as made_of
 
 from samii_rig.diagnose.along import Along, stretches
 from samii_rig.diagnose.diagnose import table
+from samii_rig.diagnose.intervals import Drawn
 from samii_rig.diagnose.model import Model, grid
 from samii_rig.diagnose.refit import Fitted
+from samii_rig.diagnose.result import Value
 from samii_rig.diagnose.rigfile import explained, toml
+from samii_rig.diagnose.rows import PHYSICS
 from samii_rig.errors import InputError
 from samii_rig.fem.model import Fem
 from samii_rig.model.tmm import Chain
@@ -183,3 +186,16 @@ def test_every_place_of_a_body_belongs_to_one_stretch() -> None:
 def test_a_beam_s_density_is_in_the_table_as_its_stiffness_is() -> None:
     variants = {e.variant for e in TABLE if e.name == ("beam_property", "beam")}
     assert variants == {"EI", "mu"}
+
+
+def test_an_interval_holds_the_draws_of_both_explanations_or_has_no_end() -> None:
+    never = np.zeros(1000, bool)
+    here = Drawn(1.0, "kg", np.full(1000, 1.0), never, never)
+    there = Drawn(2.0, "kg", np.full(1000, 2.0), never, ~never)
+    assert here.interval() == Value(1.0, "kg", 1.0, 1.0)
+    assert here.mixed(there, 0.02).interval() == Value(1.0, "kg", 1.0, 1.0)
+    assert here.mixed(there, 0.3).interval() == Value(1.0, "kg", 1.0, None)
+
+
+def test_every_effect_of_the_table_has_a_row_with_its_words() -> None:
+    assert {e.physics for e in TABLE} <= PHYSICS.keys()

@@ -10,6 +10,7 @@ import numpy as np
 from samii_rig.diagnose.along import POSITION
 from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.classes import Class
+from samii_rig.diagnose.confusions import nearest
 from samii_rig.diagnose.effect import Effect
 from samii_rig.diagnose.intervals import values_of
 from samii_rig.diagnose.judge import MOST_NAMES, Judgement
@@ -22,10 +23,7 @@ from samii_rig.types import Complex, Float
 
 DRAWS = 1000
 SHOWN = 0.01  # probability of an alternative from which it is listed
-# What a factor between two units is: their names are told, not physics.
-UNITS = {57.29578: "degrees for radians", 9.80665: "g for m/s^2", 1000.0: "milli for one",
-         6.283185: "hertz for rad/s"}  # fmt: skip
-UNIT_WITHIN = 0.03
+UNIT_WITHIN = 0.03  # relative, of a fitted gain: what a sensor's calibration may be off by
 
 
 def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> tuple[Cause, ...]:
@@ -55,11 +53,9 @@ def unit_of(effect: Effect, found: dict[str, Value]) -> str:
     """What unit a sensor's gain would be a confusion of, "" for none."""
     if effect.physics != "sensor_gain":
         return ""
-    for factor, name in UNITS.items():
-        for value in (factor, 1 / factor):
-            if abs(found["gain"].value / value - 1) < UNIT_WITHIN:
-                return name
-    return ""
+    gain = found["gain"].value
+    unit, factor = nearest(gain)
+    return unit.name if abs(gain / factor - 1) < UNIT_WITHIN else ""
 
 
 def moved(fitted: Fitted) -> tuple[Moved, ...]:

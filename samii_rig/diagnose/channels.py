@@ -13,6 +13,7 @@ import numpy as np
 from samii_rig.diagnose import insert
 from samii_rig.diagnose.effect import Effect, Factor, Key, Unknown, Values
 from samii_rig.diagnose.less import FASTER, SMALLEST
+from samii_rig.diagnose.rows import PHYSICS
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     SOURCES,
@@ -28,14 +29,7 @@ from samii_rig.types import Complex, Float
 Law = Callable[[Complex, Float], tuple[Complex, list[Complex]]]
 
 # Not physics: wiring, units and signs. They compete with physics and are reported apart.
-NOT_PHYSICS = (
-    "channel_swap",
-    "sign_error",
-    "common_gain",
-    "time_offset",
-    "unit_rest",
-    "input_not_held",
-)
+NOT_PHYSICS = tuple(row.name for row in PHYSICS.values() if not row.physical)
 
 
 def dead_time(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:

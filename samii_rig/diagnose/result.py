@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from samii_rig.diagnose.rows import PHYSICS
 from samii_rig.display import card
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse
@@ -17,13 +18,8 @@ if TYPE_CHECKING:
 Verdict = Literal["no_mismatch", "named", "ambiguous", "unknown"]
 
 # Physics that a person asks for first: where any of it could hide, and with its size.
-HIDING = {
-    "added_mass": ("a mass", "a mass under"),
-    "torsional_compliance": ("a joint that gives", "a joint spring stiffer than"),
-    "viscous_damping": ("a damper", "a damper under"),
-    "transport_delay": ("a delay", "a delay under"),
-}
-SOFT = ("torsional_compliance",)  # the larger its number, the less of it
+HIDING = {row.name: row.hidden for row in PHYSICS.values() if row.hidden}
+SOFT = tuple(row.name for row in PHYSICS.values() if row.soft)  # the larger, the less of it
 LIKELY = 0.5  # probability of a site from which it is told as the place
 
 
