@@ -14,7 +14,6 @@ from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.classes import Class, classes
 from samii_rig.diagnose.explanations import NEAR, Explanation
 from samii_rig.diagnose.measured import Measured
-from samii_rig.diagnose.own_law import OwnLaw, own_law
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Gap, Verdict
 from samii_rig.diagnose.search import Search
@@ -48,7 +47,7 @@ class Judgement:
     right: float
     evidence: Evidence
     inflation: float
-    beyond: Changing | OwnLaw | None = None
+    beyond: Changing | None = None
     partly: bool = False
 
     @property
@@ -125,7 +124,7 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
 
 def _beyond(
     search: Search, best: Explanation, evidence: Evidence, decide: Measured | None
-) -> Changing | OwnLaw | None:
+) -> Changing | None:
     """What is in no table and explains the data better."""
     if any(e.quasi is not None for e in best.effects):
         return None
@@ -134,7 +133,7 @@ def _beyond(
         base = search.nominal if absorbed else best
         if (changing := between_runs(search, base.fitted, decide)) is not None:
             return changing
-    return own_law(search, best)
+    return None
 
 
 def _evidence(

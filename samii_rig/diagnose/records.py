@@ -26,6 +26,7 @@ from samii_rig.diagnose.forms import Form
 from samii_rig.diagnose.model import Grid, Loop, grid
 from samii_rig.diagnose.refit import Fitted, Problem, refit
 from samii_rig.diagnose.result import Band, Gap, Used
+from samii_rig.diagnose.rows import RESONANT
 from samii_rig.diagnose.search import Search
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
@@ -376,9 +377,9 @@ class RecordSearch(Search):
         tries = np.ones(unknowns.size)
         # What resonates is looked for at every line: as many tries of its mass and phase, alike at
         # neighbouring places (a bound of the maximum of a scan; Davies 1987, Biometrika 74).
-        resonant = np.array([e.resonant for e in self.table], bool)
+        resonant = np.array([e.physics in RESONANT for e in self.table], bool)
         unknowns[resonant] = 2
-        tries[resonant] = 2 * self.whole.lines / max(np.count_nonzero(resonant), 1)
+        tries[resonant] = 2 * self.whole.lines / max(int(np.count_nonzero(resonant)), 1)
 
         def chance(t: float) -> float:
             return float(tries @ stats.chi2.sf(t, unknowns)) - ALARM

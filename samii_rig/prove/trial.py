@@ -7,6 +7,7 @@ to score them, and old results can be scored again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -143,7 +144,14 @@ class Answer:
 def _cause(data: Mapping[str, Any]) -> Cause:
     name = (data["physics"], data["site"])
     twins = [(t["physics"], t["site"]) for t in data.get("equivalent_to", ())]
-    values = {k: (p["value"], p["low"], p["high"]) for k, p in data.get("parameters", {}).items()}
+    values = {
+        k: (
+            p["value"],
+            -math.inf if p["low"] is None else p["low"],
+            math.inf if p["high"] is None else p["high"],
+        )
+        for k, p in data.get("parameters", {}).items()
+    }
     return Cause(name, data["probability"], frozenset([name, *twins]), values)
 
 
