@@ -66,7 +66,10 @@ class Disturbed:
             if (across := _across(spring)) is not None and across in kinds
         ]
         wide = _with_input(wide, len(inputs), AccelerationSource, "")
-        chain = Chain(wide).with_values(model.values(x))
+        chain = Chain(wide)
+        # A law that no element has stands beside the chain, and is left out of its disturbances.
+        known = set(chain.parameters)
+        chain = chain.with_values({k: v for k, v in model.values(x).items() if k in known})
         return cls(chain, rig, sensor, len(rig.actuator), tuple(pairs))
 
     def response(self, f: Float, H: Complex, loop: Loop | None) -> Complex:
