@@ -93,6 +93,11 @@ def told(judged: Judgement) -> list[str]:
                     f"{effect.site} was not held between samples but recorded as a meter sees it, "
                     "half a sample from what the rig file states"
                 )
+            case "columns_shifted":
+                out.append(
+                    f"the sensors' columns stand {effect.variant} from {effect.site}: a logger's, "
+                    "as no dead time is a whole number of samples but by chance"
+                )
             case "common_gain":
                 g = found["gain"]
                 out.append(

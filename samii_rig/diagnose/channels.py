@@ -28,6 +28,7 @@ from samii_rig.types import Complex, Float
 
 Law = Callable[[Complex, Float], tuple[Complex, list[Complex]]]
 
+MOST_SHIFTED = 5  # samples, by which a logger's columns are apart; as `signal.columns` looks for
 # Not physics: wiring, units and signs. They compete with physics and are reported apart.
 NOT_PHYSICS = tuple(row.name for row in PHYSICS.values() if not row.physical)
 
@@ -83,6 +84,12 @@ def not_held(s: Complex, _x: Float, rate_hz: float) -> tuple[Complex, list[Compl
     T = 1 / rate_hz
     inside = np.abs(s.imag) < math.pi / T
     return np.where(inside, s * T / -np.expm1(-s * T), 0.0), []
+
+
+def shifted(s: Complex, _x: Float, seconds: float) -> tuple[Complex, list[Complex]]:
+    """exp(-s t): what was measured stands a whole number of samples behind what was sent. A dead
+    time is no whole number but by chance."""
+    return np.exp(-s * seconds), []
 
 
 def second_order(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
@@ -187,6 +194,15 @@ def _input(rig: Rig, name: str, low_hz: float, high_hz: float) -> Iterator[Effec
     yield Effect(physics="sign_error", site=name, factor=Factor("input", name, minus))
     unheld = partial(not_held, rate_hz=rig.rate_hz)
     yield Effect(physics="input_not_held", site=name, factor=Factor("input", name, unheld))
+    for samples in (n for n in range(-MOST_SHIFTED, MOST_SHIFTED + 1) if n != 0):
+        behind = partial(shifted, seconds=samples / rig.rate_hz)
+        yield Effect(
+            physics="columns_shifted",
+            site=name,
+            factor=Factor("input", name, behind),
+            weight=1 / (2 * MOST_SHIFTED),
+            variant=f"{samples:+d} samples",
+        )
 
 
 Update = Callable[[float], dict[str, object]]

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.measured import repeated
+from samii_rig.diagnose.measured import repeated, whole_part
 from samii_rig.diagnose.result import Verdict
 from samii_rig.diagnose.wiring import FEW_LINES, lines_of, named, outputs_of, wired
 from samii_rig.errors import EstimateError, InputError
@@ -176,10 +176,7 @@ def _belongs(response: FrequencyResponse, rig: Rig) -> None:
             f"those of {rig.name}: {', '.join(sensors)}; recordings of another rig, or of sensors "
             "that the rig file does not have (leave them out with --output)",
         )
-    if abs(response.rate_hz / rig.rate_hz - 1) > 1e-6:
-        raise InputError(
-            "recording", "rate_hz", response.rate_hz, f"the rig's rate, {rig.rate_hz:g} Hz"
-        )
+    whole_part(response.rate_hz, rig)
 
 
 def _covered(responses: Sequence[FrequencyResponse], band: tuple[float, float] | None) -> None:

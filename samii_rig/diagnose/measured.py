@@ -189,8 +189,7 @@ def measured(
     """
     data = collect(responses, rig, band)
     rate = data.lines[0].response.rate_hz
-    if abs(rate / rig.rate_hz - 1) > 1e-6:
-        raise InputError("recording", "rate_hz", rate, f"the rig's rate, {rig.rate_hz:g} Hz")
+    whole_part(rate, rig)
     pairs = sorted(
         {(int(s), int(a)) for d in data.lines for s, a in zip(d.sensor, d.actuator, strict=True)}
     )
@@ -232,6 +231,18 @@ def measured(
         inside=(0.0, 0.0),
         rate_hz=rate,
     )
+
+
+def whole_part(rate_hz: float, rig: Rig) -> int:
+    """How many of the rig's samples there are to each that was recorded.
+
+    Raises InputError where that is no whole number.
+    """
+    times = rig.rate_hz / rate_hz
+    if times < 0.5 or abs(times / round(times) - 1) > 1e-6:
+        whole = f"the rig's rate, {rig.rate_hz:g} Hz, or a whole part of it"
+        raise InputError("recording", "rate_hz", rate_hz, whole)
+    return round(times)
 
 
 def _level(response: FrequencyResponse) -> tuple[float, str, bool]:

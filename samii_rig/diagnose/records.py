@@ -87,7 +87,8 @@ class Whole:
             raise EstimateError("no segment is sound")
         steps = {s.name: s.resolution for s in rig.sensor}
         step = tuple(steps[n] for n in wired.sensors)
-        all_, apart = (_records(p, rig, band, step) for p in (joined(levels), levels))
+        (rate,) = {run.rate_hz for run in runs}
+        all_, apart = (_records(p, rate, band, step) for p in (joined(levels), levels))
         return cls(rig, all_, wired, tuple(without.items()), apart)
 
     def by_level(self) -> Whole:
@@ -135,7 +136,7 @@ class Whole:
         """Of a fit, at any s of one contour."""
 
         def at(s: Complex) -> Complex:
-            f = np.minimum(s.imag / (2 * np.pi), self.rig.rate_hz / 2)  # but for rounding
+            f = np.minimum(s.imag / (2 * np.pi), self.records.rate_hz / 2)  # but for rounding
             there = self.grid(f, float(s.real[0]), fitted)
             return fitted.model.response(fitted.x, there)
 
@@ -172,14 +173,17 @@ class Whole:
 
 
 def _records(
-    pieces: Sequence[Piece], rig: Rig, band: tuple[float, float] | None, step: tuple[float, ...]
+    pieces: Sequence[Piece],
+    rate_hz: float,
+    band: tuple[float, float] | None,
+    step: tuple[float, ...],
 ) -> Records:
     """Those that anything drives."""
-    driven = [(p, b) for p, b in zip(pieces, excited(pieces, rig.rate_hz), strict=True) if b]
+    driven = [(p, b) for p, b in zip(pieces, excited(pieces, rate_hz), strict=True) if b]
     if not driven:
         raise EstimateError("nothing drives the rig for five cycles of any line")
     bands = tuple(band or b for _, b in driven)
-    return Records(tuple(p for p, _ in driven), rig.rate_hz, bands, step)
+    return Records(tuple(p for p, _ in driven), rate_hz, bands, step)
 
 
 def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float] | None]:

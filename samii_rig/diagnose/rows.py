@@ -64,6 +64,7 @@ _ROWS = (
     Physics("common_gain", "a scale of the input", physical=False),
     Physics("time_offset", "a channel that is stamped too early", physical=False),
     Physics("unit_rest", "a unit that is another", physical=False),
+    Physics("columns_shifted", "columns that stand samples apart", physical=False),
     Physics("input_not_held", "an input that was not held", physical=False),
 )
 PHYSICS = {row.name: row for row in _ROWS}
