@@ -130,7 +130,7 @@ class _Order:
 
         self.plants = tuple(plant or plants())
         self.rigs = {name: load_rig(name)[1] for name in rig or shipped()}
-        having, self.left_out = pairs(self.plants, self.rigs)
+        having, self.left_out = pairs(self.plants, self.rigs, asked=rig or ())
         self.jobs: Sequence[Job] = jobs(counts, seed, having)
         self.hours, self.keep = hours, keep
 

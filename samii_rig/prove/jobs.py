@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -68,11 +68,12 @@ def pairs(
     rigs: Mapping[str, str],
     kinds: Sequence[str] = KINDS,
     find: Callable[[str], Plant] = plant,
+    asked: Collection[str] | None = None,
 ) -> tuple[Pairs, list[str]]:
     """Every plant with every rig (text by name) that it does not refuse, by kind, and in words each
     rig that a plant cannot make at all.
 
-    InputError for a rig that none can make.
+    asked : rigs that one must make; None for all. InputError for one of them that none can make.
     """
     found: dict[str, list[tuple[str, str]]] = {kind: [] for kind in kinds}
     left_out = []
@@ -85,7 +86,7 @@ def pairs(
                     found[kind].append((name, rig))
             if all(why.values()):
                 left_out.append(f"{name} cannot make {rig}: {why[kinds[0]]}")
-    for rig in rigs:
+    for rig in rigs if asked is None else asked:
         if not any(rig == r for some in found.values() for _, r in some):
             raise InputError(
                 "samii-rig prove", "--rig", rig, f"a rig that {' or '.join(names)} has"
