@@ -184,9 +184,10 @@ def _samples(rig: Rig, device: OpenRig) -> Iterator[Check]:
             yield Check(s.name, "good", found)
 
 
-def _sign(rig: Rig, rig_toml: str, folder: Path, name: str) -> Check:
-    """With the loop of actuator `name` open: a wrong sign would make the centring drive the joint
-    away."""
+def _sign(rig: Rig, rig_toml: str, folder: Path, actuator: str = "") -> Check:
+    """With the loop of the actuator (the first by default) open: a wrong sign would make the
+    centring drive the joint away."""
+    name = actuator or rig.actuator[0].name
     what, loop = "encoder sign", rig.centring_of(name)
     if loop is None:
         whose = "the rig" if len(rig.actuator) == 1 else name
