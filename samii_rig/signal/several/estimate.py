@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from samii_rig.errors import EstimateError, InputError
+from samii_rig.errors import EstimateError, InputError, one_of
 from samii_rig.signal import spectra
 from samii_rig.signal.choose import Method, at_rest, choose
 from samii_rig.signal.gather import Gaps
@@ -45,7 +45,14 @@ def inputs_of(
     """Names of the inputs: those asked for, else the commands that move in any recording; none
     where a single one moves or none does, which the estimate of one input finds by itself."""
     if input is not None:
-        return (input,) if isinstance(input, str) else tuple(dict.fromkeys(input))
+        given = (input,) if isinstance(input, str) else tuple(dict.fromkeys(input))
+        for r in recordings if len(given) > 1 else ():
+            known = [c.name for c in r.channels]
+            for name in given:
+                if name not in known:
+                    where = r.source or "recording"
+                    raise InputError(where, "input", name, one_of(name, known))
+        return given
     moving = [
         n
         for r in recordings

@@ -19,6 +19,8 @@ from samii_rig.signal.groups import Group, Piece, Selection, Waveform, segments_
 from samii_rig.signal.quantisation import coarse
 from samii_rig.types import Channel, Finding, Float, Recording, Segment
 
+_TINY = 1e-300
+
 
 @dataclass(frozen=True, slots=True)
 class Columns:
@@ -137,13 +139,22 @@ def references_in_use(recording: Recording) -> list[str]:
 
 
 def outputs_of(group: Group, columns: Columns) -> Group:
-    """The same repeats as the tests of a single input see them: z the first input and the
-    outputs; other inputs are no outputs, since in a loop they follow from these."""
-    first = columns.part("inputs").start
-    keep = [first, *range(columns.part("outputs").start, len(columns.all))]
+    """The same repeats as the tests of a single input see them: z the input that follows the
+    references most, and the outputs; other inputs are no outputs, since in a loop they follow
+    from these."""
+    inputs = columns.part("inputs")
+    first = inputs.start + _driven_most(group.pieces[0], inputs)
+    keep = [first, *range(inputs.stop, len(columns.all))]
     pieces = [replace(p, z=p.z[:, keep], realisation=i) for i, p in enumerate(group.pieces)]
-    selection = Selection(columns.inputs[0], columns.outputs)
+    selection = Selection(columns.all[first], columns.outputs)
     return replace(group, selection=selection, pieces=pieces, findings=list(group.findings))
+
+
+def _driven_most(piece: Piece, inputs: slice) -> int:
+    """Which input is most alike the sum of the references."""
+    v, r = piece.z[:, inputs] - piece.z[:, inputs].mean(axis=0), piece.r - piece.r.mean()
+    size = np.linalg.norm(v, axis=0)
+    return int(np.argmax(np.abs(r @ v) / np.where(size > 0, size, np.inf)))
 
 
 def _without_foreign(e: Experiment, columns: Columns) -> None:
@@ -233,10 +244,16 @@ def _sort_in(
 
 
 def _waveform(cut: Recording, segment: Segment, columns: Columns, scale: Float) -> Waveform:
-    """All references, each in units of its largest value, one after the other."""
+    """All references, each in units of its largest value, one after the other; with fewer of
+    them than inputs also the inputs, which show what a reference drives."""
+    shown = columns.references
+    if len(shown) < len(columns.inputs):
+        peaks = [np.abs(cut.values[:, cut.column(c.name)]).max() for c in columns.inputs]
+        scale = np.append(scale, np.full(len(peaks), max(*peaks, _TINY)))
+        shown = (*shown, *columns.inputs)
     parts = [
         Waveform.of(cut, segment, cut.values[:, cut.column(c.name)] / x)
-        for c, x in zip(columns.references, scale, strict=True)
+        for c, x in zip(shown, scale, strict=True)
     ]
     return Waveform(
         np.concatenate([p.recorded for p in parts]), np.concatenate([p.counted for p in parts])

@@ -90,29 +90,32 @@ def _windows(Z: Complex, at: Int, width: int, n_in: int, at_rest: bool) -> tuple
     size = np.sqrt(np.mean(np.abs(X) ** 2, axis=1, keepdims=True))
     unit = X / np.where(size > 0, size, 1.0)
     target = near[..., n_in:].reshape(len(at), pieces * width, -1)
-    inverse = np.linalg.pinv(unit, rcond=LEAST_LEFT)
+    left, singular, right = np.linalg.svd(unit, full_matrices=False)
+    apart = singular[:, -1] > LEAST_LEFT * singular[:, 0]
+    kept = np.maximum(singular, LEAST_LEFT * singular[:, :1])[:, :, None]
+    back = right.conj().transpose(0, 2, 1)
+    inverse = back @ (left.conj().transpose(0, 2, 1) / kept)
     B = inverse @ target
     rest = target - unit @ B
     value = np.arange(n_in) * (DEGREE + 1)  # the coefficients of x^0
     scale = size[:, 0, value]
     G = B[:, value].transpose(0, 2, 1) / scale[:, None, :]
-    H, A = _joint(G, n_in)
+    H, A = _joint(G, n_in, apart)
     e = rest[..., n_in:] - rest[..., :n_in] @ H.transpose(0, 2, 1)
     dof = pieces * width - X.shape[2]
     N = e.transpose(0, 2, 1) @ e.conj() / dof
     Q = (inverse[:, value] / scale[:, :, None]).transpose(0, 2, 1) @ A
     power = np.mean(np.abs(target[..., n_in:]) ** 2, axis=1)
     noise = np.diagonal(N, axis1=1, axis2=2)
-    singular = np.linalg.svd(unit, compute_uv=False)
-    apart = singular[:, -1] > LEAST_LEFT * singular[:, 0]
     parts = (H, solve.covariance(N, Q), noise, power, apart)
     return tuple(np.asarray(x, complex) for x in parts)
 
 
-def _joint(G: Complex, n_in: int) -> tuple[Complex, Complex]:
-    """H and G_v^-1 from G (n_freq, n_in + n_out, n_in)."""
+def _joint(G: Complex, n_in: int, apart: NDArray[np.bool_]) -> tuple[Complex, Complex]:
+    """H and G_v^-1 from G (n_freq, n_in + n_out, n_in); of no meaning where not `apart`."""
     size = np.linalg.norm(G[:, :n_in], axis=2, keepdims=True)
     if not np.all(size > 0):
         raise EstimateError("an input follows none of the references; expected one for each input")
-    A = np.linalg.inv(G[:, :n_in] / size) / size.transpose(0, 2, 1)
+    unit = np.where(apart[:, None, None], G[:, :n_in] / size, np.eye(n_in))
+    A = np.linalg.inv(unit) / size.transpose(0, 2, 1)
     return np.asarray(G[:, n_in:] @ A), np.asarray(A)
