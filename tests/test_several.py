@@ -218,7 +218,7 @@ def test_coherence_tells_what_all_inputs_and_what_each_explain(rng):
 
 def test_an_input_that_drives_nothing_is_named(rng):
     made = recording(bursts(0, rng), "burst")
-    with pytest.raises(EstimateError, match=r"the input v_2 never moves .* drives it, or --input"):
+    with pytest.raises(EstimateError, match=r"input v_2 never moves .* or input='v_1'"):
         estimate([made], input=list(INPUTS))
 
 
@@ -243,7 +243,7 @@ def test_two_experiments_that_do_the_same_are_not_independent(rng):
 @pytest.mark.parametrize(
     ("option", "words"),
     [
-        ({"method": "hv"}, "expected auto, local or h1"),
+        ({"method": "hv"}, "expected auto, burst, periodic, local or h1"),
         ({"gaps": "model"}, "expected refuse or exclude"),
         ({"input": ["v_1", "v_3"]}, "expected one of u_1, u_2, v_1, v_2"),
     ],

@@ -122,9 +122,10 @@ def _several(
         return together(recordings, inputs, references, how)
     for name, own in alone.items():
         if not own:
+            rest = " ".join(f"input={n!r}" for n in inputs if n != name)
             raise EstimateError(
                 f"the input {name} never moves in these recordings; expected an experiment that "
-                f"drives it, or --input {' --input '.join(n for n in inputs if n != name)}"
+                f"drives it, or {rest}"
             )
     single = references[0] if references and len(references) == 1 else None
     found = [_one(own, name, single, how) for name, own in alone.items()]

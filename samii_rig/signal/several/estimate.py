@@ -74,11 +74,12 @@ def together(
     Raises EstimateError where there are fewer independent experiments than inputs.
     """
     if how.method in ("h2", "hv"):
-        raise InputError("estimate", "method", how.method, "auto, local or h1 with several inputs")
+        expected = "auto, burst, periodic, local or h1 with several inputs"
+        raise InputError("estimate", "method", how.method, expected)
     if any(is_stepped(r, s) for r in recordings for s in r.segments):
         raise EstimateError(
             "stepped sines are estimated for inputs in turn, while the others rest; here several "
-            "move at once: expected sweeps or multisines, or --input for one of them"
+            "move at once: expected sweeps or multisines, or a single input"
         )
     recorded = references is not None or any(references_in_use(r) for r in recordings)
     gathered = gather(recordings, inputs, how.outputs, references, how.gaps)

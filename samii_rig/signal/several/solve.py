@@ -72,8 +72,9 @@ def require_independent(
         else f"{n_experiments} experiments that are not independent"
     )
     raise EstimateError(
-        f"{where}: {found} for {n} inputs ({', '.join(inputs)}); expected {n} independent ones: "
-        "each input by itself in turn, or blocks of orthogonal multisines; --input names one alone"
+        f"{where}: {found} for {n} inputs ({', '.join(inputs)}); expected {n} independent ones "
+        "(each input in turn, or blocks of orthogonal multisines), or "
+        f"input={inputs[0]!r} alone"
     )
 
 

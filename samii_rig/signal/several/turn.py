@@ -76,7 +76,7 @@ def side_by_side(
             "repeat",
             "warning",
             f"{r.inputs[0].name} at {r.level:g} {r.level_unit} left out: no other input was "
-            f"driven at that level; --input {r.inputs[0].name} estimates it alone",
+            f"driven at that level; input={r.inputs[0].name!r} estimates it alone",
             r.inputs[0].name,
         )
         for r in alone
@@ -122,13 +122,19 @@ def columns_of(responses: Sequence[FrequencyResponse]) -> FrequencyResponse:
         level=first.level if len(levels) == 1 else float("nan"),
         input_rms=_stacked([r.input_rms[at][:, 0] for r, at in zip(responses, lines, strict=True)]),
         n_averages=sum(r.n_averages for r in responses),
-        method=f"{first.method}, inputs in turn",
-        why="; ".join(dict.fromkeys(r.why for r in responses)),
+        method="; ".join((*dict.fromkeys(r.method for r in responses), "inputs in turn")),
+        why=_why(responses),
         even=_largest([r.even for r in responses], lines, rows),
         odd=_largest([r.odd for r in responses], lines, rows),
         findings=(*findings, *_narrowed(responses, lines)),
         sources=tuple(dict.fromkeys(s for r in responses for s in r.sources)),
     )
+
+
+def _why(responses: Sequence[FrequencyResponse]) -> str:
+    if len({r.why for r in responses}) == 1:
+        return responses[0].why
+    return "; ".join(f"{r.inputs[0].name}: {r.why}" for r in responses)
 
 
 def _common_lines(responses: Sequence[FrequencyResponse]) -> list[np.ndarray]:
