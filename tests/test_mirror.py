@@ -1,4 +1,4 @@
-"""The steering mirror of Floren et al. (ISMA 2024): a real rig of three inputs and three outputs."""
+"""The steering mirror of Floren et al. (ISMA 2024): a real rig of three inputs and outputs."""
 
 from __future__ import annotations
 

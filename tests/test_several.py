@@ -206,13 +206,15 @@ def test_coherence_tells_what_all_inputs_and_what_each_explain(rng):
     partial = partial_coherence(found)
     assert partial.shape == (len(found.frequency), 3, 2)
     assert np.all((partial >= 0) & (partial <= 1))
-    n = found.n_averages
-    signal = np.abs(TRUTH(found.frequency) * found.input_rms[:, None, :]) ** 2 / 2
-    # One period of n samples has noise 2 sigma^2/n at a line where a sine a has a^2/2.
-    expected = signal / (signal + (4e-4) ** 2 / len(made[0]) * 2 * 2 / 2)
-    assert n == 16
-    strong = expected > 0.5
-    np.testing.assert_allclose(partial[strong], expected[strong], atol=0.25)
+    signal = np.abs(TRUTH(found.frequency) * found.input_rms[:, None, :]) ** 2
+    # A sine of rms a has n a^2/2 at its line of n samples, over sqrt(n); noise s has s^2, and the
+    # mean of two periods half of it.
+    samples = len(made[0]) // 2
+    expected = signal * samples / 2 / (signal * samples / 2 + (4e-4) ** 2 / 2)
+    assert found.n_averages == 8
+    strong = expected > 0.8
+    np.testing.assert_allclose(partial[strong], expected[strong], atol=0.2)
+    assert abs(np.median(partial[strong] - expected[strong])) < 0.01
     assert np.median(found.coherence) > np.median(partial)
 
 

@@ -44,7 +44,8 @@ def of_lines(
         own_part = np.nan_to_num(found.noise) / found.repeats
         if np.isfinite(found.noise).all():
             distortion = _relative(np.maximum(found.total - own_part, 0.0), found.output)
-            findings += _distorted(found, own_part, [c.name for c in columns.outputs])
+            names = [c.name for c in columns.outputs]
+            findings += _distorted(found, found.total, own_part, names)
     through = ", ".join(c.name for c in columns.references)
     many = f"{n} experiments of {len(columns.inputs)} inputs"
     holds = "the noise and what is not linear" if found.total is not None else "the noise"
@@ -57,7 +58,7 @@ def of_lines(
         dof=found.dof,
         coherence=_coherence(found.output, scatter),
         input_rms=amplitude,
-        n_averages=found.n,
+        n_averages=found.n if found.total is None else n,
         method=f"{method} (inputs together, over {over}, through {through})",
         why=f"{why}; {many}, whose scatter holds {holds}; {found.remark}".rstrip("; ,"),
         noise=noise if np.isfinite(noise).all() else None,
@@ -175,18 +176,17 @@ def _lost_lines(found: Lines) -> list[Finding]:
     return [Finding("dof", "warning" if part > MOST_LOST else "note", text)]
 
 
-def _distorted(found: Lines, noise: Float, names: Sequence[str]) -> list[Finding]:
+def _distorted(found: Lines, total: Float, noise: Float, names: Sequence[str]) -> list[Finding]:
     """A finding for each output whose means scatter by more than their noise, at a chance of
     `FALSE_FINDINGS` for a linear rig: an F test over all lines, each in units of its noise."""
     out = []
     n = len(found.at)
-    assert found.total is not None
     for i, name in enumerate(names):
-        ratio = float(np.mean(found.total[:, i] / np.maximum(noise[:, i], 1e-300)))
+        ratio = float(np.mean(total[:, i] / np.maximum(noise[:, i], 1e-300)))
         p = float(stats.f.sf(ratio, 2 * n * found.nu[1], 2 * n * found.nu[0]))
         if p >= FALSE_FINDINGS / len(names):
             continue
-        excess = float(np.sum(found.total[:, i] - noise[:, i]))
+        excess = float(np.sum(total[:, i] - noise[:, i]))
         size = np.sqrt(max(excess, 0.0) / float(np.sum(found.output[:, i])))
         of_noise = np.sqrt(float(np.sum(found.noise[:, i]) / np.sum(found.output[:, i])))
         text = (
