@@ -135,7 +135,7 @@ def test_what_both_have_is_free_in_the_model_of_both():
 @pytest.fixture(scope="module")
 def summed(plain):
     every = table(RIG, 0.5, 30.0)
-    wholes = [Whole.of(plain.runs, RIG, None, every) for _ in range(2)]
+    wholes = [Whole.of(plain.runs, RIG, None) for _ in range(2)]
     model = States(Model(RIG), RIG, (next(e for e in every if e.physics == "added_mass"),))
     starts = [u.starts[0] for u in model.effects[0].unknowns]
     x = np.append(np.zeros(model.n_nominal), np.log(starts))

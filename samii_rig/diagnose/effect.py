@@ -16,7 +16,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 
 if TYPE_CHECKING:
-    from samii_rig.diagnose.nonlinear_model import Quasi
+    from samii_rig.diagnose.forces.laws import Force
 
 Key = tuple[str, str]
 Values = Mapping[Key, float]
@@ -84,6 +84,7 @@ class Effect:
     write : the rig as a file would have it, from the built rig and the unknowns.
     weight : prior weight against the other hypotheses.
     report : physical quantities to be reported, from the unknowns.
+    resonant : whether it acts in a narrow band that may be anywhere.
     rough : part of what it does by which its law is known to be off; 0 for one that holds.
     variant : tells effects with one name and different changes apart.
     """
@@ -97,12 +98,13 @@ class Effect:
     factor: Factor | None = None
     jump: Jump | None = None
     causal: tuple[str, float] | None = None
-    quasi: Quasi | None = None
+    quasi: Force | None = None
     write: Callable[[Rig, Float], Rig] = lambda rig, _x: rig
     weight: float = 1.0
     aliases: tuple[tuple[str, str], ...] = field(default=())
     report: Callable[[Float], Float] = lambda x: x
     rough: float = 0.0
+    resonant: bool = False
     variant: str = ""
 
     @property

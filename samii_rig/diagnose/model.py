@@ -77,7 +77,7 @@ class Grid:
         return np.asarray(self.sigma + 2j * np.pi * self.frequency, np.complex128)
 
     def at(self, frequency: Float, level: Int | None = None) -> Grid:
-        """The same on some of the frequencies; what depends on their level is in `LevelGrid`."""
+        """The same on some of the frequencies, whatever their level."""
         del level
         i = np.searchsorted(self.frequency, frequency)
         return Grid(

@@ -306,6 +306,7 @@ def _oscillators(rig: Rig, where: Places) -> Iterator[Effect]:
             report=_oscillating,
             jump=Jump(f"V by w at port {port}w", _hanging, ("V", "w")),
             variant=name,
+            resonant=True,
         )
 
 

@@ -51,6 +51,7 @@ PLAIN = {
     "valve_deadband": "a dead band of the valve",
     "backlash": "play",
     "cubic_stiffness": "a joint that stiffens or softens",
+    "hysteresis": "a part that sticks, then slips",
     "flow_saturation": "a flow that saturates",
     "output_saturation": "a clipped command",
 }
