@@ -241,13 +241,16 @@ class FrequencyResponse:
         complex error dH = H.reshape(n_freq, p) - truth; the real and the imaginary part
         of one entry have variance C/2 each.
     dof : (n_freq,) complex degrees of freedom nu of `covariance` (complex Wishart): with
-        p entries, dH^H C^-1 dH is distributed as nu p/(nu-p+1) F(2p, 2(nu-p+1)).
-    coherence : (n_freq, n_out).
+        p entries, dH^H C^-1 dH is distributed as nu p/(nu-p+1) F(2p, 2(nu-p+1)). With several
+        inputs nu counts all columns of H together; one entry alone has `entry_dof`.
+    coherence : (n_freq, n_out) multiple coherence: with one input the ordinary one.
     level : amplitude of the reference in `level_unit`; NaN when mixed.
     input_rms : (n_freq, n_in) amplitude of the input at each line, in the input's unit,
         NaN when unknown: what a describing function is read against.
     even, odd : (n_freq, n_out) relative distortion levels, or None where the excitation
         does not show them.
+    noise, distortion : (n_freq, n_out) rms of the noise of one repeat, and of what is not linear
+        in one realisation, relative to the output at the line; None where nothing told them apart.
     method, why : which estimator, and why it was chosen, in plain words.
     sources : names or hashes of the recordings it came from.
     """
@@ -268,6 +271,8 @@ class FrequencyResponse:
     why: str
     even: Float | None = None
     odd: Float | None = None
+    noise: Float | None = None
+    distortion: Float | None = None
     findings: tuple[Finding, ...] = ()
     sources: tuple[str, ...] = ()
 
@@ -275,6 +280,12 @@ class FrequencyResponse:
     def estimator(self) -> str:
         """The first word of `method`: `burst`, `settled`, `periodic`, `stepped`, `local`, ..."""
         return self.method.split()[0]
+
+    @property
+    def entry_dof(self) -> Float:
+        """(n_freq,) degrees of freedom of the variance of one entry: each input's column has its
+        own part of `dof`."""
+        return self.dof / len(self.inputs)
 
     def variance(self) -> Float:
         """(n_freq, n_out, n_in) E|dH|^2, the diagonal of `covariance`."""

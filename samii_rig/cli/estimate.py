@@ -41,7 +41,10 @@ RigOverride = Annotated[
         autocompletion=rigs,
     ),
 ]
-InputOption = Annotated[str | None, typer.Option("--input", help="Input channel.")]
+InputOption = Annotated[
+    list[str] | None,
+    typer.Option("--input", help="Input channel; may be repeated [default: those that move]."),
+]
 OutputOption = Annotated[
     list[str] | None, typer.Option("--output", help="Output channel; may be repeated.")
 ]
@@ -79,7 +82,8 @@ def frf(
 ) -> None:
     """Estimate frequency responses with their uncertainty; recordings of one level are pooled.
 
-    The method is chosen from what the recordings hold, and said.
+    The method is chosen from what the recordings hold, and said. Several inputs are told apart by
+    experiments in turn or together (docs/several-inputs.md).
 
     Example: samii-rig frf runs/*.mcap --export frf.csv --save frf.mcap
     """
@@ -234,7 +238,7 @@ def read_all(logs: list[Path]) -> list[Recording]:
 
 def estimated(
     recordings: list[Recording],
-    input_: str | None,
+    input_: list[str] | None,
     output: list[str] | None,
     method: str,
     gaps: str,
@@ -247,14 +251,15 @@ def estimated(
     try:
         return estimate(
             recordings,
-            input=input_,
+            input=input_ or None,
             outputs=output,
             method=cast("Method", method),
             gaps=cast("Gaps", gaps),
             band=band,
         )
     except EstimateError as error:  # its advice in the words of the command line
-        raise EstimateError(re.sub(r"gaps='(\w+)'", r"--gaps \1", str(error))) from error
+        said = re.sub(r"(gaps|input)='(\w+)'", r"--\1 \2", str(error))
+        raise EstimateError(said) from error
 
 
 def _one_a_level(path: Path, responses: Sequence[FrequencyResponse]) -> list[Path]:

@@ -154,6 +154,8 @@ def lines_of(r: FrequencyResponse, keep: np.ndarray) -> FrequencyResponse:
         input_rms=r.input_rms[keep],
         even=None if r.even is None else r.even[keep],
         odd=None if r.odd is None else r.odd[keep],
+        noise=None if r.noise is None else r.noise[keep],
+        distortion=None if r.distortion is None else r.distortion[keep],
     )
 
 
@@ -169,6 +171,8 @@ def outputs_of(r: FrequencyResponse, keep: Sequence[int]) -> FrequencyResponse:
         outputs=tuple(r.outputs[k] for k in i),
         even=None if r.even is None else r.even[:, i],
         odd=None if r.odd is None else r.odd[:, i],
+        noise=None if r.noise is None else r.noise[:, i],
+        distortion=None if r.distortion is None else r.distortion[:, i],
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samii_rig.errors import InputError
+from samii_rig.signal.coherence import partial_coherence
 from samii_rig.types import Channel, Float, FrequencyResponse, Recording
 
 if TYPE_CHECKING:
@@ -57,7 +58,16 @@ def arrays(response: FrequencyResponse) -> Arrays:
         "sources": np.array(r.sources, dtype=np.str_),
         "findings": np.array([f"{f.severity}: {f.message}" for f in r.findings], dtype=np.str_),
     }
-    return out | {k: v for k, v in (("even", r.even), ("odd", r.odd)) if v is not None}
+    if len(r.inputs) > 1:
+        out["partial_coherence"] = partial_coherence(r)
+    return out | told(r)
+
+
+def told(response: FrequencyResponse) -> dict[str, Float]:
+    """What of `even`, `odd`, `noise` and `distortion` is known, (n_freq, n_out) each."""
+    r = response
+    every = {"even": r.even, "odd": r.odd, "noise": r.noise, "distortion": r.distortion}
+    return {k: v for k, v in every.items() if v is not None}
 
 
 def frd(response: FrequencyResponse) -> control.FrequencyResponseData:
@@ -132,7 +142,9 @@ def lines(response: FrequencyResponse) -> xarray.Dataset:
         "coherence": ((f, y), r.coherence),
         "input_rms": ((f, u), r.input_rms),
     }
-    held |= {k: ((f, y), v) for k, v in (("even", r.even), ("odd", r.odd)) if v is not None}
+    held |= {k: ((f, y), v) for k, v in told(r).items()}
+    if len(r.inputs) > 1:
+        held["partial_coherence"] = ((f, y, u), partial_coherence(r))
     made: xarray.Dataset = xr.Dataset(
         held,
         coords={

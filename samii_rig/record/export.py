@@ -6,7 +6,8 @@ ever found under its name. What each format can hold:
 - NPZ, MAT: all of it, as arrays without pickle; as variables of MATLAB 5.
 - CSV: all of it but the findings, one row a frequency, units in the names of the columns; gain
   and phase with their standard deviations in the last ones, for a spreadsheet.
-- UFF 58: H (function type 4), coherence (6); the format has no place for a covariance.
+- UFF 58: H (function type 4), coherence (6), of several inputs multiple (26) and partial coherence
+  (21); the format has no place for a covariance.
 """
 
 from __future__ import annotations
@@ -20,9 +21,10 @@ from pathlib import Path
 import numpy as np
 
 from samii_rig.errors import InputError
-from samii_rig.record.convert import arrays
+from samii_rig.record.convert import arrays, told
 from samii_rig.record.uff.channels import response_sets
 from samii_rig.record.uff.file import write_uff
+from samii_rig.signal.coherence import partial_coherence
 from samii_rig.types import Float, FrequencyResponse
 
 
@@ -82,8 +84,9 @@ def table(response: FrequencyResponse) -> tuple[list[str], Float]:
     Columns: frequency; real and imaginary part of each entry of H, outputs first; the
     covariance C = E[dH dH^H] of the entries in that order, its upper triangle, real and
     imaginary part (the diagonal is real); its degrees of freedom; coherence of each
-    output; amplitude of each input; even and odd distortion where known; gain and phase of each
-    entry, with standard deviations sqrt(C/2) and sqrt(C/2)/|H|.
+    output; amplitude of each input; even and odd distortion, noise of one repeat and distortion of
+    one realisation where known; of several inputs the partial coherence of each entry; gain and
+    phase of each entry, with standard deviations sqrt(C/2) and sqrt(C/2)/|H|.
     """
     r = response
     entries = [(f"{y.name}/{u.name}", f"{y.unit}/{u.unit}") for y in r.outputs for u in r.inputs]
@@ -108,11 +111,15 @@ def table(response: FrequencyResponse) -> tuple[list[str], Float]:
     for i, u in enumerate(r.inputs):
         names.append(f"amplitude {u.name} [{u.unit}]")
         columns.append(r.input_rms[:, i])
-    for what, level in (("even", r.even), ("odd", r.odd)):
-        if level is not None:
-            for i, y in enumerate(r.outputs):
-                names.append(f"{what} distortion {y.name} [1]")
-                columns.append(level[:, i])
+    for what, level in told(r).items():
+        said = f"{what} distortion" if what in ("even", "odd") else what
+        for i, y in enumerate(r.outputs):
+            names.append(f"{said} {y.name} [1]")
+            columns.append(level[:, i])
+    if len(r.inputs) > 1:
+        partial = partial_coherence(r).reshape(len(r.frequency), -1)
+        names += [f"partial coherence {name} [1]" for name, _ in entries]
+        columns += list(partial.T)
     for i, (name, unit) in enumerate(entries):
         gain = np.abs(flat[:, i])
         sd = np.sqrt(0.5 * r.covariance[:, i, i].real)

@@ -40,8 +40,11 @@ _FIELDS: tuple[tuple[cdr.Kind, str, str], ...] = (
     ("float64[]", "input_rms", "n_freq * n_in"),
     ("float64[]", "even", "n_freq * n_out, NaN where unknown"),
     ("float64[]", "odd", ""),
+    ("float64[]", "noise", "n_freq * n_out, of one repeat over the output; NaN where unknown"),
+    ("float64[]", "distortion", "n_freq * n_out, of one realisation over the output"),
 )
 _KINDS = tuple(kind for kind, _, _ in _FIELDS)
+_FEWER = len(_KINDS) - 2  # fields of recordings from before noise and distortion were apart
 SCHEMA_TEXT = "".join(
     f"{kind} {name}" + (f"  # {comment}\n" if comment else "\n") for kind, name, comment in _FIELDS
 )
@@ -61,6 +64,11 @@ def encode(response: FrequencyResponse) -> bytes:
         "input_rms": (response.input_rms, (n, n_in)),
         "even": (unknown if response.even is None else response.even, (n, n_out)),
         "odd": (unknown if response.odd is None else response.odd, (n, n_out)),
+        "noise": (unknown if response.noise is None else response.noise, (n, n_out)),
+        "distortion": (
+            unknown if response.distortion is None else response.distortion,
+            (n, n_out),
+        ),
     }
     for name, (array, shape) in shapes.items():
         if np.shape(array) != shape:
@@ -91,13 +99,15 @@ def encode(response: FrequencyResponse) -> bytes:
         response.input_rms,
         shapes["even"][0],
         shapes["odd"][0],
+        shapes["noise"][0],
+        shapes["distortion"][0],
     ]
     return cdr.encode(_KINDS, values)
 
 
 def decode(data: bytes) -> FrequencyResponse:
     """The response in a message; RecordingError if it is not one."""
-    values = dict(zip((name for _, name, _ in _FIELDS), cdr.decode(_KINDS, data), strict=True))
+    values = _values(data)
     try:
         inputs, outputs, findings, sources = (
             json.loads(cast(str, values[key]))
@@ -127,7 +137,10 @@ def decode(data: bytes) -> FrequencyResponse:
         value.real, value.imag = array(f"{name}_real", *shape), array(f"{name}_imag", *shape)
         return value
 
-    even, odd = array("even", n, n_out), array("odd", n, n_out)
+    def known(name: str) -> Float | None:
+        value = array(name, n, n_out) if name in values else np.full((n, n_out), np.nan)
+        return None if np.isnan(value).all() else value
+
     return FrequencyResponse(
         frequency=array("frequency", n),
         H=both("h", n, n_out, n_in),
@@ -143,11 +156,25 @@ def decode(data: bytes) -> FrequencyResponse:
         n_averages=cast(int, values["n_averages"]),
         method=cast(str, values["method"]),
         why=cast(str, values["why"]),
-        even=None if np.isnan(even).all() else even,
-        odd=None if np.isnan(odd).all() else odd,
+        even=known("even"),
+        odd=known("odd"),
+        noise=known("noise"),
+        distortion=known("distortion"),
         findings=noticed,
         sources=named,
     )
+
+
+def _values(data: bytes) -> dict[str, cdr.Value]:
+    names = [name for _, name, _ in _FIELDS]
+    try:
+        return dict(zip(names, cdr.decode(_KINDS, data), strict=True))
+    except RecordingError as error:
+        try:
+            older = cdr.decode(_KINDS[:_FEWER], data)
+        except RecordingError:
+            raise error from None
+        return dict(zip(names[:_FEWER], older, strict=True))
 
 
 def summary(response: FrequencyResponse) -> dict[str, str]:

@@ -195,7 +195,7 @@ def outside(response: FrequencyResponse, H: Complex) -> NDArray[np.bool_]:
     |dH|^2/C is F(2, 2 nu) when `H` is the truth; its quantile has the closed form
     nu ((1 - p)^(-1/nu) - 1), which tends to -ln(1 - p) with certain noise.
     """
-    nu = np.minimum(response.dof, CERTAIN)
+    nu = np.minimum(response.entry_dof, CERTAIN)
     quantile = nu * np.expm1(-np.log1p(-BAND) / nu)
     distance = np.abs(H - response.H) ** 2
     return np.asarray(distance > quantile[:, None, None] * response.variance())

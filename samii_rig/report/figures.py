@@ -32,15 +32,19 @@ _NOISE_PART = 0.004  # of the lines may lie below the gain axis
 
 
 def bode_figure(responses: Sequence[FrequencyResponse], model: ModelCurve | None = None) -> Figure:
-    """Gain and phase of every output (one column each, first input), bands of 90 %.
+    """Gain and phase of every output (one column each) to every input (one below the other), bands
+    of 90 %.
 
     Levels are told apart by colour, the model is dashed black.
     """
     responses = sorted(responses, key=lambda r: (not np.isfinite(r.level), r.level))
-    outputs, u = responses[0].outputs, responses[0].inputs[0]
-    figure = Figure(figsize=(_COLUMN_INCH * len(outputs), _ROW_INCH))
+    outputs, inputs = responses[0].outputs, responses[0].inputs
+    rows = len(inputs)
+    figure = Figure(figsize=(_COLUMN_INCH * len(outputs), _ROW_INCH * rows))
     FigureCanvasAgg(figure)
-    axes = figure.subplots(2, len(outputs), sharex=True, squeeze=False, height_ratios=(1.5, 1.0))
+    axes = figure.subplots(
+        2 * rows, len(outputs), sharex=True, squeeze=False, height_ratios=(1.5, 1.0) * rows
+    )
     width, height = figure.get_size_inches()
     # Fixed margins: matplotlib's layout engine draws everything three times to find them.
     figure.subplots_adjust(
@@ -49,36 +53,44 @@ def bode_figure(responses: Sequence[FrequencyResponse], model: ModelCurve | None
         bottom=_BOTTOM_INCH / height,
         top=1 - _TOP_INCH / height,
         wspace=_LEFT_INCH / (_COLUMN_INCH - _LEFT_INCH),
-        hspace=0.1,
+        hspace=0.1 if rows == 1 else 0.3,
     )
     curves = [Curves.of(r) for r in responses]
-    for i, y in enumerate(outputs):
-        gain, angle = axes[0, i], axes[1, i]
-        for k, c in enumerate(curves):
-            _draw(gain, angle, c, i, _COLOURS[k % len(_COLOURS)])
-        if model is not None:
-            f = responses[0].frequency
-            f = np.union1d(f, model.frequency[(model.frequency > f[0]) & (model.frequency < f[-1])])
-            H = model.at(f, y.name, u.name)
-            nearest = np.interp(f, responses[-1].frequency, curves[-1].angle[:, i, 0])
-            turn = np.rad2deg(np.unwrap(np.angle(np.where(np.isfinite(H), H, 1.0))))
-            turn += 360.0 * np.round(np.median(nearest - turn) / 360.0)
-            gain.plot(f, np.abs(H), "k--", lw=1.1, label=f"model {model.name}")
-            angle.plot(f, np.where(np.isfinite(H), turn, np.nan), "k--", lw=1.1)
-        size = np.abs(np.concatenate([r.H[:, i, 0] for r in responses]))
-        size = size[np.isfinite(size) & (size > 0)]
-        if size.size:
-            low, high = np.quantile(np.log10(size), [_NOISE_PART, 1.0])
-            if model is not None and np.isfinite(H).any():
-                low = min(low, float(np.log10(np.nanmin(np.abs(H)))))
-                high = max(high, float(np.log10(np.nanmax(np.abs(H)))))
-            room = 0.05 * (high - low) + 0.05
-            gain.set_ylim(10 ** (low - room), 10 ** (high + room))
-        _dress(gain, angle, f"{y.name}/{u.name} [{unit(y, u)}]")
-        positive = responses[0].frequency[responses[0].frequency > 0]
-        angle.set_xlim(positive[0], positive[-1])
+    for i, j in np.ndindex(len(outputs), rows):
+        _entry(axes[2 * j, i], axes[2 * j + 1, i], curves, i, j, model)
     axes[0, 0].legend(fontsize=7, frameon=False)
     return figure
+
+
+def _entry(
+    gain: Axes, angle: Axes, curves: Sequence[Curves], i: int, j: int, model: ModelCurve | None
+) -> None:
+    """One output over one input, and the model's."""
+    responses = [c.response for c in curves]
+    y, u = responses[0].outputs[i], responses[0].inputs[j]
+    for k, c in enumerate(curves):
+        _draw(gain, angle, c, i, j, _COLOURS[k % len(_COLOURS)])
+    if model is not None:
+        f = responses[0].frequency
+        f = np.union1d(f, model.frequency[(model.frequency > f[0]) & (model.frequency < f[-1])])
+        H = model.at(f, y.name, u.name)
+        nearest = np.interp(f, responses[-1].frequency, curves[-1].angle[:, i, j])
+        turn = np.rad2deg(np.unwrap(np.angle(np.where(np.isfinite(H), H, 1.0))))
+        turn += 360.0 * np.round(np.median(nearest - turn) / 360.0)
+        gain.plot(f, np.abs(H), "k--", lw=1.1, label=f"model {model.name}")
+        angle.plot(f, np.where(np.isfinite(H), turn, np.nan), "k--", lw=1.1)
+    size = np.abs(np.concatenate([r.H[:, i, j] for r in responses]))
+    size = size[np.isfinite(size) & (size > 0)]
+    if size.size:
+        low, high = np.quantile(np.log10(size), [_NOISE_PART, 1.0])
+        if model is not None and np.isfinite(H).any():
+            low = min(low, float(np.log10(np.nanmin(np.abs(H)))))
+            high = max(high, float(np.log10(np.nanmax(np.abs(H)))))
+        room = 0.05 * (high - low) + 0.05
+        gain.set_ylim(10 ** (low - room), 10 ** (high + room))
+    _dress(gain, angle, f"{y.name}/{u.name} [{unit(y, u)}]")
+    positive = responses[0].frequency[responses[0].frequency > 0]
+    angle.set_xlim(positive[0], positive[-1])
 
 
 def save_figure(path: Path | str, figure: Figure) -> Path:
@@ -105,15 +117,15 @@ def save_figure(path: Path | str, figure: Figure) -> Path:
     return path
 
 
-def _draw(gain: Axes, angle: Axes, c: Curves, i: int, colour: str) -> None:
-    r, at = c.response, lines_of(c.response, i, 0, _BINS)
-    f, size = r.frequency[at], np.abs(r.H[at, i, 0])
+def _draw(gain: Axes, angle: Axes, c: Curves, i: int, j: int, colour: str) -> None:
+    r, at = c.response, lines_of(c.response, i, j, _BINS)
+    f, size = r.frequency[at], np.abs(r.H[at, i, j])
     name = f"{r.level:g} {r.level_unit}" if np.isfinite(r.level) else "measured"
-    low = np.maximum(c.low[at, i, 0], 0.1 * size)  # zero is nowhere on a logarithmic axis
-    gain.fill_between(f, low, c.high[at, i, 0], color=colour, alpha=0.25, lw=0)
+    low = np.maximum(c.low[at, i, j], 0.1 * size)  # zero is nowhere on a logarithmic axis
+    gain.fill_between(f, low, c.high[at, i, j], color=colour, alpha=0.25, lw=0)
     gain.plot(f, size, color=colour, lw=0.9, label=name)
-    half = np.where(c.half[at, i, 0] < 180.0, c.half[at, i, 0], np.nan)
-    turn = c.angle[at, i, 0]
+    half = np.where(c.half[at, i, j] < 180.0, c.half[at, i, j], np.nan)
+    turn = c.angle[at, i, j]
     angle.fill_between(f, turn - half, turn + half, color=colour, alpha=0.25, lw=0)
     angle.plot(f, turn, color=colour, lw=0.9)
 

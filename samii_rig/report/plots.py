@@ -21,6 +21,7 @@ from samii_rig.report.canvas import (
 )
 from samii_rig.report.compare import BAND, Comparison, ModelCurve, pretty, telling
 from samii_rig.report.modes import Modes
+from samii_rig.signal.coherence import partial_coherence
 from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_width
 from samii_rig.types import Channel, Float, FrequencyResponse, Int
 
@@ -89,7 +90,9 @@ def bode(
     noise is shaded, and the modes of the last response are named."""
     responses = [c.response for c in curves]
     y, u = responses[0].outputs[output], responses[0].inputs[input]
-    titles = [f"gain [{unit(y, u)}]", "phase [\u00b0]", "coherence"]
+    several = len(responses[0].inputs) > 1
+    coherences = "coherence: multiple, partial" if several else "coherence"
+    titles = [f"gain [{unit(y, u)}]", "phase [\u00b0]", coherences]
     if _shows_distortion(responses):
         titles.append("distortion [%]")
         figure = stacked(4, titles, 920, weights=(0.36, 0.25, 0.14, 0.25))
@@ -108,6 +111,9 @@ def bode(
         anchor = phase_curve(figure, c, k, output, input, anchor)
         coherence = r.coherence[at, output]
         line(figure, f, coherence, label(r), "y3", k, legend=False, hover="%{y:.3f}")
+        if len(r.inputs) > 1:
+            partial = partial_coherence(r)[at, output, input]
+            points(figure, f, partial, f"partial, {label(r)}", "y3", k, full=False)
     curve = np.empty(0)
     if model is not None and anchor is not None:
         curve = model_gain(figure, responses, model, y.name, u.name)
@@ -128,14 +134,15 @@ def distortion_caption(responses: Sequence[FrequencyResponse]) -> str:
     """What the points of the lowest panel are, "" where there is none."""
     if not _shows_distortion(responses):
         return ""
-    return (
-        "distortion: full points odd, hollow points even, as part of the output; line: "
-        "standard deviation of the gain"
-    )
+    if any(r.even is not None or r.odd is not None for r in responses):
+        said = "full points odd, hollow points even"
+    else:
+        said = "full points what is not linear, hollow points the noise of one repeat"
+    return f"distortion: {said}, as part of the output; line: standard deviation of the gain"
 
 
 def _shows_distortion(responses: Sequence[FrequencyResponse]) -> bool:
-    return any(r.even is not None or r.odd is not None for r in responses)
+    return any(x is not None for r in responses for x in (r.even, r.odd, r.noise, r.distortion))
 
 
 def _distortion(figure: Figure, responses: Sequence[FrequencyResponse], i: int, j: int) -> None:
@@ -149,10 +156,16 @@ def _distortion(figure: Figure, responses: Sequence[FrequencyResponse], i: int, 
         name = f"standard deviation, {level_name}"
         line(figure, f, sigma, name, "y4", k, legend=False, hover="%{y:.2g} %")
         shown.append(sigma)
-        for name, level, full in (("even", r.even, False), ("odd", r.odd, True)):
+        for name, level, full in (
+            ("even", r.even, False),
+            ("odd", r.odd, True),
+            ("noise", r.noise, False),
+            ("distortion", r.distortion, True),
+        ):
             if level is not None:
-                values = 100 * level[:, i]
-                points(figure, f, values, f"{name}, {level_name}", "y4", k, full=full)
+                at = slice(None) if name in ("even", "odd") else lines_of(r, i, j)
+                values = 100 * level[at, i]
+                points(figure, f[at], values, f"{name}, {level_name}", "y4", k, full=full)
                 shown.append(values)
     logs = np.concatenate([np.log10(x[np.isfinite(x) & (x > 0)]) for x in shown])
     if logs.size:

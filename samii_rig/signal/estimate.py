@@ -17,6 +17,8 @@ from samii_rig.signal.distortion import Distortion, distortion
 from samii_rig.signal.gather import Gaps, gather
 from samii_rig.signal.groups import Group, Piece
 from samii_rig.signal.quantisation import floor_of
+from samii_rig.signal.several import turn
+from samii_rig.signal.several.estimate import How, inputs_of, together
 from samii_rig.signal.skew import skews_of, with_skew
 from samii_rig.signal.spectra import (
     burst_spectra,
@@ -42,24 +44,26 @@ DISTINCT = 0.5
 def estimate(
     recordings: Sequence[Recording],
     *,
-    input: str | None = None,
+    input: str | Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
-    reference: str | None = None,
+    reference: str | Sequence[str] | None = None,
     method: Method = "auto",
     gaps: Gaps = "refuse",
     band: tuple[float, float] | None = None,
     pooling: int | None = None,
     nperseg: int = 2048,
 ) -> tuple[FrequencyResponse, ...]:
-    """Frequency responses from one input to all outputs, one for each level and experiment.
+    """Frequency responses from the inputs to all outputs, one for each level and experiment.
 
     Parameters
     ----------
     recordings : segments of equal kind, level and reference are repeats of each other; a
         recording without segments is one segment.
-    input, outputs : channel names; without them the command that moves, and all sensors.
-    reference : column that carries the excitation; without it the reference column in use
-        (u + kp theta_ref when both are), and the input itself when none is.
+    input, outputs : channel names; without them the commands that move, and all sensors. With
+        several inputs see `samii_rig.signal.several`: in turn, each by itself while the others
+        rest; else together.
+    reference : columns that carry the excitation; without them the reference columns in use
+        (for one input u + kp theta_ref when both are), and the inputs themselves when none is.
     method : `auto`; `burst` and `periodic` line by line over repeats; `local` local
         polynomial or rational models; `h1`, `h2`, `hv` Welch, for comparison.
     gaps : what to do with a segment that misses samples: `refuse`, `exclude` it, or `model`
@@ -89,23 +93,68 @@ def estimate(
         raise InputError(
             "estimate", "band", band, "two frequencies in Hz, 0 or more, low below high"
         )
-    out: list[FrequencyResponse] = []
-    failed: list[EstimateError] = []
     skews = skews_of(recordings)
     moved = [aligned(r) for r in recordings]
     recordings = [r for r, _ in moved]
+    inputs = inputs_of(recordings, input)
+    how = How(outputs, method, gaps, band, pooling, nperseg)
+    if len(inputs) > 1:
+        references = [reference] if isinstance(reference, str) else reference
+        out = _several(recordings, inputs, references, how)
+    else:
+        named = inputs[0] if inputs else None
+        single = reference if isinstance(reference, str) else next(iter(reference or ()), None)
+        out = _one(recordings, named, single, how)
+    shifted = tuple(finding for _, finding in moved if finding)
+    out[0] = replace(out[0], findings=(*out[0].findings, *shifted))
+    return tuple(with_skew(response, skews) for response in out)
+
+
+def _several(
+    recordings: Sequence[Recording],
+    inputs: Sequence[str],
+    references: Sequence[str] | None,
+    how: How,
+) -> list[FrequencyResponse]:
+    """Responses to several inputs: in turn where no two ever move at once, else together."""
+    alone = turn.by_input(recordings, inputs)
+    if alone is None:
+        return together(recordings, inputs, references, how)
+    for name, own in alone.items():
+        if not own:
+            rest = " ".join(f"input={n!r}" for n in inputs if n != name)
+            raise EstimateError(
+                f"the input {name} never moves in these recordings; expected an experiment that "
+                f"drives it, or {rest}"
+            )
+    single = references[0] if references and len(references) == 1 else None
+    found = [_one(own, name, single, how) for name, own in alone.items()]
+    out, lost = turn.side_by_side(found)
+    out[0] = replace(out[0], findings=(*out[0].findings, *lost))
+    return out
+
+
+def _one(
+    recordings: Sequence[Recording], input: str | None, reference: str | None, how: How
+) -> list[FrequencyResponse]:
+    """Responses to one input; what could not be estimated is a finding of the first."""
+    method, band, gaps = how.method, how.band, how.gaps
+    out: list[FrequencyResponse] = []
+    failed: list[EstimateError] = []
     if method in ("auto", "periodic"):
         sines, recordings = stepped.split(recordings)
         out, failed = stepped.estimate_stepped(
-            sines, input=input, outputs=outputs, reference=reference, gaps=gaps, band=band
+            sines, input=input, outputs=how.outputs, reference=reference, gaps=gaps, band=band
         )
     groups: list[Group] = []
     if recordings or not (out or failed):
-        groups = gather(recordings, input=input, outputs=outputs, reference=reference, gaps=gaps)
+        groups = gather(
+            recordings, input=input, outputs=how.outputs, reference=reference, gaps=gaps
+        )
     usable: list[Group] = []
     for group in groups:
         try:
-            drop_stuck(group, chosen=outputs is not None)
+            drop_stuck(group, chosen=how.outputs is not None)
             if method not in ("h1", "h2", "hv"):
                 drop_foreign(group)
             usable.append(group)
@@ -114,21 +163,20 @@ def estimate(
     for group in periodic.joined(usable) if method in ("auto", "periodic") else usable:
         try:
             if method in ("h1", "h2", "hv"):
-                out.append(_welch(group, method, nperseg, band))
+                out.append(_welch(group, method, how.nperseg, band))
                 continue
             choice, why = choose(group, method)
             if choice == "local":
                 out.append(_local(group, why, band))
             else:
-                out.append(_repeats(group, choice, why, band, pooling))
+                out.append(_repeats(group, choice, why, band, how.pooling))
         except EstimateError as error:
             failed.append(error)
     if not out:
         raise failed[0]
     lost = tuple(Finding("repeat", "error", f"not estimated: {error}") for error in failed)
-    shifted = tuple(finding for _, finding in moved if finding)
-    out[0] = replace(out[0], findings=(*out[0].findings, *shifted, *lost))
-    return tuple(with_skew(response, skews) for response in out)
+    out[0] = replace(out[0], findings=(*out[0].findings, *lost))
+    return out
 
 
 def _repeats(

@@ -60,7 +60,7 @@ def gather(
         group.findings += seen.found
         name = recording.place(segment)
         z = cut.values[:, [cut.column(n) for n in own.names]]
-        kept, breaks = _whole_rows(cut, seen.names)
+        kept, breaks = whole_rows(cut, seen.names)
         measured = np.ptp(z[kept][:, 1:]) > 0
         if measured and any(np.array_equal(p.z, z[kept]) for p in group.pieces):
             raise EstimateError(
@@ -189,7 +189,7 @@ def _examine(
         alone = frozenset(spoilt) if spoilt <= outputs else frozenset()
         return _Looked(recording, segment, cut, selection, names, found, usable, alone)
 
-    kept, _ = _whole_rows(cut, names)
+    kept, _ = whole_rows(cut, names)
     short = np.count_nonzero(kept) < LEAST_SAMPLES
     if broken and (gaps == "exclude" or broken[0].kind == "timing" or short):
         timed = any(f.kind == "timing" for f in broken)
@@ -202,7 +202,7 @@ def _examine(
     return looked(not spoilt, spoilt)
 
 
-def _whole_rows(cut: Recording, names: Sequence[str]) -> tuple[NDArray[np.bool_], tuple[int, ...]]:
+def whole_rows(cut: Recording, names: Sequence[str]) -> tuple[NDArray[np.bool_], tuple[int, ...]]:
     """Rows in which no needed channel is missing, and the breaks among them."""
     columns = [cut.column(n) for n in names]
     missing = (cut.quality[:, columns] & Quality.MISSING).astype(bool)

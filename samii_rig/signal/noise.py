@@ -53,7 +53,7 @@ def pooled(e: Complex, dof_per_line: float, lines: int, H: Complex | None = None
     e : (n, n_freq, p), n residuals at each line that together have `dof_per_line` degrees
         of freedom.
     H : (n_freq, p) response from the input to the outputs, through which a disturbance may
-        have come; None where there is none to speak of.
+        have come, or (n_freq, p, n_in) from several; None where there is none to speak of.
     Windows keep their width at the ends of the band, where they lie to one side.
     """
     _, n_freq, p = e.shape
@@ -64,14 +64,23 @@ def pooled(e: Complex, dof_per_line: float, lines: int, H: Complex | None = None
     unit = e / rms
     score, factor, order = _shape(unit, dof_per_line)
     through_input = False
-    if H is not None and lively and n_freq >= disturbance.WINDOW:
-        L, log_det = disturbance.shape(unit, disturbance.from_neighbours(H) / rms, dof_per_line)
-        left = np.linalg.solve(L, unit.transpose(1, 2, 0)).transpose(2, 0, 1)
-        other, rest, rest_order = _shape(np.asarray(left), dof_per_line)
+    columns = () if H is None else H.reshape(n_freq, p, -1).transpose(2, 0, 1)
+    data, paid = dof_per_line * n_freq, 0.0
+    taken = np.asarray(np.eye(p), complex)
+    for column in columns if lively and n_freq >= disturbance.WINDOW else ():
+        near = disturbance.from_neighbours(column) / rms
+        if through_input:  # what another input's disturbance left is what this one may explain
+            near = np.asarray(np.linalg.solve(taken, near[:, :, None])[:, :, 0], complex)
+        left = unit if not through_input else _times_inverse(taken, unit)
+        L, log_det = disturbance.shape(left, near, dof_per_line)
+        left = _times_inverse(L, left)
+        other, rest, rest_order = _shape(left, dof_per_line)
         # One more number, S, was fitted.
-        data = dof_per_line * n_freq
-        if other + data * log_det + np.log(data) / 2 < score:
-            factor, order, through_input = L @ rest, rest_order, True
+        cost = paid + data * log_det + np.log(data) / 2
+        if other + cost < score:
+            taken = np.asarray(taken @ L) if through_input else L
+            factor, order, through_input = np.asarray(taken @ rest), rest_order, True
+            score, paid = other + cost, cost
     white = np.linalg.solve(factor, unit.transpose(1, 2, 0))
     power = white @ white.conj().transpose(0, 2, 1)
     total = np.concatenate([np.zeros((1, p, p)), np.cumsum(power, axis=0)])
@@ -82,6 +91,10 @@ def pooled(e: Complex, dof_per_line: float, lines: int, H: Complex | None = None
     mean = (total[start + lines] - total[start]) / nu[:, None, None]
     covariance = factor @ mean @ factor.conj().transpose(0, 2, 1)
     return Noise(covariance * rms[:, None] * rms[None, :], nu, order, through_input)
+
+
+def _times_inverse(L: Complex, e: Complex) -> Complex:
+    return np.asarray(np.linalg.solve(L, e.transpose(1, 2, 0)).transpose(2, 0, 1))
 
 
 def _shape(e: Complex, dof_per_line: float) -> tuple[float, Complex, int]:

@@ -63,5 +63,7 @@ def ratio(
         input_rms=response.input_rms * np.abs(below)[:, None],
         even=None,
         odd=None,
+        noise=None,
+        distortion=None,
         why=f"{response.why}; divided by {bottom}",
     )

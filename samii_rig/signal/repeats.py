@@ -83,6 +83,11 @@ def over_repeats(
     )
 
 
+def wanted_dof(p: int) -> int:
+    """Degrees of freedom that a pooled covariance of p outputs should have."""
+    return max(30, 12 * p)
+
+
 def pooling_lines(n: int, p: int) -> int:
     """How many lines to pool for n repeats of p outputs.
 
@@ -90,6 +95,5 @@ def pooling_lines(n: int, p: int) -> int:
     covariance; 6 for each output keep the joint form as near. An odd number keeps the
     window centred.
     """
-    target = max(30, 12 * p)
-    lines = -(-target // (n - 1))
+    lines = -(-wanted_dof(p) // (n - 1))
     return lines + 1 - lines % 2

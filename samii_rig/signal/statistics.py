@@ -55,7 +55,7 @@ def magnitude_interval(response: FrequencyResponse, level: float = 0.9) -> Inter
     Student's again for a strong response and F(2, 2 nu) for none; the lower limit is 0 where
     no response at all would do.
     """
-    variance, nu = response.variance(), _spread(response.dof, response.H)
+    variance, nu = response.variance(), _spread(response.entry_dof, response.H)
     size = np.abs(response.H)
     half = _component(response, level)
     low, high = np.maximum(size - half, 0.0), size + half
@@ -107,7 +107,7 @@ def phase_half_width(response: FrequencyResponse, level: float = 0.9) -> Float:
     """
     half = _component(response, level)
     size = np.abs(response.H)
-    zero = np.asarray(stats.f.ppf((1 + level) / 2, 2, 2 * response.dof), float)
+    zero = np.asarray(stats.f.ppf((1 + level) / 2, 2, 2 * response.entry_dof), float)
     known = size**2 > zero[:, None, None] * response.variance()
     ratio = np.divide(half, size, out=np.ones(size.shape), where=size > 0)
     return np.where(known & (ratio < 1), np.degrees(np.arcsin(np.minimum(ratio, 1.0))), 180.0)
@@ -217,7 +217,7 @@ def model_difference(
     """
     error = response.H[:, output, input] - model[:, output, input]
     known = np.isfinite(error)
-    f, nu = response.frequency[known], response.dof[known]
+    f, nu = response.frequency[known], response.entry_dof[known]
     # A line known for certain is compared as one known to a millionth.
     least = (1e-6 * np.abs(response.H[known, output, input])) ** 2 + np.finfo(float).tiny
     t2 = np.abs(error[known]) ** 2 / np.maximum(response.variance()[known, output, input], least)
@@ -315,7 +315,7 @@ def _spread(dof: Float, H: Complex) -> Float:
 
 def _component(response: FrequencyResponse, level: float) -> Float:
     """t quantile times the standard deviation of one real component."""
-    t = np.asarray(stats.t.ppf((1 + level) / 2, 2 * response.dof), float)
+    t = np.asarray(stats.t.ppf((1 + level) / 2, 2 * response.entry_dof), float)
     return np.asarray(t[:, None, None] * np.sqrt(response.variance() / 2), float)
 
 

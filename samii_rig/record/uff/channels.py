@@ -11,6 +11,7 @@ from samii_rig.errors import InputError
 from samii_rig.record.uff import function
 from samii_rig.record.uff.file import FUNCTION, DataSet, UffFile
 from samii_rig.record.uff.sets import Fields
+from samii_rig.signal.coherence import partial_coherence
 from samii_rig.types import Channel, Complex, Float, FrequencyResponse, Recording
 
 # Codes of the format: what an axis shows, and along what a channel counts.
@@ -34,6 +35,8 @@ _FUNCTIONS = {
     6: "coherence",
     9: "power spectral density",
     12: "spectrum",
+    21: "partial coherence",
+    26: "multiple coherence",
 }
 NO_LABEL = {"", "NONE", "-"}  # what universal files write for "no label"
 # An uneven abscissa has 6 digits in text, an even one a start and a step. Beyond this relative
@@ -119,13 +122,18 @@ def require_even(recording: Recording, form: str) -> None:
 
 
 def response_sets(response: FrequencyResponse) -> Iterator[DataSet]:
-    """H of each entry, and the coherence of each output."""
-    r = response
+    """H of each entry and the coherence of each output; of several inputs the multiple coherence
+    of each output and the partial coherence of each entry."""
+    r, many = response, len(response.inputs) > 1
+    partial = partial_coherence(r)
+    coherence = "Multiple coherence" if many else "Coherence"
     for i, y in enumerate(r.outputs):
         for j, u in enumerate(r.inputs):
             unit = f"{y.unit}/{u.unit}"
             yield _of_response(r, "FRF", r.H[:, i, j], (i, y), (j, u), unit)
-        yield _of_response(r, "Coherence", r.coherence[:, i], (i, y), (0, r.inputs[0]), "")
+            if many:
+                yield _of_response(r, "Partial coherence", partial[:, i, j], (i, y), (j, u), "")
+        yield _of_response(r, coherence, r.coherence[:, i], (i, y), (0, r.inputs[0]), "")
 
 
 def _of_response(
@@ -140,7 +148,12 @@ def _of_response(
     f = r.frequency
     step = (f[-1] - f[0]) / (len(f) - 1) if len(f) > 1 else 0.0
     even = len(f) > 1 and bool(np.all(np.abs(np.diff(f) / step - 1) < _EVEN))
-    kinds = {"FRF": function.FREQUENCY_RESPONSE, "Coherence": function.COHERENCE}
+    kinds = {
+        "FRF": function.FREQUENCY_RESPONSE,
+        "Coherence": function.COHERENCE,
+        "Partial coherence": function.PARTIAL_COHERENCE,
+        "Multiple coherence": function.MULTIPLE_COHERENCE,
+    }
     return DataSet(
         FUNCTION,
         function_fields(

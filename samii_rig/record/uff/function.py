@@ -1,11 +1,12 @@
 """Data set 58, a function of time or frequency, as text or (58b) as binary numbers.
 
 Its fields: id1 to id5; function_type (1 time response, 2 auto spectrum, 4 frequency response, 6
-coherence, 9 power spectral density), function_id, version, load_case; response and reference:
-_entity, _node, _direction; data_type (2 real, 4 real double, 5 complex, 6 complex double),
-points, even (1: even abscissa), x_min, x_step, z; of the axes x, y, y2 (denominator) and z:
-_type, _length, _force, _temperature (exponents), _label, _unit. Then x (points,) where the
-abscissa is uneven, and data (points,). Text holds 6 digits, of double types 13; binary holds all.
+coherence, 9 power spectral density, 21 partial and 26 multiple coherence), function_id, version,
+load_case; response and reference: _entity, _node, _direction; data_type (2 real, 4 real double,
+5 complex, 6 complex double), points, even (1: even abscissa), x_min, x_step, z; of the axes x, y,
+y2 (denominator) and z: _type, _length, _force, _temperature (exponents), _label, _unit. Then x
+(points,) where the abscissa is uneven, and data (points,). Text holds 6 digits, of double types
+13; binary holds all.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from samii_rig.record.uff.sets import Fields, whole
 
 LINES = 11  # of the head, after the line with the set's number
 TIME_RESPONSE, FREQUENCY_RESPONSE, COHERENCE = 1, 4, 6
+PARTIAL_COHERENCE, MULTIPLE_COHERENCE = 21, 26
 REAL, REAL_DOUBLE, COMPLEX, COMPLEX_DOUBLE = 2, 4, 5, 6
 
 _AXES = ("x", "y", "y2", "z")
