@@ -14,17 +14,35 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent
 VENV = ROOT / ".venv"
 BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
+PYTHON = BIN / ("python.exe" if os.name == "nt" else "python")
+PIP = (PYTHON, "-m", "pip", "--quiet", "--disable-pip-version-check")
+UV = BIN / ("uv.exe" if os.name == "nt" else "uv")
+# Trust the machine's certificates: a network may have its own. Which name counts: uv's version.
+TRUST = {"UV_SYSTEM_CERTS": "1", "UV_NATIVE_TLS": "1"}
+UV_PATIENCE = "20"  # s; pip is there when uv's way is closed, so nobody waits for uv for minutes
+
+
+def run(*command: str | Path, quiet: bool = False, **env: str) -> int:
+    """Run a command in the checkout; its exit code."""
+    words, out = [str(c) for c in command], subprocess.DEVNULL if quiet else None
+    try:
+        done = subprocess.run(
+            words, cwd=ROOT, check=False, env={**os.environ, **env}, stdout=out, stderr=out
+        )
+    except FileNotFoundError:
+        return 127
+    return done.returncode
 
 
 def call(*command: str | Path) -> None:
     """Run a command in the checkout; end with its exit code if it fails."""
-    code = subprocess.run([str(c) for c in command], cwd=ROOT, check=False).returncode
-    if code:
+    if code := run(*command):
         sys.exit(code)
 
 
@@ -36,19 +54,48 @@ def setup(extra: str) -> None:
     stamps = {name: VENV / f"installed{name}" for name in ("", "[dev]")}
     if any(s.exists() and s.read_text() == state for n, s in stamps.items() if extra in n):
         return
-    print("setting up .venv (once; one to three minutes) ...", flush=True)
-    if not (BIN / "python").exists() and not (BIN / "python.exe").exists():
-        made = subprocess.run([sys.executable, "-m", "venv", str(VENV)], check=False)
-        if made.returncode:
-            shutil.rmtree(VENV, ignore_errors=True)
-            sys.exit(
-                "make.py: this Python cannot make a virtual environment; "
-                "install its venv module (Debian and Ubuntu: apt install python3-venv)"
-            )
-    python = BIN / "python"
-    pip = [python, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    call(*pip, "install", "--constraint", "constraints.txt", "--editable", f".{extra}")
+    began = time.monotonic()
+    environment()
+    install("--constraint", "constraints.txt", "--editable", f".{extra}")
     stamps[extra].write_text(state)
+    say(f".venv is ready after {time.monotonic() - began:.0f} s")
+
+
+def say(line: str) -> None:
+    """One line about what is done."""
+    print(f"make.py: {line}", flush=True)
+
+
+def environment() -> None:
+    """A .venv of this very Python that has pip; what an earlier attempt left unfinished goes."""
+    asked = "import pip, sys; sys.exit([sys.version, sys.prefix] != sys.argv[1:])"
+    if run(PYTHON, "-c", asked, sys.version, VENV, quiet=True) == 0:
+        return
+    say(f"making .venv with Python {sys.version.split()[0]}")
+    shutil.rmtree(VENV, ignore_errors=True)
+    if run(sys.executable, "-m", "venv", VENV):
+        shutil.rmtree(VENV, ignore_errors=True)
+        sys.exit(
+            "make.py: this Python cannot make a virtual environment; "
+            "install its venv module (Debian and Ubuntu: apt install python3-venv)"
+        )
+
+
+def install(*what: str) -> None:
+    """Install into .venv by uv (seconds), and where its way is closed by pip (minutes)."""
+    short = ("--retries", "1", "--timeout", UV_PATIENCE)
+    if not UV.exists():
+        run(*PIP, "install", *short, "--constraint", "constraints.txt", "uv", quiet=True)
+    if UV.exists():
+        say("installing by uv (10 to 60 s, once)")
+        more = {**TRUST, "UV_HTTP_TIMEOUT": UV_PATIENCE, "VIRTUAL_ENV": str(VENV)}
+        if run(UV, "pip", "install", "--quiet", *what, **more) == 0:
+            return
+        say("uv could not; what it says stands above. pip is asked instead")
+    say("installing by pip (one to three minutes, once)")
+    if code := run(*PIP, "install", *what):
+        say("nothing was kept that could not be used: the same command tries again")
+        sys.exit(code)
 
 
 def demo(arguments: list[str]) -> None:
