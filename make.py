@@ -3,10 +3,16 @@
 
     python3 make.py demo     the main job on the simulated SAMII, from sweep to report
     python3 make.py check    every check: lint, types, import layers, tests
-    python3 make.py audit    the pinned packages against the known vulnerabilities of PyPI
 
-The first two make a virtual environment in .venv on first use, with the versions that
-constraints.txt pins. Anything after the command is handed on: to `samii-rig run` or to pytest.
+and for those who carry the project on:
+
+    python3 make.py lock      pin every package: constraints.txt and requirements*.txt, with hashes
+    python3 make.py licences  the licence of every package
+    python3 make.py sbom      a CycloneDX bill of materials, in dist/
+    python3 make.py audit     the pinned packages against the known vulnerabilities of PyPI
+
+Each makes a virtual environment in .venv on first use, with the versions that constraints.txt
+pins. Anything after the command is handed on: to `samii-rig run`, to pytest, to the tool.
 """
 
 import hashlib
@@ -15,12 +21,14 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent
 VENV = ROOT / ".venv"
 BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
 PYTHON = BIN / ("python.exe" if os.name == "nt" else "python")
+EVERYTHING = "[dev,docs,release]"  # that a plain installation leaves out
 PIP = (PYTHON, "-m", "pip", "--quiet", "--disable-pip-version-check")
 UV = BIN / ("uv.exe" if os.name == "nt" else "uv")
 # Trust the machine's certificates: a network may have its own. Which name counts: uv's version.
@@ -28,12 +36,12 @@ TRUST = {"UV_SYSTEM_CERTS": "1", "UV_NATIVE_TLS": "1"}
 UV_PATIENCE = "20"  # s; pip is there when uv's way is closed, so nobody waits for uv for minutes
 
 
-def run(*command: str | Path, quiet: bool = False, **env: str) -> int:
+def run(*command: str | Path, quiet: bool = False, env: dict[str, str] | None = None) -> int:
     """Run a command in the checkout; its exit code."""
     words, out = [str(c) for c in command], subprocess.DEVNULL if quiet else None
     try:
         done = subprocess.run(
-            words, cwd=ROOT, check=False, env={**os.environ, **env}, stdout=out, stderr=out
+            words, cwd=ROOT, check=False, env={**os.environ, **(env or {})}, stdout=out, stderr=out
         )
     except FileNotFoundError:
         return 127
@@ -51,7 +59,7 @@ def setup(extra: str) -> None:
     pinned = (ROOT / "pyproject.toml").read_bytes() + (ROOT / "constraints.txt").read_bytes()
     state = hashlib.sha256(pinned + sys.version.encode()).hexdigest()
     # The development set holds the plain one, so it serves both.
-    stamps = {name: VENV / f"installed{name}" for name in ("", "[dev]")}
+    stamps = {name: VENV / f"installed{name}" for name in ("", EVERYTHING)}
     if any(s.exists() and s.read_text() == state for n, s in stamps.items() if extra in n):
         return
     began = time.monotonic()
@@ -89,7 +97,7 @@ def install(*what: str) -> None:
     if UV.exists():
         say("installing by uv (10 to 60 s, once)")
         more = {**TRUST, "UV_HTTP_TIMEOUT": UV_PATIENCE, "VIRTUAL_ENV": str(VENV)}
-        if run(UV, "pip", "install", "--quiet", *what, **more) == 0:
+        if run(UV, "pip", "install", "--quiet", *what, env=more) == 0:
             return
         say("uv could not; what it says stands above. pip is asked instead")
     say("installing by pip (one to three minutes, once)")
@@ -106,7 +114,7 @@ def demo(arguments: list[str]) -> None:
 
 def check(arguments: list[str]) -> None:
     """Lint, types, import layers, tests; stops at the first that fails."""
-    setup("[dev]")
+    setup(EVERYTHING)
     call(BIN / "ruff", "check", ".")
     call(BIN / "ruff", "format", "--check", ".")
     call(BIN / "mypy")
@@ -115,17 +123,18 @@ def check(arguments: list[str]) -> None:
     call(BIN / "pytest", "-q", "-n", workers, "--durations=10", *arguments)
 
 
-def audit(arguments: list[str]) -> None:
-    """Look every pinned package up; fails for a vulnerability, and for a package not looked up."""
-    place = VENV / "audit"
-    python = place / BIN.name / "python"
-    call(sys.executable, "-m", "venv", place)
-    call(python, "-m", "pip", "--quiet", "--disable-pip-version-check", "install", "pip-audit>=2.9")
-    pinned = ("--requirement", "constraints.txt", "--no-deps", "--disable-pip")
-    call(python, "-m", "pip_audit", "--strict", *pinned, *arguments)
+def tool(name: str) -> Callable[[list[str]], None]:
+    """A command that is a file in tools/."""
+
+    def command(arguments: list[str]) -> None:
+        setup(EVERYTHING)
+        call(PYTHON, ROOT / "tools" / f"{name}.py", *arguments)
+
+    return command
 
 
-COMMANDS = {"demo": demo, "check": check, "audit": audit}
+TOOLS = ("lock", "licences", "sbom", "audit")
+COMMANDS = {"demo": demo, "check": check} | {name: tool(name) for name in TOOLS}
 
 if __name__ == "__main__":
     if sys.version_info < (3, 11):
