@@ -2,14 +2,15 @@
 """Set up and run, with nothing but Python 3.11+ (and git, which brought you this).
 
     python3 make.py demo     the main job on the simulated SAMII, from sweep to report
-    python3 make.py check    every check: lint, types, import layers, tests
+    python3 make.py check    every check: lint, types, import layers, what is published, tests
 
 and for those who carry the project on:
 
-    python3 make.py lock      pin every package: constraints.txt and requirements*.txt, with hashes
-    python3 make.py licences  the licence of every package
-    python3 make.py sbom      a CycloneDX bill of materials, in dist/
-    python3 make.py audit     the pinned packages against the known vulnerabilities of PyPI
+    python3 make.py release-check  build what is published, and use it as a stranger would
+    python3 make.py lock           pin every package, with hashes
+    python3 make.py licences       the licence of every package
+    python3 make.py sbom           a CycloneDX bill of materials, in dist/
+    python3 make.py audit          the pinned packages against the known vulnerabilities of PyPI
 
 Each makes a virtual environment in .venv on first use, with the versions that constraints.txt
 pins. Anything after the command is handed on: to `samii-rig run`, to pytest, to the tool.
@@ -29,7 +30,7 @@ VENV = ROOT / ".venv"
 BIN = VENV / ("Scripts" if os.name == "nt" else "bin")
 PYTHON = BIN / ("python.exe" if os.name == "nt" else "python")
 EVERYTHING = "[dev,docs,release]"  # that a plain installation leaves out
-PIP = (PYTHON, "-m", "pip", "--quiet", "--disable-pip-version-check")
+PIP = ("-m", "pip", "--quiet", "--disable-pip-version-check", "install")
 UV = BIN / ("uv.exe" if os.name == "nt" else "uv")
 # Trust the machine's certificates: a network may have its own. Which name counts: uv's version.
 TRUST = {"UV_SYSTEM_CERTS": "1", "UV_NATIVE_TLS": "1"}
@@ -64,7 +65,7 @@ def setup(extra: str) -> None:
         return
     began = time.monotonic()
     environment()
-    install("--constraint", "constraints.txt", "--editable", f".{extra}")
+    install(PYTHON, "--editable", f".{extra}")
     stamps[extra].write_text(state)
     say(f".venv is ready after {time.monotonic() - began:.0f} s")
 
@@ -89,19 +90,20 @@ def environment() -> None:
         )
 
 
-def install(*what: str) -> None:
-    """Install into .venv by uv (seconds), and where its way is closed by pip (minutes)."""
-    short = ("--retries", "1", "--timeout", UV_PATIENCE)
+def install(python: Path, *what: str) -> None:
+    """Install for a Python by uv (seconds), and where its way is closed by pip (minutes)."""
+    what = ("--constraint", "constraints.txt", *what)
     if not UV.exists():
-        run(*PIP, "install", *short, "--constraint", "constraints.txt", "uv", quiet=True)
+        short = ("--retries", "1", "--timeout", UV_PATIENCE, "--constraint", "constraints.txt")
+        run(PYTHON, *PIP, *short, "uv", quiet=True)
     if UV.exists():
         say("installing by uv (10 to 60 s, once)")
-        more = {**TRUST, "UV_HTTP_TIMEOUT": UV_PATIENCE, "VIRTUAL_ENV": str(VENV)}
-        if run(UV, "pip", "install", "--quiet", *what, env=more) == 0:
+        uv = (UV, "pip", "install", "--quiet", "--python", python)
+        if run(*uv, *what, env={**TRUST, "UV_HTTP_TIMEOUT": UV_PATIENCE}) == 0:
             return
         say("uv could not; what it says stands above. pip is asked instead")
     say("installing by pip (one to three minutes, once)")
-    if code := run(*PIP, "install", *what):
+    if code := run(python, *PIP, *what):
         say("nothing was kept that could not be used: the same command tries again")
         sys.exit(code)
 
@@ -113,12 +115,13 @@ def demo(arguments: list[str]) -> None:
 
 
 def check(arguments: list[str]) -> None:
-    """Lint, types, import layers, tests; stops at the first that fails."""
+    """Lint, types, import layers, what is published, tests; stops at the first that fails."""
     setup(EVERYTHING)
     call(BIN / "ruff", "check", ".")
     call(BIN / "ruff", "format", "--check", ".")
     call(BIN / "mypy")
     call(BIN / "lint-imports")
+    call(PYTHON, "-m", "tools.release")
     workers = str(min(os.cpu_count() or 1, 4))
     call(BIN / "pytest", "-q", "-n", workers, "--durations=10", *arguments)
 
@@ -128,13 +131,20 @@ def tool(name: str) -> Callable[[list[str]], None]:
 
     def command(arguments: list[str]) -> None:
         setup(EVERYTHING)
-        call(PYTHON, ROOT / "tools" / f"{name}.py", *arguments)
+        call(PYTHON, "-m", f"tools.{name}", *arguments)
 
     return command
 
 
-TOOLS = ("lock", "licences", "sbom", "audit")
-COMMANDS = {"demo": demo, "check": check} | {name: tool(name) for name in TOOLS}
+COMMANDS = {
+    "demo": demo,
+    "check": check,
+    "lock": tool("lock"),
+    "licences": tool("licences"),
+    "sbom": tool("sbom"),
+    "audit": tool("audit"),
+    "release-check": tool("release"),
+}
 
 if __name__ == "__main__":
     if sys.version_info < (3, 11):

@@ -16,48 +16,51 @@ sys.path.insert(0, str(ROOT))
 import make
 
 WHAT = ("--editable", ".")
+PINNED = "--constraint constraints.txt"
 
 
 @pytest.fixture
 def called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """make.py with a uv and a pip that write down how they are called, and do not install."""
     calls = tmp_path / "calls"
-    for name in ("uv", "pip"):
+    for name in ("uv", "python"):
         tool = tmp_path / name
         tool.write_text(f'#!/bin/sh\necho {name} "$@" >> {calls}\ntest ! -e {tmp_path}/no_{name}\n')
         tool.chmod(0o755)
     monkeypatch.setattr(make, "UV", tmp_path / "uv")
-    monkeypatch.setattr(make, "PIP", (tmp_path / "pip",))
+    monkeypatch.setattr(make, "PYTHON", tmp_path / "python")
+    monkeypatch.setattr(make, "PIP", ("-m", "pip", "install"))
     return calls
 
 
-def test_uv_installs_and_pip_is_not_asked(called: Path, capsys) -> None:
-    make.install(*WHAT)
-    assert called.read_text() == "uv pip install --quiet --editable .\n"
+def test_uv_installs_and_pip_is_not_asked(called: Path, tmp_path: Path, capsys) -> None:
+    make.install(tmp_path / "python", *WHAT)
+    (line,) = called.read_text().splitlines()
+    assert line == f"uv pip install --quiet --python {tmp_path / 'python'} {PINNED} --editable ."
     assert capsys.readouterr().out == "make.py: installing by uv (10 to 60 s, once)\n"
 
 
 def test_where_uv_cannot_pip_installs(called: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "no_uv").touch()
-    make.install(*WHAT)
-    assert called.read_text().splitlines()[1:] == ["pip install --editable ."]
+    make.install(tmp_path / "python", *WHAT)
+    assert called.read_text().splitlines()[1:] == [f"python -m pip install {PINNED} --editable ."]
     assert "uv could not" in capsys.readouterr().out
 
 
 def test_where_there_is_no_uv_pip_is_asked_for_it_then_installs(called: Path, tmp_path: Path):
     (tmp_path / "uv").unlink()
-    make.install(*WHAT)
+    make.install(tmp_path / "python", *WHAT)
     first, second = called.read_text().splitlines()
-    assert first.startswith("pip install --retries 1 ")
-    assert first.endswith(" --constraint constraints.txt uv")
-    assert second == "pip install --editable ."
+    assert first.startswith("python -m pip install --retries 1 ")
+    assert first.endswith(f" {PINNED} uv")
+    assert second == f"python -m pip install {PINNED} --editable ."
 
 
 def test_where_neither_can_it_ends_with_their_exit_code(called: Path, tmp_path: Path) -> None:
     (tmp_path / "no_uv").touch()
-    (tmp_path / "no_pip").touch()
+    (tmp_path / "no_python").touch()
     with pytest.raises(SystemExit) as end:
-        make.install(*WHAT)
+        make.install(tmp_path / "python", *WHAT)
     assert end.value.code == 1
 
 

@@ -16,10 +16,8 @@ from conftest import ROOT
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-sys.path.insert(0, str(ROOT / "tools"))
-import audit
-import licences
-import lock
+sys.path.insert(0, str(ROOT))
+from tools import audit, licences, lock
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 PLAIN = (ROOT / "requirements.txt").read_text("utf-8")

@@ -20,10 +20,11 @@ from cyclonedx.model.license import DisjunctiveLicense
 from cyclonedx.output.json import JsonV1Dot6
 from cyclonedx.schema import SchemaVersion
 from cyclonedx.validation.json import JsonStrictValidator
-from licences import ELSEWHERE, packages
 from packageurl import PackageURL
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name as plain_name
+
+from tools.licences import ELSEWHERE, packages
 
 ROOT = Path(__file__).resolve().parent.parent
 
