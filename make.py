@@ -2,10 +2,11 @@
 """Set up and run, with nothing but Python 3.11+ (and git, which brought you this).
 
     python3 make.py demo     the main job on the simulated SAMII, from sweep to report
-    python3 make.py check    every check: lint, types, import layers, what is published, tests
+    python3 make.py check    every check: lint, types, import layers, site, what is published, tests
 
 and for those who carry the project on:
 
+    python3 make.py docs           the site, in dist/docs; without a network
     python3 make.py release-check  build what is published, and use it as a stranger would
     python3 make.py lock           pin every package, with hashes
     python3 make.py licences       the licence of every package
@@ -23,7 +24,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from subprocess import STDOUT
+from tempfile import TemporaryFile
 
 ROOT = Path(__file__).resolve().parent
 VENV = ROOT / ".venv"
@@ -32,6 +36,10 @@ PYTHON = BIN / ("python.exe" if os.name == "nt" else "python")
 EVERYTHING = "[dev,docs,release]"  # that a plain installation leaves out
 PIP = ("-m", "pip", "--quiet", "--disable-pip-version-check", "install")
 UV = BIN / ("uv.exe" if os.name == "nt" else "uv")
+SITE = [
+    *(PYTHON, "-m", "sphinx", "--fresh-env", "--fail-on-warning", "--keep-going", "--quiet"),
+    *("-c", "docs", ".", "dist/docs"),
+]
 # Trust the machine's certificates: a network may have its own. Which name counts: uv's version.
 TRUST = {"UV_SYSTEM_CERTS": "1", "UV_NATIVE_TLS": "1"}
 UV_PATIENCE = "20"  # s; pip is there when uv's way is closed, so nobody waits for uv for minutes
@@ -115,15 +123,66 @@ def demo(arguments: list[str]) -> None:
 
 
 def check(arguments: list[str]) -> None:
-    """Lint, types, import layers, what is published, tests; stops at the first that fails."""
+    """Lint, types, import layers, site, what is published, tests; stops at the first that fails."""
     setup(EVERYTHING)
     call(BIN / "ruff", "check", ".")
     call(BIN / "ruff", "format", "--check", ".")
-    call(BIN / "mypy")
-    call(BIN / "lint-imports")
-    call(PYTHON, "-m", "tools.release")
-    workers = str(min(os.cpu_count() or 1, 4))
-    call(BIN / "pytest", "-q", "-n", workers, "--durations=10", *arguments)
+    side_by_side(
+        [PYTHON, "-m", "tools.kernels"],
+        [PYTHON, "-m", "tools.release"],
+        SITE,
+        [BIN / "lint-imports"],
+        [BIN / "mypy"],
+    )
+    tests(arguments)
+
+
+def tests(arguments: list[str]) -> None:
+    """All tests: those in real time, one after another, beside the others, which give way.
+
+    A test in real time waits most of its time, so that it costs the others little.
+    """
+    cores = min(os.cpu_count() or 1, 4)
+    pytest = [BIN / "pytest", "-q", "--durations=10"]
+    workers = ["-n", str(cores), "--dist", "worksteal"]  # neighbours stay together: one fixture
+    if arguments:
+        call(*pytest, *workers, *arguments)
+        return
+    nice = [] if os.name == "nt" else ["nice", "-n", "10"]
+    side_by_side(
+        [*pytest, "-m", "real_time and not slow"],
+        [*nice, *pytest, *workers, "-m", "not real_time and not slow"],
+    )
+
+
+def side_by_side(*commands: list[str | Path]) -> None:
+    """Run commands at once; the last prints as it goes, each other when it ends. Ends if one of
+    them failed, after the others."""
+    with ExitStack() as stack:
+        running = []
+        for command in commands[:-1]:
+            said = stack.enter_context(TemporaryFile("w+", encoding="utf-8"))
+            words = [str(word) for word in command]
+            process = subprocess.Popen(words, cwd=ROOT, stdout=said, stderr=STDOUT)
+            running.append((command, process, said))
+        failed = run(*commands[-1])
+        for command, process, said in running:
+            code = process.wait()
+            said.seek(0)
+            print(said.read(), end="", flush=True)
+            if code:
+                say(f"{' '.join(Path(str(w)).name for w in command)}: exit code {code}")
+            failed = failed or code
+    if failed:
+        sys.exit(failed)
+
+
+def docs(arguments: list[str]) -> None:
+    """Build the site whole; a warning is an error, so that no page is lost and no link is dead."""
+    setup(EVERYTHING)
+    shutil.rmtree(ROOT / "dist" / "docs", ignore_errors=True)
+    call(*SITE, *arguments)
+    say(f"the site is {ROOT / 'dist' / 'docs' / 'docs' / 'index.html'}")
 
 
 def tool(name: str) -> Callable[[list[str]], None]:
@@ -144,6 +203,7 @@ COMMANDS = {
     "sbom": tool("sbom"),
     "audit": tool("audit"),
     "release-check": tool("release"),
+    "docs": docs,
 }
 
 if __name__ == "__main__":
