@@ -12,9 +12,10 @@ service and the stop's own listener are asked.
 
 Attacked: the same, with tokens and 1,024 descriptors, while another process at the same address
 holds 1,100 half-sent heads at each of the two ports (and opens those that are closed anew, 500 a
-second), shows 20 wrong tokens and sends 5 heads of 100 kB a second. It yields to all others where
-they want a processor: an attacker has one of their own. Where a proxy answers the service's port
-with an error, the listener's figures are what a page gets.
+second), shows 20 wrong tokens and sends 5 heads of 100 kB a second. With a viewer's token it has
+plans of three hours predicted all the time, and the index is overwritten every second. It yields to
+all others where they want a processor: an attacker has one of their own. Where a proxy answers the
+service's port with an error, the listener's figures are what a page gets.
 
 Pairs: the simulated serial node in real time, a run without viewers and one with them by turns;
 prints how late the loop's sleeps ended in either, and that no sample is missing.
@@ -56,6 +57,7 @@ import numpy as np
 from websockets.sync.client import connect
 
 from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.index.store import FILE, PRIVATE
 from samii_rig.record.reader import read_events, read_recording
 from samii_rig.record.verify import verify
 from samii_rig.rig.load import load_rig
@@ -149,9 +151,10 @@ def ended(service: Service, id_: str) -> dict:
 HALF = b"GET / HTTP/1.1\r\nhost: x\r\n"
 HELD, ANEW = 1100, 500  # half-sent heads at each port, and so many a second opened anew
 WRONG, LARGE = 20, 5  # wrong tokens and heads of 100 kB a second
+PLANNED = 4  # plans that are asked for at once, of which two are predicted and two wait
 
 
-def attack(url: str, ports: Sequence[int]) -> None:
+def attack(url: str, ports: Sequence[int], viewer: str, index: Path) -> None:
     """All of it at once, until it is killed; it has descriptors enough of its own."""
 
     os.nice(19)
@@ -173,20 +176,41 @@ def attack(url: str, ports: Sequence[int]) -> None:
                     await http.get(f"{url}/api/state", headers=headers)
                 await asyncio.sleep(1.0 / rate)
 
+    async def plan() -> None:
+        body = {"experiment_toml": sweep(duration=900.0, repeats=11)}
+        headers = {"authorization": f"Bearer {viewer}"}
+        async with httpx.AsyncClient(timeout=300.0) as http:
+            while True:
+                with suppress(httpx.HTTPError):
+                    await http.post(f"{url}/api/dry-run", headers=headers, json=body)
+                await asyncio.sleep(0.1)
+
+    async def damage() -> None:
+        while True:
+            with suppress(OSError):
+                index.write_bytes(random.randbytes(20_000))
+            await asyncio.sleep(1.0)
+
     async def all_() -> None:
-        asked = [ask(WRONG, {"authorization": "Bearer wrong"}), ask(LARGE, {"x": "y" * 100_000})]
+        work = [damage(), *(plan() for _ in range(PLANNED))]
+        asked = [
+            *work,
+            ask(WRONG, {"authorization": "Bearer wrong"}),
+            ask(LARGE, {"x": "y" * 100_000}),
+        ]
         await asyncio.gather(*(hold(port) for port in ports), *asked)
 
     asyncio.run(all_())
 
 
 @contextmanager
-def attacked(service: Service, wanted: bool):
-    if not wanted:
+def attacked(service: Service, viewer: str):
+    if not viewer:
         yield
         return
     ports = [int(service.port), int(service.stop_port)]
-    process = get_context("spawn").Process(target=attack, args=(service.url, ports), daemon=True)
+    given = (service.url, ports, viewer, service.folder / PRIVATE / FILE)
+    process = get_context("spawn").Process(target=attack, args=given, daemon=True)
     process.start()
     time.sleep(5.0)  # until all are held
     try:
@@ -199,17 +223,18 @@ def attacked(service: Service, wanted: bool):
 
 def stops(arguments: argparse.Namespace, count: int, under_attack: bool) -> None:
     at: dict[str, tuple[list[float], list[float]]] = {"service": ([], []), "listener": ([], [])}
-    plain, missing = [], 0
+    plain, missing, viewer = [], 0, ""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as kept:
         options, more = ["--pace", "1"], {}
         if under_attack:
             tokens = Path(folder) / "tokens.json"
             more = {"token": Tokens(tokens).add("Ada", "operator"), "descriptors": 1024}
+            viewer = Tokens(tokens).add("Eve", "viewer")
             options += ["--tokens", str(tokens)]
         service = kept.enter_context(Service(Path(folder) / "runs", *options, **more))
         all_ = kept.enter_context(watching(service, arguments.viewers, arguments.slow))
         lease = kept.enter_context(service.lease())
-        kept.enter_context(attacked(service, under_attack))
+        kept.enter_context(attacked(service, viewer))
         for i in range(count):
             for v in all_:
                 v.apart = math.inf

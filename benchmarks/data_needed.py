@@ -1,6 +1,7 @@
 """How much data a diagnosis needs, and what each part of it buys.
 
-    samii-rig prove --keep --nothing 6 --one 28 --two 0 --outside 0 --joints 0 --out kept
+    samii-rig prove --keep --plant concealed --rig samii --nothing 6 --one 28 --two 0 --outside 0 \\
+        --joints 0 --force 0 --out kept
     python benchmarks/data_needed.py kept --workers 2
 
 Each kept trial is diagnosed again with less: more noise, fewer channels, one level, shorter runs;
@@ -25,7 +26,7 @@ import numpy as np
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.errors import SamiiRigError
 from samii_rig.plain import plain
-from samii_rig.prove.campaign import truth_of
+from samii_rig.prove.outcomes import truth_of
 from samii_rig.prove.score import confidently_wrong, frequency
 from samii_rig.prove.trial import Answer, Trial
 from samii_rig.record.export import replacing

@@ -3,8 +3,9 @@
     python benchmarks/gate_mutants.py [--only judgement] [--after LINE] [--sample N] [--list]
 
 Each mutant changes one operator, constant, condition, state or act, or leaves a statement out, in
-gate.py, judgement.py, latest.py, readback.py or agreement.py, and runs the gate's tests until the
-first fails. Prints the survivors, which a person must judge; exit code 1 below 98 % killed.
+gate.py, judgement.py, lane.py, latest.py, readback.py or agreement.py, and runs the gate's tests
+until the first fails. Prints the survivors, which a person must judge; exit code 1 below 98 %
+killed.
 """
 
 import argparse
@@ -28,12 +29,13 @@ import hypothesis
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-MODULES = ("judgement", "gate", "latest", "readback", "agreement")
-TESTS = ("judgement", "reference", "readback", "agreement", "", "limits", "stuck")
+MODULES = ("judgement", "gate", "lane", "latest", "readback", "agreement")
+TESTS = ("judgement", "reference", "readback", "agreement", "several", "", "limits", "stuck")
 WANTED = 0.98
 FIRST = {  # "" is tests/test_gate.py
     "judgement": ("judgement", "reference"),
-    "gate": ("",),
+    "gate": ("several", ""),
+    "lane": ("several", ""),
     "latest": ("judgement",),
     "readback": ("readback",),
     "agreement": ("agreement",),

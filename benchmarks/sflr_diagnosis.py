@@ -21,12 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.by_record import on_records
+from samii_rig.diagnose.diagnose import case_of, diagnose, table
 from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.measured import measured
 from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.nonlinear import compete
-from samii_rig.diagnose.nonlinear_time import confirm
 from samii_rig.diagnose.refit import Fitted, Problem, refit
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.search import Search
@@ -246,37 +246,33 @@ def unused(
 
 
 def motor(data: Path, rig: Rig) -> None:
-    """The motor alone: dry friction from the sweeps, held against the steps."""
+    """The motor alone: forces held against every sample of the sweeps."""
     alone = motor_alone(rig)
     sweeps = [
         r for n in MOTOR_LEVELS for r in runs_of(data, f"*motor-only_swept*amp-{n}_*", "sflr_motor")
     ]
-    responses = estimate(sweeps, band=MOTOR_BAND)
-    lines = measured(responses, alone, MOTOR_BAND)
-    at = grid(alone, lines.frequency, lines.sensor, lines.actuator)
     rivals = [e for e in table(alone, *MOTOR_BAND) if e.physics in MOTOR_RIVALS]
-    search = Search(alone, lines.splits()[0], at, rivals)
-    search.run()
-    compete(search, responses)
-    steps = {
-        n: runs_of(data, f"*ol_step_response_amp-{n}_*", "sflr_motor_open") for n in MOTOR_LEVELS
-    }
-    linear = search.nominal.fitted
-    print(f"\nmotor alone, chi-square per dof of the refitted model {search.ratio(linear):.3g}")
+    case = case_of(estimate(sweeps, band=MOTOR_BAND), alone, MOTOR_BAND, rivals, sweeps)
+    linear = on_records(case, MOTOR_BAND)
+    if linear is None:
+        print("\nmotor alone: the recordings cannot be used sample by sample")
+        return
+    linear.run(briefly=True)
+    search = ForceSearch(linear)
+    search.settled()
+    left = search.ratio(search.nominal.fitted)
+    print(f"\nmotor alone, chi-square per dof of the refitted model {left:.3g}")
     tried: set[str] = set()
     for e in search.ranked():
         force = next((x for x in e.effects if x.quasi is not None), None)
         if force is None or force.physics in tried:
             continue
         tried.add(force.physics)
-        found, at_end = e.fitted, [u for x in e.effects for u in x.unknowns][-1]
-        sd = math.sqrt(found.covariance()[-1, -1] * search.temperature)
+        found, at = e.fitted, e.fitted.model.own(e.effects.index(force))[0]
+        sd = math.sqrt(found.covariance()[at, at] * search.temperature)
         names = " and ".join(f"{x.physics} at {x.site}" for x in e.effects)
-        print(f"{names}: {math.exp(found.x[-1]):.3g} {at_end.unit} (sd {sd:.0%}), "
+        print(f"{names}: {math.exp(found.x[at]):.3g} {force.unknowns[0].unit} (sd {sd:.0%}), "
               f"chi-square per dof {search.ratio(found):.3g}")  # fmt: skip
-        for n, runs in steps.items():
-            held = confirm(linear, found, runs)
-            print(f"    steps at {n} counts: {held.linear:.2%} without, {held.forced:.2%} with it")
 
 
 def main() -> None:

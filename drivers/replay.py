@@ -149,6 +149,7 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
         plans = [e for e in read_events(path) if e.name == "plan"]
     except RecordingError as error:
         raise InputError.saying(rig.name, "device.settings.recording", str(error)) from error
+    check_rig(rig, settings)
     _check(rig, recording, str(path), bool(plans))
     device = Replay(rig, recording, int(plans[0].payload["start"]), real=chosen.pace == "real")
     return OpenRig(
@@ -165,6 +166,12 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
             "timing": recording.metadata.get("device_timing", "{}"),
         },
     )
+
+
+def check_rig(rig: Rig, settings: Mapping[str, object]) -> None:
+    """InputError for a rig with several outputs: the samples of one run are aligned by one."""
+    if len(rig.actuator) != 1:
+        raise InputError(rig.name, "actuator", len(rig.actuator), "one; a replay drives one output")
 
 
 def _check(rig: Rig, recording: Recording, path: str, planned: bool) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 
 import numpy as np
 
 from samii_rig.devices.protocols import CommandBlock, DeviceLoop
-from samii_rig.errors import DeviceError
+from samii_rig.errors import DeviceError, InputError
+from samii_rig.rig.schema import Rig
 from samii_rig.types import Int
 
 
@@ -15,6 +17,16 @@ def taken(pairs: deque[tuple[int, int]]) -> Int:
     """(n, 2) of what a sensor's `arrivals()` gives; `pairs` is empty then."""
     found = np.array([pairs.popleft() for _ in range(len(pairs))], dtype=np.int64)
     return found.reshape(-1, 2)
+
+
+def only_measures(rig: Rig, settings: Mapping[str, object]) -> None:
+    """InputError: a rig cannot be driven through a device without an output."""
+    raise InputError(
+        rig.name,
+        "device.driver",
+        rig.device.driver,
+        "a device that drives; this one only measures, beside another (docs/composite.md)",
+    )
 
 
 class NoOutput:

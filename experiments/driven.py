@@ -1,4 +1,4 @@
-"""What all experiments share that drive one actuator: levels, and how they act on the loop."""
+"""What all experiments share that drive an actuator: levels, and how they act on the loop."""
 
 from __future__ import annotations
 
@@ -67,20 +67,25 @@ class Driven(Strict):
         Without centring kp is 0, and the device reads the sensor to no effect. InputError if
         the rig has no such actuator, another unit, or no centring where it is needed.
         """
-        actuator = find_actuator(rig, self.actuator, where)
-        centring = rig.centring
+        return self._loop_on(self.actuator, rig, where)
+
+    def _loop_on(self, name: str, rig: Rig, where: str) -> tuple[float, str]:
+        actuator = find_actuator(rig, name, where)
+        centring = rig.centring_of(name)
+        first = len(rig.actuator) == 1 or name == rig.actuator[0].name
+        table = "[centring]" if first else f"centring of {name}"
         unit, what = actuator.unit, f"actuator {actuator.name}"
         if self.drive == "reference":
             if centring is None:
                 raise InputError(
-                    where, "drive", "reference", f"a rig that centres; {rig.name} has no [centring]"
+                    where, "drive", "reference", f"a rig that centres; {rig.name} has no {table}"
                 )
             unit, what = rig.units()[centring.sensor], f"sensor {centring.sensor}"
         if self.unit != unit:
             raise InputError(where, "unit", self.unit, f"{unit!r}, the unit of {what}")
         kp = self.kp if self.kp is not None else (centring.kp if centring else 0.0)
         if kp > 0 and centring is None:
-            raise InputError(where, "kp", kp, f"0; {rig.name} has no [centring]")
+            raise InputError(where, "kp", kp, f"0; {rig.name} has no {table}")
         if kp == 0 and self.drive == "reference":
             raise InputError(where, "kp", kp, "above 0: the reference acts through kp alone")
         return kp, centring.sensor if centring else rig.sensor[0].name

@@ -75,6 +75,7 @@ class ModeScan(SweptSine):
     reference, with 90 % intervals, beside the rig file's own (Fig. 8 and 9 of paper 1).
     """
 
+    several = False
     experiment: Literal["mode_scan"]  # type: ignore[assignment]
     reference: Name
     modes_hz: Annotated[tuple[float, ...], Field(min_length=1, max_length=20)]

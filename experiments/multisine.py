@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from experiments.driven import Driven
+from experiments.inputs import Inputs
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import NonNegative, Positive, Rig
 from samii_rig.run.plan import Plan, PlannedSegment
@@ -20,8 +20,8 @@ from samii_rig.types import Float
 LEAST_FACTOR = 0.01
 
 
-class Multisine(Driven):
-    """A multisine experiment file.
+class Multisine(Inputs):
+    """A multisine experiment file. Several inputs are driven together, on the same lines.
 
     Each segment is one realisation: a cosine ramp, whole periods of settling, whole measured
     periods, a ramp down. The recorded segment (kind `periodic`) holds the last settling
@@ -37,6 +37,9 @@ class Multisine(Driven):
     crest : wanted peak/rms, see `samii_rig.signal.multisine`.
     order : `by_level` runs all realisations of a level before the next, `by_realisation`
         all levels of a realisation.
+
+    With `beside` each realisation is a block of segments, 2 for two inputs and 4 for three or
+    four, in which the inputs, with random phases of their own, have orthogonal signs.
     """
 
     experiment: Literal["multisine"]
@@ -78,8 +81,9 @@ class Multisine(Driven):
             )
         self.check_band(rig, where, ("low_hz", self.low_hz), ("high_hz", self.high_hz))
         length = n * (self.settle + self.periods) + 2 * self.ramp * rig.rate_hz
-        self.check_length(rig, where, "period", length * len(self.amplitudes) * self.realisations)
-        grid, phases = np.random.SeedSequence(self.seed).spawn(2)
+        segments = len(self.amplitudes) * self.realisations * self.block
+        self.check_length(rig, where, "period", length * segments)
+        grid, *phases = np.random.SeedSequence(self.seed).spawn(2 + len(self.beside))
         lines = odd_lines(
             self.low_hz, self.high_hz, self.period, self.group, np.random.default_rng(grid)
         )
@@ -87,21 +91,33 @@ class Multisine(Driven):
             least = f"a longer one: {self.group} odd lines between low_hz and high_hz at least"
             raise InputError(where, "period", self.period, least)
         shape = schedule_factor(lines.excited / self.period, self.schedule, self.interpolation)
-        waves = realisations(n, lines.excited, shape, self.crest, self.realisations, phases)
-        return self.planned(
+        waves, *others = (
+            realisations(n, lines.excited, shape, self.crest, self.realisations, own)
+            for own in phases
+        )
+        order = self._order()
+        planned = (self._segment(rig.rate_hz, level, i, waves[i]) for level, i in order)
+        return self.together(
             rig,
-            kp,
-            sensor,
-            tuple(self._segment(rig.rate_hz, level, i, waves[i]) for level, i in self._order()),
+            self.planned(rig, kp, sensor, tuple(planned)),
+            [
+                [self._wave(rig.rate_hz, level, other[i])[0] for other in others]
+                for level, i in order
+            ],
         )
 
-    def _segment(self, rate_hz: float, level: float, i: int, wave: Float) -> PlannedSegment:
+    def _wave(self, rate_hz: float, level: float, wave: Float) -> tuple[Float, int, int]:
+        """One period repeated with its ramps, and the samples of it that are recorded."""
         n, ramp = wave.size, round(self.ramp * rate_hz)
         before = ramp + (self.settle - 1) * n
         stop = before + (1 + self.periods) * n
         turn = np.arange(-before, stop - before + ramp) % n
-        wave = level * wave[turn] * cosine_ramp(turn.size, rate_hz, ramp / rate_hz)
-        u, theta_ref = self.references(wave)
+        shaped = level * wave[turn] * cosine_ramp(turn.size, rate_hz, ramp / rate_hz)
+        return shaped, before, stop
+
+    def _segment(self, rate_hz: float, level: float, i: int, wave: Float) -> PlannedSegment:
+        shaped, before, stop = self._wave(rate_hz, level, wave)
+        u, theta_ref = self.references(shaped)
         return PlannedSegment(
             name=f"{self.name}_{level:g}_{i + 1}",
             kind="periodic",

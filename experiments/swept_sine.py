@@ -7,15 +7,15 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from experiments.driven import Driven
+from experiments.inputs import Inputs
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import NonNegative, Positive, Rig
 from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.signal.excitation import Sweep, swept_sine
 
 
-class SweptSine(Driven):
-    """A swept sine experiment file.
+class SweptSine(Inputs):
+    """A swept sine experiment file. Several inputs are swept one after the other.
 
     start_hz, stop_hz, duration : of the sweep, s; `ramp` at both of its ends is inside.
     schedule : points [Hz, factor], factor at most 1, by which the level is lowered over
@@ -68,8 +68,9 @@ class SweptSine(Driven):
             )
         self.check_band(rig, where, ("start_hz", self.start_hz), ("stop_hz", self.stop_hz))
         samples = (self.lead_in + self.duration + self.ring_down) * rig.rate_hz
-        self.check_length(rig, where, "duration", samples * len(self.amplitudes) * self.repeats)
-        return self._plan(rig, kp, sensor)
+        segments = len(self.amplitudes) * self.repeats * len(self.inputs)
+        self.check_length(rig, where, "duration", samples * segments)
+        return self.one_by_one(rig, self._plan(rig, kp, sensor))
 
     def _plan(self, rig: Rig, kp: float, sensor: str) -> Plan:
         shape, frequency = swept_sine(

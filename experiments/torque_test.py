@@ -51,6 +51,7 @@ class TorqueTest(SweptSine):
     ends of the band, and the moment's mean (m g r where the link stands out level).
     """
 
+    several = False
     experiment: Literal["torque_test"]  # type: ignore[assignment]
     angle: Name
     moment: Name

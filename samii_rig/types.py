@@ -95,6 +95,8 @@ class Segment:
     start, stop : sequence numbers, half open; lead-in and ring-down are inside.
     level : peak amplitude of the reference in `unit`; levels are never pooled silently.
     repeat : 0, 1, ...; segments of equal `kind` and `level` with the same reference.
+    excited : commands that were driven, of a rig with several; the others rested. Empty where
+        there is but one.
     """
 
     name: str
@@ -104,6 +106,7 @@ class Segment:
     level: float
     unit: str
     repeat: int = 0
+    excited: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

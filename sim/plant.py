@@ -49,15 +49,15 @@ class Tables(NamedTuple):
     ahead: Int
 
 
-def tabulate(rig: Rig, made: Realisation, inner: int) -> Tables:
-    """Tables of the first actuator's response at `inner` steps a sample."""
+def tabulate(rig: Rig, made: Realisation, inner: int, actuator: int = 0) -> Tables:
+    """Tables of the response to one actuator at `inner` steps a sample."""
     h = 1.0 / (rig.rate_hz * inner)
     p = made.poles
-    whole, delta = _split(rig.actuator[0].delay + float(made.late[0]), h)
+    whole, delta = _split(rig.actuator[actuator].delay + float(made.late[actuator]), h)
     pipeline, change = divmod(whole, inner)
     new = _phi(p, h - delta)
     old = _phi(p, h) - new
-    weight = np.where(p.imag > 0, 2.0, 1.0)[:, None] * made.residues[:, :, 0]
+    weight = np.where(p.imag > 0, 2.0, 1.0)[:, None] * made.residues[:, :, actuator]
     m = len(rig.sensor)
     row = np.zeros((m, 2, p.size))
     row_old, row_new, row_extra = np.zeros(m), np.zeros(m), np.zeros(m)
@@ -73,7 +73,7 @@ def tabulate(rig: Rig, made: Realisation, inner: int) -> Tables:
         # Read before or after the output changes within the step, the side before included.
         late = max(into - delta, 0.0)
         all_in, new_in = (c @ _phi(p, into)).real, (c @ _phi(p, late)).real
-        D = made.direct[i, 0]
+        D = made.direct[i, actuator]
         row_new[i] = new_in + (D if late > 0 else 0.0)
         row_old[i] = all_in - new_in + (0.0 if late > 0 else D)
         row_extra[i] = all_in + D

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import subprocess
+from base64 import b64decode
 from importlib import resources
 from pathlib import Path
 from types import TracebackType
@@ -16,6 +17,8 @@ from wait_kit import WITHIN, found
 from websockets.sync.client import ClientConnection, connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
+# What a key is to a browser besides its name: number, and the text that it types.
+KEYS = {"Tab": (9, ""), "Enter": (13, "\r"), "Escape": (27, ""), "ArrowDown": (40, "")}
 
 
 class Browser:
@@ -79,10 +82,19 @@ class Browser:
             f"(document.getElementById('{id_}'))"
         )
 
-    def colours(self, scheme: str) -> None:
-        """`dark` or `light`."""
+    def colours(self, scheme: str, medium: str = "") -> None:
+        """`dark` or `light`; medium : `print`, or "" for the screen."""
         feature = {"name": "prefers-color-scheme", "value": scheme}
-        self.call("Emulation.setEmulatedMedia", features=[feature])
+        self.call("Emulation.setEmulatedMedia", media=medium, features=[feature])
+
+    def size(self, width: int, height: int) -> None:
+        """Of the window, in pixels; a narrow one is a phone's."""
+        more = {"deviceScaleFactor": 1, "mobile": width < 600}
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, **more)
+
+    def picture(self, path: Path) -> None:
+        """The window as it is, as PNG."""
+        path.write_bytes(b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
 
     def until(self, expression: str, within: float = WITHIN) -> None:
         """Wait until it is true in the page; one that is just being loaded has not all parts."""
@@ -103,8 +115,12 @@ class Browser:
 
     def press(self, key: str) -> None:
         """A key, as from a keyboard."""
-        for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, code=key)
+        number, text = KEYS.get(key, (ord(key[0].upper()), key))
+        more = {"key": key, "code": key, "windowsVirtualKeyCode": number}
+        self.call(
+            "Input.dispatchKeyEvent", type="keyDown", **more, **({"text": text} if text else {})
+        )
+        self.call("Input.dispatchKeyEvent", type="keyUp", **more)
 
     def __enter__(self) -> Self:
         return self

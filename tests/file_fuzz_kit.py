@@ -131,12 +131,12 @@ def tables(rng: random.Random) -> Iterator[Callable[[], object]]:
             blocks_ = [b for i, b in enumerate(blocks_) if i in kept]
         lines = "\n".join(blocks_).split("\n")
         for _ in range(rng.choice((1, 1, 2, 8))):
-            _damage_lines(rng, lines)
+            damage_lines(rng, lines)
         damaged = "\n".join(lines)
         yield lambda model=model, damaged=damaged: parse(model, damaged, "fuzz.toml")
 
 
-def _damage_lines(rng: random.Random, lines: list[str]) -> None:
+def damage_lines(rng: random.Random, lines: list[str]) -> None:
     at = rng.randrange(len(lines))
     line = lines[at]
     match rng.randrange(7):
@@ -174,14 +174,14 @@ def recordings(rng: random.Random, folder: Path) -> Iterator[Callable[[], object
         if rng.random() < 0.5:
             head = scan.chunk_head(data, rng.choice(chunks))
             part = bytearray(data[head.data_start : head.span.end])
-            _damage_bytes(rng, part)
+            damage_bytes(rng, part)
             if len(part) == head.size:
                 b[head.data_start : head.span.end] = part
                 struct.pack_into("<I", b, head.span.content + 24, zlib.crc32(part))
         else:
-            _damage_bytes(rng, b)
+            damage_bytes(rng, b)
             if rng.random() < 0.3:
-                _damage_bytes(rng, b)
+                damage_bytes(rng, b)
         path.write_bytes(b)
         yield rng.choice(
             (
@@ -215,7 +215,7 @@ def buses(rng: random.Random, folder: Path) -> Iterator[Callable[[], object]]:
             _damage_bus(rng, lines)
         b = bytearray("\n".join(lines).encode())
         if rng.random() < 0.2:
-            _damage_bytes(rng, b)
+            damage_bytes(rng, b)
         path.write_bytes(b)
         yield load
 
@@ -245,7 +245,7 @@ def _damage_bus(rng: random.Random, lines: list[str]) -> None:
             lines[at] = line + part * rng.choice((1, 2, 40, 5000))
 
 
-def _damage_bytes(rng: random.Random, b: bytearray) -> None:
+def damage_bytes(rng: random.Random, b: bytearray) -> None:
     at = rng.randrange(len(b))
     match rng.randrange(6):
         case 0:

@@ -1,6 +1,7 @@
 """A state machine over gate and loop: commands, faults, clock steps, in whatever order.
 
-No reachable state may have output without RUNNING, fresh sensors and a live heartbeat.
+No reachable state may have output without RUNNING, fresh sensors and a live heartbeat; with two
+outputs (`GateAndPair`), no output of either.
 """
 
 from __future__ import annotations
@@ -9,16 +10,19 @@ from threading import Event
 
 import numpy as np
 from fake_device import RATE, FakeDevice, fake_rig
+from fake_pair import FakePair, pair_rig
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from samii_rig.devices.protocols import CommandBlock
 from samii_rig.errors import DeviceError, GateError, RecordingError
+from samii_rig.rig.schema import Rig
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import _Run
 from samii_rig.run.pace import LoopSettings
-from samii_rig.run.plan import Plan, PlannedSegment
-from samii_rig.safety.judgement import State
+from samii_rig.run.plan import Output, Plan, PlannedSegment
+from samii_rig.safety.judgement import State, violation
+from samii_rig.safety.latest import Latest
 from samii_rig.types import Quality, SampleBlock
 
 RIG = fake_rig()
@@ -89,12 +93,17 @@ class GateAndLoop(RuleBasedStateMachine):
         ticks=st.sampled_from([-1, 0, 1, 5, 20]),
     )
     def open(self, level: float, beat: bool, ticks: int) -> None:
-        self.device, self.sink = Spoilt(), Sunk()
+        self.begin_with(Spoilt(), RIG, plan_of(level), beat, ticks)
+
+    def begin_with(
+        self, device: Spoilt | SpoiltPair, rig: Rig, plan: Plan, beat: bool, ticks: int
+    ) -> None:
+        self.device, self.sink = device, Sunk()
         self.beating, self.beaten = beat, -(10**12)
         self.stop, self.signals = Event(), Interrupts()
         self.job = _Run(
-            plan_of(level),
-            RIG,
+            plan,
+            rig,
             self.device.open(),
             self.sink,
             None,
@@ -251,11 +260,15 @@ class GateAndLoop(RuleBasedStateMachine):
         assert gate.state is State.RUNNING
         assert self.device.deadman is not None
         # What has been judged last; the time since then the device's own deadman watches.
-        judged = self.judged
-        latest = gate._latest
-        assert all(latest.age(i, judged) <= STALE for i in range(2))
-        assert (judged - self.beaten) * 1e-9 <= HEARTBEAT
-        assert latest.peak[1] <= 0.35
+        self.judged_well()
+        assert (self.judged - self.beaten) * 1e-9 <= HEARTBEAT
+
+    def judged_well(self) -> None:
+        self.fresh(self.job.gate._latest, self.judged)
+
+    def fresh(self, latest: Latest, judged: int) -> None:
+        assert all(latest.age(i, judged) <= STALE for i in range(len(latest.peak)))
+        assert all(angle <= 0.35 for angle in latest.peak[1:])
         assert latest.peak[0] <= 5.0
         assert not latest.disorder
         assert latest.stray <= 0.05
@@ -270,3 +283,105 @@ class GateAndLoop(RuleBasedStateMachine):
             self.device.raising = None
             self.job.close(*self.ended)
         assert not self.device.live
+
+
+PAIR = pair_rig()
+
+
+def pair_plan(level: float) -> Plan:
+    """One output, the other, and both at once."""
+    u = level * np.sin(2 * np.pi * np.arange(400) / 125)
+    pairs = (np.stack(x, axis=1) for x in ((u, 0 * u), (0 * u, u), (u, -u)))
+    parts = tuple(
+        PlannedSegment(f"s{i}", "burst", level, "V", 0, x, 0 * x, (4.0, 4.0), 0 * u)
+        for i, x in enumerate(pairs)
+    )
+    beside = (Output("v_b", 2.0, "theta_b"),)
+    return Plan("machine", RATE, "v_a", 4.0, "theta_a", parts, 0, beside)
+
+
+class SpoiltPair(FakePair):
+    """Two outputs, of which the faults that can be switched hit one: `place`."""
+
+    def __init__(self, place: int) -> None:
+        super().__init__(self.spoiled)
+        self.place = place
+        self.clock_step = self.count_step = 0
+        self.flag, self.value, self.stray = 0, None, 0.0
+        self.lost = False
+        self.raising: Exception | None = None
+
+    @property
+    def frozen(self) -> float | None:
+        return self.held.get(self.place)
+
+    @frozen.setter
+    def frozen(self, value: float | None) -> None:
+        self.held = {} if value is None else {self.place: value}
+
+    def spoiled(self, block: SampleBlock) -> SampleBlock:
+        if self.raising:
+            raise self.raising
+        values, quality = block.values.copy(), block.quality.copy()
+        v, theta = self.place, 2 + self.place
+        if self.value is not None:
+            values[:1, theta] = self.value
+        values[:, v] += np.where(values[:, v] != 0.0, self.stray, 0.0)
+        quality[:, v] |= np.uint8(self.flag & Quality.LIMITED)
+        quality[:, theta] |= np.uint8(self.flag & ~Quality.LIMITED)
+        kept = np.ones(len(block), dtype=bool)
+        kept[1::3] = not self.lost
+        return SampleBlock(
+            block.channels,
+            (block.time + self.clock_step)[kept],
+            (block.sequence + self.count_step)[kept],
+            values[kept],
+            quality[kept],
+        )
+
+
+class GateAndPair(GateAndLoop):
+    """The same run with two outputs, of which one is at fault."""
+
+    @initialize(
+        level=st.sampled_from([0.1, 0.3, 1.0, 6.0]),
+        beat=st.sampled_from([True, True, True, False]),
+        ticks=st.sampled_from([-1, 1, 5, 10, 20, 20, 45]),
+        place=st.sampled_from([0, 1]),
+    )
+    def open(self, level: float, beat: bool, ticks: int, place: int) -> None:
+        self.place = place
+        self.begin_with(SpoiltPair(place), PAIR, pair_plan(level), beat, ticks)
+
+    @rule(angle=st.sampled_from([0.0, 0.3, 0.5, -0.5]))
+    def joint_is_pushed(self, angle: float) -> None:
+        self.device.theta[self.place] = angle
+
+    @precondition(lambda self: self.begun and self.ended is None)
+    @rule(
+        level=st.sampled_from([0.0, 5.5, float("nan")]),
+        gap=st.sampled_from([0, 0, 0, 1, -1, 300]),
+        apart=st.sampled_from([0, 0, 0, 1]),
+        n=st.sampled_from([1, 2, 2, 2, 3]),
+    )
+    def something_else_writes(self, level: float, gap: int, apart: int, n: int) -> None:
+        """A defect above the gate: blocks that are not the loop's, too few, or not together."""
+        gate, before = self.job.gate, len(self.device.written)
+        first = self.job.start + self.job.sent + gap
+        u = [np.zeros(3)] * n
+        u[min(self.place, n - 1)] = np.full(3, level)
+        blocks = tuple(CommandBlock(first + apart * i, x, np.zeros(3)) for i, x in enumerate(u))
+        try:
+            gate.write(blocks, self.device.now())
+        except (GateError, RecordingError):
+            assert len(self.device.written) == before
+            assert not self.device.live
+        else:
+            assert n == 2
+            assert apart == 0
+            self.job.sent += 3
+
+    def judged_well(self) -> None:
+        for lane in self.job.gate._lanes:
+            self.fresh(lane.latest, self.judged)
+            assert violation(lane.latest, lane.limits, self.judged) is None

@@ -30,7 +30,18 @@ from samii_rig.rig.schema import (
     TranslationalSpring,
 )
 from sim.assumed_modes import __main__ as command
-from sim.assumed_modes import effects, forces, kernel, make, outside, ritz, styles, trial
+from sim.assumed_modes import (
+    effects,
+    forces,
+    kernel,
+    make,
+    outside,
+    rigfile,
+    ritz,
+    size,
+    styles,
+    trial,
+)
 from sim.assumed_modes.noise import noise_model, whitener
 from sim.assumed_modes.parts import Attachment, Force, Part, Setup, nominal, setup_of
 from sim.assumed_modes.plant import plant
@@ -49,11 +60,23 @@ RIGS = (
 )
 
 
+BENCHES = (
+    "beam_on_shaker",
+    "carriage",
+    "cylinder",
+    "flexible_joint",
+    "one_mass",
+    "spindle_drive",
+    "three_masses",
+    "two_masses",
+)
+
+
 def loop_of(setup: Setup, rig: Rig) -> Loop:
-    assert rig.centring is not None
-    theta = [s.name for s in rig.sensor].index(rig.centring.sensor)
+    theta = [s.name for s in rig.sensor].index(rig.centring.sensor) if rig.centring else 0
     made = plant(setup)
-    return closed(discrete(made, timeline(setup, made, rig.rate_hz)), theta, rig.centring.kp)
+    kp = rig.centring.kp if rig.centring else 0.0
+    return closed(discrete(made, timeline(setup, made, rig.rate_hz)), theta, kp)
 
 
 def response(loop: Loop, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
@@ -82,6 +105,51 @@ def test_closed_loop_is_that_of_the_transfer_matrices(name: str, tolerance: floa
     expected = closed_response(rig, f)[:, :, 0]
     found = response(loop_of(setup_of(rig, {}), rig), f, rig.rate_hz)
     assert np.max(np.abs(found / expected - 1)) < tolerance
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_benches_that_slide_turn_and_shake_are_those_of_the_transfer_matrices(name: str) -> None:
+    rig, _ = load_rig(name)
+    f = np.geomspace(0.2, 60.0, 60)
+    expected = (closed_response if rig.centring else sampled_response)(rig, f)[:, :, 0]
+    found = response(loop_of(setup_of(rig, {}), rig), f, rig.rate_hz)
+    assert np.max(np.abs(found / expected - 1)) < 1e-5
+    # The rig file that goes with a trial is the same rig.
+    again = parse(Rig, rigfile.text(rig), name)
+    kept = (closed_response if rig.centring else sampled_response)(again, f)[:, :, 0]
+    np.testing.assert_allclose(kept, expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("rig", "effect"), [
+    ("two_masses", "added_mass"), ("two_masses", "ground_spring"),
+    ("carriage", "translational_compliance"), ("spindle_drive", "torsional_compliance"),
+    ("flexible_joint", "added_inertia"), ("cylinder", "viscous_damping"),
+])  # fmt: skip
+def test_an_effect_of_a_bench_is_named_by_places_where_it_means_the_same(
+    rig: str, effect: str
+) -> None:
+    nominal_rig, _ = load_rig(rig)
+    setup = setup_of(nominal_rig, {})
+    f = np.geomspace(1.0, 60.0, 20)
+    before = response(loop_of(setup, nominal_rig), f, nominal_rig.rate_hz)
+    draft = effects.LINEAR[effect](np.random.default_rng(3), setup)
+    scale = {"translational_compliance": 1e-5, "torsional_compliance": 0.1, "ground_spring": 2e3,
+             "viscous_damping": 20.0}.get(effect, 0.02)  # fmt: skip
+    after = response(loop_of(draft.put(setup, scale), nominal_rig), f, nominal_rig.rate_hz)
+    assert np.max(np.abs(after / before - 1)) > 1e-3
+    where = setup.turning() if effect in ("torsional_compliance", "added_inertia") else (
+        setup.shifting())  # fmt: skip
+    assert draft.site in where
+    assert {site for _, site in draft.also} <= {p.name for p in setup.parts}
+
+
+def test_what_cannot_move_so_conceals_nothing() -> None:
+    masses, joint = (setup_of(load_rig(n)[0], {}) for n in ("two_masses", "flexible_joint"))
+    rng = np.random.default_rng(0)
+    for make_draft, setup in ((effects.inertia, masses), (effects.compliance, masses),
+                              (effects.mass, joint), (effects.sideways, joint)):  # fmt: skip
+        with pytest.raises(LookupError):
+            make_draft(rng, setup)
 
 
 def _parameter(value: float, unit: str) -> Parameter:
@@ -379,7 +447,8 @@ def test_the_truth_explains_the_record_and_the_rig_file_does_not(tmp_path: Path)
     folder = make("one", seed, tmp_path, _samii(), STYLE)
     rngs = [np.random.default_rng([seed, trial.KINDS.index("one"), k]) for k in range(3)]
     scene = trial.scene_of(rngs[0], rngs[1], parse(Rig, _samii(), "samii"), STYLE)
-    (hidden,) = trial._concealed(rngs[2], "one", scene, trial.nominal_refit(scene))
+    wanted = trial.Wanted("one", "", size.CLOSE)
+    (hidden,) = trial._concealed(rngs[2], wanted, scene, trial.nominal_refit(scene))
     run = read_recording(folder / "run_01.mcap")
     y = run.values[:, -4:] - scene.noise.offset
     r = run.values[:, run.column("v_2")] + scene.control.kp * y[:, 0]
@@ -415,7 +484,8 @@ def test_nothing_conceals_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("excitation", styles.EXCITATIONS)
 def test_every_excitation_keeps_within_its_budget_and_peak(excitation: str) -> None:
-    style = styles.draw(np.random.default_rng(8), ("clean", excitation), 500.0)
+    about = styles.About(500.0)
+    style = styles.draw(np.random.default_rng(8), ("clean", excitation), about)
     pieces = [p for f in style.files for p in f]
     assert style.excitation == excitation
     assert sum(len(p.r) for p in pieces) <= 1.3 * styles.BUDGET
@@ -519,7 +589,7 @@ def test_every_force_finds_its_size(name: str) -> None:
     runs = name == "run_to_run_stiffness"
     scene = trial.scene_of(rngs[0], rngs[1], rig, ("clean", "cut"), runs=runs)
     draft = {**forces.FORCES, **outside.OUTSIDE}[name](rngs[2], scene.setup, trial._swing(scene))
-    found = trial._solved(scene, trial.nominal_refit(scene), draft, 30.0)
+    found = trial._solved(scene, trial.nominal_refit(scene), draft, 30.0, size.CLOSE)
     assert found is not None
     assert found.alone.sigma == pytest.approx(30.0, rel=0.3)
 
@@ -537,7 +607,7 @@ def test_what_is_late_by_little_has_rivals_and_by_much_has_none() -> None:
     draft = effects.lag(rngs[2], scene.setup)
     left = {}
     for target in (5.0, 100.0):
-        found = trial._solved(scene, refit, draft, target)
+        found = trial._solved(scene, refit, draft, target, size.CLOSE)
         assert found is not None
         rivals = trial._rivals(scene, refit, found)
         assert {r["physics"] for r in rivals} == {"valve_dynamics", "transport_delay"}

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from samii_rig.cli.app import app
 from samii_rig.diagnose.batch import each
 from samii_rig.index.remarks import read_remarks
-from samii_rig.prove import campaign
+from samii_rig.prove import campaign, jobs
 from samii_rig.rig.load import load_rig
 from samii_rig.workers import workers
 
@@ -61,13 +61,15 @@ def answers(out: Path) -> dict[str, Any]:
 @pytest.mark.slow  # a campaign's trial three times over
 def test_a_campaign_on_a_cluster_says_what_it_says_here(tmp_path: Path, scheduler: str) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
-    options = ["--nothing", 1, "--one", 0, "--two", 0, "--outside", 0, "--joints", 0, "--seed", 3]
+    options = ["--nothing", 1, "--one", 0, "--two", 0, "--outside", 0, "--joints", 0, "--force", 0,
+               "--seed", 3, "--rig", "samii"]  # fmt: skip
     said = call("prove", "--out", there, *options, "--scheduler", scheduler, "--json")
     assert said["failures"] == []
     assert said["trials"] == 1
-    todo = campaign.jobs({"nothing": 1}, seed=3)
+    rigs = {"samii": load_rig("samii")[1]}
+    todo = jobs.jobs({"nothing": 1}, 3, jobs.pairs(jobs.plants(), rigs)[0])
     with workers(1) as pool:
-        assert campaign.carry_out(campaign.Campaign(here, load_rig("samii")[1]), todo, pool) == []
+        assert campaign.carry_out(campaign.Campaign(here, rigs), todo, pool) == []
     assert len(answers(here)) == 1
     assert answers(here) == answers(there)
 

@@ -132,10 +132,10 @@ def test_all_four_joints_that_the_first_papers_perfect_joint_model_leaves_out_co
 
 
 def test_a_gradient_of_a_model_with_effects_is_its_derivative(problem):
-    effects = (effect("torsional_compliance", "joint_1"), effect("added_mass", "link_2", "on"))
+    effects = (effect("torsional_compliance", "joint_1"), effect("added_mass", "link_2", "along"))
     model = Model(samii(), (*effects, effect("sensor_delay", "a_0")))
     x = np.zeros(model.n)
-    x[model.n_nominal :] = np.log([3e4, 0.1, 0.5, 0.4, 1e-3])
+    x[model.n_nominal :] = np.log([3e4, 0.1, 0.5, 1.4, 1e-3])
     H, dH = model.gradient(x, problem.at)
     assert np.allclose(H, model.response(x, problem.at), rtol=1e-12)
     for j in (0, 5, *range(model.n_nominal, model.n)):

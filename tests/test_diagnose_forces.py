@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from concealed_kit import SAMII, driven
+from concealed_kit import SAMII
 from cut_kit import DESIGN, cut_sweeps
 
-from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.effect import Effect, Unknown
+from samii_rig.diagnose import by_line
+from samii_rig.diagnose.by_record import on_records
+from samii_rig.diagnose.diagnose import case_of, diagnose, table
+from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS, PLAY
+from samii_rig.diagnose.forces.model import ForceModel
+from samii_rig.diagnose.forces.problem import ForceProblem
+from samii_rig.diagnose.forces.screen import Looks, scaled, weakly
+from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
+from samii_rig.diagnose.forces.way import Ways
+from samii_rig.diagnose.forces.words import distorted
+from samii_rig.diagnose.judge import _is_thin
 from samii_rig.diagnose.measured import measured
 from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.nonlinear_inner import Inner
-from samii_rig.diagnose.nonlinear_laws import CUBIC, FRICTION, GAP
-from samii_rig.diagnose.nonlinear_model import LevelModel, Quasi
-from samii_rig.diagnose.nonlinear_records import Chains, ForceProblem
+from samii_rig.diagnose.ranking import moved
 from samii_rig.diagnose.records import RecordProblem, Whole
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Diagnosis
+from samii_rig.diagnose.screen import Screen
+from samii_rig.diagnose.stated import IN_DATA
+from samii_rig.record.importer import import_file
+from samii_rig.record.maps import load_map
+from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Recording
-from sim.concealed.parts import Law, described
+from samii_rig.types import Float, Recording
 
 # One level alone, short: every response and every search is what takes the time here.
 ONE = replace(DESIGN, levels=(1.0,), burst=18.0, high_hz=20.0)
@@ -36,43 +47,6 @@ def found_in(runs: list[Recording]) -> Diagnosis:
     """With a table of few linear effects, and all forces."""
     few = [e for e in table(SAMII, 0.5, 20.0) if e.physics in FEW]
     return diagnose(estimate(runs), SAMII, runs=runs, effects=few)
-
-
-CASES = {
-    "coulomb": (Law("coulomb", "joint_2", (0.5,)), Quasi("joint", ("joint_2",), FRICTION), 0.5),
-    "cubic": (Law("cubic", "joint_1", (1e8,)), Quasi("joint", ("joint_1",), CUBIC), 1e8),
-    "backlash": (
-        Law("backlash", "joint_1", (1e-4, 1.36e4)),
-        Quasi("joint", ("joint_1",), GAP, 1.0, ("joint_1", "k")),
-        1e-4,
-    ),
-    "flow": (
-        Law("flow_saturation", "joint_2_source", (500.0,)),
-        Quasi("flow", ("joint_2_source",), None),
-        500.0,
-    ),
-}
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_what_a_force_adds_from_rest_is_what_another_integrator_says(name: str) -> None:
-    """From rest to a cut end, no loop closed, sensor by sensor."""
-    law, quasi, p = CASES[name]
-    t = np.arange(3000) / SAMII.rate_hz
-    v = 0.5 * np.sin(2 * np.pi * (0.5 * t + 1.5 * t**2))
-    plant = described(SAMII)
-    plain = driven(plant, v)[1]
-    plant.laws = [law]
-    added = driven(plant, v, inner=16)[1] - plain
-    effect = Effect("force", "here", (Unknown("p", "1", p / 10, 10 * p, (p,)),), quasi=quasi)
-    model = LevelModel(SAMII, (effect,))
-    x = np.append(np.zeros(model.n - 1), math.log(p))
-    inner, sensed = Inner.sensed(model, x)
-    ours = sensed.of(inner.from_rest(v, p))
-    size = np.sqrt(np.mean(added**2, axis=0))
-    off = np.sqrt(np.mean((ours - added) ** 2, axis=0))
-    assert np.all(size > 0)
-    assert np.all(off < 0.03 * size), off / size
 
 
 def test_a_hardening_joint_is_named_from_one_sweep_that_ends_with_its_record(tmp_path: Path):
@@ -110,9 +84,9 @@ def test_linear_models_are_weighed_alike_with_and_without_the_lines_no_model_exp
     model = Model(SAMII)
     none = Fitted(model, np.zeros(model.n), 0.0, 0.0, np.zeros((0, model.n)), np.eye(model.n))
     lines = measured(estimate(nothing), SAMII)
-    by_line = Problem.of(lines, grid(SAMII, lines.frequency, lines.sensor, lines.actuator))
-    few = RecordProblem.about(whole, none, by_line)
-    every = ForceProblem.near(whole, none, by_line, Chains())
+    lines_problem = Problem.of(lines, grid(SAMII, lines.frequency, lines.sensor, lines.actuator))
+    few = RecordProblem.about(whole, none, lines_problem)
+    every = ForceProblem.near(whole, none, lines_problem, Ways())
     chi2 = np.array(
         [
             [float(np.sum(problem.residual(h) ** 2)) for problem in (few, every)]
@@ -122,3 +96,175 @@ def test_linear_models_are_weighed_alike_with_and_without_the_lines_no_model_exp
     # A disturbance of less than 2 % of a block's power is left out of the quadratic form alone.
     assert chi2[0, 1] - chi2[1, 1] == pytest.approx(chi2[0, 0] - chi2[1, 0], rel=1e-3)
     assert chi2[0, 1] == pytest.approx(chi2[0, 0] + few.reduced.inside[0], rel=0.02)
+
+
+def test_both_parts_of_the_lines_are_joined_again(nothing: list[Recording]) -> None:
+    """Products with what a fit leaves are those of whitened lines."""
+    search = forces_of(nothing)
+    complete, screen = search.problem.complete, Screen.of(search.problem, search.nominal.fitted)
+    rows = complete.rows.e.size * 2 + len(complete.factor)
+    parts = np.column_stack([screen.left_by(), screen.directions])[:rows]
+    rng = np.random.default_rng(4)
+    e = rng.normal(size=(2, *complete.rows.e.shape)) * np.abs(complete.rows.e)
+    lines = e[0] + 1j * e[1]
+    want = complete.split(lines) @ parts
+    joined, white = complete.joined(parts), complete.white(lines)
+    got = np.einsum("nq,nqj->j", white.conj(), joined).real
+    np.testing.assert_allclose(got, want, rtol=1e-2)
+    # A disturbance of less than 2 % of a block's power is left out of the quadratic form alone.
+    assert np.sum(np.abs(white) ** 2) == pytest.approx(np.sum(complete.split(lines) ** 2), rel=1e-2)
+
+
+def test_a_weak_force_does_to_first_order_what_it_does_in_time(nothing: list[Recording]) -> None:
+    search = forces_of(nothing)
+    nominal = search.nominal.fitted
+    looks = Looks(search.problem, (Screen.of(search.problem, nominal),))
+    hopes = weakly(search.forces, search.reach, looks)
+    assert {h.effect.key for h in hopes} == {e.key for e in search.forces}
+    for hope in hopes:
+        law = hope.effect.quasi.law
+        if law in (
+            PLAY,
+            HYSTERESIS,
+            FRICTION,
+        ):  # whose shape depends on the strength, or that stick
+            continue
+        share = 0.02 if law.told is None else 1.0
+        strengths = scaled(law, hope.strengths, share, search.reach.largest)
+        model = search.model((hope.effect,))
+        assert isinstance(model, ForceModel)
+        x = np.append(moved(nominal.model, nominal.x, model), np.log(strengths))
+        in_time = power(*looks.gains(search.problem.change(model, x))) / share**2
+        # Harmonics above the third fold back at the low rate.
+        assert in_time == pytest.approx(power(hope.own, hope.may, hope.times), rel=0.2), law.tag
+
+
+def power(own: Float, _may: Float, times: Float | float) -> float:
+    """Squared length of a change, from what it gains and how many times it should be."""
+    return float(np.ravel(own / (2 * np.asarray(times) - 1))[0])
+
+
+def forces_of(runs: list[Recording]) -> ForceSearch:
+    few = [e for e in table(SAMII, 0.5, 20.0) if e.physics in FEW]
+    linear = on_records(case_of(estimate(runs), SAMII, None, few, runs), None)
+    assert linear is not None
+    return ForceSearch(linear)
+
+
+def test_a_force_and_a_linear_effect_are_both_named(tmp_path: Path) -> None:
+    found = found_in(
+        cut_sweeps(
+            tmp_path,
+            "cubic_stiffness joint_1 k3=1e8",
+            "transport_delay joint_2_source tau=0.002",
+            design=ONE,
+        )
+    )
+    named = {(c.physics, c.site) for c in found.causes}
+    assert named == {("cubic_stiffness", "joint_1"), ("transport_delay", "joint_2_source")}
+    assert found.with_causes[0] < found.threshold
+
+
+def test_without_recordings_levels_that_differ_are_unknown_and_say_what_is_asked_for(
+    tmp_path: Path,
+) -> None:
+    runs = cut_sweeps(
+        tmp_path, "cubic_stiffness joint_1 k3=3e8", design=replace(ONE, levels=(0.4, 1.0))
+    )
+    few = [e for e in table(SAMII, 0.5, 20.0) if e.physics in FEW]
+    found = diagnose(estimate(runs), SAMII, effects=few)
+    assert found.verdict == "unknown"
+    assert found.causes == ()
+    assert by_line.DIFFER in found.not_physics
+
+
+def test_the_lines_that_a_multisine_leaves_silent_are_told(nothing: list[Recording]) -> None:
+    (one,) = estimate(nothing)
+    silent = np.zeros_like(one.H[:, :, 0], dtype=float)
+    odd = replace(one, level=0.5, level_unit="V", odd=silent + 0.03, even=silent)
+    assert distorted([odd]) == ["odd distortion of 3 % at 0.5 V", "even distortion of 0 % at 0.5 V"]
+
+
+def test_levels_that_differ_are_told_without_a_model(nothing: list[Recording]) -> None:
+    (one,) = estimate(nothing)
+    lower = replace(one, level=one.level / 2)
+    alike = measured([one, lower], SAMII)
+    other = measured([one, replace(lower, H=lower.H * 1.2)], SAMII)
+    assert alike.differing() < 1e-6
+    assert other.torn()
+    assert np.isnan(alike.take(alike.level == 0).differing())
+
+
+@pytest.mark.parametrize(("gained", "told"), [(14.0, False), (60.0, True)])
+def test_a_linear_effect_beside_a_force_must_show_in_the_data(gained: float, told: bool) -> None:
+    force = Effect("coulomb_friction", "joint_2", quasi=object())  # type: ignore[arg-type]
+    beside = Effect("added_mass", "beam")
+    one = SimpleNamespace(key=frozenset({force.key}), effects=(force,), fitted=fit_of(1000.0))
+    both = SimpleNamespace(
+        key=frozenset({force.key, beside.key}),
+        effects=(force, beside),
+        fitted=fit_of(1000.0 - gained),
+    )
+    search = SimpleNamespace(
+        found={one.key: one},
+        temperature=1.0,
+        worth=IN_DATA,
+        nominal=SimpleNamespace(fitted=fit_of(5000.0)),
+    )
+    assert _is_thin(search, both) is not told
+
+
+@pytest.mark.parametrize(
+    ("better", "rough", "told"),
+    [(2000.0, 0.05, False), (6000.0, 0.05, True), (2000.0, 0.0, True)],
+)
+def test_several_effects_must_outdo_a_law_by_more_than_it_is_off(
+    better: float, rough: float, told: bool
+) -> None:
+    loss = Effect("structural_damping", "beam", rough=rough)
+    a, b = Effect("torsional_compliance", "clamp"), Effect("viscous_damping", "joint_1")
+    one = SimpleNamespace(key=frozenset({loss.key}), effects=(loss,), fitted=fit_of(4500.0))
+    both = SimpleNamespace(
+        key=frozenset({a.key, b.key}), effects=(a, b), fitted=fit_of(4500.0 - better)
+    )
+    without = SimpleNamespace(effects=(a,), fitted=fit_of(1e5))
+    search = SimpleNamespace(
+        found={one.key: one},
+        temperature=1.0,
+        worth=IN_DATA,
+        nominal=SimpleNamespace(fitted=fit_of(1.6e6)),
+        without=lambda _e, _i: without,
+    )
+    assert _is_thin(search, both) is not told
+
+
+def fit_of(chi2: float) -> SimpleNamespace:
+    return SimpleNamespace(chi2=chi2)
+
+
+def test_the_real_motor_has_dry_friction(recordings: Path) -> None:
+    rig = load_rig("sflr")[0]
+    off = ("clamp", "beam", "accelerometer_mass")
+    motor = rig.model_copy(
+        update={
+            "element": tuple(e for e in rig.element if e.name not in off),
+            "sensor": tuple(s for s in rig.sensor if s.name == "theta"),
+            "limit": (),
+        }
+    )
+    band = (1.0, 6.0)  # above it the drive's gain falls with the amplitude, which friction cannot
+    runs = [
+        import_file(f, *load_map("sflr_motor"))
+        for n in (50, 100, 150)
+        for f in sorted(recordings.glob(f"*motor-only_swept*amp-{n}_*"))
+    ]
+    rivals = [e for e in table(motor, *band) if e.physics in ("viscous_damping", "actuator_lag")]
+    linear = on_records(case_of(estimate(runs, band=band), motor, band, rivals, runs), band)
+    assert linear is not None
+    linear.run(briefly=True)
+    search = compete_on_records(linear)
+    assert search is not None
+    best = search.ranked()[0]
+    force = next(e for e in best.effects if e.quasi is not None)
+    assert force.physics == "coulomb_friction"
+    assert search.ratio(best.fitted) < 0.75 * search.ratio(search.nominal.fitted)

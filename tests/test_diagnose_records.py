@@ -91,7 +91,7 @@ def test_what_could_hide_is_what_a_refit_leaves(nothing: list[Recording]):
     found = found_in(nothing)
     told = next(h for h in found.could_hide if h.physics == "transport_delay")
     every = table(SAMII, 0.5, 40.0)
-    whole = Whole.of(nothing, SAMII, None, every)
+    whole = Whole.of(nothing, SAMII, None)
     model = Model(SAMII)
     none = Fitted(model, np.zeros(model.n), 0.0, 0.0, np.zeros((0, model.n)), np.eye(model.n))
     lines = measured(estimate(nothing), SAMII)

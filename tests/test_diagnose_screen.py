@@ -22,7 +22,7 @@ BAND = (0.5, 40.0)
 LINES = np.geomspace(*BAND, 160)
 ALL = table(samii(), *BAND)
 PARTS = [e for e in ALL if e.jump is not None]
-ROWS = {f"{e.physics} {e.jump.states or e.jump.place.split()[0]}": e for e in PARTS}
+ROWS = {f"{e.physics} {e.jump.states or e.jump.place.split()[0]} {e.jump.fixed}": e for e in PARTS}
 
 
 def effect(physics, site, variant=""):

@@ -135,7 +135,7 @@ def test_what_both_have_is_free_in_the_model_of_both():
 @pytest.fixture(scope="module")
 def summed(plain):
     every = table(RIG, 0.5, 30.0)
-    wholes = [Whole.of(plain.runs, RIG, None, every) for _ in range(2)]
+    wholes = [Whole.of(plain.runs, RIG, None) for _ in range(2)]
     model = States(Model(RIG), RIG, (next(e for e in every if e.physics == "added_mass"),))
     starts = [u.starts[0] for u in model.effects[0].unknowns]
     x = np.append(np.zeros(model.n_nominal), np.log(starts))
@@ -244,7 +244,8 @@ def test_the_command_line_tells_two_states_apart(tmp_path: Path):
 def test_what_is_taken_off_may_be_all_of_it():
     """At its largest a part is gone, and no more: whatever its tolerance, nothing is below 0."""
     braced = load_rig("samii_braced")[0]
-    gone = [e for e in hypotheses(braced, 0.5, 30.0, signed=True) if e.variant == "less"]
+    less = [e for e in hypotheses(braced, 0.5, 30.0, signed=True) if e.variant == "less"]
+    gone = [e for e in less if e.unknowns[0].unit != "1"]  # a ratio to the file's has no end
     assert {"ground_spring", "added_mass", "viscous_damping"} <= {e.physics for e in gone}
     nominal = {(e.name, s): p.value for e in braced.element for s, p in parameters(e).items()}
     for effect in gone:
@@ -254,4 +255,37 @@ def test_what_is_taken_off_may_be_all_of_it():
         assert effect.report(largest)[0] < 0
     brace = next(e for e in gone if e.name == ("ground_spring", "brace"))
     assert set(brace.parameters(np.array([2.0e7]), nominal).values()) == {0.0}
-    assert not any(e.variant == "less" for e in hypotheses(braced, 0.5, 30.0))
+
+
+def test_in_one_state_less_than_the_file_begins_where_the_refit_ends():
+    """What has no tolerance may be gone by any part, what has one from six of them on."""
+    braced = load_rig("samii_braced")[0]
+    less = {e.name: e for e in hypotheses(braced, 0.5, 30.0) if e.variant == "less"}
+    mass, m = less["added_mass", "link_0"], RIG.element[2].m
+    assert mass.unknowns[0].low == pytest.approx(6 * m.tolerance * m.value)
+    assert mass.report(np.array([1.0, 1.0]))[0] == -1.0
+    lag = less["actuator_lag", "joint_2_source"]
+    assert lag.unknowns[0].low == pytest.approx(1.6)  # p is known to 10 %
+    assert ("viscous_damping", "joint_1") not in less  # c is known to a half: the refit has it all
+
+
+def test_a_high_pass_delay_or_lag_of_a_sensor_may_not_be_there():
+    """Its factor times the sensor's own is none at the bound of the search."""
+    sensor = next(s for s in RIG.sensor if s.name == "a_0")
+    late = sensor.model_copy(update={"delay": 2e-3, "lag": 5e-3})
+    rig = RIG.model_copy(
+        update={"sensor": tuple(late if s.name == "a_0" else s for s in RIG.sensor)}
+    )
+    less = {e.physics: e for e in hypotheses(rig, 0.5, 30.0)
+            if e.site == "a_0" and e.variant == "less"}  # fmt: skip
+    s = 2j * np.pi * np.geomspace(0.5, 30.0, 20)
+    w = 2 * np.pi * late.highpass_hz
+    own = {
+        "sensor_delay": (np.exp(-s * 2e-3), less["sensor_delay"].unknowns[0].high),
+        "sensor_lag": (1 / (1 + s * 5e-3), less["sensor_lag"].unknowns[0].high),
+        "sensor_highpass": (s / (s + w), less["sensor_highpass"].unknowns[0].low),
+    }
+    assert own.keys() == less.keys()
+    for physics, (factor, end) in own.items():
+        F, _ = less[physics].factor.value(s, np.array([end]))
+        np.testing.assert_allclose(F * factor, 1.0, atol=1e-3)

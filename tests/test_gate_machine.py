@@ -5,13 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from gate_machine import GateAndLoop
+from gate_machine import GateAndLoop, GateAndPair
 from hypothesis import settings
 
 GateAndLoop.TestCase.settings = settings(max_examples=120, stateful_step_count=25, derandomize=True)
 TestGateAndLoop = GateAndLoop.TestCase
+GateAndPair.TestCase.settings = settings(max_examples=150, stateful_step_count=25, derandomize=True)
+TestGateAndPair = GateAndPair.TestCase
 
-GATE = ("gate", "judgement", "latest", "readback")
+GATE = ("gate", "judgement", "lane", "latest", "readback")
 FOREIGN = (
     "signal",
     "record",

@@ -171,6 +171,27 @@ def test_the_profile_of_what_the_data_do_not_hold_is_open():
     assert of.open_high
 
 
+def test_of_what_is_not_there_the_data_say_how_large_it_may_be():
+    """A damper that the rig does not have has a limit, and no interval."""
+    rig = samii()
+    elements = tuple(
+        e.model_copy(update={"c": e.c.model_copy(update={"value": 0.0})})
+        if e.name == "joint_3" else e
+        for e in rig.element
+    )  # fmt: skip
+    undamped = rig.model_copy(update={"element": elements})
+    found = identify([drawn(undamped)], rig, start_off(["joint_3.c"], [1.0]), starts=1)
+    assert found.at_bound == ("joint_3.c",)
+    assert found.limit(0).startswith("at most ")
+    low, high = found.limits()
+    assert np.isnan(low[0])
+    assert 0 < high[0] < 0.3 * found.start[0]
+    said = found.plain()["parameters"]["joint_3.c"]
+    assert said["low_90"] is None
+    assert said["high_90"] == high[0]
+    assert any("ended on its bound: at most" in line for line in found.sentences())
+
+
 def test_what_cannot_be_told_apart_is_named_with_what_changes_nothing():
     rng = np.random.default_rng(0)
     J = rng.standard_normal((50, 3)) * 100

@@ -13,6 +13,7 @@ from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.pieces import Piece, pieces_of, wiring
 from samii_rig.likelihood.reduce import Records, left_by, reduced
+from samii_rig.likelihood.rounding import repeating
 from samii_rig.rig.load import load_rig
 from samii_rig.types import Channel, Complex, Float, Quality, Recording, Segment
 
@@ -80,13 +81,18 @@ def noisy(seed: int, n: int = 3000, sd: float = 0.02) -> tuple[Float, Float]:
     return u, from_rest(u, poles()) + sd * rng.standard_normal((n, 2))
 
 
-def flat(f: Float) -> Float:
-    return np.ones(f.size)
+def own_alone(f: Float) -> Complex:
+    """Sensors with noise of their own, and nothing that disturbs the rig."""
+    return np.broadcast_to(np.eye(2, dtype=complex), (f.size, 2, 2))
+
+
+def nothing_known(f: Float) -> Float:
+    return np.zeros((f.size, 2))
 
 
 def likelihood(u: Float, z: Float, denominator: Float):
     records = Records((piece(u, z),), RATE, ((0.8, 15.0),))
-    return records, reduced(records, lambda s: response(s, denominator), flat)
+    return records, reduced(records, lambda s: response(s, denominator), own_alone)
 
 
 def test_at_the_truth_chi_square_is_its_degrees_of_freedom_however_the_record_ends():
@@ -121,27 +127,32 @@ def test_an_offset_and_a_slow_wander_of_a_sensor_are_no_mismatch():
 
 
 def test_a_disturbed_mode_makes_noise_at_that_mode_and_nowhere_else():
+    """In all sensors together, by the direction in which the rig answers a force."""
     rng = np.random.default_rng(5)
     f = np.linspace(2, 8, 600)
-    power = np.abs(response(2j * np.pi * f, poles(4.0, 0.01))[:, 0]) ** 2
-    power /= np.median(power)
-    direction = np.array([1.0, 0.5])
+
+    def disturbances(g: Float) -> Complex:
+        H = response(2j * np.pi * g, poles(4.0, 0.01))
+        return np.concatenate([own_alone(g), H[:, :, None]], axis=2)
+
+    H = disturbances(f)[:, :, 2]
+    H_size = np.sqrt(np.median(np.abs(H) ** 2))
     white = (rng.standard_normal((f.size, 2)) + 1j * rng.standard_normal((f.size, 2))) / np.sqrt(2)
     pushed = (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)) / np.sqrt(2)
-    left = white + (np.sqrt(power) * pushed)[:, None] * direction
-    found = Noise.of(f, left, np.ones(f.size), lambda g: np.interp(g, f, power))
-    C = found.covariance(f)[:, 0, 0].real
-    truth = 1 + power
-    peak = power > 20
-    assert np.median(C[peak] / truth[peak]) == pytest.approx(1.0, abs=0.35)
-    assert np.median(C[~peak] / truth[~peak]) == pytest.approx(1.0, abs=0.15)
+    left = white + pushed[:, None] * H / H_size
+    found = Noise.of(f, left, np.ones(f.size), disturbances, nothing_known)
+    C = found.covariance(f)
+    truth = np.eye(2) + H[:, :, None] * H[:, None, :].conj() / H_size**2
+    ratio = np.linalg.eigvals(np.linalg.solve(truth, C)).real
+    assert ratio.min() > 0.75
+    assert ratio.max() < 1.3
     whitened = found.whitened(f, left[:, :, None])
-    assert np.mean(np.abs(whitened) ** 2) == pytest.approx(1.0, abs=0.1)
+    assert np.mean(np.abs(whitened) ** 2) == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("corner", [0.0, 0.3, 2.0])
 def test_a_sensor_that_wanders_is_as_loud_as_that_at_the_lowest_lines(corner: float):
-    """In a short record, whose lowest block is octaves wide, of one sensor of two."""
+    """In a short record, one sensor of two."""
     rng = np.random.default_rng(4)
     chi2 = []
     for _ in range(20):
@@ -149,7 +160,7 @@ def test_a_sensor_that_wanders_is_as_loud_as_that_at_the_lowest_lines(corner: fl
         truth = np.stack([1 + (corner / f) ** 2, np.ones(f.size)], axis=1)
         white = rng.standard_normal((f.size, 2)) + 1j * rng.standard_normal((f.size, 2))
         left = np.sqrt(truth / 2) * white
-        found = Noise.of(f, left, np.ones(f.size), np.ones_like)
+        found = Noise.of(f, left, np.ones(f.size), own_alone, nothing_known)
         chi2.append(np.abs(found.whitened(f, left[:, :, None])[:, :, 0]) ** 2)
     mean = np.mean(chi2, axis=0)
     for low, high in ((0, 5), (5, 15), (15, 50), (50, 398)):
@@ -157,17 +168,36 @@ def test_a_sensor_that_wanders_is_as_loud_as_that_at_the_lowest_lines(corner: fl
         np.testing.assert_allclose(each, 1.0, atol=0.35 if low == 0 else 0.2)
 
 
-def test_the_inverse_of_the_noise_is_the_sum_of_its_parts():
+def test_noise_that_no_disturbance_makes_is_told_by_its_block():
+    """Beside the sum, which knows of no hump; where the sum is right, blocks change nothing."""
     rng = np.random.default_rng(2)
-    f = np.linspace(1, 9, 300)
-    left = rng.standard_normal((f.size, 3)) + 1j * rng.standard_normal((f.size, 3))
-    left[140:160] += 8 * rng.standard_normal((20, 1)) * np.array([1, 1j, -1])
-    shape = lambda g: 1 + 60 * np.exp(-(((g - 5) / 0.2) ** 2))  # noqa: E731 -- a formula
-    found = Noise.of(f, left, np.ones(f.size), shape)
-    for block, (a, b) in enumerate(found.ranges(f)):
-        W = sum(w[:, None, None] * part for part, w in found.parts(shape(f[a:b]), block))
-        C = found.covariance(f[a:b])
-        np.testing.assert_allclose(W @ C, np.broadcast_to(np.eye(3), C.shape), atol=0.08)
+    f = np.linspace(1, 30, 3000)
+    left = (rng.standard_normal((f.size, 2)) + 1j * rng.standard_normal((f.size, 2))) / np.sqrt(2)
+    plain = Noise.of(f, left, np.ones(f.size), own_alone, nothing_known)
+    assert len(plain.edges) == 0 or np.ptp(plain.about[:, 0, 0].real) < 0.5
+    hump = (f > 10) & (f < 12)
+    left[hump, 0] *= 5
+    found = Noise.of(f, left, np.ones(f.size), own_alone, nothing_known)
+    C = found.covariance(f)[:, 0, 0].real
+    assert np.median(C[(f > 10.5) & (f < 11.5)]) == pytest.approx(25, rel=0.35)
+    assert np.median(C[f > 15]) == pytest.approx(1, rel=0.25)
+
+
+def test_noise_is_never_less_than_what_is_known_of_it():
+    rng = np.random.default_rng(3)
+    f = np.linspace(1, 30, 900)
+    left = 0.1 * (rng.standard_normal((f.size, 2)) + 1j * rng.standard_normal((f.size, 2)))
+    found = Noise.of(f, left, np.ones(f.size), own_alone, lambda g: np.full((g.size, 2), 1.0))
+    assert np.linalg.eigvalsh(found.covariance(f)).min() > 0.99
+
+
+@pytest.mark.parametrize("sigma", [0.02, 0.1, 0.2, 0.4])
+def test_a_rounding_error_repeats_itself_as_far_as_noise_does_not_dither_it(sigma: float):
+    rng = np.random.default_rng(6)
+    y = 40 * np.sin(np.linspace(0, 60, 20_000))
+    a, b = (np.rint(y + sigma * rng.standard_normal(y.size)) for _ in range(2))
+    common = float(np.mean((a - y) * (b - y))) * 12
+    assert repeating(float(np.var(a - b)) / 2) == pytest.approx(common, abs=0.06)
 
 
 def recording(n: int = 2000, level: float = 0.5, repeat: int = 0) -> Recording:
@@ -220,7 +250,7 @@ def test_bursts_in_a_row_are_predicted_however_long_the_rig_rings():
     found = pieces_of([run], SAMII, wired)
     assert [(p.moving, len(p.repeats)) for p in found] == [(False, 0), (False, 0), (True, 5)]
     records = Records(tuple(found), RATE, ((0.8, 15.0),) * 3)
-    form = reduced(records, lambda s: response(s, mode), flat)
+    form = reduced(records, lambda s: response(s, mode), own_alone)
     assert float(form.target @ form.target) / form.known == pytest.approx(1.0, abs=0.25)
     left = left_by(records, lambda s: response(s, mode), form)
     assert float(np.mean(left.chi2)) == pytest.approx(4.0, rel=0.15)

@@ -17,7 +17,7 @@ from samii_rig.devices.clock import MonotonicClock
 from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, GateError, InputError
 from samii_rig.run.dwell import Reference
-from samii_rig.run.interrupts import Interrupts
+from samii_rig.run.interrupts import PAUSE, Interrupts
 from samii_rig.run.loop import run
 from samii_rig.run.pace import LoopSettings
 from samii_rig.run.plan import Plan, PlannedSegment
@@ -609,10 +609,12 @@ def test_a_queue_that_is_full_ends_the_run_instead_of_waiting():
     queued.close()
 
 
-def test_a_second_signal_breaks_a_hang_and_none_disturbs_the_ending():
+def test_a_later_signal_breaks_a_hang_and_none_disturbs_the_ending():
     with Interrupts() as interrupts:
         signal.raise_signal(signal.SIGINT)
         assert interrupts.reason == "SIGINT (Ctrl-C)"
+        signal.raise_signal(signal.SIGTERM)  # at once: the flag may not have been looked at yet
+        time.sleep(PAUSE)
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGTERM)
         interrupts.ending = True

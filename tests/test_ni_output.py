@@ -291,7 +291,7 @@ def test_whatever_ends_the_gate_ends_the_output(board, device, end, monkeypatch)
         with pytest.raises(GateError, match=r"v_2 read back is 0\.[45]\d* V away"):
             until(lambda: (tick(), False)[1])
     else:
-        monkeypatch.setattr("samii_rig.safety.gate.observe", lambda *a: 1 / 0)
+        monkeypatch.setattr("samii_rig.safety.lane.observe", lambda *a: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             tick()
     assert board.out == 0.0

@@ -14,9 +14,18 @@ import numpy as np
 import pytest
 from prove_kit import MASS, NOTHING, SPRING, UNKNOWN, diagnosis, trial
 
-from samii_rig.prove.score import auroc, by_size, confusion, frequency, median, scores
-from samii_rig.prove.size import bearers
-from samii_rig.prove.trial import Answer, Trial
+from samii_rig.prove.score import (
+    auroc,
+    by_group,
+    by_size,
+    confusion,
+    frequency,
+    kept,
+    median,
+    parameter_errors,
+    scores,
+)
+from samii_rig.prove.trial import Answer, Hidden, Trial, Truth
 
 
 def test_a_name_is_right_at_its_place_or_up_to_its_class() -> None:
@@ -46,16 +55,6 @@ def test_a_site_has_as_many_names_as_the_effect_has_structural_twins() -> None:
     known = replace(told, truth=replace(told.truth, twins=("link_1",)))
     assert known.place_right
     assert known.place_in_set
-
-
-def test_names_count_as_the_fewest_effects_that_bear_them() -> None:
-    between = {("compliance", "clamp"), ("compliance", "beam")}
-    alone, other = {("compliance", "clamp")}, {("mass", "beam")}
-    effects = [alone, between, other]
-    assert bearers(between, effects) == [1]
-    assert bearers(between | other, effects) == [1, 2]
-    assert bearers({("lag", "v")}, effects) == []
-    assert bearers(between, []) == []
 
 
 def test_two_effects_need_two_names_and_no_third() -> None:
@@ -141,17 +140,62 @@ def test_sizes_and_confusion_count_every_single_effect_once() -> None:
     assert confusion([wrong]) == {(SPRING[0], "torsional_compliance, elsewhere"): 1}
 
 
-def test_a_class_is_held_against_the_names_that_the_data_cannot_tell_apart() -> None:
-    right = trial("one", diagnosis("named", (*SPRING, 0.9)), SPRING, size=50)
-    truth = replace(right.truth, names=2, sites=1, said=3)
-    found = {s.what: s for s in scores([replace(right, truth=truth)] * 5)}
-    assert found["names in a class over those an oracle would give, from 10 sigma"].value == 1.5
-    assert found["sites in the 90 % set over those an oracle would give, from 10 sigma"].value == 1
-
-
 def test_every_joint_has_to_come_back_and_nothing_beside() -> None:
     names = (SPRING, MASS)
     all_ = trial("joints", diagnosis("named", *((*n, 0.9) for n in names)), *names)
     less = trial("joints", diagnosis("named", (*SPRING, 0.9)), *names)
     found = {s.what: s for s in scores([all_, less])}
     assert found["every joint gives: all found"].value == 0.5
+
+
+def test_a_name_that_the_plant_says_means_the_same_is_right() -> None:
+    hidden = Hidden(*SPRING, {"k": 1.0}, frozenset([("torsional_compliance", "link_1")]))
+    said = Answer.of(diagnosis("named", ("torsional_compliance", "link_1", 0.9)))
+    assert Trial(Truth("one", 1, (hidden,), 50.0), said).right
+    assert Trial(Truth("one", 1, (hidden,), 50.0), said).place_right
+
+
+def test_sigma_kept_is_what_the_causes_explain_of_whole_records() -> None:
+    data = {**diagnosis("named", (*SPRING, 0.9)), "evidence": {"sigma": 45.0}}
+    one = trial("one", data, SPRING, size=50.0)
+    whole = replace(one, truth=replace(one.truth, whole=True))
+    assert kept([one, whole]) == [0.9]
+
+
+def test_a_ratio_is_held_against_the_truth_however_it_is_written() -> None:
+    data = diagnosis("named", ("beam_property", "beam", 0.9))
+    data["causes"][0]["parameters"] = {"EI ratio": {"value": 1.1, "low": 1.0, "high": 1.2}}
+    hidden = Hidden("beam_property", "beam", {"EI_ratio": 1.1})
+    assert parameter_errors([Trial(Truth("one", 1, (hidden,), 50.0), Answer.of(data))])[1] == [True]
+
+
+def test_a_refusal_is_a_miss_and_no_alarm() -> None:
+    refused = {"verdict": "refused", "sites": [], "causes": [], "fit": {}, "evidence": {}}
+    trials = [trial("one", refused, SPRING), trial("nothing", refused)]
+    found = {s.what: s for s in scores(trials)}
+    assert found["false alarms where nothing is missing"].value == 0.0
+    assert found["name right up to its class, from 10 sigma"].value == 0.0
+    assert found["refused, with a reason in one line"].value == 1.0
+
+
+def test_each_group_has_its_figures() -> None:
+    right = trial("one", diagnosis("named", (*SPRING, 0.9)), SPRING)
+    wrong = trial("one", diagnosis("named", (*MASS, 0.95)), SPRING)
+    trials = [
+        replace(t, truth=replace(t.truth, styles=styles))
+        for t, styles in ((right, ("cut",)), (right, ("bursts", "hum")), (wrong, ("cut", "hum")))
+    ]
+    rows = {
+        name: {s.what: s for s in some} for name, some in by_group(trials, lambda t: t.truth.styles)
+    }
+    assert rows["cut"]["name, 10"].value == 0.5
+    assert rows["bursts"]["name, 10"].value == 1.0
+    assert rows["hum"]["confidently wrong"].value == 0.5
+
+
+def test_a_diagnosis_that_broke_is_counted_and_a_slow_one_misses() -> None:
+    slow = replace(trial("nothing", NOTHING), seconds=40.0)
+    found = {s.what: s for s in scores([slow] * 3, failed=1)}
+    assert found["no answer, the diagnosis broke"].value == 0.25
+    assert found["s of a core, longest"].met is False
+    assert found["s of a core where nothing is missing, median"].value == 40.0

@@ -7,6 +7,7 @@ worker; the same through the API.
 from __future__ import annotations
 
 import asyncio
+import os
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,14 @@ def test_no_work_ends_the_service(raised: BaseException) -> None:
         raise raised
 
     assert set(desk._answered(work, ())) == {"raised", "line"}
+
+
+def test_work_for_others_stands_behind_the_run() -> None:
+    made = desk.Desk()
+    try:
+        assert made._pool.submit(os.nice, 0).result() == min(19, os.nice(0) + desk.NICE)
+    finally:
+        made.close()
 
 
 def test_the_api_answers_with_the_line(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ PARTS = [(1 / (1 + f * f), -f / (1 + f * f)) for f in F]
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     folder = tmp_path_factory.mktemp("view")
     with Service(folder / "runs", "--pace", "4") as service, Browser(folder / "browser") as browser:
-        size(browser, 1440, 900)
+        browser.size(1440, 900)
         browser.go(service.url)
         browser.until("document.querySelectorAll('#margins, #fields input').length > 3")
         browser.until("Object.keys(lamps.bounds).length > 3")
@@ -51,11 +51,6 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         browser.service = service  # type: ignore[attr-defined]
         yield browser
         assert browser.errors == []
-
-
-def size(browser: Browser, width: int, height: int) -> None:
-    more = {"deviceScaleFactor": 1, "mobile": width < 600}
-    browser.call("Emulation.setDeviceMetricsOverride", width=width, height=height, **more)
 
 
 def typed(browser: Browser, key: str, name: str, value: str) -> None:
@@ -183,7 +178,7 @@ def test_a_run_is_seen_without_scrolling(page: Browser) -> None:
             page.until("/[1-9] repeats/.test(document.getElementById('frf-about').textContent)")
             seen_at_once(page)
             for width, height in ((390, 844), (1440, 900)):
-                size(page, width, height)
+                page.size(width, height)
                 for scheme in ("dark", "light"):
                     page.colours(scheme)
                     assert violations(page) == []
@@ -206,14 +201,14 @@ def seen_at_once(page: Browser) -> None:
         "return [id, b.width, b.height, b.bottom, b.right]; })"
     )
     for width, height in ((1440, 900), (1920, 1080)):
-        size(page, width, height)
+        page.size(width, height)
         page.value("scrollTo(0, 0)")
         for id_, wide, high, bottom, right in page.value(boxes):
             assert wide > 30, id_
             assert high > 10, id_
             assert bottom <= height, (id_, bottom)
             assert right <= width, (id_, right)
-    size(page, 390, 844)
+    page.size(390, 844)
     tops = page.value(
         "['stop', 'now', 'scope', 'frf', 'start', 'list']"
         ".map((id) => document.getElementById(id).getBoundingClientRect().top)"

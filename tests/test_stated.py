@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from samii_rig.diagnose.stated import ANSWER, PLACE, Evidence, probability, weights
 from samii_rig.errors import InputError
-from samii_rig.prove.calibrate import FEWEST, fit, places, row, write
+from samii_rig.prove.calibrate import FEWEST, balanced, fit, places, row, write
 from samii_rig.prove.trial import Hidden, Truth
 
 SURE = Evidence(9.0, 1.0, 1.0, 1, False, False, 200.0, 400.0, 1, False, 1.0)
@@ -106,3 +106,15 @@ def test_weights_are_written_as_they_are_read(tmp_path):
     assert tomllib.loads(file.read_text()) == {ANSWER: {"one": 0.25, "odds": -3}}
     write(file, {"one": 0.25}, "from 2 trials", {"one": 2.0})
     assert tomllib.loads(file.read_text()) == {ANSWER: {"one": 0.25}, PLACE: {"one": 2.0}}
+
+
+def test_every_plant_and_style_counts_alike_in_the_regression():
+    groups = ["a, cut"] * 300 + ["b, bursts"] * 100
+    each = balanced(groups)
+    assert each[:300].sum() == pytest.approx(200)
+    assert each[300:].sum() == pytest.approx(200)
+    # In one group answers are right 9 times in 10, in the other never: 0.45 of both alike.
+    rows = [(SURE, i % 10 > 0) for i in range(300)] + [(SURE, False)] * 100
+    w = fit(rows, groups)
+    score = sum(w[k] * x for k, x in SURE.features().items())
+    assert 1 / (1 + np.exp(-score)) == pytest.approx(0.45, abs=0.02)

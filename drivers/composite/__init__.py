@@ -1,5 +1,5 @@
 """Several devices as one; see docs/composite.md."""
 
-from drivers.composite.rig import open_rig
+from drivers.composite.rig import check_rig, open_rig
 
-__all__ = ["open_rig"]
+__all__ = ["check_rig", "open_rig"]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -22,7 +22,7 @@ from pydantic import ConfigDict, Field
 
 from drivers.composite.sensor import MAIN, Clocks, CompositeSensor, Side
 from drivers.resampling import GAP, Track
-from samii_rig.devices.opening import open_device
+from samii_rig.devices.opening import check_device, open_device
 from samii_rig.devices.protocols import OpenRig
 from samii_rig.devices.timebase import ClockModel, Timed
 from samii_rig.errors import DeviceError, InputError, SamiiRigError
@@ -87,6 +87,13 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
         raise
 
 
+def check_rig(rig: Rig, settings: Mapping[str, object]) -> None:
+    """InputError for settings of devices that are none, or a main one that cannot drive it."""
+    parts = _read(rig, settings)
+    with _naming(MAIN):
+        check_device(_sub(rig, parts[MAIN], parts))
+
+
 def _together(rig: Rig, parts: dict[str, Part], opened: dict[str, OpenRig]) -> CompositeRig:
     main = opened[MAIN]
     sensor = main.sensor
@@ -147,6 +154,27 @@ def _settle(both: CompositeSensor, sides: list[Side], main: OpenRig) -> None:
 
 def _open(rig: Rig, name: str, part: Part, parts: dict[str, Part]) -> OpenRig:
     """One device, with the part of the rig that it measures."""
+    with _naming(name):
+        opened = open_device(_sub(rig, part, parts), {})
+    if opened.metadata.get("clock") == "simulated":
+        opened.close()
+        where = f"{name}.driver"
+        raise wrong(rig, where, part.driver, "one in real time, not a model or replay")
+    return opened
+
+
+@contextlib.contextmanager
+def _naming(name: str) -> Iterator[None]:
+    """An InputError of the device `name` says which settings it means."""
+    try:
+        yield
+    except InputError as error:
+        text = str(error).replace("device.settings.", f"device.settings.{name}.")
+        raise InputError.saying("", "", text) from error
+
+
+def _sub(rig: Rig, part: Part, parts: dict[str, Part]) -> Rig:
+    """The rig as one of its devices sees it: with what it measures."""
     elsewhere = {n for p in parts.values() for n in p.sensors or ()}
     own = set(part.sensors or ())
 
@@ -154,23 +182,13 @@ def _open(rig: Rig, name: str, part: Part, parts: dict[str, Part]) -> OpenRig:
         return sensor in own if own else sensor not in elsewhere
 
     device = Device(driver=part.driver, settings=part.settings())
-    sub = rig.model_copy(
+    return rig.model_copy(
         update={
             "sensor": tuple(s for s in rig.sensor if mine(s.name)),
             "monitor": tuple(m for m in rig.monitor if mine(m.name)),
             "device": device,
         }
     )
-    try:
-        opened = open_device(sub, {})
-    except InputError as error:
-        text = str(error).replace("device.settings.", f"device.settings.{name}.")
-        raise InputError.saying("", "", text) from error
-    if opened.metadata.get("clock") == "simulated":
-        opened.close()
-        where = f"{name}.driver"
-        raise wrong(rig, where, part.driver, "one in real time, not a model or replay")
-    return opened
 
 
 def _read(rig: Rig, settings: Mapping[str, object]) -> dict[str, Part]:
@@ -201,8 +219,10 @@ def _read(rig: Rig, settings: Mapping[str, object]) -> dict[str, Part]:
             if sensor in owner:
                 raise wrong(rig, where, sensor, f"none that {owner[sensor]} measures")
             owner[sensor] = name
-    centring = rig.centring.sensor if rig.centring else rig.sensor[0].name
-    if centring in owner:
+    loops = [loop for a in rig.actuator if (loop := rig.centring_of(a.name))]
+    for centring in [loop.sensor for loop in loops] or [rig.sensor[0].name]:
+        if centring not in owner:
+            continue
         where = f"{owner[centring]}.sensors"
         expected = f"no {centring}, on which {MAIN} closes its loop"
         raise wrong(rig, where, centring, expected)

@@ -1,5 +1,6 @@
 """A six-axis force/torque sensor on a CAN bus; see docs/force-torque.md."""
 
 from drivers.force_torque.device import open_rig
+from drivers.sensing import only_measures as check_rig
 
-__all__ = ["open_rig"]
+__all__ = ["check_rig", "open_rig"]

@@ -115,6 +115,13 @@ def read_settings(rig: Rig, given: Mapping[str, object]) -> NiSettings:
     return s
 
 
+def check_rig(rig: Rig, given: Mapping[str, object]) -> None:
+    """InputError for settings of a board that could not drive this rig."""
+    s = read_settings(rig, given)
+    if s.output is None:
+        raise wrong(rig, "output", None, "the output that drives, or this board beside another")
+
+
 def _check_output(rig: Rig, s: NiSettings, o: Output) -> None:
     if len(rig.actuator) != 1:
         raise InputError(rig.name, "actuator", len(rig.actuator), "one; the board drives one")

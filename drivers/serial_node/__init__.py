@@ -4,5 +4,6 @@ The C files beside this are the portable part of its firmware; a board needs `no
 """
 
 from drivers.serial_node.rig import open_rig
+from drivers.serial_node.settings import read_settings as check_rig
 
-__all__ = ["open_rig"]
+__all__ = ["check_rig", "open_rig"]

@@ -2,29 +2,49 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from samii_rig.cli.common import JsonOption, RigOption, SchedulerOption, WorkersOption, say_json
+from samii_rig.cli.common import JsonOption, SchedulerOption, WorkersOption, rigs, say_json
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from samii_rig.prove.campaign import Campaign
+    from samii_rig.prove.jobs import Job
+    from samii_rig.prove.outcomes import Outcome
     from samii_rig.prove.score import Score
+
+Count = typer.Option(min=0)
 
 
 def prove(
     out: Annotated[Path, typer.Option("--out", help="Folder of trials, answers and the page.")] = (
         Path("proof")
     ),
-    rig: RigOption = "samii",
+    rig: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--rig",
+            help="Shipped rig or path of a rig file, may be repeated; by default all shipped.",
+            autocompletion=rigs,
+        ),
+    ] = None,
+    plant: Annotated[
+        list[str] | None,
+        typer.Option("--plant", help="What makes the recordings, may be repeated; by default all."),
+    ] = None,
     nothing: Annotated[int, typer.Option(min=0, help="Trials that conceal nothing.")] = 300,
     one: Annotated[int, typer.Option(min=0, help="Trials that conceal one effect.")] = 430,
     two: Annotated[int, typer.Option(min=0, help="Trials that conceal two.")] = 150,
     joints: Annotated[
         int, typer.Option(min=0, help="Trials that conceal every joint's give.")
     ] = 40,
+    force: Annotated[
+        int, typer.Option(min=0, help="Trials that conceal one effect that depends on the level.")
+    ] = 150,
     outside: Annotated[
         int, typer.Option(min=0, help="Trials that conceal what the vocabulary has no word for.")
     ] = 150,
@@ -32,11 +52,22 @@ def prove(
         int,
         typer.Option(help="Seed of the first trial of each kind. Thresholds were set below 1e6."),
     ] = 1_000_000,
+    hours: Annotated[
+        float, typer.Option(min=0.0, help="Begin no trial after that long; 0 for no end.")
+    ] = 0.0,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = "",
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep the recordings (12 MB a trial).")
     ] = False,
+    page: Annotated[
+        Path | None,
+        typer.Option(help="Write the documentation's page (.md), and the outcomes beside it."),
+    ] = None,
+    of: Annotated[
+        Path | None,
+        typer.Option("--of", help="Score the outcomes kept in this file (.jsonl.xz), make none."),
+    ] = None,
     calibrate: Annotated[
         Path | None,
         typer.Option(
@@ -47,72 +78,167 @@ def prove(
 ) -> None:
     """Conceal physics from the diagnosis, trial by trial, and score what it says.
 
-    Trials that have an answer are not done again: stop at any time, call again to go on.
+    Plant, rig and style of recording are drawn for every trial. Trials that have an answer are not
+    done again: stop at any time, call again to go on.
 
     Example: samii-rig prove --nothing 6 --one 28 --two 4 --outside 3 --out proof
     """
     from samii_rig.cli.arguments import check_rig
-
-    check_rig(rig)
-
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
-
+    from samii_rig.cli.common import check_target
     from samii_rig.files import check_file, check_folder
-    from samii_rig.prove import campaign as trials
-    from samii_rig.prove.page import write_page
-    from samii_rig.prove.score import scores
-    from samii_rig.rig.load import load_rig
-    from samii_rig.workers import workers as at_work
+    from samii_rig.prove import outcomes as kept
 
-    check_folder("--out", out)
+    for name in rig or ():
+        check_rig(name)
+    if page is not None:
+        check_target("--page", page, (".md",))
     if calibrate is not None:
         check_file("--calibrate", calibrate)
-    console = Console(highlight=False)
-    _, text = load_rig(rig)
-    campaign = trials.Campaign(out.resolve(), text, keep=keep)
-    counts = {"nothing": nothing, "one": one, "two": two, "outside": outside, "joints": joints}
-    todo = trials.jobs(counts, seed)
-    trials.plant(campaign.plant)
-    bar = Progress(
-        "concealed trials",
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
-    with nullcontext() if json else bar, at_work(workers, scheduler) as executor:
-        task = bar.add_task("trials", total=len(todo))
-        failures = trials.carry_out(
-            campaign, todo, executor, lambda n, _all: bar.update(task, completed=n)
+    failures: list[str] = []
+    if of is None:
+        check_folder("--out", out)
+        counts = {"nothing": nothing, "one": one, "two": two, "outside": outside,
+                  "joints": joints, "force": force}  # fmt: skip
+        failures = _made(
+            out.resolve(), _Order(rig, plant, counts, seed, hours, keep), workers, scheduler, json
         )
-    found = trials.results(campaign.out)
-    page = write_page(campaign.out / "proof.html", found)
-    result = scores(found)
-    if json:
-        say_json(
-            {
-                "trials": len(found),
-                "failures": failures,
-                "scores": [_plain(s) for s in result],
-                "page": page,
-            }
-        )
+        made, found = kept.collected(out.resolve())
     else:
-        for s in result:
-            console.print(_line(s), soft_wrap=True)
-        for failure in failures:
-            console.print(f"failed     {failure}", soft_wrap=True)
-        console.print(f"\npage       {page}", soft_wrap=True)
+        made, found = kept.read(of)
     if calibrate is not None:
-        from samii_rig.prove import calibrate as regression
-
-        rows = trials.evidence(campaign.out)
-        origin = f"{len(rows)} trials with an effect found, of seeds from {seed}"
-        place = regression.fit(trials.place_evidence(campaign.out))
-        regression.write(calibrate, regression.fit(rows), origin, place)
+        _calibrate(calibrate, found)
+    _report(None if of else out, page, made, found, failures, json)
     if failures:
         raise typer.Exit(1)
+
+
+class _Order:
+    """What is asked for."""
+
+    def __init__(
+        self,
+        rig: list[str] | None,
+        plant: list[str] | None,
+        counts: Mapping[str, int],
+        seed: int,
+        hours: float,
+        keep: bool,
+    ) -> None:
+        from samii_rig.prove.jobs import jobs, pairs, plants
+        from samii_rig.rig.load import load_rig
+        from samii_rig.rig.shipped import shipped
+
+        self.plants = tuple(plant or plants())
+        self.rigs = {name: load_rig(name)[1] for name in rig or shipped()}
+        having, self.left_out = pairs(self.plants, self.rigs)
+        self.jobs: Sequence[Job] = jobs(counts, seed, having)
+        self.hours, self.keep = hours, keep
+
+
+def _made(out: Path, order: _Order, workers: int | None, scheduler: str, quiet: bool) -> list[str]:
+    """Carry out what is asked for; what failed, in words."""
+    import sys
+    import time
+
+    from samii_rig.prove.campaign import Campaign, carry_out, claim
+    from samii_rig.prove.progress import Progress
+    from samii_rig.workers import workers as at_work
+
+    if not order.jobs:
+        return []
+    made = {"plants": order.plants, "rigs": tuple(order.rigs), "left_out": order.left_out,
+            "command": _command(), "commit": _commit()}  # fmt: skip
+    claim(out, made)
+    campaign: Campaign = Campaign(out, order.rigs, keep=order.keep)
+    until = time.monotonic() + 3600 * order.hours if order.hours else float("inf")
+    with at_work(workers, scheduler) as executor:
+        say = Progress(len(order.jobs), None if quiet else sys.stderr)
+        return carry_out(campaign, order.jobs, executor, say, until)
+
+
+# Options that say where and how fast, not which trials.
+ELSEWHERE = ("--out", "--page", "--calibrate", "--workers", "--scheduler", "--hours")
+
+
+def _command() -> str:
+    """This call as a person would type it to have the same trials."""
+    import shlex
+    import sys
+
+    words, skip = ["samii-rig"], False
+    for word in sys.argv[1:]:
+        if not skip and word.split("=")[0] not in (*ELSEWHERE, "--keep", "--json"):
+            words.append(word)
+        skip = word in ELSEWHERE
+    return shlex.join(words)
+
+
+def _commit() -> str:
+    """The commit of the code, with + where files differ from it; else the version."""
+    import subprocess
+    from importlib.metadata import version
+
+    here = Path(__file__).parent
+    asked = ["git", "describe", "--always", "--dirty=+", "--abbrev=10", "--exclude=*"]
+    try:
+        done = subprocess.run(asked, cwd=here, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return version("samii-rig")
+    return done.stdout.strip()
+
+
+def _calibrate(file: Path, found: Sequence[Outcome]) -> None:
+    from samii_rig.prove import calibrate as regression
+    from samii_rig.prove.outcomes import evidence
+
+    rows, groups, places, place_groups = evidence(found)
+    seeds = [o["seed"] for o in found]
+    origin = (
+        f"{len(rows)} trials with an effect found, of seeds from {min(seeds, default=0)} to "
+        f"{max(seeds, default=0)}; every plant and excitation counts alike"
+    )
+    weights = regression.fit(rows, groups)
+    regression.write(file, weights, origin, regression.fit(places, place_groups))
+
+
+def _report(
+    out: Path | None,
+    page: Path | None,
+    made: dict[str, Any],
+    found: Sequence[Outcome],
+    failures: Sequence[str],
+    json: bool,
+) -> None:
+    """Write the pages, that of a campaign into `out`; print the scores."""
+    from rich.console import Console
+
+    from samii_rig.prove import evidence
+    from samii_rig.prove import outcomes as kept
+    from samii_rig.prove.page import write_page
+    from samii_rig.prove.score import scores
+
+    trials = kept.trials(found)
+    broken = sum(o.get("at") == "diagnosis" for o in found if "error" in o)
+    result = scores(trials, broken)
+    pages = [write_page(out / "proof.html", trials, failed=broken)] if out is not None else []
+    if page is not None:
+        file = page.with_name("proof-trials.jsonl.xz")
+        kept.write(file, made, found)
+        known = {"command": "", "commit": "", "left_out": (), **made}
+        known["page"] = f"samii-rig prove --of {file} --page {page}"
+        evidence.write(page, known, found, file.name)
+        pages += [page, file]
+    if json:
+        data = {"trials": len(trials), "failures": failures, "page": pages[0] if pages else None}
+        say_json({**data, "scores": [_plain(s) for s in result]})
+        return
+    console = Console(highlight=False)
+    for s in result:
+        console.print(_line(s), soft_wrap=True)
+    for failure in failures:
+        console.print(f"failed     {failure}", soft_wrap=True)
+    for path in pages:
+        console.print(f"page       {path}", soft_wrap=True)
 
 
 def _plain(s: Score) -> dict[str, Any]:

@@ -95,6 +95,7 @@ def run(
 
     from rich.console import Console
 
+    from samii_rig.devices.opening import check_device
     from samii_rig.errors import EstimateError, InputError
     from samii_rig.files import check_folder, make_folder
     from samii_rig.report.summary import show_dry_run, working
@@ -116,6 +117,8 @@ def run(
         return
     setups = setups_of(the_experiment, the_rig, rig_text)
     plans = [plan_of(the_experiment, s.rig) for s in setups]
+    for s in setups:
+        check_device(s.rig)
     with working(console, "predicting the run", quiet=json):
         predicted = [predict(p, s.rig) for p, s in zip(plans, setups, strict=True)]
     if not json:
@@ -379,6 +382,7 @@ def _prediction(predicted: DryRun) -> dict[str, Any]:
                 "high_hz": b.high_hz,
                 "std": b.std,
                 "relative": b.relative,
+                **({"input": b.input} if b.input else {}),
             }
             for b in predicted.bands
         ],

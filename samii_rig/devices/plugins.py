@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import EntryPoint
 
-from samii_rig.devices.protocols import Actuator, Clock, OpenRig, Sensor
+from samii_rig.devices.protocols import Actuator, Actuators, Clock, OpenRig, Sensor
 from samii_rig.errors import InputError, SamiiRigError
 from samii_rig.types import Channel
 
@@ -44,7 +44,9 @@ def checked_device(opened: object, who: str) -> OpenRig:
     """What a driver returned, if it is a rig whose parts are there; else InputError."""
     if not isinstance(opened, OpenRig):
         raise InputError.saying(who, "", f"returned {type(opened).__name__}; expected an OpenRig")
-    for part, kind in (("actuator", Actuator), ("sensor", Sensor), ("clock", Clock)):
+    if not isinstance(opened.actuator, Actuator | Actuators):
+        raise wrong(who, "actuator", opened.actuator, "what has all of a Actuator")
+    for part, kind in (("sensor", Sensor), ("clock", Clock)):
         found = getattr(opened, part)
         if not isinstance(found, kind):
             raise wrong(who, part, found, f"what has all of a {kind.__name__}")

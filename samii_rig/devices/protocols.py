@@ -74,6 +74,56 @@ class Actuator(Protocol):
 
 
 @runtime_checkable
+class Actuators(Protocol):
+    """Several outputs that one device drives together. Only the gate may hold them.
+
+    They are one: what drops one of them to zero (its limit, an angle, the deadman) drops all.
+
+    names : of the outputs, in the order of the rig file; so are loops and blocks below.
+    deadman : as of an `Actuator`, of all at once.
+    """
+
+    names: tuple[str, ...]
+    deadman: float | None
+
+    def configure(self, loops: tuple[DeviceLoop, ...]) -> None:
+        """Set each output's loop and limits; allowed only while all outputs are zero."""
+
+    def write(self, blocks: tuple[CommandBlock, ...]) -> None:
+        """Queue reference samples, the same ones of every output; feeds the deadman."""
+
+    def zero(self) -> None:
+        """All outputs zero now, drop all that is queued. Never raises, may be called twice."""
+
+
+class Alone:
+    """An actuator as a device's only output, so that whoever drives outputs knows one kind."""
+
+    def __init__(self, actuator: Actuator) -> None:
+        self._actuator = actuator
+        self.names = (actuator.name,)
+
+    @property
+    def deadman(self) -> float | None:
+        """The actuator's own."""
+        return self._actuator.deadman
+
+    def configure(self, loops: tuple[DeviceLoop, ...]) -> None:
+        """Its loop and limits."""
+        (loop,) = loops
+        self._actuator.configure(loop)
+
+    def write(self, blocks: tuple[CommandBlock, ...]) -> None:
+        """Its reference."""
+        (block,) = blocks
+        self._actuator.write(block)
+
+    def zero(self) -> None:
+        """Its output at zero."""
+        self._actuator.zero()
+
+
+@runtime_checkable
 class Sensor(Protocol):
     """A source of samples. The device that drives an output also reads back v."""
 
@@ -118,7 +168,7 @@ class OpenRig:
     An entry point is called with (rig: Rig, settings: dict[str, object]).
     """
 
-    actuator: Actuator
+    actuator: Actuator | Actuators
     sensor: Sensor
     clock: Clock
     description: str

@@ -7,10 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from samii_rig.diagnose.along import POSITION
 from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.classes import Class
+from samii_rig.diagnose.confusions import nearest
 from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.explanations import Explanation
+from samii_rig.diagnose.intervals import values_of
 from samii_rig.diagnose.judge import MOST_NAMES, Judgement
 from samii_rig.diagnose.measured import Measured
 from samii_rig.diagnose.refit import Fitted
@@ -21,17 +23,14 @@ from samii_rig.types import Complex, Float
 
 DRAWS = 1000
 SHOWN = 0.01  # probability of an alternative from which it is listed
-# What a factor between two units is: their names are told, not physics.
-UNITS = {57.29578: "degrees for radians", 9.80665: "g for m/s^2", 1000.0: "milli for one",
-         6.283185: "hertz for rad/s"}  # fmt: skip
-UNIT_WITHIN = 0.03
+UNIT_WITHIN = 0.03  # relative, of a fitted gain: what a sensor's calibration may be off by
 
 
 def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> tuple[Cause, ...]:
     """The physics of a class's first member. Each has its own marginal probability, or that of
     the whole class where it is given."""
     first = chosen.first
-    values = _values(first, judged.inflation)
+    values = values_of(chosen, judged.inflation)
     out = []
     for effect, found in zip(first.effects, values, strict=True):
         if effect.physics in NOT_PHYSICS or unit_of(effect, found):
@@ -45,7 +44,8 @@ def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> t
                 if any(n in same for e in c.first.effects for n in e.names)
             )
         equivalents = tuple(n for n in chosen.equivalents(effect))
-        out.append(Cause(effect.physics, effect.site, min(p, 1.0), equivalents, found))
+        place = found[POSITION].value if POSITION in found else effect.position
+        out.append(Cause(*effect.name, min(p, 1.0), equivalents, found, place))
     return tuple(out)
 
 
@@ -53,39 +53,9 @@ def unit_of(effect: Effect, found: dict[str, Value]) -> str:
     """What unit a sensor's gain would be a confusion of, "" for none."""
     if effect.physics != "sensor_gain":
         return ""
-    for factor, name in UNITS.items():
-        for value in (factor, 1 / factor):
-            if abs(found["gain"].value / value - 1) < UNIT_WITHIN:
-                return name
-    return ""
-
-
-def _values(explanation: Explanation, inflation: float) -> list[dict[str, Value]]:
-    """Parameters of every effect with 90 % intervals, from draws of the logarithms."""
-    fitted = explanation.fitted
-    model, x = fitted.model, fitted.x
-    cov = fitted.covariance()[model.n_nominal :, model.n_nominal :] * inflation
-    rng = np.random.default_rng(0)
-    centre = x[model.n_nominal :]
-    draws = rng.multivariate_normal(centre, cov, DRAWS, method="eigh") if centre.size else None
-    out, at = [], 0
-    for effect, theta in zip(model.effects, model.parts(x), strict=True):
-        n = len(effect.unknowns)
-        reported = effect.report(theta)
-        found: dict[str, Value] = {}
-        if draws is not None and n:
-            low = np.log([u.low for u in effect.unknowns])
-            high = np.log([u.high for u in effect.unknowns])
-            drawn = np.exp(np.clip(draws[:, at : at + n], low, high))
-            every = np.array([effect.report(row) for row in drawn])
-            ends = np.quantile(every, [0.05, 0.95], axis=0)
-            found = {
-                u.symbol: Value(float(reported[i]), u.unit, float(ends[0, i]), float(ends[1, i]))
-                for i, u in enumerate(effect.unknowns)
-            }
-        at += n
-        out.append(found)
-    return out
+    gain = found["gain"].value
+    unit, factor = nearest(gain)
+    return unit.name if abs(gain / factor - 1) < UNIT_WITHIN else ""
 
 
 def moved(fitted: Fitted) -> tuple[Moved, ...]:
@@ -104,7 +74,8 @@ def told(judged: Judgement) -> list[str]:
     """Findings of the chosen explanation that are not physics, in words."""
     out = []
     best = judged.best
-    for effect, found in zip(best.effects, _values(best, judged.inflation), strict=True):
+    values = values_of(judged.classes[0], judged.inflation)
+    for effect, found in zip(best.effects, values, strict=True):
         unit = unit_of(effect, found)
         match effect.physics:
             case "channel_swap":
@@ -112,10 +83,10 @@ def told(judged: Judgement) -> list[str]:
             case "sign_error":
                 out.append(f"{effect.site} has the wrong sign")
             case "time_offset":
-                t = found["tau"]
+                ms = found["tau"].times(1e3)
                 out.append(
-                    f"{effect.site} is {1e3 * t.value:.4g} ms ({1e3 * t.low:.4g} to "
-                    f"{1e3 * t.high:.4g}) ahead of the other channels: stamped or read too early"
+                    f"{effect.site} is {ms.value:.4g} ms ({ms.within()}) ahead of the other "
+                    "channels: stamped or read too early"
                 )
             case "input_not_held":
                 out.append(
@@ -125,7 +96,7 @@ def told(judged: Judgement) -> list[str]:
             case "common_gain":
                 g = found["gain"]
                 out.append(
-                    f"all channels share a gain of {g.value:.4g} ({g.low:.4g} to {g.high:.4g}): "
+                    f"all channels share a gain of {g.value:.4g} ({g.within()}): "
                     "a scale of the input, not a shape that physics would have"
                 )
             case _ if unit:

@@ -9,7 +9,10 @@ from functools import partial
 import numpy as np
 
 from samii_rig.diagnose import insert
+from samii_rig.diagnose.along import Along, stretches
 from samii_rig.diagnose.effect import Effect, Jump, Key, Unknown, Values
+from samii_rig.diagnose.fractional import Joint
+from samii_rig.diagnose.points import ON_LINK
 from samii_rig.diagnose.scales import PAIRS, REACH, Places, middle, spread
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
@@ -23,9 +26,15 @@ from samii_rig.rig.schema import (
 )
 from samii_rig.types import Float
 
+# Of a fractional damper: nearer 0 it is the spring that the joint has, nearer 1 its damper.
+POWER = (0.1, 0.9)
+POWERS = (0.2, 0.35, 0.5, 0.7)
 COMPLIANCES = (1e-4, 0.01, 1.0)  # of a line's oil over the chain's own, at which a search starts
 # No material's loss is the same at all frequencies: relaxation makes it wander by some per cent.
 LOSS_WANDERS = 0.05
+RATIO = (0.2, 5.0)  # of a beam's stiffness or density to the file's; farther off it is another beam
+# At which a search starts: not 1 in the middle, where all ratios are one effect, none.
+RATIOS = (0.5, 0.75, 1.35, 1.0, 2.0)
 DAMPED = (1e-7, 1e3)  # loss angle of a joint's spring with a damper, from invisible to gross
 
 
@@ -64,6 +73,47 @@ def _joint_dampers(rig: Rig, where: Places) -> Iterator[Effect]:
             jump=Jump(f"beside {e.name}", lambda s, x: np.asarray(s * x[:, :1])),
             variant="beside the spring",
         )
+        yield _fractional(e, tuple(w * c for c in bounds), w)
+
+
+def _fractional(
+    spring: TorsionalSpring | TranslationalSpring, forces: tuple[float, ...], w: float
+) -> Effect:
+    """A damper c s^alpha beside a spring. Its unknowns are its force over motion at w rad/s, in
+    the bounds of `forces`, and alpha: with c itself the two would hardly be told apart."""
+    low, high = forces
+    joint = Joint(spring.name, math.sqrt(low * high) / w)
+    unit = spring.k.unit.replace("/", " s^alpha/")
+
+    def told(x: Float) -> Float:
+        return np.array([x[0] / w ** x[1], x[1]])
+
+    def values(x: Float, _: Values) -> dict[Key, float]:
+        return dict(zip(joint.keys, told(x).tolist(), strict=True))
+
+    def write(rig: Rig, x: Float) -> Rig:
+        c, alpha = told(x)
+        said = (
+            f"Found beside this rig, which has no element for it: a fractional damper at "
+            f"{spring.name}, {c:.4g} {unit} with alpha = {alpha:.3g}."
+        )
+        return rig.model_copy(update={"description": f"{rig.description} {said}".strip()})
+
+    return Effect(
+        physics="fractional_damping",
+        site=spring.name,
+        unknowns=(
+            Unknown("c", unit, low, high, spread(low, high, 11)),
+            Unknown("alpha", "1", *POWER, POWERS),
+        ),
+        parameters=values,
+        fractional=joint,
+        jump=Jump(
+            f"beside {spring.name}", lambda s, x: np.asarray(x[:, :1] * (s / w) ** x[:, 1:2])
+        ),
+        report=told,
+        write=write,
+    )
 
 
 def _lines(rig: Rig, where: Places) -> Iterator[Effect]:
@@ -102,7 +152,7 @@ def _lines(rig: Rig, where: Places) -> Iterator[Effect]:
 
 
 def _links(rig: Rig, where: Places) -> Iterator[Effect]:
-    """A mass or inertia somewhere on a rigid link: the link's own m, r and I change."""
+    """A mass somewhere on a rigid link: the link's own m, r and I change."""
     w = middle(where)
     for port, e in enumerate(rig.element):
         if not isinstance(e, RigidLink) or e.L.value == 0 or e.m.value == 0:
@@ -110,18 +160,21 @@ def _links(rig: Rig, where: Places) -> Iterator[Effect]:
         x = where.strength(PAIRS.index(("V", "w")), port + 1)
         if not 0 < x < math.inf:
             continue
+        (stretch,) = stretches(rig, e)
         keys = tuple((e.name, s) for s in ("m", "r", "I"))
-        L = e.L.value
 
         def values(
-            x: Float, nominal: Values, keys: tuple[Key, ...] = keys, L: float = L
+            x: Float, nominal: Values, keys: tuple[Key, ...] = keys, stretch: Along = stretch
         ) -> dict[Key, float]:
             m, r, inertia = (nominal[k] for k in keys)
-            more, at = float(x[0]), float(x[1]) * L
+            more, at = float(x[0]), stretch.position(float(x[1]))
             total = m + more
             centre = (m * r + more * at) / total
             own = inertia + m * (r - centre) ** 2 + more * (at - centre) ** 2
             return dict(zip(keys, (total, centre, own), strict=True))
+
+        def report(x: Float, stretch: Along = stretch) -> Float:
+            return np.array([x[0], stretch.position(float(x[1]))])
 
         scale = x / w**2
         bounds = scale / REACH[1], scale / REACH[0]
@@ -129,13 +182,19 @@ def _links(rig: Rig, where: Places) -> Iterator[Effect]:
             physics="added_mass",
             site=e.name,
             unknowns=(
-                Unknown("m", "kg", *bounds, spread(*bounds, 8)),
-                Unknown("position", "L", 0.05, 1.0, (0.1, 0.4, 0.9)),
+                Unknown("m", "kg", *bounds, spread(*bounds, 11)),
+                stretch.unknown(ON_LINK),
             ),
             parameters=values,
             touches=keys,
-            jump=Jump(f"on {e.name}", lambda s, x: np.asarray(s**2 * x[:, :1]), fixed=1),
-            variant="on the link",
+            jump=Jump(
+                f"V by w {stretch.place()}",
+                lambda s, x: np.asarray(s**2 * x[:, :1]),
+                ("V", "w"),
+                fixed=1,
+            ),
+            report=report,
+            variant="along the link",
         )
 
 
@@ -173,7 +232,7 @@ def _properties(name: str, symbols: tuple[str, ...]) -> Iterator[Effect]:
         yield Effect(
             physics="beam_property",
             site=name,
-            unknowns=(Unknown(f"{symbol} ratio", "1", 0.2, 5.0, (0.5, 0.75, 1.0, 1.35, 2.0)),),
+            unknowns=(Unknown(f"{symbol} ratio", "1", *RATIO, RATIOS),),
             parameters=scaled,
             touches=(key,),
             variant=symbol,

@@ -1,14 +1,13 @@
-"""The diagnosis of whole records: by every sample; by levels of lines what stays unknown."""
+"""The diagnosis of whole records, by every sample."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 from samii_rig.diagnose import judge as verdict
-from samii_rig.diagnose.by_line import at_first, settled
+from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.judge import Judgement
-from samii_rig.diagnose.nonlinear import compete
-from samii_rig.diagnose.nonlinear_search import RIVALS, ForceSearch, compete_on_records
+from samii_rig.diagnose.measured import DIFFER
 from samii_rig.diagnose.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.result import Band, Diagnosis, Gap
 from samii_rig.diagnose.stages import Case, Progress, Shown, told
@@ -23,25 +22,21 @@ def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | N
     if not case.runs or clean.mended or clean.doubt:
         return None
     try:
-        table = case.search.table
-        whole = Whole.of(case.runs, case.search.rig, band, table, clean.sensors, clean.samples)
+        whole = Whole.of(case.runs, case.search.rig, band, clean.sensors, clean.samples)
         return RecordSearch(whole, case.search)
     except EstimateError:
         return None
 
 
-def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis | None:
-    """What whole records say; None where levels differ grossly and no force is found by which."""
+def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis:
+    """What whole records say."""
     first, bands = _at_first(search)
     progress("what is missing")
     # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
     search.run(briefly=True)
     progress("amplitude levels")
-    torn = case.search.lines.torn()
     forced = forces_on(search)
-    if torn and forced is None:
-        return None
-    if not torn and (forced is None or not forced.is_enough()):
+    if forced is None or not (case.search.lines.torn() or forced.is_enough()):
         search.run()
         forced = None if forced is None else forces_on(search)
     progress("what cannot be told apart")
@@ -50,11 +45,6 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
     else:
         first, bands = _at_first(forced)
         looked = _looked(forced)
-    if looked.judged.verdict == "unknown":
-        if torn:
-            return None
-        if (found := on_levels(case, search, progress)) is not None:
-            return found
     return _answer(case, forced or search, first, bands, looked)
 
 
@@ -129,18 +119,6 @@ def forces_on(search: RecordSearch) -> ForceSearch | None:
         return None
 
 
-def on_levels(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis | None:
-    """What the lines of each level say, if a force among them wins, alone or beside linear effects:
-    of whole records nothing is known of both together."""
-    before = at_first(case)
-    for explanation in search.ranked()[:RIVALS]:
-        there = search.at_lines(explanation)
-        case.search.keep(there.effects, there.fitted)
-    if compete(case.search, case.responses, case.runs) is None:
-        return None
-    return settled(case, before, progress)
-
-
 def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
     """The same, but where no linear response explains all records something is missing; and that in
     words."""
@@ -152,6 +130,6 @@ def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
         "model can explain, so something depends on amplitude or changed between runs",
     )
     judged = looked.judged
-    if judged.verdict == "no_mismatch":
+    if judged.verdict == "no_mismatch" or left > DIFFER:
         judged = replace(judged, verdict="unknown")
     return replace(looked, judged=judged, said=said)

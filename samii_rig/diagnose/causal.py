@@ -29,9 +29,14 @@ class CausalChain:
     """As `Chain`, with the stiffness of `beams` as in the file at `middle_hz`."""
 
     def __init__(self, chain: Chain, beams: tuple[str, ...], middle_hz: float) -> None:
-        self.plain, self._beams, self._middle = chain, beams, middle_hz
+        self.plain: Chain = chain
+        self._beams, self._middle = beams, middle_hz
         self.parameters = chain.parameters
         self._at = {key: i for i, key in enumerate(chain.parameters)}
+
+    def values(self) -> Float:
+        """As of `Chain`."""
+        return self.plain.values()
 
     def with_values(self, values: Mapping[Key, float]) -> CausalChain:
         """As of `Chain`."""

@@ -112,7 +112,7 @@ def _both(first: Case, second: Case, band: Band | None) -> tuple[Both, RecordSea
             why = (*clean.told, "they depend on the level as no linear rig does")[0]
             raise EstimateError(f"the recordings {name} cannot be compared sample by sample: {why}")
         search = case.search
-        wholes.append(Whole.of(case.runs, search.rig, band, search.table, common, clean.samples))
+        wholes.append(Whole.of(case.runs, search.rig, band, common, clean.samples))
     if wholes[0].wired != wholes[1].wired:
         raise EstimateError("the two states have no command and no sensor in common")
     longest = max(w.records.longest for w in wholes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 
@@ -11,6 +12,8 @@ import numpy as np
 
 from samii_rig.diagnose import insert
 from samii_rig.diagnose.effect import Effect, Factor, Key, Unknown, Values
+from samii_rig.diagnose.less import FASTER, SMALLEST
+from samii_rig.diagnose.rows import PHYSICS
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     SOURCES,
@@ -18,6 +21,7 @@ from samii_rig.rig.schema import (
     AngularVelocitySource,
     RelativeAngle,
     Rig,
+    SensorBase,
     TorsionalSpring,
 )
 from samii_rig.types import Complex, Float
@@ -25,14 +29,7 @@ from samii_rig.types import Complex, Float
 Law = Callable[[Complex, Float], tuple[Complex, list[Complex]]]
 
 # Not physics: wiring, units and signs. They compete with physics and are reported apart.
-NOT_PHYSICS = (
-    "channel_swap",
-    "sign_error",
-    "common_gain",
-    "time_offset",
-    "unit_rest",
-    "input_not_held",
-)
+NOT_PHYSICS = tuple(row.name for row in PHYSICS.values() if not row.physical)
 
 
 def dead_time(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
@@ -51,6 +48,17 @@ def lag(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
     """p/(s + p)."""
     F = x[0] / (s + x[0])
     return F, [s / (s + x[0]) ** 2]
+
+
+def quicker(s: Complex, x: Float, p: float) -> tuple[Complex, list[Complex]]:
+    """r (s + p)/(s + r p): a lag of corner p rad/s that has r times that, or is none."""
+    r = x[0]
+    return r * (s + p) / (s + r * p), [s * (s + p) / (s + r * p) ** 2]
+
+
+def lower(s: Complex, x: Float, w: float) -> tuple[Complex, list[Complex]]:
+    """(s + w)/(s + r w): a high-pass of corner w rad/s that has r times that, or is none."""
+    return (s + w) / (s + x[0] * w), [-w * (s + w) / (s + x[0] * w) ** 2]
 
 
 def highpass(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
@@ -89,7 +97,8 @@ def effects(rig: Rig, low_hz: float, high_hz: float) -> Iterator[Effect]:
     for actuator in rig.actuator:
         yield from _input(rig, actuator.name, low_hz, high_hz)
     for sensor in rig.sensor:
-        yield from _sensor(sensor.name, low_hz, high_hz)
+        yield from _sensor(sensor, low_hz, high_hz)
+        yield from _less(sensor)
         if isinstance(sensor, Acceleration) and sensor.tilt == 0:
             yield from _tilted(sensor.name)
         if isinstance(sensor, RelativeAngle):
@@ -180,33 +189,65 @@ def _input(rig: Rig, name: str, low_hz: float, high_hz: float) -> Iterator[Effec
     yield Effect(physics="input_not_held", site=name, factor=Factor("input", name, unheld))
 
 
-def _sensor(name: str, low_hz: float, high_hz: float) -> Iterator[Effect]:
-    def one(
-        physics: str, law: Law, unknown: Unknown, update: Callable[[float], dict[str, object]]
-    ) -> Effect:
-        def write(rig: Rig, x: Float) -> Rig:
-            return insert.sensor_changed(rig, name, **update(float(x[0])))
+Update = Callable[[float], dict[str, object]]
 
-        return Effect(
-            physics=physics,
-            site=name,
-            unknowns=(unknown,),
-            factor=Factor("sensor", name, law),
-            write=write,
-        )
 
-    yield one("sensor_delay", dead_time, _times(high_hz), lambda tau: {"delay": tau})
+def _on(name: str, physics: str, law: Law, unknown: Unknown, update: Update) -> Effect:
+    """A factor on a sensor, and what the rig file says of it."""
+
+    def write(rig: Rig, x: Float) -> Rig:
+        return insert.sensor_changed(rig, name, **update(float(x[0])))
+
+    return Effect(
+        physics=physics,
+        site=name,
+        unknowns=(unknown,),
+        factor=Factor("sensor", name, law),
+        write=write,
+    )
+
+
+def _sensor(sensor: SensorBase, low_hz: float, high_hz: float) -> Iterator[Effect]:
+    def one(physics: str, law: Law, unknown: Unknown, update: Update) -> Effect:
+        return _on(sensor.name, physics, law, unknown, update)
+
+    delay, times = sensor.delay, _times(high_hz)
+    yield one("sensor_delay", dead_time, times, lambda tau: {"delay": delay + tau})
     yield one("sensor_lag", lag, _corners("p", low_hz, high_hz), lambda p: {"lag": 1 / p})
-    yield one("sensor_gain", gain, _gains(), lambda g: {"gain": g})
+    yield one("sensor_gain", gain, _gains(), lambda g: {"gain": g * sensor.gain})
     corner = _unknown("corner", "Hz", 1e-4 * low_hz, 10 * low_hz)
     yield one("sensor_highpass", highpass, corner, lambda f: {"highpass_hz": f})
-    yield Effect(physics="sign_error", site=name, factor=Factor("sensor", name, minus))
     yield Effect(
-        physics="time_offset",
-        site=name,
-        unknowns=(_times(high_hz),),
-        factor=Factor("sensor", name, lead),
+        physics="sign_error", site=sensor.name, factor=Factor("sensor", sensor.name, minus)
     )
+    if delay < times.high:  # earlier by less, the delay of the file is not there
+        early = _unknown("tau", "s", max(times.low, delay), times.high)
+        yield Effect(
+            physics="time_offset",
+            site=sensor.name,
+            unknowns=(early,),
+            factor=Factor("sensor", sensor.name, lead),
+        )
+
+
+def _less(sensor: SensorBase) -> Iterator[Effect]:
+    """A delay, lag or high-pass of the rig file that a sensor does not have, or has less of."""
+
+    def one(physics: str, law: Law, unknown: Unknown, update: Update) -> Effect:
+        return replace(_on(sensor.name, physics, law, unknown, update), variant="less")
+
+    if sensor.delay > 0:
+        gone = _unknown("tau", "s", SMALLEST * sensor.delay, sensor.delay)
+        less = one("sensor_delay", lead, gone, lambda tau: {"delay": sensor.delay - tau})
+        yield replace(less, report=lambda x: -x)
+    if sensor.lag > 0:
+        ratio = _unknown("p ratio", "1", 1 + SMALLEST, FASTER)
+        law = partial(quicker, p=1 / sensor.lag)
+        yield one("sensor_lag", law, ratio, lambda r: {"lag": sensor.lag / r})
+    if sensor.highpass_hz > 0:
+        ratio = _unknown("corner ratio", "1", 1 / FASTER, 1 - SMALLEST)
+        law = partial(lower, w=2 * math.pi * sensor.highpass_hz)
+        yield one("sensor_highpass", law, ratio, lambda r: {"highpass_hz": r * sensor.highpass_hz})
 
 
 def _tilted(name: str) -> Iterator[Effect]:

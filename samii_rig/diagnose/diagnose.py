@@ -59,8 +59,7 @@ def diagnose(
     progress("nominal model")
     case = case_of(responses, rig, band, effects, runs)
     search = on_records(case, band)
-    found = by_records(case, search, progress) if search is not None else None
-    return by_lines(case, progress) if found is None else found
+    return by_lines(case, progress) if search is None else by_records(case, search, progress)
 
 
 def case_of(

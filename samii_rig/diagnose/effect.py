@@ -16,7 +16,8 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 
 if TYPE_CHECKING:
-    from samii_rig.diagnose.nonlinear_model import Quasi
+    from samii_rig.diagnose.forces.laws import Force
+    from samii_rig.diagnose.fractional import Joint
 
 Key = tuple[str, str]
 Values = Mapping[Key, float]
@@ -80,12 +81,17 @@ class Effect:
     factor : what it does to a channel, if that is no parameter of the rig.
     causal : (beam, Hz) whose loss factor it brings, and where the stiffness is as in the file.
     jump : its place and x(s), if it acts through one number; as `build` and `parameters` do.
+    fractional : the damper c s^alpha that it is; `parameters` sets its two.
     quasi : the nonlinear force that it is, if it is one; the first unknown is its strength.
     write : the rig as a file would have it, from the built rig and the unknowns.
     weight : prior weight against the other hypotheses.
     report : physical quantities to be reported, from the unknowns.
     rough : part of what it does by which its law is known to be off; 0 for one that holds.
     variant : tells effects with one name and different changes apart.
+    position : m from the site's upstream end, if it stands at one place along it; that of an
+        effect with a position among its unknowns is None.
+    pieces : names of what it cuts its site into, beside the one that keeps the name. They are the
+        same material, whatever other effects make of it: its `parameters` are asked for last.
     """
 
     physics: str
@@ -97,13 +103,16 @@ class Effect:
     factor: Factor | None = None
     jump: Jump | None = None
     causal: tuple[str, float] | None = None
-    quasi: Quasi | None = None
+    fractional: Joint | None = None
+    quasi: Force | None = None
     write: Callable[[Rig, Float], Rig] = lambda rig, _x: rig
     weight: float = 1.0
     aliases: tuple[tuple[str, str], ...] = field(default=())
     report: Callable[[Float], Float] = lambda x: x
     rough: float = 0.0
     variant: str = ""
+    position: float | None = None
+    pieces: tuple[str, ...] = ()
 
     @property
     def name(self) -> tuple[str, str]:

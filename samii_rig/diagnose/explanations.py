@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.forces.model import model_of
 from samii_rig.diagnose.measured import Measured, binned
 from samii_rig.diagnose.model import Grid, Model, grid
-from samii_rig.diagnose.nonlinear_model import model_of
 from samii_rig.diagnose.ranking import moved
 from samii_rig.diagnose.refit import STEPS, Fitted, Problem, refit
 from samii_rig.diagnose.stated import IN_DATA

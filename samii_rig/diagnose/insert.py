@@ -33,9 +33,14 @@ def parameter(value: float, unit: str) -> Parameter:
 def element_of(kind: type[Any], name: str, units: dict[str, str]) -> Element:
     """An element of `kind` with every parameter of `units` at 1, by symbol."""
     values = {symbol: parameter(1.0, unit) for symbol, unit in units.items()}
-    tag = get_args(kind.model_fields["kind"].annotation)[0]
-    made: Element = kind(kind=tag, name=name, **values)
+    made: Element = kind(kind=tag(kind), name=name, **values)
     return made
+
+
+def tag(kind: type[Any]) -> str:
+    """What a rig file calls an element of `kind`."""
+    name: str = get_args(kind.model_fields["kind"].annotation)[0]
+    return name
 
 
 def oscillator(name: str) -> Branch:

@@ -14,7 +14,6 @@ from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.classes import Class, classes
 from samii_rig.diagnose.explanations import NEAR, Explanation
 from samii_rig.diagnose.measured import Measured
-from samii_rig.diagnose.own_law import OwnLaw, own_law
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Gap, Verdict
 from samii_rig.diagnose.search import Search
@@ -27,7 +26,7 @@ MOSTLY = 0.5  # of the mismatch; one cause that explains it is told whatever els
 MOST_NAMES = 4  # of a class; more is no answer
 UNEXPLAINED = 3e-4  # chance that noise alone leaves more than the threshold
 MUST_SHOW = 900.0  # of chi-square, that an effect explains of the data: 30 noise units
-PARTLY = 0.9  # of the mismatch: several effects that leave more, and more than noise, are no answer
+PARTLY = 0.9  # of the mismatch: effects that leave more of it, and more than noise, are not named
 SAID = ("named", "ambiguous")  # verdicts that come with causes
 
 
@@ -39,7 +38,7 @@ class Judgement:
     nothing : probability of nothing missing. right : that the chosen explanation is right, up to
         its class, by its evidence. inflation : factor on covariances for what it leaves.
     beyond : what is in no table and explains the data better; the place is then its own.
-    partly : whether several effects together leave much of the mismatch.
+    partly : whether the effects leave much of the mismatch, and more than noise.
     """
 
     verdict: Verdict
@@ -48,7 +47,7 @@ class Judgement:
     right: float
     evidence: Evidence
     inflation: float
-    beyond: Changing | OwnLaw | None = None
+    beyond: Changing | None = None
     partly: bool = False
 
     @property
@@ -107,13 +106,12 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
     evidence = _evidence(search, ordered, ranked, decide)
     said = _verdict(ordered[0], evidence, search, decide)
     beyond = _beyond(search, ordered[0].first, evidence, decide) if said != "no_mismatch" else None
-    # What one effect does not explain may be another's; with two, sums of them mimic what is in no
-    # table.
-    partly = (
-        evidence.effects > 1 and evidence.closed < PARTLY and _unexplained(evidence, search, decide)
-    )
+    # Beside more than noise that nothing explains, an effect is believed for the part that is its.
+    partly = evidence.closed < PARTLY and _unexplained(evidence, search, decide)
+    if partly:
+        said = _most(said, evidence)
     return Judgement(
-        verdict="unknown" if beyond or (partly and said in SAID) else said,
+        verdict="unknown" if beyond else said,
         classes=ordered,
         nothing=nothing,
         right=probability(evidence),
@@ -126,7 +124,7 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
 
 def _beyond(
     search: Search, best: Explanation, evidence: Evidence, decide: Measured | None
-) -> Changing | OwnLaw | None:
+) -> Changing | None:
     """What is in no table and explains the data better."""
     if any(e.quasi is not None for e in best.effects):
         return None
@@ -135,7 +133,7 @@ def _beyond(
         base = search.nominal if absorbed else best
         if (changing := between_runs(search, base.fitted, decide)) is not None:
             return changing
-    return own_law(search, best)
+    return None
 
 
 def _evidence(
@@ -149,7 +147,8 @@ def _evidence(
     # Sums, not 1 - p: odds of a million are told from odds of a billion.
     others = sum(c.probability for c in ordered[1:])
     empty = next((e.weight for e in ranked if not e.effects), -math.inf)
-    before, left = search.ratio(search.nominal.fitted), search.ratio(first.fitted)
+    base = _as_meant(search, first).fitted
+    before, left = search.ratio(base), search.ratio(first.fitted)
     return Evidence(
         odds=math.log(max(chosen.probability, TINY) / max(others, TINY)),
         left=left,
@@ -158,7 +157,7 @@ def _evidence(
         forced=any(e.quasi is not None for e in first.effects),
         confirmed=False,
         gain=min(first.weight - empty, 1e6),
-        drop=(search.nominal.fitted.chi2 - first.fitted.chi2) / search.temperature,
+        drop=(base.chi2 - first.fitted.chi2) / search.temperature,
         names=chosen.names(),
         pair=len(first.effects) == 2 and len({e.physics for e in first.effects}) == 1,
         closed=(before - left) / (before - 1) if before > 1 else 0.0,
@@ -166,10 +165,19 @@ def _evidence(
     )
 
 
+def _as_meant(search: Search, best: Explanation) -> Explanation:
+    """The nominal model of what was meant to be recorded: with what is no physics of `best`, which
+    no physics gets the credit for."""
+    meant = frozenset(e.key for e in best.effects if e.physics in NOT_PHYSICS)
+    return search.found.get(meant, search.nominal)
+
+
 def confirmed(judged: Judgement) -> Judgement:
     """The same once a nonlinear force was confirmed in time."""
     evidence = replace(judged.evidence, confirmed=True)
-    said = "unknown" if judged.partly or evidence.names > MOST_NAMES else _said(evidence)
+    said = "unknown" if evidence.names > MOST_NAMES else _said(evidence)
+    if judged.partly:
+        said = _most(said, evidence)
     return replace(judged, verdict=said, right=probability(evidence), evidence=evidence)
 
 
@@ -204,6 +212,14 @@ def _said(evidence: Evidence) -> Verdict:
         return "named" if right >= SURE else "ambiguous"
     one = evidence.effects == 1 and evidence.closed > MOSTLY
     return "ambiguous" if one else "unknown"
+
+
+def _most(said: Verdict, evidence: Evidence) -> Verdict:
+    """What may be said of effects that leave much: one cause of most of it may be told. Sums of
+    two mimic what is in no table."""
+    if said not in SAID:
+        return said
+    return "ambiguous" if evidence.effects == 1 and evidence.closed > MOSTLY else "unknown"
 
 
 def doubted(judged: Judgement, most: Verdict) -> Judgement:

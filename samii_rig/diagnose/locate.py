@@ -22,6 +22,7 @@ from samii_rig.diagnose.model import Model
 from samii_rig.diagnose.moebius import Place, place_of
 from samii_rig.diagnose.refit import Fitted, Problem
 from samii_rig.diagnose.result import Trace
+from samii_rig.diagnose.screen import Start
 from samii_rig.diagnose.search import Search
 from samii_rig.types import Complex, Float
 
@@ -53,24 +54,25 @@ class Located:
         return self.chi2 / max(self.dof, 1.0)
 
 
-def moebius(rig_model: Model, effect: Effect, problem: Problem, x: Float) -> tuple[Complex, Place]:
-    """a (n, q), and the place of an effect with a jump, about a model at x."""
+def moebius(
+    rig_model: Model, effect: Effect, problem: Problem, x: Float, own: Start = ()
+) -> tuple[Complex, Place]:
+    """a (n, q), and the place of an effect with a jump, about a model at x. own : the effect's
+    unknowns, of which the last may belong to the place; where not given, those of a start."""
+    assert effect.jump is not None
     a = rig_model.response(x, problem.at)
     trial = rig_model.having((*rig_model.effects, effect))
-    fixed = tuple(u.starts[0] for u in effect.unknowns[_free(effect) :])
-    return a, place_of(trial, x, effect, problem.at, a, fixed)
+    values = own or tuple(u.starts[0] for u in effect.unknowns)
+    return a, place_of(trial, x, effect, problem.at, a, values[len(values) - effect.jump.fixed :])
 
 
-def _free(effect: Effect) -> int:
-    assert effect.jump is not None
-    return len(effect.unknowns) - effect.jump.fixed
-
-
-def locate(base: Fitted, effect: Effect, problem: Problem, *, held: bool = False) -> Located:
+def locate(
+    base: Fitted, effect: Effect, problem: Problem, *, held: bool = False, own: Start = ()
+) -> Located:
     """The best x(w) of one place with the nominal parameters refitted in the same fit, or `held`
-    where the base has them."""
+    where the base has them. own : as of `moebius`."""
     model = base.model
-    a, place = moebius(model, effect, problem, base.x)
+    a, place = moebius(model, effect, problem, base.x, own)
     b, c = place.b, place.c
     d = problem.data.H
     J = base.jacobian
@@ -117,7 +119,9 @@ def traces(search: Search, judged: Judgement) -> tuple[Trace, ...]:
     for i, effect in enumerate(best.effects):
         base = _without(search, best, i)
         if base is not None and effect.jump is not None and effect.jump.states is not None:
-            shown.append(locate(at_lines(base.fitted, search), effect, problem, held=True))
+            own = tuple(best.fitted.model.parts(best.fitted.x)[i].tolist())
+            about = at_lines(base.fitted, search)
+            shown.append(locate(about, effect, problem, held=True, own=own))
     base = _without(search, best, 0) if best.effects else search.nominal
     if base is not None:
         taken = {i.effect.jump.place for i in shown if i.effect.jump is not None}

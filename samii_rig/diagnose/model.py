@@ -10,6 +10,7 @@ import numpy as np
 
 from samii_rig.diagnose.causal import CausalChain
 from samii_rig.diagnose.effect import Effect, Key
+from samii_rig.diagnose.fractional import ChainLike, FractionalChain
 from samii_rig.model.sampled import hold_at, sampled_response, sensors_at
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.elements import flattened
@@ -19,6 +20,7 @@ from samii_rig.types import Complex, Float, Int
 ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smooth between
 ORDERS = (-1, 1, -2, 2)  # aliases that a factor on a channel changes
 STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
+FARTHEST = 6.0  # tolerances that a refit moves a nominal parameter at most
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +79,7 @@ class Grid:
         return np.asarray(self.sigma + 2j * np.pi * self.frequency, np.complex128)
 
     def at(self, frequency: Float, level: Int | None = None) -> Grid:
-        """The same on some of the frequencies; what depends on their level is in `LevelGrid`."""
+        """The same on some of the frequencies, whatever their level."""
         del level
         i = np.searchsorted(self.frequency, frequency)
         return Grid(
@@ -167,8 +169,12 @@ class Model:
         self.n_nominal, self.n = n, n + len(unknowns)
         self.prior = np.full(self.n, math.inf)
         self.prior[:n] = [known[k].tolerance for k in self.keys]
-        self.lower = np.concatenate([-6 * self.prior[:n], [math.log(u.low) for u in unknowns]])
-        self.upper = np.concatenate([6 * self.prior[:n], [math.log(u.high) for u in unknowns]])
+        self.lower = np.concatenate(
+            [-FARTHEST * self.prior[:n], [math.log(u.low) for u in unknowns]]
+        )
+        self.upper = np.concatenate(
+            [FARTHEST * self.prior[:n], [math.log(u.high) for u in unknowns]]
+        )
 
     def having(self, effects: Sequence[Effect]) -> Model:
         """The same rig with other effects; nominal parameters keep their place in x."""
@@ -178,13 +184,17 @@ class Model:
         """The same effects in a rig that was changed."""
         return Model(change(self.rig), self.effects)
 
-    def chain_of(self, rig: Rig) -> Chain | CausalChain:
+    def chain_of(self, rig: Rig) -> ChainLike:
         """The chain of a rig, as the effects have it."""
-        chain = Chain(rig)
+        chain: ChainLike = Chain(rig)
         causal = dict(e.causal for e in self.effects if e.causal is not None)
-        if not causal:
-            return chain
-        return CausalChain(chain, tuple(causal), next(iter(causal.values())))
+        if causal:
+            pieces = [p for e in self.effects if e.site in causal for p in e.pieces]
+            middle = next(iter(causal.values()))
+            chain = CausalChain(chain.plain, (*causal, *pieces), middle)
+        for joint in (e.fractional for e in self.effects if e.fractional is not None):
+            chain = FractionalChain(chain, joint)
+        return chain
 
     def parts(self, x: Float) -> list[Float]:
         """The values of each effect's unknowns."""
@@ -205,16 +215,16 @@ class Model:
             zip(self.keys, (self._start * np.exp(x[: self.n_nominal])).tolist(), strict=True)
         )
         all_values = {**self.nominal, **moved}
-        for effect, theta in zip(self.effects, self.parts(x), strict=True):
+        pairs = zip(self.effects, self.parts(x), strict=True)
+        for effect, theta in sorted(pairs, key=lambda pair: bool(pair[0].pieces)):
             change = effect.parameters(theta, all_values)
             all_values.update(change)
             moved.update(change)
         return moved
 
     def plain(self, x: Float) -> Chain:
-        """The chain at x, a loss factor the same at all frequencies."""
-        chain = self.chain.with_values(self.values(x))
-        return chain.plain if isinstance(chain, CausalChain) else chain
+        """The chain at x, a loss factor the same at all frequencies, no fractional damper."""
+        return self.chain.with_values(self.values(x)).plain
 
     def response(self, x: Float, at: Grid) -> Complex:
         """(n, q) at the grid's frequencies."""

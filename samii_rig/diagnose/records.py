@@ -20,31 +20,28 @@ from scipy import optimize, stats
 
 from samii_rig.diagnose import forms
 from samii_rig.diagnose.answer import gap_of
-from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.disturbed import Disturbed
 from samii_rig.diagnose.explanations import FIVE, Explanation
 from samii_rig.diagnose.forms import Form
-from samii_rig.diagnose.model import Grid, Loop, Model, grid
-from samii_rig.diagnose.moebius import place_of
-from samii_rig.diagnose.ranking import moved
+from samii_rig.diagnose.model import Grid, Loop, grid
 from samii_rig.diagnose.refit import Fitted, Problem, refit
 from samii_rig.diagnose.result import Band, Gap, Used
+from samii_rig.diagnose.rows import RESONANT
 from samii_rig.diagnose.search import Search
-from samii_rig.errors import EstimateError, SamiiRigError
+from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
-from samii_rig.likelihood.noise import Shape
+from samii_rig.likelihood.noise import Disturbances
 from samii_rig.likelihood.pieces import Piece, Wiring, joined, pieces_of, wiring
-from samii_rig.likelihood.reduce import Left, Records, Reduced, Response, left_by, reduced
+from samii_rig.likelihood.reduce import CYCLES, Left, Records, Reduced, Response, left_by, reduced
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned
 from samii_rig.signal.groups import segments_of
 from samii_rig.signal.statistics import octaves
 from samii_rig.types import Complex, Finding, Float, Int, Recording
 
-AXIS = 200  # frequencies, on which the power of what disturbs is scaled
-FORCED = ("added_mass", "added_inertia")  # physics at every place where a force acts
 SHOW, TURN = 9, 10  # one line in ten is kept apart, to show on what was found
 WIDER = 1.1  # of the band that is excited, the band that takes part
-EXCITED = 3e-2  # of the largest, an input's amplitude density that excites: 1e-3 of its power
+EXCITED = 0.1  # of the largest, an input's amplitude density that excites: 1 % of its power
 HIGHEST = 0.45  # of the rate: aliases of both sides meet above
 MOST_MADE = 6  # times that the likelihood is made about the nominal model
 # Noise units by which a change from the reference may be off between nodes, where it is taken for
@@ -62,7 +59,6 @@ class Whole:
     rig: Rig
     records: Records
     wired: Wiring
-    ports: tuple[Effect, ...]
     left_out: tuple[tuple[str, str], ...] = ()
     apart: Records | None = None  # the same, every level by itself
 
@@ -72,11 +68,10 @@ class Whole:
         runs: Sequence[Recording],
         rig: Rig,
         band: tuple[float, float] | None = None,
-        table: Sequence[Effect] = (),
         sensors: Sequence[str] | None = None,
         findings: Sequence[Finding] = (),
     ) -> Whole:
-        """All runs of one rig. table : in which the places are found where a force may act.
+        """All runs of one rig.
 
         sensors : those that are sound, all that were recorded if None. findings : of the samples;
         segments that they are about are left out, but not for a sensor that is left out itself.
@@ -90,9 +85,10 @@ class Whole:
         levels = pieces_of(runs, rig, wired, without, apart=True)
         if not levels:
             raise EstimateError("no segment is sound")
-        all_, apart = (_records(p, rig, band) for p in (joined(levels), levels))
-        ports = tuple(e for e in table if e.physics in FORCED and e.jump and not e.jump.fixed)
-        return cls(rig, all_, wired, ports, tuple(without.items()), apart)
+        steps = {s.name: s.resolution for s in rig.sensor}
+        step = tuple(steps[n] for n in wired.sensors)
+        all_, apart = (_records(p, rig, band, step) for p in (joined(levels), levels))
+        return cls(rig, all_, wired, tuple(without.items()), apart)
 
     def by_level(self) -> Whole:
         """The same records, the levels not summed up: for what depends on amplitude."""
@@ -145,46 +141,29 @@ class Whole:
 
         return at
 
-    def disturbed(self, fitted: Fitted) -> Shape:
-        """How much, squared, a force moves the rig where it acts: of all places the mean.
+    def disturbed(self, fitted: Fitted) -> Disturbances:
+        """What each disturbance of a fit makes in all sensors, the loop around them closed."""
+        made = Disturbed.of(fitted.model, fitted.x, self.sensor)
 
-        The input need not see a mode that a force or the floor excites; every place does.
-        """
-
-        axis = np.geomspace(*self.records.band, AXIS)
-        scale = np.median(self._moved(fitted, axis), axis=1)
-        moves = scale > 0  # what a brace holds does not
-
-        def at(f: Float) -> Float:
-            once, which = np.unique(f, return_inverse=True)
-            power = self._moved(fitted, once)[moves].T / scale[moves]
-            return np.asarray(np.mean(power, axis=1)[which])
+        def at(f: Float) -> Complex:
+            return made.response(f, self.response_at(fitted, f), self.loop)
 
         return at
 
-    def _moved(self, fitted: Fitted, f: Float) -> Float:
-        """(m, n) of the sensors by the input, and of each place by a force there, squared."""
-        there = self.grid(f, 0.0, fitted)
-        h = fitted.model.response(fitted.x, there)
-        each = list(np.abs(h).T ** 2)
-        for effect in self.ports:
-            try:
-                model = Model(self.rig, (*fitted.model.effects, effect))
-                known = moved(fitted.model, fitted.x, model)
-                each.append(np.abs(place_of(model, known, effect, there, h).c) ** 2)
-            except SamiiRigError:
-                continue
-        return np.stack(each)
+    def response_at(self, fitted: Fitted, f: Float) -> Complex:
+        """(n, q) of a fit at real frequencies f (n,)."""
+        once, which = np.unique(f, return_inverse=True)
+        return np.asarray(fitted.model.response(fitted.x, self.grid(once, 0.0, fitted))[which])
 
     def about(self, fitted: Fitted, at: Float | None = None) -> Reduced:
         """The likelihood near a fit, on the lines that are fitted. at : Hz of its nodes."""
-        shape = self.disturbed(fitted)
-        return reduced(self.records, self.response(fitted), shape, self._loop, _fitted, at)
+        disturbed = self.disturbed(fitted)
+        return reduced(self.records, self.response(fitted), disturbed, self._loop, _fitted, at)
 
     def complete(self, fitted: Fitted) -> Complete:
         """The same, with what no linear model explains."""
-        shape = self.disturbed(fitted)
-        return Complete.about(self.records, self.response(fitted), shape, self._loop, _fitted)
+        disturbed = self.disturbed(fitted)
+        return Complete.about(self.records, self.response(fitted), disturbed, self._loop, _fitted)
 
     def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
         """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
@@ -192,11 +171,15 @@ class Whole:
         return left_by(self.records, self.response(fitted), noise, self._loop, part)
 
 
-def _records(pieces: Sequence[Piece], rig: Rig, band: tuple[float, float] | None) -> Records:
+def _records(
+    pieces: Sequence[Piece], rig: Rig, band: tuple[float, float] | None, step: tuple[float, ...]
+) -> Records:
     """Those that anything drives."""
     driven = [(p, b) for p, b in zip(pieces, excited(pieces, rig.rate_hz), strict=True) if b]
-    bands = tuple(band or (float(b[0]), float(b[1])) for _, b in driven)
-    return Records(tuple(p for p, _ in driven), rig.rate_hz, bands)
+    if not driven:
+        raise EstimateError("nothing drives the rig for five cycles of any line")
+    bands = tuple(band or b for _, b in driven)
+    return Records(tuple(p for p, _ in driven), rig.rate_hz, bands, step)
 
 
 def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float] | None]:
@@ -209,8 +192,12 @@ def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float]
     for piece, R in zip(pieces, spectra, strict=True):
         f = np.arange(R.size) * (rate_hz / piece.r.size)
         on = np.flatnonzero(R[2:] > least) + 2
-        highest = HIGHEST * rate_hz
-        out.append((f[on[0]] / WIDER, min(WIDER * f[on[-1]], highest)) if on.size else None)
+        if not on.size:
+            out.append(None)
+            continue
+        lowest, highest = CYCLES * rate_hz / len(piece.z), HIGHEST * rate_hz
+        low, high = max(f[on[0]] / WIDER, lowest), min(WIDER * f[on[-1]], highest)
+        out.append((float(low), float(high)) if high - low > CYCLES * f[1] else None)
     return out
 
 
@@ -387,9 +374,15 @@ class RecordSearch(Search):
     def worth(self) -> float:
         """As of `Explanations`: with `ALARM`, noise reaches it in the best of the whole table."""
         unknowns = np.array([max(len(e.unknowns), 1) for e in self.table])
+        tries = np.ones(unknowns.size)
+        # What resonates is looked for at every line: as many tries of its mass and phase, alike at
+        # neighbouring places (a bound of the maximum of a scan; Davies 1987, Biometrika 74).
+        resonant = np.array([e.physics in RESONANT for e in self.table], bool)
+        unknowns[resonant] = 2
+        tries[resonant] = 2 * self.whole.lines / max(int(np.count_nonzero(resonant)), 1)
 
         def chance(t: float) -> float:
-            return float(np.sum(stats.chi2.sf(t, unknowns))) - ALARM
+            return float(tries @ stats.chi2.sf(t, unknowns)) - ALARM
 
         return float(optimize.brentq(chance, 1.0, HIGHEST_WORTH))
 

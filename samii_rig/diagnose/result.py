@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from samii_rig.diagnose.rows import PHYSICS
 from samii_rig.display import card
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse
@@ -17,24 +18,33 @@ if TYPE_CHECKING:
 Verdict = Literal["no_mismatch", "named", "ambiguous", "unknown"]
 
 # Physics that a person asks for first: where any of it could hide, and with its size.
-HIDING = {
-    "added_mass": ("a mass", "a mass under"),
-    "torsional_compliance": ("a joint that gives", "a joint spring stiffer than"),
-    "viscous_damping": ("a damper", "a damper under"),
-    "transport_delay": ("a delay", "a delay under"),
-}
-SOFT = ("torsional_compliance",)  # the larger its number, the less of it
+HIDING = {row.name: row.hidden for row in PHYSICS.values() if row.hidden}
+SOFT = tuple(row.name for row in PHYSICS.values() if row.soft)  # the larger, the less of it
 LIKELY = 0.5  # probability of a site from which it is told as the place
 
 
 @dataclass(frozen=True, slots=True)
 class Value:
-    """A parameter of a cause with its 90 % interval."""
+    """A parameter of a cause with its 90 % interval; low or high is None where the data set no
+    limit on that side, and the other is then a limit that 95 % keep."""
 
     value: float
     unit: str
-    low: float
-    high: float
+    low: float | None
+    high: float | None
+
+    def times(self, factor: float) -> Value:
+        """In another unit, factor above 0."""
+        low, high = (None if x is None else factor * x for x in (self.low, self.high))
+        return Value(factor * self.value, self.unit, low, high)
+
+    def within(self) -> str:
+        """The interval in words."""
+        if self.low is None:
+            return "no limit" if self.high is None else f"at most {self.high:.4g}"
+        if self.high is None:
+            return f"at least {self.low:.4g}"
+        return f"{self.low:.4g} to {self.high:.4g}"
 
     def plain(self) -> dict[str, Any]:
         """As plain data."""
@@ -43,19 +53,22 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """One effect of an explanation. equivalents : what these data do not tell from it."""
+    """One effect of an explanation. equivalents : what these data do not tell from it.
+    position : m from the site's upstream end, None for what stands at no place along it."""
 
     physics: str
     site: str
     probability: float
     equivalents: tuple[tuple[str, str], ...]
     parameters: dict[str, Value]
+    position: float | None = None
 
     def plain(self) -> dict[str, Any]:
         """As plain data."""
         return {
             "physics": self.physics,
             "site": self.site,
+            "position": self.position,
             "probability": self.probability,
             "equivalent_to": [{"physics": p, "site": s} for p, s in self.equivalents],
             "parameters": {k: v.plain() for k, v in self.parameters.items()},
@@ -308,8 +321,7 @@ class Diagnosis:
                 c.site,
                 f"{c.probability:.0%}",
                 ", ".join(
-                    f"{k} = {v.value:.4g} {v.unit} ({v.low:.4g} to {v.high:.4g})"
-                    for k, v in c.parameters.items()
+                    f"{k} = {v.value:.4g} {v.unit} ({v.within()})" for k, v in c.parameters.items()
                 ),
                 ", ".join(f"{p.replace('_', ' ')} at {s}" for p, s in c.equivalents),
             )

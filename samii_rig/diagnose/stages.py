@@ -10,11 +10,11 @@ from samii_rig.diagnose import answer
 from samii_rig.diagnose import judge as verdict
 from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.findings import Doubt, Sound
+from samii_rig.diagnose.forces.words import next_levels
 from samii_rig.diagnose.hiding import could_hide
 from samii_rig.diagnose.judge import Judgement
 from samii_rig.diagnose.locate import traces
 from samii_rig.diagnose.measured import Measured
-from samii_rig.diagnose.nonlinear import next_levels
 from samii_rig.diagnose.plan import next_experiment
 from samii_rig.diagnose.result import Band, Diagnosis, Gap, Used
 from samii_rig.diagnose.rigfile import explained

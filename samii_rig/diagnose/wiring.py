@@ -13,17 +13,11 @@ from itertools import combinations
 
 import numpy as np
 
+from samii_rig.diagnose.confusions import nearest
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse
 
-# What a factor between two units is.
-UNITS = {
-    57.29577951308232: "degrees for radians",
-    9.80665: "g for m/s^2",
-    1000.0: "milli for one",
-    6.283185307179586: "hertz for rad/s",
-}
 POINTS = 300  # lines of a response that are looked at
 UNIT_WITHIN = 1.25  # factor between a channel's gain and a unit; what a rig file may be off by
 ALIKE = 1.6  # half of a channel's lines lie within this factor of their median
@@ -119,9 +113,8 @@ def _gains(H: Complex, model: Complex, r: FrequencyResponse) -> tuple[Float, lis
     for k in range(n):
         name = r.outputs[k].name
         if unit[k] != 1.0 and not every:
-            factor = max(unit[k], 1 / unit[k])
             words.append(f"{name} is {unit[k]:.4g} times what the rig file says: "
-                         f"{UNITS[factor]}; divided by it")  # fmt: skip
+                         f"{nearest(unit[k])[0].name}; divided by it")  # fmt: skip
         if turned[k] and not (n > 1 and all(turned)):
             words.append(f"{name} has the wrong sign; turned round")
         gains[k] = (-1.0 if turned[k] else 1.0) / unit[k]
@@ -136,8 +129,7 @@ def _unit(log: Complex) -> float:
     low, middle, high = np.quantile(size, [0.25, 0.5, 0.75])
     if high - low > 2 * math.log(ALIKE):
         return 1.0
-    factors = [f for u in UNITS for f in (u, 1 / u)]
-    best = min(factors, key=lambda u: abs(float(middle) - math.log(u)))
+    _, best = nearest(math.exp(float(middle)))
     return best if abs(float(middle) - math.log(best)) < math.log(UNIT_WITHIN) else 1.0
 
 

@@ -160,6 +160,7 @@ def _result(posed: Problem, found: Minimum, starts: int, reached: int) -> Identi
     measured = J[: data.n_real]
     prediction = posed.predictor.response(found.x)
     outputs = [name for d in data.lines for name in d.outputs]
+    at_bound, on_top = bounds_met(free, found.x)
     return Identification(
         rig=posed.changed(found.x),
         names=free.names,
@@ -172,8 +173,9 @@ def _result(posed: Problem, found: Minimum, starts: int, reached: int) -> Identi
         start_fit=posed.fit(np.zeros(n), 0),
         residuals=residuals_of(data, prediction),
         identifiability=identifiability(measured, free.names, outputs),
-        at_bound=bounds_met(free, found.x),
+        at_bound=at_bound,
         starts=starts,
         reached=reached,
         prediction=tuple(prediction),
+        on_top=on_top,
     )

@@ -17,6 +17,7 @@ from samii_rig.signal.statistics import octaves
 from samii_rig.signal.whitening import Fit
 from samii_rig.types import Complex, Float
 
+TAIL = 0.05  # beyond either end of an interval of 90 %, and beyond a limit
 AT_BOUND = 1e-3  # distance of log(value) from its bound that counts as on it
 
 
@@ -45,7 +46,7 @@ class Identification:
     rig : with the values found. names, units, start, values : (n,) SI.
     log_covariance : (n, n) of log(value) if the model holds.
     prior_sd : (n,) relative, inf for none.
-    at_bound : names of parameters that ended on a bound.
+    at_bound : names of parameters that ended on a bound. on_top : of these, on the upper one.
     starts, reached : how many starts were tried, how many ended at this optimum.
     prediction : (n_freq, p) at the lines used, for each response.
     """
@@ -65,6 +66,7 @@ class Identification:
     starts: int
     reached: int
     prediction: tuple[Complex, ...]
+    on_top: tuple[str, ...] = ()
 
     def value(self, name: str) -> float:
         """SI value of the parameter called `element.symbol`."""
@@ -84,6 +86,33 @@ class Identification:
         ends = np.stack([self.values / factor, self.values * factor])
         return np.min(ends, axis=0), np.max(ends, axis=0)
 
+    def limits(self) -> tuple[Float, Float]:
+        """As `interval` of 90 %, but of a parameter on a bound: NaN for the end that the data do
+        not set, and for the other a limit that 95 % keep.
+
+        On its lower bound it is told from 0 no more, on its upper one from any larger: what the
+        data know is linear in the value, or in its inverse, and no longer in its logarithm.
+        """
+        low, high = self.interval()
+        reach = float(stats.norm.isf(TAIL)) * self.inflation()
+        width = reach * np.sqrt(np.diag(self.log_covariance))
+        for i, name in enumerate(self.names):
+            if name not in self.at_bound:
+                continue
+            if name in self.on_top:
+                ends = self.values[i] / (1 + width[i]), math.nan
+            else:
+                ends = math.nan, self.values[i] * (1 + width[i])
+            low[i], high[i] = ends if self.values[i] > 0 else ends[::-1]
+        return low, high
+
+    def limit(self, i: int) -> str:
+        """The limit of parameter i in words; "" where it has an interval."""
+        low, high = (float(end[i]) for end in self.limits())
+        if math.isnan(low):
+            return f"at most {high:.3g} {self.units[i]}"
+        return f"at least {low:.3g} {self.units[i]}" if math.isnan(high) else ""
+
     def correlation(self) -> Float:
         """(n, n) correlation of the estimates of log(value)."""
         sd = np.sqrt(np.diag(self.log_covariance))
@@ -91,15 +120,19 @@ class Identification:
 
     def plain(self) -> dict[str, object]:
         """Numbers and words as plain data, for machines."""
-        low, high = self.interval()
+        low, high = self.limits()
+
+        def end(x: float) -> float | None:
+            return None if math.isnan(x) else float(x)
+
         return {
             "rig": self.rig.name,
             "parameters": {
                 name: {
                     "start": float(self.start[i]),
                     "value": float(self.values[i]),
-                    "low_90": float(low[i]),
-                    "high_90": float(high[i]),
+                    "low_90": end(low[i]),
+                    "high_90": end(high[i]),
                     "unit": self.units[i],
                 }
                 for i, name in enumerate(self.names)
@@ -127,7 +160,11 @@ class Identification:
                 "missing acts like noise."
             )
         out = [first, *self.identifiability.sentences]
-        out += [f"{name} ended on its bound." for name in self.at_bound]
+        out += [
+            f"{name} ended on its bound: {self.limit(i)}."
+            for i, name in enumerate(self.names)
+            if name in self.at_bound
+        ]
         if self.reached < self.starts:
             out.append(
                 f"{self.reached} of {self.starts} starts ended here, the others at a worse fit."
@@ -162,7 +199,12 @@ def residuals_of(data: Data, prediction: Sequence[Complex]) -> tuple[Residual, .
     return tuple(out)
 
 
-def bounds_met(space: Space, x: Float) -> tuple[str, ...]:
-    """Names of the parameters that lie on a bound at x."""
-    near = np.minimum(x - space.lower, space.upper - x) < AT_BOUND
-    return tuple(name for name, on in zip(space.names, near, strict=True) if on)
+def bounds_met(space: Space, x: Float) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the parameters that lie on a bound at x, and of those on their upper one."""
+    top = space.upper - x < AT_BOUND
+    near = top | (x - space.lower < AT_BOUND)
+
+    def names(some: Sequence[bool]) -> tuple[str, ...]:
+        return tuple(name for name, on in zip(space.names, some, strict=True) if on)
+
+    return names(near.tolist()), names(top.tolist())

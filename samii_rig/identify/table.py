@@ -26,7 +26,7 @@ def summary_table(found: Identification) -> RenderableType:
         table.add_row(
             name,
             f"{found.values[i]:.5g}",
-            f"\u00b1 {100 * half:.2g} %",
+            found.limit(i) or f"\u00b1 {100 * half:.2g} %",
             f"{100 * (found.values[i] / found.start[i] - 1):+.1f} %",
             found.units[i],
         )

@@ -178,6 +178,9 @@ def braced(rig: Rig, first: str, base: Literal["clamped", "pinned"] = "clamped")
         raise InputError("braced", "first", first, "an element before a source that drives")
     channels = {x["name"] for x in (*data["sensor"], *data["actuator"])}
     data["limit"] = [x for x in data["limit"] if x["channel"] in channels]
+    if data["actuator"][0]["centring"]:  # it was not the first
+        data["centring"] = data["actuator"][0]["centring"]
+        data["actuator"][0] = {**data["actuator"][0], "centring": None}
     if data["centring"] and data["centring"]["sensor"] not in channels:
         data["centring"] = None
     return Rig.model_validate(data)

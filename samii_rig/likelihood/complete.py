@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from samii_rig.likelihood.noise import Shape
+from samii_rig.likelihood.noise import Disturbances
 from samii_rig.likelihood.reduce import Records, Reduced, Response, Rows, formed, orthonormal
 from samii_rig.types import Complex, Float, Int
 
@@ -43,14 +43,13 @@ class Complete:
         cls,
         records: Records,
         response: Response,
-        shape: Shape,
+        disturbances: Disturbances,
         loop: tuple[float, int] | None = None,
         part: Callable[[Int], NDArray[np.bool_]] | None = None,
     ) -> Complete:
         """As `reduced`."""
-        found, rows = formed(records, response, shape, loop, part)
-        own = np.linalg.cholesky(found.noise.covariance(rows.f))
-        root = np.sqrt(2) * np.linalg.inv(own)
+        found, rows = formed(records, response, disturbances, loop, part)
+        root = np.sqrt(2) * np.linalg.inv(found.noise.root(rows.f))
         each = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
         nuisances = tuple((on, _columns(root[on] @ rows.N[on])) for on in each)
         m = found.factor.shape[0]
@@ -63,16 +62,29 @@ class Complete:
 
     def split(self, e: Complex) -> Float:
         """(m + 2 n q,) both parts of lines e (n, q), in noise units."""
-        g = self._white(e)
+        g = self.white(e)
         X, q = self.rows.X, e.shape[1]
         back = np.einsum("nji,nj->ni", self.root.conj(), g)
         head = (X.conj().T @ back).real.T.ravel()
         t = linalg.solve_triangular(self.factor, head, trans="T", check_finite=False)
         d = linalg.solve_triangular(self.factor, t, check_finite=False)
-        rest = g - self._white(X @ d.reshape(q, -1).T)
+        rest = g - self.white(X @ d.reshape(q, -1).T)
         return np.concatenate([t, rest.real.ravel(), rest.imag.ravel()])
 
-    def _white(self, e: Complex) -> Complex:
+    def joined(self, parts: Float) -> Complex:
+        """(n, q, k) of what `split` would make of lines: of slopes or residuals, both `parts`
+        (m + 2 n q, k), the whitened lines. Their real products are those of the parts."""
+        m, (n, q) = len(self.factor), self.rows.e.shape
+        d = linalg.solve_triangular(self.factor, parts[:m], check_finite=False)
+        own = self.rows.X @ d.reshape(q, -1, parts.shape[1]).transpose(1, 0, 2).reshape(
+            -1, q * parts.shape[1]
+        )
+        own = own.reshape(n, q, -1)
+        out = np.stack([self.white(own[:, :, j]) for j in range(parts.shape[1])], axis=2)
+        rest = parts[m:].reshape(2, n, q, -1)
+        return np.asarray(out + rest[0] + 1j * rest[1])
+
+    def white(self, e: Complex) -> Complex:
         """(n, q) whitened, without nuisances."""
         white = (self.root @ e[:, :, None])[:, :, 0]
         for on, Q in self.nuisances:

@@ -1,168 +1,227 @@
-"""The noise of all sensors together.
+"""The noise of all sensors together, in the directions that the rig gives it.
 
-In blocks of lines each sensor's own noise and what they share is one covariance C0. What disturbs
-the rig itself, forces, a floor, the loop's own noise, comes out by the rig's poles, with another
-covariance C1. So in a block
+Each sensor has noise of its own. Forces on the rig, torques across its joints, the floor and what
+is added to its input come out through the rig and its loop, so that a model of the rig knows how
+they look in all sensors: u_k(f) of disturbance k. At a line
 
-    C(f) = C0 + a(f)^2 C1,
+    C(f) = sum_k p_k(f) u_k(f) u_k(f)^H,  p_k(f) = sum_c lambda_kc/(1 + (f/f_c)^2),  lambda >= 0.
 
-a the size of what such a disturbance moves, with the poles of the rig; C0 and C1 by expectation
-maximisation (Dempster, Laird and Rubin 1977, J. R. Stat. Soc. B 39).
+The powers are the most likely ones (Whittle's likelihood, multiplicative steps: Fevotte, Bertin
+and Durrieu 2009, Neural Comput. 21, eq. 2.11). Few of them are not zero, so the noise is known well
+from one short record, at lightly damped modes and at its lowest lines too.
 
-Sensors wander, with a power that falls by f^2. Where a block is wide beside its frequency, as the
-lowest ones of a short record are, each sensor's power in it is 1 + g/f^2 times C0 and C1, and the
-block is cut into narrow ones with that.
+What the sum does not give is told by blocks of lines: each has a covariance of its own about it, as
+far from it as all blocks together say that they are (empirical Bayes, inverse Wishart prior).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from scipy.special import gammaln
 
-from samii_rig.types import Complex, Float
+from samii_rig.types import Complex, Float, Int
 
-# Degrees of freedom for each sensor from which a block of lines tells the covariance: its inverse
-# is then off by 1/sqrt(12 q), and 0.6 % of an effect's sigma is lost to it.
+# Degrees of freedom for each sensor in a block of lines, and its width over its frequency, at
+# least: from fewer lines its covariance is off by more than 1/sqrt(12 q).
 FREEDOM = 12.0
-NARROWEST = 0.1  # of its frequency, a block's width at least: sensors' own noise is smooth
-TURNS = 40  # of the maximisation: C1 is then within a few per cent of its end
-SEEN = 0.02  # of C0's power, less than which a disturbance adds nothing that counts
+NARROWEST = 0.1
+# Corners of the colours, times the one before: a sum of them is within 5 % of any power of the
+# frequency from 0 to -2 (log-spaced relaxations; van der Ziel 1950, Physica 16).
+APART = 4.0
+SMALL = 0.02  # of a bin's frequency, its width: over it no colour changes by more than 4 %
+TURN = 0.15  # nepers or rad, by which what a disturbance makes may change within a bin
+STEPS = 200  # of the powers, at most: without progress they end before
+PROGRESS = 0.02  # of the logarithm of the likelihood, gained by a step, that goes on
+LOUD = 1e-6  # of all, power of a component that counts
+# Degrees of freedom with which a block may believe the sum: from not at all to wholly.
+BELIEF = np.geomspace(4.0, 4e4, 25)
+LITTLE = 0.02  # of a line's freedom: one with less says nothing
 
-WIDE = 1.5  # highest over lowest frequency of a block from which 1/f^2 shows beside a constant
-RED_TURNS = 100  # of the fit of 1/f^2: g is then within a few per cent of its end
-
-LITTLE = 0.1  # of a line's freedom: one with less says nothing by itself
-
-Shape = Callable[[Float], Float]
-"""f (n,) Hz -> (n,), a^2, about 1."""
+Disturbances = Callable[[Float], Complex]
+"""f (n,) Hz -> (n, q, K), what each of K disturbances of power 1 makes in each of q sensors; the
+first q are the sensors' own noises."""
+Known = Callable[[Float], Float]
+"""f (n,) Hz -> (n, q), power of each sensor's own noise that is known beforehand."""
 
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """Power a sample in blocks of lines.
+    """Power a sample of q sensors.
 
-    edges : (g - 1,) Hz between blocks. own, pushed : (g, q, q) C0 and C1, such that the inverse of
-    C is that of the noise in the mean.
+    disturbances : u_k. known : of the first q of them, beside `power`. corners : (c,) Hz of the
+    colours, inf for white. power : (K, c) lambda. edges : (g - 1,) Hz between blocks.
+    about : (g, q, q) covariance of each block over the sum's.
     """
 
+    disturbances: Disturbances
+    known: Known
+    corners: Float
+    power: Float
     edges: Float
-    own: Complex
-    pushed: Complex
-    shape: Shape
+    about: Complex
 
     @classmethod
-    def of(cls, f: Float, left: Complex, free: Float, shape: Shape) -> Noise:
+    def of(
+        cls, f: Float, left: Complex, free: Float, disturbances: Disturbances, known: Known
+    ) -> Noise:
         """From lines (n, q) of noise at increasing f (n,), each with its freedom (n,)."""
-        q = left.shape[1]
-        starts, have = [0], 0.0
-        for i in range(f.size):
-            have += float(free[i])
-            if have >= FREEDOM * q and f[i] > f[starts[-1]] * (1 + NARROWEST):
-                starts.append(i + 1)
-                have = 0.0
-        # What is left at the end is too little for a block of its own.
-        ends = [*starts[:-1], f.size] if len(starts) > 1 else [0, f.size]
-        power = shape(f)
-        lows, each = [], []
-        for a, b in pairwise(ends):
-            first, red = lows_of(f[a:b]), _red(f[a:b], left[a:b], free[a:b], power[a:b])
-            louder = np.sqrt(1 + red / f[a:b, None] ** 2)
-            C0, C1 = _fitted(left[a:b] / louder, free[a:b], power[a:b])
-            middle = np.sqrt(first * np.append(first[1:], f[b - 1]))
-            for low, scale in zip(first, np.sqrt(1 + red / middle[:, None] ** 2), strict=True):
-                lows.append(low)
-                each.append((scale[:, None] * C0 * scale, scale[:, None] * C1 * scale))
-        own, pushed = (np.stack(C) for C in zip(*each, strict=True))
-        return cls(np.array(lows[1:]), own, pushed, shape)
+        some = free > LITTLE
+        f, left, free = f[some], left[some], free[some]
+        once, which = np.unique(f, return_inverse=True)
+        u = disturbances(once)
+        bins = _bins(once, u)
+        S, w = _gathered(left, free, bins[which])
+        middle = np.searchsorted(bins, np.arange(bins[-1] + 1))
+        corners = _corners(once)
+        scale = np.sqrt(np.einsum("nq,n->q", np.abs(left) ** 2, 1 / free) / f.size)
+        scale = np.where(scale > 0, scale, 1.0)
+        S = S / (scale[:, None] * scale)
+        u = u[middle] / scale[:, None]
+        power = _powers(u, S, w, _colours(once[middle], corners), known(once[middle]))
+        alike = np.eye(left.shape[1], dtype=np.complex128)[None]
+        plain = cls(disturbances, known, corners, power, np.zeros(0), alike)
+        return plain._about(f, left, free)
 
-    def ranges(self, f: Float) -> list[tuple[int, int]]:
-        """Where the lines f (n,), increasing, of each block stand."""
-        at = np.searchsorted(f, self.edges).tolist()
-        return list(pairwise([0, *at, f.size]))
+    def _about(self, f: Float, left: Complex, free: Float) -> Noise:
+        """The same, what the sum does not give by blocks."""
+        white = self.whitened(f, left[:, :, None])[:, :, 0]
+        q = left.shape[1]
+        starts = _blocks(f, free, FREEDOM * q)
+        each = [slice(a, b) for a, b in pairwise([*starts, f.size])]
+        A = np.stack([white[on].T @ white[on].conj() for on in each])
+        n = np.array([float(np.sum(free[on])) for on in each])
+        nu = max(BELIEF, key=lambda nu: _chance(A, n, float(nu)))
+        if nu == BELIEF[-1]:
+            return self
+        about = (nu * np.eye(q) + A) / (nu + n)[:, None, None]
+        # No block is quieter than what is known beforehand.
+        values, turn = np.linalg.eigh(about)
+        least = np.stack([self._least(f[on], V) for on, V in zip(each, turn, strict=True)])
+        about = (turn * np.maximum(values, least)[:, None, :]) @ turn.conj().swapaxes(1, 2)
+        return replace(self, edges=f[starts[1:]], about=about)
+
+    def _least(self, f: Float, directions: Complex) -> Float:
+        """(q,) mean part of what is known in the noise's power along whitened directions (q, q)."""
+        q = len(directions)
+        own = self.disturbances(f)[:, :, :q] * np.sqrt(self.known(f))[:, None, :]
+        along = directions.conj().T @ np.linalg.solve(self.root(f), own)
+        return np.asarray(np.mean(np.sum(np.abs(along) ** 2, axis=2), axis=0))
 
     def covariance(self, f: Float) -> Complex:
         """(n, q, q) at f (n,)."""
-        block = np.searchsorted(self.edges, f, side="right")
-        return np.asarray(self.own[block] + self.shape(f)[:, None, None] * self.pushed[block])
-
-    def parts(self, power: Float, block: int) -> list[tuple[Complex, Float]]:
-        """The inverse of C at lines of a block as sums of W (q, q) times weights (n,).
-
-        power : (n,), their `shape`.
-        """
-        root = np.linalg.inv(np.linalg.cholesky(self.own[block]))
-        # Directions in which C0 is 1 and C1 diagonal.
-        values, turn = np.linalg.eigh(root @ self.pushed[block] @ root.conj().T)
-        G = turn.conj().T @ root
-        loud = [i for i, value in enumerate(values) if value * np.max(power, initial=0.0) > SEEN]
-        rest = np.delete(G, loud, axis=0)
-        out: list[tuple[Complex, Float]] = []
-        if rest.size:
-            out.append((np.asarray(rest.conj().T @ rest, np.complex128), np.ones(power.size)))
-        for i in loud:
-            out.append((np.outer(G[i].conj(), G[i]), 1 / (1 + power * values[i])))
-        return out
+        L = self.root(f)
+        return np.asarray(L @ L.conj().swapaxes(1, 2))
 
     def whitened(self, f: Float, e: Complex) -> Complex:
         """(n, q, m) in units of the noise, of lines e (n, q, m) at f (n,)."""
-        return np.asarray(np.linalg.solve(np.linalg.cholesky(self.covariance(f)), e))
+        return np.asarray(np.linalg.solve(self.root(f), e))
 
     def scaled(self, f: Float, white: Complex) -> Float:
         """(n, q) power of each sensor over its own noise's, of `whitened` lines (n, q)."""
-        C = self.covariance(f)
-        plain = (np.linalg.cholesky(C) @ white[:, :, None])[:, :, 0]
-        return np.asarray(np.abs(plain) ** 2 / np.diagonal(C, axis1=1, axis2=2).real)
+        L = self.root(f)
+        plain = (L @ white[:, :, None])[:, :, 0]
+        return np.asarray(np.abs(plain) ** 2 / np.sum(np.abs(L) ** 2, axis=2))
+
+    def root(self, f: Float) -> Complex:
+        """(n, q, q) L with L L^H = C at f (n,)."""
+        once, which = np.unique(f, return_inverse=True)
+        u, p = self.disturbances(once), _colours(once, self.corners) @ self.power.T
+        p[:, : u.shape[1]] += self.known(once)
+        plain = (u * p[:, None, :]) @ u.conj().swapaxes(1, 2)
+        block = np.searchsorted(self.edges, once, side="right")
+        roots = np.linalg.cholesky(self.about)[block]
+        return np.asarray((_cholesky(plain) @ roots)[which])
 
 
-def lows_of(f: Float) -> Float:
-    """Hz at which the narrow blocks begin into which the lines f (n,) of one block are cut."""
-    wide = f[-1] / f[0]
-    parts = int(np.ceil(np.log(wide) / np.log(1 + NARROWEST))) if wide > WIDE else 1
-    marks = f[0] * wide ** (np.arange(parts) / parts)
-    # Each begins with a line of its own.
-    return np.asarray(f[np.unique(np.searchsorted(f, marks * (1 - 1e-9)))])
+def _cholesky(C: Complex) -> Complex:
+    """Of (n, q, q), each sensor in units of its own size, so that no unit counts."""
+    size = np.sqrt(np.diagonal(C, axis1=1, axis2=2).real)
+    alike = C / (size[:, :, None] * size[:, None, :])
+    q = C.shape[1]
+    return np.asarray(size[:, :, None] * np.linalg.cholesky(alike + 1e-9 * np.eye(q)))
 
 
-def _red(f: Float, left: Complex, free: Float, power: Float) -> Float:
-    """(q,) g in Hz^2 of each sensor: its power in a block is 1 + g/f^2 times a constant, beside
-    what disturbs the rig. By multiplicative steps of Whittle's likelihood (Fevotte, Bertin and
-    Durrieu 2009, Neural Comput. 21, eq. 2.11, to the power 1/2 for it to grow at every step)."""
-    some = free > LITTLE
-    if f[-1] / f[0] <= WIDE or np.count_nonzero(some) <= 2 * left.shape[1]:
-        return np.zeros(left.shape[1])
-    w = free[some]
-    shapes = np.stack([np.ones(w.size), power[some], (f[0] / f[some]) ** 2])
-    P = (np.abs(left[some]) ** 2 / w[:, None]).T
-    size = np.repeat(np.mean(P, axis=1)[:, None], len(shapes), axis=1)
-    for _ in range(RED_TURNS):
-        S = size @ shapes
-        size = size * np.sqrt(((w * P / S**2) @ shapes.T) / ((w / S) @ shapes.T))
-    return np.asarray(size[:, 2] / size[:, 0] * f[0] ** 2)
+def _corners(f: Float) -> Float:
+    """Hz, from below the lowest line to above the highest, then white."""
+    count = int(np.ceil(np.log(f[-1] / f[0]) / np.log(APART))) + 1
+    return np.append(f[0] / APART * APART ** np.arange(count), np.inf)
 
 
-def _fitted(left: Complex, free: Float, power: Float) -> tuple[Complex, Complex]:
-    """C0 and C1 of one block: lines left (n, q) with their freedom (n,), and a^2 (n,)."""
-    q = left.shape[1]
-    # A complex Wishart matrix of nu degrees of freedom: the inverse's mean is nu/(nu - q).
-    total = float(np.sum(free))
-    fair = total / max(total - q, 1.0)
-    C = left.T @ left.conj() / max(total, 1.0)
-    some = free > LITTLE
-    if np.count_nonzero(some) <= 2 * q:
-        return C * fair, np.zeros_like(C)
-    w, a2 = free[some], power[some][:, None, None]
-    e = left[some] / np.sqrt(w)[:, None]
-    weight = (w / np.sum(w))[:, None, None]
-    C0, C1 = C, C / float(np.max(a2))
-    for _ in range(TURNS):
-        part = a2 * C1
-        gain = part @ np.linalg.inv(C0 + part)
-        u = (gain @ e[:, :, None])[:, :, 0]
-        spread = part - gain @ part
-        rest = e - u
-        C0 = np.sum(weight * (rest[:, :, None] * rest.conj()[:, None, :] + spread), axis=0)
-        C1 = np.sum(weight / a2 * (u[:, :, None] * u.conj()[:, None, :] + spread), axis=0)
-    return C0 * fair, C1 * fair
+def _colours(f: Float, corners: Float) -> Float:
+    """(n, c) of power, 1 at its largest over the band."""
+    lowest = corners[0] * APART
+    return np.asarray((1 + (lowest / corners) ** 2) / (1 + (f[:, None] / corners) ** 2))
+
+
+def _bins(f: Float, u: Complex) -> Int:
+    """(n,) the bin of each frequency: neighbours at which disturbances look alike."""
+    size = np.linalg.norm(u, axis=(0,), keepdims=True)
+    one = u / np.where(size > 0, size, 1.0)
+    turning = np.linalg.norm(np.diff(one, axis=0), axis=1) / np.maximum(
+        np.linalg.norm(one[1:], axis=1), 1e-300
+    )
+    step = np.diff(np.log(f)) / SMALL + np.max(turning, axis=1, initial=0.0) / TURN
+    place = np.floor(np.append(0.0, np.cumsum(step)))
+    return np.unique(place, return_inverse=True)[1].astype(np.int64)
+
+
+def _gathered(left: Complex, free: Float, bins: Int) -> tuple[Complex, Float]:
+    """(b, q, q) sums of e e^H over the lines of each bin, and their freedom (b,)."""
+    n, q = int(bins.max()) + 1, left.shape[1]
+    S = np.zeros((n, q, q), np.complex128)
+    np.add.at(S, bins, left[:, :, None] * left[:, None, :].conj())
+    return S, np.asarray(np.bincount(bins, free, n), np.float64)
+
+
+def _powers(u: Complex, S: Complex, w: Float, g: Float, known: Float) -> Float:
+    """(K, c) most likely powers. u : (b, q, K). S : (b, q, q) sums of w lines each. g : (b, c).
+    known : (b, q)."""
+    q, K = u.shape[1:]
+    size = np.sum(np.abs(u) ** 2, axis=1)
+    mean = (w @ size) / np.sum(w)
+    power = np.repeat(q / np.where(mean > 0, mean, np.inf)[:, None], g.shape[1], axis=1)
+    power /= K * g.shape[1] * np.mean(g, axis=0)
+    before = -np.inf
+    for _ in range(STEPS):
+        p = g @ power.T
+        p[:, :q] += known
+        C = (u * p[:, None, :]) @ u.conj().swapaxes(1, 2)
+        C[:, range(q), range(q)] *= 1 + 1e-9
+        own = np.linalg.inv(C)
+        back = own @ S
+        log = -float(w @ np.linalg.slogdet(C)[1] + np.sum(np.trace(back, axis1=1, axis2=2).real))
+        if log - before < PROGRESS:
+            break
+        before = log
+        a = np.sum(u.conj() * ((back @ own) @ u), axis=1).real
+        b = np.sum(u.conj() * (own @ u), axis=1).real
+        down = (w[:, None] * b).T @ g
+        power = power * np.sqrt(np.divide(a.T @ g, down, out=np.zeros_like(power), where=down > 0))
+    share = power * ((w @ size)[:, None] / np.sum(w))
+    return np.where(share > LOUD * np.sum(share), power, 0.0)
+
+
+def _blocks(f: Float, free: Float, least: float) -> list[int]:
+    """Where blocks begin that have so much freedom at least."""
+    starts, have = [0], 0.0
+    for i in range(f.size):
+        have += float(free[i])
+        if have >= least and f[i] > f[starts[-1]] * (1 + NARROWEST):
+            starts.append(i + 1)
+            have = 0.0
+    # What is left at the end is too little for a block of its own.
+    return starts[:-1] if len(starts) > 1 else [0]
+
+
+def _chance(A: Complex, n: Float, nu: float) -> float:
+    """Logarithm of the chance of scatters A (g, q, q) of n (g,) lines, if each block's covariance
+    is drawn about 1 with nu degrees of freedom (up to a constant)."""
+    q = A.shape[1]
+    order = np.arange(q)
+    gammas = np.sum(gammaln(nu + q + n[:, None] - order) - gammaln(nu + q - order), axis=1)
+    det = np.linalg.slogdet(nu * np.eye(q) + A)[1]
+    return float(np.sum(gammas + (nu + q) * q * np.log(nu) - (nu + q + n) * det))

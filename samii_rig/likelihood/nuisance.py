@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.polynomial import legendre
 
+from samii_rig.likelihood import rounding
 from samii_rig.likelihood.contour import Contour
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.types import Complex, Float, Int
@@ -18,6 +19,7 @@ WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
 # what is left of the motion of every mode is a sum of their answers. Behind inputs that are known
 # only what rings longest is left, of few modes: one to an octave.
 AN_OCTAVE, BEHIND = 3.0, 1.0
+UNREAD = 6  # parts in which what is hardly read has a factor of its own
 NEW = 1e-5  # of the largest, a direction in which past inputs still differ
 
 
@@ -48,6 +50,37 @@ def offsets(
         sensed[:, entry] += 1
         shapes.append(sensed * step)
     return np.stack([_window(piece, k, Y, contour) for Y in shapes], axis=2)
+
+
+def unread(
+    piece: Piece,
+    k: Int,
+    H: Complex,
+    contour: Contour,
+    loop: tuple[float, int] | None,
+    step: Float,
+) -> Complex:
+    """(n_lines, q, m) of motion that a converter hardly reads, as it stays within a step: rounding
+    scales it by a factor that nobody knows, and the loop is told so. In parts of equal power: the
+    factor depends on the amplitude."""
+    n, q = piece.z.shape
+    y = contour.record(H * contour.damped(piece.r)[:, None], piece.r.size)[piece.history :]
+    out = []
+    for i in np.flatnonzero(step > 0):
+        part = rounding.within(piece, y[:, i], float(step[i]), contour.rate_hz)
+        grown = np.cumsum(part**2)
+        if grown[-1] <= 0:
+            continue
+        turn = np.minimum((UNREAD * grown / grown[-1]).astype(np.int64), UNREAD - 1)
+        for j in range(UNREAD):
+            spectrum = np.fft.rfft(np.where(turn == j, part, 0.0))[k]
+            seen = np.zeros((k.size, q), complex)
+            seen[:, i] = spectrum
+            if loop is not None and loop[1] == i:
+                there = np.round(k * (contour.samples / n)).astype(np.int64)
+                seen -= loop[0] * H[there] * spectrum[:, None]
+            out.append(seen)
+    return np.stack(out, axis=2) if out else np.zeros((k.size, q, 0), complex)
 
 
 def past(piece: Piece, k: Int, H: Complex, contour: Contour) -> Complex:

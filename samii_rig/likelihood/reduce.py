@@ -12,7 +12,7 @@ residual of the best d, smoothed along frequency: a transient is in A, and does 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,17 +20,22 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from samii_rig.errors import EstimateError
-from samii_rig.likelihood import nuisance
+from samii_rig.likelihood import nuisance, rounding
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
-from samii_rig.likelihood.noise import Noise, Shape
+from samii_rig.likelihood.noise import Disturbances, Noise
 from samii_rig.likelihood.pieces import Piece, Samples
 from samii_rig.types import Complex, Float, Int
 
 SPACING = 0.2  # nodes, times the distance over which the reference's response turns by 1 rad
 WIDEST = 0.1  # nodes, apart over frequency at most
+BELOW = 2**0.5  # the same, below the band: a change of 1/s is linear between them to 3 %
 ENOUGH = 0.75  # lines over unknowns of a change, from which a piece shows its noise by itself
 RIDGES, MORE = 5, 30.0  # tries of a ridge, each so many times the one before
+CYCLES = (
+    5  # in a record, of its lowest line: below, wandering is as large as what polynomials leave
+)
+AT_ONCE = 4096  # lines whose products are formed together: 30 MB at 120 nodes
 SAME = 1e-9  # of the largest, power in a direction that columns do not have
 
 Response = Callable[[Complex], Complex]
@@ -98,19 +103,26 @@ class Reduced:
 class Records:
     """All pieces, on common contours.
 
-    bands : Hz, of the lines of each that take part. least : samples for which the contours are long
+    bands : Hz, of the lines of each that take part. steps : of each sensor's converter, none where
+    they are not known. least : samples for which the contours are long
     enough at least, so that those of other records are the same.
     """
 
     pieces: tuple[Piece, ...]
     rate_hz: float
     bands: tuple[tuple[float, float], ...]
+    steps: tuple[float, ...] = ()
     least: int = 0
 
     @property
     def band(self) -> tuple[float, float]:
         """Hz, from the lowest to the highest line."""
         return min(low for low, _ in self.bands), max(high for _, high in self.bands)
+
+    @property
+    def step(self) -> Float:
+        """(q,) of each sensor's converter, 0 where it is not known."""
+        return np.array(self.steps or (0.0,) * self.pieces[0].z.shape[1])
 
     @property
     def longest(self) -> int:
@@ -135,7 +147,7 @@ class Records:
         n = len(piece.z)
         band = self.bands[next(i for i, p in enumerate(self.pieces) if p is piece)]
         low, high = (f * n / self.rate_hz for f in band)
-        k = np.arange(max(1, int(np.ceil(low))), min(int(high), (n - 1) // 2) + 1)
+        k = np.arange(max(CYCLES, int(np.ceil(low))), min(int(high), (n - 1) // 2) + 1)
         return Lines(k, np.asarray(k * (self.rate_hz / n), np.float64))
 
     def left(self, samples: Samples | Piece, k: Int, H: Complex, contour: Contour) -> Complex:
@@ -193,7 +205,11 @@ def nodes_of(contour: Contour, H: Complex, band: tuple[float, float]) -> Int:
     place = np.cumsum(np.where(inside, np.minimum(density, 1.0), 0.0))
     first, last = np.flatnonzero(inside)[[0, -1]]
     marks = np.arange(place[first], place[last], 1.0)
-    return np.unique(np.append(np.searchsorted(place, marks), last))
+    # An input below the band moves what integrates it, and the end of a record makes that seen
+    # at all lines.
+    below = first / BELOW ** np.arange(1.0, np.log(max(first, 1)) / np.log(BELOW))
+    low = np.rint(np.append(below, 0.0)).astype(np.int64)
+    return np.unique(np.concatenate([low, np.searchsorted(place, marks), [last]]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,33 +236,28 @@ class Rows:
             self.piece[which], self.order[which],
         )  # fmt: skip
 
-    def weighted(self, weight: Float) -> Rows:
-        """Each line times the root of its weight (n,)."""
-        root = np.sqrt(weight)[:, None]
-        return replace(self, X=root * self.X, e=root * self.e, N=root[:, :, None] * self.N)
-
 
 def reduced(
     records: Records,
     response: Response,
-    shape: Shape,
+    disturbances: Disturbances,
     loop: tuple[float, int] | None = None,
     part: Callable[[Int], NDArray[np.bool_]] | None = None,
     at: Float | None = None,
 ) -> Reduced:
     """The likelihood of all models near a reference.
 
-    shape : of what disturbs the rig, along frequency.
+    disturbances : what each of them makes in all sensors, along frequency.
     loop : kp and sensor of the loop that `response` has closed. part : which lines of a piece
     count, by their number. at : Hz of the nodes; None for as dense as the reference turns.
     """
-    return formed(records, response, shape, loop, part, at)[0]
+    return formed(records, response, disturbances, loop, part, at)[0]
 
 
 def formed(
     records: Records,
     response: Response,
-    shape: Shape,
+    disturbances: Disturbances,
     loop: tuple[float, int] | None = None,
     part: Callable[[Int], NDArray[np.bool_]] | None = None,
     at: Float | None = None,
@@ -261,9 +272,11 @@ def formed(
         nodes = np.rint(at * (smooth.samples / smooth.rate_hz)).astype(np.int64)
     rows = _rows(records, smooth, nodes, H, loop)
     left, free = _residual(rows)
+    known = rounding.added(records.pieces, records.step, H, exact)
     power = Noise.of(
         *_with_repeats(records, H, exact, loop, rows.f, left, free),
-        shape=shape,
+        disturbances=disturbances,
+        known=known,
     )
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
     rows = rows.take(np.flatnonzero(counted))
@@ -295,6 +308,8 @@ def _with_repeats(
     """Frequency, lines and freedom of all that tells noise: what repeats differ by, too."""
     every = [(f, left, free)]
     for piece in records.pieces:
+        if np.any(rounding.alike(piece, records.step) > rounding.ALIKE):
+            continue
         every += _beside(records, piece, piece.repeats, H, exact, loop)
     f, left, free = (np.concatenate(x) for x in zip(*every, strict=True))
     order = np.argsort(f, kind="stable")
@@ -370,9 +385,11 @@ def _nuisances(
     k, exact = records.lines(piece).k, records.exact()
     own = [nuisance.wander(len(piece.z), k, piece.z.shape[1])]
     own += [nuisance.past(piece, k, H, exact)] if piece.moving else []
-    own += [nuisance.offsets(piece, k, H, exact, loop)] if not piece.history else []
+    own += [nuisance.unread(piece, k, H, exact, loop, records.step)]
+    own += [nuisance.offsets(piece, k, H, exact, loop)]
     N = np.concatenate(own, axis=2)
-    return np.asarray(N / np.linalg.norm(N, axis=(0, 1)))
+    size = np.linalg.norm(N, axis=(0, 1))
+    return np.asarray(N[:, :, size > 0] / size[size > 0])
 
 
 def _without(e: Complex, N: Complex) -> tuple[Complex, Float]:
@@ -458,12 +475,13 @@ class _Form:
 def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     """factor, target of `Reduced`, and chi-square of the reference with the best nuisances."""
     b, q = reference.shape
-    sums, power = _Sums(b, q, rows.N.shape[2]), noise.shape(rows.f)
-    for block, (first, last) in enumerate(noise.ranges(rows.f)):
-        own = rows.take(slice(first, last))
-        for W, weight in noise.parts(power[first:last], block):
-            sums.add(own.weighted(weight), 2 * W)
-    M, g = sums.matrix(), sums.head.T.ravel()
+    sums = _Sums(b, q, rows.N.shape[2])
+    L = np.linalg.inv(noise.root(rows.f))
+    W = 2 * (L.conj().swapaxes(1, 2) @ L)
+    for first in range(0, rows.f.size, AT_ONCE):
+        on = slice(first, first + AT_ONCE)
+        sums.add(rows.take(on), W[on])
+    M, g = sums.matrix, sums.head.T.ravel()
     cross = sums.cross.swapaxes(0, 1).reshape(2 * b * q, -1)
     values, turn = np.linalg.eigh(sums.nuisance)
     kept = values > SAME * max(values[-1], 1e-300)
@@ -498,38 +516,33 @@ def _factor(M: Float, ridge: Float) -> tuple[Float, Float]:
 
 
 class _Sums:
-    """What the normal equations need, summed over blocks of lines with one noise each."""
+    """What the normal equations need, summed over lines."""
 
     def __init__(self, b: int, q: int, m: int) -> None:
         self.total = 0.0
-        self.grams: list[Complex] = []
-        self.weights: list[Complex] = []
+        self.matrix = np.zeros((2 * b * q, 2 * b * q))  # sensor by sensor
         self.head = np.zeros((2 * b, q))
         self.cross = np.zeros((2 * b, q, m))
         self.nuisance = np.zeros((m, m))
         self.nuisance_head = np.zeros(m)
 
-    def matrix(self) -> Float:
-        """(2 b q, 2 b q), sensor by sensor."""
-        W = np.stack(self.weights)
-        q, size = W.shape[1], self.grams[0].shape[0]
-        grams = np.stack(self.grams).reshape(len(W), size * size)
-        flat = W.reshape(len(W), q * q).T
-        M = flat.real @ grams.real - flat.imag @ grams.imag
-        M = M.reshape(q, q, size, size).swapaxes(1, 2).reshape(q * size, q * size)
-        return np.asarray(M)
-
     def add(self, rows: Rows, W: Complex) -> None:
-        """One block. W : (q, q) twice the inverse of its noise."""
+        """Some lines. W : (n, q, q) twice the inverse of the noise of each."""
+        n, q, m = rows.N.shape
+        size = rows.X.shape[1]
+        real = _real(rows.X)
+        for i in range(q):
+            for j in range(i, q):
+                part = real.T @ _real(W[:, i, j, None] * rows.X)
+                own, other = slice(i * size, (i + 1) * size), slice(j * size, (j + 1) * size)
+                self.matrix[own, other] += part
+                if i != j:
+                    self.matrix[other, own] += part.T
         back = rows.X.conj().T
-        We = rows.e @ W.T
-        WN = np.einsum("ij,njm->nim", W, rows.N)
-        gram = back @ rows.X
-        self.grams.append(gram)
-        self.weights.append(W)
+        We = (W @ rows.e[:, :, None])[:, :, 0]
+        WN = W @ rows.N
         self.total += float(np.sum(rows.e.conj() * We).real)
         self.head += (back @ We).real
-        n, q, m = WN.shape
         self.cross += (back @ WN.reshape(n, q * m)).real.reshape(-1, q, m)
         flat = rows.N.reshape(n * q, m)
         self.nuisance += (flat.conj().T @ WN.reshape(n * q, m)).real

@@ -68,6 +68,11 @@ class Chain:
             self._rig, self._changed = _with(self._rig, self._changed), {}
         return self._rig
 
+    @property
+    def plain(self) -> Chain:
+        """The chain itself, for what wraps one."""
+        return self
+
     def values(self) -> Float:
         """(n_param,) the values of `parameters`, SI units."""
         return self._c.values.copy()

@@ -49,12 +49,20 @@ def places(truth: Truth, answer: Mapping[str, Any]) -> list[tuple[Evidence, bool
         return []
     known = Evidence(**{f.name: told[f.name] for f in fields(Evidence) if f.name in told})
     causes = Answer.of({**answer, "causes": told["causes"]}).causes
-    hidden = {e.site for e in truth.effects}
+    hidden = {site for e in truth.effects for site in e.sites}
     return [(known, bool(hidden & {site for _, site in c.names})) for c in causes]
 
 
-def fit(rows: Sequence[tuple[Evidence, bool]]) -> dict[str, float]:
-    """The weights.
+def balanced(groups: Sequence[str]) -> np.ndarray:
+    """(n,) the weight of each row, so that every group counts as any other; 1 in the mean."""
+    names, of, count = np.unique(np.asarray(groups), return_inverse=True, return_counts=True)
+    return np.asarray(len(groups) / (len(names) * count[of]), dtype=np.float64)
+
+
+def fit(
+    rows: Sequence[tuple[Evidence, bool]], groups: Sequence[str] | None = None
+) -> dict[str, float]:
+    """The weights. groups : of each row, such as plant and style; each counts alike.
 
     Raises InputError for fewer than `FEWEST` rows.
     """
@@ -63,11 +71,12 @@ def fit(rows: Sequence[tuple[Evidence, bool]]) -> dict[str, float]:
     names = list(rows[0][0].features())
     X = np.array([list(e.features().values()) for e, _ in rows])
     y = np.array([2.0 * right - 1 for _, right in rows])
+    each = balanced(groups) if groups else np.ones(len(rows))
 
     def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
         score = y * (X @ w)
-        gradient = -(X.T @ (y * special.expit(-score))) + w / WIDE**2
-        return float(-np.sum(special.log_expit(score)) + 0.5 * w @ w / WIDE**2), gradient
+        gradient = -(X.T @ (each * y * special.expit(-score))) + w / WIDE**2
+        return float(-np.sum(each * special.log_expit(score)) + 0.5 * w @ w / WIDE**2), gradient
 
     found = optimize.minimize(loss, np.zeros(len(names)), jac=True, method="BFGS")
     return dict(zip(names, found.x.tolist(), strict=True))

@@ -1,13 +1,15 @@
 """Concealed trials, made and diagnosed on all cores or on a cluster, resumable at any point.
 
+    OUT/campaign.json                  plants, rigs and code of the first call
     OUT/recordings/<trial>/*.mcap      what the diagnosis reads
     OUT/truth/<trial>.json             what it must not read, written before
     OUT/answers/<trial>.json           what it said
     OUT/sizes/<trial>.json             how large the effect is in the data (`prove.size`)
+    OUT/outcomes/<kind>_<seed>.json    which trial that was, its plant and rig, s of each part
 
-The plant that makes the recordings is found by its entry point (`samii_rig.plants`), as devices
-are: nothing here knows it. A process that diagnoses refuses to open a truth (an audit hook, which
-nothing in the process can take back), and checks that the recordings carry the truth's hash.
+The plants that make the recordings are found by their entry points (`prove.jobs`), as devices are:
+nothing here knows them. A process that diagnoses refuses to open a truth (an audit hook, which
+nothing in the process can take back); the recordings must carry the truth's hash.
 """
 
 from __future__ import annotations
@@ -17,19 +19,18 @@ import json
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Executor, Future, as_completed
+import time
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import FIRST_COMPLETED as FIRST
+from concurrent.futures import Executor, Future, wait
 from dataclasses import asdict, dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from samii_rig.diagnose.stated import Evidence
 from samii_rig.errors import InputError, SamiiRigError
-from samii_rig.prove.calibrate import places, row
-from samii_rig.prove.trial import Answer, Hidden, Trial, Truth
+from samii_rig.prove.jobs import Job, plant
 from samii_rig.record.export import replacing
 from samii_rig.record.reader import read_notes, read_recording
 from samii_rig.rig.load import parse
@@ -38,85 +39,132 @@ from samii_rig.rig.schema import Rig
 if TYPE_CHECKING:
     from samii_rig.prove.size import Sized
 
-GROUP = "samii_rig.plants"
-KINDS = ("nothing", "one", "two", "outside", "joints")
-
-
-@dataclass(frozen=True, slots=True)
-class Job:
-    """One trial to be made and diagnosed."""
-
-    kind: str
-    seed: int
+LONGEST = 900.0  # s of a diagnosis, thirty times its goal: then it is ended and counts as failed
+AT_ONCE = 4  # trials handed out for each one that was asked for, so that a stop ends soon
 
 
 @dataclass(frozen=True, slots=True)
 class Campaign:
-    """Where the trials are, the rig that they hide something in, the plant that makes them.
+    """Where the trials are, and the rig files (text by name) that they hide something in.
 
     keep : whether recordings stay once they have been diagnosed.
     """
 
     out: Path
-    rig_toml: str
-    plant: str = "concealed"
+    rigs: Mapping[str, str]
     keep: bool = False
 
 
-def jobs(counts: Mapping[str, int], seed: int) -> list[Job]:
-    """`counts` trials of each kind with seeds from `seed` on, kinds in turn, so that a
-    campaign that is stopped early has some of each."""
-    rows = [[Job(k, seed + i) for i in range(counts.get(k, 0))] for k in KINDS]
-    place = [
-        ((i + 0.5) / len(row), k, job) for k, row in enumerate(rows) for i, job in enumerate(row)
-    ]
-    return [job for _, _, job in sorted(place, key=lambda x: x[:2])]
+Progress = Callable[[int, int], None]
+
+
+def claim(out: Path, made: Mapping[str, Any]) -> None:
+    """Note in `out` what its trials are made of, or check that it is that.
+
+    InputError for a folder whose trials are of other plants or rigs.
+    """
+    file = out / "campaign.json"
+    if not file.exists():
+        _write(file, made)
+        return
+    first = json.loads(file.read_text("utf-8"))
+    for key in ("plants", "rigs"):
+        if sorted(first[key]) != sorted(made[key]):
+            had = ", ".join(first[key])
+            raise InputError("samii-rig prove", f"--{key[:-1]}", ", ".join(made[key]), had)
 
 
 def carry_out(
     campaign: Campaign,
     todo: Iterable[Job],
     executor: Executor,
-    progress: Callable[[int, int], None] = lambda _done, _all: None,
+    progress: Progress = lambda _done, _failed: None,
+    until: float = float("inf"),
 ) -> list[str]:
     """Make and diagnose every trial that has no answer yet; returns what failed, in words.
 
-    A trial that fails leaves no answer, and is done again by the next call.
+    A trial that fails leaves no answer, and is done again by the next call. until : instant of
+    `time.monotonic` after which none is begun. progress : called with trials done and failed.
     """
-    waiting: dict[Future[None], Job] = {
-        executor.submit(_one, campaign, job.kind, job.seed): job for job in todo
-    }
-    failures = []
-    for n, future in enumerate(as_completed(waiting), 1):
-        job = waiting[future]
-        try:
-            future.result()
-        except SamiiRigError as error:
-            failures.append(f"{job.kind} {job.seed}: {error}")
-        progress(n, len(waiting))
+    left = [job for job in todo if not _done(campaign.out, job)]
+    running: set[Future[str]] = set()
+    failures: list[str] = []
+    done = 0
+    try:
+        while left or running:
+            room = AT_ONCE * _size(executor) - len(running)
+            while left and room > 0 and time.monotonic() < until:
+                running.add(executor.submit(one, campaign, left.pop(0)))
+                room -= 1
+            if not running:
+                break
+            ended, running = wait(running, return_when=FIRST)
+            for future in ended:
+                done += 1
+                failures += [said] if (said := _outcome(future)) else []
+                progress(done, len(failures))
+            if time.monotonic() >= until:
+                running = {f for f in running if not f.cancel()}
+    except KeyboardInterrupt:
+        for future in running:
+            future.cancel()
     return failures
 
 
-def _one(campaign: Campaign, kind: str, seed: int) -> None:
-    """Make one trial, then have a process that sees no truth diagnose it."""
-    folder = plant(campaign.plant)(kind, seed, campaign.out, campaign.rig_toml)
-    answer = campaign.out / "answers" / f"{folder.name}.json"
-    if answer.exists():
-        return
+def _size(executor: Executor) -> int:
+    return int(getattr(executor, "_max_workers", 32))
+
+
+def _outcome(future: Future[str]) -> str:
+    try:
+        return future.result()
+    except Exception as error:  # a worker that was killed ends no campaign
+        return f"{type(error).__name__}: {error}"
+
+
+def _done(out: Path, job: Job) -> bool:
+    file = out / "outcomes" / f"{job.name}.json"
+    return file.exists() and "error" not in json.loads(file.read_text("utf-8"))
+
+
+def one(campaign: Campaign, job: Job) -> str:
+    """Make one trial, then have a process that sees no truth diagnose it; "" or what failed."""
+    outcome: dict[str, Any] = {"plant": job.plant, "rig": job.rig, "kind": job.kind,
+                               "seed": job.seed, "seconds": {}}  # fmt: skip
+    try:
+        _carried(campaign, job, outcome)
+    except Exception as error:  # whatever ends a trial is said on the page, and ends no campaign
+        outcome["error"] = str(error) if isinstance(error, SamiiRigError) else repr(error)
+    _write(campaign.out / "outcomes" / f"{job.name}.json", outcome)
+    return f"{job.kind} {job.seed}: {outcome['error']}" if "error" in outcome else ""
+
+
+def _carried(campaign: Campaign, job: Job, outcome: dict[str, Any]) -> None:
+    seconds = outcome["seconds"]
+    outcome["at"] = "plant"
+    start = time.process_time()
+    folder = plant(job.plant)(job.kind, job.seed, campaign.out, campaign.rigs[job.rig])
+    seconds["plant"] = time.process_time() - start
     truth = campaign.out / "truth" / f"{folder.name}.json"
-    _check_hash(folder, truth)
+    outcome |= {"trial": folder.name, "truth_sha256": _checked_hash(folder, truth)}
+    outcome["at"] = "diagnosis"
     said = _Reader.of(campaign.out / "truth").diagnose(folder)
+    seconds["diagnosis"] = said.get("seconds", LONGEST)
     if "error" in said:
         raise SamiiRigError(said["error"])
-    _write(campaign.out / "sizes" / answer.name, asdict(_sized(folder, truth, said)))
-    _write(answer, said)
+    outcome["at"] = "size"
+    start = time.process_time()
+    _write(campaign.out / "sizes" / f"{folder.name}.json", asdict(_sized(folder, truth)))
+    seconds["size"] = time.process_time() - start
+    _write(campaign.out / "answers" / f"{folder.name}.json", said["answer"])
+    outcome["at"] = "end"
     if not campaign.keep:
         for log in folder.glob("*.mcap"):
             log.unlink()
 
 
-def _sized(folder: Path, truth: Path, said: Mapping[str, Any]) -> Sized:
-    """Sigma that the best simpler explanation leaves; the drawn one where nothing was recorded
+def _sized(folder: Path, truth: Path) -> Sized:
+    """Sigma that the best simpler explanation leaves; the truth's own where it holds no responses
     to compute it from."""
     from samii_rig.prove.size import Sized, size_of
 
@@ -126,9 +174,8 @@ def _sized(folder: Path, truth: Path, said: Mapping[str, Any]) -> Sized:
         return Sized(float(told["size"]))
     log = min(folder.glob("*.mcap"))
     rig = parse(Rig, read_recording(log).rig_toml, str(log))
-    causes = Answer.of(said).causes
     with np.load(arrays) as held:
-        return size_of(told, held, rig, causes[0].names if causes else ())
+        return size_of(told, held, rig)
 
 
 def _write(path: Path, data: Mapping[str, Any]) -> None:
@@ -137,20 +184,12 @@ def _write(path: Path, data: Mapping[str, Any]) -> None:
         part.write_text(json.dumps(data, indent=1), encoding="utf-8")
 
 
-def plant(name: str) -> Callable[[str, int, Path, str], Path]:
-    """The plant of this name: (kind, seed, out, rig file's text) -> folder of the recordings."""
-    known = {point.name: point for point in metadata.entry_points(group=GROUP)}
-    if name not in known:
-        raise InputError("samii-rig prove", "--plant", name, f"one of {', '.join(sorted(known))}")
-    loaded: Callable[[str, int, Path, str], Path] = known[name].load()
-    return loaded
-
-
-def _check_hash(folder: Path, truth: Path) -> None:
+def _checked_hash(folder: Path, truth: Path) -> str:
     digest = hashlib.sha256(truth.read_bytes()).hexdigest()
     for log in folder.glob("*.mcap"):
         if read_notes(log).get("truth_sha256") != digest:
             raise SamiiRigError(f"{log}: its truth is not the one that it was made with")
+    return digest
 
 
 class _Reader:
@@ -182,40 +221,16 @@ class _Reader:
         stdin, stdout = self._process.stdin, self._process.stdout
         assert stdin is not None
         assert stdout is not None
-        stdin.write(f"{folder}\n")
-        stdin.flush()
-        line = stdout.readline()
+        watch = threading.Timer(LONGEST, self._process.kill)
+        watch.start()
+        try:
+            stdin.write(f"{folder}\n")
+            stdin.flush()
+            line = stdout.readline()
+        finally:
+            watch.cancel()
         if not line:
-            raise SamiiRigError(f"{folder}: the diagnosis ended without an answer")
+            self._process.wait()
+            return {"error": f"ended without an answer (within {LONGEST:g} s one is expected)"}
         said: dict[str, Any] = json.loads(line)
         return said
-
-
-def results(out: Path) -> list[Trial]:
-    """Every trial that has an answer, in the order of kind and seed."""
-    trials = [Trial(truth, Answer.of(said)) for truth, said in _answers(out)]
-    return sorted(trials, key=lambda t: (KINDS.index(t.truth.kind), t.truth.seed))
-
-
-def evidence(out: Path) -> list[tuple[Evidence, bool]]:
-    """Of every trial in which an effect was found: its evidence, and whether it was right."""
-    return [found for truth, said in _answers(out) if (found := row(truth, said)) is not None]
-
-
-def place_evidence(out: Path) -> list[tuple[Evidence, bool]]:
-    """The same of each cause's place."""
-    return [found for truth, said in _answers(out) for found in places(truth, said)]
-
-
-def truth_of(out: Path, trial: str) -> Truth:
-    """What a trial conceals, at the size that a refit leaves of it where that was found."""
-    truth = json.loads((out / "truth" / f"{trial}.json").read_text("utf-8"))
-    effects = tuple(Hidden(e["physics"], e["site"], e["parameters"]) for e in truth["effects"])
-    file = out / "sizes" / f"{trial}.json"
-    sized = json.loads(file.read_text("utf-8")) if file.exists() else {"size": truth["size"]}
-    return Truth(truth["kind"], truth["seed"], effects, **sized)
-
-
-def _answers(out: Path) -> Iterator[tuple[Truth, dict[str, Any]]]:
-    for answer in sorted((out / "answers").glob("*.json")):
-        yield truth_of(out, answer.stem), json.loads(answer.read_text("utf-8"))

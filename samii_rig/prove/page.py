@@ -19,33 +19,36 @@ from samii_rig.record.export import replacing
 FAILURES = 60  # shown at most; the largest effects first
 
 
-def write_page(path: Path, trials: Sequence[Trial], title: str = "The proof") -> Path:
-    """Write the page about `trials` to `path`; nothing half-written is left."""
+def write_page(
+    path: Path, trials: Sequence[Trial], title: str = "The proof", failed: int = 0
+) -> Path:
+    """Write the page about `trials` to `path`; nothing half-written is left. failed : diagnoses
+    that ended without an answer."""
     with replacing(path) as part:
-        part.write_text(render(trials, title), encoding="utf-8")
+        part.write_text(render(trials, title, failed), encoding="utf-8")
     return path
 
 
-def render(trials: Sequence[Trial], title: str) -> str:
+def render(trials: Sequence[Trial], title: str, failed: int = 0) -> str:
     """The page as text."""
     kinds = Counter(t.truth.kind for t in trials)
-    failed = sorted((t for t in trials if not acceptable(t)), key=lambda t: -t.truth.size)
+    wrong = sorted((t for t in trials if not acceptable(t)), key=lambda t: -t.truth.size)
     sizes = by_size(trials)
     style = (resources.files("samii_rig.report") / "assets" / "page.css").read_text("utf-8")
     return _template().render(
         title=title,
         subtitle=f"{len(trials)} concealed trials: {kinds['nothing']} hide nothing, "
         f"{kinds['one']} one effect, {kinds['two']} two, "
-        f"{kinds['joints']} the give of every joint, {kinds['outside']} something outside the "
-        "vocabulary. Every interval holds 90 %.",
+        f"{kinds['joints']} the give of every joint, {kinds['force']} a force, {kinds['outside']} "
+        "something outside the vocabulary. Every interval holds 90 %.",
         style=Markup(style),
-        scores=[_row(s) for s in scores(trials)],
+        scores=[cells(s) for s in scores(trials, failed)],
         calibration=Markup(figures.calibration(trials)),
         sizes=Markup(figures.sizes(sizes)),
         confusion=Markup(figures.confusion_matrix(confusion(trials))),
         physics=[(name, [_cell(s) for s in some], some[0].n) for name, some in by_physics(trials)],
-        failures=[_failure(t) for t in failed[:FAILURES]],
-        hidden_failures=max(0, len(failed) - FAILURES),
+        failures=[failure(t) for t in wrong[:FAILURES]],
+        hidden_failures=max(0, len(wrong) - FAILURES),
     )
 
 
@@ -56,8 +59,13 @@ def acceptable(trial: Trial) -> bool:
     return trial.right
 
 
-def _row(s: Score) -> dict[str, str]:
-    share = not s.what.startswith(("AUROC", "expected", "parameter", "gap", "names in", "sites in"))
+# Beginnings of the figures that are no frequencies.
+PLAIN = ("AUROC", "expected", "parameter", "sigma", "s of", "calibration")
+
+
+def cells(s: Score) -> dict[str, str]:
+    """A score in words, for a row of a table."""
+    share = not s.what.startswith(PLAIN)
     goal = _goal(s, share)
     word = {None: "", True: "met", False: "missed"}[s.met]
     mark = {None: "note", True: "good", False: "bad"}[s.met]
@@ -93,11 +101,13 @@ def _cell(s: Score) -> str:
     return "" if math.isnan(s.value) else f"{100 * s.value:.0f} %"
 
 
-def _failure(t: Trial) -> dict[str, str]:
+def failure(t: Trial) -> dict[str, str]:
+    """A trial that failed, for a row of a table."""
     hidden = ", ".join(f"{e.physics} at {e.site}" for e in t.truth.effects) or "nothing"
     said = ", ".join(f"{c.name[0]} at {c.name[1]} ({c.probability:.2f})" for c in t.answer.causes)
     return {
         "trial": f"{t.truth.kind} {t.truth.seed}",
+        "where": f"{t.truth.plant}, {t.truth.rig}",
         "size": f"{t.truth.size:.1f}",
         "hidden": hidden,
         "said": f"{t.answer.verdict}: {said}" if said else t.answer.verdict,

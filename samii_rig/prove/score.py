@@ -1,6 +1,6 @@
 """Scores of many trials, each a frequency or a quantile with its 90 % interval.
 
-Goals are those of the proof (docs/proof.md). A frequency's interval is Wilson's, a
+Goals are those of the proof (docs/evidence/proof.md). A frequency's interval is Wilson's, a
 median's is that of order statistics, others are from a bootstrap over trials.
 """
 
@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from scipy import stats
 
-from samii_rig.prove.trial import Trial
+from samii_rig.prove.trial import REFUSED, Trial
 
 T = TypeVar("T")
 Stated = tuple[float, bool]
@@ -112,11 +112,6 @@ def auroc(positive: Sequence[float], negative: Sequence[float]) -> float:
     return float(np.mean((a > b) + 0.5 * (a == b)))
 
 
-def ratio(pairs: Sequence[tuple[int, int]]) -> float:
-    """Sum of the first over that of the second; NaN without any."""
-    return sum(a for a, _ in pairs) / sum(b for _, b in pairs) if pairs else math.nan
-
-
 def stated(trial: Trial) -> list[Stated]:
     """Every cause named; one is right when it is one of the effects, up to its class."""
     if not trial.answer.speaks:
@@ -159,78 +154,108 @@ def parameter_errors(trials: Sequence[Trial]) -> tuple[list[float], list[bool]]:
         for effect, cause in trial.matches():
             if effect.name != cause.name:
                 continue
+            known = {_symbol(s): x for s, x in effect.parameters.items()}
             for symbol, (value, low, high) in cause.parameters.items():
-                true = effect.parameters.get(symbol)
+                true = known.get(_symbol(symbol))
                 if true:
                     errors.append(abs(value - true) / abs(true))
                     covered.append(low <= true <= high)
     return errors, covered
 
 
-def scores(trials: Sequence[Trial]) -> list[Score]:
-    """Every figure of the proof over all trials, in the order of its table."""
-    nothing = [t for t in trials if t.truth.kind == "nothing"]
-    one = [t for t in trials if t.truth.kind == "one"]
-    two = [t for t in trials if t.truth.kind == "two"]
-    outside = [t for t in trials if t.truth.kind == "outside"]
+def _symbol(name: str) -> str:
+    """A parameter's symbol; that of a ratio is the beam's own, whoever writes it."""
+    return name.replace("_", " ").removesuffix(" ratio")
 
-    def above(some: Sequence[Trial], sigma: float) -> list[Trial]:
-        return [t for t in some if t.truth.size >= sigma]
 
-    out = [
+def above(trials: Sequence[Trial], sigma: float, *kinds: str) -> list[Trial]:
+    """Trials of these kinds whose effect has `sigma` or more."""
+    return [t for t in trials if t.truth.kind in kinds and t.truth.size >= sigma]
+
+
+def scores(trials: Sequence[Trial], failed: int = 0) -> list[Score]:
+    """Every figure of the proof over all trials, in the order of its table. failed : diagnoses that
+    ended without an answer."""
+    return [
+        *_size_scores(trials),
+        *_name_scores(trials),
+        *_outside_scores(trials),
+        *_honest_scores(trials),
+        *_force_scores(trials),
+        *_time_scores(trials),
         frequency(
-            "false alarms where nothing is missing",
-            [t.answer.verdict != "no_mismatch" for t in nothing],
-            at_most(0.01),
-        )
+            "refused, with a reason in one line", [t.answer.verdict == REFUSED for t in trials]
+        ),
+        frequency(
+            "no answer, the diagnosis broke",
+            [True] * failed + [False] * len(trials),
+            at_most(0.0),
+        ),
     ]
-    for sigma, place, name in ((10.0, 0.90, 0.90), (30.0, 0.98, 0.97)):
-        big = above(one, sigma)
-        text = f"from {sigma:g} sigma"
-        out.append(frequency(f"place right, {text}", [t.place_right for t in big], at_least(place)))
-        out.append(
+
+
+def kept(trials: Sequence[Trial]) -> list[float]:
+    """Sigma that the causes explain over what whole records hold, of single effects that were named
+    right, from 10 sigma."""
+    some = above(trials, 10.0, "one", "force")
+    return [t.answer.sigma / t.truth.size for t in some if t.right and t.truth.whole]
+
+
+def false_alarms(trials: Sequence[Trial]) -> list[bool]:
+    """Of each trial that conceals nothing whether it was told otherwise."""
+    some = [t for t in trials if t.truth.kind == "nothing"]
+    return [detected(t) for t in some]
+
+
+def detected(t: Trial) -> bool:
+    """Whether it says that something is missing."""
+    return t.answer.verdict not in ("no_mismatch", REFUSED)
+
+
+def _size_scores(trials: Sequence[Trial]) -> list[Score]:
+    alarms = frequency(
+        "false alarms where nothing is missing", false_alarms(trials), at_most(0.005)
+    )
+    upper = Score(
+        "upper bound of those", alarms.high, alarms.low, alarms.high, alarms.n, at_most(0.01)
+    )
+    small = [t for t in above(trials, 3.0, "one") if t.truth.size < 10.0]
+    return [
+        median("sigma kept, from 10 sigma", kept(trials), at_least(0.9)),
+        alarms,
+        upper,
+        frequency("found, 3 to 10 sigma", [detected(t) for t in small], at_least(0.5)),
+    ]
+
+
+def _name_scores(trials: Sequence[Trial]) -> list[Score]:
+    out = []
+    for sigma, place, name in ((10.0, 0.95, 0.92), (30.0, 0.98, 0.97)):
+        big, text = above(trials, sigma, "one"), f"from {sigma:g} sigma"
+        out += [
+            frequency(f"place right, {text}", [t.place_right for t in big], at_least(place)),
+            frequency(f"place in the 90 % set, {text}", [t.place_in_set for t in big]),
             frequency(
-                f"place in the 90 % set, {text}", [t.place_in_set for t in big], at_least(0.98)
-            )
-        )
-        out.append(
-            frequency(f"name right up to its class, {text}", [t.right for t in big], at_least(name))
-        )
-    counted = [t for t in above(one, 10.0) if t.truth.said]
-    out.append(
-        bootstrap(
-            "names in a class over those an oracle would give, from 10 sigma",
-            [(t.truth.said, t.truth.names) for t in counted],
-            ratio,
-            at_most(1.2),
-        )
-    )
-    counted = [t for t in above(one, 10.0) if t.truth.sites and t.answer.sites]
-    out.append(
-        bootstrap(
-            "sites in the 90 % set over those an oracle would give, from 10 sigma",
-            [(len(t.answer.site_set()), t.truth.sites) for t in counted],
-            ratio,
-            at_most(1.2),
-        )
-    )
-    out.append(
+                f"name right up to its class, {text}", [t.right for t in big], at_least(name)
+            ),
+        ]
+    two = [t.right for t in above(trials, 10.0, "two")]
+    joints = [t.right for t in trials if t.truth.kind == "joints"]
+    return [
+        *out,
+        frequency("two effects: both found", two, at_least(0.85)),
+        frequency("every joint gives: all found", joints, at_least(0.95)),
+    ]
+
+
+def _outside_scores(trials: Sequence[Trial]) -> list[Score]:
+    strange, familiar = above(trials, 30.0, "outside"), above(trials, 30.0, "one")
+    return [
         frequency(
-            "confidently wrong",
-            [confidently_wrong(t) for t in trials],
-            at_most(0.02),
-        )
-    )
-    strange = above(outside, 30.0)
-    out.append(
-        frequency(
-            "outside the vocabulary, from 30 sigma: unknown or ambiguous",
-            [t.answer.verdict in ("unknown", "ambiguous") for t in strange],
-            at_least(0.90),
-        )
-    )
-    familiar = above(one, 30.0)
-    out.append(
+            "outside the table, from 30 sigma: not named",
+            [t.answer.verdict != "named" for t in strange],
+            at_least(0.95),
+        ),
         bootstrap(
             "AUROC of 1 - best probability, from 30 sigma",
             [*strange, *familiar],
@@ -238,42 +263,65 @@ def scores(trials: Sequence[Trial]) -> list[Score]:
                 [1 - t.confidence for t in some if t.truth.kind == "outside"],
                 [1 - t.confidence for t in some if t.truth.kind == "one"],
             ),
-            at_least(0.95),
-        )
-    )
-    out.append(
-        frequency("two effects: both found", [t.right for t in above(two, 10.0)], at_least(0.80))
-    )
-    joints = [t for t in trials if t.truth.kind == "joints"]
-    out.append(frequency("every joint gives: all found", [t.right for t in joints], at_least(0.95)))
-    out.append(
+            at_least(0.97),
+        ),
+    ]
+
+
+def _honest_scores(trials: Sequence[Trial]) -> list[Score]:
+    known = above(trials, 10.0, "one", "two", "force", "joints")
+    errors, covered = parameter_errors(known)
+    gaps = [
+        t.answer.gap_closed
+        for t in trials
+        if t.truth.size >= 30.0 and t.answer.speaks and t.answer.gap_closed is not None
+    ]
+    return [
+        frequency("confidently wrong", [confidently_wrong(t) for t in trials], at_most(0.007)),
+        frequency(
+            "named though the gap did not close, from 30 sigma", [g < 0 for g in gaps], at_most(0.0)
+        ),
+        frequency("90 % intervals of parameters cover, from 10 sigma", covered, (0.88, 0.92)),
+        median("parameter error, from 10 sigma", errors),
         bootstrap(
             "expected calibration error",
             [stated(t) for t in trials],
             calibration_error,
-            at_most(0.05),
-        )
-    )
-    errors, covered = parameter_errors(above(one, 30.0))
-    out.append(median("parameter error, from 30 sigma", errors, at_most(0.05)))
-    out.append(frequency("90 % intervals of parameters cover", covered, (0.85, 0.95)))
-    gaps = [
-        t.answer.gap_closed for t in familiar if t.answer.speaks and t.answer.gap_closed is not None
+            at_most(0.02),
+        ),
     ]
-    out.append(median("gap closed on data not used, from 30 sigma", gaps, at_least(0.9)))
-    every = [
-        t.answer.gap_closed
-        for t in above(trials, 30.0)
-        if t.answer.speaks and t.answer.gap_closed is not None
-    ]
-    out.append(
+
+
+FORCES = ("cubic_stiffness", "backlash", "coulomb_friction", "output_saturation")
+
+
+def _force_scores(trials: Sequence[Trial]) -> list[Score]:
+    big = above(trials, 10.0, "one", "force")
+    return [
         frequency(
-            "named though the gap did not close, from 30 sigma",
-            [g < 0 for g in every],
-            at_most(0.0),
+            f"{name} by name, from 10 sigma",
+            [t.right for t in big if t.truth.effects[0].physics == name],
+            at_least(0.9),
         )
-    )
-    return out
+        for name in FORCES
+    ]
+
+
+def _time_scores(trials: Sequence[Trial]) -> list[Score]:
+    timed = [t for t in trials if t.seconds > 0]
+    quick = [t.seconds for t in timed if t.truth.kind == "nothing"]
+    every = [t.seconds for t in timed]
+
+    def quantile(q: float) -> Callable[[Sequence[float]], float]:
+        return lambda some: float(np.quantile(some, q)) if len(some) else math.nan
+
+    longest = max(every, default=math.nan)
+    return [
+        median("s of a core where nothing is missing, median", quick, at_most(1.0)),
+        median("s of a core, median", every),
+        bootstrap("s of a core, 95 of 100 within", every, quantile(0.95), at_most(10.0)),
+        Score("s of a core, longest", longest, longest, longest, len(every), at_most(30.0)),
+    ]
 
 
 def by_size(trials: Sequence[Trial]) -> list[tuple[str, list[Score]]]:
@@ -288,16 +336,45 @@ def by_size(trials: Sequence[Trial]) -> list[tuple[str, list[Score]]]:
 
 def by_physics(trials: Sequence[Trial], sigma: float = 10.0) -> list[tuple[str, list[Score]]]:
     """The same by row of the vocabulary, single effects from `sigma`."""
-    big = [t for t in trials if t.truth.kind == "one" and t.truth.size >= sigma]
+    big = above(trials, sigma, "one", "force")
     names = sorted({t.truth.effects[0].physics for t in big})
     return [
         (name, _short([t for t in big if t.truth.effects[0].physics == name])) for name in names
     ]
 
 
+def by_group(
+    trials: Sequence[Trial], groups: Callable[[Trial], Sequence[str]]
+) -> list[tuple[str, list[Score]]]:
+    """What must hold in each group by itself: of a plant, a rig, a style. groups : those that a
+    trial belongs to."""
+    members: dict[str, list[Trial]] = {}
+    for t in trials:
+        for name in groups(t):
+            members.setdefault(name, []).append(t)
+    return [(name, _within(some)) for name, some in sorted(members.items())]
+
+
+def _within(trials: Sequence[Trial]) -> list[Score]:
+    """The figures of one group, with the goals that hold for each group."""
+    ten, thirty = above(trials, 10.0, "one"), above(trials, 30.0, "one")
+    return [
+        frequency("false alarms", false_alarms(trials)),
+        median("sigma kept", kept(trials), at_least(0.8)),
+        frequency("place, 10", [t.place_right for t in ten], at_least(0.95)),
+        frequency("name, 10", [t.right for t in ten], at_least(0.92)),
+        frequency("place, 30", [t.place_right for t in thirty], at_least(0.98)),
+        frequency("name, 30", [t.right for t in thirty], at_least(0.97)),
+        frequency("confidently wrong", [confidently_wrong(t) for t in trials], at_most(0.007)),
+        bootstrap(
+            "calibration error", [stated(t) for t in trials], calibration_error, at_most(0.05)
+        ),
+    ]
+
+
 def _short(trials: Sequence[Trial]) -> list[Score]:
     return [
-        frequency("detected", [t.answer.verdict != "no_mismatch" for t in trials]),
+        frequency("detected", [detected(t) for t in trials]),
         frequency("place right", [t.place_right for t in trials]),
         frequency("name right", [t.right for t in trials]),
         frequency("confidently wrong", [confidently_wrong(t) for t in trials]),
@@ -324,6 +401,7 @@ def confusion(trials: Sequence[Trial], sigma: float = 10.0) -> dict[tuple[str, s
             # Right physics at a wrong place is no right answer.
             said = f"{said}, elsewhere" if said == hidden else said
         else:
-            said = "nothing" if t.answer.verdict == "no_mismatch" else "unknown"
+            words = {"no_mismatch": "nothing", REFUSED: REFUSED}
+            said = words.get(t.answer.verdict, "unknown")
         out[hidden, said] = out.get((hidden, said), 0) + 1
     return out

@@ -7,6 +7,7 @@ to score them, and old results can be scored again.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,46 +19,77 @@ Name = tuple[str, str]
 """(physics, site), in the words of the vocabulary and of the rig file."""
 
 NAMED = ("named", "ambiguous")
+REFUSED = "refused"  # in place of a verdict: the recordings are none that a diagnosis takes
+WHOLE = "whole records"  # a truth's `size_is` where its size is of these
 ALL_BUT_TENTH = 0.9  # probability that a set of sites holds
 
 
 @dataclass(frozen=True, slots=True)
 class Hidden:
-    """One concealed effect: its name, its parameters (SI) by symbol."""
+    """One concealed effect: its name, its parameters (SI) by symbol. also : other names that mean
+    the same here, by the plant's own account."""
 
     physics: str
     site: str
     parameters: Mapping[str, float] = field(default_factory=dict)
+    also: frozenset[Name] = frozenset()
 
     @property
     def name(self) -> Name:
         """(physics, site)."""
         return self.physics, self.site
 
+    @property
+    def names(self) -> frozenset[Name]:
+        """All its names."""
+        return self.also | {self.name}
+
+    @property
+    def sites(self) -> frozenset[str]:
+        """All names of its place."""
+        return frozenset(site for _, site in self.names)
+
 
 @dataclass(frozen=True, slots=True)
 class Truth:
     """What a trial conceals.
 
-    kind : `nothing`, `one`, `two`, `outside`, or `joints` (every joint gives).
-    size : sigma that are left when the nearest smaller explanation has been refitted.
-    names, sites : how many these data cannot tell from the effect; said : names in the answer's
-        class, structural twins as one. 0 where they were not counted. twins : other sites that a
-        single effect might as well be told to be at, by structure.
+    kind : `nothing`, `one`, `two`, `outside`, `joints` (every joint gives), or `force` (one effect
+        that depends on the level).
+    size : sigma that are left when the nearest smaller explanation has been refitted. whole :
+        whether that is of whole records, or of the bursts alone. twins : other sites that a single
+        effect might as well be told to be at, by structure. styles : how it was recorded, the
+        excitation first.
     """
 
     kind: str
     seed: int
     effects: tuple[Hidden, ...]
     size: float = 0.0
-    names: int = 0
-    sites: int = 0
-    said: int = 0
     twins: Sequence[str] = ()
+    whole: bool = False
+    plant: str = ""
+    rig: str = ""
+    styles: Sequence[str] = ()
 
     def places(self, effect: Hidden) -> frozenset[str]:
         """All names of an effect's site."""
-        return frozenset((effect.site, *(self.twins if len(self.effects) == 1 else ())))
+        return effect.sites | frozenset(self.twins if len(self.effects) == 1 else ())
+
+    @classmethod
+    def of(cls, data: Mapping[str, Any]) -> Truth:
+        """From plain data, as `prove.outcomes` keeps it."""
+        effects = tuple(
+            Hidden(
+                e["physics"], e["site"], e["parameters"], frozenset(map(tuple, e.get("also", ())))
+            )
+            for e in data["effects"]
+        )
+        return cls(
+            data["kind"], data["seed"], effects, data["size"], tuple(data.get("twins", ())),
+            data.get("size_is") == WHOLE, data.get("plant", ""), data.get("rig", ""),
+            tuple(data.get("styles", ())),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +111,8 @@ class Answer:
     causes: tuple[Cause, ...]
     sites: tuple[tuple[str, float], ...]
     gap_closed: float | None
+    sigma: float = 0.0
+    """Root of the chi-square of the data that the causes explain."""
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Answer:
@@ -86,7 +120,8 @@ class Answer:
         causes = tuple(_cause(c) for c in data["causes"])
         sites = sorted(((s["site"], s["probability"]) for s in data["sites"]), key=lambda s: -s[1])
         gap = data["fit"].get("gap_closed")
-        return cls(data["verdict"], causes, tuple(sites), gap["value"] if gap else None)
+        sigma = float((data.get("evidence") or {}).get("sigma") or 0.0)
+        return cls(data["verdict"], causes, tuple(sites), gap["value"] if gap else None, sigma)
 
     @property
     def speaks(self) -> bool:
@@ -109,16 +144,24 @@ class Answer:
 def _cause(data: Mapping[str, Any]) -> Cause:
     name = (data["physics"], data["site"])
     twins = [(t["physics"], t["site"]) for t in data.get("equivalent_to", ())]
-    values = {k: (p["value"], p["low"], p["high"]) for k, p in data.get("parameters", {}).items()}
+    values = {
+        k: (
+            p["value"],
+            -math.inf if p["low"] is None else p["low"],
+            math.inf if p["high"] is None else p["high"],
+        )
+        for k, p in data.get("parameters", {}).items()
+    }
     return Cause(name, data["probability"], frozenset([name, *twins]), values)
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A truth and the answer to it."""
+    """A truth and the answer to it. seconds : process time of the diagnosis, 0 if not measured."""
 
     truth: Truth
     answer: Answer
+    seconds: float = 0.0
 
     def matches(self) -> tuple[tuple[Hidden, Cause], ...]:
         """The pairing of effects and causes in which most names are right, right ones only."""
@@ -162,11 +205,11 @@ class Trial:
 
 
 def _same_name(effect: Hidden, cause: Cause) -> bool:
-    return effect.name in cause.names
+    return bool(effect.names & cause.names)
 
 
 def _same_place(effect: Hidden, cause: Cause) -> bool:
-    return any(site == effect.site for _, site in cause.names)
+    return any(site in effect.sites for _, site in cause.names)
 
 
 def _best(

@@ -207,6 +207,7 @@ def segment_to_map(segment: Segment) -> dict[str, str]:
         "level": repr(float(segment.level)),
         "unit": segment.unit,
         "repeat": str(segment.repeat),
+        **({"excited": " ".join(segment.excited)} if segment.excited else {}),
     }
 
 
@@ -224,6 +225,7 @@ def segment_from_map(data: dict[str, str]) -> Segment:
             level=float(data["level"]),
             unit=data["unit"],
             repeat=int(data["repeat"]),
+            excited=tuple(data.get("excited", "").split()),
         )
     except (KeyError, ValueError) as error:
         raise RecordingError("a segment of the recording cannot be read") from error

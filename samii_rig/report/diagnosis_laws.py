@@ -72,9 +72,9 @@ FACTORS: dict[str, Law] = {
 
 
 def jump_of(cause: Cause) -> Jump | None:
-    """The jump that a cause makes; None where it is none, is spread over a body, or acts on the
+    """The jump that a cause makes; None where it is none, or acts on the
     input too, as a hydraulic line."""
-    if "position" in cause.parameters or "omega" in cause.parameters:
+    if "omega" in cause.parameters:
         return None
     rows = JUMPS.get(cause.physics, ())
     if len(rows) < 2:

@@ -14,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.diagnose import insert
+from samii_rig.diagnose.along import POSITION
 from samii_rig.diagnose.measured import binned, measured
 from samii_rig.diagnose.model import Model, grid
+from samii_rig.diagnose.points import POINTS
 from samii_rig.diagnose.refit import Problem, refit
 from samii_rig.diagnose.result import Cause
 from samii_rig.diagnose.rigfile import explained
-from samii_rig.diagnose.vocabulary import REPORTED
 from samii_rig.model.sampled import sampled_response
 from samii_rig.report.compare import ModelCurve
 from samii_rig.report.diagnosis_laws import factor_curve, jump_curve
@@ -32,6 +33,8 @@ STRENGTHS = (0.5, 1.0, 2.0)  # times the cause's own; three points give the Moeb
 _CURVED = np.array([1 / 0.75, -1 / 0.5, 1 / 1.5])
 # x falls with these symbols: the stronger the part, the smaller.
 _INVERSE = ("torsional_compliance", "translational_compliance", "velocity_feedback")
+# Parameters of elements by the symbols that a cause tells them by.
+_REPORTED = {row.physics: {row.strong: row.reported} for row in POINTS if row.reported}
 _KEPT = {"D"}  # parameters that say what the part is, not how strong
 MOST_LINES = 1500  # at which a model is evaluated for a picture
 BINS_PER_DECADE = 30
@@ -209,8 +212,9 @@ def _product(a: Complex, W: Complex, b: Complex) -> Complex:
 
 def _part(cause: Cause, rig: Rig) -> str | None:
     """Name of the element that was put in for `cause`: the one with its values."""
-    symbols = {v: k for k, v in REPORTED.get(cause.physics, {}).items()}
-    wanted = {symbols.get(k, k): v.value for k, v in cause.parameters.items()}
+    symbols = {v: k for k, v in _REPORTED.get(cause.physics, {}).items()}
+    own = {k: v for k, v in cause.parameters.items() if k != POSITION}
+    wanted = {symbols.get(k, k): v.value for k, v in own.items()}
     for e in rig.element:
         if not e.name.startswith(insert.PREFIX):
             continue

@@ -21,39 +21,11 @@ from samii_rig.diagnose.result import (
     percent,
     sentence,
 )
+from samii_rig.diagnose.rows import PHYSICS
 from samii_rig.report.diagnosis_laws import Jump, jump_of
 from samii_rig.report.verdicts import Mark, without_folders
 
-PLAIN = {
-    "torsional_compliance": "a joint or clamp that gives",
-    "translational_compliance": "a support that gives sideways",
-    "added_mass": "a mass",
-    "added_inertia": "a rotary inertia",
-    "ground_spring": "a spring to ground",
-    "gravity_stiffness": "the stiffness of gravity",
-    "viscous_damping": "a damper",
-    "structural_damping": "the beam's own damping",
-    "beam_property": "a beam other than given",
-    "joint_stiffness": "a joint softer or stiffer than it was",
-    "attached_oscillator": "something that hangs on and resonates",
-    "actuator_lag": "a lag of the drive",
-    "valve_dynamics": "a valve of second order",
-    "transport_delay": "a dead time of the drive",
-    "velocity_feedback": "a drive that gives way to torque",
-    "hydraulic_compressibility": "oil that is compressed",
-    "sensor_delay": "a delay of the sensor",
-    "sensor_lag": "a lag of the sensor",
-    "sensor_gain": "a gain of the sensor",
-    "sensor_highpass": "a high-pass of the sensor",
-    "gravity_cross_sensitivity": "an accelerometer that tilts",
-    "noncollocated_encoder": "an encoder across other parts",
-    "coulomb_friction": "dry friction",
-    "valve_deadband": "a dead band of the valve",
-    "backlash": "play",
-    "cubic_stiffness": "a joint that stiffens or softens",
-    "flow_saturation": "a flow that saturates",
-    "output_saturation": "a clipped command",
-}
+PLAIN = {row.name: row.words for row in PHYSICS.values()}
 WORDS = {
     "no_mismatch": "no mismatch",
     "named": "named",
@@ -181,8 +153,13 @@ def quantity(v: Value) -> tuple[str, str]:
             break
     unit = re.sub(r"\^(-?\d+)", lambda m: m[1].translate(_POWERS), v.unit)
     unit = "" if unit == "1" else f"\u00a0{prefix}{unit}"
-    value, low, high = (_digits(x / factor) for x in (v.value, v.low, v.high))
-    return f"{value}{unit}", f"{low} to {high}{unit}"
+    value = f"{_digits(v.value / factor)}{unit}"
+    if v.low is None and v.high is None:
+        return value, "no limit"
+    if v.low is None or v.high is None:
+        way, end = ("at most", v.high) if v.low is None else ("at least", v.low)
+        return value, f"{way} {_digits((end or 0.0) / factor)}{unit}"
+    return value, f"{_digits(v.low / factor)} to {_digits(v.high / factor)}{unit}"
 
 
 def _digits(x: float) -> str:

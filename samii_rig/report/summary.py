@@ -201,13 +201,13 @@ def dry_run_summary(predicted: DryRun) -> RenderableType:
     for name in ("channel", "held to its", "predicted", "limit", "margin", "where", ""):
         margins.add_column(name)
     peaks_of = dict(zip(predicted.channels, predicted.peaks.max(axis=0), strict=True))
-    actuator = predicted.channels[0]
+    outputs = predicted.outputs or predicted.channels[:1]
     # The worst of each channel; the others are no nearer.
     worst = {m.channel: m for m in reversed(predicted.margins)}
     for m in sorted(worst.values(), key=lambda m: m.margin):
         style = "green" if m.margin > _MARGIN_CLOSE else "yellow" if m.margin >= 0 else "bold red"
         value = f"{m.predicted:.3g} {pretty(m.unit)}"
-        if m.channel == actuator and m.what == "limit":
+        if m.channel in outputs and m.what == "limit":
             # The gate judges the output by a bound on what the device may add to the reference.
             value = f"\u2264 {value}, peak {peaks_of[m.channel]:.3g}"
         margins.add_row(
@@ -225,7 +225,8 @@ def dry_run_summary(predicted: DryRun) -> RenderableType:
         errors.add_column(name)
     rows: dict[str, dict[str, str]] = {}
     for b in predicted.bands:
-        key = f"{b.level:g} {b.level_unit}, {b.low_hz:.3g}\u2013{b.high_hz:.3g} Hz"
+        by = f"{b.input}, " if b.input else ""
+        key = f"{by}{b.level:g} {b.level_unit}, {b.low_hz:.3g}\u2013{b.high_hz:.3g} Hz"
         rows.setdefault(key, {})[b.channel] = f"{100 * b.relative:.2g} %"
     for key, cells in rows.items():
         errors.add_row(key, *(cells.get(c, "") for c in channels))

@@ -50,6 +50,7 @@ def in_si(data: Any) -> Any:
     units = _units(out)
     for key, change in (
         ("element", lambda t: _source(t, units)),
+        ("actuator", lambda t: _actuator(t, written, units)),
         ("limit", lambda t: _limit(t, units)),
         ("agreement", lambda t: _agreement(t, written, units)),
         ("feedback", lambda t: _feedback(t, written, units)),
@@ -147,6 +148,13 @@ def _centring(table: Table, written: dict[str, str], units: dict[str, str]) -> T
     if name not in written:
         return table
     return _scaled(table, ("kp",), units[name], written[name])
+
+
+def _actuator(table: Table, written: dict[str, str], units: dict[str, str]) -> Table:
+    loop = table.get("centring")
+    return (
+        {**table, "centring": _centring(loop, written, units)} if isinstance(loop, dict) else table
+    )
 
 
 def _feedback(table: Table, written: dict[str, str], units: dict[str, str]) -> Table:

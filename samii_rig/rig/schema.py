@@ -163,12 +163,25 @@ class Monitor(Strict):
         return self
 
 
+class Centring(Strict):
+    """The loop that keeps the joint centred: v = u + kp (theta_ref - theta).
+
+    It runs in the device, at the sample rate. kp is in actuator units per sensor unit.
+    """
+
+    sensor: Name
+    kp: NonNegative
+
+
 class ActuatorSpec(Strict):
     """The input of the rig: the converter that drives an angular velocity source.
 
     The converter holds each sample until the next (zero-order hold); `delay` s pass
     between a sample's time stamp and the moment the output changes. `deadman` s after the
     last command the device itself drops its output to zero; without it the rig cannot be armed.
+
+    centring : the loop on this output, where it is not the rig's first; that of the first is the
+        rig's own [centring].
     """
 
     name: Name
@@ -178,6 +191,7 @@ class ActuatorSpec(Strict):
     resolution: NonNegative = 0.0
     delay: NonNegative = 0.0
     deadman: Positive | None = None
+    centring: Centring | None = None
 
     @model_validator(mode="after")
     def _range(self) -> Self:
@@ -238,16 +252,6 @@ class Service(Strict):
     """
 
     when_lost: Literal["go_on", "stop"] = "go_on"
-
-
-class Centring(Strict):
-    """The loop that keeps the joint centred: v = u + kp (theta_ref - theta).
-
-    It runs in the device, at the sample rate. kp is in actuator units per sensor unit.
-    """
-
-    sensor: Name
-    kp: NonNegative
 
 
 MOST_STATES = 8  # of one feedback filter; a damping loop has one to four
@@ -341,6 +345,32 @@ def _driven(e: Source, inputs: dict[str, ActuatorSpec]) -> None:
     expected = input_unit(e.kind, inputs[e.input].unit)
     if e.K.unit != expected:
         raise ValueError(f"element {e.name}: K has unit {e.K.unit!r}; expected {expected!r}")
+
+
+def _check_centring(rig: Rig) -> None:
+    """ValueError for a loop on no sensor, one sensor in two loops, or the first one misplaced."""
+    first = rig.actuator[0]
+    if first.centring is not None:
+        raise ValueError(
+            f"actuator {first.name}: centring on {first.centring.sensor!r}; expected the table "
+            "[centring], as this is the rig's first actuator"
+        )
+    known, owner = [s.name for s in rig.sensor], dict[str, str]()
+    for a in rig.actuator:
+        loop = rig.centring_of(a.name)
+        if loop is None:
+            continue
+        where = "centring" if a is first else f"actuator {a.name}: centring"
+        if loop.sensor not in known:
+            raise ValueError(
+                f"{where}: sensor {loop.sensor!r} does not exist; expected one of {known}"
+            )
+        if loop.sensor in owner:
+            raise ValueError(
+                f"{where}: sensor {loop.sensor!r} centres {owner[loop.sensor]} already; expected "
+                "one that this actuator turns"
+            )
+        owner[loop.sensor] = a.name
 
 
 class Rig(Strict):
@@ -468,11 +498,7 @@ class Rig(Strict):
                 raise ValueError(
                     f"{where}: units {units[one]!r} and {units[other]!r}; expected one"
                 )
-        if self.centring and self.centring.sensor not in {s.name for s in self.sensor}:
-            raise ValueError(
-                f"centring: sensor {self.centring.sensor!r} does not exist; "
-                f"expected one of {[s.name for s in self.sensor]}"
-            )
+        _check_centring(self)
         for loop in self.feedback:
             for what, name, known in (
                 ("sensor", loop.sensor, [s.name for s in self.sensor]),
@@ -489,6 +515,13 @@ class Rig(Strict):
                     f"feedback {loop.name}: unit {loop.unit!r} of F(s); expected {unit!r}"
                 )
         return self
+
+    def centring_of(self, actuator: str) -> Centring | None:
+        """The loop on one actuator: [centring] on the first, its own on another."""
+        first, *others = self.actuator
+        if actuator == first.name:
+            return self.centring
+        return next((a.centring for a in others if a.name == actuator), None)
 
     def units(self) -> dict[str, str]:
         """Unit of every channel, actuators, sensors and monitors, by name."""

@@ -99,7 +99,7 @@ def carry_out(
             "operator": operator,
             "started": datetime.now(UTC).isoformat(timespec="seconds"),
             "device": device.description,
-            "centring": f"{plan.centring_sensor} {plan.kp!r}",
+            "centring": "; ".join(f"{o.centring_sensor} {o.kp!r}" for o in plan.outputs),
             "predicted_peaks": json.dumps(_peaks(predicted)),
             **{f"device_{key}": value for key, value in device.metadata.items()},
             **({f"fault_cleared_{k}": v for k, v in asdict(cleared).items()} if cleared else {}),

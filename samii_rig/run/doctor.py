@@ -67,7 +67,8 @@ def examine(
     if protections:
         yield from own_protections(rig, protections)
     if move:
-        yield _sign(rig, rig_toml, folder)
+        for actuator in rig.actuator:
+            yield _sign(rig, rig_toml, folder, actuator.name)
 
 
 def _machine() -> Check:
@@ -183,19 +184,21 @@ def _samples(rig: Rig, device: OpenRig) -> Iterator[Check]:
             yield Check(s.name, "good", found)
 
 
-def _sign(rig: Rig, rig_toml: str, folder: Path) -> Check:
-    """With the loop open: a wrong sign would make the centring drive the joint away."""
-    what = "encoder sign"
-    if rig.centring is None:
-        return Check(what, "look", "the rig centres on no encoder", "state [centring]")
-    name, sensor = rig.actuator[0].name, rig.centring.sensor
-    limits = gate_limits(rig, name, rig.centring.kp, sensor)
+def _sign(rig: Rig, rig_toml: str, folder: Path, name: str) -> Check:
+    """With the loop of actuator `name` open: a wrong sign would make the centring drive the joint
+    away."""
+    what, loop = "encoder sign", rig.centring_of(name)
+    if loop is None:
+        whose = "the rig" if len(rig.actuator) == 1 else name
+        return Check(what, "look", f"{whose} centres on no encoder", "state [centring]")
+    sensor = loop.sensor
+    limits = gate_limits(rig, name, loop.kp, sensor)
     if limits.turning == 0.0:
         return Check(what, "look", f"how far {sensor} follows {name} is not known from the model")
     # Half of the pulse's peak over its time, see `session.pulse`.
     expected = limits.turning * 0.5 * PULSE_PART * limits.output.max * PULSE
     try:
-        move = pulse(rig, rig_toml, folder)
+        move = pulse(rig, rig_toml, folder, name)
     except SamiiRigError as error:
         return Check.failed(what, error)
     turned = move.after - move.before

@@ -8,7 +8,8 @@ for a minute, an integrator's drift) is part of the prediction. The sampled clos
 with the filters F_i of the rig's feedback loops is evaluated on the circle
 z = exp((sigma + j w) T) a little outside the unit circle, and the time series is brought back
 with exp(sigma t). On that circle an integrator is finite, and what a discrete Fourier transform
-wraps around comes back smaller by exp(-sigma T_plan).
+wraps around comes back smaller by exp(-sigma T_plan). Several outputs make one such loop of
+matrices, see `samii_rig.run.closed`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,6 @@ import numpy as np
 from scipy import fft
 
 from samii_rig.errors import InputError, LimitError
-from samii_rig.model.loops import Loops, loops_of
 from samii_rig.model.sampled import filter_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import (
@@ -34,11 +34,13 @@ from samii_rig.rig.schema import (
     Rig,
     flattened,
 )
+from samii_rig.run.closed import ClosedLoops
 from samii_rig.run.dwell import ways
-from samii_rig.run.expected import BandError, expected_errors
+from samii_rig.run.expected import BandError, exciting_only, expected_errors
 from samii_rig.run.margins import Margin, margins, worse_of
+from samii_rig.run.outputs import columns, completed, plan_limits
 from samii_rig.run.plan import Plan
-from samii_rig.safety.limits import find_actuator, gate_limits
+from samii_rig.safety.limits import GateLimits, find_actuator
 from samii_rig.types import Complex, Float
 
 WRAP = 1e-3  # what is left of the signal after one turn of the transform
@@ -48,8 +50,6 @@ PAD = 0.05
 # Aliases on each side. The hold has its zeros there, so the next ones add under 0.1 % to a
 # response below a tenth of the rate.
 ALIASES = 1
-# A closed loop without poles outside the circle does not wind around 0 at all.
-MOST_WINDING = 0.5
 # Where on the real axis a chain that falls over is looked for: parts of the sample rate (rad/s
 # over Hz), and points.
 LOWEST_FALL, HIGHEST_FALL, FALLS = 1e-6, 10.0, 2000
@@ -62,7 +62,7 @@ class DryRun:
     duration, shortest : s, with every dwell in full and as short as it may be.
     channels, units : of `peaks` : (n_segment, n_channel), largest |value| of the command v,
     of each sensor and of the moment or force at each actuated joint, in the segment.
-    margins : worst first.
+    margins : worst first. outputs : the actuators that are driven, the first channels.
     """
 
     duration: float
@@ -73,6 +73,7 @@ class DryRun:
     slew: float
     margins: tuple[Margin, ...]
     bands: tuple[BandError, ...]
+    outputs: tuple[str, ...] = ()
 
     def refuse(self) -> None:
         """LimitError if a limit would be broken; it names the largest level that would not."""
@@ -104,6 +105,7 @@ def predict(plan: Plan, rig: Rig) -> DryRun:
     rig could never be armed, its source moves nothing, a dwell would leave a step, or the plan
     has another sample rate.
     """
+    plan = completed(plan, rig)
     if plan.rate_hz != rig.rate_hz:
         where, expected = f"experiment {plan.experiment}", f"{rig.rate_hz:g}, the rig's own"
         raise InputError(where, "rate_hz", plan.rate_hz, expected)
@@ -121,40 +123,59 @@ def predict(plan: Plan, rig: Rig) -> DryRun:
 
 
 def _predict(plan: Plan, rig: Rig) -> DryRun:
-    if find_actuator(rig, plan.actuator, rig.name).deadman is None:
-        expected = "the device's own, in s; without one it is never armed"
-        raise InputError(rig.name, f"actuator[{plan.actuator}].deadman", None, expected)
-    moments = _joint_moments(rig, plan.actuator)
+    for output in plan.outputs:
+        if find_actuator(rig, output.actuator, rig.name).deadman is None:
+            expected = "the device's own, in s; without one it is never armed"
+            raise InputError(rig.name, f"actuator[{output.actuator}].deadman", None, expected)
+    driven = [o.actuator for o in plan.outputs]
+    moments = tuple(m for name in driven for m in _joint_moments(rig, name))
     seen = rig.model_copy(update={"sensor": (*rig.sensor, *moments)})
-    u = np.concatenate([s.u for s in plan.segments])
-    theta_ref = np.concatenate([s.theta_ref for s in plan.segments])
+    u = np.concatenate([columns(s.u) for s in plan.segments])
+    theta_ref = np.concatenate([columns(s.theta_ref) for s in plan.segments])
     n = fft.next_fast_len(math.ceil(len(u) * (1 + PAD)), real=True)
     sigma = -math.log(WRAP) * plan.rate_hz / n
     omega = 2 * np.pi * plan.rate_hz * np.arange(n // 2 + 1) / n
     s = np.asarray(sigma + 1j * omega, dtype=np.complex128)
-    H = _sampled(seen, plan.actuator, s)
-    names = [s.name for s in seen.sensor]
-    if not np.any(np.abs(H) > 0.0):
-        expected = f"an end that {plan.actuator} can push against; it moves nothing"
-        raise InputError(rig.name, "base", rig.base, expected)
-    limits = gate_limits(rig, plan.actuator, plan.kp, plan.centring_sensor)
-    loops = _loops(rig, plan)
-    filters = loops.filters(np.exp(s / plan.rate_hz), plan.rate_hz)
-    sensitivity = 1.0 + loops.gain(H[:, :, None], filters)
-    if plan.kp != 0.0 or loops.feedback:
-        _refuse_unstable(sensitivity, plan, loops)
-    shrink = np.exp(-sigma * np.arange(len(u)) / plan.rate_hz)
-    drive = fft.rfft((u + plan.kp * theta_ref) * shrink, n)
-    command = drive / sensitivity
-    v = fft.irfft(command, n)[: len(u)] / shrink
-    y = np.stack([fft.irfft(command * H[:, i], n)[: len(u)] / shrink for i in range(len(names))])
-    added = {
-        loop.name: fft.irfft(command * filters[:, k] * H[:, i], n)[: len(u)] / shrink
-        for k, (i, loop) in enumerate(loops.feedback)
-    }
+    H = _sampled(seen, driven, s)
+    for j, name in enumerate(driven):
+        if not np.any(np.abs(H[:, :, j]) > 0.0):
+            expected = f"an end that {name} can push against; it moves nothing"
+            raise InputError(rig.name, "base", rig.base, expected)
+    limits = plan_limits(plan, rig)
+    closed = ClosedLoops.of(plan, rig, H, np.exp(s / plan.rate_hz))
+    closed.refuse_unstable(plan)
+    shrink = np.exp(-sigma * np.arange(len(u)) / plan.rate_hz)[:, None]
+    kp = np.array([o.kp for o in plan.outputs])
+    command = closed.outputs(fft.rfft((u + kp * theta_ref) * shrink, n, axis=0))
 
-    series = {plan.actuator: v, **dict(zip(names, y, strict=True))}
-    units = {**rig.units(), **{m.name: m.unit for m in moments}}
+    def in_time(spectrum: Complex) -> Float:
+        x: Float = fft.irfft(spectrum, n)[: len(u)] / shrink[:, 0]
+        return x
+
+    v = {name: in_time(command[:, j]) for j, name in enumerate(driven)}
+    y = {x.name: in_time((command * H[:, i]).sum(axis=1)) for i, x in enumerate(seen.sensor)}
+    added = {
+        loop.name: in_time((command * H[:, i]).sum(axis=1) * own[:, k])
+        for one, own in zip(closed.loops, closed.filters, strict=True)
+        for k, (i, loop) in enumerate(one.feedback)
+    }
+    return _seen(plan, rig, limits, {**v, **y}, added, omega / (2 * np.pi), H)
+
+
+def _seen(
+    plan: Plan,
+    rig: Rig,
+    limits: tuple[GateLimits, ...],
+    series: dict[str, Float],
+    added: dict[str, Float],
+    hz: Float,
+    H: Complex,
+) -> DryRun:
+    """What the predicted series come to. H : (n, n_sensor, k) at hz."""
+    units = {
+        **rig.units(),
+        **{m.name: m.unit for o in plan.outputs for m in _joint_moments(rig, o.actuator)},
+    }
     ends = np.cumsum([len(s.u) for s in plan.segments])
     parts = [slice(int(e) - len(s.u), int(e)) for s, e in zip(plan.segments, ends, strict=True)]
     peaks = np.array([[np.abs(x[part]).max() for x in series.values()] for part in parts])
@@ -162,22 +183,27 @@ def _predict(plan: Plan, rig: Rig) -> DryRun:
         if not np.isfinite(x).all():
             raise LimitError(f"the model gives no number for {name} of {rig.name}; nothing is sent")
     spectrum = np.abs(H[:, : len(rig.sensor)])
+    near, bands, steepest = [], list[BandError](), 0.0
+    for j, (output, own) in enumerate(zip(plan.outputs, limits, strict=True)):
+        v, alone = series[output.actuator], plan.only(j)
+        steepest = max(steepest, float(np.abs(np.diff(v, prepend=0.0)).max() * plan.rate_hz))
+        near.append(margins(alone, rig, own, series, added, parts))
+        exciting, its_parts = exciting_only(alone, parts)
+        if exciting.segments:
+            found = expected_errors(exciting, rig, v, its_parts, hz, spectrum[:, :, j])
+            name = output.actuator if plan.beside else ""
+            bands += [replace(band, input=name) for band in found]
     return DryRun(
         duration=plan.duration,
         shortest=plan.duration,
         channels=tuple(series),
         units=tuple(units[name] for name in series),
         peaks=peaks,
-        slew=float(np.abs(np.diff(v, prepend=0.0)).max() * plan.rate_hz),
-        margins=margins(plan, rig, limits, series, added, parts),
-        bands=tuple(expected_errors(plan, rig, v, parts, omega / (2 * np.pi), spectrum)),
+        slew=steepest,
+        margins=near[0] if len(near) == 1 else worse_of(near),
+        bands=tuple(bands),
+        outputs=tuple(o.actuator for o in plan.outputs),
     )
-
-
-def _loops(rig: Rig, plan: Plan) -> Loops:
-    """The loops of a plan on its actuator, the only column that is looked at."""
-    theta = [s.name for s in rig.sensor].index(plan.centring_sensor)
-    return replace(loops_of(rig, plan.actuator), actuator=0, theta=theta, kp=plan.kp)
 
 
 def _joint_moments(rig: Rig, actuator: str) -> tuple[Moment | Force, ...]:
@@ -221,35 +247,25 @@ def _refuse_falling(rig: Rig) -> None:
         )
 
 
-def _sampled(rig: Rig, actuator: str, s: Complex) -> Complex:
-    """Sampled response (n, n_sensor) from the actuator at complex s: `sampled_response`
+def _sampled(rig: Rig, actuators: list[str], s: Complex) -> Complex:
+    """Sampled response (n, n_sensor, k) from these actuators at complex s: `sampled_response`
     with few aliases, off the imaginary axis."""
-    j = [a.name for a in rig.actuator].index(actuator)
+    places = [[a.name for a in rig.actuator].index(name) for name in actuators]
+    delays = np.array([rig.actuator[j].delay for j in places])
     chain = Chain(rig)
-    total = np.zeros((len(s), len(rig.sensor)), dtype=np.complex128)
+    total = np.zeros((len(s), len(rig.sensor), len(places)), dtype=np.complex128)
     for k in range(-ALIASES, ALIASES + 1):
         at = s + 2j * np.pi * rig.rate_hz * k
         T = 1.0 / rig.rate_hz
-        hold = -np.expm1(-at * T) / (at * T) * np.exp(-at * rig.actuator[j].delay)
+        hold = -np.expm1(-at * T) / (at * T)
+        late = np.exp(-at[:, None] * delays)
         # A chain answers a real input: G(conj s) = conj G(s).
         upper = np.where(at.imag < 0, at.conj(), at)
-        G = chain.evaluate(upper)[:, :, j]
-        G = np.where((at.imag < 0)[:, None], G.conj(), G)
+        G = chain.evaluate(upper)[:, :, places]
+        G = np.where((at.imag < 0)[:, None, None], G.conj(), G)
         F = np.stack([filter_response(x, at) * np.exp(-at * x.delay) for x in rig.sensor], axis=1)
-        total += G * F * hold[:, None]
+        total += G * F[:, :, None] * (hold[:, None] * late)[:, None, :]
     return total
-
-
-def _refuse_unstable(sensitivity: Complex, plan: Plan, loops: Loops) -> None:
-    """Nyquist: 1 + L has no pole outside the circle and is 1 far out, so the times it
-    winds around 0 along the circle are the closed loop's poles outside."""
-    turns = float(np.abs(np.diff(np.unwrap(np.angle(sensitivity))).sum()) / np.pi)
-    if turns > MOST_WINDING:
-        centring = f"the centring loop with kp = {plan.kp:g} on {plan.centring_sensor}"
-        names = ", ".join(f"{f.name} on {f.sensor}" for _, f in loops.feedback)
-        what = f"{centring} and the feedback {names}" if names else centring
-        smaller = "a smaller kp or gain" if names else "a smaller kp"
-        raise LimitError(f"{what} would be unstable by the model; expected {smaller}")
 
 
 def _round_down(x: float) -> str:

@@ -29,9 +29,14 @@ def check_segments(plan: Plan) -> None:
     """
     where = f"experiment {plan.experiment}"
     for s in plan.segments:
-        shapes = {x.shape for x in (s.u, s.theta_ref, s.frequency)}
-        if shapes != {(s.u.size,)} or s.u.size == 0:
+        n, k = s.frequency.size, len(plan.outputs)
+        shapes = {s.u.shape, s.theta_ref.shape}
+        wide = (n,) if k == 1 else (n, k)
+        if shapes != {wide} or s.frequency.shape != (n,) or n == 0:
+            shapes.add(s.frequency.shape)
             expected = "u, theta_ref and frequency of one length, at least one sample"
+            if k > 1:
+                expected = f"u and theta_ref of {k} columns, and {expected}"
             raise InputError(where, s.name, sorted(shapes), expected)
         wrong = _wrong(s, s.dwell) if s.dwell else None
         if wrong:
@@ -53,7 +58,7 @@ def _wrong(s: PlannedSegment, d: Dwell) -> tuple[str, object, str] | None:
     if not (start <= d.first and d.last <= stop):
         return "first", (d.first, d.last), f"inside what is recorded, {start} to {stop}"
     for x in (s.u, s.theta_ref):
-        blocks = x[d.first : d.last].reshape(d.blocks, d.block)
+        blocks = x[d.first : d.last].reshape(d.blocks, -1)
         if not np.abs(blocks - blocks[0]).max() <= ALIKE * max(1.0, np.abs(blocks[0]).max()):
             return "block", d.block, "a reference that is the same in every block"
     return None
@@ -85,8 +90,8 @@ def ways(plan: Plan) -> tuple[Plan, ...]:
 class Reference:
     """The samples of a plan in one row, and where its segments are in it.
 
-    u, theta_ref : (n,); changed only at samples that are still to be sent. InputError as
-    `check_segments`.
+    u, theta_ref : (n,), of several outputs (n, k); changed only at samples that are still to be
+    sent. InputError as `check_segments`.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -132,7 +137,7 @@ class Watch:
     def __init__(self, reference: Reference, channels: tuple[Channel, ...], actuator: str) -> None:
         self._reference = reference
         self._names = [c.name for c in channels]
-        self._input = self._names.index(actuator)
+        self._actuator = actuator
         self._segment = -1
         self._sum: Complex = np.zeros((0, 0), dtype=np.complex128)
         self._held: Int = np.zeros(0, dtype=np.int64)
@@ -169,8 +174,12 @@ class Watch:
         self._reference.shorten(i, segment.dwell.first + blocks * segment.dwell.block)
         return Left(segment.name, blocks, relative)
 
+    def _driven(self, i: int) -> str:
+        """The actuator that segment i drives; the first of several."""
+        return (*self._reference.segments[i].excited, self._actuator)[0]
+
     def _add(self, i: int, dwell: Dwell, block: SampleBlock, first: int) -> None:
-        columns = [self._input, *(self._names.index(name) for name in dwell.outputs)]
+        columns = [self._names.index(name) for name in (self._driven(i), *dwell.outputs)]
         if i != self._segment:
             self._segment, self._whole = i, 0
             self._sum = np.zeros((dwell.blocks, len(columns)), dtype=np.complex128)

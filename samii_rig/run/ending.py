@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -14,7 +13,7 @@ from samii_rig.errors import DeviceError, DiskError, RecordingError, SamiiRigErr
 from samii_rig.record.reader import read_recording
 from samii_rig.record.writer import RunWriter
 from samii_rig.safety.limits import ChannelLimit
-from samii_rig.types import SampleBlock, StopRecord
+from samii_rig.types import Float, SampleBlock, StopRecord
 
 # s after zero within which the read-back must show it: samples on their way at that moment
 # may still show the output before.
@@ -86,9 +85,12 @@ class Zero:
     trouble : why the output may not be at zero, "" if it is.
     """
 
-    def __init__(self, device: OpenRig, output: ChannelLimit) -> None:
-        self._device, self._output = device, output
-        self._column = [c.name for c in device.sensor.channels].index(output.channel)
+    def __init__(self, device: OpenRig, *outputs: ChannelLimit) -> None:
+        self._device, self._outputs = device, outputs
+        names = [c.name for c in device.sensor.channels]
+        self._columns = [names.index(output.channel) for output in outputs]
+        # What each output's converter cannot tell from zero.
+        self._least = np.array([output.slack / 2 for output in outputs])
         self.trouble = ""
 
     def force(self) -> None:
@@ -117,46 +119,50 @@ class Zero:
         shown, disobeyed = self._shown(tick, keep, window)
         if not spoke:
             return
-        if abs(shown) <= self._least:
-            name, unit = self._output.channel, self._output.unit
-            if disobeyed > self._least and not self.trouble:
-                text = f"{name} read {disobeyed:.4g} {unit} after zero(), which did nothing"
+        if self._at_zero(shown):
+            if not self._at_zero(disobeyed) and not self.trouble:
+                text = f"{self._reads(disobeyed)} after zero(), which did nothing"
                 self.trouble = f"{_NOT_AT_ZERO}: {text}; the deadman ended it"
             return
         before = self.trouble
         self.force()
         self._shown(tick, keep, (0, 0))
-        name, unit = self._output.channel, self._output.unit
-        if math.isnan(shown):
-            raise DeviceError(f"{_NOT_SHOWN} {name} at zero: none came any more")
+        if np.isnan(shown).any():
+            names = " and ".join(output.channel for output in self._outputs)
+            raise DeviceError(f"{_NOT_SHOWN} {names} at zero: none came any more")
         self.trouble = (
-            self.trouble or before or (f"{_NOT_AT_ZERO}: {name} read {shown:.4g} {unit} after zero")
+            self.trouble or before or (f"{_NOT_AT_ZERO}: {self._reads(shown)} after zero")
         )
 
-    @property
-    def _least(self) -> float:
-        """What the output's converter cannot tell from zero."""
-        return self._output.slack / 2
+    def _at_zero(self, v: Float) -> bool:
+        """Whether every output is; v (k,), of which NaN is not."""
+        return bool((v <= self._least).all())
+
+    def _reads(self, v: Float) -> str:
+        """The output that is furthest from zero; v (k,)."""
+        i = int(np.argmax(v - self._least))
+        return f"{self._outputs[i].channel} read {v[i]:.4g} {self._outputs[i].unit}"
 
     def _shown(
         self, tick: float, keep: Callable[[SampleBlock], None], window: tuple[int, int]
-    ) -> tuple[float, float]:
-        """The newest output that came back once zero had time to show, NaN if none came; and the
-        largest of those samples that the device took inside the window of its time, ns."""
-        clock, shown, inside = self._device.clock, math.nan, 0.0
+    ) -> tuple[Float, Float]:
+        """(k,) each: the newest |v| that came back once zero had time to show, NaN if none came;
+        and the largest of those samples that the device took inside the window of its time, ns."""
+        clock = self._device.clock
+        shown, inside = np.full(len(self._outputs), np.nan), np.zeros(len(self._outputs))
         until = clock.now() + round(SHOWN_WITHIN * 1e9)
         newest = -1
         while True:
             clock.sleep(tick)
             block = self._device.sensor.read()
             keep(block)
-            v = np.abs(block.values[:, self._column])
-            there = np.isfinite(v)
+            v = np.abs(block.values[:, self._columns])
+            there = np.isfinite(v).all(axis=1)
             if there.any():
                 time = block.time[there]
-                shown, newest = float(v[there][-1]), int(time[-1])
+                shown, newest = v[there][-1], int(time[-1])
                 judged = (time >= window[0]) & (time < window[1])
-                inside = max(inside, float(v[there][judged].max(initial=0.0)))
-            over = abs(shown) <= self._least and newest >= window[1]
+                inside = np.maximum(inside, v[there][judged].max(axis=0, initial=0.0))
+            over = self._at_zero(shown) and newest >= window[1]
             if over or clock.now() >= until:
                 return shown, inside

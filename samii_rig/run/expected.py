@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -24,7 +24,7 @@ class BandError:
         each 1/duration of a segment wide (of a periodic reference, the lines that it drives;
         of stepped sines, their frequencies, each dwell in full),
         all repeats averaged. Averaging n neighbouring lines divides it by sqrt(n).
-    relative : std/|H|, median.
+    relative : std/|H|, median. input : the actuator, "" where the rig has but one.
     """
 
     channel: str
@@ -34,6 +34,20 @@ class BandError:
     high_hz: float
     std: float
     relative: float
+    input: str = ""
+
+
+def exciting_only(plan: Plan, parts: list[slice]) -> tuple[Plan, list[slice]]:
+    """The segments of a plan with one output that excite it, and where they are.
+
+    Several inputs that are driven together by references that are orthogonal over the segments
+    are as well known as each would be by itself in all of them.
+    """
+    kept = [
+        i for i, s in enumerate(plan.segments) if plan.actuator in (s.excited or (plan.actuator,))
+    ]
+    segments = tuple(plan.segments[i] for i in kept)
+    return replace(plan, segments=segments), [parts[i] for i in kept]
 
 
 def expected_errors(
@@ -60,6 +74,8 @@ def expected_errors(
                 sigma = math.hypot(sensor.noise_rms, sensor.resolution / math.sqrt(12))
                 std = sigma * math.sqrt(n / len(members)) / V[inside]
                 H = np.interp(f[inside], hz, size[:, i])
+                if not H.all():
+                    continue  # this input does not move it at all
                 out.append(
                     BandError(
                         sensor.name,
@@ -96,7 +112,10 @@ def _stepped(
             for i, sensor in enumerate(rig.sensor):
                 sigma = math.hypot(sensor.noise_rms, sensor.resolution / math.sqrt(12))
                 std = sigma * np.sqrt(length[inside]) / drive[inside]
-                relative = std / np.interp(at[inside], hz, size[:, i])
+                H = np.interp(at[inside], hz, size[:, i])
+                if not H.all():
+                    continue
+                relative = std / H
                 middle = float(np.median(std)), float(np.median(relative))
                 out.append(BandError(sensor.name, level, unit, low, high, *middle))
     return out

@@ -14,6 +14,7 @@ from samii_rig.rig.load import parse, read_text, tables
 from samii_rig.rig.schema import Rig
 from samii_rig.run.catalogue import kinds as kinds
 from samii_rig.run.catalogue import shipped as shipped
+from samii_rig.run.outputs import completed
 from samii_rig.run.plan import Experiment, Plan
 from samii_rig.run.plugins import checked_plan
 
@@ -80,10 +81,10 @@ def origin(experiment: object) -> str:
 
 
 def plan_of(experiment: Experiment, rig: Rig) -> Plan:
-    """The plan of an experiment for this rig.
+    """The plan of an experiment for this rig, with an output for each of its actuators.
 
     InputError if the rig cannot be asked this, or if what the experiment gives is no plan.
     """
     who = origin(experiment)
     with asked(who, "plan()"):
-        return checked_plan(experiment.plan(rig), rig, who)
+        return completed(checked_plan(experiment.plan(rig), rig, who), rig)

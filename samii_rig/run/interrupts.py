@@ -10,6 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType, TracebackType
 
+from samii_rig.safety.gate import Gate
+
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
@@ -54,12 +56,21 @@ def _called_back(frame: FrameType | None) -> bool:
     return False
 
 
+class Hung(BaseException):
+    """The actuator kept the gate waiting, and a person has asked again to end that.
+
+    No Exception: a driver that tries once more on an error of its own must not take this for one.
+    """
+
+
 class Interrupts:
     """While this context is open, SIGINT, SIGTERM and SIGHUP set `reason` instead of killing.
 
-    A second signal, for a program that hangs in a device and never looks at the flag,
-    raises KeyboardInterrupt, but not again within `PAUSE`: of a key that is held down one press
-    counts, or no line of the ending would ever be reached. Once `ending` is set (the output is at
+    A program that works has looked at the flag, and ended, long before `PAUSE` is over, so that
+    nothing is raised where a command is judged and sent. A signal after that is for one that hangs
+    in a device: it raises KeyboardInterrupt, or `Hung` in the gate, whose actuator is then what
+    hangs. Not again within `PAUSE`: of a key that is held down one press counts, or no line of the
+    ending would ever be reached. Once `ending` is set (the output is at
     zero and only the recording is being closed) further signals are ignored. `give_up` is for
     work in between that can be left out: the next signal raises KeyboardInterrupt, the rest are
     ignored. Only Python's main thread may handle signals; in any other this does nothing.
@@ -109,10 +120,22 @@ class Interrupts:
         if self._optional:
             self.ending = True
             raise KeyboardInterrupt(name)
-        if self.reason:
-            now = time.monotonic()
-            if now < self._deaf_until:
-                return
-            self._deaf_until = now + PAUSE
+        now = time.monotonic()
+        if self.reason and now < self._deaf_until:
+            return
+        self._deaf_until = now + PAUSE
+        if not self.reason:
+            self.reason = f"{name} (Ctrl-C)" if number == signal.SIGINT else name
+        elif _in_gate(frame):
+            raise Hung(f"the actuator did not return; {name} came again after {PAUSE:g} s")
+        else:
             raise KeyboardInterrupt(name)
-        self.reason = f"{name} (Ctrl-C)" if number == signal.SIGINT else name
+
+
+def _in_gate(frame: FrameType | None) -> bool:
+    """Whether the gate is at work, or waits for its actuator."""
+    while frame is not None:
+        if frame.f_globals.get("__name__") == Gate.__module__:
+            return True
+        frame = frame.f_back
+    return False

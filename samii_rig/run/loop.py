@@ -22,6 +22,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run.dwell import Reference, Watch
 from samii_rig.run.ending import Status, Zero, attempt, with_troubles
 from samii_rig.run.interrupts import Interrupts
+from samii_rig.run.outputs import columns, completed, plan_limits
 from samii_rig.run.pace import COUNTS_AS_LATE, LoopSettings, choose_ahead, choose_tick
 from samii_rig.run.plan import Plan
 from samii_rig.run.progress import Progress, nearer
@@ -29,7 +30,6 @@ from samii_rig.run.sink import Collector, QueuedSink, Sink, pair_clocks
 from samii_rig.safety.gate import Gate, GateEvent
 from samii_rig.safety.judgement import State
 from samii_rig.safety.latest import CLOCK_DRIFT
-from samii_rig.safety.limits import gate_limits
 from samii_rig.types import Quality, SampleBlock, Segment, StopRecord
 
 FIRST_SAMPLE = 1.0  # s to wait for the device's first sample
@@ -100,6 +100,7 @@ class _Run:
         alive: Callable[[], bool] | None,
         settings: LoopSettings,
     ) -> None:
+        plan = completed(plan, rig)
         self.plan, self.rig, self.device, self.settings = plan, rig, device, settings
         self.progress, self.alive = progress, alive
         self.clock, self.sensor = device.clock, device.sensor
@@ -111,11 +112,9 @@ class _Run:
         self.collector = Collector(
             rig, plan, self.reference, self.sensor.channels, max(1, round(GATHER * plan.rate_hz))
         )
-        limits = gate_limits(
-            rig, plan.actuator, plan.kp, plan.centring_sensor, settings.heartbeat_age
-        )
+        limits = plan_limits(plan, rig, settings.heartbeat_age)
         self.gate = Gate(device.actuator, limits, self.sensor.channels, self._log)
-        self.zero = Zero(device, limits.output)
+        self.zero = Zero(device, *(one.output for one in limits))
         self.watch = Watch(self.reference, self.sensor.channels, plan.actuator)
         # Last: it starts a thread.
         self.queued = None if simulated else QueuedSink(sink)
@@ -306,12 +305,17 @@ class _Run:
         n = upto - self.sent
         if n <= 0:
             return
-        u, theta_ref = np.zeros(n), np.full(n, self.reference.theta_ref[-1])
         part = slice(self.sent, min(upto, len(self.reference.u)))
-        if part.start < part.stop:
-            u[: part.stop - part.start] = self.reference.u[part]
-            theta_ref[: part.stop - part.start] = self.reference.theta_ref[part]
-        self.gate.write(CommandBlock(self.start + self.sent, u, theta_ref), self.clock.now())
+        blocks = []
+        for of_u, of_ref in zip(
+            columns(self.reference.u).T, columns(self.reference.theta_ref).T, strict=True
+        ):
+            u, theta_ref = np.zeros(n), np.full(n, of_ref[-1])
+            if part.start < part.stop:
+                u[: part.stop - part.start] = of_u[part]
+                theta_ref[: part.stop - part.start] = of_ref[part]
+            blocks.append(CommandBlock(self.start + self.sent, u, theta_ref))
+        self.gate.write(tuple(blocks), self.clock.now())
         self.sent = upto
 
     def _report_segments(self) -> None:
@@ -323,7 +327,16 @@ class _Run:
             begin = self.start + self.reference.begin(self.done)
             first, last = s.recorded or (0, len(s.u))
             self.sink.segment(
-                Segment(s.name, s.kind, begin + first, begin + last, s.level, s.unit, s.repeat)
+                Segment(
+                    s.name,
+                    s.kind,
+                    begin + first,
+                    begin + last,
+                    s.level,
+                    s.unit,
+                    s.repeat,
+                    s.excited,
+                )
             )
             self.done += 1
 

@@ -41,13 +41,15 @@ class Dwell:
 class PlannedSegment:
     """One thing to do: a reference and what it is called in the recording (see `Segment`).
 
-    u, theta_ref : (n,) at the rig's rate, lead-in and ring-down included.
+    u, theta_ref : (n,) at the rig's rate, lead-in and ring-down included; (n, k) of a plan with
+        k outputs, in the order of `Plan.outputs`.
     band_hz : where the excitation has its energy.
     frequency : (n,) Hz at each sample, NaN at rest, inf where the whole band is driven at
         once; for the progress display.
     dwell : the part that may be left early, None for a segment that is done as it is.
     recorded : the samples [start, stop) of u that the recording's segment holds, None for
         all; what is outside (ramps, settling) is recorded too, but belongs to no segment.
+    excited : actuators that it drives, of a plan with several outputs; the others rest.
     """
 
     name: str
@@ -61,6 +63,7 @@ class PlannedSegment:
     frequency: Float
     recorded: tuple[int, int] | None = None
     dwell: Dwell | None = None
+    excited: tuple[str, ...] = ()
 
     def shortened(self, leave: int) -> PlannedSegment:
         """As it is when its dwell is left at sample `leave`, and cannot be left any more."""
@@ -78,8 +81,20 @@ class PlannedSegment:
 
 
 @dataclass(frozen=True, slots=True)
+class Output:
+    """One output of a plan and the loop on it: v = u + kp (theta_ref - theta)."""
+
+    actuator: str
+    kp: float
+    centring_sensor: str
+
+
+@dataclass(frozen=True, slots=True)
 class Plan:
-    """All that a run will do, sample by sample, before anything moves."""
+    """All that a run will do, sample by sample, before anything moves.
+
+    actuator, kp, centring_sensor : of the first output. beside : the outputs after it.
+    """
 
     experiment: str
     rate_hz: float
@@ -88,6 +103,29 @@ class Plan:
     centring_sensor: str
     segments: tuple[PlannedSegment, ...]
     seed: int
+    beside: tuple[Output, ...] = ()
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """All outputs, in the order of the columns of a segment's u."""
+        return (Output(self.actuator, self.kp, self.centring_sensor), *self.beside)
+
+    def only(self, place: int) -> Plan:
+        """What it asks of one of its outputs, as a plan with that output alone."""
+        if not self.beside:
+            return self
+        one = self.outputs[place]
+        segments = tuple(
+            replace(s, u=s.u[:, place], theta_ref=s.theta_ref[:, place]) for s in self.segments
+        )
+        return replace(
+            self,
+            actuator=one.actuator,
+            kp=one.kp,
+            centring_sensor=one.centring_sensor,
+            segments=segments,
+            beside=(),
+        )
 
     @property
     def duration(self) -> float:

@@ -16,7 +16,8 @@ from samii_rig.errors import DeviceError, GateError, SamiiRigError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.check import Check
 from samii_rig.run.session import listen, opened
-from samii_rig.safety.gate import FLIGHT, Gate
+from samii_rig.safety.gate import Gate
+from samii_rig.safety.lane import FLIGHT
 from samii_rig.safety.limits import MAX_AHEAD, gate_limits
 from samii_rig.types import Quality, SampleBlock
 

@@ -25,7 +25,7 @@ from samii_rig.record.writer import RunWriter
 from samii_rig.rig.schema import Rig
 from samii_rig.run.ending import finish
 from samii_rig.run.loop import run
-from samii_rig.run.plan import Plan, PlannedSegment
+from samii_rig.run.plan import Output, Plan, PlannedSegment
 from samii_rig.run.priority import prioritised
 from samii_rig.run.sink import recorded_channels
 from samii_rig.safety.latch import Latch
@@ -133,28 +133,32 @@ def jog(rig: Rig, rig_toml: str, to: float, speed: float, folder: Path) -> Move:
         rest = np.full(round(max(settle, SETTLE) * rig.rate_hz), to)
         theta_ref = np.concatenate([before + (to - before) * way, rest])
         kp = rig.centring.kp
-        move = _moved(rig, rig_toml, device, 0.0 * theta_ref, theta_ref, kp, folder)
+        output = Output(name, kp, sensor)
+        move = _moved(rig, rig_toml, device, 0.0 * theta_ref, theta_ref, output, folder)
         reads = next(x for x in rig.sensor if x.name == sensor)
         blind = NEAR_NOISE * math.hypot(reads.noise_rms, reads.resolution)
         return replace(move, to=to, within=max(NEAR * abs(to - before), blind))
 
 
-def pulse(rig: Rig, rig_toml: str, folder: Path) -> Move:
-    """A short push with the loop open, from which the sign of the encoder is seen."""
-    assert rig.centring is not None
+def pulse(rig: Rig, rig_toml: str, folder: Path, actuator: str) -> Move:
+    """A short push with the actuator's loop open, from which the sign of its encoder is seen."""
+    loop = rig.centring_of(actuator)
+    assert loop is not None
     n = round(PULSE * rig.rate_hz)
-    limits = gate_limits(rig, rig.actuator[0].name, 0.0, rig.centring.sensor)
+    limits = gate_limits(rig, actuator, 0.0, loop.sensor)
     u = PULSE_PART * limits.output.max * np.sin(np.pi * np.arange(n) / n) ** 2
     u = np.concatenate([u, np.zeros(round(SETTLE * rig.rate_hz))])
     with opened(rig) as device:
-        return _moved(rig, rig_toml, device, u, 0.0 * u, 0.0, folder)
+        return _moved(rig, rig_toml, device, u, 0.0 * u, Output(actuator, 0.0, loop.sensor), folder)
 
 
 def still(rig: Rig, rig_toml: str, seconds: float, folder: Path) -> Move:
     """The output live at zero with the loop open: what moves now, the valve's null moves."""
+    assert rig.centring is not None
     u = np.zeros(round(seconds * rig.rate_hz))
+    output = Output(rig.actuator[0].name, 0.0, rig.centring.sensor)
     with opened(rig) as device:
-        return _moved(rig, rig_toml, device, u, u, 0.0, folder)
+        return _moved(rig, rig_toml, device, u, u, output, folder)
 
 
 def _moved(
@@ -163,24 +167,24 @@ def _moved(
     device: OpenRig,
     u: Float,
     theta_ref: Float,
-    kp: float,
+    output: Output,
     folder: Path,
 ) -> Move:
-    assert rig.centring is not None
-    sensor, actuator = rig.centring.sensor, rig.actuator[0]
+    """A move of one output; of a rig with several the others rest in their own loops."""
+    sensor, actuator = output.centring_sensor, output.actuator
     level = float(np.abs(u).max())
     segment = PlannedSegment(
         "move",
         "transient",
         level,
-        actuator.unit,
+        rig.units()[actuator],
         0,
         u,
         theta_ref,
         (0.0, 1.0),
         np.full(len(u), np.nan),
     )
-    plan = Plan("jog", rig.rate_hz, actuator.name, kp, sensor, (segment,), 0)
+    plan = Plan("jog", rig.rate_hz, actuator, output.kp, sensor, (segment,), 0)
     before = float(np.mean(column(listen(device, 0.1), sensor)))
     make_folder("--out", folder)
     path = folder / f"{datetime.now(UTC):%Y-%m-%dT%H-%M-%S-%f}_jog.mcap"

@@ -10,9 +10,11 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from samii_rig.devices.channels import reference_names
 from samii_rig.errors import DeviceError, DiskError
 from samii_rig.rig.schema import Rig
 from samii_rig.run.dwell import Reference
+from samii_rig.run.outputs import columns, completed
 from samii_rig.run.plan import Plan
 from samii_rig.types import Channel, Quality, SampleBlock, Segment
 
@@ -153,11 +155,15 @@ def recorded_channels(rig: Rig, plan: Plan, channels: tuple[Channel, ...]) -> tu
     """
     if any(c.role == "reference" for c in channels):
         return channels
-    units = rig.units()
-    angle = units.get(plan.centring_sensor, "1")
-    u = Channel("u", units[plan.actuator], "reference", description="excitation")
-    theta_ref = Channel("theta_ref", angle, "reference", description="centring set point")
-    return (*channels, u, theta_ref)
+    units, added = rig.units(), list[Channel]()
+    for output in completed(plan, rig).outputs:
+        angle = units.get(output.centring_sensor, "1")
+        u, theta_ref = reference_names(rig, output.actuator)
+        added += [
+            Channel(u, units[output.actuator], "reference", description="excitation"),
+            Channel(theta_ref, angle, "reference", description="centring set point"),
+        ]
+    return (*channels, *added)
 
 
 class Collector:
@@ -204,14 +210,16 @@ class Collector:
         values = np.concatenate([b.values for b in blocks])
         quality = np.concatenate([b.quality for b in blocks])
         if self._added:
-            u, theta_ref = self._reference.u, self._reference.theta_ref
-            n = len(u)
+            pairs = zip(
+                columns(self._reference.u).T, columns(self._reference.theta_ref).T, strict=True
+            )
+            sent = [x for pair in pairs for x in pair]
+            n = len(self._reference.u)
             at = sequence - self._start
             inside = (at >= 0) & (at < n) & (self._start >= 0)
             at = np.where(inside, at, 0)
-            columns = [np.where(inside, x[at], 0.0) for x in (u, theta_ref)]
-            values = np.column_stack([values, *columns])
-            known = np.full((len(sequence), 2), Quality.GOOD, dtype=np.uint8)
+            values = np.column_stack([values, *(np.where(inside, x[at], 0.0) for x in sent)])
+            known = np.full((len(sequence), len(sent)), Quality.GOOD, dtype=np.uint8)
             quality = np.concatenate([quality, known], axis=1)
         time = np.concatenate([b.time for b in blocks])
         return SampleBlock(self.channels, time, sequence, values, quality)

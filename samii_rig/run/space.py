@@ -14,7 +14,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run.plan import Plan
 from samii_rig.types import Channel
 
-REFERENCES = 2  # columns beside the device's own: u and theta_ref
+REFERENCES = 2  # columns beside the device's own, of each actuator: u and theta_ref
 # bytes for what is no sample: rig and experiment file, events, summary, and the last 0.4 s
 BESIDE = 1_000_000
 
@@ -22,7 +22,7 @@ BESIDE = 1_000_000
 def recording_bytes(plan: Plan, rig: Rig) -> int:
     """Most bytes that the recording of a plan takes on the disk: noise does not pack, and every
     dwell may need its full time."""
-    columns = len(rig.units()) + REFERENCES
+    columns = len(rig.units()) + REFERENCES * len(rig.actuator)
     layout = SampleLayout((Channel("", "", "sensor"),) * columns, plan.rate_hz)
     return math.ceil(plan.duration * plan.rate_hz) * (layout.record.itemsize + INDEX_BYTES) + BESIDE
 

@@ -1,22 +1,21 @@
-"""The safety gate: the one way from any intent to the actuator.
+"""The safety gate: the one way from any intent to the actuators.
 
-`judgement` decides, `Gate` alone holds the actuator and does what was decided, nothing
-else. Every way out but RUNNING's "go on" ends with the output at zero. The gate knows no
+`judgement` decides, `Gate` alone holds the actuators and does what was decided, nothing
+else. Every way out but RUNNING's "go on" ends with all outputs at zero. The gate knows no
 experiment and no estimator, only limits, samples and requests.
+
+Several outputs of one device are one state: each is judged by itself (`lane.Lane`), all are let
+through or none, and what is wrong with one ends all at zero.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import numpy as np
-
-from samii_rig.devices.protocols import Actuator, CommandBlock
+from samii_rig.devices.protocols import Actuator, Actuators, Alone, CommandBlock
 from samii_rig.errors import GateError
-from samii_rig.safety.agreement import Followed, apart
 from samii_rig.safety.judgement import (
     Act,
     Arm,
@@ -29,14 +28,13 @@ from samii_rig.safety.judgement import (
     State,
     Stop,
     Write,
-    decide,
+    decide_all,
 )
-from samii_rig.safety.latest import Latest, observe
+from samii_rig.safety.lane import Lane
+from samii_rig.safety.latest import Latest
 from samii_rig.safety.limits import GateLimits
-from samii_rig.safety.readback import Places, Sent, stray
+from samii_rig.safety.readback import Sent
 from samii_rig.types import Channel, SampleBlock
-
-FLIGHT = 0.05  # s that a sample may take from the device to here
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,17 +47,19 @@ class GateEvent:
 
 
 class Gate:
-    """Holds the actuator and does what `decide` says.
+    """Holds the actuators and does what `decide_all` says.
 
     Parameters
     ----------
     actuator : driven by nobody else from here on.
-    channels : of the device's samples; GateError if one that the limits need is not there.
+    limits : of its output; of several, of each in the device's own order.
+    channels : of the device's samples; GateError if one that the limits need is not there, or if
+        the limits are not those of all its outputs.
     log : gets every decision that changes the state or refuses, after it was carried out.
         (Commands that pass are in the recording themselves.)
 
     Every method takes `now`, ns on the host's clock. Those that ask raise GateError when
-    refused, with the output already at zero.
+    refused, with all outputs already at zero.
 
     FAULT is latched as long as this object lives; `samii_rig.safety.latch` carries it on to the
     next run.
@@ -67,30 +67,23 @@ class Gate:
 
     def __init__(
         self,
-        actuator: Actuator,
-        limits: GateLimits,
+        actuator: Actuator | Actuators,
+        limits: GateLimits | Sequence[GateLimits],
         channels: tuple[Channel, ...],
         log: Callable[[GateEvent], None],
     ) -> None:
-        names = [c.name for c in channels]
-        for needed in limits.channels:
-            if needed.channel not in names:
-                raise GateError(
-                    f"the device reports no channel {needed.channel}, which the gate needs; "
-                    f"it has {', '.join(names)}"
-                )
-        self._actuator, self._limits, self._log = actuator, limits, log
-        self._columns = np.array([names.index(c.channel) for c in limits.channels])
-        self._rates = tuple(
-            i
-            for i, c in enumerate(limits.channels)
-            if math.isfinite(c.max_rate) or c.channel == limits.centring_sensor
-        )
-        self._places = Places.among(channels, limits.output.channel, limits.centring_sensor)
-        self._pairs = [(names.index(a.sensor), names.index(a.other)) for a in limits.agreements]
-        self._followed = [Followed() for _ in limits.agreements]
-        self._sent = Sent()
-        self._latest = Latest.nothing(len(self._columns))
+        each = (limits,) if isinstance(limits, GateLimits) else tuple(limits)
+        self._lanes = tuple(Lane(one, channels, i) for i, one in enumerate(each))
+        self._actuator = actuator if isinstance(actuator, Actuators) else Alone(actuator)
+        judged = tuple(lane.name for lane in self._lanes)
+        if len(self._actuator.names) != len(judged) or (
+            len(judged) > 1 and self._actuator.names != judged
+        ):
+            raise GateError(
+                f"the device drives {', '.join(self._actuator.names)}, and the limits are those "
+                f"of {', '.join(judged)}; expected the same outputs in the same order"
+            )
+        self._log = log
         self._state = State.SAFE
         self.fault = ""
 
@@ -99,63 +92,60 @@ class Gate:
         """Where the gate stands."""
         return self._state
 
+    @property
+    def _latest(self) -> Latest:
+        return self._lanes[0].latest
+
+    @property
+    def _sent(self) -> Sent:
+        return self._lanes[0].sent
+
     def beat(self, now: int) -> None:
         """A sign of life from the operator's client."""
-        self._latest = replace(self._latest, heartbeat=now)
+        for lane in self._lanes:
+            lane.beat(now)
 
     def arm(self, now: int) -> None:
         """Hand the device its limits and be ready."""
-        self._ask(Arm(self._actuator.deadman), now)
+        self._ask(self._alike(Arm(self._actuator.deadman)), now)
 
     def start(self, now: int) -> None:
         """Let commands through from now on."""
-        self._ask(Start(), now)
+        self._ask(self._alike(Start()), now)
 
     def observe(self, block: SampleBlock, now: int) -> None:
         """Take in all samples that arrived, perhaps none, and judge them."""
         with self._fault_on_error():
-            latest = observe(self._latest, block, self._columns, self._rates, now)
-            if len(block):  # nothing new takes nothing back
-                strayed = stray(self._sent, block, self._places, self._limits.kp)
-                latest = replace(latest, stray=strayed, apart=self._apart(block))
-            self._latest = latest
-            self._sent = self._sent.after(latest.sequence)
-        self._ask(Check(), now)
+            for lane in self._lanes:
+                lane.observe(block, now)
+        self._ask(self._alike(Check()), now)
 
-    def write(self, block: CommandBlock, now: int) -> None:
-        """Send a reference."""
-        self._ask(Write(block, self._sent), now)
+    def write(self, block: CommandBlock | tuple[CommandBlock, ...], now: int) -> None:
+        """Send a reference; of several outputs a block each, of the same samples."""
+        blocks = (block,) if isinstance(block, CommandBlock) else block
+        # One block too few or too many is for the judgement to refuse.
+        sent = [lane.sent for lane in self._lanes] + [Sent()] * len(blocks)
+        self._ask(tuple(Write(b, s) for b, s in zip(blocks, sent, strict=False)), now)
 
     def stop(self, reason: str, now: int) -> None:
         """End at zero; allowed at any time, more than once."""
-        self._ask(Stop(reason), now)
+        self._ask(self._alike(Stop(reason)), now)
 
     def fail(self, reason: str, now: int) -> None:
         """End at zero and in FAULT; allowed at any time."""
-        self._ask(Fail(reason), now)
+        self._ask(self._alike(Fail(reason)), now)
 
     def clear(self, person: str, reason: str, now: int) -> None:
         """Leave FAULT on a person's word."""
-        self._ask(Clear(person, reason), now)
+        self._ask(self._alike(Clear(person, reason)), now)
 
     def margin(self) -> tuple[str, float]:
         """The channel nearest to its limit in the newest block, and 1 - |value|/limit."""
-        used = [
-            (p / c.max, c.channel)
-            for p, c in zip(self._latest.peak, self._limits.channels, strict=True)
-        ]
-        worst, name = max(used)
+        worst, name = max(lane.nearest() for lane in self._lanes)
         return name, 1.0 - worst
 
-    def _apart(self, block: SampleBlock) -> tuple[float, ...]:
-        found = [
-            apart(a, columns, before, block)
-            for a, columns, before in zip(
-                self._limits.agreements, self._pairs, self._followed, strict=True
-            )
-        ]
-        self._followed = [followed for followed, _ in found]
-        return tuple(way for _, way in found)
+    def _alike(self, request: Request) -> tuple[Request, ...]:
+        return (request,) * len(self._lanes)
 
     @contextmanager
     def _fault_on_error(self) -> Iterator[None]:
@@ -168,46 +158,40 @@ class Gate:
             self._zero()
             raise
 
-    def _ask(self, request: Request, now: int) -> None:
+    def _ask(self, requests: tuple[Request, ...], now: int) -> None:
         before = self._state
         with self._fault_on_error():
-            decision = decide(before, request, self._latest, self._limits, now)
-            self._do(request, decision)
+            known = [(lane.latest, lane.limits) for lane in self._lanes]
+            decision = decide_all(before, requests, known, now)
+            self._do(requests, decision)
         self._state = decision.state
         if before is State.FAULT and decision.state is State.SAFE:
             # Only a clear does this. Start afresh, so that arming needs new samples.
-            beat = self._latest.heartbeat
-            self._latest = replace(Latest.nothing(len(self._columns)), heartbeat=beat)
-            self._followed = [Followed() for _ in self._followed]
+            for lane in self._lanes:
+                lane.afresh()
             self.fault = ""
         elif before is not State.FAULT and decision.state is State.FAULT:
             self.fault = decision.reason
         if not decision.accepted or decision.state is not before:
-            self._log(GateEvent(now, type(request).__name__.lower(), decision))
+            what = type(requests[0]).__name__.lower() if requests else "write"
+            self._log(GateEvent(now, what, decision))
         if not decision.accepted:
             raise GateError(decision.reason)
 
-    def _do(self, request: Request, decision: Decision) -> None:
+    def _do(self, requests: tuple[Request, ...], decision: Decision) -> None:
         if decision.act is Act.ZERO:
             self._zero()
         elif decision.act is Act.CONFIGURE:
-            self._actuator.configure(self._limits.device_loop())
-            # From here on the device must change nothing by itself, but for what was under way.
-            first = self._latest.sequence + 1 + math.ceil(FLIGHT * self._limits.rate_hz)
-            self._latest = replace(self._latest, first=first)
-        elif decision.act is Act.WRITE and isinstance(request, Write):
-            self._send(request.block)
+            self._actuator.configure(tuple(lane.limits.device_loop() for lane in self._lanes))
+            for lane in self._lanes:
+                lane.configured()
+        elif decision.act is Act.WRITE:
+            self._send(tuple(r.block for r in requests if isinstance(r, Write)))
 
-    def _send(self, block: CommandBlock) -> None:
-        self._actuator.write(block)
-        self._sent = self._sent.then(block)
-        self._latest = replace(
-            self._latest,
-            first=min(block.first, self._latest.first),
-            next=block.first + len(block),
-            u=float(block.u[-1]),
-            theta_ref=float(block.theta_ref[-1]),
-        )
+    def _send(self, blocks: tuple[CommandBlock, ...]) -> None:
+        self._actuator.write(blocks)
+        for lane, block in zip(self._lanes, blocks, strict=True):
+            lane.wrote(block)
 
     def _zero(self) -> None:
         try:
@@ -215,5 +199,5 @@ class Gate:
         finally:
             # Twice costs nothing and covers a first call that a second Ctrl-C cut short.
             self._actuator.zero()
-            self._sent = Sent()
-            self._latest = replace(self._latest, first=-1, next=-1, u=0.0, theta_ref=0.0)
+            for lane in self._lanes:
+                lane.zeroed()

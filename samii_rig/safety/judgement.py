@@ -10,6 +10,7 @@ device, so the whole input space can be tested, and mutants of them killed.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
@@ -166,6 +167,38 @@ def decide(
         or command_violation(request.block, latest, limits, request.sent)
         or Decision(state, Act.WRITE, True, "write")
     )
+
+
+def decide_all(
+    state: State,
+    requests: Sequence[Request],
+    known: Sequence[tuple[Latest, GateLimits]],
+    now: int,
+) -> Decision:
+    """What may happen to all outputs of a device: each is judged by itself, and what is refused
+    to one is refused to all.
+
+    requests, known : one of each output; every request of the same kind. A reference comes whole,
+    a block of the same samples for every output, or is refused.
+    """
+    if len(requests) != len(known):
+        return _fault(
+            "shape", f"a reference for {len(requests)} outputs; expected {len(known)} of them"
+        )
+    spans = {(len(r.block), r.block.first) for r in requests if isinstance(r, Write)}
+    if len(spans) > 1:
+        return _fault("shape", "the references of the outputs are not of the same samples")
+    decisions = [
+        decide(state, request, latest, limits, now)
+        for request, (latest, limits) in zip(requests, known, strict=True)
+    ]
+    for decision, (_, limits) in zip(decisions, known, strict=True):
+        if not decision.accepted:
+            name = limits.output.channel
+            if len(known) == 1 or name in decision.reason:
+                return decision
+            return replace(decision, reason=f"{name}: {decision.reason}")
+    return decisions[0]
 
 
 def violation(latest: Latest, limits: GateLimits, now: int) -> Decision | None:

@@ -168,9 +168,17 @@ def find_actuator(rig: Rig, name: str, where: str) -> ActuatorSpec:
 
 
 def gate_limits(
-    rig: Rig, actuator: str, kp: float, sensor: str, heartbeat_age: float = math.inf
+    rig: Rig,
+    actuator: str,
+    kp: float,
+    sensor: str,
+    heartbeat_age: float = math.inf,
+    beside: tuple[str, ...] = (),
 ) -> GateLimits:
     """The limits of a rig file for a run that drives `actuator` and centres by `sensor`.
+
+    beside : actuators that are driven too. An angle that they turn as well says nothing of this
+    one alone: it is judged by its noise, and no loop may centre by it.
 
     The feedback loops of the rig on that actuator are part of the run.
     Several limits on one channel: the tightest of each number holds. The ends of the
@@ -193,27 +201,16 @@ def gate_limits(
         Addition(f, reach(f, rig.rate_hz).slew) for f in rig.feedback if f.actuator == actuator
     )
     agreements = tuple(
-        _agreement(rig, a) for a in rig.agreement if a.over is None or a.other == actuator
+        _agreement(rig, a, beside) for a in rig.agreement if a.over is None or a.other == actuator
     )
     compared = {name for a in agreements for name in (a.sensor, a.other)}
-    sensors = []
-    for s in rig.sensor:
-        limited = s.name in compared or any(True for _ in rig.limits_on(s.name))
-        read = [a.loop.name for a in feedback if a.loop.sensor == s.name]
-        if limited or read or (kp != 0.0 and s.name == sensor):
-            reason = "the loop that centres the joint reads it"
-            if read:
-                reason = f"the feedback {read[0]} reads it"
-            c = _channel(rig, s.name, s.unit, math.inf, reason, s.stale_after, 0.0)
-            stuck = _stuck(rig, spec, s, c.max)
-            _refuse_blind(rig, spec, s, stuck, centring=kp != 0.0 and s.name == sensor, read=read)
-            sensors.append(replace(c, stuck=stuck))
+    sensors = _sensor_limits(rig, spec, kp, sensor, beside, feedback, compared)
     sensors += [
         _channel(rig, m.name, m.unit, math.inf, "", m.stale_after, 0.0)
         for m in rig.monitor
         if m.name in compared or any(True for _ in rig.limits_on(m.name))
     ]
-    turning = sum(_angle_gain(rig, actuator, s) for s in rig.sensor if s.name == sensor)
+    turning = sum(_own_gain(rig, actuator, beside, s) for s in rig.sensor if s.name == sensor)
     readback = max(READBACK_STEPS * spec.resolution, READBACK_PART * output.max)
     return GateLimits(
         rig.rate_hz,
@@ -229,24 +226,52 @@ def gate_limits(
     )
 
 
-def _agreement(rig: Rig, a: schema.Agreement) -> Agreement:
+def _sensor_limits(
+    rig: Rig,
+    spec: ActuatorSpec,
+    kp: float,
+    sensor: str,
+    beside: tuple[str, ...],
+    feedback: tuple[Addition, ...],
+    compared: set[str],
+) -> list[ChannelLimit]:
+    """Of each sensor that has a limit, is compared with another, or is read by a loop."""
+    sensors = []
+    for s in rig.sensor:
+        limited = s.name in compared or any(True for _ in rig.limits_on(s.name))
+        read = [a.loop.name for a in feedback if a.loop.sensor == s.name]
+        if limited or read or (kp != 0.0 and s.name == sensor):
+            reason = "the loop that centres the joint reads it"
+            if read:
+                reason = f"the feedback {read[0]} reads it"
+            c = _channel(rig, s.name, s.unit, math.inf, reason, s.stale_after, 0.0)
+            gain = _own_gain(rig, spec.name, beside, s)
+            stuck = _stuck(spec, s, c.max, gain)
+            centring = kp != 0.0 and s.name == sensor
+            _refuse_blind(rig, spec, s, stuck, gain, centring=centring, read=read)
+            sensors.append(replace(c, stuck=stuck))
+    return sensors
+
+
+def _agreement(rig: Rig, a: schema.Agreement, beside: tuple[str, ...]) -> Agreement:
     unit = rig.units()[a.sensor]
     if a.over is None:
         return Agreement(a.sensor, a.other, unit, a.max, a.reason)
     (sensor,) = (s for s in rig.sensor if s.name == a.sensor)
-    gain = _angle_gain(rig, a.other, sensor)
+    gain = _own_gain(rig, a.other, beside, sensor)
     if gain == 0.0:
-        expected = f"an angle that {a.other} turns through an angular velocity source"
+        alone = " alone" if beside else ""
+        expected = f"an angle that {a.other}{alone} turns through an angular velocity source"
         raise InputError(rig.name, "agreement.sensor", a.sensor, expected)
     return Agreement(a.sensor, a.other, unit, a.max, a.reason, gain, a.over)
 
 
-def _stuck(rig: Rig, actuator: ActuatorSpec, sensor: Sensor, most: float) -> Stuck:
-    """What the sensor must show of a command, from the chain's statics and its own noise."""
+def _stuck(actuator: ActuatorSpec, sensor: Sensor, most: float, gain: float) -> Stuck:
+    """What the sensor must show of a command, from the chain's statics (gain, see `_angle_gain`)
+    and its own noise."""
     noisy = sensor.noise_rms > NOISY * sensor.resolution
     noise_after = NOISE_AFTER if noisy else math.inf
     effort = NOISE_STEPS * actuator.resolution
-    gain = _angle_gain(rig, actuator.name, sensor)
     floor = STUCK_PART * most if math.isfinite(most) else 0.0
     travel = max(STUCK_STEPS * sensor.resolution, floor)
     if gain == 0.0 or travel == 0.0:
@@ -260,6 +285,7 @@ def _refuse_blind(
     actuator: ActuatorSpec,
     sensor: Sensor,
     stuck: Stuck,
+    gain: float,
     *,
     centring: bool,
     read: list[str],
@@ -271,7 +297,7 @@ def _refuse_blind(
     or a force turns a joint by what its inertia and springs let it. A feedback is held by its
     `max` meanwhile, so its sensor's missing noise is a sign that comes in time.
     """
-    where, follows = f"sensor[{sensor.name}]", _angle_gain(rig, actuator.name, sensor) != 0.0
+    where, follows = f"sensor[{sensor.name}]", gain != 0.0
     if centring and not follows:
         expected = (
             f"an angle that {actuator.name} turns through an angular velocity source, or a "
@@ -308,6 +334,13 @@ def _angle_gain(rig: Rig, actuator: str, sensor: Sensor) -> float:
                 return speed[sensor.after] - speed[sensor.against]
             return speed[sensor.after] if clamped else 0.0
     return 0.0
+
+
+def _own_gain(rig: Rig, actuator: str, beside: tuple[str, ...], sensor: Sensor) -> float:
+    """The same, 0 too where another output turns the sensor: it may undo what this one does."""
+    if any(_angle_gain(rig, other, sensor) != 0.0 for other in beside):
+        return 0.0
+    return _angle_gain(rig, actuator, sensor)
 
 
 def _speeds(rig: Rig, actuator: str) -> dict[str, float]:

@@ -67,12 +67,16 @@ class Places:
     theta_ref: int | None
 
     @classmethod
-    def among(cls, channels: tuple[Channel, ...], output: str, sensor: str) -> Places:
-        """ValueError if the output is not there."""
+    def among(
+        cls, channels: tuple[Channel, ...], output: str, sensor: str, place: int = 0
+    ) -> Places:
+        """ValueError if the output is not there. place : of it among the device's outputs."""
         names = [c.name for c in channels]
         references = [i for i, c in enumerate(channels) if c.role == "reference"]
-        # Of a device that reports references, the first two are u and theta_ref.
-        u, theta_ref = references[:2] if len(references) > 1 else (None, None)
+        # Of a device that reports references, the first two are u and theta_ref of its first
+        # output, the next two those of the next.
+        own = references[2 * place : 2 * place + 2]
+        u, theta_ref = own if len(own) > 1 else (None, None)
         theta = names.index(sensor) if sensor in names else None
         return cls(names.index(output), theta, u, theta_ref)
 

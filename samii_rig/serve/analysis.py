@@ -8,7 +8,6 @@ segment that goes on, where its reference has come down to rest by itself.
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 import time
@@ -16,7 +15,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from samii_rig.errors import RecordingError
 from samii_rig.serve.job import LOG, RESPONSES, SO_FAR, Job
+from samii_rig.serve.shared import get
 
 CERTAIN = 0.95
 IN_A_ROW = 2
@@ -30,7 +31,7 @@ class Analysis:
         self._recordings = recordings
         self._job: Job | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._read: dict[str, tuple[int, dict[str, Any]]] = {}
+        self._read: tuple[int, dict[str, Any]] = (0, {})
         self._answers: list[str] = []
 
     def turn(self, job: Job | None) -> None:
@@ -48,9 +49,7 @@ class Analysis:
                     stdout=log,
                     stderr=log,
                 )
-        new = self._newer(SO_FAR)
-        if new is not None:
-            self._answers.append(_answer(new))
+        self._look()
 
     def close(self) -> None:
         """The run is over, or the service ends."""
@@ -60,7 +59,7 @@ class Analysis:
             self._process.kill()
             self._process.wait()
         self._process, self._job = None, None
-        self._read, self._answers = {}, []
+        self._read, self._answers = (0, {}), []
 
     @property
     def certain(self) -> str:
@@ -71,16 +70,16 @@ class Analysis:
     def state(self) -> dict[str, Any]:
         """What is told to everybody who looks: a word that changes with the responses and their
         age in s, the diagnosis with its own, and whether the analyst is gone."""
-        diagnosis = dict(self._read.get(SO_FAR, (0, {}))[1])
+        diagnosis = dict(self._read[1])
         if diagnosis:
-            diagnosis["age_s"] = round(time.time() - diagnosis["time"], 1)
+            diagnosis["age_s"] = _age(diagnosis["time"])
             diagnosis["certain"] = self.certain
-            diagnosis["next_toml"] = bool(diagnosis["next_toml"])
+            diagnosis["next_toml"] = bool(diagnosis.get("next_toml"))
         seen, age = 0, 0.0
         if self._job is not None:
             with suppress(OSError):
                 seen = (self._job.folder / RESPONSES).stat().st_mtime_ns
-                age = round(time.time() - 1e-9 * seen, 1)
+                age = _age(1e-9 * seen)
         return {
             "responses": str(seen),
             "responses_age_s": age,
@@ -88,17 +87,22 @@ class Analysis:
             "failed": self._process is not None and self._process.poll() is not None,
         }
 
-    def _newer(self, name: str) -> dict[str, Any] | None:
-        """What a file of the analyst says, if it says something new."""
+    def _look(self) -> None:
+        """Take in what the analyst says, if it says something new that can be read."""
         assert self._job is not None
-        path = self._job.folder / name
-        with suppress(OSError, ValueError):
+        path = self._job.folder / SO_FAR
+        with suppress(OSError, RecordingError, LookupError, TypeError, ValueError):
             written = path.stat().st_mtime_ns
-            if written != self._read.get(name, (0, {}))[0]:
-                found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-                self._read[name] = (written, found)
-                return found
-        return None
+            if written != self._read[0]:
+                found = get(path)
+                answer = _answer(found)
+                self._read = (written, {**found, "time": float(found["time"])})
+                self._answers.append(answer)
+
+
+def _age(written: float) -> float:
+    """s since then; 0 where the clock was set back meanwhile."""
+    return max(0.0, round(time.time() - written, 1))
 
 
 def _answer(found: dict[str, Any]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import os
 import resource
 import tempfile
 from base64 import b64encode
@@ -29,6 +30,7 @@ from samii_rig.workers import ends_with_its_parent
 WORKERS = 2
 WITHIN = 120.0  # s that a piece of work may take
 MEMORY = 8 << 30  # bytes of address space of one of them
+NICE = 5  # steps behind the loop, the service and the stop, as the analyst is
 MOST_POINTS = 4000  # of one curve in one answer
 MOST_VALUES = 8_000_000  # of samples in one answer: ten channels at 1 kHz for 13 minutes
 
@@ -76,6 +78,7 @@ def _pool() -> ProcessPoolExecutor:
 
 def _begin() -> None:
     ends_with_its_parent()
+    os.nice(NICE)
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
 
 

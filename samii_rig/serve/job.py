@@ -12,7 +12,6 @@ import os
 import re
 import secrets
 import signal
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -23,7 +22,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from samii_rig.errors import GateError, RecordingError
+from samii_rig.serve.shared import get, made, put
 
+NAME = re.compile(r"[^/\0]+\.mcap")  # of a recording, in the folder of all
 ID = re.compile(r"\d{8}T\d{12}-[0-9a-f]{6}")
 REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS = (
     "request.json",
@@ -111,7 +112,7 @@ class Job:
             job = cls(folder)
             job.set(JobState())
             # Last: a folder without it is not a job.
-            _put(folder / REQUEST, asdict(request), durable=True)
+            put(folder / REQUEST, asdict(request), durable=True)
         except OSError as error:
             raise RecordingError(f"{folder} cannot be written: {error.strerror}") from error
         return job
@@ -124,15 +125,33 @@ class Job:
         found = (f for f in jobs.iterdir() if ID.fullmatch(f.name) and (f / REQUEST).is_file())
         return [Job(f) for f in sorted(found, key=lambda f: f.name)]
 
+    def order(self) -> Request:
+        """What was asked for; RecordingError where that cannot be read: it is not to be run."""
+        found = made(Request, self.folder / REQUEST)
+        if found.setup < 0 or not NAME.fullmatch(found.recording):
+            raise RecordingError(f"{self.folder / REQUEST} is not what this version writes")
+        return found
+
     @cached_property
     def request(self) -> Request:
-        """What was asked for."""
-        return Request(**_get(self.folder / REQUEST))
+        """What was asked for, for those who show it."""
+        with suppress(RecordingError):
+            return self.order()
+        return Request("unreadable", f"{self.id}.mcap", diagnosis=False)
 
     @property
     def written(self) -> JobState:
-        """How it stands, as was written last."""
-        return JobState(**_get(self.folder / STATE))
+        """How it stands, as was written last. One that cannot be read may still drive the rig."""
+        try:
+            return made(JobState, self.folder / STATE)
+        except RecordingError as error:
+            return JobState("running", error=str(error))
+
+    def _holder(self) -> int:
+        """The number of the process that runs it, as that wrote it into the lock; 0 for none."""
+        with suppress(OSError, ValueError):
+            return max(0, int((self.folder / LOCK).read_bytes()[:20]))
+        return 0
 
     @property
     def state(self) -> JobState:
@@ -148,11 +167,11 @@ class Job:
     def set(self, state: JobState) -> None:
         """Write how it stands, whole or not at all."""
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        _put(self.folder / STATE, {**asdict(state), "time": now}, durable=True)
+        put(self.folder / STATE, {**asdict(state), "time": now}, durable=True)
 
     def tell(self, name: str, data: dict[str, Any]) -> None:
         """Write what is known so far into the file `name`, whole or not at all."""
-        _put(self.folder / name, data, durable=False)
+        put(self.folder / name, data, durable=False)
 
     def alive(self) -> bool:
         """Whether somebody runs it now."""
@@ -191,8 +210,10 @@ class Job:
         if not self.alive():
             return False
         if self._first_to_stop(by) or (self.moving and self._insists()):
-            with suppress(ProcessLookupError, RecordingError):
-                if pid := self.written.pid:
+            pid = self._holder() or self.written.pid
+            # Below 2 it would mean many processes, or the first of all.
+            if pid > 1:
+                with suppress(OSError, OverflowError):
                     os.kill(pid, signal.SIGTERM)
         return True
 
@@ -206,8 +227,10 @@ class Job:
             try:
                 file = os.open(path, how | os.O_EXCL, 0o644)
             except FileExistsError:
-                first = False
-                if len(self.stops()) >= MOST_STOPS:
+                before = self.stops()
+                # What stands there and cannot be read has stopped nobody.
+                first = not before and path.stat().st_size > 0
+                if len(before) >= MOST_STOPS:
                     return False
                 file = os.open(path, how)
             try:
@@ -227,11 +250,8 @@ class Job:
 
     @property
     def moving(self) -> bool:
-        """Whether it may drive the rig now, or soon; one that cannot be read may."""
-        phase: Phase = "running"
-        with suppress(RecordingError):
-            phase = self.written.phase
-        return phase in ("starting", "running") and self.alive()
+        """Whether it may drive the rig now, or soon."""
+        return self.written.phase in ("starting", "running") and self.alive()
 
     def early(self, state: JobState) -> bool:
         """Whether it ended by its own order, and by nothing else that came on the way there."""
@@ -240,14 +260,18 @@ class Job:
     def stops(self) -> list[dict[str, str]]:
         """Who asked for a stop, and when."""
         try:
-            lines = (self.folder / STOPS).read_text(encoding="utf-8").splitlines()
-        except FileNotFoundError:
+            lines = (self.folder / STOPS).read_text("utf-8", "replace").splitlines()
+        except OSError:
             return []
         # Of a full disk the last one may be half.
         found = []
         for line in lines:
-            with suppress(ValueError):
-                found.append(json.loads(line))
+            with suppress(ValueError, TypeError, KeyError, RecursionError):
+                stop = json.loads(line)
+                by, time = str(stop["by"]), datetime.fromisoformat(stop["time"])
+                if time.tzinfo is not None:
+                    by = by.encode("utf-8", "replace").decode()
+                    found.append({"time": stop["time"], "by": by})
         return found
 
 
@@ -256,7 +280,7 @@ def ask_all_to_stop(jobs: Path, by: str) -> bool:
     # The newest first, each at once: what runs is among the last that were asked for.
     stopped = [job.stop(by) for job in reversed(Job.all(jobs))]
     with suppress(OSError):
-        _put(jobs / ASKED, {"by": by}, durable=False)
+        put(jobs / ASKED, {"by": by}, durable=False)
     return any(stopped)
 
 
@@ -271,28 +295,6 @@ def asked_to_stop(jobs: Path) -> str:
     found: dict[str, Any] = {}
     if path.exists():
         with suppress(RecordingError):
-            found = _get(path)
+            found = get(path)
         path.unlink(missing_ok=True)
     return str(found.get("by", ""))
-
-
-def _put(path: Path, data: dict[str, Any], *, durable: bool) -> None:
-    """Whole or not at all, whoever else writes it; `durable` if it is to outlive a power cut."""
-    text = json.dumps(data, allow_nan=False)
-    handle, name = tempfile.mkstemp(dir=path.parent)
-    with os.fdopen(handle, "w", encoding="utf-8") as file:
-        file.write(text)
-        if durable:
-            file.flush()
-            os.fsync(file.fileno())
-    Path(name).replace(path)
-
-
-def _get(path: Path) -> dict[str, Any]:
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{path} cannot be read: {error}") from error
-    if not isinstance(found, dict):
-        raise RecordingError(f"{path} is not what this version writes")
-    return found

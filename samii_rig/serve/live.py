@@ -9,6 +9,7 @@ how many.
 from __future__ import annotations
 
 import json
+import math
 import mmap
 import os
 import struct
@@ -27,6 +28,7 @@ from samii_rig.types import Channel, Float, Int, SampleBlock
 MAGIC = b"SAMIILV1"
 SECONDS = 8.0  # of samples in the ring: what a viewer sees who comes late
 LEAST_ROWS = 1024
+MOST = 2**62  # of a count, so that what is reckoned with it fits numpy's integers
 PAGE = 16384  # bytes for the description and for the progress, each
 # Header: magic, channels, rows, rate; then counts of rows that are whole and that are begun, the
 # service's sign of life in ns of the system's monotonic clock, and whether it knows enough.
@@ -51,7 +53,8 @@ class _Map:
     def __init__(self, data: mmap.mmap) -> None:
         self._data = data
         magic, self.columns, self.rows, self.rate_hz = _HEAD.unpack_from(data, 0)
-        if magic != MAGIC or len(data) < _size(self.columns, self.rows):
+        right = magic == MAGIC and self.rows > 0 and 0.0 < self.rate_hz < math.inf
+        if not right or len(data) < _size(self.columns, self.rows):
             raise RecordingError("the live data are not what this version writes")
         self.sequence: Int = np.frombuffer(data, np.int64, self.rows, _RING)
         begin = _RING + 8 * self.rows
@@ -60,8 +63,8 @@ class _Map:
         ).reshape(self.rows, self.columns)
 
     def count(self, at: int) -> int:
-        """One of the header's counts."""
-        return int(_COUNT.unpack_from(self._data, at)[0])
+        """One of the header's counts; more than any run has is what was damaged."""
+        return min(int(_COUNT.unpack_from(self._data, at)[0]), MOST)
 
     def put_count(self, at: int, value: int) -> None:
         """Write one of them, in one store."""
@@ -73,7 +76,7 @@ class _Map:
             version, length = _TEXT.unpack_from(self._data, at)
             raw = bytes(self._data[at + _TEXT.size : at + _TEXT.size + length])
             if version % 2 == 0 and _TEXT.unpack_from(self._data, at)[0] == version:
-                return raw.decode()
+                return raw.decode("utf-8", "replace")
         return None
 
     def put_text(self, at: int, text: str) -> None:
@@ -153,8 +156,17 @@ class LiveReader:
         except (OSError, ValueError, struct.error) as error:
             raise RecordingError(f"there are no live data at {path}") from error
         self.rate_hz = float(self._map.rate_hz)
-        self.channels: list[dict[str, str]] = json.loads(self._map.text(_DESCRIPTION) or "[]")
+        self.channels: list[dict[str, str]] = self._described(path)
         self._progress: dict[str, Any] = {}
+
+    def _described(self, path: Path) -> list[dict[str, str]]:
+        """The channels, as they were told when it was made."""
+        with suppress(ValueError, TypeError, KeyError, RecursionError):
+            found = json.loads(self._map.text(_DESCRIPTION) or "[]")
+            told = [{key: str(c[key]) for key in ("name", "unit", "role")} for c in found]
+            if len(told) == self._map.columns:
+                return told
+        raise RecordingError(f"{path} does not tell its channels")
 
     @property
     def whole(self) -> int:
@@ -176,8 +188,9 @@ class LiveReader:
         """How far the run is."""
         text = self._map.text(_PROGRESS)
         if text is not None:
-            with suppress(ValueError):
-                self._progress = json.loads(text)
+            with suppress(ValueError, RecursionError):
+                found = json.loads(text)
+                self._progress = found if isinstance(found, dict) else self._progress
         return self._progress
 
     def enough(self) -> None:

@@ -23,9 +23,9 @@ def averages(plan: Plan, segment: int) -> tuple[int, int]:
 
 def planned(job: Job) -> tuple[Setup, str, Plan]:
     """The rig as the run needs it, the experiment's text and its plan; InputError if they are
-    wrong."""
+    wrong, RecordingError if they cannot be read."""
     rig_toml = (job.folder / RIG).read_text(encoding="utf-8")
     rig = parse(Rig, rig_toml, RIG)
     experiment, text = load_experiment(str(job.folder / EXPERIMENT), rig)
-    setup = setups_of(experiment, rig, rig_toml)[job.request.setup]
+    setup = setups_of(experiment, rig, rig_toml)[job.order().setup]
     return setup, text, plan_of(experiment, setup.rig)

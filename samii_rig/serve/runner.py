@@ -41,7 +41,7 @@ class Runner:
     """One run. recordings : the folder in which its recording will lie."""
 
     def __init__(self, job: Job, recordings: Path) -> None:
-        self.job, self.request = job, job.request
+        self.job, self.request = job, job.order()
         self.path = recordings / self.request.recording
         self.state = JobState()
         self.live: LiveWriter | None = None
@@ -204,6 +204,9 @@ def main() -> None:
     """Entry point."""
     folder, recordings, lock = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     os.set_inheritable(lock, False)
+    # Who stops us finds our number here where our state cannot be read.
+    os.ftruncate(lock, 0)
+    os.write(lock, str(os.getpid()).encode())
     try:
         Runner(Job(folder), recordings).go()
     except SamiiRigError as error:

@@ -50,14 +50,13 @@ class Supervisor:
         self.held = ""
         self._forget()
         for job in Job.all(self._jobs):
-            with suppress(RecordingError):
-                phase = job.written.phase
-                if phase not in OVER:
-                    self._open.append(job)
-                else:
-                    self.last = self.plain(job)
-                if phase == "queued":
-                    self.held = "the service was started anew"
+            phase = job.written.phase
+            if phase not in OVER:
+                self._open.append(job)
+            else:
+                self.last = self.plain(job)
+            if phase == "queued":
+                self.held = "the service was started anew"
         self.turn()
 
     @property
@@ -124,9 +123,8 @@ class Supervisor:
     def _forget(self) -> None:
         """Jobs that are over for long are taken away; their recordings stay."""
         for job in Job.all(self._jobs)[:-KEPT]:
-            with suppress(RecordingError):
-                if job.written.phase in OVER:
-                    shutil.rmtree(job.folder, ignore_errors=True)
+            if job.written.phase in OVER:
+                shutil.rmtree(job.folder, ignore_errors=True)
 
     def _free(self, stem: str) -> str:
         """A name that no recording has, nor one that is asked for."""
@@ -225,7 +223,7 @@ class Supervisor:
             job.set(state)
         if state.phase != "cancelled" and state.status != "completed" and not job.early(state):
             self.held = f"{recording}: {state.status or 'refused'}, {state.reason or state.error}"
-        if state.live:
+        if Path(state.live).name == f"{job.id}.live":
             Path(state.live).unlink(missing_ok=True)
         self._later.submit(self._filed, job, state)
 

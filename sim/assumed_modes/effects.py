@@ -17,6 +17,7 @@ from sim.assumed_modes.parts import (
     ANGLE_SOURCES,
     EXTENDED,
     JOINTS,
+    MOTION_SOURCES,
     SOURCES,
     Attachment,
     Lag,
@@ -63,36 +64,56 @@ class Draft:
         return self.run(setup, self.values(strength), run)
 
 
-def _port_names(setup: Setup, after: str | None) -> tuple[str, ...]:
+GIVES = (*JOINTS, *MOTION_SOURCES, "cylinder")  # of an axial chain; the rest of it is rigid
+
+
+def _port_names(setup: Setup, after: str | None, *, jump: bool = True) -> tuple[str, ...]:
     """Names by which the port behind `after` goes: the parts at both of its sides, and the parts
-    without extent next to it."""
+    without extent next to it.
+
+    jump : whether it is a motion that jumps there. Along an axial chain what gives is the same
+    anywhere between two bodies, and what hangs on or holds it anywhere between two that give.
+    """
     order = list(setup.parts)
     at = -1 if after is None else [p.name for p in order].index(after)
     names = []
     for way in (range(at, -1, -1), range(at + 1, len(order))):
         for i in way:
             names.append(order[i].name)
-            if order[i].kind in EXTENDED:
+            ends = setup.motion == "axial" and (order[i].kind in GIVES) != jump
+            if order[i].kind in EXTENDED or ends:
                 break
     return tuple(dict.fromkeys(names))
 
 
-def _ports(setup: Setup) -> list[tuple[str | None, str]]:
+def _hosts(setup: Setup, names: set[str]) -> list[Part]:
+    """Links, beams and masses among `names`."""
+    hosts = [p for p in setup.parts if p.kind in (*EXTENDED, "lumped_mass") and p.name in names]
+    if not hosts:
+        raise LookupError("nothing of this chain moves so")
+    return hosts
+
+
+def _ports(setup: Setup, names: set[str]) -> list[tuple[str | None, str]]:
     """(behind which part, its site) where the chain may give: the base, links' and beams' ends and
-    the joints that are there already."""
+    the joints that are there already, of the parts `names`."""
     out: list[tuple[str | None, str]] = []
     for i, part in enumerate(setup.parts):
         last = i == len(setup.parts) - 1
-        if part.kind in JOINTS or (part.kind in EXTENDED and not last):
+        if part.name not in names:
+            continue
+        if part.kind in (*JOINTS, "cylinder") or (part.kind in EXTENDED and not last):
             out.append((part.name, part.name))
     if setup.base == "clamped" and setup.parts[0].kind == "beam":
         out.append((None, setup.parts[0].name))
+    if not out:
+        raise LookupError("nothing of this chain can give so")
     return out
 
 
-def _place(rng: Rng, setup: Setup) -> tuple[str, float]:
-    """A link, beam or mass at random, and a place on it (m) that moves."""
-    hosts = [p for p in setup.parts if p.kind in (*EXTENDED, "lumped_mass")]
+def _place(rng: Rng, setup: Setup, names: set[str]) -> tuple[str, float]:
+    """A link, beam or mass of `names` at random, and a place on it (m) that moves."""
+    hosts = _hosts(setup, names)
     host = hosts[int(rng.integers(len(hosts)))]
     first = host is setup.parts[0]
     return host.name, float(rng.uniform(0.3 if first else 0.0, 1.0)) * host.values.get("L", 0.0)
@@ -102,7 +123,7 @@ def _at_end(setup: Setup, on: str, x: float) -> tuple[str, ...]:
     """Names of the neighbours that mean the same place, for a place at a link's end."""
     part = setup.part(on)
     if part.kind not in EXTENDED:
-        return _port_names(setup, on)
+        return _port_names(setup, on, jump=False)
     before = [p.name for p in setup.parts][: [p.name for p in setup.parts].index(on)]
     if x >= (1 - NEAR) * part.values["L"]:
         return _port_names(setup, on)
@@ -113,7 +134,7 @@ def _at_end(setup: Setup, on: str, x: float) -> tuple[str, ...]:
 
 def compliance(rng: Rng, setup: Setup) -> Draft:
     """A clamp or joint that gives in rotation."""
-    ports = _ports(setup)
+    ports = _ports(setup, setup.turning())
     after, site = ports[int(rng.integers(len(ports)))]
     loss = float(np.exp(rng.uniform(np.log(3e-4), np.log(8e-3))))  # s, c over k
 
@@ -129,8 +150,8 @@ def compliance(rng: Rng, setup: Setup) -> Draft:
 
 
 def sideways(rng: Rng, setup: Setup) -> Draft:
-    """A support that gives sideways."""
-    ports = _ports(setup)
+    """A support that gives sideways, or what gives along an axial chain."""
+    ports = _ports(setup, setup.shifting())
     after, site = ports[int(rng.integers(len(ports)))]
     loss = float(np.exp(rng.uniform(np.log(3e-4), np.log(8e-3))))
 
@@ -147,9 +168,9 @@ def sideways(rng: Rng, setup: Setup) -> Draft:
 
 def _attached(
     physics: str, kind: str, rng: Rng, setup: Setup, units: dict[str, str],
-    values: Callable[[float], Numbers], start: float, most: float,
+    values: Callable[[float], Numbers], start: float, most: float, *, turns: bool = False,
 ) -> Draft:  # fmt: skip
-    on, x = _place(rng, setup)
+    on, x = _place(rng, setup, setup.turning() if turns else setup.shifting())
 
     def apply(s: Setup, v: Numbers) -> Setup:
         return s.attached(Attachment(kind, on, x, v))  # type: ignore[arg-type]
@@ -182,18 +203,21 @@ def inertia(rng: Rng, setup: Setup) -> Draft:
         lambda x: {"m": 0.0, "J": x},
         1e-9,
         10.0,
+        turns=True,
     )
 
 
 def brace(rng: Rng, setup: Setup) -> Draft:
     """A spring to ground, against displacement or rotation."""
     loss = float(np.exp(rng.uniform(np.log(3e-4), np.log(1e-2))))
-    turn = rng.random() < 0.3
+    turn = rng.random() < 0.3 or not setup.shifting()
+    turn = turn and bool(setup.turning())
     units = {"k": "N m/rad", "c": "N m s/rad"} if turn else {"k": "N/m", "c": "N s/m"}
     kind = "ground_torsion" if turn else "ground"
     return _attached(
-        "ground_spring", kind, rng, setup, units, lambda x: {"k": x, "c": loss * x}, 1e-5, 1e7
-    )
+        "ground_spring", kind, rng, setup, units, lambda x: {"k": x, "c": loss * x}, 1e-5, 1e7,
+        turns=turn,
+    )  # fmt: skip
 
 
 def gravity(rng: Rng, setup: Setup) -> Draft:
@@ -219,7 +243,7 @@ def gravity(rng: Rng, setup: Setup) -> Draft:
 def damping(rng: Rng, setup: Setup) -> Draft:
     """More viscous damping: of a joint, or against the ground."""
     joints = [p.name for p in setup.parts if p.kind in JOINTS]
-    if rng.random() < 0.5:
+    if rng.random() < 0.5 and setup.shifting():
         return _attached(
             "viscous_damping", "ground", rng, setup, {"c": "N s/m"},
             lambda x: {"k": 0.0, "c": x}, 1e-5, 1e5,

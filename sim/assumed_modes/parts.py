@@ -26,14 +26,30 @@ KINDS = (
     "translational_ground_spring",
     "gravity_stiffness",
     "oil_column",
+    "cylinder",
+    "gear",
+    "spindle",
     "angular_velocity_source",
     "angular_velocity_source_2",
     "torque_source",
     "force_source",
+    "velocity_source",
+    "displacement_source",
+    "acceleration_source",
 )
+# Other words of the rig file for the same thing.
+SAME_AS = {
+    "mass": "lumped_mass",
+    "inertia": "lumped_mass",
+    "spring": "translational_spring",
+    "damper": "translational_spring",
+    "ground_spring": "translational_ground_spring",
+    "ground_damper": "translational_ground_spring",
+}
 EXTENDED = ("beam", "rigid_link")  # kinds on which a place may lie between two ports
-SOURCES = ("angular_velocity_source", "angular_velocity_source_2", "torque_source", "force_source")
-ANGLE_SOURCES = SOURCES[:2]
+ANGLE_SOURCES = ("angular_velocity_source", "angular_velocity_source_2")
+MOTION_SOURCES = ("velocity_source", "displacement_source", "acceleration_source")  # prescribe w
+SOURCES = (*ANGLE_SOURCES, *MOTION_SOURCES, "torque_source", "force_source")
 JOINTS = ("torsional_spring", "translational_spring")
 
 
@@ -96,7 +112,8 @@ class Lag:
 class Setup:
     """The whole of what is simulated.
 
-    delay : s by which the source acts later than the converter's output changes.
+    motion : "lateral" or "axial", as of the rig file. delay : s by which the source acts later than
+    the converter's output changes.
     """
 
     base: str
@@ -108,6 +125,7 @@ class Setup:
     forces: tuple[Force, ...] = ()
     path: tuple[Lag, ...] = ()
     delay: float = 0.0
+    motion: str = "lateral"
 
     def part(self, name: str) -> Part:
         """The part called `name`; KeyError if there is none."""
@@ -115,6 +133,22 @@ class Setup:
             if part.name == name:
                 return part
         raise KeyError(name)
+
+    def turning(self) -> set[str]:
+        """Names of the parts that may turn: of an axial chain those before its spindle."""
+        names = [p.name for p in self.parts]
+        return set(names if self.motion == "lateral" else names[: self._spindle()])
+
+    def shifting(self) -> set[str]:
+        """Names of the parts that may shift: none of a lateral chain that has no mass to shift."""
+        names = [p.name for p in self.parts]
+        if self.motion == "axial":
+            return set(names[self._spindle() :])
+        heavy = any(p.values.get("m", 0.0) > 0 or p.kind == "beam" for p in self.parts)
+        return set(names if heavy else ())
+
+    def _spindle(self) -> int:
+        return next((i for i, p in enumerate(self.parts) if p.kind == "spindle"), 0)
 
     def with_value(self, name: str, symbol: str, value: float) -> Setup:
         """The same with one number of one part changed."""
@@ -173,11 +207,14 @@ def setup_of(rig: Rig, values: Values) -> Setup:
         raise InputError(rig.name, "tip", rig.tip, "'free' for this plant")
     parts = []
     for e in rig.element:
-        if e.kind not in KINDS:
+        kind = SAME_AS.get(e.kind, e.kind)
+        if kind not in KINDS:
             raise InputError(rig.name, f"element[{e.name}].kind", e.kind, f"one of {KINDS}")
         own = {s: values.get((e.name, s), p.value) for s, p in parameters(e).items()}
-        parts.append(Part(e.name, e.kind, own))
+        parts.append(Part(e.name, kind, own))
     delays = {p.values["tau"] for p in parts if p.kind in SOURCES}
     if len(delays) != 1:
         raise InputError(rig.name, "tau", sorted(delays), "one dead time for all sources")
-    return Setup(rig.base, tuple(parts), rig.sensor, rig.actuator[0], delay=delays.pop())
+    return Setup(
+        rig.base, tuple(parts), rig.sensor, rig.actuator[0], delay=delays.pop(), motion=rig.motion
+    )

@@ -13,9 +13,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.errors import SamiiRigError
-from samii_rig.rig.schema import AbsoluteAngle, Acceleration, Moment, RelativeAngle, SensorBase
+from samii_rig.rig.schema import (
+    AbsoluteAngle,
+    Acceleration,
+    Displacement,
+    Force,
+    Moment,
+    Pressure,
+    RelativeAngle,
+    SensorBase,
+    Velocity,
+)
 from samii_rig.types import Float
-from sim.assumed_modes.parts import Lag, Part, Setup
+from sim.assumed_modes.parts import SOURCES, Lag, Part, Setup
 from sim.assumed_modes.ritz import FLOOR, Mechanism
 
 GRAVITY = 9.80665  # m/s^2, as the rig file's `tilt` means it
@@ -110,7 +120,9 @@ def _path_sections(path: tuple[Lag, ...]) -> list[tuple[Float, Float, Float, flo
 
 
 def _source_states(part: Part) -> int:
-    if part.kind == "angular_velocity_source":
+    if part.kind in ("displacement_source", "acceleration_source"):
+        return 2
+    if part.kind in ("angular_velocity_source", "velocity_source"):
         return 2
     if part.kind == "angular_velocity_source_2":
         return 3
@@ -149,7 +161,7 @@ def _solution(A: Float, b: Float) -> Float:
 def plant(setup: Setup, pushes: tuple[Push, ...] = ()) -> Plant:
     """The continuous plant of `setup`, with inputs for its laws and for the disturbances."""
     mech = Mechanism(setup)
-    sources = [p for p in setup.parts if p.kind.endswith(("source", "source_2"))]
+    sources = [p for p in setup.parts if p.kind in SOURCES]
     filters = [sensor_sections(s) for s in setup.sensors]
     path = _path_sections(setup.path)
     f = mech.free
@@ -213,8 +225,15 @@ def _source(
     motion: tuple[Float, Float, Float],
     load: Float,
 ) -> None:
-    """The states of a source and what it does: its angle prescribed, or a force."""
+    """The states of a source and what it does: its angle or displacement prescribed, or a force."""
     values, (Q, dQ, ddQ) = part.values, motion
+    if part.kind in ("displacement_source", "acceleration_source"):
+        at, w = mech.sources[part.name], values["omega"]
+        first = sig._used  # the states of a second-order filter: its output, and its rate over w
+        static = values["K"] / (w**2 if part.kind == "acceleration_source" else 1.0)
+        Q[at] = sig.filtered(static * drive, [_second(w, values["zeta"])])
+        dQ[at], ddQ[at] = w * sig.unit(first + 1), w * sig.rate[first + 1]
+        return
     if part.name in mech.sources:
         at = mech.sources[part.name]
         second = part.kind == "angular_velocity_source_2"
@@ -256,11 +275,25 @@ def _seen(
         case Acceleration():
             w, theta = mech.place(sensor.on, sensor.position)
             row = w @ ddQ + sensor.tilt * GRAVITY * (theta @ Q)
+        case Displacement():
+            row = _stretch(sensor, mech) @ Q
+        case Velocity():
+            row = _stretch(sensor, mech) @ motion[1]
+        case Force():
+            row = inside[mech.gaps[sensor.after]]
+        case Pressure():
+            row = -inside[mech.gaps[sensor.after]] / sensor.area
         case Moment():
             row = inside[mech.cuts[sensor.after]]
         case _:
             raise TypeError(type(sensor))
     return row
+
+
+def _stretch(sensor: Displacement | Velocity, mech: Mechanism) -> Float:
+    """The row of w between a sensor's two places; one of them may be the ground."""
+    w = mech.after(sensor.after)[0]
+    return w if sensor.against is None else w - mech.after(sensor.against)[0]
 
 
 def _read(on: str, mech: Mechanism, Q: Float, dQ: Float, inside: Float) -> tuple[Float, Float]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,17 @@ class Faults:
 
     shift: int
     gaps: tuple[tuple[int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Log:
+    """What a file holds. values (n, n_channels), without the faults of the logger; notes : more
+    metadata."""
+
+    values: Float
+    segments: list[Segment]
+    faults: Faults
+    notes: Mapping[str, str] = field(default_factory=dict)
 
 
 def draw_faults(rng: np.random.Generator, style: Style, n: int) -> Faults:
@@ -99,11 +111,10 @@ def write(
     rig_toml: str,
     style: Style,
     kp: float,
-    values: Float,
-    segments: list[Segment],
-    faults: Faults,
+    log: Log,
 ) -> None:
-    """One file. values (n, n_channels), without the faults of the logger."""
+    """One file."""
+    values, segments, faults = log.values, log.segments, log.faults
     channels = channels_of(rig, style)
     rate = style.rate_hz / style.every
     n_sensor = len(rig.sensor)
@@ -126,7 +137,7 @@ def write(
         channels, np.rint(sequence[kept] * 1e9 / rate).astype(np.int64), sequence[kept],
         values[kept], quality[kept],
     )  # fmt: skip
-    notes = {"experiment": style.excitation, "operator": "", "started": STARTED}
+    notes = {"experiment": style.excitation, "operator": "", "started": STARTED, **log.notes}
     if rig.centring:
         notes["centring"] = f"{rig.centring.sensor} {kp}"
     with RunWriter(path, channels, rate, rig_toml=rig_toml, metadata=notes) as writer:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from samii_rig.rig.load import parse
-from samii_rig.rig.schema import Acceleration, AntiAlias, Beam, Rig, RigidLink
+from samii_rig.rig.schema import Acceleration, AntiAlias, Beam, LumpedMass, Rig, RigidLink
 
 MOST_SENSORS = 6
 LEAST_SENSORS = 2
@@ -52,10 +52,14 @@ def _chosen(rng: np.random.Generator, rig: Rig) -> list[Any]:
     others = [s for s in rig.sensor if s.name != centring]
     keep = order + [others[i] for i in rng.permutation(len(others))][: n - 1]
     keep.sort(key=[*rig.sensor].index)
-    hosts = [e for e in rig.element if isinstance(e, RigidLink | Beam)]
-    while len(keep) < n:
+    hosts = [
+        e for e in rig.element
+        if isinstance(e, RigidLink | Beam) or (isinstance(e, LumpedMass) and e.m.value > 0)
+    ]  # fmt: skip
+    while hosts and len(keep) < n:
         host = hosts[int(rng.integers(len(hosts)))]
-        at = round(float(rng.uniform(0.2, 1.0)) * host.L.value, 4)
+        length = host.L.value if isinstance(host, RigidLink | Beam) else 0.0
+        at = round(float(rng.uniform(0.2, 1.0)) * length, 4)
         like = next((s for s in rig.sensor if isinstance(s, Acceleration)), _accelerometer())
         keep.append(
             like.model_copy(update={"name": f"a_x{len(keep)}", "on": host.name, "position": at})

@@ -19,10 +19,18 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy.linalg import eigh
 
-from samii_rig.rig.schema import Moment
+from samii_rig.rig.schema import Force, Moment, Pressure
 from samii_rig.types import Float
-from sim.assumed_modes.parts import ANGLE_SOURCES, EXTENDED, JOINTS, Part, Setup
+from sim.assumed_modes.parts import (
+    ANGLE_SOURCES,
+    EXTENDED,
+    JOINTS,
+    MOTION_SOURCES,
+    Part,
+    Setup,
+)
 
 # Shapes a beam. With 12 all natural frequencies of SAMII and SFLR below 200 Hz are right to
 # 2e-7; the shapes beyond carry the statics of what is higher.
@@ -64,21 +72,29 @@ class Mechanism:
     """Mass, damping and stiffness over all coordinates, and the rows of every place.
 
     M, C, K : (n, n), prescribed coordinates included. free : the coordinates that move by
-    themselves. sources : coordinate of each angle source by name. cuts : coordinate of a
-    rotation, locked, at the place of each moment sensor: what holds it is the moment.
-    joints : coordinate of each spring by name.
+    themselves. sources : coordinate of each source of an angle or a displacement by name.
+    cuts, gaps : coordinate of a rotation or a displacement, locked, at the place of each sensor
+    of the moment or of the force: what holds it is that. joints : coordinate of each spring by
+    name.
     """
 
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         self._cut_after = [s.after for s in setup.sensors if isinstance(s, Moment)]
-        n = 3 + len(self._cut_after) + sum(_coordinates(p) for p in setup.parts)
+        self._gap_after = [s.after for s in setup.sensors if isinstance(s, Force | Pressure)]
+        n = (
+            3
+            + len(self._cut_after)
+            + len(self._gap_after)
+            + sum(_coordinates(p) for p in setup.parts)
+        )
         n += sum(a.kind == "oscillator" for a in setup.attachments)
         self._n, self._used = n, 1
         self.M, self.C, self.K = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
         self.maxwell: list[Maxwell] = []
         self.sources: dict[str, int] = {}
         self.cuts: dict[str, int] = {}
+        self.gaps: dict[str, int] = {}
         self.joints: dict[str, int] = {}
         self._before: dict[str, tuple[Float, Float]] = {}
         self._after: dict[str, tuple[Float, Float]] = {}
@@ -91,7 +107,7 @@ class Mechanism:
             self.maxwell += [Maxwell(at, k, t) for k, t in zip(r.stiffness, r.times, strict=True)]
         n = self._used
         self.M, self.C, self.K = self.M[:n, :n], self.C[:n, :n], self.K[:n, :n]
-        held = {FLOOR, *self.sources.values(), *self.cuts.values()}
+        held = {FLOOR, *self.sources.values(), *self.cuts.values(), *self.gaps.values()}
         self.free = np.array([i for i in range(n) if i not in held], dtype=np.int64)
 
     @property
@@ -134,7 +150,7 @@ class Mechanism:
         w, theta = self._unit(FLOOR), np.zeros(self._n)
         if self.setup.base == "free":
             w = w + self._unit(self._new())
-        if self.setup.base != "clamped":
+        if self.setup.base != "clamped" and self.setup.motion == "lateral":
             theta = theta + self._unit(self._new())
         for part in self.setup.parts:
             self._before[part.name] = (w, theta)
@@ -142,6 +158,9 @@ class Mechanism:
             if part.name in self._cut_after and part.name not in self.cuts:
                 self.cuts[part.name] = self._new()
                 theta = theta + self._unit(self.cuts[part.name])
+            if part.name in self._gap_after and part.name not in self.gaps:
+                self.gaps[part.name] = self._new()
+                w = w + self._unit(self.gaps[part.name])
             self._after[part.name] = (w, theta)
 
     def _through(self, part: Part, w: Float, theta: Float) -> tuple[Float, Float]:
@@ -152,9 +171,15 @@ class Mechanism:
             self.C[at, at] += v.get("c", 0.0)
             jump = self._unit(at)
             return (w + jump, theta) if part.kind == "translational_spring" else (w, theta + jump)
-        if part.kind in ANGLE_SOURCES:
-            self.sources[part.name] = self._new()
-            return w, theta + self._unit(self.sources[part.name])
+        if part.kind == "cylinder":
+            return w + self._unit(self._cylinder(part)), theta
+        if part.kind in (*ANGLE_SOURCES, *MOTION_SOURCES):
+            moved = self._unit(self.sources.setdefault(part.name, self._new()))
+            return (w, theta + moved) if part.kind in ANGLE_SOURCES else (w + moved, theta)
+        if part.kind == "gear":
+            return w, theta / v["n"]
+        if part.kind == "spindle":  # what turned stays behind
+            return w + v["lead"] * theta, np.zeros(self._n)
         if part.kind == "rigid_link":
             self._attach("mass", (w + v["r"] * theta, theta), {"m": v["m"], "J": v["I"]})
             return w + v["L"] * theta, theta
@@ -168,6 +193,18 @@ class Mechanism:
         elif part.kind in ("torsional_ground_spring", "gravity_stiffness"):
             self._attach("ground_torsion", (w, theta), v)
         return w, theta
+
+    def _cylinder(self, part: Part) -> int:
+        """The coordinate of the oil's stretch: a spring and, by the leak, one that relaxes
+        (`samii_rig.rig.elements.Cylinder`, k(s) in partial fractions)."""
+        v = part.values
+        S0, S1, S2 = (v["A_1"] ** n / v["V_1"] + v["A_2"] ** n / v["V_2"] for n in range(3))
+        at = self.joints[part.name] = self._new()
+        relaxes = v["leak"] > 0
+        self.K[at, at] += v["B"] * (S2 - relaxes * S1**2 / S0)
+        if relaxes:
+            self.maxwell.append(Maxwell(at, v["B"] * S1**2 / S0, 1.0 / (v["B"] * v["leak"] * S0)))
+        return at
 
     def _beam(self, part: Part) -> None:
         v = part.values
@@ -226,7 +263,23 @@ class Mechanism:
 def _coordinates(part: Part) -> int:
     if part.kind == "beam":
         return ORDER
-    return int(part.kind in (*JOINTS, *ANGLE_SOURCES, "oil_column"))
+    return int(part.kind in (*JOINTS, *ANGLE_SOURCES, *MOTION_SOURCES, "oil_column", "cylinder"))
+
+
+def first_hz(setup: Setup) -> float:
+    """The first natural frequency, Hz, sources held; 0 where nothing swings."""
+    mech = Mechanism(setup)
+    f = np.ix_(mech.free, mech.free)
+    K = mech.K[f].copy()
+    for branch in mech.maxwell:  # swings are fast beside what relaxes
+        at = np.flatnonzero(mech.free == branch.at)
+        K[at, at] += branch.k
+    try:
+        square = eigh(K, mech.M[f], eigvals_only=True)
+    except np.linalg.LinAlgError:  # a coordinate without mass
+        return 0.0
+    stiff = square[square > 1.0]  # rad^2/s^2: what only turns on has none
+    return float(np.sqrt(stiff[0])) / (2 * np.pi) if stiff.size else 0.0
 
 
 RELAX_LOW, RELAX_HIGH = 0.05, 2000.0  # Hz, band over which the loss factor is held

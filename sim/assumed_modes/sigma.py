@@ -24,6 +24,9 @@ STEP = 1e-5  # of a parameter, for a difference; rounding is 1e-12, curvature 1e
 ROUNDS = 12  # of Gauss-Newton
 FURTHEST = 3.0  # nepers by which a refit may move a parameter
 ENOUGH = 0.01  # of sigma^2, by which a round must lower it to be followed by another
+# Of sigma^2, by which a whole step may miss what the derivatives foretold and still be the last:
+# 1 % of sigma, at a fifth of the time where an effect leaves the linear range of no parameter.
+FORETOLD = 0.02
 # Levenberg's and Marquardt's, relative to the diagonal, until one lowers the cost.
 DAMPINGS = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 INSIDE = 0.9  # of the way to where an unknown ends
@@ -110,6 +113,20 @@ def _left(cost: float, moved: Float) -> Left:
     return Left(float(np.sqrt(max(cost, 0.0))), float(np.sqrt(max(data, 0.0))), moved)
 
 
+@dataclass(frozen=True, slots=True)
+class Slopes:
+    """Whitened derivatives of a waveform's record: rows (n_unknown, n n_y), and their products
+    gram (n_unknown, n_unknown)."""
+
+    rows: Float
+    gram: Float
+
+    @classmethod
+    def of(cls, rows: Float) -> Slopes:
+        """With their products."""
+        return cls(rows, rows @ rows.T)
+
+
 class Refit:
     """Refits unknowns (nominal parameters, and others if wanted) to records without noise.
 
@@ -134,7 +151,8 @@ class Refit:
         else:
             self._nuisance, self.y = known._nuisance, known.y
             more = self._columns(np.zeros(self.n), self.y, range(known.n, self.n))
-            self.J = [np.hstack([a, b]) for a, b in zip(known.J, more, strict=True)]
+            both = zip(known.J, more, strict=True)
+            self.J = [Slopes.of(np.vstack([a.rows, b.rows])) for a, b in both]
 
     def _free(self, n: int) -> Float:
         """Orthonormal basis (n n_y, m) of a record's offsets and mains lines, whitened."""
@@ -147,28 +165,24 @@ class Refit:
         each = [self.bench.white(np.outer(x, e)).ravel() for x in columns for e in np.eye(n_y)]
         return np.asarray(np.linalg.qr(np.array(each).T)[0])
 
-    def _white(self, ys: Sequence[Float]) -> list[Float]:
-        out = []
-        for y, Q in zip(ys, self._nuisance, strict=True):
-            x = self.bench.white(y).ravel()
-            out.append(x - Q @ (Q.T @ x))
-        return out
-
-    def _derivatives(self, at: Float) -> tuple[list[Float], list[Float]]:
-        """Samples at unit level, and (n n_y, n_unknown) whitened derivatives, a waveform each."""
+    def _derivatives(self, at: Float) -> tuple[list[Float], list[Slopes]]:
+        """Samples at unit level, and whitened derivatives, a waveform each."""
         y0 = self.bench.linear(self.build(at))
         return y0, self._columns(at, y0, range(self.n))
 
-    def _columns(self, at: Float, y0: Sequence[Float], which: range) -> list[Float]:
+    def _columns(self, at: Float, y0: Sequence[Float], which: range) -> list[Slopes]:
         columns: list[list[Float]] = [[] for _ in y0]
         for i in which:
             moved = at.copy()
             moved[i] += self.step[i]
             y1 = self.bench.linear(self.build(moved))
-            change = [(b - a) / self.step[i] for a, b in zip(y0, y1, strict=True)]
-            for column, x in zip(columns, self._white(change), strict=True):
-                column.append(x)
-        return [np.array(c).T for c in columns]
+            for column, a, b in zip(columns, y0, y1, strict=True):
+                column.append(self.bench.white((b - a) / self.step[i]).ravel())
+        out = []
+        for column, Q in zip(columns, self._nuisance, strict=True):
+            rows = np.array(column)
+            out.append(Slopes.of(rows - (rows @ Q) @ Q.T))
+        return out
 
     def raw(self, records: Records) -> float:
         """sigma before any refit."""
@@ -211,11 +225,16 @@ class Refit:
                     continue
                 new = self._cost(records, y1) + float(there @ there)
                 if new < cost:
+                    whole = damping == 0.0 and bool(np.all(there == at + step))
                     step = there - at
                     hoped = float(step @ (2 * (g - at) - G @ step))
                     gained, cost, at, y = cost - new, new, there, y1
                     break
+            else:
+                whole = False
             if fresh and gained < ENOUGH * cost:
+                break
+            if whole and abs(gained - hoped) < FORETOLD * cost:
                 break
             fresh = gained < 0.5 * hoped or gained < ENOUGH * cost
             if fresh:
@@ -232,18 +251,17 @@ class Refit:
         self,
         records: Records,
         y: Sequence[Float],
-        J: Sequence[Float],
+        J: Sequence[Slopes],
     ) -> tuple[Float, Float, float]:
         N, g, total = np.zeros((self.n, self.n)), np.zeros(self.n), 0.0
         for w, rows, y0, own, Q in zip(
             self.bench.waveforms, records, y, J, self._nuisance, strict=True
         ):
-            gram = own.T @ own
             for level, row in zip(w.levels, rows, strict=True):
                 x = self.bench.white(row - level * y0).ravel()
                 x -= Q @ (Q.T @ x)
-                N += w.repeats * level**2 * gram
-                g += w.repeats * level * (own.T @ x)
+                N += w.repeats * level**2 * own.gram
+                g += w.repeats * level * (own.rows @ x)
                 total += w.repeats * float(x @ x)
         return N, g, total
 

@@ -14,6 +14,7 @@ from sim.assumed_modes.simulate import Control, clean
 
 LEAST, MOST = 3.0, 300.0  # sigma of an effect, drawn evenly in the logarithm between them
 CLOSE = 1.25  # ratio to the drawn sigma that is near enough; the truth says what it is
+NEAR = 1.0  # tolerance; a refit that moves nothing by more has one minimum
 TRIES = 9  # strengths tried for one effect
 RAW = 3.0  # sigma before any refit at which the derivatives foretell what is left
 FIRST_JUMP = 0.01  # of RAW: what shows less than that grows by its inverse
@@ -43,11 +44,15 @@ def records(bench: Bench, control: Control, setup: Setup) -> Records:
 
 
 def solve(
-    refit: Refit, draft: Draft, of: Callable[[float], Records], target: float
+    refit: Refit,
+    draft: Draft,
+    of: Callable[[float], Records],
+    target: float,
+    close: float = CLOSE,
 ) -> tuple[float, Left] | None:
     """The strength that leaves about `target` sigma, with what it leaves; None if none does.
 
-    of : records with the effect at a strength.
+    of : records with the effect at a strength. close : ratio to the target that is near enough.
     """
     if draft.fixed:
         left = refit.left(of(1.0))
@@ -70,7 +75,7 @@ def solve(
         ratio = left.sigma / target
         if best is None or abs(np.log(ratio)) < abs(np.log(best[1].sigma / target)):
             best = (x, left)
-        if 1 / CLOSE < ratio < CLOSE or (x == draft.most and ratio < 1):
+        if 1 / close < ratio < close or (x == draft.most and ratio < 1):
             break
         if abs(np.log(x / last[0])) > 1e-6:
             slope = np.log(left.sigma / last[1]) / np.log(x / last[0])
@@ -82,6 +87,8 @@ def solve(
             x = float(np.sqrt(low * high)) if low > 0 and np.isfinite(high) else draft.most
     if best is None or not LEAST * 0.8 <= best[1].sigma <= MOST * CLOSE:
         return None
+    if float(np.abs(best[1].moved).max(initial=0.0)) < NEAR:
+        return best
     # From the nominal parameters themselves there may be a lower minimum.
     other = refit.left(of(best[0]))
     return (best[0], min(best[1], other, key=lambda x: x.sigma))

@@ -43,6 +43,7 @@ OPTIONS: dict[str, float] = {
 
 # Loop samples that a trial has at most, so that it is made in some seconds.
 BUDGET = 100_000
+HIGH_HZ = (15.0, 45.0)  # the band's upper end is drawn between these
 LEAST_PERIODS = 2  # measured periods of a multisine of many
 
 
@@ -80,7 +81,17 @@ class Style:
     files: tuple[tuple[Piece, ...], ...] = field(default=(), repr=False)
 
 
-def draw(rng: Rng, forced: tuple[str, ...], rig_rate_hz: float, *, runs: bool = False) -> Style:
+@dataclass(frozen=True, slots=True)
+class About:
+    """What a style is drawn for: the rig's samples/s, its first resonance (Hz), and s of
+    records at most, for which there is room within `BUDGET`."""
+
+    rate_hz: float
+    first_hz: float = 0.0
+    seconds: float = np.inf
+
+
+def draw(rng: Rng, forced: tuple[str, ...], about: About, *, runs: bool = False) -> Style:
     """A style. forced : excitation and options by name, `clean` for no option; runs : several."""
     named = [x for x in forced if x in EXCITATIONS]
     choice = [x for x in EXCITATIONS if x in RUNS] if runs else list(EXCITATIONS)
@@ -90,9 +101,11 @@ def draw(rng: Rng, forced: tuple[str, ...], rig_rate_hz: float, *, runs: bool = 
     if "clean" in forced:
         chosen = []
     chosen = [x for x in OPTIONS if x in chosen or x in forced]
-    rate, every = _rates(rng, rig_rate_hz, tuple(chosen))
+    rate, every = _rates(rng, about.rate_hz, tuple(chosen))
     low = float(rng.uniform(0.3, 0.8))
-    high = float(min(rng.uniform(15.0, 45.0), 0.4 * rate / every))
+    # A rig that has no resonance within is driven to twice its first one.
+    above = HIGH_HZ[0], HIGH_HZ[1] if about.first_hz < HIGH_HZ[1] else 2.0 * about.first_hz
+    high = float(min(rng.uniform(*above), 0.4 * rate / every))
     n_levels = (
         1 if excitation == "single" else int(rng.choice([1, 2, 3, 4], p=[0.3, 0.4, 0.2, 0.1]))
     )
@@ -101,7 +114,7 @@ def draw(rng: Rng, forced: tuple[str, ...], rig_rate_hz: float, *, runs: bool = 
         repeats = max(2, repeats)
     levels = tuple(float(x) for x in np.geomspace(1.0, 0.25, 4)[:n_levels][::-1])
     style = Style(excitation, tuple(chosen), rate, every, low, high, levels, repeats)
-    return _filled(rng, style, runs=runs)
+    return _filled(rng, style, min(about.seconds, BUDGET / rate), runs=runs)
 
 
 def _rates(rng: Rng, rig_rate_hz: float, options: tuple[str, ...]) -> tuple[float, int]:
@@ -117,9 +130,8 @@ def _rates(rng: Rng, rig_rate_hz: float, options: tuple[str, ...]) -> tuple[floa
     return rate, every
 
 
-def _filled(rng: Rng, style: Style, *, runs: bool) -> Style:
-    """The style with its references, as long as the budget allows."""
-    seconds = BUDGET / style.rate_hz
+def _filled(rng: Rng, style: Style, seconds: float, *, runs: bool) -> Style:
+    """The style with its references, all records together `seconds` long at most."""
     levels, repeats = style.levels, style.repeats
     while len(levels) * repeats > (2 if runs else 1) and seconds / (len(levels) * repeats) < 18.0:
         if len(levels) > 1 and (repeats == 1 or runs):

@@ -33,10 +33,11 @@ from sim.assumed_modes.parts import (
     setup_of,
 )
 from sim.assumed_modes.plant import Push, UnphysicalError, plant
+from sim.assumed_modes.ritz import first_hz
 from sim.assumed_modes.sampled import Loop, closed, discrete, impulse, timeline
 from sim.assumed_modes.sigma import FURTHEST, STEP, Bench, Left, Records, Refit, Waveform, convolved
 from sim.assumed_modes.simulate import Control, recorded
-from sim.assumed_modes.size import LEAST, MOST, records, records_by_run, solve
+from sim.assumed_modes.size import CLOSE, LEAST, MOST, records, records_by_run, solve
 from sim.assumed_modes.styles import Style
 
 KINDS = ("nothing", "one", "two", "outside", "force")
@@ -47,7 +48,10 @@ FORCED_TRIES = 40  # effects drawn until one has a size
 # digits, so not smaller.
 RIVAL_STEP = 1e-2
 RIVAL = 30.0  # times the lateness of what it stands in for: a rival's strength, 1 sigma
-OTHER = 3.0  # nepers by which the other effect's strength may move in a refit, 1 sigma
+LOSSY = 0.01  # s, damping over stiffness of a joint that had none, at most, in a refit
+OTHER_SPAN = 10.0  # times its strength: that of the other effect in a refit, 1 sigma
+OTHER_STEP = 1e-2  # of its strength, for a difference
+OTHER = 3.0  # nepers by which a joint's stiffness and damping may move in a refit, 1 sigma
 
 Rng = np.random.Generator
 
@@ -102,22 +106,61 @@ def make(kind: str, seed: int, out: Path, rig_toml: str, style: tuple[str, ...] 
     folder = out / f"{kind}_{seed}"
     if folder.exists():
         raise InputError(str(folder), "", "there already", "a trial that was not made yet")
-    rngs = [np.random.default_rng([seed, KINDS.index(kind), k]) for k in range(5)]
-    beyond = str(rngs[2].choice(list(OUTSIDE))) if kind == "outside" else ""
-    runs = beyond == "run_to_run_stiffness"
-    scene = scene_of(rngs[0], rngs[1], parse(Rig, rig_toml, "rig file"), style, runs=runs)
-    refit = None if kind == "nothing" else nominal_refit(scene)
-    found = [] if refit is None else _concealed(rngs[2], kind, scene, refit, beyond)
+    made = conceal(kind, seed, parse(Rig, rig_toml, "rig file"), style)
+    scene, rngs = made.scene, made.rngs
     folder.mkdir(parents=True)
     (folder / "rig.toml").write_text(scene.rig_toml, encoding="utf-8")
     faults = [
-        file_of(folder, i, scene, found, rngs[3], rngs[4]) for i in range(len(scene.style.files))
+        file_of(folder, i, scene, made.found, rngs[3], rngs[4])
+        for i in range(len(scene.style.files))
     ]
     truth = out / "truth"
     truth.mkdir(exist_ok=True)
-    text = json.dumps(_truth(kind, seed, scene, refit, found, faults), indent=1)
+    text = json.dumps(made.truth(faults, rivals=True), indent=1)
     (truth / f"{kind}_{seed}.json").write_text(text + "\n", encoding="utf-8")
     return folder
+
+
+@dataclass(frozen=True, slots=True)
+class Conceals:
+    """A trial before it is recorded. rngs : of the scene, its disturbances, the effects, the
+    records and the one who logs them, in this order."""
+
+    kind: str
+    seed: int
+    scene: Scene
+    refit: Refit | None
+    found: list[Concealed]
+    rngs: list[Rng]
+
+    def truth(self, faults: list[record.Faults], *, rivals: bool = False) -> dict[str, Any]:
+        """The truth as plain data. rivals : with what else may be late."""
+        return _truth(self, faults, rivals=rivals)
+
+
+def conceal(
+    kind: str,
+    seed: int,
+    rig: Rig,
+    style: tuple[str, ...] = (),
+    *,
+    seconds: float = np.inf,
+    close: float = CLOSE,
+) -> Conceals:
+    """Draw a trial of a rig. seconds : of records, at most; close : ratio of a size to the drawn
+    one that is near enough.
+
+    Raises SamiiRigError where no effect has a size.
+    """
+    rngs = [np.random.default_rng([seed, KINDS.index(kind), k]) for k in range(5)]
+    beyond = str(rngs[2].choice(list(OUTSIDE))) if kind == "outside" else ""
+    runs = beyond == "run_to_run_stiffness"
+    scene = scene_of(rngs[0], rngs[1], rig, style, runs=runs, seconds=seconds)
+    refit = None if kind == "nothing" else nominal_refit(scene)
+    found: list[Concealed] = []
+    if refit is not None:
+        found = _concealed(rngs[2], Wanted(kind, beyond, close), scene, refit)
+    return Conceals(kind, seed, scene, refit, found, rngs)
 
 
 def _built(rig: Rig, about: Nominal, drawn: Float, moved: Float) -> Setup:
@@ -132,10 +175,19 @@ def _built(rig: Rig, about: Nominal, drawn: Float, moved: Float) -> Setup:
 
 
 def scene_of(
-    rng: Rng, disturb: Rng, rig: Rig, forced: tuple[str, ...], *, runs: bool = False
+    rng: Rng,
+    disturb: Rng,
+    rig: Rig,
+    forced: tuple[str, ...],
+    *,
+    runs: bool = False,
+    seconds: float = np.inf,
 ) -> Scene:
     """A rig with its nominal parameters, style and noise drawn."""
-    style = styles.draw(rng, forced, rig.rate_hz, runs=runs)
+    # The torque tests are of the band below their resonance; a bench that slides is driven to it.
+    first = first_hz(setup_of(rig, {})) if rig.motion == "axial" else 0.0
+    about_rig = styles.About(rig.rate_hz, first, seconds)
+    style = styles.draw(rng, forced, about_rig, runs=runs)
     measured = "measured" in style.options
     shown = style.rate_hz / style.every if measured else style.rate_hz
     rig = rigfile.varied(rng, rig, shown, style.options)
@@ -213,8 +265,11 @@ def _noise(rng: Rng, setup: Setup, style: Style, control: Control) -> Noise:
     pushes = _pushes(rng, setup)
     corner = np.exp(rng.uniform(np.log(1.0), np.log(40.0), len(pushes)))
     effect = unit_effect(_loop(setup, control, pushes), corner, style.rate_hz)
+    # What nothing of this rig answers to disturbs nothing, as a floor under what only turns.
+    felt = np.flatnonzero((effect > 0).any(axis=0))
+    pushes, corner, effect = tuple(pushes[i] for i in felt), corner[felt], effect[:, felt]
     share = np.exp(rng.uniform(np.log(0.3), np.log(3.0), len(pushes)))
-    rms = share / np.sqrt(len(pushes)) / (effect / floor[:, None]).max(axis=0)
+    rms = share / np.sqrt(max(1, len(pushes))) / (effect / floor[:, None]).max(axis=0)
     has = {name: float(name in style.options) for name in ("wander", "hum", "spikes")}
     draws = rng.uniform(2.0, 10.0, n_y), rng.uniform(0.0, 5.0, n_y), rng.uniform(10.0, 60.0, n_y)
     return Noise(
@@ -234,6 +289,7 @@ def _pushes(rng: Rng, setup: Setup) -> tuple[Push, ...]:
     """One to three disturbances at places where they make sense."""
     joints = [p.name for p in setup.parts if p.kind in JOINTS]
     hosts = [p for p in setup.parts if p.kind in (*EXTENDED, "lumped_mass")]
+    hosts = [p for p in hosts if p.name in setup.shifting()] or hosts
     host = hosts[int(rng.integers(len(hosts)))]
     choice = [
         Push("joint", str(rng.choice(joints))) if joints else Push("valve"),
@@ -274,19 +330,27 @@ def nominal_refit(scene: Scene) -> Refit:
     return Refit(scene.bench, scene.built, STEP / own, FURTHEST / own)
 
 
-def _concealed(
-    rng: Rng, kind: str, scene: Scene, refit: Refit, beyond: str = ""
-) -> list[Concealed]:
-    wanted = 2 if kind == "two" else 1
-    names = (*(table.LINEAR if kind != "force" else ()), *FORCES)
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """The kind of a trial, its physics outside the table ("" for none), and how close to a drawn
+    size it has to come, as a ratio."""
+
+    kind: str
+    beyond: str
+    close: float
+
+
+def _concealed(rng: Rng, wish: Wanted, scene: Scene, refit: Refit) -> list[Concealed]:
+    wanted = 2 if wish.kind == "two" else 1
+    names = (*(table.LINEAR if wish.kind != "force" else ()), *FORCES)
     swing = _swing(scene)
     found: list[Concealed] = []
     for _ in range(FORCED_TRIES):
         target = float(np.exp(rng.uniform(np.log(LEAST), np.log(MOST))))
-        draft = _draft(rng, names, beyond, scene, swing)
+        draft = _draft(rng, names, wish.beyond, scene, swing)
         if draft is None or any(_clash(f.draft, draft) for f in found):
             continue
-        one = _solved(scene, refit, draft, target)
+        one = _solved(scene, refit, draft, target, wish.close)
         if one is not None:
             found.append(one)
         if len(found) == wanted:
@@ -317,45 +381,58 @@ def _draft(
         return None  # this rig has no place for it
 
 
-def _solved(scene: Scene, refit: Refit, draft: Draft, target: float) -> Concealed | None:
+def _solved(
+    scene: Scene, refit: Refit, draft: Draft, target: float, close: float
+) -> Concealed | None:
     def of(strength: float) -> Records:
-        if draft.run is not None:
-            runs = range(len(scene.bench.waveforms))
-            each = [draft.put_in(scene.setup, strength, i) for i in runs]
-            return records_by_run(scene.bench, each)
-        return records(scene.bench, scene.control, draft.put(scene.setup, strength))
+        return _records_of(scene, draft, strength)
 
     try:
-        got = solve(refit, draft, of, target)
+        got = solve(refit, draft, of, target, close)
     except UnphysicalError:
         return None
     return None if got is None else Concealed(draft, got[0], target, got[1])
 
 
-def _beside(scene: Scene, effect: Concealed, others: list[Concealed]) -> Left:
+def _records_of(scene: Scene, draft: Draft, strength: float) -> Records:
+    """Records without noise, with an effect of this strength."""
+    if draft.run is not None:
+        runs = range(len(scene.bench.waveforms))
+        return records_by_run(scene.bench, [draft.put_in(scene.setup, strength, i) for i in runs])
+    return records(scene.bench, scene.control, draft.put(scene.setup, strength))
+
+
+def _beside(scene: Scene, refit: Refit, effect: Concealed, others: list[Concealed]) -> Left:
     """What a refit leaves of `effect` where the others' strengths are free as well.
 
-    A force is no part of the linear records that are refitted, so it does not stand beside.
+    A force is no part of the linear records that are refitted, so it does not stand beside; what
+    has no strength is there.
     """
     others = [o for o in others if o.draft.physics not in FORCES]
     if not others:
         return effect.alone
-    n = len(scene.drawn)
+    n = refit.n
+    free = [o for o in others if not o.draft.fixed]
 
     def build(offsets: Float) -> Setup:
         setup = scene.built(offsets[:n])
-        for x, other in zip(offsets[n:], others, strict=True):
-            setup = other.draft.put(setup, other.strength * float(np.exp(OTHER * x)))
+        for other in others:
+            if other.draft.fixed:
+                setup = other.draft.put(setup, other.strength)
+        for x, other in zip(offsets[n:], free, strict=True):
+            setup = other.draft.put(setup, OTHER_SPAN * x * other.strength) if x > 0 else setup
         return setup
 
-    own = np.array(scene.nominal.tolerance)
-    step = np.concatenate([STEP / own, np.full(len(others), STEP / OTHER)])
-    reach = np.concatenate([FURTHEST / own, np.full(len(others), 2.0)])
-    refit = Refit(scene.bench, build, step, reach)
-    both = effect.draft.put(build(np.zeros(n + len(others))), effect.strength)
-    start = np.concatenate([effect.alone.moved, np.zeros(len(others))])
+    more = np.ones(len(free))
+    step = np.concatenate([refit.step, OTHER_STEP / OTHER_SPAN * more])
+    reach = np.concatenate([refit.reach, 2.0 * more])
+    known = refit if len(free) == len(others) else None
+    both = scene.setup
+    for one in (*others, effect):
+        both = one.draft.put(both, one.strength)
+    start = np.concatenate([effect.alone.moved, more / OTHER_SPAN])
     rows = records(scene.bench, scene.control, both)
-    return min((refit.left(rows, x) for x in (start, 0.0 * start)), key=lambda x: x.sigma)
+    return Refit(scene.bench, build, step, reach, known).left(rows, start)
 
 
 def _rivals(scene: Scene, refit: Refit | None, effect: Concealed) -> list[dict[str, Any]]:
@@ -386,10 +463,8 @@ def _rivals(scene: Scene, refit: Refit | None, effect: Concealed) -> list[dict[s
     return out
 
 
-def file_of(
-    folder: Path, i: int, scene: Scene, found: list[Concealed], rng: Rng, logger: Rng
-) -> record.Faults:
-    """Record file i of a style, with the effects `found`."""
+def logged(i: int, scene: Scene, found: list[Concealed], rng: Rng, logger: Rng) -> record.Log:
+    """Record i of a style, with the effects `found`."""
     style, setup = scene.style, scene.setup
     for effect in found:
         setup = effect.draft.put_in(setup, effect.strength, i)
@@ -397,26 +472,56 @@ def file_of(
     u, segments = record.reference(pieces, scene.level, style)
     y, v = recorded(setup, scene.control, scene.noise, u, rng)
     values = record.columns(scene.rig, style, u, v, y, logger)
-    faults = record.draw_faults(logger, style, len(values))
+    return record.Log(values, segments, record.draw_faults(logger, style, len(values)))
+
+
+def save(folder: Path, i: int, scene: Scene, log: record.Log) -> None:
+    """Write record i of a scene."""
     path = folder / f"run_{i + 1:02d}.mcap"
-    record.write(path, scene.rig, scene.rig_toml, style, scene.control.kp, values, segments, faults)
-    return faults
+    record.write(path, scene.rig, scene.rig_toml, scene.style, scene.control.kp, log)
 
 
-def _truth(
-    kind: str,
-    seed: int,
-    scene: Scene,
-    refit: Refit | None,
-    found: list[Concealed],
-    faults: list[record.Faults],
-) -> dict[str, Any]:
+def file_of(
+    folder: Path, i: int, scene: Scene, found: list[Concealed], rng: Rng, logger: Rng
+) -> record.Faults:
+    """Record file i of a style, with the effects `found`."""
+    one = logged(i, scene, found, rng, logger)
+    save(folder, i, scene, one)
+    return one.faults
+
+
+def _mimicked(scene: Scene, refit: Refit, effect: Concealed) -> Left:
+    """What a refit leaves of physics outside the table where stiffness and damping of its joint are
+    free as well: the nearest that is within the table."""
+    on, n = effect.draft.site, refit.n
+
+    def build(offsets: Float) -> Setup:
+        setup = scene.built(offsets[:n])
+        own = setup.part(on).values
+        for symbol, x in zip(("k", "c"), offsets[n:], strict=True):
+            # A joint without damping may have that of a hundredth of its stiffness at 1 rad/s.
+            most = max(own[symbol], LOSSY * own["k"]) if symbol == "c" else own[symbol]
+            moved = own[symbol] * float(np.exp(OTHER * x)) if own[symbol] else most * abs(x)
+            setup = setup.with_value(on, symbol, moved)
+        return setup
+
+    step = np.concatenate([refit.step, [STEP / OTHER] * 2])
+    reach = np.concatenate([refit.reach, [2.0, 2.0]])
+    more = Refit(scene.bench, build, step, reach, refit)
+    rows = _records_of(scene, effect.draft, effect.strength)
+    return more.left(rows, np.append(effect.alone.moved, [0.0, 0.0]))
+
+
+def _truth(made: Conceals, faults: list[record.Faults], *, rivals: bool) -> dict[str, Any]:
+    kind, seed, scene, refit, found = made.kind, made.seed, made.scene, made.refit, made.found
     style, about = scene.style, scene.nominal
     names = [f"{e}.{s}" for e, s in about.keys]
     effects = []
     for effect in found:
         others = [o for o in found if o is not effect]
-        left = _beside(scene, effect, others)
+        left = effect.alone if refit is None else _beside(scene, refit, effect, others)
+        if kind == "outside" and refit is not None:
+            left = min(left, _mimicked(scene, refit, effect), key=lambda x: x.data)
         draft, numbers = effect.draft, effect.draft.values(effect.strength)
         effects.append(
             {
@@ -432,7 +537,7 @@ def _truth(
                 "sigma_data": left.data,
                 "sigma_alone": effect.alone.sigma,
                 "sigma_drawn": effect.target,
-                "rivals": _rivals(scene, refit, effect),
+                "rivals": _rivals(scene, refit, effect) if rivals else [],
                 "moved": dict(zip(names, left.moved.tolist(), strict=False)),
             }
         )

@@ -11,8 +11,9 @@ import numpy as np
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Rig
 from sim import kernel
+from sim.base import UNRELATED, realised
+from sim.electronics import converters, drive
 from sim.plant import tabulate
-from sim.rig import UNRELATED, converters, drive, realised
 from sim.settings import SimSettings
 from sim.wire.protocol import RAILS
 

@@ -60,6 +60,8 @@ export class Recordings {
     $("one-notes").replaceChildren();
     for (const n of remarks?.notes || []) put($("one-notes"), "li", `${n.time.slice(0, 16).replace("T", " ")} ${n.author}: ${n.text}`);
     $("one").scrollIntoView({ block: "start" });
+    // Who opened it by a key goes on from here.
+    $("h-one").focus({ preventScroll: true });
     const signals = await ask("GET", `/recordings/${id}/signals?pixels=700`);
     const time = $("one-time"), bode = $("one-frf");
     time.style.height = `${40 + 70 * signals.curves.length}px`;

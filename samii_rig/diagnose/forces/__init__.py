@@ -1,0 +1,1 @@
+"""Forces that depend on amplitude, computed in time under every recorded command."""

@@ -1,0 +1,143 @@
+"""The force laws: one row each, with all that is known of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from samii_rig.diagnose.effect import Key
+from samii_rig.diagnose.forces import steps
+from samii_rig.diagnose.forces.place import Kind, Place
+from samii_rig.diagnose.forces.steps import Step
+from samii_rig.types import Float
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """A force law.
+
+    tag : its own. physics : its name in the table. unknowns : their symbols; how they enter the
+        law's numbers (n_unknown, 2), each number a sum of unknowns, or `fixed` where none does.
+    step : in time, driven by a motion. told : (command (n,), numbers) -> force (n,) and its slopes
+        (n, 2), of a law that the command alone drives.
+    weak : (motion (n,), command (n,), numbers) -> force (n,) of a motion that it does not change,
+        of a law that has a step.
+    of_speed : whether it is driven by the speed of what is read. scaled : whether the last number
+        is a parameter of the rig. words : what it is.
+    """
+
+    tag: str
+    physics: str
+    words: str
+    kinds: tuple[Kind, ...]
+    symbols: tuple[str, ...]
+    enter: tuple[tuple[float, float], ...]
+    weak: Callable[[Float, Float, Float], Float] | None = None
+    fixed: tuple[float, float] = (0.0, 0.0)
+    step: Step | None = None
+    told: Callable[[Float, Float], tuple[Float, Float]] | None = None
+    of_speed: bool = False
+    scaled: bool = False
+
+    def __post_init__(self) -> None:
+        if {self.step is None, self.weak is None} != {self.told is not None}:
+            raise ValueError(f"{self.tag}: a law is driven by a motion or by the command")
+
+    def numbers(self, strengths: Float, scale: float = 1.0) -> Float:
+        """(2,) the law's numbers. scale : the rig's own parameter of a law that has one."""
+        own = np.array(self.fixed) + np.asarray(strengths) @ np.array(self.enter)
+        if self.scaled:
+            own[-1] = scale
+        return np.ascontiguousarray(own)
+
+
+@njit(cache=True)
+def _hysteresis(x: Float, p: Float) -> Float:
+    out = np.zeros(x.size)
+    h, before = 0.0, 0.0
+    for n in range(x.size):
+        new = steps.advanced(h, x[n] - before, p[0], p[1])[0]
+        out[n] = -0.5 * (h + new)
+        h, before = new, x[n]
+    return out
+
+
+def _clip_slopes(y: Float, half: Float) -> tuple[Float, Float]:
+    kept = np.clip(y, -half, half)
+    by = np.where(np.abs(y) > half, np.sign(y), 0.0)
+    return kept, by
+
+
+def _overlap(v: Float, p: Float) -> tuple[Float, Float]:
+    kept, by = _clip_slopes(v, p[0] / 2)
+    return -kept, np.stack([-by / 2, np.zeros_like(by)], axis=1)
+
+
+def _excess(v: Float, p: Float) -> tuple[Float, Float]:
+    kept, by = _clip_slopes(v, p[0])
+    return kept - v, np.stack([by, np.zeros_like(by)], axis=1)
+
+
+def _starved(M: Float, v: Float, p: Float) -> Float:
+    return np.asarray(v * (np.sqrt(np.maximum(1 + np.sign(v) * M / p[0], 0.0)) - 1))
+
+
+ONE = ((1.0, 0.0),)
+FRICTION = Law(
+    "friction", "coulomb_friction", "dry friction", ("joint", "drive"), ("T_c",), ((1.0, 1.0),),
+    weak=lambda y, _v, p: np.where(y > 0, -p[0], p[1]) * (y != 0), step=steps.friction,
+    of_speed=True,
+)  # fmt: skip
+UNEVEN = Law(
+    "uneven", "coulomb_friction", "dry friction that differs by direction", ("joint", "drive"),
+    ("T_c forward", "T_c backward"), ((1.0, 0.0), (0.0, 1.0)), weak=FRICTION.weak,
+    step=steps.friction, of_speed=True,
+)  # fmt: skip
+HARDENING = Law(
+    "hardening", "cubic_stiffness", "a spring that hardens", ("joint",), ("k3",), ONE,
+    weak=lambda y, _v, p: p[0] * p[1] * y**3, fixed=(0.0, -1.0), step=steps.cubic,
+)  # fmt: skip
+SOFTENING = Law(
+    "softening", "cubic_stiffness", "a spring that softens", ("joint",), ("k3",), ONE,
+    weak=HARDENING.weak, fixed=(0.0, 1.0), step=steps.cubic,
+)  # fmt: skip
+PLAY = Law(
+    "play", "backlash", "play", ("joint",), ("width",), ONE,
+    weak=lambda y, _v, p: p[1] * np.clip(y, -p[0] / 2, p[0] / 2), step=steps.play, scaled=True,
+)  # fmt: skip
+HYSTERESIS = Law(
+    "hysteresis", "hysteresis", "a part that sticks, then slips (Bouc-Wen)", ("joint",),
+    ("T_y", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=lambda y, _v, p: _hysteresis(y, p),
+    step=steps.hysteresis,
+)  # fmt: skip
+ORIFICE = Law(
+    "orifice", "flow_saturation", "flow with limited supply", ("flow",), ("T_s",), ONE,
+    weak=_starved, step=steps.orifice,
+)  # fmt: skip
+OVERLAP = Law(
+    "overlap", "valve_deadband", "a dead band of the valve", ("command",), ("width",), ONE,
+    told=_overlap,
+)  # fmt: skip
+CLIPPED = Law(
+    "clipped", "output_saturation", "a clipped command", ("command",), ("limit",), ONE,
+    told=_excess,
+)  # fmt: skip
+LAWS = (FRICTION, UNEVEN, HARDENING, SOFTENING, PLAY, HYSTERESIS, ORIFICE, OVERLAP, CLIPPED)
+
+
+@dataclass(frozen=True)
+class Force:
+    """A law at a place. scale : the rig's parameter that is its last number, if it has one."""
+
+    place: Place
+    law: Law
+    scale: Key | None = None
+
+    def __post_init__(self) -> None:
+        if self.place.kind not in self.law.kinds:
+            raise ValueError(f"{self.law.tag} does not act on a {self.place.kind}")
+        if self.law.scaled != (self.scale is not None):
+            raise ValueError(f"{self.law.tag} needs a parameter of the rig")

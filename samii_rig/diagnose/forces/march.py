@@ -1,0 +1,100 @@
+"""The one integrator of all laws: a rig's partial fractions by exact steps, the force in the loop.
+
+The force is held over each step and found together with the motion that it makes. The slopes of
+the force by its strengths are led along with it (tangent-linear), through the same step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, types
+
+from samii_rig.diagnose.forces.steps import NUMBERS, OUT, SIGNATURE, Step
+from samii_rig.types import Float, Int
+
+_law = types.FunctionType(SIGNATURE)
+_f8, _i8 = types.float64, types.int64
+_row, _rows = types.Array(_f8, 1, "C"), types.Array(_f8, 2, "C")
+_FAST = {"reassoc", "contract", "nsz"}
+
+
+@njit(_rows(_law, _rows, _rows, _rows, _f8, _f8, _row, _i8, _i8, _row, _rows), cache=True,
+      fastmath=_FAST)  # fmt: skip
+def march(
+    law: Step,
+    grow: Float,
+    by_v: Float,
+    by_e: Float,
+    direct: float,
+    g: float,
+    v: Float,
+    late: int,
+    inner: int,
+    p: Float,
+    seeds: Float,
+) -> Float:
+    """(1 + m, n inner) the force under a command v (n,) from rest, and its slopes along m changes
+    of its numbers.
+
+    grow, by_v, by_e : (2, n_pole) real and imaginary parts. What drives the force is the sum of
+    all real parts, and direct and g per unit of command and of force. late : steps of dead time.
+    seeds : (m, 2) each change of the numbers p (2,).
+    """
+    m, n_pole = seeds.shape[0], grow.shape[1]
+    wr, wi = np.zeros((1 + m, n_pole)), np.zeros((1 + m, n_pole))
+    f = np.zeros((1 + m, v.size * inner))
+    out = np.zeros(OUT)
+    y, before, held, memory = np.zeros(1 + m), np.zeros(1 + m), np.zeros(1 + m), np.zeros(1 + m)
+    for step in range(v.size * inner):
+        u = v[(step - late) // inner] if step >= late else 0.0
+        for i in range(1 + m):
+            e, total = held[i], 0.0
+            given = u if i == 0 else 0.0
+            for k in range(n_pole):
+                real, imag = wr[i, k] + by_e[0, k] * e, wi[i, k] + by_e[1, k] * e
+                wr[i, k] = grow[0, k] * real - grow[1, k] * imag + by_v[0, k] * given
+                wi[i, k] = grow[0, k] * imag + grow[1, k] * real + by_v[1, k] * given
+                total += wr[i, k]
+            y[i] = total + direct * given
+        out[:] = 0.0
+        law(before[0], y[0], u, g, p, memory[0], out)
+        f[0, step] = held[0] = out[0]
+        for i in range(1, 1 + m):
+            along = out[1] * before[i] + out[2] * y[i] + out[4] * memory[i]
+            keeps = out[5] * before[i] + out[6] * y[i] + out[7] * memory[i]
+            for j in range(NUMBERS):
+                along += out[8 + 2 * j] * seeds[i - 1, j]
+                keeps += out[9 + 2 * j] * seeds[i - 1, j]
+            f[i, step] = held[i] = along
+            memory[i] = keeps
+        memory[0] = out[3]
+        for i in range(1 + m):
+            before[i] = y[i] + g * held[i]
+    return f
+
+
+@njit(cache=True, fastmath=_FAST)
+def read(e: Float, grow: Float, by_e: Float, direct: Float, inner: int, late: Int) -> Float:
+    """(n, q) what sensors show of a force e (n inner,), before each sample's steps.
+
+    grow : (2, n_pole); by_e : (2, q, n_pole) what a force held over a step makes of each sensor's
+    state. late : (q,) steps of each sensor's delay.
+    """
+    q, n_pole = by_e.shape[1], by_e.shape[2]
+    n = e.size // inner
+    out = np.zeros((n, q))
+    wr, wi = np.zeros(n_pole), np.zeros(n_pole)
+    before = 0.0
+    for step in range(e.size):
+        for i in range(q):
+            if (step + late[i]) % inner == 0 and (step + late[i]) // inner < n:
+                y = direct[i] * before
+                for k in range(n_pole):
+                    y += by_e[0, i, k] * wr[k] - by_e[1, i, k] * wi[k]
+                out[(step + late[i]) // inner, i] = y
+        before = e[step]
+        for k in range(n_pole):
+            real = grow[0, k] * wr[k] - grow[1, k] * wi[k] + before
+            wi[k] = grow[0, k] * wi[k] + grow[1, k] * wr[k]
+            wr[k] = real
+    return out

@@ -1,0 +1,112 @@
+"""A rig with one force in it: the linear rig on the nodes, and what the force adds to all lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.forces.laws import Force
+from samii_rig.diagnose.model import Grid, Model
+from samii_rig.errors import InputError
+from samii_rig.model.tmm import Chain
+from samii_rig.rig.schema import Rig
+from samii_rig.types import Complex, Float
+
+
+@dataclass(frozen=True, slots=True)
+class RecordGrid(Grid):
+    """The nodes of whole records, where a force is computed in time under every record's input.
+
+    added : (model, x, moving) -> (n, q, 1 + m) what the force adds to the records' lines, and its
+    slopes by the entries `moving` of x. A model with a force predicts the nodes, and these lines
+    behind them.
+    """
+
+    added: Callable[[ForceModel, Float, Sequence[int]], Complex] = field(kw_only=True)
+
+
+class ForceModel(Model):
+    """A model one of whose effects is a force; on a plain grid the force is left out.
+
+    force : it. unknowns : where its strengths stand in x. moving : these, and the parameter of the
+    rig that is one of its numbers.
+    """
+
+    def __init__(self, rig: Rig, effects: Sequence[Effect]) -> None:
+        super().__init__(rig, effects)
+        forced = [(i, e) for i, e in enumerate(effects) if e.quasi is not None]
+        if len(forced) != 1:
+            raise InputError(rig.name, "effects", len(forced), "one force at a time")
+        which, effect = forced[0]
+        assert effect.quasi is not None
+        self.force: Force = effect.quasi
+        self.chain = self.chain_of(self.force.place.widened(self.built))
+        self.unknowns = tuple(self.own(which))
+        scale = self.force.scale
+        self.moving = (*self.unknowns, *((self.keys.index(scale),) if scale in self.keys else ()))
+
+    def plain(self, x: Float) -> Chain:
+        """As of `Model`, without the force's input and sensor."""
+        return Chain(self.built).with_values(self.values(x))
+
+    def strengths(self, x: Float) -> Float:
+        """The force's unknowns."""
+        return np.exp(x[list(self.unknowns)])
+
+    def numbers(self, x: Float) -> Float:
+        """(2,) the numbers of its law."""
+        scale = self.force.scale
+        known = 1.0 if scale is None else float({**self.nominal, **self.values(x)}[scale])
+        return self.force.law.numbers(self.strengths(x), known)
+
+    def seeds(self, x: Float, moving: Sequence[int]) -> Float:
+        """(m, 2) slopes of `numbers` by entries of x, each a logarithm."""
+        own = np.array(self.force.law.enter) * self.strengths(x)[:, None]
+        by_scale = np.array([0.0, self.numbers(x)[1]])
+        rows = [own[self.unknowns.index(j)] if j in self.unknowns else by_scale for j in moving]
+        return np.ascontiguousarray(rows, np.float64).reshape(-1, 2)
+
+    def channels(self, x: Float, s: Complex) -> tuple[Complex, dict[str, Complex]] | None:
+        """(n,) at s what the effects on channels do to the command, and to each sensor by name;
+        None where no effect is on a channel."""
+        some = [
+            (e.factor, theta)
+            for e, theta in zip(self.effects, self.parts(x), strict=True)
+            if e.factor is not None
+        ]
+        given = np.ones(s.size, complex)
+        seen: dict[str, Complex] = {}
+        for factor, theta in some:
+            F = factor.value(s, theta)[0]
+            if factor.kind == "input":
+                given = given * F
+            else:
+                seen[factor.channel] = seen.get(factor.channel, np.ones_like(F)) * F
+        return (given, seen) if some else None
+
+    def response(self, x: Float, at: Grid) -> Complex:
+        """(n, q) at the grid's lines; of whole records, behind these what the force adds to all."""
+        h = super().response(x, at)
+        if not isinstance(at, RecordGrid):
+            return h
+        return np.concatenate([h, at.added(self, x, ())[:, :, 0]])
+
+    def gradient(self, x: Float, at: Grid) -> tuple[Complex, Complex]:
+        """The same, and its derivatives (n, q, n_x). The force moves with its own numbers; what the
+        chain's other parameters do to it is of second order."""
+        h, dh = super().gradient(x, at)
+        if not isinstance(at, RecordGrid):
+            return h, dh
+        added = at.added(self, x, self.moving)
+        more = np.zeros((*added.shape[:2], self.n), complex)
+        more[:, :, list(self.moving)] = added[:, :, 1:]
+        return np.concatenate([h, added[:, :, 0]]), np.concatenate([dh, more])
+
+
+def model_of(rig: Rig, effects: Sequence[Effect]) -> Model:
+    """The model that the effects need."""
+    forced = any(e.quasi is not None for e in effects)
+    return ForceModel(rig, effects) if forced else Model(rig, effects)

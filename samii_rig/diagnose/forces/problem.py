@@ -1,0 +1,177 @@
+"""Forces in the likelihood of whole records.
+
+A force e at its place moves the sensors of the open loop by y_e; the command v was recorded. So
+
+    y = H_open v + y_e,   v = r - kp theta   ->   y - y_e = H (r - kp theta_e),
+
+H the closed loop's response: less what the force does to the sensors, a record is one of the linear
+rig under a slightly other input. A force on the command, v + e in the place of v, is the input
+r + e. What drives the force is computed in time from the recorded command and the force itself,
+from rest to the record's last sample: harmonics, start and cut end are in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+
+from samii_rig.diagnose.forces.model import ForceModel, RecordGrid
+from samii_rig.diagnose.forces.way import Ways
+from samii_rig.diagnose.model import Grid
+from samii_rig.diagnose.records import RecordProblem, Whole
+from samii_rig.diagnose.refit import Fitted, Problem
+from samii_rig.likelihood.complete import Complete
+from samii_rig.likelihood.pieces import Piece, Samples
+from samii_rig.types import Complex, Float
+
+
+@dataclass(frozen=True)
+class Moved:
+    """What a force does under the commands of all pieces."""
+
+    whole: Whole
+    ways: Ways
+
+    def of(self, model: ForceModel, x: Float, moving: Sequence[int] = ()) -> list[list[Samples]]:
+        """Of each piece the change of its input r (history + n,) and of its sensors z (n, q), then
+        the slopes of both by the entries `moving` of x."""
+        p, seeds = model.numbers(x), model.seeds(x, moving)
+        if model.force.law.told is not None:
+            return [_told(piece, model, p, seeds) for piece in self.whole.records.pieces]
+        way, wired = self.ways.at(model, x), self.whole.wired
+        contour = self.whole.records.exact()
+        channels = model.channels(x, contour.s)
+        out = []
+        for piece in self.whole.records.pieces:
+            v, times = mean_command(piece)
+            if channels is not None:
+                v = contour.record(contour.damped(v) * channels[0], v.size)
+            own = []
+            for e in way.force(model, v, p, seeds):
+                y = times * way.sensed.of(e)[:, self.whole.sensor]
+                for name, F in channels[1].items() if channels is not None else ():
+                    j = wired.sensors.index(name)
+                    y[:, j] = contour.record(contour.damped(y[:, j]) * F, len(y))
+                r = np.zeros(piece.r.size)
+                if wired.kp:
+                    r -= wired.kp * y[:, wired.sensors.index(wired.centring)]
+                own.append(Samples(r, y[piece.history :]))
+            out.append(own)
+        return out
+
+    def without(self, fitted: Fitted) -> Whole:
+        """The records as those of the linear part of a fit."""
+        assert isinstance(fitted.model, ForceModel)
+        moved = self.of(fitted.model, fitted.x)
+        records = self.whole.records
+        pieces = tuple(
+            replace(piece, r=piece.r + m.r, z=piece.z - m.z)
+            for piece, (m,) in zip(records.pieces, moved, strict=True)
+        )
+        return replace(self.whole, records=replace(records, pieces=pieces))
+
+
+def _told(piece: Piece, model: ForceModel, p: Float, seeds: Float) -> list[Samples]:
+    """A force on the command alone, of every record by itself: a converter's steps fall differently
+    each time."""
+    told = model.force.law.told
+    assert told is not None
+    r = np.zeros((1 + len(seeds), piece.r.size))
+    for command in piece.commands:
+        e, slopes = told(command.v, p)
+        r[0] += command.part * e
+        r[1:] += command.part * (slopes @ seeds.T).T
+    still = np.zeros_like(piece.z)
+    return [Samples(own, still) for own in r]
+
+
+def mean_command(piece: Piece) -> tuple[Float, float]:
+    """The command of a piece's records, which repeat each other, and how many times the piece has
+    what one of them does."""
+    times = sum(c.part for c in piece.commands)
+    return np.asarray(sum(c.part * c.v for c in piece.commands) / times), times
+
+
+@dataclass(frozen=True)
+class ForceProblem(RecordProblem):
+    """The likelihood of whole records for models with and without a force, near a reference.
+
+    complete : all lines. goal : of them, both parts.
+    """
+
+    complete: Complete = field(kw_only=True)
+    goal: Float = field(kw_only=True)
+
+    @classmethod
+    def near(cls, whole: Whole, fitted: Fitted, by_line: Problem, ways: Ways) -> ForceProblem:
+        """About a fit, with a force or without."""
+        moved = Moved(whole, ways)
+        about = moved.without(fitted) if isinstance(fitted.model, ForceModel) else whole
+        complete = about.complete(fitted)
+        records, exact = whole.records, whole.records.exact()
+        S = whole.response(fitted)(exact.s)
+        order, k = complete.rows.order, [records.lines(p).k for p in records.pieces]
+
+        def added(model: ForceModel, x: Float, moving: Sequence[int]) -> Complex:
+            each = [
+                np.stack([-records.left(Samples(m.r, -m.z), k_, S, exact) for m in own], axis=2)
+                for own, k_ in zip(moved.of(model, x, moving), k, strict=True)
+            ]
+            return np.asarray(np.concatenate(each)[order])
+
+        nodes = whole.grid(complete.reduced.frequency, complete.reduced.sigma, fitted)
+        own: dict[str, Any] = {f.name: getattr(nodes, f.name) for f in fields(nodes)}
+        at = RecordGrid(**own, added=added)
+        e = complete.rows.e
+        if isinstance(fitted.model, ForceModel):
+            e = np.asarray(e + added(fitted.model, fitted.x, ())[:, :, 0])
+        return cls(
+            by_line.data, by_line.root, at, by_line=by_line, reduced=complete.reduced,
+            complete=complete, goal=complete.split(e),
+        )  # fmt: skip
+
+    @property
+    def expected(self) -> float:
+        """As of `Problem`."""
+        return self.complete.expected
+
+    def residual(self, h: Complex) -> Float:
+        """As of `Problem`."""
+        b = self.reduced.reference.shape[0]
+        d = (h[:b] - self.reduced.reference)[:, :, None]
+        return np.asarray(self._moved(d, h[b:, :, None])[:, 0] - self.goal)
+
+    def whiten(self, dh: Complex) -> Float:
+        """As of `Problem`."""
+        b = self.reduced.reference.shape[0]
+        return self._moved(dh[:b], dh[b:])
+
+    def toward(self, h: Complex) -> ForceProblem:
+        """As of `Problem`."""
+        return replace(self, goal=self.residual(h) + self.goal)
+
+    def change(self, model: ForceModel, x: Float) -> Float:
+        """What the force of a model adds to the prediction, in noise units.
+
+        Raises SamiiRigError where the rig has no partial fractions at x.
+        """
+        assert isinstance(self.at, RecordGrid)
+        return self.complete.split(self.at.added(model, x, ())[:, :, 0])
+
+    def without_force(self) -> RecordProblem:
+        """For linear models alone, beside the force that the reference has."""
+        own = {f.name: getattr(self.at, f.name) for f in fields(Grid)}
+        at = Grid(**own)
+        return RecordProblem(self.data, self.root, at, by_line=self.by_line, reduced=self.reduced)
+
+    def _moved(self, d: Complex, lines: Complex) -> Float:
+        """(m + 2 n q, p) of changes on the nodes and of lines."""
+        out = np.zeros((self.goal.size, d.shape[2]))
+        out[: self.reduced.factor.shape[0]] = self.reduced.slopes(d)
+        if lines.size:
+            for j in np.flatnonzero(np.any(lines != 0, axis=(0, 1))):
+                out[:, j] += self.complete.split(lines[:, :, j])
+        return out

@@ -1,0 +1,176 @@
+"""What each force may explain, to first order: the force of the motion that it does not change.
+
+A weak force acts on the linear rig's own motion, and what it adds to the lines follows by one
+product (Born's approximation). How far it lies along what a fit leaves, over its length, bounds
+what it explains: no multiple of it explains more. Only forces whose bound may matter are computed
+in time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.forces.laws import (
+    CLIPPED,
+    HYSTERESIS,
+    ORIFICE,
+    OVERLAP,
+    PLAY,
+    Force,
+    Law,
+)
+from samii_rig.diagnose.forces.problem import ForceProblem
+from samii_rig.diagnose.forces.reach import Reach, Span
+from samii_rig.diagnose.screen import Screen
+from samii_rig.types import Complex, Float
+
+# Widths of a gap over the largest motion at which it is tried: what it does to the rest has its
+# largest part where both are alike, and falls slowly.
+GAPS = (3e-4, 2e-3, 1e-2, 4e-2, 0.15, 0.5)
+# Limits over the largest amplitude: one just below it cuts only a little.
+LIMITS = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
+SLIPS = (0.03, 0.15, 0.6)  # motion at which a part slips over the largest motion
+WEAK = 1e-3  # of the upper end of a supply's range
+CAP = 1.5  # power of its height, that what a limit cuts off a sine grows with
+STRONG = 0.03  # of the motion that drives it, that a force may change to count as weak
+
+
+@dataclass(frozen=True, slots=True)
+class Hope:
+    """What a force should gain of chi-square beside each base, and at which strengths.
+
+    own : (n_look,) gain at `strengths`. may : (n_look,) the gain of its best multiple, `times` as
+    strong. weak : whether the first order is enough.
+    """
+
+    effect: Effect
+    strengths: Float
+    own: Float
+    may: Float
+    times: float
+    weak: bool = True
+
+
+@dataclass(frozen=True)
+class Looks:
+    """Fits, and what they leave, against which changes of the lines are held."""
+
+    problem: ForceProblem
+    screens: tuple[Screen, ...]
+
+    def gains(self, g: Float) -> tuple[Float, Float, Float]:
+        """(n_look,) of a change g of what is predicted: fall of chi-square with it, with its best
+        multiple, and how many times it is that."""
+        found = []
+        for look in self.screens:
+            through = look.directions[: g.size].T @ g
+            found.append((-float(g @ look.left_by()[: g.size]), float(g @ g - through @ through)))
+        return _gains(*np.array(found).T)
+
+    def weakly(self, changes: Sequence[Complex]) -> list[tuple[Float, Float, Float]]:
+        """`gains` of each of many changes of the lines (n, q)."""
+        rows = self.problem.complete.rows.e.size * 2 + len(self.problem.complete.factor)
+        sides = [np.column_stack([s.left_by(), s.directions])[:rows] for s in self.screens]
+        joined = self.problem.complete.joined(np.concatenate(sides, axis=1))
+        flat = _real(joined.reshape(-1, joined.shape[2]))
+        out, ends = [], np.cumsum([side.shape[1] for side in sides])
+        for change in changes:
+            g = _real(self.problem.complete.white(change).ravel())
+            each = np.split(g @ flat, ends[:-1])
+            power = float(g @ g)
+            found = [(-x[0], power - float(x[1:] @ x[1:])) for x in each]
+            out.append(_gains(*np.array(found).T))
+        return out
+
+
+def _real(x: Complex) -> Float:
+    return np.concatenate([x.real, x.imag])
+
+
+def _gains(along: Float, power: Float) -> tuple[Float, Float, Float]:
+    known = (power > 0) & np.isfinite(power)
+    power = np.where(known, power, 1.0)
+    times = np.where(known, along / power, 0.0)
+    own = np.where(known, 2 * along - power, -np.inf)
+    return own, np.maximum(along, 0.0) * np.maximum(times, 0.0) * known, times
+
+
+def tries(effect: Effect, reach: Reach) -> list[Float]:
+    """Strengths at which the shape of a force differs."""
+    assert effect.quasi is not None
+    law, high = effect.quasi.law, effect.unknowns[0].high
+    if law is CLIPPED:
+        return [np.array([high * x]) for x in LIMITS]
+    if law in (OVERLAP, PLAY):
+        return [np.array([high / 2 * x]) for x in GAPS]
+    if law is ORIFICE:
+        return [np.array([high * WEAK])]
+    if law is HYSTERESIS:
+        motion = reach.motion(effect.quasi.place, of_speed=False)
+        top = max(float(np.max(np.abs(y))) for y in motion)
+        k = effect.unknowns[1].high * WEAK
+        return [np.array([k * top * x, k]) for x in SLIPS]
+    return [np.array([high * WEAK])]
+
+
+def scaled(law: Law, strengths: Float, times: float, largest: float) -> Float:
+    """The strengths at which a weak force is about so many times as strong. largest : command."""
+    if law is CLIPPED:
+        cut = np.maximum(largest - strengths, 0.0)
+        return np.asarray(largest - cut * times ** (1 / CAP))
+    return np.asarray(strengths / times if law is ORIFICE else strengths * times)
+
+
+def weakly(effects: Sequence[Effect], reach: Reach, looks: Looks) -> list[Hope]:
+    """Of each force its best try, to first order."""
+    records, order = reach.whole.records, looks.problem.complete.rows.order
+    k = [records.lines(p).k for p in records.pieces]
+    which, shapes, changed = [], [], []
+    for effect in effects:
+        force = effect.quasi
+        assert force is not None
+        ports = reach.ports(force.place, of_speed=force.law.of_speed)
+        if ports is None:
+            continue
+        for strengths in tries(effect, reach):
+            p = force.law.numbers(strengths, reach.scale(force.scale))
+            spectra, share = _forces(force, p, reach)
+            lines = map(Span.lines, reach.spans, spectra, ports.sensors, k)
+            shapes.append(np.concatenate(list(lines))[order])
+            which.append((effect, strengths))
+            changed.append(share)
+    best: dict[str, Hope] = {}
+    gains = looks.weakly(shapes)
+    for (effect, strengths), share, (own, may, times) in zip(which, changed, gains, strict=True):
+        at = int(np.argmax(may))
+        weak = share * max(float(times[at]), 0.0) < STRONG
+        hope = Hope(effect, strengths, own, may, float(times[at]), weak)
+        old = best.get(effect.key)
+        if old is None or may[at] > np.max(old.may):
+            best[effect.key] = hope
+    return sorted(best.values(), key=lambda h: -float(np.max(h.may)))
+
+
+def _forces(force: Force, p: Float, reach: Reach) -> tuple[list[Complex], float]:
+    """Of each piece the damped spectrum of a force under the motion that it does not change, and
+    the share by which it would change that, at the worst lines."""
+    if force.law.told is not None:
+        told = force.law.told
+        each = [
+            s.spectrum(np.asarray(sum(c.part * told(c.v, p)[0] for c in piece.commands)) / s.times)
+            for s, piece in zip(reach.spans, reach.whole.records.pieces, strict=True)
+        ]
+        return each, 0.0
+    assert force.law.weak is not None
+    motion = reach.motion(force.place, of_speed=force.law.of_speed)
+    e = [force.law.weak(y, v, p) for y, v in zip(motion, reach.commands, strict=True)]
+    ports = reach.ports(force.place, of_speed=force.law.of_speed)
+    assert ports is not None
+    moved = max(float(np.sqrt(np.mean(x**2))) for x in e) * math.sqrt(np.mean(ports.y1**2))
+    moves = max(float(np.sqrt(np.mean(y**2))) for y in motion)
+    return [s.damped(x) for s, x in zip(reach.spans, e, strict=True)], float(moved / moves)

@@ -1,0 +1,289 @@
+"""Forces that depend on amplitude as further hypotheses of whole records.
+
+What each force may explain is bounded to first order; the few that may matter are computed in time
+under the recorded commands. Linear explanations and those with a force then stand on the very same
+lines with the same weights, about the best of them, and one rule decides. A force is held against
+what is left beside one linear effect too, and linear effects against what a force leaves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import copy
+
+import numpy as np
+
+from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.explanations import NEAR, Explanation, Explanations
+from samii_rig.diagnose.forces.laws import FRICTION
+from samii_rig.diagnose.forces.model import ForceModel
+from samii_rig.diagnose.forces.problem import ForceProblem, Moved
+from samii_rig.diagnose.forces.reach import Reach
+from samii_rig.diagnose.forces.screen import Hope, Looks, scaled, weakly
+from samii_rig.diagnose.forces.table import forces, uneven
+from samii_rig.diagnose.forces.way import Ways
+from samii_rig.diagnose.judge import threshold
+from samii_rig.diagnose.model import Model
+from samii_rig.diagnose.ranking import moved, ranking
+from samii_rig.diagnose.records import RecordSearch, Whole
+from samii_rig.diagnose.refit import STEPS, Fitted
+from samii_rig.diagnose.screen import Screen
+from samii_rig.errors import SamiiRigError
+from samii_rig.likelihood.reduce import Left
+from samii_rig.types import Float
+
+CLOSER = 2  # times that the best strength is looked at closer
+TIMES = (0.05, 20.0)  # of a strength, one such step
+TRIED = 4  # physics of which a force is refitted
+# Of what an effect must explain, that a force explains to first order to be computed in time:
+# strong ones were seen to gain 3 times as much once refitted, weak ones gain what it says.
+STRONG, WEAK = 0.3, 0.45
+MARCHED = 12  # forces that are computed in time
+LESS = 0.08  # of the largest bound, below which a force is not
+PROMISING = 0.25  # of what the best force gains, at least
+AGAIN = 3  # times that the likelihood is made anew about the best explanation
+STILL = 0.5  # standard deviations, a move from one to the next that is none
+RENEWED = 6  # times that the chain through which a force acts is renewed in between
+RIVALS = 4  # linear explanations that forces are held against
+BESIDE = 3  # linear effects that are refitted beside the best force, and the other way round
+
+
+class ForceSearch(RecordSearch):
+    """As `RecordSearch`, on the complete likelihood, with every level by itself."""
+
+    def __init__(self, linear: RecordSearch) -> None:
+        assert isinstance(linear.whole, Whole)  # of one state
+        self.levels = whole = linear.whole.by_level()
+        self._ways = Ways()
+        self.linear = linear
+        nominal = linear.nominal.fitted
+        self.reach = Reach(whole, nominal.model, nominal.x, int(linear.grid.actuator[0]))
+        self.forces = tuple(forces(whole.rig, self.reach))
+        super().__init__(whole, linear.by_line)
+        self.use((*linear.table, *self.forces))
+
+    def __post_init__(self) -> None:
+        self.use(self.table)
+        ranked = self.linear.ranked()
+        self._about(ranked[0].fitted)
+        kept = [e for e in ranked[:RIVALS] if e.weight > ranked[0].weight - NEAR]
+        self._only((self.linear.nominal, *kept))
+
+    def _only(self, some: Sequence[Explanation]) -> None:
+        """Refit some explanations, and forget all others."""
+        self.found = {}
+        for e in {e.key: e for e in some}.values():
+            end = self.refitted(e.effects, e, far=False)
+            if end is not None:
+                self.keep(e.effects, end)
+
+    def _about(self, fitted: Fitted) -> None:
+        self._ways.renew()
+        self.problem = ForceProblem.near(self.levels, fitted, self.by_line.problem, self._ways)
+        between = self.levels.between(self.reduced, fitted)
+        self._between = between, fitted.model.response(fitted.x, between)
+
+    def refitted_from(
+        self,
+        effects: tuple[Effect, ...],
+        start: Float,
+        give_up: float = math.inf,
+        steps: int = STEPS,
+        *,
+        far: bool = True,
+    ) -> Fitted | None:
+        """As of `Explanations`; a force is computed in time at every step, and its slopes too."""
+        forced = isinstance(self.model(effects), ForceModel)
+        return super().refitted_from(effects, start, give_up, steps, far=far and not forced)
+
+    def settled(self) -> bool:
+        """Refit what promises most, and all that may compete again about the best of it, until
+        that stands still. Whether it has a force."""
+        first = next((e for e in self.ranked() if len(e.effects) == 1), None)
+        hopes = self.hopes(self.nominal if first is None else first)
+        self._try(hopes, self.nominal, 0)
+        if first is not None:
+            self._try(hopes, first, -1)
+        self.temper()
+        for _ in range(AGAIN):
+            best = self.ranked()[0]
+            if not isinstance(best.fitted.model, ForceModel):
+                return False
+            self._about(best.fitted)
+            near = [e for e in self.ranked() if e.weight > best.weight - NEAR]
+            self._only((*near, self.nominal))
+            self._through(self.ranked()[0])
+            self.temper()
+            after = self.ranked()[0]
+            if after.key == best.key and after.fitted.away(best.fitted) < STILL:
+                break
+        self._either_way(self.ranked()[0])
+        self.pair()
+        self.temper()
+        return isinstance(self.ranked()[0].fitted.model, ForceModel)
+
+    def _try(self, hopes: Sequence[Hope], base: Explanation, look: int) -> None:
+        """Refit the forces that may be the best beside `base`, by the gains of that look."""
+        for hope in _worth_while(hopes, self.worth, look):
+            effects = (*base.effects, hope.effect)
+            end = self.refitted(effects, base, np.log(hope.strengths).tolist())
+            if end is not None and base.fitted.chi2 - end.chi2 > (
+                self.worth if base.effects else 0
+            ):
+                self.keep(effects, end)
+
+    def _through(self, best: Explanation) -> None:
+        """Refit it with the chain through which its force acts renewed where each refit ended,
+        until that stands still."""
+        for _ in range(RENEWED):
+            if not isinstance(best.fitted.model, ForceModel):
+                return
+            self._ways.renew()
+            end = self.refitted(best.effects, best)
+            if end is None:
+                return
+            del self.found[best.key]
+            self.keep(best.effects, end)
+            still, best = best.fitted.away(end) < STILL, self.found[best.key]
+            if still:
+                return
+
+    def _either_way(self, best: Explanation) -> None:
+        """Dry friction that may differ by direction, from where it did not."""
+        forced = next((e for e in best.effects if e.quasi is not None), None)
+        if forced is None or forced.quasi is None or forced.quasi.law is not FRICTION:
+            return
+        other = uneven(forced)
+        at = best.effects.index(forced)
+        effects = (*best.effects[:at], *best.effects[at + 1 :], other)
+        own = best.fitted.model.own(at)
+        start = np.append(np.delete(best.fitted.x, list(own)), np.repeat(best.fitted.x[own[0]], 2))
+        if other.key not in {e.key for e in self.table}:
+            self.use((*self.table, other))
+        end = self.refitted_from(effects, start)
+        if end is not None and best.fitted.chi2 - end.chi2 > self.worth:
+            self.keep(effects, end)
+
+    def pair(self) -> None:
+        """Linear effects beside the best force; each of both must explain what an effect must."""
+        best = self.ranked()[0]
+        single = len(best.effects) == 1 and isinstance(best.fitted.model, ForceModel)
+        if not single or self.is_enough():
+            return
+        plain, rest = self.beside(best)
+        assert isinstance(plain, RecordSearch)
+        for drop, effect, starts in ranking(
+            Screen.of(plain.problem, rest.fitted), self.linear.table, (), plain.model
+        )[:BESIDE]:
+            effects = (*best.effects, effect)
+            if drop < self.worth / 2 or self.model(effects) is None:
+                continue
+            end = self.refitted(effects, best, np.log(starts[0]).tolist())
+            alone = [best, self.found.get(frozenset({effect.key}))]
+            if end is not None and all(
+                e is None or e.fitted.chi2 - end.chi2 > self.worth for e in alone
+            ):
+                self.keep(effects, end)
+
+    def is_enough(self) -> bool:
+        """Whether the best explanation leaves no more than noise."""
+        return self.ratio(self.ranked()[0].fitted) < threshold(self.spread)
+
+    def hopes(self, other: Explanation) -> list[Hope]:
+        """Every force that may explain as much as an effect must beside the nominal parameters, or
+        beside another explanation, with what it gains beside both."""
+        nominal = self.nominal
+        bases = {e.key: e for e in (nominal, other)}.values()
+        screens = tuple(Screen.of(self._force_problem, e.fitted) for e in bases)
+        looks = Looks(self._force_problem, screens)
+        hopes = weakly(self.forces, self.reach, looks)
+        most = max((float(np.max(h.may)) for h in hopes), default=0.0)
+        some = [h for h in hopes if self._matters(h, most)][:MARCHED]
+        found = [self._closer(h, looks, nominal) for h in some]
+        # Beside the nominal parameters alone it must do as much as a linear effect did.
+        ahead = screens[0].base.cost - min(look.base.cost for look in screens)
+        return [
+            h
+            for h in found
+            if h is not None and (h.own[0] >= STRONG * ahead or h.own[-1] >= self.worth / 2)
+        ]
+
+    def _matters(self, hope: Hope, most: float) -> bool:
+        may = float(np.max(hope.may))
+        return may > max((WEAK if hope.weak else STRONG) * self.worth, LESS * most)
+
+    def _closer(self, hope: Hope, looks: Looks, nominal: Explanation) -> Hope | None:
+        """The same, computed in time where the first order leads, and closer to its best."""
+        effect, old = hope.effect, nominal.fitted
+        model = self.model((effect,))
+        assert effect.quasi is not None
+        if not isinstance(model, ForceModel):
+            return None
+        known = moved(old.model, old.x, model)
+        low, high = np.array([(u.low, u.high) for u in effect.unknowns]).T
+        strengths, times, best = hope.strengths, hope.times, None
+        for _ in range(1 + CLOSER):
+            if not times > 0:
+                break
+            times = min(max(times, TIMES[0]), TIMES[1]) if best else times
+            strengths = scaled(effect.quasi.law, strengths, times, self.reach.largest)
+            strengths = np.clip(strengths, low, high)
+            try:
+                g = self._force_problem.change(model, np.append(known, np.log(strengths)))
+            except SamiiRigError:
+                break
+            own, may, each = looks.gains(g)
+            at = int(np.argmax(own))
+            times = float(each[at])
+            if best is None or own[at] > np.max(best.own):
+                best = Hope(effect, strengths, own, may, times, weak=False)
+        return best
+
+    def left(self, fitted: Fitted, *, shown: bool = False) -> Left:
+        """As of `RecordSearch`."""
+        if not isinstance(fitted.model, ForceModel):
+            return super().left(fitted, shown=shown)
+        rest = Moved(self.levels, self._ways).without(fitted)
+        return rest.left(fitted, self.reduced, shown=shown)
+
+    def beside(self, best: Explanation) -> tuple[Explanations, Explanation]:
+        """As of `Explanations`: the records without the force of `best`, about which the likelihood
+        stands."""
+        linear = tuple(e for e in best.effects if e.quasi is None)
+        model = Model(self.rig, linear)
+        plain = copy(self)
+        plain.problem = self._force_problem.without_force()
+        old = best.fitted
+        gone = list(old.model.unknowns) if isinstance(old.model, ForceModel) else []
+        x = np.delete(old.x, gone)
+        h, dh = model.gradient(x, plain.problem.at)
+        J, r = plain.problem.whiten(dh), plain.problem.residual(h)
+        fitted = Fitted(model, x, float(r @ r), old.penalty, J, J.T @ J)
+        return plain, Explanation(linear, fitted, 0.0)
+
+    @property
+    def _force_problem(self) -> ForceProblem:
+        assert isinstance(self.problem, ForceProblem)
+        return self.problem
+
+
+def compete_on_records(linear: RecordSearch) -> ForceSearch | None:
+    """Let forces compete with what the linear search of whole records found; None where none wins.
+
+    Raises SamiiRigError where no force can be computed on this rig.
+    """
+    search = ForceSearch(linear)
+    return search if search.settled() else None
+
+
+def _worth_while(hopes: Sequence[Hope], worth: float, look: int) -> list[Hope]:
+    """Those that may be the best: of each physics the first, and the first's at other places."""
+    ranked = sorted(hopes, key=lambda h: -float(h.own[look]))
+    some = [h for h in ranked if h.own[look] > max(worth / 2, PROMISING * ranked[0].own[look])]
+    if not some:
+        return []
+    first = list({h.effect.physics: h for h in reversed(some)}.values())[::-1]
+    # Torques and angles of neighbouring joints go nearly together.
+    elsewhere = [h for h in some[1:] if h.effect.physics == some[0].effect.physics]
+    return list({h.effect.key: h for h in (*first[:TRIED], *elsewhere[:TRIED])}.values())

@@ -1,0 +1,130 @@
+"""One step of each force law, found together with the motion that the force itself makes.
+
+What drives a force is `free` at the end of a step without the force over it, and free + g f with
+it. A step fills `out` with
+
+    0: f   1: df/dbefore   2: df/dfree   3: memory after it   4: df/dmemory
+    5: dm/dbefore   6: dm/dfree   7: dm/dmemory   8, 10: df/dp   9, 11: dm/dp
+
+where m is the memory after the step, and p are the law's numbers. Smooth laws act on the middle of
+the step, so that errors fall with the square of its length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit, types
+
+from samii_rig.types import Float
+
+OUT, NUMBERS = 12, 2  # entries of `out`, and numbers of a law at most
+NEWTON = 5  # steps to the root of a law that is monotonous
+_f8, _row = types.float64, types.Array(types.float64, 1, "C")
+SIGNATURE = types.void(_f8, _f8, _f8, _f8, _row, _f8, _row)
+
+Step = Callable[[float, float, float, float, Float, float, Float], None]
+"""(before, free, u, g, p, memory, out); u is the command."""
+
+
+@njit(SIGNATURE, cache=True)
+def friction(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """Dry friction: what stops the speed, within -p0 and p1 (Karnopp 1985)."""
+    stops = -free / g
+    out[0] = min(max(stops, -p[0]), p[1])
+    if stops < -p[0]:
+        out[8] = -1.0
+    elif stops > p[1]:
+        out[10] = 1.0
+    else:
+        out[2] = -1.0 / g
+
+
+@njit(SIGNATURE, cache=True)
+def cubic(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """p1 p0 y^3, p1 = -1 of a spring that hardens and 1 of one that softens."""
+    middle, k = 0.5 * (before + free), p[0] * p[1]
+    slope = 0.5 * g * k
+    x = before
+    for _ in range(NEWTON):
+        x -= (x - middle - slope * x * x * x) / (1.0 - 3.0 * slope * x * x)
+    out[0] = k * x * x * x
+    # f = k (middle + g f/2)^3, differentiated.
+    held = 1.0 - 3.0 * slope * x * x
+    out[1] = out[2] = 1.5 * k * x * x / held
+    out[8], out[10] = p[1] * x * x * x / held, p[0] * x * x * x / held
+
+
+@njit(SIGNATURE, cache=True)
+def play(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """What a gap of width p0 takes from a spring of stiffness p1."""
+    held = 1.0 - 0.5 * g * p[1]
+    inside = 0.5 * (before + free) / held
+    x = min(max(inside, -0.5 * p[0]), 0.5 * p[0])
+    out[0] = p[1] * x
+    if x == inside:
+        out[1] = out[2] = 0.5 * p[1] / held
+        out[10] = x / held
+    else:
+        out[8] = 0.5 * p[1] * np.sign(x)
+        out[10] = x
+
+
+@njit(SIGNATURE, cache=True)
+def orifice(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """What the load takes from the flow u: u (sqrt(1 + sign(u) M/p0) - 1)."""
+    sign = 1.0 if u >= 0.0 else -1.0
+    moment = 0.5 * (before + free)
+    root = np.sqrt(max(1.0 + sign * moment / p[0], 0.0))
+    out[0] = u * (root - 1.0)
+    if root > 0.0:
+        slope = 0.5 * u * sign / (p[0] * root)
+        out[1] = out[2] = 0.5 * slope
+        out[8] = -slope * moment / p[0]
+
+
+@njit(cache=True)
+def advanced(h: float, dx: float, top: float, k: float) -> tuple[float, float, float, float, float]:
+    """The hysteretic force h after a motion dx, and its slopes by dx, h, top and k: exactly that of
+    Bouc-Wen with n = 1 and beta = gamma, dh = k dx (1 - |h|/top) growing and k dx falling."""
+    sign = 1.0 if dx >= 0.0 else -1.0
+    way, held = abs(dx), h * sign
+    if held < 0.0 and k * way <= -held:
+        return h + k * dx, k, 1.0, 0.0, dx
+    if held < 0.0:  # back to zero first
+        E = np.exp(-(k * way + held) / top)
+        by_top = 1.0 - E - E * (k * way + held) / top
+        return sign * top * (1.0 - E), k * E, E, sign * by_top, sign * E * way
+    E = np.exp(-k * way / top)
+    rest = (top - held) * E
+    by_top = 1.0 - E - rest * k * way / top**2
+    return sign * (top - rest), k * rest / top, E, sign * by_top, sign * rest * way / top
+
+
+@njit(SIGNATURE, cache=True)
+def hysteresis(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """Bouc-Wen of height p0 and of stiffness p1 before it slips; the mean force of the step."""
+    dx = free - before - g * memory
+    for _ in range(NEWTON):
+        h, slope, _, _, _ = advanced(memory, dx, p[0], p[1])
+        off = dx - (free - before) + 0.5 * g * (memory + h)
+        dx -= off / (1.0 + 0.5 * g * slope)
+    h, slope, by_h, by_top, by_k = advanced(memory, dx, p[0], p[1])
+    held = 1.0 + 0.5 * g * slope
+    out[0], out[3] = -0.5 * (memory + h), h
+    out[5], out[6] = -slope / held, slope / held
+    out[7] = (by_h - 0.5 * g * slope) / held
+    out[9], out[11] = by_top / held, by_k / held
+    out[1], out[2], out[8], out[10] = -0.5 * out[5], -0.5 * out[6], -0.5 * out[9], -0.5 * out[11]
+    out[4] = -0.5 * (1.0 + out[7])

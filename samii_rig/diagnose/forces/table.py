@@ -1,0 +1,142 @@
+"""The forces that a rig may hide, each with its range over the data at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from samii_rig.diagnose.effect import Effect, Unknown
+from samii_rig.diagnose.forces.laws import (
+    CLIPPED,
+    FRICTION,
+    HARDENING,
+    HYSTERESIS,
+    ORIFICE,
+    OVERLAP,
+    PLAY,
+    SOFTENING,
+    UNEVEN,
+    Force,
+    Law,
+)
+from samii_rig.diagnose.forces.place import Place
+from samii_rig.diagnose.forces.reach import Reach
+from samii_rig.diagnose.scales import spread
+from samii_rig.rig.schema import ANGLE_SOURCES, SOURCES, Rig, TorsionalSpring
+
+STARTS = 14  # of a strength over its range
+COMPUTED = 0.01  # of a strength: what it was off by where it is hidden in strong forces
+RANGE = (1e-6, 30.0)  # of a strength over the one that doubles or halves the motion at its place
+SOFTEST = 1.0  # the same of a stiffness that falls: beyond, a spring would push
+WIDTHS = (1e-6, 2.0)  # of a gap or limit over the largest amplitude that meets it
+LEAST_LIMIT = 0.02  # of the largest command
+WEAKEST_SUPPLY = 1e4  # of the largest moment: the loss of flow is 1e-4/2 of the flow
+
+
+def forces(rig: Rig, reach: Reach) -> Iterator[Effect]:
+    """Every force that the table knows on this rig; ranges are those of the data."""
+    order = [e.name for e in rig.element]
+    kinds = {e.name: e for e in rig.element}
+    for e in rig.element:
+        if isinstance(e, TorsionalSpring):
+            at = order.index(e.name)
+            near: list[tuple[str, ...]] = [
+                (order[i], e.name) if i < at else (e.name, order[i])
+                for i in (at - 1, at + 1)
+                if 0 <= i < len(order) and isinstance(kinds[order[i]], ANGLE_SOURCES)
+            ]
+            for across in ((e.name,), *near):
+                yield from _joint(reach, across, e.name)
+    actuator = rig.actuator[reach.actuator]
+    source = next(
+        (e for e in rig.element if isinstance(e, SOURCES) and e.input == actuator.name), None
+    )
+    if source is None:
+        return
+    turns = isinstance(source, ANGLE_SOURCES)
+    yield from _drive(reach, source.name, actuator.name, actuator.unit, turns=turns)
+
+
+def _joint(reach: Reach, across: tuple[str, ...], spring: str) -> Iterator[Effect]:
+    """Forces between both sides of a joint: of its spring alone, or of spring and source."""
+    place = Place("joint", across)
+    other = next((n for n in across if n != spring), "")
+    speed, ports = _largest(reach, place, of_speed=True), reach.ports(place, of_speed=True)
+    if speed <= 0 or ports is None:
+        return
+    torque = np.pi / 4 * speed / float(np.median(ports.y1))
+    yield effect(
+        FRICTION, place, spring, other, (_log("T_c", "N m", RANGE[0] * torque, RANGE[1] * torque),)
+    )
+    turned = reach.ports(place, of_speed=False)
+    if other or turned is None:
+        return
+    top = _largest(reach, place, of_speed=False)
+    doubles = 1 / float(np.median(turned.y1))  # N m/rad
+    k3 = 4 / 3 * doubles / top**2
+    for law, most in ((HARDENING, RANGE[1]), (SOFTENING, SOFTEST)):
+        unknown = _log("k3", "N m/rad^3", RANGE[0] * k3, most * k3)
+        yield effect(law, place, spring, "", (unknown,))
+    width = _log("width", "rad", WIDTHS[0] * top, WIDTHS[1] * top)
+    yield effect(PLAY, place, spring, "", (width,), (spring, "k"))
+    T_y = _log("T_y", "N m", RANGE[0] * doubles * top, RANGE[1] * doubles * top)
+    k = _log("k", "N m/rad", RANGE[0] * doubles, RANGE[1] * doubles)
+    yield effect(HYSTERESIS, place, spring, "", (T_y, k))
+
+
+def _drive(reach: Reach, source: str, alias: str, unit: str, *, turns: bool) -> Iterator[Effect]:
+    """Forces on the command. turns : whether the source gives an angle."""
+    largest, across = reach.largest, (source,)
+    low, high = WIDTHS[0] * largest, WIDTHS[1] * largest
+    drive, flow = Place("drive", across), Place("flow", across)
+    if turns and reach.ports(drive, of_speed=True) is not None:
+        yield effect(FRICTION, drive, source, alias, (_log("T_c", unit, low, high),))
+    top = _largest(reach, flow, of_speed=False) if turns else 0.0
+    if top > 0:
+        yield effect(ORIFICE, flow, source, alias, (_log("T_s", "N m", top, WEAKEST_SUPPLY * top),))
+    told = Place("command", across)
+    yield effect(OVERLAP, told, source, alias, (_log("width", unit, low, high),))
+    limit = _log("limit", unit, LEAST_LIMIT * largest, largest)
+    yield effect(CLIPPED, told, source, alias, (limit,))
+
+
+def uneven(even: Effect) -> Effect:
+    """Dry friction that may differ by direction in the place of one that does not."""
+    assert even.quasi is not None
+    (T_c,) = even.unknowns
+    unknowns = tuple(_log(symbol, T_c.unit, T_c.low, T_c.high) for symbol in UNEVEN.symbols)
+    alias = even.aliases[0][1] if even.aliases else ""
+    return effect(UNEVEN, even.quasi.place, even.site, alias, unknowns)
+
+
+def _largest(reach: Reach, place: Place, *, of_speed: bool) -> float:
+    return max(
+        (float(np.max(np.abs(y))) for y in reach.motion(place, of_speed=of_speed)), default=0
+    )
+
+
+def _log(symbol: str, unit: str, low: float, high: float) -> Unknown:
+    return Unknown(symbol, unit, low, high, spread(low, high, STARTS))
+
+
+def effect(
+    law: Law,
+    place: Place,
+    site: str,
+    alias: str,
+    unknowns: tuple[Unknown, ...],
+    scale: tuple[str, str] | None = None,
+) -> Effect:
+    """A force as a hypothesis. alias : another name of its site."""
+    softens = law is SOFTENING
+    return Effect(
+        physics=law.physics,
+        site=site,
+        unknowns=unknowns,
+        quasi=Force(place, law, scale),
+        aliases=((law.physics, alias),) if alias else (),
+        rough=0.0 if place.kind == "command" else COMPUTED,
+        variant=f"{law.tag} {place.name}",
+        report=(lambda x: -x) if softens else (lambda x: x),
+    )

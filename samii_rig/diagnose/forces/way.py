@@ -1,0 +1,166 @@
+"""The rig's way from command and force to what drives the force, and on to its sensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from samii_rig.diagnose.forces.march import march, read
+from samii_rig.diagnose.forces.model import ForceModel
+from samii_rig.diagnose.rigfile import valued
+from samii_rig.errors import InputError
+from samii_rig.model.realise import Realisation, realise
+from samii_rig.rig.schema import Rig
+from samii_rig.types import Complex, Float, Int
+
+INNER = 8  # steps a sample: 3 % of what a force adds, halved steps a quarter of that
+
+
+@dataclass(frozen=True, slots=True)
+class Sensed:
+    """A rig's partial fractions from a force to its sensors, no loop closed; as `read` has it."""
+
+    grow: Float
+    by_e: Float
+    direct: Float
+    late: Int
+
+    def of(self, e: Float) -> Float:
+        """(n, q) of a force e (n INNER,) from rest."""
+        return read(e, self.grow, self.by_e, self.direct, INNER, self.late)
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """A rig's partial fractions from command and force to what drives the force, by exact steps.
+
+    The rig has one actuator. grow, by_v, by_e : (2, n_pole) what a step makes of a state, and of
+    command and force held over it, real and imaginary parts. direct, g : as `march` has them.
+    late : steps of dead time. structure : the chain's own poles.
+    """
+
+    grow: Float
+    by_v: Float
+    by_e: Float
+    direct: float
+    g: float
+    late: int
+    structure: Complex
+    sensed: Sensed
+
+    @classmethod
+    def of(cls, model: ForceModel, x: Float, near: Complex | None = None) -> Way:
+        """Of a force that the motion drives. near : as `realise` has it.
+
+        Raises InputError as that does.
+        """
+        made = realise(_widened(model, x), near=near)
+        rig = model.built
+        n = len(rig.sensor)
+        h = 1 / (rig.rate_hz * INNER)
+        grow, push = _steps(made.poles, h)
+        pairs = np.where(made.poles.imag > 0, 2.0, 1.0)
+        by_e = made.residues[:, :n, -1].T * (pairs * push)
+        late = np.array([round(s.delay / h) for s in rig.sensor], np.int64)
+        parts = np.ascontiguousarray(_parts(by_e))
+        sensed = Sensed(_parts(grow), parts, np.ascontiguousarray(made.direct[:n, -1]), late)
+        return cls._made(model, made, sensed)
+
+    @classmethod
+    def _made(cls, model: ForceModel, made: Realisation, sensed: Sensed) -> Way:
+        """From partial fractions whose last sensor is what drives the force."""
+        rig = model.built
+        h = 1 / (rig.rate_hz * INNER)
+        late = round((rig.actuator[0].delay + float(made.late[0])) / h)
+        on = np.any(made.residues[:, -1] != 0, axis=1)  # the others are of sensors' filters
+        poles = made.poles[on]
+        grow, push = _steps(poles, h)
+        R = made.residues[on, -1] * np.where(poles.imag > 0, 2.0, 1.0)[:, None]
+        D = made.direct[-1]
+        if model.force.law.of_speed:  # and at once by what changes it
+            D = R.sum(axis=0).real
+            R = R * poles[:, None]
+        both = push[:, None] * R
+        g = float(D[-1] + both[:, -1].real.sum())
+        return cls(
+            _parts(grow), _parts(both[:, 0]), _parts(both[:, -1]), float(D[0]), g, late,
+            made.structure.poles, sensed,
+        )  # fmt: skip
+
+    def force(self, model: ForceModel, v: Float, p: Float, seeds: Float) -> Float:
+        """(1 + m, n INNER) a force of numbers p under a command v (n,) that begins when the rig is
+        at rest, and its slopes along `seeds` (m, 2).
+
+        Raises InputError where it is no number: the numbers are of no stable rig.
+        """
+        step = model.force.law.step
+        if step is None:
+            raise InputError(
+                model.rig.name, "force", model.force.law.tag, "a law that a motion drives"
+            )
+        v = np.ascontiguousarray(v, np.float64)
+        e = march(
+            step,
+            self.grow,
+            self.by_v,
+            self.by_e,
+            self.direct,
+            self.g,
+            v,
+            self.late,
+            INNER,
+            p,
+            seeds,
+        )
+        if not np.all(np.isfinite(e[:, -1])):
+            raise InputError(model.rig.name, "force", model.force.law.tag, "a stable rig with it")
+        return e
+
+
+@dataclass
+class Ways:
+    """The partial fractions through which forces act, kept where each was computed first: what the
+    chain's parameters change of a force is of second order, until `renew` asks for it."""
+
+    kept: dict[str, Way] = field(default_factory=dict)
+    near: Complex | None = None  # poles, which are the same wherever a force acts
+
+    def at(self, model: ForceModel, x: Float) -> Way:
+        """Of a model near x, whatever the strength.
+
+        Raises SamiiRigError where it has none.
+        """
+        speed = str(model.force.law.of_speed)
+        key = " ".join((model.force.place.name, speed, *_beside(model)))
+        if key not in self.kept:
+            self.kept[key] = Way.of(model, x, self.near)
+            self.near = self.kept[key].structure
+        return self.kept[key]
+
+    def renew(self) -> None:
+        """Compute all anew, where they are asked for next."""
+        self.kept.clear()
+
+
+def _beside(model: ForceModel) -> list[str]:
+    return [e.key for e in model.effects if e.quasi is None]
+
+
+def _widened(model: ForceModel, x: Float) -> Rig:
+    """The rig at x with what its force needs more."""
+    values = model.values(x)
+    element = tuple(valued(e, values, {}) for e in model.built.element)
+    return model.force.place.widened(model.built.model_copy(update={"element": element}))
+
+
+def _steps(poles: Complex, h: float) -> tuple[Complex, Complex]:
+    """What a step h makes of the state of each pole, and of an input held over it."""
+    grow = np.exp(poles * h)
+    still = np.abs(poles) * h < 1e-12
+    return grow, np.where(still, h, (grow - 1) / np.where(still, 1.0, poles))
+
+
+def _parts(x: Complex) -> Float:
+    """(2, n) real and imaginary parts."""
+    return np.ascontiguousarray(np.stack([x.real, x.imag]))

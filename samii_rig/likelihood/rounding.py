@@ -1,0 +1,100 @@
+"""What a converter's steps add to the noise, known before anything is measured.
+
+A rounding error is white, of step^2/12, where the motion crosses steps. Two things make it more:
+- Under an input that repeats itself the error repeats itself too, but for what noise of sd sigma
+  dithers: of harmonic h of a sawtooth, 6/(pi h)^2 of its power, exp(-(2 pi h sigma/step)^2) is
+  the same in all repeats (Widrow and Kollar 2008, Quantization Noise, ch. 4).
+- Where the motion stays within few steps, what is read is not in proportion to it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from scipy import ndimage, optimize
+
+from samii_rig.likelihood.contour import Contour
+from samii_rig.likelihood.pieces import Piece
+from samii_rig.types import Complex, Float
+
+WHITE = 1 / 12  # of a step, squared
+HARMONIC = np.arange(1.0, 200.0)  # of a sawtooth: all but 0.3 % of its power
+# Steps within which a motion is not read in proportion: the describing function of a staircase
+# is within 10 % of 1 from here on.
+FEW = 3.0
+SHORT = 0.5  # s in which a motion that crosses no step is not read: some periods of the band
+ALIKE = 0.05  # of a rounding error, that repeats itself: repeats do not show it
+# Of the power of what is not read, that is left where a factor of its own was taken out: it varies
+# from none to all over the amplitudes within a step.
+LEFT = 0.25
+AROUND = 5  # lines over which the power of what is not read is the mean
+
+
+def repeating(spread: float) -> float:
+    """The part of a rounding error's power that repeats, from the variance of repeats about their
+    mean, in steps squared: spread = (1 - part)/12 + sigma^2."""
+
+    def part(power: float) -> float:
+        each = 6 / (np.pi * HARMONIC) ** 2
+        return float(each @ np.exp(-((2 * np.pi * HARMONIC) ** 2) * power))
+
+    if spread >= 1:
+        return 0.0
+    found = optimize.brentq(lambda x: (1 - part(x)) * WHITE + x - spread, 0.0, 1.0)
+    return part(float(found))
+
+
+def alike(piece: Piece, step: Float) -> Float:
+    """(q,) part of each sensor's rounding error that is the same in all repeats of a piece."""
+    out = np.zeros(step.size)
+    for i in np.flatnonzero(step > 0) if piece.repeats else ():
+        # What repeats differ by from sample to sample: no wandering.
+        power = np.mean([np.var(np.diff(s.z[:, i])) / 2 for s in piece.repeats])
+        out[i] = repeating(float(power) / step[i] ** 2)
+    return out
+
+
+def added(
+    pieces: tuple[Piece, ...], step: Float, H: Complex, exact: Contour
+) -> Callable[[Float], Float]:
+    """f (n,) Hz -> (n, q) power a sample of each sensor's rounding, in all pieces the largest.
+
+    step : (q,) of the converters. H : (M//2 + 1, q) on `exact`.
+    """
+    each = [_of_piece(p, step, H, exact) for p in pieces]
+
+    def at(f: Float) -> Float:
+        out = np.zeros((f.size, step.size))
+        for frequency, power in each:
+            more = np.stack([np.interp(f, frequency, p) for p in power.T], axis=1)
+            out = np.maximum(out, more)
+        return out
+
+    return at
+
+
+def _of_piece(piece: Piece, step: Float, H: Complex, exact: Contour) -> tuple[Float, Float]:
+    n, q = piece.z.shape
+    frequency = np.asarray(np.fft.rfftfreq(n, 1 / exact.rate_hz), np.float64)
+    power = np.zeros((frequency.size, q))
+    if not np.any(step > 0):
+        return frequency, power
+    same = alike(piece, step)
+    y = exact.record(H * exact.damped(piece.r)[:, None], piece.r.size)[piece.r.size - n :]
+    for i in np.flatnonzero(step > 0):
+        power[:, i] = WHITE * step[i] ** 2 * (1 + len(piece.repeats) * same[i])
+        part = within(piece, y[:, i], float(step[i]), exact.rate_hz)
+        unread = np.abs(np.fft.rfft(part)) ** 2 / n
+        power[:, i] += LEFT * ndimage.uniform_filter1d(unread, AROUND)
+    return frequency, power
+
+
+def within(piece: Piece, y: Float, step: float, rate_hz: float) -> Float:
+    """(n,) what of the motion y (n,) of a sensor stays within few steps, less its mean."""
+    times = math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
+    width = max(int(SHORT * rate_hz), 3)
+    high, low = ndimage.maximum_filter1d(y, width), ndimage.minimum_filter1d(y, width)
+    still = high - low < FEW * step * times
+    return np.where(still, y - np.mean(y[still]), 0.0) if still.any() else np.zeros(y.size)
