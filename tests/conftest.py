@@ -4,6 +4,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -22,27 +23,46 @@ KITS = {"wire_kit", "can_kit", "faults_kit"}
 settings.register_profile("same", deadline=None, derandomize=True)
 settings.register_profile("explore", deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
-TRIES_MORE, APART = 7, 2.0  # s; longer together than another program's burst of work
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Of some tries in real time one must hold: a loaded machine is late by itself."""
+    """Who uses a device in real time is a test in real time."""
     for item in items:
         here = vars(item.getparent(pytest.Module).obj)  # type: ignore[union-attr]
         used = {getattr(thing, "__module__", "") for thing in here.values()}
         if KITS & used:
             item.add_marker("real_time")
-        if (KITS | {"serve_kit"}) & used:
-            item.add_marker(pytest.mark.flaky(reruns=TRIES_MORE, reruns_delay=APART))
 
 
-@pytest.fixture(autouse=True)
-def one_at_a_time(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Tests of real time run one after another: side by side they would be late for each other,
-    and one could open the port that another has just pulled."""
-    if request.node.get_closest_marker("real_time") is None or sys.platform == "win32":
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    """A device in real time, its host and its test come before the rest of the machine's work, as
+    they would at a bench. Processes that the test starts inherit it."""
+    if item.get_closest_marker("real_time") is None or sys.platform == "win32":
+        return (yield)
+    with _one_at_a_time(), _first():
+        return (yield)
+
+
+@contextmanager
+def _first() -> Iterator[None]:
+    """Before other processes, if the user may ask for it; who may not has the machine as it is."""
+    if not hasattr(os, "sched_setscheduler"):  # macOS
         yield
         return
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    try:
+        yield
+    finally:
+        os.sched_setscheduler(0, *before)
+
+
+@contextmanager
+def _one_at_a_time() -> Iterator[None]:
+    """Side by side they would be late for each other, and one could open the port that another has
+    just pulled."""
     import fcntl
 
     run = os.environ.get("PYTEST_XDIST_TESTRUNUID", str(os.getpid()))

@@ -80,7 +80,6 @@ def _modules(done: Done) -> set[str]:
 
 
 @pytest.mark.real_time
-@pytest.mark.flaky(reruns=3, reruns_delay=2.0)  # one of its tests is on the wire
 def test_the_project_of_the_page_passes_by_the_commands_of_its_workflow_and_container(tmp_path):
     steps = yaml.safe_load(FILES["rig.yml"])["jobs"]["simulated"]["steps"]
     install, test = [step["run"] for step in steps if "run" in step]

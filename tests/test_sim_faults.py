@@ -90,7 +90,6 @@ def test_every_name_is_on_the_page_with_where_it_works():
 
 
 @pytest.mark.real_time
-@pytest.mark.flaky(reruns=3, reruns_delay=2.0)
 def test_the_rig_on_the_wire_is_a_device_that_ends_its_process():
     given = {"seed": 3, "node": board(RIG).settings("/dev/none")}
     wired = open_rig(RIG.model_copy(update={"device": Device(settings=given)}), {})

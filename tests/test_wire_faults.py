@@ -301,6 +301,16 @@ def test_a_script_of_faults_is_carried_out_or_refused(wire, tmp_path):
         WireRig(wire.rig, SimSettings(seed=1), None).obey("explode")
 
 
+def test_a_line_that_stalled_passes_again_when_the_rig_is_as_new(wire):
+    wire.tell("stall 60")
+    wire.rest()
+    device = wire.open()  # the node answers
+    try:
+        until(lambda: device.sensor.read() is not None)
+    finally:
+        device.close()
+
+
 # What is said when it does not open
 
 

@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from wait_kit import found
+from wait_kit import WITHIN, found
 
 from samii_rig.devices.opening import open_device
 from samii_rig.devices.protocols import OpenRig
@@ -66,7 +66,7 @@ class Wire:
     def close(self) -> None:
         assert self.process.stdin is not None
         self.process.stdin.close()
-        self.process.wait(10)
+        self.process.wait(WITHIN)
         assert self.process.stdout is not None
         self.process.stdout.close()
 

@@ -45,6 +45,12 @@ def check_logs(logs: Iterable[Path]) -> None:
         require_file(path)
 
 
+def check_recordings(folder: Path) -> None:
+    """InputError unless it is a folder."""
+    if not folder.is_dir():
+        raise InputError("FOLDER", "", str(folder), "a folder of recordings")
+
+
 def check_choice(option: str, value: str, choices: Iterable[str]) -> None:
     """InputError unless an option is one of its words."""
     if value not in choices:

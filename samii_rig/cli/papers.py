@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from samii_rig.papers.catalogue import Entry
     from samii_rig.papers.result import Result
 
+FORMATS = ("svg", "png", "pdf")  # of `report.figures`, which takes seconds to import
+
 
 def papers(
     ids: Annotated[
@@ -40,18 +42,16 @@ def papers(
 
     Example: samii-rig papers table-1 p2-fig-12 --out pictures
     """
-    from rich.console import Console
-
-    from samii_rig.errors import InputError
-    from samii_rig.files import check_file, make_folder
+    from samii_rig.cli.arguments import check_choice
     from samii_rig.papers.catalogue import entries
 
-    chosen = entries(ids or [])  # a wrong name is said before the plots are imported
-    from samii_rig.report.figures import SUFFIXES
+    chosen = entries(ids or [])
+    check_choice("--format", format_, FORMATS)
 
-    if f".{format_}" not in SUFFIXES:
-        expected = f"one of {', '.join(s[1:] for s in SUFFIXES)}"
-        raise InputError("samii-rig papers", "--format", format_, expected)
+    from rich.console import Console
+
+    from samii_rig.files import check_file, make_folder
+
     console = Console(highlight=False)
     if list_:
         if json:

@@ -28,14 +28,18 @@ def recordings(
 
     Example: samii-rig recordings runs --experiment swept_sine --since 2026-11-01
     """
+    from samii_rig.cli.arguments import check_recordings
+
+    check_recordings(folder)
+    query.where()  # a wrong time is said before a large folder is read
+    query.page()
+
     from dataclasses import asdict
 
     from rich.console import Console
 
     from samii_rig.index.store import index_for_reading
 
-    query.where()  # a wrong time is said before a large folder is read
-    query.page()
     console = Console(highlight=False, stderr=json)
     with console.status("index ...") as shown, index_for_reading(folder) as index:
         index.refresh(lambda done, of: shown.update(f"index: {done:,} of {of:,} recordings ..."))

@@ -79,12 +79,15 @@ def serve(
 
     Example: samii-rig serve --rig samii --folder runs --port 8340
     """
+    from samii_rig.cli.arguments import check_rig
     from samii_rig.errors import InputError
-    from samii_rig.rig.load import load_rig
 
+    check_rig(rig)
     if os.name != "posix":
         expected = "Linux or macOS, whose signals and locks it uses"
         raise InputError("samii-rig serve", "", os.name, expected)
+    from samii_rig.rig.load import load_rig
+
     try:
         from samii_rig.serve.access import Tokens
         from samii_rig.serve.app import serve as run

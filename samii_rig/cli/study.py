@@ -48,19 +48,22 @@ def study(
 
     check_rig(rig)
 
+    from samii_rig.errors import InputError
+    from samii_rig.model.vary import vary as values_of
+    from samii_rig.rig.load import load_rig
+
+    the_rig, text = load_rig(rig)
+    varied = [values_of(the_rig, given) for given in vary]
+
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
-    from samii_rig.errors import InputError
-    from samii_rig.model import study as grid
+    from samii_rig.model.study import study as modes_over
     from samii_rig.record.export import replacing
     from samii_rig.report.figures import SUFFIXES, save_figure
     from samii_rig.report.study import figure, table, write_csv
-    from samii_rig.rig.load import load_rig
     from samii_rig.workers import workers as at_work
 
-    the_rig, text = load_rig(rig)
-    varied = [grid.vary(the_rig, given) for given in vary]
     if plot is not None and len(varied) > 2:
         raise InputError("--plot", "", [v.name for v in varied], "one or two --vary to draw")
     for option, path, suffixes in (("--out", out, (".csv",)), ("--plot", plot, SUFFIXES)):
@@ -74,7 +77,7 @@ def study(
         bar = stack.enter_context(Progress(*columns, console=console, transient=True, disable=json))
         executor = stack.enter_context(at_work(workers, scheduler))
         task = bar.add_task("points", total=None)
-        found = grid.study(
+        found = modes_over(
             text,
             varied,
             band or (0.0, the_rig.rate_hz / 10),

@@ -20,40 +20,17 @@ from samii_rig.model.modes import Poles, determinant
 from samii_rig.model.poles import find_poles
 from samii_rig.model.realise import search_region
 from samii_rig.model.tmm import Chain
+from samii_rig.model.vary import MOST_POINTS
+from samii_rig.model.vary import Varied as Varied
+from samii_rig.model.vary import vary as vary
 from samii_rig.rig.load import parse
-from samii_rig.rig.schema import Rig, flattened, parameters
+from samii_rig.rig.schema import Rig
 from samii_rig.types import Float, Int
 
-MOST_POINTS = 100_000  # some 0.1 s each: three hours of one core
 TOGETHER = 8  # points that are one piece of work
 AT_REST = 1e-6  # Re s over the edge of the search, below which a pole is not called unstable
 
 Point = tuple[list[tuple[int, float, float]], str]  # (number, Hz, ratio) of each mode; the note
-
-
-@dataclass(frozen=True, slots=True)
-class Varied:
-    """A parameter and its values.
-
-    key : (element, symbol). own : the rig file's value. values : (n,) from the lowest to the
-        highest, in equal steps or, with `log`, equal ratios.
-    """
-
-    key: tuple[str, str]
-    unit: str
-    own: float
-    values: Float
-    log: bool
-
-    @property
-    def name(self) -> str:
-        """`element.symbol`."""
-        return ".".join(self.key)
-
-    @property
-    def one_sign(self) -> bool:
-        """Whether percentages of it mean something: the range does not hold 0."""
-        return bool(self.values[0] * self.values[-1] > 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,37 +69,6 @@ class Study:
             if (y[known] > 0).all() and np.linalg.matrix_rank(x[known]) == x.shape[1]:
                 out[m] = np.linalg.lstsq(x[known], np.log(y[known]))[0][1:]
         return out
-
-
-def vary(rig: Rig, text: str) -> Varied:
-    """`element.symbol=LOW:HIGH:N` or, in equal ratios, `element.symbol=LOW:HIGH:N:log`.
-
-    Raises InputError for an unknown parameter or what is no range of two values or more.
-    """
-    name, _, given = text.partition("=")
-    element, _, symbol = name.partition(".")
-    elements = {e.name: parameters(e) for e in flattened(rig.element)}
-    if element not in elements:
-        raise InputError("--vary", "", name, f"an element of {rig.name}: {', '.join(elements)}")
-    own = elements[element].get(symbol)
-    if own is None:
-        expected = f"a parameter of {element}: {', '.join(elements[element])}"
-        raise InputError("--vary", "", name, expected)
-    log = given.endswith(":log")
-    try:
-        first, second, third = given.removesuffix(":log").split(":")
-        low, high, n = float(first), float(second), int(third)
-    except ValueError:
-        expected = "LOW:HIGH:N or LOW:HIGH:N:log"
-        raise InputError("--vary", name, given, expected) from None
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise InputError("--vary", name, given, "LOW below HIGH, both finite")
-    if log and low <= 0:
-        raise InputError("--vary", name, given, "LOW above 0, as its steps are ratios")
-    if not 2 <= n <= MOST_POINTS:
-        raise InputError("--vary", name, given, f"2 to {MOST_POINTS:,} values")
-    values = np.geomspace(low, high, n) if log else np.linspace(low, high, n)
-    return Varied((element, symbol), own.unit, own.value, values, log)
 
 
 def study(

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from samii_rig.errors import InputError, one_of
-from samii_rig.papers.result import Result
+
+if TYPE_CHECKING:
+    from samii_rig.papers.result import Result
 
 
 @dataclass(frozen=True, slots=True)

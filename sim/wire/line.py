@@ -35,6 +35,11 @@ class Line:
         self._held.clear()
         return out
 
+    def drop(self) -> None:
+        """What is on its way is gone."""
+        self._open = self._late = b""
+        self._held.clear()
+
     def _frames(self, data: bytes) -> bytes:
         if not (self.duplicate or self.reorder or self._open or self._late):
             return data

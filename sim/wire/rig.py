@@ -270,7 +270,9 @@ class WireRig:
                         self._stray, self._relay = 0, True
                         self._plant.rest()
                         self._history.clear()
-                        self._late = 0
+                        self._late, self._stalled = 0, 0.0
+                        for line_of in self._lines.values():
+                            line_of.drop()
                 case ["clock", change]:
                     self._clock += int(change)
                 case ["emergency", level]:
