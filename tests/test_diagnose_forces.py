@@ -267,4 +267,5 @@ def test_the_real_motor_has_dry_friction(recordings: Path) -> None:
     best = search.ranked()[0]
     force = next(e for e in best.effects if e.quasi is not None)
     assert force.physics == "coulomb_friction"
-    assert search.ratio(best.fitted) < 0.75 * search.ratio(search.nominal.fitted)
+    # More than half of what the nominal model leaves over the noise.
+    assert search.ratio(best.fitted) - 1 < (search.ratio(search.nominal.fitted) - 1) / 2

@@ -239,7 +239,7 @@ def whole_part(rate_hz: float, rig: Rig) -> int:
     Raises InputError where that is no whole number.
     """
     times = rig.rate_hz / rate_hz
-    if times < 0.5 or abs(times / round(times) - 1) > 1e-6:
+    if times < 1 - 1e-6 or abs(times / round(times) - 1) > 1e-6:
         whole = f"the rig's rate, {rig.rate_hz:g} Hz, or a whole part of it"
         raise InputError("recording", "rate_hz", rate_hz, whole)
     return round(times)
