@@ -36,7 +36,7 @@ PYTHON = BIN / ("python.exe" if os.name == "nt" else "python")
 EVERYTHING = "[dev,docs,release]"  # that a plain installation leaves out
 PIP = ("-m", "pip", "--quiet", "--disable-pip-version-check", "install")
 UV = BIN / ("uv.exe" if os.name == "nt" else "uv")
-SITE = [
+SITE: list[str | Path] = [
     *(PYTHON, "-m", "sphinx", "--fresh-env", "--fail-on-warning", "--keep-going", "--quiet"),
     *("-c", "docs", ".", "dist/docs"),
 ]
