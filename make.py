@@ -23,7 +23,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from subprocess import STDOUT
@@ -36,7 +36,7 @@ PYTHON = BIN / ("python.exe" if os.name == "nt" else "python")
 EVERYTHING = "[dev,docs,release]"  # that a plain installation leaves out
 PIP = ("-m", "pip", "--quiet", "--disable-pip-version-check", "install")
 UV = BIN / ("uv.exe" if os.name == "nt" else "uv")
-SITE = [
+SITE: list[str | Path] = [
     *(PYTHON, "-m", "sphinx", "--fresh-env", "--fail-on-warning", "--keep-going", "--quiet"),
     *("-c", "docs", ".", "dist/docs"),
 ]
@@ -143,19 +143,19 @@ def tests(arguments: list[str]) -> None:
     A test in real time waits most of its time, so that it costs the others little.
     """
     cores = min(os.cpu_count() or 1, 4)
-    pytest = [BIN / "pytest", "-q", "--durations=10"]
+    pytest: list[str | Path] = [BIN / "pytest", "-q", "--durations=10"]
     workers = ["-n", str(cores), "--dist", "worksteal"]  # neighbours stay together: one fixture
     if arguments:
         call(*pytest, *workers, *arguments)
         return
-    nice = [] if os.name == "nt" else ["nice", "-n", "10"]
+    nice: list[str | Path] = [] if os.name == "nt" else ["nice", "-n", "10"]
     side_by_side(
         [*pytest, "-m", "real_time and not slow"],
         [*nice, *pytest, *workers, "-m", "not real_time and not slow"],
     )
 
 
-def side_by_side(*commands: list[str | Path]) -> None:
+def side_by_side(*commands: Sequence[str | Path]) -> None:
     """Run commands at once; the last prints as it goes, each other when it ends. Ends if one of
     them failed, after the others."""
     with ExitStack() as stack:
