@@ -14,6 +14,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, 
 
 from samii_rig.devices.protocols import CommandBlock
 from samii_rig.errors import GateError
+from samii_rig.run import interrupts
 from samii_rig.safety.gate import Gate
 from samii_rig.safety.judgement import State
 from samii_rig.safety.limits import gate_limits
@@ -408,3 +409,7 @@ class AnyOrder(RuleBasedStateMachine):
 
 AnyOrder.TestCase.settings = settings(max_examples=150, stateful_step_count=30)
 TestAnyOrder = AnyOrder.TestCase
+
+
+def test_the_gate_is_where_signals_look_for_it():
+    assert Gate.__module__ == interrupts.GATE

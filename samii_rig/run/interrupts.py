@@ -10,12 +10,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType, TracebackType
 
-from samii_rig.safety.gate import Gate
-
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
 )
 
+GATE = "samii_rig.safety.gate"  # by name: a command line that only shows its help does not load it
 # s; what an ending takes at most until its output is at zero, and less than a person's patience.
 PAUSE = 0.5
 
@@ -135,7 +134,7 @@ class Interrupts:
 def _in_gate(frame: FrameType | None) -> bool:
     """Whether the gate is at work, or waits for its actuator."""
     while frame is not None:
-        if frame.f_globals.get("__name__") == Gate.__module__:
+        if frame.f_globals.get("__name__") == GATE:
             return True
         frame = frame.f_back
     return False
