@@ -86,7 +86,6 @@ def prove(
     from samii_rig.cli.arguments import check_rig
     from samii_rig.cli.common import check_target
     from samii_rig.files import check_file, check_folder
-    from samii_rig.prove import outcomes as kept
 
     for name in rig or ():
         check_rig(name)
@@ -94,6 +93,8 @@ def prove(
         check_target("--page", page, (".md",))
     if calibrate is not None:
         check_file("--calibrate", calibrate)
+    from samii_rig.prove import outcomes as kept
+
     failures: list[str] = []
     if of is None:
         check_folder("--out", out)
