@@ -24,12 +24,12 @@ from pathlib import Path
 
 import numpy as np
 
-from samii_rig.diagnose.channels import NOT_PHYSICS
+from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.measured import measured
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.refit import Problem, refit
+from samii_rig.diagnose.fit.refit import Problem, refit
+from samii_rig.diagnose.physics.channels import NOT_PHYSICS
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig, parameters

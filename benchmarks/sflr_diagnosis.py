@@ -21,15 +21,15 @@ from typing import Any
 
 import numpy as np
 
-from samii_rig.diagnose.by_record import on_records
+from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
-from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
+from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.forces.search import ForceSearch
-from samii_rig.diagnose.measured import measured
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.refit import Fitted, Problem, refit
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.diagnose.result import Diagnosis
-from samii_rig.diagnose.search import Search
+from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.record.importer import import_file
 from samii_rig.record.maps import load_map
 from samii_rig.rig.load import load_rig

@@ -190,7 +190,7 @@ def _simulated(device: Device, asked: _Asked) -> Device:
 
 def _recorded(rig: Rig, experiment: str, path: Path) -> Recording:
     """One run of one experiment, as `samii-rig run` does it, through the gate."""
-    from samii_rig.diagnose.rigfile import toml
+    from samii_rig.diagnose.fit.rigfile import toml
     from samii_rig.errors import InputError
     from samii_rig.run.campaign import carry_out
     from samii_rig.run.dryrun import predict

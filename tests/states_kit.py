@@ -12,7 +12,7 @@ import numpy as np
 
 from samii_rig.diagnose.changed import State
 from samii_rig.diagnose.diagnose import table
-from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate

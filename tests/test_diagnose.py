@@ -16,15 +16,15 @@ import pytest
 from conftest import ROOT
 from identify_kit import noiseless, samii
 
-from samii_rig.diagnose import vocabulary
-from samii_rig.diagnose.classes import distance
+from samii_rig.diagnose.data.measured import binned, measured, usable
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.locate import locate, moebius
-from samii_rig.diagnose.measured import binned, measured, usable
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.refit import Problem, refit
-from samii_rig.diagnose.rigfile import toml
-from samii_rig.diagnose.search import Search
+from samii_rig.diagnose.fit.classes import distance
+from samii_rig.diagnose.fit.refit import Problem, refit
+from samii_rig.diagnose.fit.rigfile import toml
+from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.physics import vocabulary
+from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.verdict.locate import locate, moebius
 from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.identify.velocity_feedback import in_series

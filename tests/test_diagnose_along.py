@@ -7,14 +7,14 @@ import pytest
 from elements_kit import ANGLE, BEAM, SOURCE, part
 from elements_kit import rig as made_of
 
-from samii_rig.diagnose.along import Along, stretches
 from samii_rig.diagnose.diagnose import table
-from samii_rig.diagnose.intervals import Drawn
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.refit import Fitted
+from samii_rig.diagnose.fit.intervals import Drawn
+from samii_rig.diagnose.fit.refit import Fitted
+from samii_rig.diagnose.fit.rigfile import explained, toml
+from samii_rig.diagnose.physics.along import Along, stretches
+from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.diagnose.result import Value
-from samii_rig.diagnose.rigfile import explained, toml
-from samii_rig.diagnose.rows import PHYSICS
 from samii_rig.errors import InputError
 from samii_rig.fem.model import Fem
 from samii_rig.model.tmm import Chain

@@ -9,17 +9,17 @@ import pytest
 from identify_kit import noiseless, samii
 from test_diagnose import ALL, FEW, LINES, concealing, effect
 
-from samii_rig.diagnose.between_runs import between_runs
-from samii_rig.diagnose.classes import RIVAL, Class
+from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose
-from samii_rig.diagnose.explanations import Explanation
-from samii_rig.diagnose.judge import Judgement, confirmed, judge, shown
-from samii_rig.diagnose.measured import measured
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.moebius import place_of
+from samii_rig.diagnose.fit.between_runs import between_runs
+from samii_rig.diagnose.fit.classes import RIVAL, Class
+from samii_rig.diagnose.fit.explanations import Explanation
+from samii_rig.diagnose.fit.moebius import place_of
+from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.fit.stated import Evidence, probability
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.diagnose.result import Gap
-from samii_rig.diagnose.search import Search
-from samii_rig.diagnose.stated import Evidence, probability
+from samii_rig.diagnose.verdict.judge import Judgement, confirmed, judge, shown
 from samii_rig.identify.bootstrap import redraw
 
 COMPLIANCE = "torsional_compliance"

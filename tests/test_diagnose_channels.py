@@ -6,7 +6,7 @@ import numpy as np
 from identify_kit import noiseless, samii
 
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.model import Model, grid
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.model.sampled import sensors_at
 from samii_rig.model.tmm import Chain

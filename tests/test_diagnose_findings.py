@@ -11,9 +11,9 @@ import pytest
 from identify_kit import noiseless, samii, without_tolerances
 from sweep_kit import swept
 
-from samii_rig.diagnose import findings, wiring
+from samii_rig.diagnose.data import findings, wiring
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.model import Model, grid
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.errors import EstimateError, InputError, SamiiRigError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.rig.load import load_rig

@@ -11,26 +11,26 @@ import pytest
 from concealed_kit import SAMII
 from cut_kit import DESIGN, cut_sweeps
 
-from samii_rig.diagnose import by_line
-from samii_rig.diagnose.by_record import on_records
+from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
-from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.fit.ranking import moved
+from samii_rig.diagnose.fit.records import RecordProblem, Whole
+from samii_rig.diagnose.fit.refit import Fitted, Problem
+from samii_rig.diagnose.fit.screen import Screen
+from samii_rig.diagnose.fit.stated import IN_DATA
 from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS, PLAY
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.problem import ForceProblem
 from samii_rig.diagnose.forces.screen import Looks, scaled, weakly
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.way import Ways
-from samii_rig.diagnose.forces.words import distorted
-from samii_rig.diagnose.judge import _is_thin
-from samii_rig.diagnose.measured import measured
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.ranking import moved
-from samii_rig.diagnose.records import RecordProblem, Whole
-from samii_rig.diagnose.refit import Fitted, Problem
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.diagnose.result import Diagnosis
-from samii_rig.diagnose.screen import Screen
-from samii_rig.diagnose.stated import IN_DATA
+from samii_rig.diagnose.verdict import by_line
+from samii_rig.diagnose.verdict.by_record import on_records
+from samii_rig.diagnose.verdict.force_words import distorted
+from samii_rig.diagnose.verdict.judge import _is_thin
 from samii_rig.record.importer import import_file
 from samii_rig.record.maps import load_map
 from samii_rig.rig.load import load_rig

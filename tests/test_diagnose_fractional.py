@@ -5,8 +5,8 @@ import pytest
 from identify_kit import samii
 
 from samii_rig.diagnose.diagnose import table
-from samii_rig.diagnose.fractional import FractionalChain, Joint
-from samii_rig.diagnose.model import Model, grid
+from samii_rig.diagnose.physics.fractional import FractionalChain, Joint
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.model.tmm import Chain
 
 F = np.geomspace(0.5, 40.0, 20)

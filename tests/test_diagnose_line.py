@@ -7,8 +7,8 @@ from elements_kit import rig as made_of
 from identify_kit import noiseless, samii
 
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.rigfile import toml
+from samii_rig.diagnose.fit.rigfile import toml
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.fem.model import Fem
 from samii_rig.fem.reduce import reduce
 from samii_rig.identify.bootstrap import redraw

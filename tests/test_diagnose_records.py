@@ -10,11 +10,11 @@ import pytest
 from concealed_kit import SAMII
 from cut_kit import cut_sweeps
 
+from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.measured import measured
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.records import RecordProblem, Whole
-from samii_rig.diagnose.refit import Fitted, Problem, refit
+from samii_rig.diagnose.fit.records import RecordProblem, Whole
+from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from identify_kit import noiseless, samii
 
-from samii_rig.diagnose.causal import RISE, CausalChain
+from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import table
-from samii_rig.diagnose.judge import judge
-from samii_rig.diagnose.locate import traces
-from samii_rig.diagnose.measured import measured
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.moebius import place_of
-from samii_rig.diagnose.refit import Problem, refit
-from samii_rig.diagnose.screen import Screen
-from samii_rig.diagnose.search import Search
+from samii_rig.diagnose.fit.moebius import place_of
+from samii_rig.diagnose.fit.refit import Problem, refit
+from samii_rig.diagnose.fit.screen import Screen
+from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.physics.causal import RISE, CausalChain
+from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.verdict.judge import judge
+from samii_rig.diagnose.verdict.locate import traces
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.model.sampled import sampled_response
 from samii_rig.model.tmm import Chain

@@ -17,13 +17,13 @@ from typer.testing import CliRunner
 from samii_rig.cli.app import app
 from samii_rig.diagnose.changed import State, changed, common_rig
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.insert import inserted, oscillator
-from samii_rig.diagnose.known import stated, with_known
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.records import Whole
-from samii_rig.diagnose.refit import Fitted
-from samii_rig.diagnose.states import Both, BothGrid, States
-from samii_rig.diagnose.vocabulary import hypotheses
+from samii_rig.diagnose.fit.known import stated, with_known
+from samii_rig.diagnose.fit.records import Whole
+from samii_rig.diagnose.fit.refit import Fitted
+from samii_rig.diagnose.fit.states import Both, BothGrid, States
+from samii_rig.diagnose.physics.insert import inserted, oscillator
+from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.errors import InputError
 from samii_rig.report.diagnosis import write_diagnosis
 from samii_rig.rig.elements import flattened

@@ -7,7 +7,7 @@ import pytest
 from identify_kit import samii
 
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.model import Model, grid
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.schema import Parameter, Rig, TorqueSource

@@ -7,11 +7,11 @@ import pytest
 from identify_kit import noiseless, samii
 from test_diagnose import ALL, LINES, concealing, effect
 
+from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.measured import measured
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.refit import refit
-from samii_rig.diagnose.search import Search
+from samii_rig.diagnose.fit.refit import refit
+from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.identify.bootstrap import redraw
 
 

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from samii_rig.diagnose.effect import Effect, Unknown
 from samii_rig.diagnose.forces import laws
 from samii_rig.diagnose.forces.laws import Force, Law
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.place import Place
 from samii_rig.diagnose.forces.steps import OUT, advanced
 from samii_rig.diagnose.forces.way import INNER, Way
+from samii_rig.diagnose.physics.effect import Effect, Unknown
 from samii_rig.errors import InputError
 from samii_rig.likelihood.contour import EXACT, Contour
 from samii_rig.model.sampled import hold_at, sensors_at

@@ -12,12 +12,12 @@ import pytest
 from identify_kit import noiseless, samii
 from report_kit import Page, recorded
 
-from samii_rig.diagnose.channels import NOT_PHYSICS
 from samii_rig.diagnose.diagnose import diagnose
-from samii_rig.diagnose.insert import DISPLACEMENT
-from samii_rig.diagnose.model import Model, grid
+from samii_rig.diagnose.physics.channels import NOT_PHYSICS
+from samii_rig.diagnose.physics.insert import DISPLACEMENT
+from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.result import Band, Cause, Diagnosis, Gap, Trace, Value
-from samii_rig.diagnose.vocabulary import hypotheses
 from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.report import diagnosis_words as words

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from samii_rig.diagnose.stated import ANSWER, PLACE, Evidence, probability, weights
+from samii_rig.diagnose.fit.stated import ANSWER, PLACE, Evidence, probability, weights
 from samii_rig.errors import InputError
 from samii_rig.prove.calibrate import FEWEST, balanced, fit, places, row, write
 from samii_rig.prove.trial import Hidden, Truth

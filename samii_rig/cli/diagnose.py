@@ -179,7 +179,7 @@ def _together(
 
     from samii_rig.diagnose.changed import State, changed
     from samii_rig.diagnose.diagnose import diagnose as found_by
-    from samii_rig.diagnose.known import stated, with_known
+    from samii_rig.diagnose.fit.known import stated, with_known
     from samii_rig.report.summary import working
 
     output, gaps, band = how
@@ -250,7 +250,7 @@ def _saved(logs: list[Path], *, two: bool) -> list[SavedResponses]:
 
 def chosen(file: SavedResponses, output: list[str] | None) -> tuple[FrequencyResponse, ...]:
     """Saved responses of the outputs that are asked for; InputError names one that is not there."""
-    from samii_rig.diagnose.wiring import outputs_of
+    from samii_rig.diagnose.data.wiring import outputs_of
     from samii_rig.errors import one_of
 
     if output is None:
@@ -315,7 +315,7 @@ def _write(folder: Path, found: Diagnosis) -> str:
     import json
     from dataclasses import replace
 
-    from samii_rig.diagnose.rigfile import toml
+    from samii_rig.diagnose.fit.rigfile import toml
     from samii_rig.files import make_folder
 
     make_folder("--out", folder)

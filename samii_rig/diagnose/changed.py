@@ -10,17 +10,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from samii_rig.diagnose.by_record import by_samples
 from samii_rig.diagnose.diagnose import case_of, diagnose
-from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.insert import PREFIX
-from samii_rig.diagnose.judge import threshold
-from samii_rig.diagnose.known import with_known
-from samii_rig.diagnose.records import RecordSearch, Whole
+from samii_rig.diagnose.fit.explanations import threshold
+from samii_rig.diagnose.fit.known import with_known
+from samii_rig.diagnose.fit.records import RecordSearch, Whole
+from samii_rig.diagnose.fit.rigfile import explained
+from samii_rig.diagnose.fit.states import Both, StatesSearch
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.insert import PREFIX
 from samii_rig.diagnose.result import Before, Diagnosis
-from samii_rig.diagnose.rigfile import explained
-from samii_rig.diagnose.stages import Case, Progress
-from samii_rig.diagnose.states import Both, StatesSearch
+from samii_rig.diagnose.verdict.by_record import by_samples
+from samii_rig.diagnose.verdict.stages import Case, Progress
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.reduce import Records
 from samii_rig.rig.elements import Branch, flattened, parameters

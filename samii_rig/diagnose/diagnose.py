@@ -10,17 +10,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from samii_rig.diagnose import findings
-from samii_rig.diagnose.by_line import by_lines
-from samii_rig.diagnose.by_record import by_records, on_records
-from samii_rig.diagnose.classes import without_twins
-from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.measured import measured, usable
-from samii_rig.diagnose.model import grid
+from samii_rig.diagnose.data import findings
+from samii_rig.diagnose.data.measured import measured, usable
+from samii_rig.diagnose.fit.classes import without_twins
+from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.model import grid
+from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.result import Diagnosis
-from samii_rig.diagnose.search import Search
-from samii_rig.diagnose.stages import Case, Progress
-from samii_rig.diagnose.vocabulary import hypotheses
+from samii_rig.diagnose.verdict.by_line import by_lines
+from samii_rig.diagnose.verdict.by_record import by_records, on_records
+from samii_rig.diagnose.verdict.stages import Case, Progress
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
 

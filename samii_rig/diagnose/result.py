@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from samii_rig.diagnose.rows import PHYSICS
+from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.display import card
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse

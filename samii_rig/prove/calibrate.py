@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy import optimize, special
 
-from samii_rig.diagnose.stated import ANSWER, IN_DATA, PLACE, Evidence
+from samii_rig.diagnose.fit.stated import ANSWER, IN_DATA, PLACE, Evidence
 from samii_rig.errors import InputError
 from samii_rig.prove.trial import Answer, Trial, Truth
 from samii_rig.record.export import replacing

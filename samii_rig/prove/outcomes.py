@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from samii_rig.diagnose.stated import Evidence
+from samii_rig.diagnose.fit.stated import Evidence
 from samii_rig.errors import InputError
 from samii_rig.files import reason
 from samii_rig.prove.calibrate import places, row

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.diagnose import table
-from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.explanations import Explanation
-from samii_rig.diagnose.measured import Measured
-from samii_rig.diagnose.model import grid
-from samii_rig.diagnose.search import FIRST, Search
+from samii_rig.diagnose.fit.explanations import Explanation
+from samii_rig.diagnose.fit.search import FIRST, Search
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.model import grid
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 

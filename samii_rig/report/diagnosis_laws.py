@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from samii_rig.diagnose.insert import DISPLACEMENT
+from samii_rig.diagnose.physics.insert import DISPLACEMENT
 from samii_rig.diagnose.result import Cause, Trace
 from samii_rig.types import Complex, Float
 

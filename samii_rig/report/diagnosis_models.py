@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samii_rig.diagnose import insert
-from samii_rig.diagnose.along import POSITION
-from samii_rig.diagnose.measured import binned, measured
-from samii_rig.diagnose.model import Model, grid
-from samii_rig.diagnose.points import POINTS
-from samii_rig.diagnose.refit import Problem, refit
+from samii_rig.diagnose.data.measured import binned, measured
+from samii_rig.diagnose.fit.refit import Problem, refit
+from samii_rig.diagnose.fit.rigfile import explained
+from samii_rig.diagnose.physics import insert
+from samii_rig.diagnose.physics.along import POSITION
+from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.points import POINTS
 from samii_rig.diagnose.result import Cause
-from samii_rig.diagnose.rigfile import explained
 from samii_rig.model.sampled import sampled_response
 from samii_rig.report.compare import ModelCurve
 from samii_rig.report.diagnosis_laws import factor_curve, jump_curve

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.diagnose.result import (
     HIDING,
     LIKELY,
@@ -21,7 +22,6 @@ from samii_rig.diagnose.result import (
     percent,
     sentence,
 )
-from samii_rig.diagnose.rows import PHYSICS
 from samii_rig.report.diagnosis_laws import Jump, jump_of
 from samii_rig.report.verdicts import Mark, without_folders
 

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from samii_rig.devices.opening import open_device
 from samii_rig.devices.protocols import OpenRig
-from samii_rig.diagnose.rigfile import toml
+from samii_rig.diagnose.fit.rigfile import toml
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.schema import Device, Rig, Strict
 from samii_rig.rig.settings import checked

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from samii_rig.diagnose.effect import Key
 from samii_rig.diagnose.forces import steps
 from samii_rig.diagnose.forces.place import Kind, Place
 from samii_rig.diagnose.forces.steps import Step
+from samii_rig.diagnose.physics.effect import Key
 from samii_rig.types import Float
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from samii_rig.diagnose import insert
+from samii_rig.diagnose.physics import insert
 from samii_rig.rig.schema import (
     ActuatorSpec,
     Moment,

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from samii_rig.diagnose.fit.records import RecordProblem, Whole
+from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.forces.model import ForceModel, RecordGrid
 from samii_rig.diagnose.forces.way import Ways
-from samii_rig.diagnose.model import Grid
-from samii_rig.diagnose.records import RecordProblem, Whole
-from samii_rig.diagnose.refit import Fitted, Problem
+from samii_rig.diagnose.physics.model import Grid
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.pieces import Piece, Samples
 from samii_rig.types import Complex, Float

@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 from scipy import fft
 
-from samii_rig.diagnose.effect import Key
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.forces.place import Place
 from samii_rig.diagnose.forces.problem import mean_command
-from samii_rig.diagnose.model import Model
-from samii_rig.diagnose.records import Whole
+from samii_rig.diagnose.physics.effect import Key
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.model.sampled import dead_time, hold_at, sensors_at

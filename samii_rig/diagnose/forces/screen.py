@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samii_rig.diagnose.effect import Effect
+from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.laws import (
     CLIPPED,
     HYSTERESIS,
@@ -26,7 +26,7 @@ from samii_rig.diagnose.forces.laws import (
 )
 from samii_rig.diagnose.forces.problem import ForceProblem
 from samii_rig.diagnose.forces.reach import Reach, Span
-from samii_rig.diagnose.screen import Screen
+from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.types import Complex, Float
 
 # Widths of a gap over the largest motion at which it is tried: what it does to the rest has its

@@ -14,21 +14,20 @@ from copy import copy
 
 import numpy as np
 
-from samii_rig.diagnose.effect import Effect
-from samii_rig.diagnose.explanations import NEAR, Explanation, Explanations
+from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, threshold
+from samii_rig.diagnose.fit.ranking import moved, ranking
+from samii_rig.diagnose.fit.records import RecordSearch, Whole
+from samii_rig.diagnose.fit.refit import STEPS, Fitted
+from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.laws import FRICTION
-from samii_rig.diagnose.forces.model import ForceModel
+from samii_rig.diagnose.forces.model import ForceModel, model_of
 from samii_rig.diagnose.forces.problem import ForceProblem, Moved
 from samii_rig.diagnose.forces.reach import Reach
 from samii_rig.diagnose.forces.screen import Hope, Looks, scaled, weakly
 from samii_rig.diagnose.forces.table import forces, uneven
 from samii_rig.diagnose.forces.way import Ways
-from samii_rig.diagnose.judge import threshold
-from samii_rig.diagnose.model import Model
-from samii_rig.diagnose.ranking import moved, ranking
-from samii_rig.diagnose.records import RecordSearch, Whole
-from samii_rig.diagnose.refit import STEPS, Fitted
-from samii_rig.diagnose.screen import Screen
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
 from samii_rig.likelihood.reduce import Left
 from samii_rig.types import Float
@@ -83,6 +82,10 @@ class ForceSearch(RecordSearch):
         self.problem = ForceProblem.near(self.levels, fitted, self.by_line.problem, self._ways)
         between = self.levels.between(self.reduced, fitted)
         self._between = between, fitted.model.response(fitted.x, between)
+
+    def made(self, effects: tuple[Effect, ...]) -> Model:
+        """As of `Explanations`; of a force and linear effects beside it, or of those alone."""
+        return model_of(self.rig, effects)
 
     def refitted_from(
         self,

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from samii_rig.diagnose.effect import Effect, Unknown
 from samii_rig.diagnose.forces.laws import (
     CLIPPED,
     FRICTION,
@@ -22,7 +21,8 @@ from samii_rig.diagnose.forces.laws import (
 )
 from samii_rig.diagnose.forces.place import Place
 from samii_rig.diagnose.forces.reach import Reach
-from samii_rig.diagnose.scales import spread
+from samii_rig.diagnose.physics.effect import Effect, Unknown
+from samii_rig.diagnose.physics.scales import spread
 from samii_rig.rig.schema import ANGLE_SOURCES, SOURCES, Rig, TorsionalSpring
 
 STARTS = 14  # of a strength over its range

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from samii_rig.diagnose.fit.rigfile import valued
 from samii_rig.diagnose.forces.march import march, read
 from samii_rig.diagnose.forces.model import ForceModel
-from samii_rig.diagnose.rigfile import valued
 from samii_rig.errors import InputError
 from samii_rig.model.realise import Realisation, realise
 from samii_rig.rig.schema import Rig

@@ -1,0 +1,1 @@
+"""Models held against records or lines: refits, the screen, the search, what is alike."""

@@ -1,0 +1,264 @@
+"""Explanations of one set of lines: refitted jointly with the rig's own parameters, and weighed.
+
+What is the same for all of them is here: the bins in which lines are looked at, the prior and the
+temperature. Which are tried is the search's (`search`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import stats
+
+from samii_rig.diagnose.data.measured import Measured, binned
+from samii_rig.diagnose.fit.ranking import moved
+from samii_rig.diagnose.fit.refit import STEPS, Fitted, Problem, refit
+from samii_rig.diagnose.fit.stated import IN_DATA
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.model import Grid, Model, grid
+from samii_rig.errors import SamiiRigError
+from samii_rig.rig.schema import Rig
+from samii_rig.types import Float
+
+CHANCE = (0.5, 0.4, 0.02)  # before the data: of nothing, one, two effects missing
+FEWER = 0.05  # of each further effect
+NEAR = 25.0  # of the logarithm of evidence: explanations further below the best are let go
+FIVE = 5.0  # standard deviations of chi-square beyond which what is left is more than noise
+ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and bins over which it is looked for
+UNEXPLAINED = 3e-4  # chance that noise alone leaves more than the threshold
+EXACT = 4e-4  # of the mismatch: what beams, sensors and integrators are modelled to
+
+
+def threshold(spread: float) -> float:
+    """Chi-square per degree of freedom that noise alone exceeds as rarely as `UNEXPLAINED` says.
+    spread : its relative variance."""
+    return float(stats.gamma.isf(UNEXPLAINED, 1 / spread, scale=spread))
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """Some effects, refitted. weight : logarithm of evidence times prior."""
+
+    effects: tuple[Effect, ...]
+    fitted: Fitted
+    weight: float
+
+    @property
+    def key(self) -> frozenset[str]:
+        """The same for the same effects in another order."""
+        return frozenset(e.key for e in self.effects)
+
+
+@dataclass
+class Explanations:
+    """All explanations of one set of lines that were refitted.
+
+    lines : those that are fitted. grid : of all frequencies. table : all single effects.
+    found : every explanation that was refitted, by key.
+    """
+
+    rig: Rig
+    lines: Measured
+    grid: Grid
+    table: Sequence[Effect]
+    found: dict[frozenset[str], Explanation] = field(default_factory=dict)
+    problem: Problem = field(init=False)
+    temperature: float = 1.0
+    _gross: float = 0.0  # chi-square that the nominal model leaves
+    _rows: Counter[str] = field(init=False)
+    _total: dict[str, float] = field(init=False)
+    _models: dict[tuple[str, ...], Model | None] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.use(self.table)
+        model = Model(self.rig)
+        at = self.grid.at(self.lines.frequency)
+        x = np.zeros(model.n)
+        shape = model.response(x, at)
+        self.problem = Problem.of(binned(self.lines, shape, misfit=math.inf), self.grid)
+        nominal = refit(model, self.problem, x)
+        self.rebin(nominal)
+        self.keep((), refit(model, self.problem, nominal.x))
+
+    def use(self, table: Sequence[Effect]) -> None:
+        """Another table, with a prior even over the rows of that."""
+        self.table = table
+        self._rows = Counter(e.physics for e in table)
+        self._total = {p: sum(e.weight for e in table if e.physics == p) for p in self._rows}
+
+    @property
+    def nominal(self) -> Explanation:
+        """Nothing is missing."""
+        return self.found[frozenset()]
+
+    def ranked(self) -> list[Explanation]:
+        """All explanations, the most probable first."""
+        return sorted(self.found.values(), key=lambda e: -e.weight)
+
+    def weigh(self, effects: Iterable[Effect], fitted: Fitted) -> float:
+        """Logarithm of evidence times prior, less what effects beside the first must be worth
+        where the mismatch is gross: they may not live on what models are not exact to."""
+        effects = tuple(effects)
+        beside = self.inexact(effects, self._gross)
+        return fitted.evidence(self.temperature) + self.log_prior(effects) - beside
+
+    def inexact(self, effects: Sequence[Effect], gross: float) -> float:
+        """Logarithm of evidence that effects beside the first must be worth on lines where the
+        nominal model leaves `gross` of chi-square."""
+        return 0.5 * EXACT**2 * gross / self.temperature * max(len(effects) - 1, 0)
+
+    def log_prior(self, effects: Iterable[Effect]) -> float:
+        """Before the data: of how many, which rows, which sites of a row."""
+        effects = tuple(effects)
+        n = len(effects)
+        chance = CHANCE[n] if n < len(CHANCE) else CHANCE[-1] * FEWER ** (n - len(CHANCE) + 1)
+        each = (math.log(e.weight / self._total[e.physics] / len(self._rows)) for e in effects)
+        return math.log(chance) + math.lgamma(n + 1) + sum(each)
+
+    def temper(self) -> None:
+        """Take the temperature of the explanation that fits best, and weigh all anew.
+
+        What even that leaves is a part of the truth that is not in the table, and has structure
+        along frequency: lines count by how much they and their neighbours say that is new.
+        """
+        best = min(self.found.values(), key=lambda e: e.fitted.cost)
+        self.temperature = self.leftover(best.fitted)
+        for key, e in self.found.items():
+            self.found[key] = replace(e, weight=self.weigh(e.effects, e.fitted))
+
+    @property
+    def worth(self) -> float:
+        """Chi-square that an effect must explain of the data to be called missing."""
+        return IN_DATA
+
+    @property
+    def spread(self) -> float:
+        """Relative variance of chi-square over all lines."""
+        return self.lines.spread
+
+    def leftover(self, fitted: Fitted) -> float:
+        """Chi-square per degree of freedom times the bins over which what is left is alike; 1
+        where noise would leave as much."""
+        left = self.ratio(fitted)
+        if left <= 1 + FIVE * math.sqrt(self.spread):
+            return 1.0
+        h = fitted.model.response(fitted.x, self.problem.at)
+        r = (self.problem.root @ (h - self.problem.data.H)[:, :, None])[:, :, 0]
+        power = float(np.sum(np.abs(r) ** 2))
+        alike = 1.0
+        for lag in range(1, min(MOST_ALIKE, len(r) - 1)):
+            rho = float(np.sum(r[lag:] * r[:-lag].conj()).real) / power
+            if rho < ALIKE:
+                break
+            alike += 2 * rho
+        return left * alike
+
+    def ratio(self, fitted: Fitted) -> float:
+        """Chi-square per degree of freedom over all lines, also inside the bins."""
+        found, mean = self.problem.data.inside
+        # Directions that the data determine take chi-square away.
+        taken = float(np.trace(np.linalg.solve(fitted.precision(), fitted.information)))
+        return (fitted.chi2 + found) / max(self.problem.expected + mean - taken, 1.0)
+
+    def model(self, effects: tuple[Effect, ...]) -> Model | None:
+        """The model with these effects; None if the rig does not allow them together."""
+        key = tuple(e.key for e in effects)
+        if key not in self._models:
+            try:
+                self._models[key] = self.made(effects)
+            except SamiiRigError:
+                self._models[key] = None
+        return self._models[key]
+
+    def made(self, effects: tuple[Effect, ...]) -> Model:
+        """The model with these effects. Raises SamiiRigError."""
+        return Model(self.rig, effects)
+
+    def refitted(
+        self,
+        effects: tuple[Effect, ...],
+        base: Explanation,
+        more: Sequence[float] = (),
+        give_up: float = math.inf,
+        *,
+        far: bool = True,
+    ) -> Fitted | None:
+        """From where `base` ended, and `more` logarithms of further unknowns."""
+        model = self.model(effects)
+        if model is None:
+            return None
+        start = np.append(moved(base.fitted.model, base.fitted.x, model), more)
+        return self.refitted_from(effects, start, give_up, far=far)
+
+    def refitted_from(
+        self,
+        effects: tuple[Effect, ...],
+        start: Float,
+        give_up: float = math.inf,
+        steps: int = STEPS,
+        *,
+        far: bool = True,
+    ) -> Fitted | None:
+        """From a vector of the model with these effects, which the rig allows together; None where
+        that is no rig, or no step can be computed."""
+        model = self.model(effects)
+        assert model is not None
+        try:
+            return refit(model, self.problem, start, far=far, give_up=give_up, steps=steps)
+        except (SamiiRigError, np.linalg.LinAlgError):
+            return None
+
+    def keep(self, effects: tuple[Effect, ...], fitted: Fitted) -> None:
+        """Weigh it, and keep it unless the same effects were refitted to more weight."""
+        if not effects:
+            self._gross = fitted.chi2
+        made = Explanation(effects, fitted, self.weigh(effects, fitted))
+        old = self.found.get(made.key)
+        if old is None or made.weight > old.weight:
+            self.found[made.key] = made
+
+    def without(self, whole: Explanation, i: int) -> Explanation | None:
+        """`whole` less its effect i, refitted."""
+        effects = whole.effects[:i] + whole.effects[i + 1 :]
+        key = frozenset(e.key for e in effects)
+        if key not in self.found:
+            gone = list(whole.fitted.model.own(i))
+            less = replace(whole.fitted, x=np.delete(whole.fitted.x, gone))
+            base = Explanation(effects, less, 0.0)
+            end = self.refitted(effects, base)
+            if end is None:
+                return None
+            self.keep(effects, end)
+        return self.found[key]
+
+    def bare(self, whole: Explanation, i: int) -> Explanation | None:
+        """`whole` less its effect i, not refitted."""
+        effects = whole.effects[:i] + whole.effects[i + 1 :]
+        less = self.model(effects)
+        old = whole.fitted.model
+        if less is None or less.keys != old.keys:
+            return None
+        x = np.delete(whole.fitted.x, list(old.own(i)))
+        h, dh = less.gradient(x, self.problem.at)
+        J, r = self.problem.whiten(dh), self.problem.residual(h)
+        fitted = Fitted(less, x, float(r @ r), whole.fitted.penalty, J, J.T @ J)
+        return Explanation(effects, fitted, 0.0)
+
+    def beside(self, best: Explanation) -> tuple[Explanations, Explanation]:
+        """Where linear effects can be weighed beside `best`, and the linear part of it there."""
+        return self, best
+
+    def rebin(self, fitted: Fitted) -> None:
+        """Bins, and aliases, as of this model: those of a rigid joint are not those of one that
+        gives, by as little as a large effect leaves room for a small one."""
+        old = self.grid
+        chain = fitted.model.plain(fitted.x)
+        self.grid = grid(self.rig, old.frequency, old.sensor, old.actuator, chain)
+        at = self.grid.at(self.lines.frequency)
+        shape = fitted.model.response(fitted.x, at)
+        misfit = fitted.cost / self.problem.expected
+        self.problem = Problem.of(binned(self.lines, shape, misfit=misfit), self.grid)

@@ -1,0 +1,129 @@
+"""Chi-square as a quadratic form in what one part changes, one complex number at each frequency.
+
+A part at a place changes every output by b phi, with b (n, q) of the place and phi (n,) of its law
+and strength. Directions that may still move for nothing are projected out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from samii_rig.diagnose.physics.effect import Unknown
+from samii_rig.types import Complex, Float
+
+LONGEST = 3.0  # a step of a logarithm
+ROUNDS = 6  # of a descent, at most
+SETTLED = 0.05  # of chi-square, gained in one of them: less and they end
+STEP = 1e-4  # of a logarithm, for derivatives of a law
+
+
+class Form(Protocol):
+    """Chi-square of phi, and its derivatives."""
+
+    def cost(self, phi: Complex) -> Float:
+        """(m,) chi-square of phi (m, n)."""
+        ...
+
+    def normal(self, phi: Complex, d: Complex) -> tuple[Float, Float]:
+        """Half the gradient (m, k), and the Gauss-Newton matrix (m, k, k), along d (m, k, n)."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Lines:
+    """Of lines with independent noise: residuals r + v phi.
+
+    lin (n,) : conj(r) v. square (n,) : |v|^2. P (n, m) : directions on v. power, q (m,) : of r.
+    """
+
+    lin: Complex
+    square: Float
+    P: Complex
+    power: float
+    q: Float
+
+    def cost(self, phi: Complex) -> Float:
+        """As of `Form`."""
+        q = self.q + (phi @ self.P).real
+        power = self.power + 2 * (phi @ self.lin).real + (np.abs(phi) ** 2) @ self.square
+        cost = power - np.sum(q**2, axis=1)
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    def normal(self, phi: Complex, d: Complex) -> tuple[Float, Float]:
+        """As of `Form`."""
+        q = self.q + (phi @ self.P).real
+        own = (d @ self.P).real
+        pull = self.lin.conj() + self.square * phi
+        g = np.einsum("mkn,mn->mk", d.conj(), pull).real - np.einsum("mkj,mj->mk", own, q)
+        H = ((d.conj() * self.square) @ d.swapaxes(1, 2)).real - own @ own.swapaxes(1, 2)
+        return np.asarray(g), np.asarray(H)
+
+
+@dataclass(frozen=True, slots=True)
+class Dense:
+    """Of residuals r + K (Re phi, Im phi) that are not one frequency's each.
+
+    K : (p, 2 n) and r (p,), directions projected out. on : of all frequencies, the n that count.
+    """
+
+    K: Float
+    r: Float
+    more: float
+    on: slice
+
+    def cost(self, phi: Complex) -> Float:
+        """As of `Form`."""
+        left = self._moved(phi) + self.r
+        cost = np.sum(left**2, axis=1) + self.more
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    def normal(self, phi: Complex, d: Complex) -> tuple[Float, Float]:
+        """As of `Form`."""
+        m, k, n = d.shape
+        left = self._moved(phi) + self.r
+        along = self._moved(d.reshape(m * k, n)).reshape(m, k, -1)
+        g = np.einsum("mkp,mp->mk", along, left)
+        return np.asarray(g), np.asarray(along @ along.swapaxes(1, 2))
+
+    def _moved(self, phi: Complex) -> Float:
+        phi = phi[:, self.on]
+        return np.asarray(np.concatenate([phi.real, phi.imag], axis=1) @ self.K.T)
+
+
+def descend(
+    form: Form,
+    phi_of: Callable[[Float], Complex],
+    y: Float,
+    cost: Float,
+    unknowns: tuple[Unknown, ...],
+) -> tuple[Float, Float]:
+    """Chi-square and logarithms (m, k) after a few damped Gauss-Newton steps from y."""
+    low, high = np.log([(u.low, u.high) for u in unknowns]).T
+    m, k = y.shape
+    damping = np.full(m, 1e-2)
+    for turn in range(ROUNDS):
+        ahead = (y[:, None, :] + STEP * np.eye(k)).reshape(-1, k)
+        every = phi_of(np.exp(np.concatenate([y, ahead])))
+        phi = every[:m]
+        d = (every[m:].reshape(m, k, -1) - phi[:, None, :]) / STEP
+        g, H = form.normal(phi, d)
+        diagonal = np.einsum("mkk->mk", H)
+        tiny = 1e-9 * np.max(np.abs(diagonal), axis=1, initial=1e-30)[:, None]
+        A = H + (damping[:, None] * np.abs(diagonal) + tiny)[:, :, None] * np.eye(k)
+        if not (np.all(np.isfinite(A)) and np.all(np.isfinite(g))):
+            break
+        step = np.clip(-np.linalg.solve(A, g[:, :, None])[:, :, 0], -LONGEST, LONGEST)
+        new = np.clip(y + step, low, high)
+        there = form.cost(phi_of(np.exp(new)))
+        better = there < cost
+        settled = turn > 0 and not np.any(cost - there > SETTLED)
+        y = np.where(better[:, None], new, y)
+        cost = np.where(better, there, cost)
+        damping = np.where(better, damping * 0.1, damping * 30)
+        if settled:
+            break
+    return cost, y

@@ -1,0 +1,65 @@
+"""Parameters that a person states: known to differ from the rig file, and exact."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from samii_rig.diagnose.fit.rigfile import toml
+from samii_rig.errors import InputError, one_of
+from samii_rig.rig.elements import flattened
+from samii_rig.rig.load import checked, tables
+from samii_rig.rig.schema import Rig, parameters
+
+WHERE = "--known"
+SHAPE = "ELEMENT.PARAMETER=VALUE, as accelerometer_mass.m=0"
+
+
+def stated(words: Sequence[str]) -> dict[str, float]:
+    """{"element.parameter": value} from `element.parameter=value`, in the rig file's units.
+
+    Raises InputError for what is not of this form, a number that is none, or a name twice.
+    """
+    out: dict[str, float] = {}
+    for word in words:
+        name, sign, text = word.partition("=")
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not sign or "." not in name or not math.isfinite(value):
+            raise InputError(WHERE, "", word, SHAPE)
+        if name in out:
+            raise InputError(WHERE, name, word, "each parameter once")
+        out[name] = value
+    return out
+
+
+def with_known(rig: Rig, known: Mapping[str, float]) -> Rig:
+    """The rig with these parameters, by "element.parameter", at these values, exactly.
+
+    Raises InputError for an element or a parameter that the rig file does not have, or a value
+    that no rig can have.
+    """
+    data = tables(toml(rig), WHERE)
+    every = {e.name: e for e in flattened(rig.element)}
+    rows = {row["name"]: row for row in _flat(data["element"])}
+    for name, value in known.items():
+        element, _, symbol = name.rpartition(".")
+        if element not in every:
+            raise InputError(WHERE, name, element, one_of(element, every))
+        have = parameters(every[element])
+        if symbol not in have:
+            raise InputError(WHERE, name, symbol, one_of(symbol, have))
+        rows[element][symbol] = {
+            "value": value,
+            "unit": have[symbol].unit,
+            "source": f"stated as known; in the rig file {have[symbol].value:g}",
+        }
+    return checked(Rig, data, WHERE) if known else rig
+
+
+def _flat(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Tables of elements, those in branches too."""
+    return [x for row in rows for x in (row, *_flat(row.get("element", ())))]

@@ -1,0 +1,468 @@
+"""The search on whole records: every explanation held against every sample.
+
+Explanations are compared by the likelihood of whole records (`samii_rig.likelihood`) about the
+best one so far, made anew whenever that moves. Responses line by line serve for what is seen
+better there: a first step from far away, and pictures.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from samii_rig.diagnose.fit import forms
+from samii_rig.diagnose.fit.explanations import FIVE, Explanation
+from samii_rig.diagnose.fit.forms import Form
+from samii_rig.diagnose.fit.gap import gap_of
+from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
+from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.physics.disturbed import Disturbed
+from samii_rig.diagnose.physics.model import Grid, Loop, grid
+from samii_rig.diagnose.physics.rows import RESONANT
+from samii_rig.diagnose.result import Band, Gap, Used
+from samii_rig.errors import EstimateError
+from samii_rig.likelihood.complete import Complete
+from samii_rig.likelihood.noise import Disturbances
+from samii_rig.likelihood.pieces import Piece, Wiring, joined, pieces_of, wiring
+from samii_rig.likelihood.reduce import CYCLES, Left, Records, Reduced, Response, left_by, reduced
+from samii_rig.rig.schema import Rig
+from samii_rig.signal.columns import aligned
+from samii_rig.signal.groups import segments_of
+from samii_rig.signal.statistics import octaves
+from samii_rig.types import Complex, Finding, Float, Int, Recording
+
+SHOW, TURN = 9, 10  # one line in ten is kept apart, to show on what was found
+WIDER = 1.1  # of the band that is excited, the band that takes part
+EXCITED = 0.1  # of the largest, an input's amplitude density that excites: 1 % of its power
+HIGHEST = 0.45  # of the rate: aliases of both sides meet above
+MOST_MADE = 6  # times that the likelihood is made about the nominal model
+# Noise units by which a change from the reference may be off between nodes, where it is taken for
+# linear, for the likelihood to stand: less than noise makes of one unknown.
+BETWEEN = 0.5
+ALARM = 2e-3  # chance that noise alone makes the best of all effects look missing
+HIGHEST_WORTH = 1e3  # of chi-square, beyond what any table asks for
+ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and octaves' parts over which it is sought
+
+
+@dataclass(frozen=True)
+class Whole:
+    """Records, and how a model predicts them."""
+
+    rig: Rig
+    records: Records
+    wired: Wiring
+    left_out: tuple[tuple[str, str], ...] = ()
+    apart: Records | None = None  # the same, every level by itself
+
+    @classmethod
+    def of(
+        cls,
+        runs: Sequence[Recording],
+        rig: Rig,
+        band: tuple[float, float] | None = None,
+        sensors: Sequence[str] | None = None,
+        findings: Sequence[Finding] = (),
+    ) -> Whole:
+        """All runs of one rig.
+
+        sensors : those that are sound, all that were recorded if None. findings : of the samples;
+        segments that they are about are left out, but not for a sensor that is left out itself.
+
+        Raises EstimateError where they hold nothing to compare.
+        """
+        runs = [aligned(run)[0] for run in runs]
+        wired = wiring(runs, rig, sensors)
+        bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
+        without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
+        levels = pieces_of(runs, rig, wired, without, apart=True)
+        if not levels:
+            raise EstimateError("no segment is sound")
+        steps = {s.name: s.resolution for s in rig.sensor}
+        step = tuple(steps[n] for n in wired.sensors)
+        (rate,) = {run.rate_hz for run in runs}
+        all_, apart = (_records(p, rate, band, step) for p in (joined(levels), levels))
+        return cls(rig, all_, wired, tuple(without.items()), apart)
+
+    def by_level(self) -> Whole:
+        """The same records, the levels not summed up: for what depends on amplitude."""
+        return self if self.apart is None else replace(self, records=self.apart)
+
+    @property
+    def sensor(self) -> Int:
+        """(q,) indices into the rig's sensors."""
+        names = [s.name for s in self.rig.sensor]
+        return np.array([names.index(n) for n in self.wired.sensors], np.int64)
+
+    @property
+    def loop(self) -> Loop | None:
+        """The loop around the sensors."""
+        if not self.wired.kp:
+            return None
+        return Loop(self.wired.kp, self.wired.sensors.index(self.wired.centring))
+
+    @property
+    def _loop(self) -> tuple[float, int] | None:
+        return (self.loop.kp, self.loop.entry) if self.loop else None
+
+    def grid(self, frequency: Float, sigma: float, fitted: Fitted) -> Grid:
+        """The grid beside the imaginary axis, with the aliases of a fit."""
+        names = [a.name for a in self.rig.actuator]
+        actuator = np.full(self.sensor.size, names.index(self.wired.command))
+        chain = fitted.model.plain(fitted.x)
+        return grid(self.rig, frequency, self.sensor, actuator, chain, sigma, self.loop)
+
+    def nodes(self, found: Reduced, fitted: Fitted) -> Grid:
+        """The nodes of a likelihood."""
+        return self.grid(found.frequency, found.sigma, fitted)
+
+    def between(self, found: Reduced, fitted: Fitted) -> Grid:
+        """What is between them."""
+        return self.grid(found.between, found.sigma, fitted)
+
+    @property
+    def lines(self) -> int:
+        """Lines of the records that take part."""
+        return self.records.count
+
+    def response(self, fitted: Fitted) -> Response:
+        """Of a fit, at any s of one contour."""
+
+        def at(s: Complex) -> Complex:
+            f = np.minimum(s.imag / (2 * np.pi), self.records.rate_hz / 2)  # but for rounding
+            there = self.grid(f, float(s.real[0]), fitted)
+            return fitted.model.response(fitted.x, there)
+
+        return at
+
+    def disturbed(self, fitted: Fitted) -> Disturbances:
+        """What each disturbance of a fit makes in all sensors, the loop around them closed."""
+        made = Disturbed.of(fitted.model, fitted.x, self.sensor)
+
+        def at(f: Float) -> Complex:
+            return made.response(f, self.response_at(fitted, f), self.loop)
+
+        return at
+
+    def response_at(self, fitted: Fitted, f: Float) -> Complex:
+        """(n, q) of a fit at real frequencies f (n,)."""
+        once, which = np.unique(f, return_inverse=True)
+        return np.asarray(fitted.model.response(fitted.x, self.grid(once, 0.0, fitted))[which])
+
+    def about(self, fitted: Fitted, at: Float | None = None) -> Reduced:
+        """The likelihood near a fit, on the lines that are fitted. at : Hz of its nodes."""
+        disturbed = self.disturbed(fitted)
+        return reduced(self.records, self.response(fitted), disturbed, self._loop, _fitted, at)
+
+    def complete(self, fitted: Fitted) -> Complete:
+        """The same, with what no linear model explains."""
+        disturbed = self.disturbed(fitted)
+        return Complete.about(self.records, self.response(fitted), disturbed, self._loop, _fitted)
+
+    def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
+        """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
+        part = _shown if shown else _fitted
+        return left_by(self.records, self.response(fitted), noise, self._loop, part)
+
+
+def _records(
+    pieces: Sequence[Piece],
+    rate_hz: float,
+    band: tuple[float, float] | None,
+    step: tuple[float, ...],
+) -> Records:
+    """Those that anything drives."""
+    driven = [(p, b) for p, b in zip(pieces, excited(pieces, rate_hz), strict=True) if b]
+    if not driven:
+        raise EstimateError("nothing drives the rig for five cycles of any line")
+    bands = tuple(band or b for _, b in driven)
+    return Records(tuple(p for p, _ in driven), rate_hz, bands, step)
+
+
+def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float] | None]:
+    """Hz, of each piece the band in which its input has more than a small part of the largest
+    density of all; None for one that nothing drives: what is left of a sweep behind a gap."""
+    spectra = [np.abs(np.fft.rfft(p.r)) / math.sqrt(p.r.size) for p in pieces]
+    # The offset's line, and the one that it leaks to, are no excitation.
+    least = EXCITED * max(float(np.max(R[2:])) for R in spectra)
+    out: list[tuple[float, float] | None] = []
+    for piece, R in zip(pieces, spectra, strict=True):
+        f = np.arange(R.size) * (rate_hz / piece.r.size)
+        on = np.flatnonzero(R[2:] > least) + 2
+        if not on.size:
+            out.append(None)
+            continue
+        lowest, highest = CYCLES * rate_hz / len(piece.z), HIGHEST * rate_hz
+        low, high = max(f[on[0]] / WIDER, lowest), min(WIDER * f[on[-1]], highest)
+        out.append((float(low), float(high)) if high - low > CYCLES * f[1] else None)
+    return out
+
+
+def _named_in(messages: Sequence[str], places: Iterable[str]) -> dict[str, str]:
+    """The first message that names each of the places, of those that any names."""
+    out = {}
+    for place in places:
+        whole = re.compile(rf"(?<![\w.]){re.escape(place)}(?![\w.])")
+        why = next((m for m in messages if whole.search(m)), None)
+        if why is not None:
+            out[place] = why
+    return out
+
+
+def _fitted(k: Int) -> NDArray[np.bool_]:
+    return np.asarray(k % TURN != SHOW)
+
+
+def _shown(k: Int) -> NDArray[np.bool_]:
+    return np.asarray(k % TURN == SHOW)
+
+
+class Recorded(Protocol):
+    """Records as a search needs them: of one state of a rig, or of two."""
+
+    @property
+    def wired(self) -> Wiring:
+        """Which columns are read."""
+        ...
+
+    @property
+    def sensor(self) -> Int:
+        """(q,) indices into the rig's sensors."""
+        ...
+
+    @property
+    def lines(self) -> int:
+        """Lines of the records that take part."""
+        ...
+
+    @property
+    def left_out(self) -> tuple[tuple[str, str], ...]:
+        """Records that do not, and why."""
+        ...
+
+    def about(self, fitted: Fitted) -> Reduced:
+        """The likelihood near a fit, on the lines that are fitted."""
+        ...
+
+    def nodes(self, found: Reduced, fitted: Fitted) -> Grid:
+        """The nodes of a likelihood."""
+        ...
+
+    def between(self, found: Reduced, fitted: Fitted) -> Grid:
+        """What is between them."""
+        ...
+
+    def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
+        """What a fit leaves, line by line."""
+        ...
+
+
+@dataclass(frozen=True)
+class RecordProblem(Problem):
+    """The likelihood of whole records near a reference. at : the nodes of its contour.
+
+    data, root : of responses line by line; `by_line` is the problem that they pose.
+    """
+
+    by_line: Problem = field(kw_only=True)
+    reduced: Reduced = field(kw_only=True)
+
+    @classmethod
+    def about(cls, whole: Recorded, fitted: Fitted, by_line: Problem) -> RecordProblem:
+        """About a fit."""
+        found = whole.about(fitted)
+        at = whole.nodes(found, fitted)
+        return cls(by_line.data, by_line.root, at, by_line=by_line, reduced=found)
+
+    @property
+    def lines(self) -> Problem:
+        """As of `Problem`."""
+        return self.by_line
+
+    @property
+    def expected(self) -> float:
+        """As of `Problem`."""
+        return self.reduced.known
+
+    def residual(self, h: Complex) -> Float:
+        """As of `Problem`."""
+        return self.reduced.residual(h)
+
+    def whiten(self, dh: Complex) -> Float:
+        """As of `Problem`."""
+        return self.reduced.slopes(dh)
+
+    def toward(self, h: Complex) -> RecordProblem:
+        """As of `Problem`."""
+        goal = self.reduced.slopes((h - self.reduced.reference)[:, :, None])[:, 0]
+        return replace(self, reduced=replace(self.reduced, target=goal))
+
+    def form(self, b: Complex, left: Float, directions: Float) -> Form:
+        """As of `Problem`."""
+        p, on = self.reduced.factor.shape[0], self.at.changed
+        by_one, by_j = (np.concatenate([x.real, x.imag], axis=1) for x in (b[on], 1j * b[on]))
+        moved = self._by_node @ np.stack([by_one, by_j], axis=2)
+        K = np.concatenate([moved[:, :, 0].T, moved[:, :, 1].T], axis=1)
+        Q = directions[:p]
+        r = left - directions @ (directions.T @ left)
+        # Rows of the priors are moved by the projection too: kept as the projection's own part.
+        turn = Q.T @ K
+        K_left = np.concatenate([K - Q @ turn, -directions[p:] @ turn])
+        return forms.Dense(K_left, r, 0.0, on)
+
+    @cached_property
+    def _by_node(self) -> Float:
+        """(n, p, 2 q) the factor, of the nodes that a part changes: real parts of all sensors, then
+        imaginary ones."""
+        F = self.reduced.factor[..., self.at.changed]
+        return np.ascontiguousarray(F.transpose(3, 0, 2, 1)).reshape(F.shape[3], F.shape[0], -1)
+
+
+class RecordSearch(Search):
+    """As `Search`, on whole records."""
+
+    def __init__(self, whole: Recorded, by_line: Search) -> None:
+        self.whole, self.by_line = whole, by_line
+        super().__init__(by_line.rig, by_line.lines, by_line.grid, by_line.table)
+
+    def __post_init__(self) -> None:
+        self.use(self.table)
+        fitted = self.first()
+        self._about(fitted)
+        for _ in range(MOST_MADE):
+            fitted = refit(fitted.model, self.problem, fitted.x)
+            if self._stands(fitted):
+                break
+            self._about(fitted)
+        else:  # a gross mismatch: the nominal model is weighed where the likelihood stands now
+            fitted = refit(fitted.model, self.problem, fitted.x)
+        self.keep((), fitted)
+
+    def first(self) -> Fitted:
+        """Where the nominal model starts."""
+        return self.by_line.nominal.fitted
+
+    def _about(self, fitted: Fitted) -> None:
+        """The likelihood anew, about a fit."""
+        self.problem = RecordProblem.about(self.whole, fitted, self.by_line.problem)
+        between = self.whole.between(self.reduced, fitted)
+        self._between = between, fitted.model.response(fitted.x, between)
+
+    def _stands(self, fitted: Fitted) -> bool:
+        """Whether a fit changes the response as linearly between nodes as the likelihood has it."""
+        between, reference = self._between
+        d = fitted.model.response(fitted.x, self.problem.at) - self.reduced.reference
+        middle = fitted.model.response(fitted.x, between) - reference
+        return self.reduced.bent(d, middle) < BETWEEN
+
+    @property
+    def reduced(self) -> Reduced:
+        """The likelihood in use."""
+        assert isinstance(self.problem, RecordProblem)
+        return self.problem.reduced
+
+    @property
+    def spread(self) -> float:
+        """As of `Explanations`."""
+        free = self.reduced.inside[1]
+        return 2.0 / self.problem.expected + 2.0 / free  # the noise is known to so much
+
+    @property
+    def worth(self) -> float:
+        """As of `Explanations`: with `ALARM`, noise reaches it in the best of the whole table."""
+        unknowns = np.array([max(len(e.unknowns), 1) for e in self.table])
+        tries = np.ones(unknowns.size)
+        # What resonates is looked for at every line: as many tries of its mass and phase, alike at
+        # neighbouring places (a bound of the maximum of a scan; Davies 1987, Biometrika 74).
+        resonant = np.array([e.physics in RESONANT for e in self.table], bool)
+        unknowns[resonant] = 2
+        tries[resonant] = 2 * self.whole.lines / max(int(np.count_nonzero(resonant)), 1)
+
+        def chance(t: float) -> float:
+            return float(tries @ stats.chi2.sf(t, unknowns)) - ALARM
+
+        return float(optimize.brentq(chance, 1.0, HIGHEST_WORTH))
+
+    def ratio(self, fitted: Fitted) -> float:
+        """Chi-square per degree of freedom of what a change of the response explains."""
+        taken = float(np.trace(np.linalg.solve(fitted.precision(), fitted.information)))
+        return fitted.chi2 / max(self.problem.expected - taken, 1.0)
+
+    def inconsistent(self) -> tuple[float, float]:
+        """Chi-square per degree of freedom of what no change of one linear response explains, and
+        its standard deviation from noise."""
+        both = (self.reduced.inside, self.reduced.differing)
+        each = ((found / mean, math.sqrt(2 / mean)) for found, mean in both if mean > 0)
+        return max(each, key=lambda one: (one[0] - 1) / one[1])
+
+    def leftover(self, fitted: Fitted) -> float:
+        """As of `Explanations`."""
+        left = self.ratio(fitted)
+        if left <= 1 + FIVE * math.sqrt(self.spread):
+            return 1.0
+        h = fitted.model.response(fitted.x, self.problem.at)
+        # What is left in the directions of the nodes, in units of what each would have.
+        F = self.reduced.factor
+        r = self.problem.residual(h)[: F.shape[0]]
+        pull = np.tensordot(r, F, 1) / np.linalg.norm(F, axis=0)
+        pull = pull.reshape(-1, F.shape[3]).T
+        power, alike = float(np.sum(pull**2)), 1.0
+        for lag in range(1, min(MOST_ALIKE, len(pull) - 1)):
+            rho = float(np.sum(pull[lag:] * pull[:-lag])) / power
+            if rho < ALIKE:
+                break
+            alike += 2 * rho
+        return left * alike
+
+    def rebin(self, fitted: Fitted) -> None:
+        """The likelihood anew, about this fit, unless the one in use serves."""
+        if self._stands(fitted):
+            return
+        self._about(fitted)
+
+    def _nearest(self) -> Explanation:
+        return self.ranked()[0]
+
+    def left(self, fitted: Fitted, *, shown: bool = False) -> Left:
+        """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
+        return self.whole.left(fitted, self.reduced, shown=shown)
+
+    def bands(self, fitted: Fitted) -> tuple[Band, ...]:
+        """Chi-square per degree of freedom of each sensor in each octave."""
+        left = self.left(fitted)
+        out = []
+        for low, high in octaves(left.frequency):
+            inside = (left.frequency >= low) & (left.frequency < high)
+            if inside.any():
+                top = min(high, float(left.frequency[-1]))
+                mean = np.mean(left.each[inside], axis=0)
+                names = self.whole.wired.sensors
+                out += [Band(n, low, top, float(x)) for n, x in zip(names, mean, strict=True)]
+        return tuple(out)
+
+    def used(self) -> Used:
+        """Lines of the whole records, those kept apart too; all that were excited take part."""
+        return Used(self.whole.lines, self.whole.lines, self.whole.left_out)
+
+    def shown(self, before: Fitted, after: Fitted) -> tuple[float, float, Gap]:
+        """On the lines kept apart: chi-square per degree of freedom of both, and the gap closed."""
+        a = self.left(before, shown=True).chi2
+        b = a if after is before else self.left(after, shown=True).chi2
+        floor = np.full(a.size, 2.0 * self.whole.sensor.size)
+        mean = float(np.sum(floor))
+        return float(np.sum(a)) / mean, float(np.sum(b)) / mean, gap_of(a, b, floor)
+
+    def at_lines(self, explanation: Explanation) -> Explanation:
+        """An explanation of records as one of responses line by line."""
+        fitted, problem = explanation.fitted, self.by_line.problem
+        h, dh = fitted.model.gradient(fitted.x, problem.at)
+        J, r = problem.whiten(dh), problem.residual(h)
+        there = replace(fitted, chi2=float(r @ r), jacobian=J, information=J.T @ J)
+        return replace(explanation, fitted=there)

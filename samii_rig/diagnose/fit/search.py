@@ -1,0 +1,324 @@
+"""Which physics, and where: every hypothesis refitted, weighed, added and taken away again.
+
+A screen holds each effect, at starts over its whole range, against what the model so far
+cannot explain, with the uncertain parameters projected out. The best are refitted jointly with
+these parameters. Effects are added while the evidence grows, each is then tried without and
+with every other in its place.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations
+from samii_rig.diagnose.fit.ranking import moved, ranking
+from samii_rig.diagnose.fit.refit import Fitted, refit
+from samii_rig.diagnose.fit.screen import Screen, Start
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.types import Float
+
+MOST = 5  # effects in one explanation, if all are of one physics
+MIXED = 2  # effects of different physics: with more, sums of them mimic what is in no table
+FIRST, LATER = 30, 6  # candidates that are refitted in the first round, and in later ones
+STRAIGHT = 15  # of them, from the nominal parameters as the rig file has them
+WORTH = 8.0  # of chi-square, gain in the screen below which a candidate is not refitted
+ENOUGH = 1.15  # chi-square over its mean below which growth looks at one explanation only
+SATURATED = "torsional_compliance"  # joints that give: what is missing in many places at once
+MOST_SATURATED = 12  # of these places
+WEAK = (4, 5, 6)  # tenths of the range at which they start
+BEAM = 2  # explanations that are grown further
+HOPELESS = 20.0  # times the best chi-square, above which an explanation is let go
+AGAIN, STILL = 4, 0.3  # times that bins are made anew at most, and a move that is none
+SWAPS = 2  # rounds of them, the second about what won the first
+ANYHOW = 2  # of the most promising in another's place are refitted whatever the screen says
+SHARE = 0.3  # of the best candidate's gain: one that promises less is not refitted
+BENT = 3.0  # of the penalty of a nominal parameter above which the refit hides what is missing
+GROSS = 8.0  # chi-square over its mean above which candidates race before they are refitted
+AHEAD, FINALISTS = 5, 5  # steps of that race, and how many go on
+OTHERS = 3  # of other physics than theirs, that go on too
+BROAD = 4  # single effects of different physics that are grown where none is enough
+
+Candidate = tuple[float, tuple[Effect, ...], list[Float]]  # chi-square hoped for, and starts
+
+
+class Search(Explanations):
+    """What is tried: effects added, taken away again and swapped."""
+
+    def run(self, *, briefly: bool = False) -> list[Explanation]:
+        """Grow, swap, prune; all explanations, the most probable first. briefly : single effects
+        alone."""
+        self.grow(self.nominal, FIRST, open_to_all=not briefly)
+        if self._bent(self.ranked()[0]):
+            self.grow(self._straight(), STRAIGHT, again=True)
+        self.temper()
+        if briefly:
+            return self.ranked()
+        for turn in range(MOST - 1):
+            before = self._nearest() if turn == 0 else self.ranked()[0]
+            if not before.effects:
+                break
+            self.renew(before)
+            if turn == 0 and not self._enough(self.ranked()[0]):
+                # What is one of two often stands behind what mimics both.
+                for base in list(_each_physics(self.ranked()))[:BROAD]:
+                    self.grow(base, LATER)
+                self.saturate(SATURATED)
+            for base in self._beam():
+                self.grow(base, LATER)
+            self.temper()
+            self.prune()
+            if self.ranked()[0].key == before.key:
+                break
+        for _ in range(SWAPS):
+            best = self.ranked()[0]
+            if not best.effects:
+                break
+            self.swap(best)
+            self.temper()
+            self.prune()
+            if self.ranked()[0].key == best.key:
+                break
+        return self.ranked()
+
+    def _bent(self, best: Explanation) -> bool:
+        """Whether nominal parameters at unlikely values may hide what is missing."""
+        n = self.nominal.fitted.model.n_nominal
+        hidden = not self._enough(best) and self.nominal.fitted.penalty > BENT * n
+        return hidden or best.fitted.penalty > BENT * n
+
+    def _straight(self) -> Explanation:
+        """The rig as its file has it: where the refitted one took values that their tolerances make
+        unlikely, it has done what is missing by them, and hides it."""
+        model = self.nominal.fitted.model
+        there = refit(model, self.problem, np.zeros(model.n), far=False, steps=0)
+        return Explanation((), there, 0.0)
+
+    def grow(
+        self, base: Explanation, most: int, *, again: bool = False, open_to_all: bool = False
+    ) -> None:
+        """Refit `base` with each of the most promising further effects; again : those too that
+        were refitted from elsewhere. open_to_all : where a race decides, not of those alone."""
+        if len(base.effects) >= MOST:
+            return
+        tried: list[Candidate] = []
+        gross = base.fitted.cost > GROSS * self.problem.expected
+        entered = None if gross and open_to_all else most
+        for drop, effect, starts in self.screen(base)[:entered]:
+            effects = (*base.effects, effect)
+            model = self.model(effects)
+            known_ = not again and frozenset(e.key for e in effects) in self.found
+            if drop < WORTH or known_ or self._mixed(effects) or not model:
+                continue
+            known = moved(base.fitted.model, base.fitted.x, model)
+            whole = [np.append(known, np.log(start)) for start in starts]
+            tried.append((base.fitted.cost - drop, effects, whole))
+        if gross:
+            tried = self._ahead([*tried, *self._switches(base)])
+        best = min((e.fitted.cost for e in self.found.values()), default=math.inf)
+        reached = base.fitted.cost
+        for predicted, effects, starts_ in tried:
+            if base.fitted.cost - predicted < SHARE * (base.fitted.cost - reached):
+                continue
+            end: Fitted | None = None
+            for x in starts_:
+                new = self.refitted_from(effects, x, best)
+                if new is not None and (end is None or new.cost < end.cost):
+                    end = new
+                if end is not None and end.cost < predicted + WORTH:
+                    break
+            if end is not None:
+                self.keep(effects, end)
+                reached = min(reached, end.cost)
+                best = min(best, end.cost + 2 * NEAR)
+
+    def _switches(self, base: Explanation) -> list[Candidate]:
+        """Effects that are there or not, from the nominal parameters as the rig file has them:
+        where a gross mismatch has bent these, no step along them shows what such an effect does."""
+        out: list[Candidate] = []
+        for effect in self.table:
+            effects = (*base.effects, effect)
+            model = None if effect.unknowns or self._mixed(effects) else self.model(effects)
+            if model is not None and frozenset(e.key for e in effects) not in self.found:
+                x = moved(base.fitted.model, base.fitted.x, model)
+                x[: model.n_nominal] = 0.0
+                out.append((-math.inf, effects, [x]))
+        return out
+
+    @staticmethod
+    def _mixed(effects: Sequence[Effect]) -> bool:
+        """Whether these are too many of different physics."""
+        return len(effects) > MIXED and len({e.physics for e in effects}) > 1
+
+    def _ahead(self, tried: Sequence[Candidate]) -> list[Candidate]:
+        """Those that a few steps of a refit bring farthest, from where these ended.
+
+        Far from the noise the nominal parameters stand where they mend what is missing, and
+        what a screen about them says of a cure does not rank it.
+        """
+        ends = []
+        for _, effects, starts in tried:
+            for x in starts:
+                end = self.refitted_from(effects, x, steps=AHEAD)
+                if end is not None:
+                    ends.append((end.cost, effects, [end.x]))
+        ends.sort(key=lambda end: end[0])
+        first, rest = ends[:FINALISTS], ends[FINALISTS:]
+        seen = {end[1][-1].physics for end in first}
+        others: dict[str, Candidate] = {}
+        for other in rest:
+            if (physics := other[1][-1].physics) not in seen:
+                others.setdefault(physics, other)
+        return first + list(others.values())[:OTHERS]
+
+    def screen(self, base: Explanation) -> list[tuple[float, Effect, list[Start]]]:
+        """How far chi-square should fall with each further effect, and one or two starts for its
+        refit; the largest first."""
+        look = Screen.of(self.problem, base.fitted)
+        return ranking(look, self.table, base.effects, self.model)
+
+    def saturate(self, physics: str) -> None:
+        """Every place of one physics at once, taken away again one by one while that is better.
+
+        What is missing everywhere in small parts is not found by adding one part after another.
+        """
+        effects = tuple(e for e in self.table if e.physics == physics)
+        if not 2 <= len(effects) <= MOST_SATURATED:
+            return
+        ends = []
+        for tenth in WEAK:
+            start = [
+                math.log(u.starts[tenth * len(u.starts) // 10]) for e in effects for u in e.unknowns
+            ]
+            end = self.refitted(effects, self.nominal, start)
+            ends += [end] if end is not None else []
+        if not ends:
+            return
+        end = min(ends, key=lambda end: end.cost)
+        whole = Explanation(effects, end, self.weigh(effects, end))
+        while whole.effects:
+            least = self._least(whole)
+            less = [self.without(whole, i) for i in least[:2]]
+            best = max((e for e in less if e is not None), key=lambda e: e.weight, default=None)
+            if best is None or best.weight < whole.weight:
+                break
+            whole = best
+        self.keep(whole.effects, whole.fitted)
+
+    def _least(self, whole: Explanation) -> list[int]:
+        """Its effects, first the one without which chi-square should rise least."""
+        bare = [self.bare(whole, i) for i in range(len(whole.effects))]
+        left = [Screen.of(self.problem, e.fitted).left() if e else math.inf for e in bare]
+        return [int(i) for i in np.argsort(left)]
+
+    def prune(self) -> None:
+        """Try the best explanation without each of its effects, until none can go."""
+        while True:
+            best = self.ranked()[0]
+            if len(best.effects) < 2:
+                return
+            for i in range(len(best.effects)):
+                self.without(best, i)
+            if self.ranked()[0].key == best.key:
+                return
+
+    def swap(self, whole: Explanation) -> None:
+        """Every effect of `whole` taken out, and every other tried in its place, about where
+        `whole` left the rest."""
+        enough = whole.fitted.cost + 4 * NEAR * self.temperature
+        for i, gone in enumerate(whole.effects):
+            base = self.bare(whole, i)
+            if base is None:
+                continue
+            if len(gone.unknowns) > 2:
+                self._elsewhere(whole, i, base, enough)
+            screened = self.screen(base)
+            for rank, (drop, effect, starts) in enumerate(screened[: LATER + 1]):
+                effects = (*base.effects, effect)
+                done = frozenset(e.key for e in effects) in self.found or self._mixed(effects)
+                # At the place of what was taken out a simpler law may do what that did.
+                there = effect.jump and gone.jump and effect.jump.place == gone.jump.place
+                if done or (rank >= ANYHOW and not there and base.fitted.cost - drop > enough):
+                    continue
+                end = self.refitted(effects, base, np.log(starts[0]).tolist(), enough)
+                if end is not None:
+                    self.keep(effects, end)
+
+    def _elsewhere(self, whole: Explanation, i: int, base: Explanation, enough: float) -> None:
+        """Effect i of `whole` at every other place, from the values that it has at its own: several
+        unknowns that start elsewhere may end far from them."""
+        gone = whole.effects[i]
+        own = whole.fitted.x[whole.fitted.model.own(i)]
+        for effect in self.table:
+            alike = effect.physics == gone.physics and len(effect.unknowns) == own.size
+            if not alike or effect.key in {e.key for e in whole.effects}:
+                continue
+            effects = (*base.effects, effect)
+            bounds = np.log([(u.low, u.high) for u in effect.unknowns]).T
+            if self.model(effects) is None or self._mixed(effects):
+                continue
+            end = self.refitted(effects, base, np.clip(own, *bounds).tolist(), enough)
+            if end is not None and end.cost < enough:
+                self.keep(effects, end)
+
+    def _nearest(self) -> Explanation:
+        """The most probable explanation; where even that leaves much, the one nearest to the lines
+        themselves: bins about a gross mismatch hide how well another would do."""
+        ranked = self.ranked()
+        if self._enough(ranked[0]):
+            return ranked[0]
+        at = self.grid.at(self.lines.frequency, self.lines.level)
+
+        def left(e: Explanation) -> float:
+            return float(np.sum(self.lines.chi_square(e.fitted.model.response(e.fitted.x, at))))
+
+        return min(ranked[:FINALISTS], key=left)
+
+    def _beam(self) -> list[Explanation]:
+        ranked = self.ranked()
+        best = ranked[0]
+        size = len(best.effects)
+        near = [e for e in ranked if len(e.effects) == size]
+        grown = near[:1] if self._enough(best) else near[:BEAM]
+        if size > MIXED:  # many places of one physics may stand for two of different physics
+            one = [e for e in ranked if len(e.effects) == 1]
+            grown += [e for e in one if e.weight > best.weight - 4 * NEAR][:1]
+        return grown
+
+    def _enough(self, explanation: Explanation) -> bool:
+        """Whether what an explanation leaves is near what noise would."""
+        return explanation.fitted.chi2 < ENOUGH * self.problem.expected
+
+    def renew(self, best: Explanation) -> None:
+        """Bins anew about the best explanation until it stands still, for bins about a model that
+        is off lead to one that is; and what may still compete refitted on them."""
+        near = [e for e in self.ranked()[:FIRST] if e.weight > best.weight - 4 * NEAR]
+        broad = list(_each_physics(self.ranked()))[:BROAD]
+        keep = [e for e in (*near, *broad) if e.fitted.cost < HOPELESS * best.fitted.cost]
+        nominal = self.nominal
+        for _ in range(AGAIN):
+            self.rebin(best.fitted)
+            end = self.refitted(best.effects, best)
+            if end is None:
+                break
+            still = best.fitted.away(end) < STILL
+            best = replace(best, fitted=end)
+            if still:
+                break
+        self.found.clear()
+        for e in {e.key: e for e in (*keep, best, nominal)}.values():
+            end = self.refitted(e.effects, e)
+            if end is not None:
+                self.keep(e.effects, end)
+
+
+def _each_physics(ranked: Sequence[Explanation]) -> Iterator[Explanation]:
+    """The first single effect of each physics."""
+    seen = set()
+    for e in ranked:
+        if len(e.effects) == 1 and e.effects[0].physics not in seen:
+            seen.add(e.effects[0].physics)
+            yield e

@@ -1,0 +1,1 @@
+"""What may be missing: every effect, the table of them, and the rig with effects in it."""

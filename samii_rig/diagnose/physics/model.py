@@ -1,0 +1,317 @@
+"""The sampled rig with effects added, as a function of one vector of logarithms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from samii_rig.diagnose.physics.causal import CausalChain
+from samii_rig.diagnose.physics.effect import Effect, Key
+from samii_rig.diagnose.physics.fractional import ChainLike, FractionalChain
+from samii_rig.model.sampled import hold_at, sampled_response, sensors_at
+from samii_rig.model.tmm import Chain
+from samii_rig.rig.elements import flattened
+from samii_rig.rig.schema import Rig, parameters
+from samii_rig.types import Complex, Float, Int
+
+ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smooth between
+ORDERS = (-1, 1, -2, 2)  # aliases that a factor on a channel changes
+STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
+FARTHEST = 6.0  # tolerances that a refit moves a nominal parameter at most
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """A proportional loop of the device, v = r - kp y of one entry, closed around the rig."""
+
+    kp: float
+    entry: int
+
+    def part(self, H: Complex, b: Complex) -> tuple[Complex, Complex]:
+        """b (n, q) and c (n,) around which a part is closed that changes H by b x:
+        H + b x becomes, closed, H/(1 + L) + b' x/(1 - c x)."""
+        sensitivity = 1 / (1 + self.kp * H[:, self.entry])
+        back = self.kp * b[:, self.entry] * sensitivity
+        return sensitivity[:, None] * (b - back[:, None] * H), -back
+
+    def closed(self, H: Complex) -> Complex:
+        """(n, q) to the reference from those to the command."""
+        return np.asarray(H / (1 + self.kp * H[:, self.entry])[:, None])
+
+    def slopes(self, H: Complex, dH: Complex) -> Complex:
+        """(n, q, m) derivatives of `closed`."""
+        sensitivity = 1 / (1 + self.kp * H[:, self.entry])
+        back = self.kp * dH[:, self.entry, None, :] * self.closed(H)[:, :, None]
+        return np.asarray(sensitivity[:, None, None] * (dH - back))
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Frequencies (n,), at s = sigma + 2 pi j f, with what does not change between models there.
+
+    factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
+    folded : (order, n, q) of these the ones of `ORDERS`, or none. rate_hz : of the samples.
+    sensor, actuator : (q,) entries. loop : closed around them, if responses are to the reference.
+    sigma : of all, or (n,) of each.
+    """
+
+    frequency: Float
+    factor: Complex
+    aliases: Complex
+    folded: Complex
+    rate_hz: float
+    sensor: Int
+    actuator: Int
+    sigma: float | Float = field(default=0.0, kw_only=True)
+    loop: Loop | None = field(default=None, kw_only=True)
+
+    @property
+    def changed(self) -> slice:
+        """The rows on which further effects act."""
+        return slice(None)
+
+    @property
+    def s(self) -> Complex:
+        """(n,) rad/s."""
+        return np.asarray(self.sigma + 2j * np.pi * self.frequency, np.complex128)
+
+    def at(self, frequency: Float, level: Int | None = None) -> Grid:
+        """The same on some of the frequencies, whatever their level."""
+        del level
+        i = np.searchsorted(self.frequency, frequency)
+        return Grid(
+            frequency, self.factor[i], self.aliases[i], self.folded[:, i], self.rate_hz,
+            self.sensor, self.actuator, sigma=self.sigma, loop=self.loop,
+        )  # fmt: skip
+
+    def orders(self) -> list[Complex]:
+        """s (n,) of each order of `folded`."""
+        known = ORDERS[: len(self.folded)]
+        return [self.s + 2j * np.pi * k * self.rate_hz for k in known]
+
+
+def grid(
+    rig: Rig,
+    frequency: Float,
+    sensor: Int,
+    actuator: Int,
+    chain: Chain | None = None,
+    sigma: float = 0.0,
+    loop: Loop | None = None,
+) -> Grid:
+    """The grid of a rig at sorted frequencies, Hz. chain : whose aliases these are, if they are
+    not the rig's own. sigma : 1/s, how far beside the imaginary axis.
+    loop : closed around the entries."""
+    f = np.unique(frequency)
+
+    def around(s: Complex) -> Complex:
+        hold = np.stack([hold_at(s, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
+        return np.asarray(sensors_at(rig.sensor, s)[:, sensor] * hold[:, actuator])
+
+    # Aliases hardly change from the imaginary axis to a line beside it.
+    few = np.geomspace(f[f > 0][0], f[-1], min(ALIAS_POINTS, f.size))
+    few[-1] = f[-1]
+    chain = Chain(rig) if chain is None else chain
+
+    def spread(few_: Complex) -> Complex:
+        return np.stack([np.interp(f, few, r) for r in few_.T], axis=1)
+
+    def term(f: Float) -> Complex:
+        s = np.asarray(2j * np.pi * f, np.complex128)
+        return np.asarray(chain.response(f)[:, sensor, actuator] * around(s))
+
+    rest = sampled_response(rig, few, chain)[:, sensor, actuator] - term(few)
+    folded = []
+    for k in ORDERS:
+        there = term(np.abs(few + k * rig.rate_hz))
+        folded.append(spread(there if k > 0 else there.conj()))
+    s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
+    return Grid(
+        f,
+        around(s),
+        spread(rest),
+        np.stack(folded),
+        rig.rate_hz,
+        sensor,
+        actuator,
+        sigma=sigma,
+        loop=loop,
+    )
+
+
+class Model:
+    """A rig, the effects added to it, and its uncertain nominal parameters.
+
+    The vector x is log(value/nominal) of the nominal parameters `keys`, then the logarithm of
+    each effect's unknowns. prior : (n_x,) standard deviations, inf for unknowns, whose
+    bounds are `lower` and `upper`.
+    """
+
+    def __init__(self, rig: Rig, effects: Sequence[Effect] = ()) -> None:
+        self.rig, self.effects = rig, tuple(effects)
+        built = rig
+        for effect in effects:
+            built = effect.build(built)
+        self.built = built
+        self.chain = self.chain_of(built)
+        known = {(e.name, s): p for e in flattened(rig.element) for s, p in parameters(e).items()}
+        have = set(self.chain.parameters)
+        self.keys: tuple[Key, ...] = tuple(
+            k for k, p in known.items() if p.tolerance > 0 and p.value != 0 and k in have
+        )
+        self.nominal = {k: p.value for k, p in known.items()}
+        self._start = np.array([self.nominal[k] for k in self.keys])
+        unknowns = [u for e in effects for u in e.unknowns]
+        n = len(self.keys)
+        self.n_nominal, self.n = n, n + len(unknowns)
+        self.prior = np.full(self.n, math.inf)
+        self.prior[:n] = [known[k].tolerance for k in self.keys]
+        self.lower = np.concatenate(
+            [-FARTHEST * self.prior[:n], [math.log(u.low) for u in unknowns]]
+        )
+        self.upper = np.concatenate(
+            [FARTHEST * self.prior[:n], [math.log(u.high) for u in unknowns]]
+        )
+
+    def having(self, effects: Sequence[Effect]) -> Model:
+        """The same rig with other effects; nominal parameters keep their place in x."""
+        return Model(self.rig, effects)
+
+    def under(self, change: Callable[[Rig], Rig]) -> Model:
+        """The same effects in a rig that was changed."""
+        return Model(change(self.rig), self.effects)
+
+    def chain_of(self, rig: Rig) -> ChainLike:
+        """The chain of a rig, as the effects have it."""
+        chain: ChainLike = Chain(rig)
+        causal = dict(e.causal for e in self.effects if e.causal is not None)
+        if causal:
+            pieces = [p for e in self.effects if e.site in causal for p in e.pieces]
+            middle = next(iter(causal.values()))
+            chain = CausalChain(chain.plain, (*causal, *pieces), middle)
+        for joint in (e.fractional for e in self.effects if e.fractional is not None):
+            chain = FractionalChain(chain, joint)
+        return chain
+
+    def parts(self, x: Float) -> list[Float]:
+        """The values of each effect's unknowns."""
+        out, at = [], self.n_nominal
+        for effect in self.effects:
+            out.append(np.exp(x[at : at + len(effect.unknowns)]))
+            at += len(effect.unknowns)
+        return out
+
+    def own(self, i: int) -> range:
+        """Where the unknowns of effect i stand in x."""
+        first = self.n_nominal + sum(len(e.unknowns) for e in self.effects[:i])
+        return range(first, first + len(self.effects[i].unknowns))
+
+    def values(self, x: Float) -> dict[Key, float]:
+        """The chain's parameters that differ from the built rig's."""
+        moved = dict(
+            zip(self.keys, (self._start * np.exp(x[: self.n_nominal])).tolist(), strict=True)
+        )
+        all_values = {**self.nominal, **moved}
+        pairs = zip(self.effects, self.parts(x), strict=True)
+        for effect, theta in sorted(pairs, key=lambda pair: bool(pair[0].pieces)):
+            change = effect.parameters(theta, all_values)
+            all_values.update(change)
+            moved.update(change)
+        return moved
+
+    def plain(self, x: Float) -> Chain:
+        """The chain at x, a loss factor the same at all frequencies, no fractional damper."""
+        return self.chain.with_values(self.values(x)).plain
+
+    def response(self, x: Float, at: Grid) -> Complex:
+        """(n, q) at the grid's frequencies."""
+        chain = self.chain.with_values(self.values(x))
+        G = chain.evaluate(at.s)[:, at.sensor, at.actuator]
+        F, _ = self._factors(x, at, slopes=False)
+        H = np.asarray(G * at.factor * F + self._aliases(x, at, slopes=False)[0])
+        return H if at.loop is None else at.loop.closed(H)
+
+    def gradient(self, x: Float, at: Grid) -> tuple[Complex, Complex]:
+        """The same, and its derivatives (n, q, n_x)."""
+        values = self.values(x)
+        keys = tuple(values)
+        chain = self.chain.with_values(values)
+        G, dG = chain.gradient_at(at.s, keys)
+        G, dG = G[:, at.sensor, at.actuator], dG[:, at.sensor, at.actuator]
+        F, slopes = self._factors(x, at, slopes=True)
+        factor = at.factor * F
+        dG *= factor[:, :, None]
+        dH = np.zeros((*G.shape, self.n), complex)
+        n = self.n_nominal
+        dH[:, :, :n] = dG[:, :, :n] * np.array([values[k] for k in self.keys])
+        read = self._reading()
+        if read:
+            map_ = np.zeros((len(keys), len(read)))
+            for i, j in enumerate(read):
+                ahead = x.copy()
+                ahead[j] += STEP
+                there = self.values(ahead)
+                map_[:, i] = [(there[k] - values[k]) / STEP for k in keys]
+            dH[:, :, read] = dG @ map_
+        for j, dlog in slopes:
+            dH[:, :, j] += G * at.factor * dlog
+        aliases, more = self._aliases(x, at, slopes=True)
+        for j, slope in more:
+            dH[:, :, j] += slope
+        H = G * factor + aliases
+        return (H, dH) if at.loop is None else (at.loop.closed(H), at.loop.slopes(H, dH))
+
+    def _aliases(
+        self, x: Float, at: Grid, *, slopes: bool
+    ) -> tuple[Complex, list[tuple[int, Complex]]]:
+        """What the aliases add where factors act on them too, and its slopes."""
+        total, more = at.aliases, []
+        if any(e.factor is not None for e in self.effects):
+            for s, part in zip(at.orders(), at.folded, strict=True):
+                F, each = self._factors(x, at, slopes=slopes, s=s)
+                total = total + part * (F - 1)
+                more += [(j, part * slope) for j, slope in each]
+        return total, more
+
+    def _reading(self) -> list[int]:
+        """Entries of x that reach the chain's parameters through an effect."""
+        touched = {k for e in self.effects for k in e.touches}
+        return [i for i, k in enumerate(self.keys) if k in touched] + list(
+            range(self.n_nominal, self.n)
+        )
+
+    def _factors(
+        self, x: Float, at: Grid, *, slopes: bool, s: Complex | None = None
+    ) -> tuple[Complex, list[tuple[int, Complex]]]:
+        """(n, q) product of the factors at s, by default at the grid's own, and its slopes."""
+        total = np.ones((at.frequency.size, at.sensor.size), complex)
+        parts = []
+        s = at.s if s is None else s
+        first = self.n_nominal
+        for effect, theta in zip(self.effects, self.parts(x), strict=True):
+            if effect.factor is not None:
+                F, dF = effect.factor.value(s, theta)
+                on = self.entries(effect, at)
+                total[:, on] *= F[:, None]
+                parts.append((first, on, F, dF, theta))
+            first += len(effect.unknowns)
+        out: list[tuple[int, Complex]] = []
+        if slopes:
+            for first, on, F, dF, theta in parts:
+                for j, d in enumerate(dF):
+                    slope = np.zeros_like(total)
+                    slope[:, on] = total[:, on] * (d * theta[j] / F)[:, None]
+                    out.append((first + j, slope))
+        return total, out
+
+    def entries(self, effect: Effect, at: Grid) -> Int:
+        """Entries of the grid that an effect's factor is on."""
+        assert effect.factor is not None
+        if effect.factor.kind == "input":
+            names = [a.name for a in self.rig.actuator]
+            return np.flatnonzero(at.actuator == names.index(effect.factor.channel))
+        names = [s.name for s in self.rig.sensor]
+        return np.flatnonzero(at.sensor == names.index(effect.factor.channel))

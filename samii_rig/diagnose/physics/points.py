@@ -1,0 +1,431 @@
+"""Parts at a point: a jump of one state, driven by another, at a port or along a body.
+
+A row of `POINTS` is the jump and its conjugate (diagnosis of point faults), the element that makes
+it, its law x(s) and its unknowns.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+
+from samii_rig.diagnose.physics import along as along_
+from samii_rig.diagnose.physics import insert
+from samii_rig.diagnose.physics.along import Along, stretches
+from samii_rig.diagnose.physics.effect import Effect, Jump, Key, Unknown, Values
+from samii_rig.diagnose.physics.insert import DISPLACEMENT, VOLUME
+from samii_rig.diagnose.physics.scales import PAIRS, REACH, Places, middle, spread
+from samii_rig.model.tmm import State
+from samii_rig.rig.elements import quantities
+from samii_rig.rig.schema import (
+    ANGLE_SOURCES,
+    Branch,
+    Element,
+    GravityStiffness,
+    LumpedMass,
+    RelativeAngle,
+    Rig,
+    RigidLink,
+    TorsionalGroundSpring,
+    TorsionalSpring,
+    TranslationalGroundSpring,
+    TranslationalSpring,
+    parameters,
+)
+from samii_rig.types import Complex, Float
+
+Law = Literal["spring", "softness", "column", "damper", "slip", "mass"]
+LOSS = (1e-4, 10.0)  # damping force over spring force in mid band
+LOSS_STARTS = (0.05,)
+MOST_DAMPED = 0.3  # damping ratio of an oscillator; with more it is a damper and does not resonate
+JOINTS = (TorsionalSpring, TranslationalSpring, *ANGLE_SOURCES)
+# Parts of the way along a stretch at which a search begins; its ends are ports. What moves a rigid
+# link goes with the square of the place at most; a beam has its modes between.
+ON_LINK = (0.3, 0.75)
+ON_BEAM = (0.2, 0.5, 0.8)
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A row: physics at a point.
+
+    jump, by : the state that jumps and the one that drives it.
+    law : what x(s) is: softness 1/(k + c s), column the same with k = D^2/C_h, slip 1/(c s),
+        spring k + c s, damper c s, mass m s^2. strong, loss : symbols of its parameters, loss ""
+        where there is none.
+    kind : the element that it adds to the rig file. tag : in that element's name.
+    reported : symbol that the strong one is told by; "" for its own.
+    at_source : whether it belongs to a source only. either_sign : whether the strong one may
+        be negative (a pendulum upside down). along : whether it may stand along a body.
+    """
+
+    physics: str
+    jump: State
+    by: State
+    law: Law
+    strong: str
+    loss: str
+    kind: type[Any]
+    tag: str
+    reported: str = ""
+    at_source: bool = False
+    either_sign: bool = False
+    along: bool = False
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the element's parameters, by symbol."""
+        return {symbol: q.unit for symbol, q in quantities(self.kind).items()}  # type: ignore[arg-type]
+
+    @property
+    def pair(self) -> int:
+        """Its jump among `scales.PAIRS`."""
+        return PAIRS.index((self.jump, self.by))
+
+    def bounds(self, x: float, w: float) -> tuple[float, float]:
+        """Of the strong unknown. x : of the jump where it begins to matter, at w rad/s."""
+        match self.law:
+            case "softness" | "column" | "slip":
+                scale = 1 / x if self.law != "slip" else 1 / (x * w)
+                low, high = (scale * r for r in REACH)
+                if self.law == "column":  # C_h/D^2 is the compliance
+                    return DISPLACEMENT**2 / high, DISPLACEMENT**2 / low
+                return low, high
+            case "spring" | "damper" | "mass":
+                scale = x / w ** ("spring", "damper", "mass").index(self.law)
+                return scale / REACH[1], scale / REACH[0]
+
+    def unknowns(self, x: float, w: float) -> tuple[Unknown, ...]:
+        """The strong one, and the loss over it."""
+        low, high = self.bounds(x, w)
+        unit = VOLUME if self.law == "column" else self.units[self.strong]
+        strong = Unknown(self.reported or self.strong, unit, low, high, spread(low, high, 11))
+        if not self.loss:
+            return (strong,)
+        return strong, Unknown(self.loss, self.units[self.loss], *LOSS, LOSS_STARTS)
+
+    def values(self, name: str, x: Float, sign: float, w: float) -> dict[Key, float]:
+        """Parameters of the element of this name."""
+        out = dict.fromkeys(((name, s) for s in self.units), 0.0)
+        strong = self._strong(x, sign)
+        out[name, "k" if self.law == "column" else self.strong] = float(strong)
+        if self.loss:
+            out[name, self.loss] = float(strong * x[1] / w)
+        return out
+
+    def report(self, x: Float, sign: float, w: float) -> Float:
+        """The strong parameter and the loss, as they are told."""
+        own = x[0] if self.law == "column" else sign * x[0]
+        return np.array([own, self._strong(x, sign) * x[1] / w] if self.loss else [own])
+
+    def x(self, s: Complex, x: Float, sign: float, w: float) -> Complex:
+        """x(s), (m, n), of unknowns (m, k)."""
+        strong = self._strong(x.T, sign)
+        value = np.asarray(strong)[:, None]
+        more = s * (strong * x[:, 1] / w)[:, None] if self.loss else 0.0 * s
+        match self.law:
+            case "softness" | "column":
+                return np.asarray(1 / (value + more))
+            case "slip":
+                return np.asarray(1 / (value * s))
+            case "spring":
+                return np.asarray(value + more)
+            case "damper":
+                return np.asarray(value * s)
+            case "mass":
+                return np.asarray(value * s**2)
+
+    def _strong(self, x: Float, sign: float) -> Any:
+        return DISPLACEMENT**2 / x[0] if self.law == "column" else sign * x[0]
+
+
+POINTS: tuple[Point, ...] = (
+    Point(
+        "torsional_compliance", "theta", "M", "softness", "k", "c", TorsionalSpring, "spring_"
+    ),
+    Point(
+        "translational_compliance", "w", "V", "softness", "k", "c", TranslationalSpring,
+        "shear_spring_",
+    ),
+    Point("added_mass", "V", "w", "mass", "m", "", LumpedMass, "mass_", along=True),
+    Point("added_inertia", "M", "theta", "mass", "I", "", LumpedMass, "inertia_", "J", along=True),
+    Point(
+        "ground_spring", "M", "theta", "spring", "k", "c", TorsionalGroundSpring, "brace_",
+        along=True,
+    ),
+    Point(
+        "ground_spring", "V", "w", "spring", "k", "c", TranslationalGroundSpring, "brace_",
+        along=True,
+    ),
+    Point(
+        "gravity_stiffness", "M", "theta", "spring", "k", "", GravityStiffness, "gravity_",
+        either_sign=True,
+    ),
+    Point(
+        "viscous_damping", "M", "theta", "damper", "c", "", TorsionalGroundSpring, "damper_",
+        along=True,
+    ),
+    Point(
+        "viscous_damping", "V", "w", "damper", "c", "", TranslationalGroundSpring, "damper_",
+        along=True,
+    ),
+    Point(
+        "velocity_feedback", "theta", "M", "slip", "c", "", TorsionalSpring, "slip_", "g_v",
+        at_source=True,
+    ),
+    Point(
+        "hydraulic_compressibility", "theta", "M", "column", "C_h", "c", TorsionalSpring, "oil_",
+        at_source=True,
+    ),
+)  # fmt: skip
+
+
+def effects(rig: Rig, where: Places) -> Iterator[Effect]:
+    """All of them on this rig."""
+    for row in POINTS:
+        for port in range(len(where.names)):
+            yield from _at_port(rig, where, row, port)
+    for port in range(len(where.names)):
+        yield from _hanging_at(rig, where, port)
+    for at, element in enumerate(rig.element):
+        for stretch in stretches(rig, element):
+            for row in POINTS:
+                yield from _along(rig, where, row, at, stretch)
+            yield from _hanging_along(rig, where, at, stretch)
+
+
+def _at_port(rig: Rig, where: Places, row: Point, port: int) -> Iterator[Effect]:
+    x = where.strength(row.pair, port)
+    if not 0 < x < math.inf:
+        return
+    kinds = {e.name: e for e in rig.element}
+    names = where.names[port]
+    if row.at_source and not any(isinstance(kinds[n], ANGLE_SOURCES) for n in names):
+        return
+    w = middle(where)
+    after = names[0] if port > 0 else None
+    signs = (1.0, -1.0) if row.either_sign else (1.0,)
+    site, others, position = _site(rig, row, names, port)
+    for (seen, tail), sign in product(_readings(rig, row, names, port), signs):
+        name = f"{insert.PREFIX}{row.tag}{port}{tail}"
+
+        def build(r: Rig, name: str = name, seen: tuple[str, ...] = seen) -> Rig:
+            made = insert.element_of(row.kind, name, row.units)
+            return insert.inserted(r, after, made, seen)
+
+        def values(x: Float, _: Values, name: str = name, sign: float = sign) -> dict[Key, float]:
+            return row.values(name, x, sign, w)
+
+        def report(x: Float, sign: float = sign) -> Float:
+            return row.report(x, sign, w)
+
+        def x_of(s: Complex, x: Float, sign: float = sign) -> Complex:
+            return row.x(s, x, sign, w)
+
+        yield Effect(
+            physics=row.physics,
+            site=site,
+            unknowns=row.unknowns(x, w),
+            build=build,
+            parameters=values,
+            jump=Jump(f"{row.jump} by {row.by} at port {port}{tail}", x_of, (row.jump, row.by)),
+            aliases=tuple((row.physics, o) for o in others),
+            report=report,
+            weight=1 / len(signs),
+            variant=name if sign > 0 else f"{name} negative",
+            position=position,
+        )
+
+
+def _readings(
+    rig: Rig, row: Point, names: tuple[str, ...], port: int
+) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Which relative angles at whose end the part stands see it: none, or all of them."""
+    tail = "w" if row.jump in ("w", "V") else ""
+    yield (), tail
+    if row.jump != "theta":
+        return
+    edge = tuple(
+        s.name
+        for s in rig.sensor
+        if isinstance(s, RelativeAngle) and sum(n in s.across for n in names) == 1
+    )
+    if edge:
+        yield edge, f"{tail}e"
+
+
+def _site(
+    rig: Rig, row: Point, names: tuple[str, ...], port: int
+) -> tuple[str, tuple[str, ...], float | None]:
+    """The element that the place is called by, the other name that it has, and where it is along
+    the first."""
+    kinds = {e.name: e for e in rig.element}
+
+    def joint(name: str) -> bool:
+        return isinstance(kinds[name], JOINTS)
+
+    # What holds a chain of masses to the ground holds a mass, as a person would say it.
+    bodily = row.law == "mass" or (rig.motion == "axial" and row.jump == "V")
+    ranked = sorted(names, key=lambda n: joint(n) if bodily else not joint(n))
+    body = kinds[ranked[0]]
+    position = None
+    if isinstance(body, along_.BODIES):
+        position = body.L.value if port > 0 and ranked[0] == names[0] else 0.0
+    return ranked[0], tuple(ranked[1:]), position
+
+
+def _strength(where: Places, pair: int, at: int) -> float:
+    """As of `Places`, of element `at`: of the end where a part matters the sooner."""
+    return min(where.strength(pair, at), where.strength(pair, at + 1))
+
+
+def _along(rig: Rig, where: Places, row: Point, at: int, stretch: Along) -> Iterator[Effect]:
+    """A row's part along a body."""
+    element = rig.element[at]
+    link = isinstance(element, RigidLink)
+    # Wherever a part turns a rigid link it does the same: that is a port's. A mass on a link that
+    # has some is in `bodies`.
+    own = isinstance(element, RigidLink) and row.law == "mass" and element.m.value > 0
+    if not row.along or own or (link and row.jump == "M"):
+        return
+    x = _strength(where, row.pair, at)
+    if not 0 < x < math.inf or (rig.motion == "axial" and row.jump == "M"):
+        return
+    w = middle(where)
+    tail = "w" if row.jump == "V" else ""
+    name = f"{insert.PREFIX}{row.tag}{at}{tail}_{stretch.number}"
+    yield _standing(
+        rig,
+        row,
+        stretch,
+        row.unknowns(x, w),
+        (name, insert.element_of(row.kind, name, row.units)),
+        lambda x: row.values(name, x, 1.0, w),
+        lambda x: row.report(x, 1.0, w),
+        lambda s, x: row.x(s, x, 1.0, w),
+    )
+
+
+def _standing(
+    rig: Rig,
+    row: Point,
+    stretch: Along,
+    unknowns: tuple[Unknown, ...],
+    part: tuple[str, Element],
+    values: Callable[[Float], dict[Key, float]],
+    report: Callable[[Float], Float],
+    x_of: Callable[[Complex, Float], Complex],
+) -> Effect:
+    """An effect with a place along a body as its last unknown. part : name and element.
+    values, report, x_of : of the other unknowns."""
+    name, element = part
+    body = next(e for e in rig.element if e.name == stretch.body)
+    symbols = [s for s in parameters(body) if s != "L"]
+    touches = tuple((body.name, s) for s in parameters(body))
+    link = isinstance(body, RigidLink)
+
+    def build(r: Rig) -> Rig:
+        if link:
+            parts = element.element if isinstance(element, Branch) else (element,)
+            return along_.carried(r, body.name, f"{name}_on", parts)
+        return along_.cut(r, stretch, element)
+
+    def placed(x: Float, nominal: Values) -> dict[Key, float]:
+        out = values(x)
+        if link:
+            out[along_.arm_of(f"{name}_on"), "L"] = stretch.position(float(x[-1]))
+            return out
+        out |= stretch.lengths(float(x[-1]), nominal[body.name, "L"])
+        for piece in stretch.pieces:
+            out |= {(piece, s): nominal[body.name, s] for s in symbols}
+        return out
+
+    return Effect(
+        physics=row.physics,
+        site=body.name,
+        unknowns=(*unknowns, stretch.unknown(ON_LINK if link else ON_BEAM)),
+        build=build,
+        parameters=placed,
+        touches=() if link else touches,
+        jump=Jump(f"{row.jump} by {row.by} {stretch.place()}", x_of, (row.jump, row.by), fixed=1),
+        report=lambda x: np.append(report(x), stretch.position(float(x[-1]))),
+        weight=stretch.share,
+        variant=f"along {name}",
+        pieces=() if link else stretch.pieces,
+    )
+
+
+HANGING = Point("attached_oscillator", "V", "w", "mass", "m", "", LumpedMass, "oscillator_")
+
+
+def _swinging(where: Places, x: float) -> tuple[Unknown, ...]:
+    """Mass, natural frequency and damping ratio of what hangs on; told as m, k, c."""
+    low_w, high_w = (2 * math.pi * float(where.frequency[i]) for i in (0, -1))
+    scale = x / middle(where) ** 2
+    masses = (1e-5 * scale, 3 * scale)
+    return (
+        Unknown("m", "kg", *masses, spread(*masses, 7)),
+        Unknown("k", "N/m", low_w, 2 * high_w, spread(low_w, high_w, 48)),
+        Unknown("c", "N s/m", 1e-3, MOST_DAMPED, (0.05,)),
+    )
+
+
+def _hanging_at(rig: Rig, where: Places, port: int) -> Iterator[Effect]:
+    x = where.strength(HANGING.pair, port)
+    if not 0 < x < math.inf:
+        return
+    names = where.names[port]
+    name = f"{insert.PREFIX}{HANGING.tag}{port}"
+    after = names[0] if port > 0 else None
+    site, others, position = _site(rig, HANGING, names, port)
+    yield Effect(
+        physics=HANGING.physics,
+        site=site,
+        unknowns=_swinging(where, x),
+        build=lambda r: insert.inserted(r, after, insert.oscillator(name)),
+        parameters=lambda x, _: _hung(name, x),
+        aliases=tuple((HANGING.physics, o) for o in others),
+        report=_oscillating,
+        jump=Jump(f"V by w at port {port}w", _hanging, ("V", "w")),
+        variant=name,
+        position=position,
+    )
+
+
+def _hanging_along(rig: Rig, where: Places, at: int, stretch: Along) -> Iterator[Effect]:
+    x = _strength(where, HANGING.pair, at)
+    if not 0 < x < math.inf:
+        return
+    name = f"{insert.PREFIX}{HANGING.tag}{at}_{stretch.number}"
+    yield _standing(
+        rig,
+        HANGING,
+        stretch,
+        _swinging(where, x),
+        (name, insert.oscillator(name)),
+        lambda x: _hung(name, x),
+        lambda x: _oscillating(x[:3]),
+        _hanging,
+    )
+
+
+def _hung(name: str, x: Float) -> dict[Key, float]:
+    m, k, c = (float(v) for v in _oscillating(x[:3]))
+    return {(f"{name}_spring", "k"): k, (f"{name}_spring", "c"): c, (f"{name}_mass", "m"): m}
+
+
+def _hanging(s: Complex, x: Float) -> Complex:
+    """Force over motion of a mass on a spring, (m, n)."""
+    m, w, zeta = (x[:, i : i + 1] for i in range(3))
+    held = w**2 + 2 * zeta * w * s
+    return np.asarray(m * s**2 * held / (s**2 + held))
+
+
+def _oscillating(x: Float) -> Float:
+    """m, k, c from mass, natural frequency and damping ratio."""
+    return np.array([x[0], x[0] * x[1] ** 2, 2 * x[2] * x[0] * x[1]])

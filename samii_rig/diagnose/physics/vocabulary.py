@@ -1,0 +1,51 @@
+"""The table of physics: what may have been left out of a rig file, as data.
+
+Parts at a point are rows of `points`, changes of what the chain is made of are in `bodies`, what a
+rig has less of in `less`, factors in `channels`. A lab adds effects by the entry point
+`samii_rig.effects`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+
+from samii_rig.devices.plugins import asked, named, wrong
+from samii_rig.diagnose.physics import bodies, channels, less, points
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.scales import places
+from samii_rig.rig.schema import Rig
+
+GROUP = "samii_rig.effects"  # of entry points
+
+
+def hypotheses(rig: Rig, low_hz: float, high_hz: float, *, signed: bool = False) -> list[Effect]:
+    """Every single effect that the table knows on this rig; ranges are those of the band.
+
+    signed : with what is less than it was, in parameters that the refit moves too: what may change
+    between two states.
+    """
+    where = places(rig, low_hz, high_hz)
+    return [
+        *points.effects(rig, where),
+        *bodies.effects(rig, where),
+        *less.effects(rig, between=signed),
+        *channels.effects(rig, low_hz, high_hz),
+        *plugged(rig, low_hz, high_hz),
+    ]
+
+
+def plugged(rig: Rig, low_hz: float, high_hz: float) -> Iterator[Effect]:
+    """The effects of other packages: each entry point of `samii_rig.effects` is a function
+    (rig, low_hz, high_hz) -> iterable of Effect, seen by the command line, the service and workers.
+
+    Raises InputError with the entry point's name for what it raises or gives in place of effects.
+    """
+    for point in entry_points(group=GROUP):
+        who = named(point)
+        with asked(who, "effects"):
+            made = list(point.load()(rig, low_hz, high_hz))
+        for effect in made:
+            if not isinstance(effect, Effect):
+                raise wrong(who, "effects", effect, "an Effect")
+        yield from made

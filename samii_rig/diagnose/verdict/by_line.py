@@ -1,0 +1,51 @@
+"""The diagnosis of responses line by line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from samii_rig.diagnose.fit.explanations import threshold
+from samii_rig.diagnose.result import Diagnosis, Used
+from samii_rig.diagnose.verdict import answer
+from samii_rig.diagnose.verdict import judge as verdict
+from samii_rig.diagnose.verdict.force_words import distorted
+from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, told
+
+DIFFER = (
+    "levels differ; give the recordings: friction, play, hardening and the like are told from "
+    "whole records alone"
+)
+
+
+def by_lines(case: Case, progress: Progress) -> Diagnosis:
+    """What the lines of all responses say; nothing is named where levels differ by more than noise,
+    as linear effects bend towards what no linear rig does."""
+    search, show = case.search, case.show
+    nominal = search.nominal.fitted
+    first, bands = search.ratio(nominal), answer.bands(search, nominal)
+    torn = search.lines.torn()
+    progress("what is missing")
+    search.run(briefly=torn)
+    progress("what cannot be told apart")
+    judged = verdict.judge(search, case.decide)
+    nominal, best = search.nominal.fitted, judged.best
+    there = search.grid.at(show.frequency, show.level)
+    plain, after = (f.model.response(f.x, there) for f in (nominal, best.fitted))
+    gap, due = answer.gap(show, plain, after), answer.due_there(show, plain, after)
+    judged = verdict.shown(judged, gap, due)
+    if torn:
+        judged = replace(judged, verdict="unknown")
+    shown = Shown(
+        first=first,
+        threshold=threshold(search.spread),
+        bands=bands,
+        nominal=(search.ratio(nominal), show.per_dof(plain)),
+        with_causes=(search.ratio(best.fitted), show.per_dof(after)),
+        gap=gap,
+        used=Used(case.lines.n, sum(r.frequency.size for r in case.responses)),
+    )
+    clean = case.clean
+    said = (DIFFER, *distorted(case.responses)) if torn else ()
+    if clean.doubt is None and clean.guessed is not None:
+        return told(case, search, judged, shown, (*said, clean.guessed.why), clean.guessed)
+    return told(case, search, judged, shown, said, clean.doubt)

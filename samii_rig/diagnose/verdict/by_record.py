@@ -1,0 +1,145 @@
+"""The diagnosis of whole records, by every sample."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from samii_rig.diagnose.data.measured import DIFFER
+from samii_rig.diagnose.fit.explanations import threshold
+from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
+from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
+from samii_rig.diagnose.result import Band, Diagnosis, Gap
+from samii_rig.diagnose.verdict import judge as verdict
+from samii_rig.diagnose.verdict.judge import Judgement
+from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, told
+from samii_rig.errors import EstimateError, SamiiRigError
+
+# Physics of channels whose command was not sent as it was recorded.
+NOT_KNOWN = ("input_not_held", "columns_shifted")
+ALL = 0.99  # of the rig's samples, that a record has
+MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
+
+
+def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | None:
+    """The search on whole records, where they can be used as they are."""
+    clean = case.clean
+    if not case.runs or clean.mended or clean.doubt:
+        return None
+    try:
+        whole = Whole.of(case.runs, case.search.rig, band, clean.sensors, clean.samples)
+        return RecordSearch(whole, case.search)
+    except EstimateError:
+        return None
+
+
+def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis:
+    """What whole records say."""
+    first, bands = _at_first(search)
+    progress("what is missing")
+    # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
+    search.run(briefly=True)
+    progress("amplitude levels")
+    forced = forces_on(search)
+    if forced is None or not (case.search.lines.torn() or forced.is_enough()):
+        search.run()
+        forced = None if forced is None else forces_on(search)
+    progress("what cannot be told apart")
+    if forced is None:
+        looked = _consistent(search, _looked(search))
+    else:
+        first, bands = _at_first(forced)
+        looked = _looked(forced)
+    return _answer(case, forced or search, first, bands, looked)
+
+
+def by_samples(
+    case: Case,
+    search: RecordSearch,
+    first: float,
+    bands: tuple[Band, ...],
+    progress: Progress,
+) -> Diagnosis:
+    """The answer, once all linear explanations of the records were tried. first, bands : what the
+    refitted nominal model left before, in all and by band."""
+    progress("what cannot be told apart")
+    return _answer(case, search, first, bands, _consistent(search, _looked(search)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Looked:
+    """What was judged, with chi-square per degree of freedom on the lines kept apart by the nominal
+    model and with the causes, the gap closed there, and what else there is to say."""
+
+    judged: Judgement
+    plain: float
+    after: float
+    gap: Gap
+    said: tuple[str, ...] = ()
+
+
+def _looked(search: RecordSearch) -> _Looked:
+    judged = verdict.judge(search)
+    plain, after, gap = search.shown(search.nominal.fitted, judged.best.fitted)
+    if any(e.quasi is not None for e in judged.best.effects) and gap.low > 0:
+        # Computed in time, and seen on lines that it was not fitted to.
+        judged = verdict.confirmed(judged)
+    judged = verdict.shown(judged, gap, judged.evidence.drop / (TURN - 1))
+    return _Looked(judged, plain, after, gap)
+
+
+def _at_first(search: RecordSearch) -> tuple[float, tuple[Band, ...]]:
+    """What the refitted nominal model leaves, in all and by band."""
+    return search.ratio(search.nominal.fitted), search.bands(search.nominal.fitted)
+
+
+def _answer(
+    case: Case,
+    search: RecordSearch,
+    first: float,
+    bands: tuple[Band, ...],
+    looked: _Looked,
+) -> Diagnosis:
+    nominal, best = search.nominal.fitted, looked.judged.best
+    shown = Shown(
+        first=first,
+        threshold=threshold(search.spread),
+        bands=bands,
+        nominal=(search.ratio(nominal), looked.plain),
+        with_causes=(search.ratio(best.fitted), looked.after),
+        gap=looked.gap,
+        used=search.used(),
+    )
+    of_lines = case.clean.of_lines
+    clean = replace(case.clean, told=tuple(w for w in case.clean.told if w not in of_lines))
+    return told(replace(case, clean=clean), search, looked.judged, shown, looked.said)
+
+
+def forces_on(search: RecordSearch) -> ForceSearch | None:
+    """The search among forces, where one explains the records best; None where none does, or where
+    the rig has no partial fractions in which it could be computed, or where not every sample of
+    the command was recorded."""
+    whole = search.whole
+    if any(e.physics in NOT_KNOWN for e in search.ranked()[0].effects):
+        return None  # a force is computed from the command, which is not as recorded
+    if isinstance(whole, Whole) and whole.records.rate_hz < whole.rig.rate_hz * ALL:
+        return None
+    try:
+        return compete_on_records(search)
+    except SamiiRigError:
+        return None
+
+
+def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
+    """The same, but where no linear response explains all records something is missing; and that in
+    words."""
+    left, sd = search.inconsistent()
+    if left < 1 + MORE * sd:
+        return looked
+    said = (
+        f"the records disagree: chi-square per degree of freedom {left:.3g} of what no linear "
+        "model can explain, so something depends on amplitude or changed between runs",
+    )
+    judged = looked.judged
+    if judged.verdict == "no_mismatch" or left > DIFFER:
+        judged = replace(judged, verdict="unknown")
+    return replace(looked, judged=judged, said=said)

@@ -1,0 +1,100 @@
+"""What these data would not have shown: how small an effect must be to stay unseen.
+
+The nominal parameters do what they can against it: an effect counts by what their refit leaves.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import stats
+
+from samii_rig.diagnose.fit.explanations import Explanation, Explanations
+from samii_rig.diagnose.fit.ranking import moved, place_at
+from samii_rig.diagnose.fit.screen import Screen
+from samii_rig.diagnose.physics.channels import NOT_PHYSICS
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.result import Hiding
+from samii_rig.errors import SamiiRigError
+from samii_rig.types import Float
+
+FOUND = 0.9  # probability with which an effect of the size that is told would have been found
+TRIES = 16  # strengths over the range of an effect, log-spaced, for one that is weak
+
+
+def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
+    """Of each physics and site, beside what was found, the smallest that would have been seen."""
+    look = Screen.of(search.problem, best.fitted).of_data()
+    needed = math.sqrt(search.worth * search.temperature) + float(stats.norm.ppf(FOUND))
+    found: dict[tuple[str, str], Hiding] = {}
+    taken = {e.key for e in best.effects}
+    for effect in search.table:
+        plain = effect.unknowns and effect.quasi is None and effect.physics not in NOT_PHYSICS
+        if plain and effect.key not in taken and effect.name not in found:
+            seen = _smallest(search, best, look, effect, needed)
+            if seen is not None:
+                found[effect.name] = seen
+    return tuple(found.values())
+
+
+def _smallest(
+    search: Explanations, best: Explanation, look: Screen, effect: Effect, needed: float
+) -> Hiding | None:
+    """Where noise units reach what is needed. What a refit leaves grows with a weak strength, or
+    with its inverse, in proportion: so far as a refit bends, this is exact for what is weak."""
+    first, others = effect.unknowns[0], effect.unknowns[1:]
+    strength = np.geomspace(first.low, first.high, TRIES)
+    middle = [u.starts[len(u.starts) // 2] for u in others]
+    values = np.column_stack([strength, np.tile(middle, (TRIES, 1))])
+    with np.errstate(all="ignore"):
+        changed = _changed(search, best, look, effect, values)
+    if changed is None:
+        return None
+    before, left = (np.sqrt(np.maximum(x, 0.0)) for x in changed)
+    # Where it moves the records by about their noise: neither rounding nor curvature matters.
+    weak = np.nanargmin(np.abs(np.log(np.maximum(before, 1e-12))))
+    rate = needed / max(float(left[weak]), 1e-12)
+    value = values[weak].copy()
+    value[0] *= rate if before[-1] > before[0] else 1 / rate
+    within = first.low <= value[0] <= first.high
+    size = float(effect.report(value)[0]) if within else None
+    return Hiding(effect.physics, effect.site, first.symbol, size, first.unit)
+
+
+def _changed(
+    search: Explanations, best: Explanation, look: Screen, effect: Effect, values: Float
+) -> tuple[Float, Float] | None:
+    """Chi-square (m,) of what an effect with unknowns (m, k) changes: all of it, and what a refit
+    leaves; None where the rig does not allow it."""
+    linear = all(e.quasi is None for e in best.effects)
+    if linear and effect.jump is not None:
+        k = values.shape[1] - effect.jump.fixed
+        fixed = tuple(values[0, k:].tolist())
+        place = place_at(look, best.effects, effect, search.model, fixed)
+        if place is None:
+            return None
+        b, phi = place.b, place.phi(effect.jump.x(look.s, values))
+    elif linear and effect.factor is not None:
+        b, law = look.factor(effect)
+        phi = law(values)
+    else:
+        return _with_model(search, best, look, effect, values)
+    return look.bare().form(b).cost(phi), look.form(b).cost(phi)
+
+
+def _with_model(
+    search: Explanations, best: Explanation, look: Screen, effect: Effect, values: Float
+) -> tuple[Float, Float] | None:
+    model = search.model((*best.effects, effect))
+    if model is None:
+        return None
+    known = moved(best.fitted.model, best.fitted.x, model)
+    out = np.full((2, len(values)), np.nan)
+    for i, value in enumerate(values):
+        x = np.append(known, np.log(value))
+        try:
+            out[:, i] = [float(np.sum(at.left_with(model, x) ** 2)) for at in (look.bare(), look)]
+        except SamiiRigError:
+            continue
+    return None if np.all(np.isnan(out)) else (out[0], out[1])

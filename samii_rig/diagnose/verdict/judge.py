@@ -1,0 +1,317 @@
+"""From explanations to a verdict: probabilities, the unknown, and what it is worth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from samii_rig.diagnose.data.measured import Measured
+from samii_rig.diagnose.fit.between_runs import Changing, between_runs
+from samii_rig.diagnose.fit.classes import Class, classes
+from samii_rig.diagnose.fit.explanations import NEAR, Explanation, threshold
+from samii_rig.diagnose.fit.refit import Fitted, Problem
+from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.fit.stated import IN_DATA, PLACE, TINY, Evidence, probability
+from samii_rig.diagnose.physics.channels import NOT_PHYSICS
+from samii_rig.diagnose.result import Gap, Verdict
+
+NOTHING = 0.2  # probability of nothing missing below which it is called missing
+SURE = 0.8  # probability of an answer from which it is named
+DOUBT = 0.3  # probability of an answer below which none is given
+MOSTLY = 0.5  # of the mismatch; one cause that explains it is told whatever else is missing
+MOST_NAMES = 4  # of a class; more is no answer
+MUST_SHOW = 900.0  # of chi-square, that an effect explains of the data: 30 noise units
+PARTLY = 0.9  # of the mismatch: effects that leave more of it, and more than noise, are not named
+SAID = ("named", "ambiguous")  # verdicts that come with causes
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """classes : the most probable first; empty effects mean that nothing is missing. Their
+        probabilities are among what was looked at.
+
+    nothing : probability of nothing missing. right : that the chosen explanation is right, up to
+        its class, by its evidence. inflation : factor on covariances for what it leaves.
+    beyond : what is in no table and explains the data better; the place is then its own.
+    partly : whether the effects leave much of the mismatch, and more than noise.
+    """
+
+    verdict: Verdict
+    classes: tuple[Class, ...]
+    nothing: float
+    right: float
+    evidence: Evidence
+    inflation: float
+    beyond: Changing | None = None
+    partly: bool = False
+
+    @property
+    def best(self) -> Explanation:
+        """The chosen explanation."""
+        return self.classes[0].first
+
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Probability of each class; what is left to one is of what was not looked at."""
+        shares = self._shared(self.right)
+        if self.beyond is None:
+            return shares
+        return tuple((1 - max(p for _, p in self.beyond.sites)) * share for share in shares)
+
+    def _shared(self, first: float) -> tuple[float, ...]:
+        """Of each class, where that of the first is known."""
+        if not self.best.effects:
+            return tuple(c.probability for c in self.classes)
+        others = [c.probability for c in self.classes[1:]]
+        scale = min((1 - first) / sum(others), 1.0) if sum(others) > 0 else 0.0
+        return (first, *(scale * p for p in others))
+
+    @property
+    def placed(self) -> tuple[float, ...]:
+        """As `shares`, that each class's sites are right, whatever the physics there."""
+        return self._shared(probability(self.evidence, PLACE))
+
+    @property
+    def outside(self) -> float:
+        """Probability of something that was not looked at."""
+        return max(0.0, 1 - sum(self.shares))
+
+
+def judge(search: Search, decide: Measured | None = None) -> Judgement:
+    """Probabilities of all explanations that were looked at, and the verdict.
+
+    decide : lines that took no part in the fit, on which the best explanation must hold too.
+    """
+    thin = _thin(search)
+    for key, e in search.found.items():
+        search.found[key] = replace(e, fitted=e.fitted.roughly())
+    kept = [e for e in search.ranked() if e.key not in thin]
+    ranked = _decided(search, decide, kept) if decide is not None else kept
+    weights = np.array([e.weight for e in ranked])
+    p = np.exp(weights - np.max(weights))
+    grouped = classes(ranked, (p / p.sum()).tolist(), search.problem, search.temperature)
+    nothing = sum(c.probability for c in grouped if not c.first.effects)
+    ordered = tuple(_chosen_first(grouped, nothing))
+    evidence = _evidence(search, ordered, ranked, decide)
+    said = _verdict(ordered[0], evidence, search, decide)
+    beyond = _beyond(search, ordered[0].first, evidence, decide) if said != "no_mismatch" else None
+    # Beside more than noise that nothing explains, an effect is believed for the part that is its.
+    partly = evidence.closed < PARTLY and _unexplained(evidence, search, decide)
+    if partly:
+        said = _most(said, evidence)
+    return Judgement(
+        verdict="unknown" if beyond else said,
+        classes=ordered,
+        nothing=nothing,
+        right=probability(evidence),
+        evidence=evidence,
+        inflation=search.temperature,
+        beyond=beyond,
+        partly=partly,
+    )
+
+
+def _beyond(
+    search: Search, best: Explanation, evidence: Evidence, decide: Measured | None
+) -> Changing | None:
+    """What is in no table and explains the data better."""
+    if any(e.quasi is not None for e in best.effects):
+        return None
+    if decide is not None and evidence.held > threshold(decide.spread):
+        absorbed = evidence.drop <= search.worth
+        base = search.nominal if absorbed else best
+        if (changing := between_runs(search, base.fitted, decide)) is not None:
+            return changing
+    return None
+
+
+def _evidence(
+    search: Search,
+    ordered: Sequence[Class],
+    ranked: Sequence[Explanation],
+    decide: Measured | None,
+) -> Evidence:
+    chosen = ordered[0]
+    first = chosen.first
+    # Sums, not 1 - p: odds of a million are told from odds of a billion.
+    others = sum(c.probability for c in ordered[1:])
+    empty = next((e.weight for e in ranked if not e.effects), -math.inf)
+    base = _as_meant(search, first).fitted
+    before, left = search.ratio(base), search.ratio(first.fitted)
+    return Evidence(
+        odds=math.log(max(chosen.probability, TINY) / max(others, TINY)),
+        left=left,
+        held=_held(search, decide, first.fitted) if decide is not None else 1.0,
+        effects=len(first.effects),
+        forced=any(e.quasi is not None for e in first.effects),
+        confirmed=False,
+        gain=min(first.weight - empty, 1e6),
+        drop=(base.chi2 - first.fitted.chi2) / search.temperature,
+        names=chosen.names(),
+        pair=len(first.effects) == 2 and len({e.physics for e in first.effects}) == 1,
+        closed=(before - left) / (before - 1) if before > 1 else 0.0,
+        worth=search.worth,
+    )
+
+
+def _as_meant(search: Search, best: Explanation) -> Explanation:
+    """The nominal model of what was meant to be recorded: with what is no physics of `best`, which
+    no physics gets the credit for."""
+    meant = frozenset(e.key for e in best.effects if e.physics in NOT_PHYSICS)
+    return search.found.get(meant, search.nominal)
+
+
+def confirmed(judged: Judgement) -> Judgement:
+    """The same once a nonlinear force was confirmed in time."""
+    evidence = replace(judged.evidence, confirmed=True)
+    said = "unknown" if evidence.names > MOST_NAMES else _said(evidence)
+    if judged.partly:
+        said = _most(said, evidence)
+    return replace(judged, verdict=said, right=probability(evidence), evidence=evidence)
+
+
+def _verdict(
+    chosen: Class,
+    evidence: Evidence,
+    search: Search,
+    decide: Measured | None,
+) -> Verdict:
+    # What a refit of the nominal parameters absorbs, at the cost of values that their tolerances
+    # make unlikely, is not in the data; what is no physics is told beside the verdict.
+    physics = [e for e in chosen.first.effects if e.physics not in NOT_PHYSICS]
+    if not physics or evidence.drop <= search.worth:
+        return "unknown" if _unexplained(evidence, search, decide) else "no_mismatch"
+    if evidence.names > MOST_NAMES:
+        return "unknown"
+    said = _said(evidence)
+    # A nonlinear force is named once it was confirmed in time: see `confirmed`.
+    return "ambiguous" if said == "named" and evidence.forced else said
+
+
+def _unexplained(evidence: Evidence, search: Search, decide: Measured | None) -> bool:
+    """Whether more than noise is left on lines that were fitted or on those that were not: what
+    changes from run to run is seen by the latter alone."""
+    held = decide is not None and evidence.held > threshold(decide.spread)
+    return held or evidence.left > threshold(search.spread)
+
+
+def _said(evidence: Evidence) -> Verdict:
+    right = probability(evidence)
+    if right >= DOUBT:
+        return "named" if right >= SURE else "ambiguous"
+    one = evidence.effects == 1 and evidence.closed > MOSTLY
+    return "ambiguous" if one else "unknown"
+
+
+def _most(said: Verdict, evidence: Evidence) -> Verdict:
+    """What may be said of effects that leave much: one cause of most of it may be told. Sums of
+    two mimic what is in no table."""
+    if said not in SAID:
+        return said
+    return "ambiguous" if evidence.effects == 1 and evidence.closed > MOSTLY else "unknown"
+
+
+def doubted(judged: Judgement, most: Verdict) -> Judgement:
+    """The same where something is wrong with the recordings that could pass for physics: no more
+    is said than `most`."""
+    return replace(judged, verdict=most) if judged.verdict in SAID else judged
+
+
+def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
+    """The same, but nothing is named that makes data worse which it was not fitted to: beyond what
+    chance does, or at all if it is so large that it must show, there too.
+
+    due : of `answer.due_there`; a command that is clipped at the highest level alone shows at no
+        other.
+    """
+    must = judged.evidence.drop > MUST_SHOW and due > IN_DATA
+    worse = gap.high < 0 or (gap.value < 0 and must)
+    if judged.verdict in SAID and worse:
+        return replace(judged, verdict="unknown")
+    return judged
+
+
+def _thin(search: Search) -> set[frozenset[str]]:
+    """Explanations of which one linear effect, beside the others, is not in the data: it spares
+    the nominal parameters values that their tolerances make unlikely, and no more."""
+    out: set[frozenset[str]] = set()
+    while True:
+        ranked = [e for e in search.ranked() if e.key not in out]
+        near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
+        if not (thin := {e.key for e in near if _is_thin(search, e)}):
+            return out
+        out |= thin
+
+
+def _is_thin(search: Search, e: Explanation) -> bool:
+    if len(e.effects) < 2:
+        return False
+    single = [s for s in search.found.values() if len(s.effects) == 1 and not s.key <= e.key]
+    if any(s.fitted.chi2 - e.fitted.chi2 < _off(search, s) for s in single if s.effects[0].rough):
+        # Several effects that fit better than one, by no more than its own law may be off.
+        return True
+    fewer: list[Explanation | None] = []
+    for i, effect in enumerate(e.effects):
+        if all(x.quasi is None for x in e.effects):
+            fewer.append(search.without(e, i))
+        elif effect.quasi is None:
+            # A force is not refitted here: without this one it was fitted to itself, or not at all.
+            fewer.append(search.found.get(e.key - {effect.key}))
+    return any(
+        less is not None and less.fitted.chi2 - e.fitted.chi2 < _worth(search, less)
+        for less in fewer
+    )
+
+
+def _worth(search: Search, less: Explanation) -> float:
+    """Chi-square that an effect beside those of `less` must explain: more than chance does, and
+    more than their own laws are off by."""
+    return max(search.worth * search.temperature, _off(search, less))
+
+
+def _off(search: Search, e: Explanation) -> float:
+    """Chi-square that an explanation leaves because the laws of its effects do not quite hold."""
+    rough = max((effect.rough for effect in e.effects), default=0.0)
+    return rough**2 * (search.nominal.fitted.chi2 - e.fitted.chi2)
+
+
+def _decided(search: Search, lines: Measured, ranked: list[Explanation]) -> list[Explanation]:
+    """Those of `ranked` that may still compete, and that nothing is missing, weighed anew by how
+    likely each makes lines that were not fitted; the most probable first."""
+    rivals = [e for e in ranked if e.weight > ranked[0].weight - NEAR or not e.effects]
+    predicted = {e.key: _predicted(search, lines, e.fitted) for e in rivals}
+    gross, _ = predicted[search.nominal.key]
+    heard = []
+    for e in rivals:
+        chi2, spread = predicted[e.key]
+        lost = 0.5 * (chi2 / search.temperature + spread) + search.inexact(e.effects, gross)
+        heard.append(replace(e, weight=e.weight - lost))
+    return sorted(heard, key=lambda e: -e.weight)
+
+
+def _held(search: Search, lines: Measured, fitted: Fitted) -> float:
+    """Chi-square over its mean on lines that were not fitted."""
+    return _predicted(search, lines, fitted)[0] / float(np.sum(lines.expected))
+
+
+def _predicted(search: Search, lines: Measured, fitted: Fitted) -> tuple[float, float]:
+    """Chi-square on lines that were not fitted, with the covariance of the noise and of the
+    fit's own error there together; and the logarithm of that covariance's determinant over
+    the noise's."""
+    there = Problem.of(lines, search.grid)
+    h, dh = fitted.model.gradient(fitted.x, there.at)
+    J, r = there.whiten(dh), there.residual(h)
+    own, information = J.T @ r, J.T @ J
+    before = fitted.precision()
+    both = before + information
+    chi2 = float(r @ r - own @ np.linalg.solve(both, own))
+    return chi2, float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(before)[1])
+
+
+def _chosen_first(grouped: Sequence[Class], nothing: float) -> list[Class]:
+    """Nothing missing last, unless that is the answer."""
+    alarmed = nothing < NOTHING
+    return sorted(grouped, key=lambda c: (bool(c.first.effects) != alarmed, -c.probability))

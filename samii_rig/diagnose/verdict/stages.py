@@ -1,0 +1,122 @@
+"""What the stages of a diagnosis hand on: the case, and the answer from what was judged."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from samii_rig.diagnose.data.findings import Doubt, Sound
+from samii_rig.diagnose.data.measured import Measured
+from samii_rig.diagnose.fit.rigfile import explained
+from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.physics.channels import NOT_PHYSICS
+from samii_rig.diagnose.result import Band, Diagnosis, Gap, Used
+from samii_rig.diagnose.verdict import answer
+from samii_rig.diagnose.verdict import judge as verdict
+from samii_rig.diagnose.verdict.force_words import next_levels
+from samii_rig.diagnose.verdict.hiding import could_hide
+from samii_rig.diagnose.verdict.judge import Judgement
+from samii_rig.diagnose.verdict.locate import traces
+from samii_rig.diagnose.verdict.plan import next_experiment
+from samii_rig.types import FrequencyResponse, Recording
+
+ALTERNATIVES = 6
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is to be explained.
+
+    clean : the responses without what is no physics. responses : those that intervals can rest on.
+    runs : the recordings. lines : of all responses; search : on those that are fitted; decide,
+    show : those that decide, and those that show on what was found.
+    """
+
+    clean: Sound
+    responses: Sequence[FrequencyResponse]
+    runs: Sequence[Recording]
+    lines: Measured
+    search: Search
+    decide: Measured | None
+    show: Measured
+
+
+@dataclass(frozen=True)
+class Shown:
+    """How well each model does. first : chi-square per degree of freedom of the nominal one before
+    anything was tried; nominal, with_causes : on the lines fitted and on those shown."""
+
+    first: float
+    threshold: float
+    bands: tuple[Band, ...]
+    nominal: tuple[float, float]
+    with_causes: tuple[float, float]
+    gap: Gap
+    used: Used
+
+
+def told(
+    case: Case,
+    search: Search,
+    judged: Judgement,
+    shown: Shown,
+    said: Sequence[str] = (),
+    doubt: Doubt | None = None,
+) -> Diagnosis:
+    """The answer. said : what else there is to say, in words. doubt : why less may be said."""
+    clean, best = case.clean, judged.best
+    if doubt:
+        judged = verdict.doubted(judged, doubt.most)
+    if len(set(case.lines.outputs)) == 1 and len(best.effects) > 1:
+        # Trials of four channels say nothing of how often one curve tells several places apart.
+        judged = verdict.doubted(judged, "ambiguous")
+    missing = judged.verdict != "no_mismatch"
+    if not missing and best.effects and all(e.physics in NOT_PHYSICS for e in best.effects):
+        # The model is held against what was meant to be recorded.
+        shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
+    causes = answer.causes_of(judged.classes[0], judged) if judged.verdict in verdict.SAID else ()
+    words = list(clean.told)
+    if missing or best.effects:
+        words += answer.told(judged)
+    words += (*said, *clean.lacks)
+    why, experiment, gain = next_levels(judged) or next_experiment(search, judged)
+    if doubt and missing:
+        why, experiment, gain = doubt.why, doubt.experiment, None
+    ranked = list(zip(judged.classes, judged.shares, strict=True))[len(causes) > 0 :]
+    alternatives = tuple(
+        (answer.causes_of(c, judged, share), share)
+        for c, share in ranked[:ALTERNATIVES]
+        if share >= answer.SHOWN and missing
+    )
+    return Diagnosis(
+        verdict=judged.verdict,
+        chi2_per_dof=shown.first,
+        threshold=shown.threshold,
+        bands=shown.bands,
+        sites=tuple(answer.sites(judged)) if missing else (),
+        causes=causes,
+        alternatives=alternatives,
+        nominal=shown.nominal,
+        with_causes=shown.with_causes,
+        noise_floor=1.0,
+        gap=shown.gap,
+        not_physics=tuple(dict.fromkeys(words)),
+        why=why,
+        experiment=experiment,
+        outside=judged.outside,
+        rig=explained(best.fitted) if best.effects else None,
+        traces=traces(search, judged) if missing else (),
+        moved=answer.moved(best.fitted),
+        could_hide=could_hide(*search.beside(best)),
+        used=shown.used,
+        sigma=math.sqrt(max(judged.evidence.drop, 0.0)) if best.effects else 0.0,
+        gain=gain,
+        evidence={
+            **judged.evidence.plain(),
+            "beyond": judged.beyond is not None,
+            "causes": [c.plain() for c in answer.causes_of(judged.classes[0], judged)],
+        },
+    )
