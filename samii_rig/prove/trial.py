@@ -21,6 +21,8 @@ Name = tuple[str, str]
 NAMED = ("named", "ambiguous")
 REFUSED = "refused"  # in place of a verdict: the recordings are none that a diagnosis takes
 WHOLE = "whole records"  # a truth's `size_is` where its size is of these
+# What plants call a part that has a row in the table under another name.
+IN_TABLE = {"fractional_damper": "fractional_damping"}
 ALL_BUT_TENTH = 0.9  # probability that a set of sites holds
 
 
@@ -79,17 +81,18 @@ class Truth:
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Truth:
         """From plain data, as `prove.outcomes` keeps it."""
-        effects = tuple(
-            Hidden(
-                e["physics"], e["site"], e["parameters"], frozenset(map(tuple, e.get("also", ())))
-            )
-            for e in data["effects"]
-        )
+        effects = tuple(_hidden(e) for e in data["effects"])
         return cls(
             data["kind"], data["seed"], effects, data["size"], tuple(data.get("twins", ())),
             data.get("size_is") == WHOLE, data.get("plant", ""), data.get("rig", ""),
             tuple(data.get("styles", ())),
         )  # fmt: skip
+
+
+def _hidden(data: Mapping[str, Any]) -> Hidden:
+    physics = IN_TABLE.get(data["physics"], data["physics"])
+    also = frozenset(map(tuple, data.get("also", ())))
+    return Hidden(physics, data["site"], data["parameters"], also)
 
 
 @dataclass(frozen=True, slots=True)
