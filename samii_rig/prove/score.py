@@ -219,11 +219,17 @@ def _size_scores(trials: Sequence[Trial]) -> list[Score]:
     upper = Score(
         "upper bound of those", alarms.high, alarms.low, alarms.high, alarms.n, at_most(0.01)
     )
+    nothing = [t for t in trials if t.truth.kind == "nothing"]
     small = [t for t in above(trials, 3.0, "one") if t.truth.size < 10.0]
     return [
         median("sigma kept, from 10 sigma", kept(trials), at_least(0.9)),
         alarms,
         upper,
+        frequency(
+            "physics told where nothing is missing",
+            [t.answer.speaks for t in nothing],
+            at_most(0.005),
+        ),
         frequency("found, 3 to 10 sigma", [detected(t) for t in small], at_least(0.5)),
     ]
 
