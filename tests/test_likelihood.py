@@ -126,6 +126,19 @@ def test_an_offset_and_a_slow_wander_of_a_sensor_are_no_mismatch():
     assert float(np.mean(left.chi2)) == pytest.approx(4.0, rel=0.15)
 
 
+def test_a_sensor_in_another_unit_changes_nothing():
+    """Offsets and wandering of each are taken out, however large its numbers are."""
+    u, z = noisy(7)
+    z = z + np.linspace(-1, 1, len(z))[:, None] ** 2
+    unit = np.array([1.0, 1e7])
+    both = []
+    for scale in (np.ones(2), unit):
+        records = Records((piece(u, z * scale),), RATE, ((0.8, 15.0),))
+        found = reduced(records, lambda s, scale=scale: response(s, poles()) * scale, own_alone)
+        both.append((float(found.target @ found.target), found.inside[0]))
+    np.testing.assert_allclose(both[1], both[0], rtol=1e-3)
+
+
 def test_a_disturbed_mode_makes_noise_at_that_mode_and_nowhere_else():
     """In all sensors together, by the direction in which the rig answers a force."""
     rng = np.random.default_rng(5)

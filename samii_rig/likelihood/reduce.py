@@ -483,9 +483,11 @@ def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
         sums.add(rows.take(on), W[on])
     M, g = sums.matrix, sums.head.T.ravel()
     cross = sums.cross.swapaxes(0, 1).reshape(2 * b * q, -1)
-    values, turn = np.linalg.eigh(sums.nuisance)
-    kept = values > SAME * max(values[-1], 1e-300)
-    root = turn[:, kept] / np.sqrt(values[kept])
+    # Each in units of its own size: a metre and a metre a second squared are of one kind here.
+    size = np.sqrt(np.maximum(np.diagonal(sums.nuisance), 1e-300))
+    values, turn = np.linalg.eigh(sums.nuisance / np.outer(size, size))
+    kept = values > SAME * values[-1]
+    root = turn[:, kept] / np.sqrt(values[kept]) / size[:, None]
     cross, own_head = cross @ root, root.T @ sums.nuisance_head
     # Where nothing was excited nothing is known: there the diagonal keeps the factor regular, and
     # takes the directions' place. What nuisances leave is as exact as what they were taken from.
