@@ -494,7 +494,8 @@ def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     diagonal = np.diagonal(M).copy()
     M -= cross @ cross.T
     g = g - cross @ own_head
-    C, ridge = _factor(M, SAME * np.maximum(diagonal, SAME * np.max(diagonal)))
+    largest = np.repeat(np.max(diagonal.reshape(q, -1), axis=1), 2 * b)  # in its own unit
+    C, ridge = _factor(M, SAME * np.maximum(diagonal, SAME * largest))
     turned, _ = linalg.lapack.dtrtri(C)
     return _Form(
         known=C.shape[0] - float(ridge @ np.sum(turned**2, axis=1)),
