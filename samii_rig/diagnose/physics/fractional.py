@@ -137,8 +137,11 @@ class FractionalChain:
             where=two[:, None] != 0,
         )  # fmt: skip
         below = R * xs[0] - xs[1]
-        d = (R - 1) / below
-        dd = dR * ((xs[0] - xs[1]) / below**2)[:, None]
+        # Where nothing moves both are rounding, and d is none.
+        some = below != 0
+        d = np.divide(R - 1, below, out=np.zeros_like(R), where=some)
+        turn = np.divide(xs[0] - xs[1], below**2, out=np.zeros_like(R), where=some)
+        dd = dR * turn[:, None]
         x = self._c * s**self._alpha
         phi = x / (1 - d * x)
         by_x = 1 / (1 - d * x) ** 2
