@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from samii_rig.cli import main
 from samii_rig.cli.app import app
+from samii_rig.devices import opening
 from samii_rig.errors import DeviceError, GateError
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.schema import Rig
@@ -64,6 +65,8 @@ class Bench:
         self.rig.write_text(TEXT + '\n[device]\ndriver = "bench"\n')
         self.experiment = tmp_path / "thrice.toml"
         self.experiment.write_text("")  # what it would say is `Thrice`
+        # The fake has no entry point, so nobody can be asked what it could run.
+        monkeypatch.setattr(opening, "check_device", lambda rig: None)
         monkeypatch.setattr(campaign, "open_device", self.open)
 
     def open(self, rig, settings):
