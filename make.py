@@ -138,9 +138,10 @@ def check(arguments: list[str]) -> None:
 
 
 def tests(arguments: list[str]) -> None:
-    """All tests: those in real time, one after another, beside the others, which give way.
+    """All tests: those in real time first, one after another and nothing beside them.
 
-    A test in real time waits most of its time, so that it costs the others little.
+    What failed of them is tried once more, and told: another program on this machine may have had
+    the cores for longer than a device waits.
     """
     cores = min(os.cpu_count() or 1, 4)
     pytest: list[str | Path] = [BIN / "pytest", "-q", "--durations=10"]
@@ -148,11 +149,10 @@ def tests(arguments: list[str]) -> None:
     if arguments:
         call(*pytest, *workers, *arguments)
         return
-    nice: list[str | Path] = [] if os.name == "nt" else ["nice", "-n", "10"]
-    side_by_side(
-        [*pytest, "-m", "real_time and not slow"],
-        [*nice, *pytest, *workers, "-m", "not real_time and not slow"],
-    )
+    if run(*pytest, "-m", "real_time and not slow"):
+        say("what failed in real time is tried once more, alone")
+        call(*pytest, "--last-failed", "-m", "real_time and not slow")
+    call(*pytest, *workers, "-m", "not real_time and not slow")
 
 
 def side_by_side(*commands: Sequence[str | Path]) -> None:

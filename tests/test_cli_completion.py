@@ -32,7 +32,7 @@ def completed(line: str, shell: str = "bash") -> list[str]:
     ("line", "offered"),
     [
         ("samii-rig rec", ["recover", "recordings"]),
-        ("samii-rig run --rig samii_t", ["samii_torque_horizontal", "samii_torque_vertical"]),
+        ("samii-rig run --rig samii_to", ["samii_torque_horizontal", "samii_torque_vertical"]),
         ("samii-rig diagnose --rig sf", ["sflr"]),
         ("samii-rig run torq", ["torque_test"]),
         ("samii-rig run --rig ./bench", []),
