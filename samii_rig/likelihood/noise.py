@@ -88,8 +88,10 @@ class Noise:
 
     def _about(self, f: Float, left: Complex, free: Float) -> Noise:
         """The same, what the sum does not give by blocks."""
-        white = self.whitened(f, left[:, :, None])[:, :, 0]
         q = left.shape[1]
+        own = self.disturbances(f)[:, :, :q] * np.sqrt(self.known(f))[:, None, :]
+        both = self.whitened(f, np.concatenate([left[:, :, None], own], axis=2))
+        white, sure = both[:, :, 0], both[:, :, 1:]
         starts = _blocks(f, free, FREEDOM * q)
         each = [slice(a, b) for a, b in pairwise([*starts, f.size])]
         A = np.stack([white[on].T @ white[on].conj() for on in each])
@@ -100,16 +102,9 @@ class Noise:
         about = (nu * np.eye(q) + A) / (nu + n)[:, None, None]
         # No block is quieter than what is known beforehand.
         values, turn = np.linalg.eigh(about)
-        least = np.stack([self._least(f[on], V) for on, V in zip(each, turn, strict=True)])
+        least = np.stack([_along(sure[on], V) for on, V in zip(each, turn, strict=True)])
         about = (turn * np.maximum(values, least)[:, None, :]) @ turn.conj().swapaxes(1, 2)
         return replace(self, edges=f[starts[1:]], about=about)
-
-    def _least(self, f: Float, directions: Complex) -> Float:
-        """(q,) mean part of what is known in the noise's power along whitened directions (q, q)."""
-        q = len(directions)
-        own = self.disturbances(f)[:, :, :q] * np.sqrt(self.known(f))[:, None, :]
-        along = directions.conj().T @ np.linalg.solve(self.root(f), own)
-        return np.asarray(np.mean(np.sum(np.abs(along) ** 2, axis=2), axis=0))
 
     def covariance(self, f: Float) -> Complex:
         """(n, q, q) at f (n,)."""
@@ -135,6 +130,12 @@ class Noise:
         block = np.searchsorted(self.edges, once, side="right")
         roots = np.linalg.cholesky(self.about)[block]
         return np.asarray((_cholesky(plain) @ roots)[which])
+
+
+def _along(sure: Complex, directions: Complex) -> Float:
+    """(q,) mean power of what is known, whitened (n, q, q), along directions (q, q)."""
+    power = np.abs(directions.conj().T @ sure) ** 2
+    return np.asarray(np.mean(np.sum(power, axis=2), axis=0))
 
 
 def _cholesky(C: Complex) -> Complex:
