@@ -41,6 +41,13 @@ def identify(
             "zero or mode shape ratio counts."
         ),
     ] = None,
+    pose: Annotated[
+        list[str] | None,
+        typer.Option(
+            help='The rig\'s angle to the way down in each recording, in their order, as "30 deg" '
+            "[default: that of the rig file which each carries]."
+        ),
+    ] = None,
     gaps: GapsOption = "refuse",
     band: BandOption = None,
     json: JsonOption = False,
@@ -48,6 +55,7 @@ def identify(
     """Identify parameters by maximum likelihood, with intervals and what cannot be known.
 
     All channels and levels count, in units of their noise. A model that does not fit is said so.
+    Recordings in several poses share one set of parameters (docs/identify.md).
 
     Example: samii-rig identify runs/*.mcap --free joint_1.k --free joint_2.k
     """
@@ -66,6 +74,7 @@ def identify(
     from samii_rig.identify import methods
     from samii_rig.identify.maximum_likelihood import identify as maximum_likelihood
     from samii_rig.identify.parameters import uncertain
+    from samii_rig.identify.poses import at_pose, poses_of
     from samii_rig.identify.table import method_table, summary_table
     from samii_rig.report.summary import working
 
@@ -76,23 +85,35 @@ def identify(
     if held is None:
         raise without_rig()
     console = Console(highlight=False)
+    at = poses_of(recordings, held[0], pose or ())
     if method != "likelihood":
+        if len(set(at)) > 1:
+            expected = "recordings in one pose, or --method likelihood"
+            raise InputError("--method", "", method, expected)
         responses = estimated(recordings, None, None, "auto", gaps, band)
         with working(console, "identifying", quiet=json):
             by = methods.from_responses(
-                cast("methods.Method", method), responses, held[0], free or (), outputs=output,
-                band=band,
+                cast("methods.Method", method), responses, at_pose(held[0], at[0]), free or (),
+                outputs=output, band=band,
             )  # fmt: skip
         if json:
             say_json(by.plain())
         else:
             console.print(method_table(by))
         return
-    responses = estimated(recordings, None, output, "auto", gaps, band)
+    in_pose = [
+        (response, one)
+        for one in dict.fromkeys(at)  # recordings of one pose are pooled
+        for response in estimated(
+            [r for r, own in zip(recordings, at, strict=True) if own == one],
+            None, output, "auto", gaps, band,
+        )
+    ]  # fmt: skip
     with working(console, "identifying", quiet=json):
         found = maximum_likelihood(
-            responses, held[0], free or uncertain(held[0]), prior=not free, band=band
-        )
+            [response for response, _ in in_pose], held[0], free or uncertain(held[0]),
+            prior=not free, band=band, poses=[one for _, one in in_pose],
+        )  # fmt: skip
     if json:
         say_json(found.plain())
     else:

@@ -28,6 +28,7 @@ from samii_rig.identify.likelihood import (
 from samii_rig.identify.parameters import Free, Space, changed, space
 from samii_rig.identify.predict import Predictor
 from samii_rig.identify.result import Identification, bounds_met, residuals_of
+from samii_rig.rig.pose import Angle
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.whitening import Fit, goodness
 from samii_rig.types import Float, FrequencyResponse
@@ -83,8 +84,12 @@ def problem(
     prior: bool = False,
     band: tuple[float, float] | None = None,
     outputs: Sequence[str] | None = None,
+    poses: Sequence[Angle | None] = (),
 ) -> Problem:
     """What `identify` solves; the arguments and errors are the same."""
+    if poses and len(poses) != len(responses):
+        have = f"{len(poses)} poses of {len(responses)} responses"
+        raise InputError("identify", "poses", have, "one for each response")
     chosen = space(rig, free, prior)
     data = collect(responses, rig, band, outputs)
     needed = sum(1 for sd in chosen.prior_sd if not np.isfinite(sd))
@@ -92,7 +97,7 @@ def problem(
         have = f"{data.independent():.0f} real numbers for {needed} parameters without a prior"
         expected = "more lines, more outputs, fewer free parameters or their priors"
         raise InputError("identify", "data", have, expected)
-    return Problem(rig, data, chosen, Predictor(rig, data, chosen))
+    return Problem(rig, data, chosen, Predictor(rig, data, chosen, poses))
 
 
 def identify(
@@ -106,6 +111,7 @@ def identify(
     starts: int = STARTS,
     spread: float = SPREAD,
     seed: int = 1,
+    poses: Sequence[Angle | None] = (),
 ) -> Identification:
     """Maximum likelihood, or maximum posterior, estimate of `free` from `responses`.
 
@@ -115,6 +121,7 @@ def identify(
     free : names `element.symbol`, or `Free` for bounds and a start of one's own.
     prior : use the rig file's tolerances as Gaussian priors on the logarithms.
     band : Hz. outputs : the channels to use, default all that were measured.
+    poses : of the rig in each response, if they differ: one set of parameters for all.
     starts : the first is the rig file's values, the others are drawn within `spread` of them.
 
     Raises
@@ -128,7 +135,7 @@ def identify(
     if not 0 <= spread < 1:
         raise InputError("identify", "spread", spread, "0 or more and below 1")
     return solve(
-        problem(responses, rig, free, prior=prior, band=band, outputs=outputs),
+        problem(responses, rig, free, prior=prior, band=band, outputs=outputs, poses=poses),
         starts=starts,
         spread=spread,
         seed=seed,
