@@ -19,9 +19,12 @@ from samii_rig.fem.model import Fem
 from samii_rig.model.modes import natural_frequencies
 from samii_rig.model.realise import realise
 from samii_rig.model.tmm import Chain
+from samii_rig.prove.jobs import Plant
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.run import dryrun
+from sim.assumed_modes.proof import plant as assumed_modes
+from sim.concealed.proof import plant as concealed
 from sim.rig import open_rig
 
 EI, MU, L = 0.5, 0.6, 1.5  # N m^2, kg/m, m of a slack strip: its weight bends it as much as EI
@@ -303,3 +306,11 @@ def test_a_pose_in_degrees_is_kept_as_it_was_written() -> None:
     assert rig.pose
     assert (rig.pose.unit, rig.pose.written) == ("rad", "deg")
     assert Rig.model_validate(rig.model_dump(exclude_defaults=True)) == rig
+
+
+@pytest.mark.parametrize("plant", [concealed, assumed_modes])
+def test_a_plant_of_the_proof_without_gravity_refuses_a_rig_with_it(plant: Plant) -> None:
+    text = load_rig("samii")[1]
+    hung = text.replace('base = "clamped"', 'base = "clamped"\ngravity = 9.81')
+    assert plant.refuses("one", text) == ""
+    assert "gravity is 9.81; expected none for this plant" in plant.refuses("one", hung)

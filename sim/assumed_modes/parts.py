@@ -205,6 +205,8 @@ def setup_of(rig: Rig, values: Values) -> Setup:
         raise InputError(rig.name, "feedback", rig.feedback[0].name, "none for this plant")
     if rig.tip != "free":
         raise InputError(rig.name, "tip", rig.tip, "'free' for this plant")
+    if rig.pull:
+        raise InputError(rig.name, "gravity", rig.gravity, "none for this plant, or a level pose")
     parts = []
     for e in rig.element:
         kind = SAME_AS.get(e.kind, e.kind)

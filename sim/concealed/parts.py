@@ -128,6 +128,8 @@ def described(rig: Rig) -> Description:
         raise InputError(rig.name, "element", len(sources), "one angular_velocity_source")
     if rig.tip != "free":
         raise InputError(rig.name, "tip", rig.tip, "'free', to conceal something in")
+    if rig.pull:
+        raise InputError(rig.name, "gravity", rig.gravity, "none for this plant, or a level pose")
     parts = []
     for element in rig.element:
         if element.kind not in SUPPORTED:
