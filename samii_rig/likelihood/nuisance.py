@@ -52,6 +52,16 @@ def offsets(
     return np.stack([_window(piece, k, Y, contour) for Y in shapes], axis=2)
 
 
+def edges(piece: Piece, k: Int, H: Complex, contour: Contour) -> Complex:
+    """(n_lines, q, m) of the input's edges, which came some part of a sample earlier or later."""
+    shapes = []
+    for edge in piece.edges:
+        pulse = np.zeros(piece.r.size)
+        pulse[edge] = 1.0
+        shapes.append(_window(piece, k, H * contour.damped(pulse)[:, None], contour))
+    return np.stack(shapes, axis=2) if shapes else np.zeros((k.size, len(H[0]), 0), complex)
+
+
 def unread(
     piece: Piece,
     k: Int,

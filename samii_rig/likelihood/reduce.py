@@ -386,6 +386,7 @@ def _nuisances(
     own = [nuisance.wander(len(piece.z), k, piece.z.shape[1])]
     own += [nuisance.past(piece, k, H, exact)] if piece.moving else []
     own += [nuisance.unread(piece, k, H, exact, loop, records.step)]
+    own += [nuisance.edges(piece, k, H, exact)]
     own += [nuisance.offsets(piece, k, H, exact, loop)]
     N = np.concatenate(own, axis=2)
     size = np.linalg.norm(N, axis=(0, 1))

@@ -7,6 +7,7 @@ rows behind what was sent: each row is read at another time than the one before.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +22,7 @@ FARTHEST = 5  # samples; a logger that is later has another fault
 # keeps a few per cent. One that is rounded keeps a quarter of its step in the median, and a shift
 # that is seen above that leaves a fifth more.
 LEFT, ROUNDED, SEEN = 0.2, 0.3, 1.2
+ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same
 LOOKED_AT = 1 << 14  # samples about the largest reference: thousands tell a shift, millions cost
 SENT = ("reference", "command")  # roles of columns that are sent, not measured
 
@@ -64,9 +66,83 @@ def shift_of(recording: Recording) -> int:
     return shifts[best] if exact or off[best] < LEFT * none else 0
 
 
-def aligned(recording: Recording) -> tuple[Recording, Finding | None]:
-    """A recording whose rows hold what was sent and measured at one time, and what was done."""
-    m = shift_of(recording)
+def aligned(recordings: Sequence[Recording]) -> list[tuple[Recording, Finding | None]]:
+    """Recordings whose rows hold what was sent and measured at one time, and what was done: by the
+    law of the loop; where that tells nothing, so that all answer the same input alike."""
+    law = "by the loop's own law what was measured stands"
+    own = [_moved(r, shift_of(r), law) for r in recordings]
+    out: list[tuple[Recording, Finding | None]] = []
+    for recording, said in own:
+        first = next((r for r, _ in out if _alike(r, recording)), None)
+        if said is None and first is not None:
+            m = _against(first, recording)
+            said_of = f"beside {first.source or 'another recording'} what was measured stands"
+            recording, said = _moved(recording, m, said_of)
+        out.append((recording, said))
+    return out
+
+
+def _alike(one: Recording, other: Recording) -> bool:
+    """Whether two recordings are of one input, but for its size."""
+    a, b = _command(one), _command(other)
+    n = min(a.size, b.size)
+    if one.names("command") != other.names("command") or n < max(a.size, b.size) - 2 * FARTHEST:
+        return False
+    a, b = a[:n], b[:n]
+    across, powers = float(a @ b), float(a @ a) * float(b @ b)
+    return across > 0 and across**2 > (1 - ALIKE**2) * powers
+
+
+def _command(recording: Recording) -> Float:
+    """(n,) of the first segment; nothing where that has gaps."""
+    name = next(iter(recording.names("command")), "")
+    span = _first(recording)
+    if not name or span is None:
+        return np.zeros(0)
+    v = recording.values[span, recording.column(name)]
+    return np.asarray(v, np.float64) if np.all(np.isfinite(v)) else np.zeros(0)
+
+
+def _first(recording: Recording) -> slice | None:
+    """The rows of the first segment, and of all where none is told."""
+    if not recording.segments:
+        return slice(0, recording.sequence.size)
+    first = recording.segments[0]
+    a, b = np.searchsorted(recording.sequence, [first.start, first.stop])
+    span = slice(int(a), int(b))
+    whole = b > a and recording.sequence[b - 1] - recording.sequence[a] == b - 1 - a
+    return span if whole else None
+
+
+def _against(first: Recording, recording: Recording) -> int:
+    """Samples by which the sensors of a recording stand behind those of another of the same input;
+    0 where no shift makes them clearly more alike."""
+    a, b = _first(first), _first(recording)
+    assert a is not None
+    assert b is not None
+    names = [n for n in first.names("sensor") if n in recording.names("sensor")]
+    v, w = _command(first), _command(recording)
+    n = min(v.size, w.size)
+    size = float(v[:n] @ w[:n]) / float(v[:n] @ v[:n])
+    inside = slice(FARTHEST, n - FARTHEST)
+    off = np.zeros((len(names), 2 * FARTHEST + 1))
+    for row, name in zip(off, names, strict=True):
+        x, y = (
+            size * first.values[a, first.column(name)],
+            recording.values[b, recording.column(name)],
+        )
+        x, y = (np.nan_to_num(z[:n] - np.nanmean(z)) for z in (x, y))
+        for i, m in enumerate(range(-FARTHEST, FARTHEST + 1)):
+            row[i] = np.mean((np.roll(y, -m) - x)[inside] ** 2)
+    off = off[np.all(off > 0, axis=1)]
+    if not len(off):
+        return 0
+    # A sensor that shows next to nothing but noise has no say.
+    best = int(np.argmin(np.sum(np.log(off), axis=0)))
+    return best - FARTHEST if np.min(off[:, best] / off[:, FARTHEST]) < LEFT else 0
+
+
+def _moved(recording: Recording, m: int, law: str) -> tuple[Recording, Finding | None]:
     if m == 0:
         return recording, None
     sequence = recording.sequence
@@ -86,10 +162,7 @@ def aligned(recording: Recording) -> tuple[Recording, Finding | None]:
         segments=tuple(_within(recording, sequence[kept])),
     )
     late = f"{abs(m)} sample{'s' * (abs(m) > 1)} {'later' if m > 0 else 'earlier'}"
-    text = (
-        f"{recording.source or 'recording'}: by the loop's own law what was measured stands {late} "
-        "than what was sent; set right"
-    )
+    text = f"{recording.source or 'recording'}: {law} {late} than what was sent; set right"
     return moved, Finding("timing", "warning", text)
 
 
