@@ -55,7 +55,7 @@ def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
 
     impulse : (m, q) answer to an impulse of the input.
     """
-    n, q = piece.z.shape
+    q = piece.z.shape[1]
     out = np.zeros((k.size, q, len(piece.edges)), complex)
     for j, edge in enumerate(piece.edges):
         y = np.concatenate([np.zeros((edge, q)), impulse[: piece.r.size - edge]])
