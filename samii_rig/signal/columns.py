@@ -84,54 +84,65 @@ def aligned(recordings: Sequence[Recording]) -> list[tuple[Recording, Finding | 
 
 def _alike(one: Recording, other: Recording) -> bool:
     """Whether two recordings are of one input, but for its size."""
-    a, b = _command(one), _command(other)
-    n = min(a.size, b.size)
-    if one.names("command") != other.names("command") or n < max(a.size, b.size) - 2 * FARTHEST:
+    if one.names("command") != other.names("command") or not one.names("command"):
         return False
-    a, b = a[:n], b[:n]
-    across, powers = float(a @ b), float(a @ a) * float(b @ b)
+    a, b = _overlap(one, other)
+    name = one.names("command")[0]
+    v, w = one.values[a, one.column(name)], other.values[b, other.column(name)]
+    if v.size <= 2 * FARTHEST or not np.all(np.isfinite(v) & np.isfinite(w)):
+        return False
+    across, powers = float(v @ w), float(v @ v) * float(w @ w)
     return across > 0 and across**2 > (1 - ALIKE**2) * powers
 
 
-def _command(recording: Recording) -> Float:
-    """(n,) of the first segment; nothing where that has gaps."""
-    name = next(iter(recording.names("command")), "")
-    span = _first(recording)
-    if not name or span is None:
-        return np.zeros(0)
-    v = recording.values[span, recording.column(name)]
-    return np.asarray(v, np.float64) if np.all(np.isfinite(v)) else np.zeros(0)
+def _overlap(one: Recording, other: Recording) -> tuple[slice, slice]:
+    """Rows of both that are as far from the start of their first segments; none where these are
+    not as long, but for the ends that a shift takes, or have gaps."""
+    a, b = _first(one), _first(other)
+    none = slice(0, 0), slice(0, 0)
+    if a is None or b is None:
+        return none
+    (rows_a, at_a, n_a), (rows_b, at_b, n_b) = a, b
+    if abs(n_a - n_b) > 2 * FARTHEST:
+        return none
+    low = max(at_a, at_b)
+    high = min(at_a + rows_a.stop - rows_a.start, at_b + rows_b.stop - rows_b.start)
+
+    def within(rows: slice, at: int) -> slice:
+        return slice(rows.start + low - at, rows.start + high - at)
+
+    return within(rows_a, at_a), within(rows_b, at_b)
 
 
-def _first(recording: Recording) -> slice | None:
-    """The rows of the first segment, and of all where none is told."""
-    if not recording.segments:
-        return slice(0, recording.sequence.size)
-    first = recording.segments[0]
-    a, b = np.searchsorted(recording.sequence, [first.start, first.stop])
-    span = slice(int(a), int(b))
-    whole = b > a and recording.sequence[b - 1] - recording.sequence[a] == b - 1 - a
-    return span if whole else None
+def _first(recording: Recording) -> tuple[slice, int, int] | None:
+    """The rows of the first segment, all where none is told, how far they begin behind its start,
+    and its length; None where a row is missing between them."""
+    sequence = recording.sequence
+    if not sequence.size:
+        return None
+    start, stop = int(sequence[0]), int(sequence[-1]) + 1
+    if recording.segments:
+        start, stop = recording.segments[0].start, recording.segments[0].stop
+    a, b = (int(x) for x in np.searchsorted(sequence, [start, stop]))
+    if a == b or sequence[b - 1] - sequence[a] != b - 1 - a:
+        return None
+    return slice(a, b), int(sequence[a]) - start, stop - start
 
 
 def _against(first: Recording, recording: Recording) -> int:
     """Samples by which the sensors of a recording stand behind those of another of the same input;
     0 where no shift makes them clearly more alike."""
-    a, b = _first(first), _first(recording)
-    assert a is not None
-    assert b is not None
+    a, b = _overlap(first, recording)
+    command = first.names("command")[0]
+    v, w = first.values[a, first.column(command)], recording.values[b, recording.column(command)]
+    size = float(v @ w) / float(v @ v)
+    inside = slice(FARTHEST, v.size - FARTHEST)
     names = [n for n in first.names("sensor") if n in recording.names("sensor")]
-    v, w = _command(first), _command(recording)
-    n = min(v.size, w.size)
-    size = float(v[:n] @ w[:n]) / float(v[:n] @ v[:n])
-    inside = slice(FARTHEST, n - FARTHEST)
     off = np.zeros((len(names), 2 * FARTHEST + 1))
     for row, name in zip(off, names, strict=True):
-        x, y = (
-            size * first.values[a, first.column(name)],
-            recording.values[b, recording.column(name)],
-        )
-        x, y = (np.nan_to_num(z[:n] - np.nanmean(z)) for z in (x, y))
+        x = size * first.values[a, first.column(name)]
+        y = recording.values[b, recording.column(name)]
+        x, y = (np.nan_to_num(z - np.nanmean(z)) for z in (x, y))
         for i, m in enumerate(range(-FARTHEST, FARTHEST + 1)):
             row[i] = np.mean((np.roll(y, -m) - x)[inside] ** 2)
     off = off[np.all(off > 0, axis=1)]
