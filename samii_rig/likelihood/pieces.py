@@ -82,16 +82,22 @@ def wiring(
 ) -> Wiring:
     """The columns of all recordings that the rig file knows, of `sensors` alone if given.
 
-    Raises EstimateError where they have no sensor or no command in common, or where the loop is
-    closed around a sensor that is left out.
+    Raises EstimateError where they have no sensor or no command in common, where they have several
+    commands, or where the loop is closed around a sensor that is left out.
     """
     known = [s.name for s in rig.sensor]
     common = set.intersection(*({c.name for c in r.channels} for r in recordings))
     asked = common if sensors is None else common & set(sensors)
     found = tuple(n for n in known if n in asked)
-    command = next((a.name for a in rig.actuator if a.name in common), "")
-    if not found or not command:
+    commands = [a.name for a in rig.actuator if a.name in common]
+    if not found or not commands:
         raise EstimateError("the recordings have no command and no sensor of the rig in common")
+    if len(commands) > 1:
+        raise EstimateError(
+            f"the recordings have {len(commands)} commands, {', '.join(commands)}; expected one, "
+            "as whole records are predicted from a single input"
+        )
+    (command,) = commands
     centring = rig.centring
     if centring is None or centring.sensor not in common or rig.feedback:
         return Wiring(command, found, "", 0.0)
