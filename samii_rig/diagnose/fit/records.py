@@ -43,6 +43,7 @@ SHOW, TURN = 9, 10  # one line in ten is kept apart, to show on what was found
 # Of the largest, an input's energy in a third of an octave that excites: steps through frequencies,
 # of as many periods each, and steps of the input have that over 2.5 decades.
 EXCITED, PARTS = 0.003, 3
+HARMONIC = 3  # the lowest that a force makes which is alike both ways
 HIGHEST = 0.45  # of the rate: aliases of both sides meet above
 MOST_MADE = 6  # times that the likelihood is made about the nominal model
 # Noise units by which a change from the reference may be off between nodes, where it is taken for
@@ -100,6 +101,13 @@ class Whole:
     def by_level(self) -> Whole:
         """The same records, the levels not summed up: for what depends on amplitude."""
         return self if self.apart is None else replace(self, records=self.apart)
+
+    def with_harmonics(self) -> Whole:
+        """The same records, with the lines at which a force shows that depends on the level: up to
+        the third harmonics of what is excited."""
+        records, most = self.records, HIGHEST * self.records.rate_hz
+        bands = tuple((low, min(HARMONIC * high, most)) for low, high in records.bands)
+        return replace(self, records=replace(records, bands=bands))
 
     @property
     def sensor(self) -> Int:
