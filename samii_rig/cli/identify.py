@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,10 @@ from samii_rig.cli.estimate import (
     estimated,
     read_all,
 )
+
+if TYPE_CHECKING:
+    from samii_rig.rig.pose import Angle
+    from samii_rig.types import FrequencyResponse, Recording
 
 
 def identify(
@@ -101,14 +105,7 @@ def identify(
         else:
             console.print(method_table(by))
         return
-    in_pose = [
-        (response, one)
-        for one in dict.fromkeys(at)  # recordings of one pose are pooled
-        for response in estimated(
-            [r for r, own in zip(recordings, at, strict=True) if own == one],
-            None, output, "auto", gaps, band,
-        )
-    ]  # fmt: skip
+    in_pose = _in_poses(recordings, at, output, gaps, band)
     with working(console, "identifying", quiet=json):
         found = maximum_likelihood(
             [response for response, _ in in_pose], held[0], free or uncertain(held[0]),
@@ -118,3 +115,18 @@ def identify(
         say_json(found.plain())
     else:
         console.print(summary_table(found))
+
+
+def _in_poses(
+    recordings: list[Recording],
+    at: list[Angle],
+    output: list[str] | None,
+    gaps: str,
+    band: tuple[float, float] | None,
+) -> list[tuple[FrequencyResponse, Angle]]:
+    """Responses with the pose of their recordings; those of one pose are pooled."""
+    found = []
+    for pose in dict.fromkeys(at):
+        alike = [r for r, own in zip(recordings, at, strict=True) if own == pose]
+        found += [(r, pose) for r in estimated(alike, None, output, "auto", gaps, band)]
+    return found
