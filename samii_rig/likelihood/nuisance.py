@@ -6,8 +6,6 @@ that of the best amplitudes, which for diffuse Gaussian ones is the marginal lik
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.polynomial import legendre
 
@@ -36,13 +34,33 @@ def wander(n: int, k: Int, q: int) -> Complex:
     return out.reshape(k.size, q, -1)
 
 
-def offsets(piece: Piece, k: Int, steps: Sequence[Float]) -> Complex:
+def offsets(piece: Piece, k: Int, step: Float, loop: tuple[float, int] | None) -> Complex:
     """(n_lines, q, 1 or 2) of an input that has an offset, and of a loop's sensor that has one:
     both act from the first sample on.
 
-    steps : (m, q) what the sensors show of a step of each.
+    step : (m, q) answer to a step of the input. loop : its kp, and the sensor.
     """
-    return np.stack([np.fft.rfft(y[piece.history :], axis=0)[k] for y in steps], axis=2)
+    step = step[: piece.r.size]
+    shapes = [step]
+    if loop is not None:
+        kp, entry = loop
+        sensed = -kp * step
+        sensed[:, entry] += 1
+        shapes.append(sensed)
+    return np.stack([np.fft.rfft(y[piece.history :], axis=0)[k] for y in shapes], axis=2)
+
+
+def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
+    """(n_lines, q, m) of the input's edges, which came some part of a sample earlier or later.
+
+    impulse : (m, q) answer to an impulse of the input.
+    """
+    q = piece.z.shape[1]
+    out = np.zeros((k.size, q, len(piece.edges)), complex)
+    for j, edge in enumerate(piece.edges):
+        y = np.concatenate([np.zeros((edge, q)), impulse[: piece.r.size - edge]])
+        out[:, :, j] = np.fft.rfft(y[piece.history :], axis=0)[k]
+    return out
 
 
 def unread(

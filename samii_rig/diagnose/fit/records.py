@@ -41,8 +41,10 @@ from samii_rig.signal.statistics import octaves
 from samii_rig.types import Complex, Finding, Float, Int, Recording
 
 SHOW, TURN = 9, 10  # one line in ten is kept apart, to show on what was found
-WIDER = 1.1  # of the band that is excited, the band that takes part
-EXCITED = 0.1  # of the largest, an input's amplitude density that excites: 1 % of its power
+# Of the largest, an input's energy in a third of an octave that excites: steps through frequencies,
+# of as many periods each, and steps of the input have that over 2.5 decades.
+EXCITED, PARTS = 0.003, 3
+HARMONIC = 3  # the lowest that a force makes which is alike both ways
 MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
 ALIASES = 16  # sums over aliases that are kept
 HIGHEST = 0.45  # of the rate: aliases of both sides meet above
@@ -81,7 +83,7 @@ class Whole:
 
         Raises EstimateError where they hold nothing to compare.
         """
-        runs = [aligned(run)[0] for run in runs]
+        runs = [run for run, _ in aligned(runs)]
         wired = wiring(runs, rig, sensors)
         bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
         without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
@@ -94,9 +96,21 @@ class Whole:
         all_, apart = (_records(p, rate, band, step) for p in (joined(levels), levels))
         return cls(rig, all_, wired, tuple(without.items()), apart)
 
+    @property
+    def every(self) -> int:
+        """Samples of the rig for each that was recorded."""
+        return round(self.rig.rate_hz / self.records.rate_hz)
+
     def by_level(self) -> Whole:
         """The same records, the levels not summed up: for what depends on amplitude."""
         return self if self.apart is None else replace(self, records=self.apart)
+
+    def with_harmonics(self) -> Whole:
+        """The same records, with the lines at which a force shows that depends on the level: up to
+        the third harmonics of what is excited."""
+        records, most = self.records, HIGHEST * self.records.rate_hz
+        bands = tuple((low, min(HARMONIC * high, most)) for low, high in records.bands)
+        return replace(self, records=replace(records, bands=bands))
 
     @property
     def sensor(self) -> Int:
@@ -216,21 +230,29 @@ def _records(
 
 def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float] | None]:
     """Hz, of each piece the band in which its input has more than a small part of the largest
-    density of all; None for one that nothing drives: what is left of a sweep behind a gap."""
-    spectra = [np.abs(np.fft.rfft(p.r)) / math.sqrt(p.r.size) for p in pieces]
-    # The offset's line, and the one that it leaks to, are no excitation.
-    least = EXCITED * max(float(np.max(R[2:])) for R in spectra)
+    energy of all; None for one that nothing drives: what is left of a sweep behind a gap."""
+    each = [_energy(p, rate_hz) for p in pieces]
+    least = EXCITED * max(float(np.max(energy)) for _, energy in each)
     out: list[tuple[float, float] | None] = []
-    for piece, R in zip(pieces, spectra, strict=True):
-        f = np.arange(R.size) * (rate_hz / piece.r.size)
-        on = np.flatnonzero(R[2:] > least) + 2
+    for piece, (edges, energy) in zip(pieces, each, strict=True):
+        on = np.flatnonzero(energy > least)
         if not on.size:
             out.append(None)
             continue
-        lowest, highest = CYCLES * rate_hz / len(piece.z), HIGHEST * rate_hz
-        low, high = max(f[on[0]] / WIDER, lowest), min(WIDER * f[on[-1]], highest)
-        out.append((float(low), float(high)) if high - low > CYCLES * f[1] else None)
+        line = rate_hz / len(piece.z)
+        low, high = max(edges[on[0]], CYCLES * line), min(edges[on[-1] + 1], HIGHEST * rate_hz)
+        out.append((float(low), float(high)) if high - low > CYCLES * line else None)
     return out
+
+
+def _energy(piece: Piece, rate_hz: float) -> tuple[Float, Float]:
+    """Hz of the edges (m + 1,) of parts of an octave, and the input's energy (m,) in each."""
+    power = np.abs(np.fft.rfft(piece.r)) ** 2 / piece.r.size
+    f = np.arange(power.size) * (rate_hz / piece.r.size)
+    # The offset's line, and the one that it leaks to, are no excitation.
+    part = np.floor(PARTS * np.log2(f[2:] / f[2])).astype(np.int64)
+    edges = f[2] * 2 ** (np.arange(part[-1] + 2) / PARTS)
+    return np.asarray(edges), np.asarray(np.bincount(part, power[2:]), np.float64)
 
 
 def _named_in(messages: Sequence[str], places: Iterable[str]) -> dict[str, str]:

@@ -14,9 +14,6 @@ from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, told
 from samii_rig.errors import EstimateError, SamiiRigError
 
-# Physics of channels whose command was not sent as it was recorded.
-NOT_KNOWN = ("input_not_held", "columns_shifted")
-ALL = 0.99  # of the rig's samples, that a record has
 MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 
 
@@ -116,13 +113,7 @@ def _answer(
 
 def forces_on(search: RecordSearch) -> ForceSearch | None:
     """The search among forces, where one explains the records best; None where none does, or where
-    the rig has no partial fractions in which it could be computed, or where not every sample of
-    the command was recorded."""
-    whole = search.whole
-    if any(e.physics in NOT_KNOWN for e in search.ranked()[0].effects):
-        return None  # a force is computed from the command, which is not as recorded
-    if isinstance(whole, Whole) and whole.records.rate_hz < whole.rig.rate_hz * ALL:
-        return None
+    the rig has no partial fractions in which it could be computed."""
     try:
         return compete_on_records(search)
     except SamiiRigError:
