@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import time
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -92,6 +93,25 @@ def test_who_breaks_a_worker_breaks_no_other(monkeypatch: pytest.MonkeyPatch) ->
             await made.do(time.sleep, 60, by="Eve")
         assert first in made._open._all
         assert second not in made._open._all
+
+    try:
+        asyncio.run(ask())
+    finally:
+        made.close()
+
+
+def test_a_worker_that_died_is_replaced() -> None:
+    made = desk.Desk()
+
+    async def ask() -> None:
+        def pid() -> Any:
+            return made.do(os.getpid, by="Ada", kept=True)  # type: ignore[arg-type]
+
+        first = await pid()
+        os.kill(first, signal.SIGKILL)
+        with pytest.raises(RecordingError):
+            await pid()
+        assert await pid() != first
 
     try:
         asyncio.run(ask())

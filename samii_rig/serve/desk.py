@@ -78,21 +78,23 @@ class _Workers:
     ) -> dict[str, Any]:
         async with self._places.place(by):
             pool = self._idle.pop()
-            answer = asyncio.get_running_loop().run_in_executor(pool, _answered, work, arguments)
             try:
+                loop = asyncio.get_running_loop()
+                answer = loop.run_in_executor(pool, _answered, work, arguments)
                 return await asyncio.wait_for(answer, WITHIN)
-            except (BrokenProcessPool, TimeoutError) as error:
+            except (BrokenProcessPool, TimeoutError, asyncio.CancelledError) as error:
+                # It is broken, or still works on what nobody waits for.
+                _end(pool)
+                self._all.remove(pool)
+                pool = _pool()
+                self._all.append(pool)
+                if isinstance(error, asyncio.CancelledError):
+                    raise
                 raise errors.RecordingError(
                     f"it took more than {WITHIN:g} s or {MEMORY >> 30} GB; "
                     "expected a smaller question"
                 ) from error
             finally:
-                if not answer.done() or answer.cancelled() or answer.exception():
-                    # It still works on what nobody waits for, or is broken.
-                    _end(pool)
-                    self._all.remove(pool)
-                    pool = _pool()
-                    self._all.append(pool)
                 self._idle.append(pool)
 
     def close(self) -> None:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from samii_rig.diagnose.fit import forms
-from samii_rig.diagnose.fit.explanations import FIVE, Explanation
+from samii_rig.diagnose.fit.explanations import FIVE, Explanation, threshold
 from samii_rig.diagnose.fit.forms import Form
 from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.refit import Fitted, Problem, counted, refit
@@ -48,6 +48,9 @@ HARMONIC = 3  # the lowest that a force makes which is alike both ways
 MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
 ALIASES = 16  # sums over aliases that are kept
 HIGHEST = 0.45  # of the rate: aliases of both sides meet above
+COOLER = (
+    10**0.5
+)  # times less noise from a refit to the next, where a plain one leaves more than noise
 MOST_MADE = 6  # times that the likelihood is made about the nominal model
 # Noise units by which a change from the reference may be off between nodes, where it is taken for
 # linear, for the likelihood to stand: less than noise makes of one unknown.
@@ -349,6 +352,12 @@ class RecordProblem(Problem):
         """As of `Problem`."""
         return self.reduced.slopes(dh)
 
+    def warmed(self, times: float) -> RecordProblem:
+        """The same with noise of so many times the power."""
+        root, form = math.sqrt(times), self.reduced
+        warm = replace(form, factor=form.factor / root, target=form.target / root)
+        return replace(self, reduced=warm)
+
     def toward(self, h: Complex) -> RecordProblem:
         """As of `Problem`."""
         goal = self.reduced.slopes((h - self.reduced.reference)[:, :, None])[:, 0]
@@ -394,7 +403,33 @@ class RecordSearch(Search):
             self._about(fitted)
         else:  # a gross mismatch: the nominal model is weighed where the likelihood stands now
             fitted = refit(fitted.model, self.problem, fitted.x)
+        if self.ratio(fitted) > threshold(self.spread):
+            fitted = self._cooled(fitted)
         self.keep((), fitted)
+
+    def _cooled(self, fitted: Fitted) -> Fitted:
+        """The same, or a better fit: from the parameters of the rig file on, the noise first taken
+        for so large that these fit, then for less and less. Modes that lie near each other lead a
+        plain refit to the wrong one."""
+        model = fitted.model
+        x = np.zeros(model.n)
+        self._about(self._there(model, x))
+        cold = self.problem.expected / max(self._there(model, x).cost, 1.0)
+        steps = int(np.ceil(-np.log(min(cold, 1.0)) / np.log(COOLER)))
+        for k in range(steps, -1, -1):
+            assert isinstance(self.problem, RecordProblem)
+            x = refit(model, self.problem.warmed(COOLER**k), x).x
+            now = self._there(model, x)
+            if not self._stands(now):
+                self._about(now)
+        now = refit(model, self.problem, x)
+        if now.cost < self._there(model, fitted.x).cost:
+            return now
+        self._about(fitted)
+        return refit(model, self.problem, fitted.x)
+
+    def _there(self, model: Model, x: Float) -> Fitted:
+        return refit(model, self.problem, x, far=False, steps=0)
 
     def first(self) -> Fitted:
         """Where the nominal model starts."""
