@@ -48,9 +48,7 @@ HARMONIC = 3  # the lowest that a force makes which is alike both ways
 MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
 ALIASES = 16  # sums over aliases that are kept
 HIGHEST = 0.45  # of the rate: aliases of both sides meet above
-COOLER = (
-    10**0.5
-)  # times less noise from a refit to the next, where a plain one leaves more than noise
+COOLER = 10**0.5  # times less noise from one refit to the next, where a plain one leaves too much
 MOST_MADE = 6  # times that the likelihood is made about the nominal model
 # Noise units by which a change from the reference may be off between nodes, where it is taken for
 # linear, for the likelihood to stand: less than noise makes of one unknown.
