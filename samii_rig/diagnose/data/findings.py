@@ -15,6 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from samii_rig.diagnose.data.measured import repeated, whole_part
+from samii_rig.diagnose.data.pace import paced
 from samii_rig.diagnose.data.wiring import FEW_LINES, Mend, lines_of, named, outputs_of, wired
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Verdict
@@ -100,6 +101,7 @@ def sound(
     given = responses
     responses, doubt = _timed(given, told)
     finite, said = _finite(_fine(responses))
+    paced(finite, rig)
     found = wired(finite, rig)
     steady, changed = _steady(found.responses)
     guessed = None

@@ -124,7 +124,8 @@ def _ratio(H: Complex, model: Complex) -> Complex:
     return np.asarray(np.log(np.where(good, H, np.nan) / np.where(good, model, np.nan)))
 
 
-def _misfit(H: Complex, model: Complex) -> float:
+def misfit(H: Complex, model: Complex) -> float:
+    """Mean squared logarithm of measurement over model, of one line `MOST_MISFIT` at most."""
     log = np.abs(_ratio(H, model)) ** 2
     return float(np.nanmean(np.minimum(log, MOST_MISFIT)))
 
@@ -133,8 +134,8 @@ def _swaps(H: Complex, model: Complex) -> list[tuple[int, int]]:
     """Pairs of outputs that each fit the other's model, the clearest first, none twice."""
     found = []
     for a, b in combinations(range(H.shape[1]), 2):
-        before = (_misfit(H[:, [a]], model[:, [a]]), _misfit(H[:, [b]], model[:, [b]]))
-        after = (_misfit(H[:, [b]], model[:, [a]]), _misfit(H[:, [a]], model[:, [b]]))
+        before = (misfit(H[:, [a]], model[:, [a]]), misfit(H[:, [b]], model[:, [b]]))
+        after = (misfit(H[:, [b]], model[:, [a]]), misfit(H[:, [a]], model[:, [b]]))
         if min(before) > MISFIT and max(after) < SWAPPED * min(before):
             found.append((sum(after), a, b))
     out: list[tuple[int, int]] = []

@@ -85,9 +85,8 @@ def _of_any() -> Iterator[Mistake]:
     """Of a column of any kind."""
     yield Mistake("sign_error", "has the wrong sign", partial(scaled, by=-1.0))
     for unit in UNITS:
-        first, second = unit.name.split(" for ")
-        for name, by in ((unit.name, unit.factor), (f"{second} for {first}", 1 / unit.factor)):
-            said = f"is {by:.4g} times what it should be: {name}"
+        for by in (unit.factor, 1 / unit.factor):
+            said = f"is {by:.4g} times what it should be: {unit.name}"
             yield Mistake("unit_error", said, partial(scaled, by=by), 1 / (2 * len(UNITS)))
 
 
