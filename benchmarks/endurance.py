@@ -208,6 +208,7 @@ class Endured:
         self.wrong: list[str] = []
         self.refused: list[str] = []
         self.opened = False  # the recording of the run at hand
+        self.began = False  # its fault, or the wait for it, once it ran
         self.ends: Counter[tuple[str, str]] = Counter()
         self.samples = 0
 
@@ -220,7 +221,7 @@ class Endured:
         fault, path = self.rng.choice(FAULTS), self.folder / f"{n}.mcap"
         # At first the output is still at rest: it begins 0.1 s ahead.
         running, delay = self.rng.random() < 0.8, self.rng.uniform(0.2, 2.0)
-        boot, self.opened = self.wire.history()["boot"], False
+        boot, self.opened, self.began = self.wire.history()["boot"], False, False
         status, reason = (
             self._host(fault, delay, path)
             if fault == KILLED
@@ -229,8 +230,8 @@ class Endured:
         self.ends[fault, status] += 1
         if running and status == "completed" and fault in ENDING:
             self.wrong.append(f"run {n}: {fault} ended nothing")
-        # What was refused before it was armed has nothing to latch.
-        if (running or status == "tripped") and status in LATCHED and not self.latch.fault:
+        # What was refused before it was armed, by a late machine too, has nothing to latch.
+        if (self.began or status == "tripped") and status in LATCHED and not self.latch.fault:
             self.wrong.append(f"run {n}, {fault}: {status}, and nothing is latched")
         if fault == "unplug":
             self.wire.rig.device.settings["port"] = self.wire.plug()
@@ -269,11 +270,10 @@ class Endured:
             return writer
 
         timer = threading.Timer(delay, self._inject, [fault])
-        began = threading.Event()
 
         def progress(_: object) -> None:
-            if running and not began.is_set():
-                began.set()
+            if running and not self.began:
+                self.began = True
                 timer.start()
 
         if not running:

@@ -59,7 +59,7 @@ def rows(recording: Recording, kept: slice | np.ndarray) -> Recording:
 @pytest.mark.parametrize("m", [-FARTHEST, -2, -1, 1, 3, FARTHEST])
 def test_columns_that_stand_late_are_set_right(m: int):
     whole = loop()
-    found, finding = aligned(late(whole, m))
+    ((found, finding),) = aligned([late(whole, m)])
     assert finding is not None
     assert f"{abs(m)} sample" in finding.message
     assert "run.mcap" in finding.message
@@ -70,14 +70,32 @@ def test_columns_that_stand_late_are_set_right(m: int):
 def test_rows_beside_a_gap_are_given_up_and_no_other():
     whole = loop()
     kept = np.r_[0:1500, 1600:N]
-    found, _ = aligned(rows(late(whole, 3), kept[kept < N - 3]))
+    ((found, _),) = aligned([rows(late(whole, 3), kept[kept < N - 3])])
     np.testing.assert_array_equal(found.values, whole.values[found.sequence])
     assert len(found) >= kept.size - 12
 
 
 def test_a_recording_in_order_is_left_as_it_is():
     whole = loop()
-    assert aligned(whole) == (whole, None)
+    assert aligned([whole]) == [(whole, None)]
+
+
+@pytest.mark.parametrize("m", [-4, -1, 2, FARTHEST])
+def test_recordings_of_one_input_are_set_beside_each_other_where_no_law_is_known(m: int):
+    first, other = loop(rig_toml=""), loop(seed=2, rig_toml="")
+    (_, no), (found, finding) = aligned([first, late(other, m)])
+    assert no is None
+    assert finding is not None
+    assert f"beside run.mcap what was measured stands {abs(m)} sample" in finding.message
+    np.testing.assert_array_equal(found.values, other.values[found.sequence])
+
+
+def test_recordings_of_other_inputs_are_left_as_they_are():
+    other = late(loop(rig_toml=""), 2)
+    values = other.values.copy()
+    values[:, 1] = np.random.default_rng(5).standard_normal(len(values))
+    other = replace(other, values=values)
+    assert [said for _, said in aligned([loop(rig_toml=""), other])] == [None, None]
 
 
 @pytest.mark.parametrize(

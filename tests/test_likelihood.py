@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from samii_rig.errors import EstimateError
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
@@ -284,3 +285,19 @@ def test_a_gap_and_a_missing_sample_begin_a_piece_that_moves():
     )
     found = pieces_of([run], SAMII, wiring([run], SAMII))
     assert [(len(p.z), p.moving) for p in found] == [(700, False), (580, True), (650, True)]
+
+
+def test_a_record_with_two_commands_is_refused_in_one_line_that_names_both():
+    """The second input would otherwise be physics that the model left out."""
+    rig = load_rig("samii_two_joints")[0]
+    one = recording()
+    run = replace(
+        one,
+        channels=(Channel("v_3", "V", "command"), *one.channels),
+        values=np.column_stack([one.values[:, 0], one.values]),
+        quality=np.zeros((len(one), len(one.channels) + 1), np.int64),
+    )
+    with pytest.raises(EstimateError, match="have 2 commands, v_2, v_3; expected one") as refused:
+        wiring([run], rig)
+    assert "\n" not in str(refused.value)
+    assert wiring([one], rig).command == "v_2"

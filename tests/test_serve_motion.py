@@ -12,7 +12,7 @@ from samii_rig.model.sampled import sensor_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.elements import BEAMS
 from samii_rig.rig.load import load_rig
-from samii_rig.serve import desk
+from samii_rig.serve import questions
 from samii_rig.serve.motion import BENDS, Motion, motion
 
 RIG, TEXT = load_rig("samii")
@@ -75,7 +75,7 @@ def test_a_rig_without_sensors_of_motion_is_drawn_at_rest() -> None:
 
 
 def test_the_rig_comes_with_its_motion(found: Motion) -> None:
-    answer = desk.rig(TEXT)
+    answer = questions.rig(TEXT)
     assert answer["motion"]["sensors"] == list(found.sensors)
     np.testing.assert_allclose(answer["motion"]["matrix"], found.matrix, atol=1e-5)
     assert len(answer["motion"]["x"]) == len(answer["motion"]["element"])

@@ -11,7 +11,7 @@ from wait_kit import WITHIN, found
 
 BEGUN = {
     "workers": "from samii_rig.workers import workers; w = workers(1); pool = w.__enter__()",
-    "desk": "from samii_rig.serve.desk import Desk; pool = Desk()._pool",
+    "desk": "from samii_rig.serve.desk import Desk; pool = Desk()._open._all[0]",
 }
 
 

@@ -67,6 +67,10 @@ class Contour:
         y = fft.irfft(Y, self.samples, axis=0)[:n]
         return np.asarray(y / self._decay(n, y.ndim))
 
+    def predicted(self, H: Complex, r: Float) -> Float:
+        """(n, q) what H (M//2 + 1, q) answers to an input r (n,)."""
+        return self.record(H * self.damped(r)[:, None], r.size)
+
     def _decay(self, n: int, axes: int) -> Float:
         decay = np.exp(-self.sigma / self.rate_hz * np.arange(n))
         return np.asarray(decay.reshape((n,) + (1,) * (axes - 1)), np.float64)

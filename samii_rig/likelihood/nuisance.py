@@ -6,6 +6,8 @@ that of the best amplitudes, which for diffuse Gaussian ones is the marginal lik
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.polynomial import legendre
 
@@ -34,27 +36,32 @@ def wander(n: int, k: Int, q: int) -> Complex:
     return out.reshape(k.size, q, -1)
 
 
-def offsets(
-    piece: Piece, k: Int, H: Complex, contour: Contour, loop: tuple[float, int] | None
-) -> Complex:
+def offsets(piece: Piece, k: Int, steps: Sequence[Float]) -> Complex:
     """(n_lines, q, 1 or 2) of an input that has an offset, and of a loop's sensor that has one:
     both act from the first sample on.
 
-    H : (M//2 + 1, q) from the input on the contour. loop : its kp, and the sensor.
+    steps : (m, q) what the sensors show of a step of each.
     """
-    step = contour.damped(np.ones(piece.r.size))[:, None]
-    shapes = [H * step]
-    if loop is not None:
-        kp, entry = loop
-        sensed = -kp * H
-        sensed[:, entry] += 1
-        shapes.append(sensed * step)
-    return np.stack([_window(piece, k, Y, contour) for Y in shapes], axis=2)
+    return np.stack([np.fft.rfft(y[piece.history :], axis=0)[k] for y in steps], axis=2)
+
+
+def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
+    """(n_lines, q, m) of the input's edges, which came some part of a sample earlier or later.
+
+    impulse : (m, q) answer to an impulse of the input.
+    """
+    q = piece.z.shape[1]
+    out = np.zeros((k.size, q, len(piece.edges)), complex)
+    for j, edge in enumerate(piece.edges):
+        y = np.concatenate([np.zeros((edge, q)), impulse[: piece.r.size - edge]])
+        out[:, :, j] = np.fft.rfft(y[piece.history :], axis=0)[k]
+    return out
 
 
 def unread(
     piece: Piece,
     k: Int,
+    y: Float,
     H: Complex,
     contour: Contour,
     loop: tuple[float, int] | None,
@@ -62,9 +69,12 @@ def unread(
 ) -> Complex:
     """(n_lines, q, m) of motion that a converter hardly reads, as it stays within a step: rounding
     scales it by a factor that nobody knows, and the loop is told so. In parts of equal power: the
-    factor depends on the amplitude."""
+    factor depends on the amplitude.
+
+    y : (n, q) as the sensors would move without noise. H : (M//2 + 1, q) from the input on the
+    contour. loop : its kp, and the sensor.
+    """
     n, q = piece.z.shape
-    y = contour.record(H * contour.damped(piece.r)[:, None], piece.r.size)[piece.history :]
     out = []
     for i in np.flatnonzero(step > 0):
         part = rounding.within(piece, y[:, i], float(step[i]), contour.rate_hz)
@@ -83,19 +93,20 @@ def unread(
     return np.stack(out, axis=2) if out else np.zeros((k.size, q, 0), complex)
 
 
-def past(piece: Piece, k: Int, H: Complex, contour: Contour) -> Complex:
+def past(piece: Piece, k: Int, impulse: Float) -> Complex:
     """(n_lines, q, m) of motion from before the first input that is known: answers to inputs that
-    acted then."""
+    acted then.
+
+    impulse : (m, q) answer to an impulse of the input.
+    """
     known = piece.history + len(piece.z)
-    longest = min(len(piece.z), contour.samples - known)
+    longest = min(len(piece.z), len(impulse) - known)
     dense = BEHIND if piece.history else AN_OCTAVE
     lags = np.unique(np.rint(2 ** np.arange(0, np.log2(longest), 1 / dense)).astype(np.int64))
     spectra = []
     for lag in lags:
-        impulse = np.zeros(lag)
-        impulse[0] = 1.0
-        y = contour.record(H * contour.damped(impulse)[:, None], int(lag) + known)
-        spectra.append(np.fft.rfft(y[lag + piece.history :], axis=0)[k])
+        y = impulse[lag + piece.history : lag + known]
+        spectra.append(np.fft.rfft(y, axis=0)[k])
     return _independent(np.stack(spectra, axis=2))
 
 
@@ -109,8 +120,3 @@ def _independent(shapes: Complex) -> Complex:
     _, values, turn = np.linalg.svd(rows / size, full_matrices=False)
     kept = turn[values > NEW * values[0]].T / size[:, None]
     return np.asarray(shapes @ kept)
-
-
-def _window(piece: Piece, k: Int, Y: Complex, contour: Contour) -> Complex:
-    y: Float = contour.record(Y, piece.r.size)[piece.history :]
-    return np.asarray(np.fft.rfft(y, axis=0)[k])

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samii_rig.errors import EstimateError
+from samii_rig.likelihood import inputs, spikes
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.groups import segments_of
 from samii_rig.types import Float, Quality, Recording, Segment
@@ -49,7 +50,8 @@ class Piece:
     r : (history + n,) input of the loop, or of the rig where none is closed; the rig is at rest
         before it, unless `moving`. z : (n, q) sensors. history : samples of input before them.
     levels : as the segments state them, with their unit.
-    commands : of all records that the piece is a sum of.
+    commands : of all records that the piece is a sum of. struck : spikes of each sensor in them.
+    edges : samples of r at which the input jumps at an instant within them that nobody knows.
     """
 
     name: str
@@ -61,6 +63,8 @@ class Piece:
     repeats: tuple[Samples, ...] = ()
     contrasts: tuple[Samples, ...] = ()
     commands: tuple[Command, ...] = ()
+    struck: tuple[int, ...] = ()
+    edges: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,16 +82,22 @@ def wiring(
 ) -> Wiring:
     """The columns of all recordings that the rig file knows, of `sensors` alone if given.
 
-    Raises EstimateError where they have no sensor or no command in common, or where the loop is
-    closed around a sensor that is left out.
+    Raises EstimateError where they have no sensor or no command in common, where they have several
+    commands, or where the loop is closed around a sensor that is left out.
     """
     known = [s.name for s in rig.sensor]
     common = set.intersection(*({c.name for c in r.channels} for r in recordings))
     asked = common if sensors is None else common & set(sensors)
     found = tuple(n for n in known if n in asked)
-    command = next((a.name for a in rig.actuator if a.name in common), "")
-    if not found or not command:
+    commands = [a.name for a in rig.actuator if a.name in common]
+    if not found or not commands:
         raise EstimateError("the recordings have no command and no sensor of the rig in common")
+    if len(commands) > 1:
+        raise EstimateError(
+            f"the recordings have {len(commands)} commands, {', '.join(commands)}; expected one, "
+            "as whole records are predicted from a single input"
+        )
+    (command,) = commands
     centring = rig.centring
     if centring is None or centring.sensor not in common or rig.feedback:
         return Wiring(command, found, "", 0.0)
@@ -111,6 +121,8 @@ def pieces_of(
     The input of the loop is v + kp theta as they were recorded: it holds the reference, the
     rounding and the clipping of the command, and nothing of the sensors' noise.
     """
+    steps = {s.name: s.resolution for s in rig.sensor}
+    step = np.array([steps[n] for n in wired.sensors])
     found: list[Piece] = []
     for recording in recordings:
         columns = [recording.column(n) for n in (wired.command, *wired.sensors)]
@@ -118,13 +130,15 @@ def pieces_of(
         bad = (recording.quality[:, columns] & SPOILT) != 0
         bad[:, 0] = False  # what went out is known, limited or not
         whole = np.all(np.isfinite(values) & ~bad, axis=1)
+        theta = values[:, 1 + wired.sensors.index(wired.centring)] if wired.kp else None
+        values[:, 0], edges = inputs.sent(recording, columns[0], wired.kp, theta)
         r = values[:, 0].copy()
-        if wired.kp:
-            r += wired.kp * values[:, 1 + wired.sensors.index(wired.centring)]
+        if theta is not None:
+            r += wired.kp * theta
         for segment in segments_of(recording):
             if recording.place(segment) in without:
                 continue
-            found += _cut(recording, segment, r, values, whole)
+            found += _cut(recording, segment, r, values, whole, edges, step)
     repeats = _joined(found, levels=False)
     return repeats if apart else joined(repeats)
 
@@ -135,16 +149,21 @@ def joined(pieces: list[Piece]) -> list[Piece]:
 
 
 def _cut(
-    recording: Recording, segment: Segment, r: Float, values: Float, whole: NDArray[np.bool_]
+    recording: Recording,
+    segment: Segment,
+    r: Float,
+    values: Float,
+    whole: NDArray[np.bool_],
+    edges: NDArray[np.bool_],
+    step: Float,
 ) -> list[Piece]:
     """The stretches of a segment between gaps, each with the input before it. values : of the
-    command, then of the sensors."""
+    command, then of the sensors. step : of the sensors' converters."""
     a, b = np.searchsorted(recording.sequence, [segment.start, segment.stop])
     jumps = np.flatnonzero(np.diff(recording.sequence) != 1) + 1
     ends = np.unique(np.concatenate([jumps, np.flatnonzero(np.diff(whole.astype(np.int8))) + 1]))
-    edges = [0, *ends.tolist(), len(r)]
     out = []
-    for start, stop in pairwise(edges):
+    for start, stop in pairwise([0, *ends.tolist(), len(r)]):
         low, high = max(start, int(a)), min(stop, int(b))
         if high - low < LEAST_SAMPLES or not whole[low]:
             continue
@@ -155,8 +174,10 @@ def _cut(
         part = r[low - history : high]
         level = (segment.level, segment.unit)
         told = Command(values[low - history : high, 0].copy(), 1.0)
-        z = values[low:high, 1:]
-        out.append(Piece(name, part, z, history, (level,), moving, commands=(told,)))
+        z, struck = spikes.mended(values[low:high, 1:], step)
+        piece = Piece(name, part, z, history, (level,), moving, commands=(told,))
+        at = tuple(np.flatnonzero(edges[low - history : high]).tolist())
+        out.append(replace(piece, struck=tuple(struck.tolist()), edges=at))
     return out
 
 
@@ -207,4 +228,6 @@ def _turned(group: list[Piece], *, levels: bool) -> Piece:
             for part, p in zip(U[0], group, strict=True)
             for told in p.commands
         ),
+        tuple(np.sum([p.struck for p in group], axis=0).tolist()),
+        tuple(sorted({edge for p in group for edge in p.edges})),
     )

@@ -12,7 +12,7 @@ residual of the best d, smoothed along frequency: a transient is in A, and does 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from samii_rig.errors import EstimateError
-from samii_rig.likelihood import nuisance, rounding
+from samii_rig.likelihood import rounding
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Disturbances, Noise
 from samii_rig.likelihood.pieces import Piece, Samples
+from samii_rig.likelihood.seen import Answers, Seen
 from samii_rig.types import Complex, Float, Int
 
 SPACING = 0.2  # nodes, times the distance over which the reference's response turns by 1 rad
@@ -55,7 +56,8 @@ class Reduced:
     """A quadratic form in what a model has on the nodes.
 
     frequency : (b,) Hz of the nodes, s = sigma + 2 pi j f. reference : (b, q).
-    factor : (m, q, 2, b) so that factor . (Re d, Im d) - target (m,) is standard normal noise.
+    factor : (m, q, 2, b) so that factor . (Re d, Im d) - target (m,) is standard normal noise;
+    of one state upper triangular.
     known : directions of d that the records tell anything of, the mean of chi-square.
     inside : chi-square that no d explains, and its mean.
     noise : of a sample. differing : chi-square of levels against each other, and its mean.
@@ -77,9 +79,11 @@ class Reduced:
 
     def slopes(self, dh: Complex) -> Float:
         """(m, p) of derivatives (b, q, p)."""
-        b, q, p = dh.shape
-        flat = np.stack([dh.real, dh.imag]).transpose(2, 0, 1, 3).reshape(2 * q * b, p)
-        return np.asarray(self.factor.reshape(-1, 2 * q * b) @ flat)
+        flat = by_sensor(dh)
+        C = self.factor.reshape(len(flat), -1).T  # upper triangular
+        if flat.shape[1] == 1:
+            return np.asarray(linalg.blas.dtrmv(C, flat[:, 0], lower=1, trans=1)[:, None])
+        return np.asarray(linalg.blas.dtrmm(1.0, C, flat, lower=1, trans_a=1))
 
     @property
     def between(self) -> Float:
@@ -97,6 +101,12 @@ class Reduced:
         at_nodes[:-1] += off / 2
         at_nodes[1:] += off / 2
         return float(np.linalg.norm(self.slopes(at_nodes[:, :, None])))
+
+
+def by_sensor(dh: Complex) -> Float:
+    """(q 2 b, p) of derivatives (b, q, p): of each sensor all real parts, then imaginary ones."""
+    b, q, p = dh.shape
+    return np.stack([dh.real, dh.imag]).transpose(2, 0, 1, 3).reshape(2 * q * b, p)
 
 
 @dataclass(frozen=True)
@@ -152,10 +162,13 @@ class Records:
 
     def left(self, samples: Samples | Piece, k: Int, H: Complex, contour: Contour) -> Complex:
         """(n, q) lines k of what H (M//2 + 1, q) on `exact` leaves of samples, a sample's power."""
-        Y = H * contour.damped(samples.r)[:, None]
-        n = len(samples.z)
-        y = samples.z - contour.record(Y, samples.r.size)[samples.r.size - n :]
-        return np.asarray(np.fft.rfft(y, axis=0)[k] / np.sqrt(n))
+        y = samples.z - contour.predicted(H, samples.r)[samples.r.size - len(samples.z) :]
+        return np.asarray(np.fft.rfft(y, axis=0)[k] / np.sqrt(len(y)))
+
+    def seen(self, H: Complex, loop: tuple[float, int] | None) -> list[Seen]:
+        """Of each piece what H on `exact` leaves, and what else is in it."""
+        answers = Answers.of(H, self.exact(), loop, self.longest)
+        return [Seen.of(p, self.lines(p).k, answers, self.step) for p in self.pieces]
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,16 +192,18 @@ def left_by(
     part: Callable[[Int], NDArray[np.bool_]] | None = None,
 ) -> Left:
     """The lines of all pieces under one model, in units of the noise that `noise` has."""
-    rows = _rows(records, None, np.zeros(0, np.int64), response(records.exact().s), loop)
+    rows = _rows(records, None, records.seen(response(records.exact().s), loop))
     if part is not None:
         rows = rows.take(np.flatnonzero(part(rows.k)))
-    n, q = rows.e.shape
-    white = np.sqrt(2) * noise.noise.whitened(rows.f, rows.e[:, :, None])[:, :, 0]
-    N = np.sqrt(2) * noise.noise.whitened(rows.f, rows.N).reshape(n * q, -1)
-    Q = orthonormal(np.concatenate([N.real, N.imag]))
-    goal = np.concatenate([white.real.ravel(), white.imag.ravel()])
-    goal -= Q @ (Q.T @ goal)
-    white = (goal[: n * q] + 1j * goal[n * q :]).reshape(n, q)
+    both = np.concatenate([rows.e[:, :, None], rows.N], axis=2)
+    both = np.sqrt(2) * noise.noise.whitened(rows.f, both)
+    white = both[:, :, 0]
+    for on, m in rows.each():
+        N = both[on][:, :, 1 : 1 + m].reshape(-1, m)
+        Q = orthonormal(_real(N))
+        goal = _real(white[on].ravel())
+        goal -= Q @ (Q.T @ goal)
+        white[on] = _complex(goal).reshape(on.size, -1)
     each = noise.noise.scaled(rows.f, white) / 2
     return Left(rows.f, np.sum(np.abs(white) ** 2, axis=1), each)
 
@@ -217,7 +232,8 @@ class Rows:
     """Lines of all pieces by frequency, each in units of the root of its record's power.
 
     X : (n, 2 b) what a change on the nodes does. e : (n, q) what the reference leaves.
-    N : (n, q, m) nuisances. f : (n,) Hz. k : (n,) numbers of the lines. piece : (n,) which.
+    N : (n, q, m) nuisances of each line's own piece, columns of zeros behind them.
+    f : (n,) Hz. k : (n,) numbers of the lines. piece : (n,) which.
     order : (n,) of the lines of all pieces, one after the other, which these are.
     """
 
@@ -235,6 +251,23 @@ class Rows:
             self.X[which], self.e[which], self.N[which], self.f[which], self.k[which],
             self.piece[which], self.order[which],
         )  # fmt: skip
+
+    def each(self) -> list[tuple[Int, int]]:
+        """Of each piece its lines, and how many nuisances they have."""
+        some = np.any(self.N != 0, axis=1)
+        lines = [np.flatnonzero(self.piece == i) for i in np.unique(self.piece)]
+        counts = [np.flatnonzero(np.any(some[on], axis=0)) for on in lines]
+        return [(on, int(c[-1]) + 1 if c.size else 0) for on, c in zip(lines, counts, strict=True)]
+
+    def apart(self) -> Rows:
+        """The same, the nuisances of every piece in columns of their own."""
+        each = self.each()
+        N = np.zeros((*self.N.shape[:2], sum(m for _, m in each)), complex)
+        first = 0
+        for on, m in each:
+            N[on, :, first : first + m] = self.N[on, :, :m]
+            first += m
+        return replace(self, N=N)
 
 
 def reduced(
@@ -270,13 +303,13 @@ def formed(
         nodes = nodes_of(smooth, S / np.median(np.abs(S[inside]), axis=0), records.band)
     else:
         nodes = np.rint(at * (smooth.samples / smooth.rate_hz)).astype(np.int64)
-    rows = _rows(records, smooth, nodes, H, loop)
+    seen = records.seen(H, loop)
+    rows = _rows(records, _columns(records, smooth, nodes), seen)
     left, free = _residual(rows)
-    known = rounding.added(records.pieces, records.step, H, exact)
     power = Noise.of(
-        *_with_repeats(records, H, exact, loop, rows.f, left, free),
+        *_with_repeats(records, H, seen, rows.f, left, free),
         disturbances=disturbances,
-        known=known,
+        known=rounding.added([s.rounding for s in seen]),
     )
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
     rows = rows.take(np.flatnonzero(counted))
@@ -291,123 +324,93 @@ def formed(
         known=form.known,
         inside=(form.total - float(form.target @ form.target), count - form.known),
         noise=power,
-        differing=_differing(records, H, exact, loop, power),
+        differing=_differing(records, H, seen, power),
     )
     return made, rows
 
 
 def _with_repeats(
-    records: Records,
-    H: Complex,
-    exact: Contour,
-    loop: tuple[float, int] | None,
-    f: Float,
-    left: Complex,
-    free: Float,
+    records: Records, H: Complex, seen: Sequence[Seen], f: Float, left: Complex, free: Float
 ) -> tuple[Float, Complex, Float]:
     """Frequency, lines and freedom of all that tells noise: what repeats differ by, too."""
     every = [(f, left, free)]
-    for piece in records.pieces:
+    for piece, own in zip(records.pieces, seen, strict=True):
         if np.any(rounding.alike(piece, records.step) > rounding.ALIKE):
             continue
-        every += _beside(records, piece, piece.repeats, H, exact, loop)
+        every += _beside(records, piece, piece.repeats, H, own)
     f, left, free = (np.concatenate(x) for x in zip(*every, strict=True))
     order = np.argsort(f, kind="stable")
     return f[order], left[order], free[order]
 
 
 def _beside(
-    records: Records,
-    piece: Piece,
-    others: Sequence[Samples],
-    H: Complex,
-    exact: Contour,
-    loop: tuple[float, int] | None,
+    records: Records, piece: Piece, others: Sequence[Samples], H: Complex, own: Seen
 ) -> list[tuple[Float, Complex, Float]]:
     """Of the repeats or contrasts of a piece: Hz (n,), what H leaves without nuisances (n, q), and
     the freedom left (n,)."""
     if not others:
         return []
-    lines, N = records.lines(piece), _nuisances(records, piece, H, loop)
-    left = (records.left(samples, lines.k, H, exact) for samples in others)
-    return [(lines.frequency, *_without(e, N)) for e in left]
+    lines, exact = records.lines(piece), records.exact()
+    left = np.stack([records.left(samples, lines.k, H, exact) for samples in others], axis=2)
+    left, free = _without(left, own.N)
+    return [(lines.frequency, left[:, :, i], free) for i in range(len(others))]
 
 
 def _differing(
-    records: Records, H: Complex, exact: Contour, loop: tuple[float, int] | None, noise: Noise
+    records: Records, H: Complex, seen: Sequence[Seen], noise: Noise
 ) -> tuple[float, float]:
     """Chi-square of the levels against each other, and its mean."""
     total = count = 0.0
-    for piece in records.pieces:
-        for f, e, free in _beside(records, piece, piece.contrasts, H, exact, loop):
-            total += 2 * float(np.sum(np.abs(noise.whitened(f, e[:, :, None])) ** 2))
-            count += 2.0 * e.shape[1] * float(np.sum(free))
+    for piece, own in zip(records.pieces, seen, strict=True):
+        every = _beside(records, piece, piece.contrasts, H, own)
+        if every:
+            left = np.stack([e for _, e, _ in every], axis=2)
+            total += 2 * float(np.sum(np.abs(noise.whitened(every[0][0], left)) ** 2))
+            count += 2.0 * left.shape[1] * sum(float(np.sum(free)) for _, _, free in every)
     return total, count
 
 
-def _rows(
-    records: Records,
-    smooth: Contour | None,
-    nodes: Int,
-    H: Complex,
-    loop: tuple[float, int] | None,
-) -> Rows:
-    """smooth, nodes : of changes; None where none is asked for."""
-    exact = records.exact()
-    none = [np.zeros((records.lines(p).k.size, 0), complex) for p in records.pieces]
-    changes = none if smooth is None else _columns(records, smooth, nodes)
-    spectra, errors, frequency, number, nuisances = [], [], [], [], []
-    which: list[Int] = []
-    for piece, X in zip(records.pieces, changes, strict=True):
-        lines = records.lines(piece)
-        weight = 1 / np.sqrt(len(piece.z))
-        q = piece.z.shape[1]
-        spectra.append(X * weight)
-        errors.append(records.left(piece, lines.k, H, exact))
-        frequency.append(lines.frequency)
-        number.append(lines.k)
-        which.append(np.full(lines.k.size, len(which)))
-        nuisances.append(_nuisances(records, piece, H, loop))
-    order = np.argsort(np.concatenate(frequency), kind="stable")
-    N = np.zeros((order.size, q, sum(x.shape[2] for x in nuisances)), complex)
-    row = column = 0
-    for x in nuisances:
-        N[row : row + x.shape[0], :, column : column + x.shape[2]] = x
-        row, column = row + x.shape[0], column + x.shape[2]
-    X, e, f, k, of = (np.concatenate(x)[order] for x in (spectra, errors, frequency, number, which))
-    return Rows(X, e, N[order], f, k, of, order)
-
-
-def _nuisances(
-    records: Records, piece: Piece, H: Complex, loop: tuple[float, int] | None
-) -> Complex:
-    """(n, q, m) of one piece, of size 1 each."""
-    k, exact = records.lines(piece).k, records.exact()
-    own = [nuisance.wander(len(piece.z), k, piece.z.shape[1])]
-    own += [nuisance.past(piece, k, H, exact)] if piece.moving else []
-    own += [nuisance.unread(piece, k, H, exact, loop, records.step)]
-    own += [nuisance.offsets(piece, k, H, exact, loop)]
-    N = np.concatenate(own, axis=2)
-    size = np.linalg.norm(N, axis=(0, 1))
-    return np.asarray(N[:, :, size > 0] / size[size > 0])
+def _rows(records: Records, changes: Sequence[Complex] | None, seen: Sequence[Seen]) -> Rows:
+    """changes : of each piece what one on the nodes does; None where none is asked for."""
+    lines = [records.lines(p) for p in records.pieces]
+    size = [x.k.size for x in lines]
+    order = np.argsort(np.concatenate([x.frequency for x in lines]), kind="stable")
+    # Where each line of each piece stands.
+    place = np.split(np.argsort(order), np.cumsum(size)[:-1])
+    n, q, m = order.size, seen[0].e.shape[1], max(s.N.shape[2] for s in seen)
+    X = np.zeros((n, changes[0].shape[1] if changes else 0), complex)
+    e, N, f = np.zeros((n, q), complex), np.zeros((n, q, m), complex), np.zeros(n)
+    k, which = np.zeros(n, np.int64), np.zeros(n, np.int64)
+    for i, (on, piece) in enumerate(zip(place, records.pieces, strict=True)):
+        if changes:
+            X[on] = changes[i] * (1 / np.sqrt(len(piece.z)))
+        e[on], f[on], k[on], which[on] = seen[i].e, lines[i].frequency, lines[i].k, i
+        N[on, :, : seen[i].N.shape[2]] = seen[i].N
+    return Rows(X, e, N, f, k, which, order)
 
 
 def _without(e: Complex, N: Complex) -> tuple[Complex, Float]:
-    """(n, q) without nuisances (n, q, m), each sensor's by itself, and the freedom left (n,)."""
-    n, q = e.shape
+    """(n, q, p) without nuisances (n, q, m), each sensor's by itself, and the freedom left (n,)."""
+    n, q = e.shape[:2]
     out, used = np.zeros_like(e), np.zeros(2 * n)
     for c in range(q):
         Q = orthonormal(_real(N[:, c][:, np.any(N[:, c] != 0, axis=0)]))
         goal = _real(e[:, c])
         goal = goal - Q @ (Q.T @ goal)
         used += np.sum(Q**2, axis=1)
-        out[:, c] = goal[:n] + 1j * goal[n:]
+        out[:, c] = _complex(goal)
     return out, np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
 
 
 def _real(x: Complex) -> Float:
     """Real parts over imaginary parts."""
     return np.concatenate([x.real, x.imag])
+
+
+def _complex(x: Float) -> Complex:
+    """From real parts over imaginary parts."""
+    half = len(x) // 2
+    return np.asarray(x[:half] + 1j * x[half:])
 
 
 def _columns(records: Records, contour: Contour, nodes: Int) -> list[Complex]:
@@ -432,7 +435,7 @@ def _residual(rows: Rows) -> tuple[Complex, Float]:
     n, q = rows.e.shape
     pieces = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
     if min(len(on) for on in pieces) < ENOUGH * rows.X.shape[1]:
-        pieces = [np.arange(n)]
+        pieces, rows = [np.arange(n)], rows.apart()
     left, free = np.zeros((n, q), complex), np.zeros(n)
     for on in pieces:
         left[on], free[on] = _of_piece(rows.take(on))
@@ -475,25 +478,17 @@ class _Form:
 def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     """factor, target of `Reduced`, and chi-square of the reference with the best nuisances."""
     b, q = reference.shape
-    sums = _Sums(b, q, rows.N.shape[2])
     L = np.linalg.inv(noise.root(rows.f))
     W = 2 * (L.conj().swapaxes(1, 2) @ L)
-    for first in range(0, rows.f.size, AT_ONCE):
-        on = slice(first, first + AT_ONCE)
-        sums.add(rows.take(on), W[on])
-    M, g = sums.matrix, sums.head.T.ravel()
-    cross = sums.cross.swapaxes(0, 1).reshape(2 * b * q, -1)
-    # Each in units of its own size: a metre and a metre a second squared are of one kind here.
-    size = np.sqrt(np.maximum(np.diagonal(sums.nuisance), 1e-300))
-    values, turn = np.linalg.eigh(sums.nuisance / np.outer(size, size))
-    kept = values > SAME * values[-1]
-    root = turn[:, kept] / np.sqrt(values[kept]) / size[:, None]
-    cross, own_head = cross @ root, root.T @ sums.nuisance_head
+    We = (W @ rows.e[:, :, None])[:, :, 0]
+    M = _products(rows.X, W)
+    g = (rows.X.conj().T @ We).real.T.ravel()
+    cross, own_head = _nuisances(rows, W, We)
     # Where nothing was excited nothing is known: there the diagonal keeps the factor regular, and
     # takes the directions' place. What nuisances leave is as exact as what they were taken from.
     diagonal = np.diagonal(M).copy()
     M -= cross @ cross.T
-    g = g - cross @ own_head
+    g -= cross @ own_head
     largest = np.repeat(np.max(diagonal.reshape(q, -1), axis=1), 2 * b)  # in its own unit
     C, ridge = _factor(M, SAME * np.maximum(diagonal, SAME * largest))
     turned, _ = linalg.lapack.dtrtri(C)
@@ -501,9 +496,51 @@ def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
         known=C.shape[0] - float(ridge @ np.sum(turned**2, axis=1)),
         factor=np.ascontiguousarray(C).reshape(-1, q, 2, b),
         target=linalg.solve_triangular(C, g, trans="T", check_finite=False),
-        total=sums.total - float(own_head @ own_head),
-        nuisances=int(kept.sum()),
+        total=float(np.sum(rows.e.conj() * We).real) - float(own_head @ own_head),
+        nuisances=own_head.size,
     )
+
+
+def _nuisances(rows: Rows, W: Complex, We: Complex) -> tuple[Float, Float]:
+    """The directions of all nuisances, of length 1: their products with the changes of all nodes
+    (q 2 b, m), and with what the reference leaves (m,)."""
+    found = []
+    for on, m in rows.each():
+        N, X = rows.N[on][:, :, :m], rows.X[on]
+        q, flat = N.shape[1], N.reshape(-1, m)
+        WN = W[on] @ N
+        square = (flat.conj().T @ WN.reshape(-1, m)).real
+        # Each in units of its own size: a metre and a metre a second squared are of one kind here.
+        size = np.sqrt(np.maximum(np.diagonal(square), 1e-300))
+        values, turn = np.linalg.eigh(square / np.outer(size, size))
+        cross = _real(X).T @ _real(WN.reshape(-1, q * m))
+        cross = cross.reshape(-1, q, m).swapaxes(0, 1).reshape(-1, m)
+        head = (flat.conj().T @ We[on].ravel()).real
+        found.append((values, turn / size[:, None], cross, head))
+    largest = max(float(np.max(values, initial=0.0)) for values, *_ in found)
+    crosses, heads = [], []
+    for values, turn, cross, head in found:
+        kept = values > SAME * largest
+        root = turn[:, kept] / np.sqrt(values[kept])
+        crosses.append(cross @ root)
+        heads.append(root.T @ head)
+    return np.concatenate(crosses, axis=1), np.concatenate(heads)
+
+
+def _products(X: Complex, W: Complex) -> Float:
+    """(q 2 b, q 2 b) real parts of X^H W_ij X of lines X (n, 2 b), sensor by sensor."""
+    q, size = W.shape[1], X.shape[1]
+    M = np.zeros((q * size, q * size))
+    for first in range(0, len(X), AT_ONCE):
+        x, w = X[first : first + AT_ONCE], W[first : first + AT_ONCE]
+        real = _real(x)
+        for i in range(q):
+            own = slice(i * size, (i + 1) * size)
+            root = real * np.tile(np.sqrt(w[:, i, i].real), 2)[:, None]
+            M[own, own] += root.T @ root
+            for j in range(i + 1, q):
+                M[own, j * size : (j + 1) * size] += real.T @ _real(w[:, i, j, None] * x)
+    return np.triu(M) + np.triu(M, 1).T
 
 
 def _factor(M: Float, ridge: Float) -> tuple[Float, Float]:
@@ -516,37 +553,3 @@ def _factor(M: Float, ridge: Float) -> tuple[Float, Float]:
         except np.linalg.LinAlgError:
             ridge = MORE * ridge
     raise EstimateError("the records hold no numbers that a response could be told from")
-
-
-class _Sums:
-    """What the normal equations need, summed over lines."""
-
-    def __init__(self, b: int, q: int, m: int) -> None:
-        self.total = 0.0
-        self.matrix = np.zeros((2 * b * q, 2 * b * q))  # sensor by sensor
-        self.head = np.zeros((2 * b, q))
-        self.cross = np.zeros((2 * b, q, m))
-        self.nuisance = np.zeros((m, m))
-        self.nuisance_head = np.zeros(m)
-
-    def add(self, rows: Rows, W: Complex) -> None:
-        """Some lines. W : (n, q, q) twice the inverse of the noise of each."""
-        n, q, m = rows.N.shape
-        size = rows.X.shape[1]
-        real = _real(rows.X)
-        for i in range(q):
-            for j in range(i, q):
-                part = real.T @ _real(W[:, i, j, None] * rows.X)
-                own, other = slice(i * size, (i + 1) * size), slice(j * size, (j + 1) * size)
-                self.matrix[own, other] += part
-                if i != j:
-                    self.matrix[other, own] += part.T
-        back = rows.X.conj().T
-        We = (W @ rows.e[:, :, None])[:, :, 0]
-        WN = W @ rows.N
-        self.total += float(np.sum(rows.e.conj() * We).real)
-        self.head += (back @ We).real
-        self.cross += (back @ WN.reshape(n, q * m)).real.reshape(-1, q, m)
-        flat = rows.N.reshape(n * q, m)
-        self.nuisance += (flat.conj().T @ WN.reshape(n * q, m)).real
-        self.nuisance_head += (flat.conj().T @ We.ravel()).real

@@ -10,14 +10,13 @@ A rounding error is white, of step^2/12, where the motion crosses steps. Two thi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy import ndimage, optimize
 
-from samii_rig.likelihood.contour import Contour
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.types import Complex, Float
+from samii_rig.types import Float
 
 WHITE = 1 / 12  # of a step, squared
 HARMONIC = np.arange(1.0, 200.0)  # of a sawtooth: all but 0.3 % of its power
@@ -56,17 +55,14 @@ def alike(piece: Piece, step: Float) -> Float:
     return out
 
 
-def added(
-    pieces: tuple[Piece, ...], step: Float, H: Complex, exact: Contour
-) -> Callable[[Float], Float]:
+def added(each: Sequence[tuple[Float, Float]]) -> Callable[[Float], Float]:
     """f (n,) Hz -> (n, q) power a sample of each sensor's rounding, in all pieces the largest.
 
-    step : (q,) of the converters. H : (M//2 + 1, q) on `exact`.
+    each : of every piece, as `of_piece` has it.
     """
-    each = [_of_piece(p, step, H, exact) for p in pieces]
 
     def at(f: Float) -> Float:
-        out = np.zeros((f.size, step.size))
+        out = np.zeros((f.size, each[0][1].shape[1]))
         for frequency, power in each:
             more = np.stack([np.interp(f, frequency, p) for p in power.T], axis=1)
             out = np.maximum(out, more)
@@ -75,19 +71,23 @@ def added(
     return at
 
 
-def _of_piece(piece: Piece, step: Float, H: Complex, exact: Contour) -> tuple[Float, Float]:
+def of_piece(piece: Piece, step: Float, y: Float, rate_hz: float) -> tuple[Float, Float]:
+    """Hz (m,) and power a sample (m, q) of each sensor's rounding.
+
+    step : (q,) of the converters. y : (n, q) as the sensors would move without noise.
+    """
     n, q = piece.z.shape
-    frequency = np.asarray(np.fft.rfftfreq(n, 1 / exact.rate_hz), np.float64)
+    frequency = np.asarray(np.fft.rfftfreq(n, 1 / rate_hz), np.float64)
     power = np.zeros((frequency.size, q))
     if not np.any(step > 0):
         return frequency, power
     same = alike(piece, step)
-    y = exact.record(H * exact.damped(piece.r)[:, None], piece.r.size)[piece.r.size - n :]
     for i in np.flatnonzero(step > 0):
         power[:, i] = WHITE * step[i] ** 2 * (1 + len(piece.repeats) * same[i])
-        part = within(piece, y[:, i], float(step[i]), exact.rate_hz)
-        unread = np.abs(np.fft.rfft(part)) ** 2 / n
-        power[:, i] += LEFT * ndimage.uniform_filter1d(unread, AROUND)
+        part = within(piece, y[:, i], float(step[i]), rate_hz)
+        if part.any():
+            unread = np.abs(np.fft.rfft(part)) ** 2 / n
+            power[:, i] += LEFT * ndimage.uniform_filter1d(unread, AROUND)
     return frequency, power
 
 

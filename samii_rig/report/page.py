@@ -148,8 +148,9 @@ def _bode(
     said = ["the bands hold the true value of each line with 90 % probability"]
     said += ["shaded: the model differs by more than noise"] if compared else []
     said += [d] if (d := plots.distortion_caption(responses)) else []
+    chosen = ("Response", views)
     return Plot(
-        "bode", "Responses", "; ".join(said), {"sets": sets}, tuple(names), "Response", views
+        "bode", "Responses", "; ".join(said), {"sets": sets}, tuple(names), *chosen, gain=True
     )
 
 

@@ -64,8 +64,18 @@ def time_series(parts: Sequence[Piece]) -> Figure:
     pixels = int(np.clip(_POINTS / 2 / curves, _FEWEST, _PIXELS))
     return {
         "layout": layout,
-        "sets": [{"name": p.name, "data": _traces(p.recording, pixels)} for p in parts],
+        "sets": [
+            {"name": p.name, "data": _traces(p.recording, pixels), **_taken(p.recording)}
+            for p in parts
+        ],
     }
+
+
+def _taken(r: Recording) -> dict[str, float]:
+    """When the samples were taken. stamp : ms since 1970 in UTC of the first, 0 where nobody
+    knows. lasts : s."""
+    stamp = round(r.wall_time[0] * 1e-6, 3) if r.clock_offset else 0
+    return {"stamp": stamp, "lasts": float(r.time[-1] - r.time[0]) * 1e-9}
 
 
 def _traces(r: Recording, pixels: int) -> list[dict[str, Any]]:

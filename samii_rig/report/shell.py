@@ -30,7 +30,8 @@ class Plot:
     """One figure of the page and what is said above it.
 
     options : names of its sets, for a select; chosen : what they are. views : of each option
-    there are so many sets, one after the other, for a second select.
+    there are so many sets, one after the other, for a second select. gain : its first panel is
+    a gain, which may be shown in dB.
     """
 
     id: str
@@ -40,6 +41,7 @@ class Plot:
     options: tuple[str, ...] = ()
     chosen: str = "Segment"
     views: tuple[str, ...] = ()
+    gain: bool = False
 
     @property
     def json(self) -> Markup:
@@ -50,7 +52,8 @@ class Plot:
 
 def page_text(template: str, plots: Iterable[Plot], **parts: object) -> str:
     """A page from `template` of the assets, with the style, scripts and data that it needs."""
-    style, script, plotly = _asset("page.css"), _asset("page.js"), _plotly()
+    style, plotly = _asset("page.css"), _plotly()
+    script = _asset("page.js") + _asset("video.js")
     return (
         _environment()
         .get_template(template)
@@ -83,7 +86,7 @@ def _policy(*scripts: str) -> str:
     """Content-Security-Policy: nothing from anywhere, and of scripts these alone.
 
     plotly sets styles on elements, so inline styles are allowed; blob and data images are its
-    "save as PNG".
+    "save as PNG". A film that the reader opens from their own disk is a blob too.
     """
     hashes = " ".join(
         f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'"
@@ -91,7 +94,7 @@ def _policy(*scripts: str) -> str:
     )
     return (
         f"default-src 'none'; script-src {hashes}; style-src 'unsafe-inline'; "
-        "img-src data: blob:; form-action 'none'; base-uri 'none'"
+        "img-src data: blob:; media-src blob:; form-action 'none'; base-uri 'none'"
     )
 
 

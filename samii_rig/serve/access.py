@@ -47,6 +47,7 @@ RATE, BURST = 40.0, 200.0  # requests/s and at once, of one address
 GUESSES, GUESS_BURST = 0.2, 10.0  # wrong tokens/s and at once, of one address
 MOST_ADDRESSES = 4096
 MAX_NAME = 40  # characters
+DRIVES = "who drives"  # as whom requests with the lease are counted
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,7 +156,8 @@ class Buckets:
 
 
 class Guard:
-    """Lets through what may pass, with who asks as `scope["state"]["person"]`.
+    """Lets through what may pass, with who asks as `scope["state"]["person"]`, and as whom what
+    they ask is counted as `scope["state"]["counted"]`.
 
     hosts : names and ports under which the service may be called; a browser that was led here
     by another name (DNS rebinding) is refused.
@@ -226,7 +228,8 @@ class Guard:
             return 429, "too many wrong tokens; wait a minute"
         counted = f"token of {known.name}" if known else address
         if self._holds(headers.get("x-lease", "")):
-            counted = "who drives"
+            counted = DRIVES
+        scope["state"]["counted"] = counted
         if not self._asked.take(counted):
             return 429, "too many requests; expected fewer than 40 a second"
         origin = headers.get("origin")

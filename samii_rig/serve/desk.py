@@ -1,61 +1,56 @@
 """Work that takes more than a moment, in processes beside the service's own.
 
-The service's loop must be free for a stop at any moment: predictions, readings of recordings and
-the like are done here. Every function takes and gives plain data; what a person did wrong comes
-back as a line, as an exception of ours cannot pass between processes.
+The service's loop must be free for a stop at any moment: what is in `questions` is answered here.
+Every function takes and gives plain data; what a person did wrong comes back as a line, as an
+exception of ours cannot pass between processes.
 """
 
 from __future__ import annotations
 
 import asyncio
-import math
 import os
 import resource
-import tempfile
-from base64 import b64encode
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
-from itertools import pairwise
 from multiprocessing import get_context
-from pathlib import Path
 from typing import Any
 
 from samii_rig import errors
 from samii_rig.errors import SamiiRigError
 from samii_rig.plain import plain
+from samii_rig.serve.places import Places
 from samii_rig.workers import ends_with_its_parent
 
-WORKERS = 2
+WORKERS = 2  # processes for whoever looks
+EACH = 8  # pieces of work of one asker at once: a page that opens a recording asks for four
+WAITS = 20.0  # s for a place: longer than a report takes, and a person looks elsewhere by then
 WITHIN = 120.0  # s that a piece of work may take
 MEMORY = 8 << 30  # bytes of address space of one of them
-NICE = 5  # steps behind the loop, the service and the stop, as the analyst is
-MOST_POINTS = 4000  # of one curve in one answer
-MOST_VALUES = 8_000_000  # of samples in one answer: ten channels at 1 kHz for 13 minutes
+# Steps behind the service, whose session they share. Run and listener have sessions of their own,
+# to which Linux gives the same share as to this one whatever the steps.
+NICE = 5
 
 
 class Desk:
-    """Hands work to the processes; they are started when there is some."""
+    """Hands work to the processes; they are started when there is some.
+
+    One place is kept for whoever drives, so that a run never waits for those who look.
+    """
 
     def __init__(self) -> None:
-        self._pool = _pool()
+        self._kept = _Workers(1, WITHIN)
+        self._open = _Workers(WORKERS, WAITS)
 
-    async def do(self, work: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
-        """The answer; raises what the work raised, RecordingError if it broke or took too long."""
-        loop = asyncio.get_running_loop()
-        pool = self._pool
-        try:
-            answer = await asyncio.wait_for(
-                loop.run_in_executor(pool, _answered, work, arguments), WITHIN
-            )
-        except (BrokenProcessPool, TimeoutError) as error:
-            if self._pool is pool:
-                self.close()
-                self._pool = _pool()
-            raise errors.RecordingError(
-                f"it took more than {WITHIN:g} s or {MEMORY >> 30} GB; expected a smaller question"
-            ) from error
+    async def do(
+        self, work: Callable[..., dict[str, Any]], *arguments: Any, by: str, kept: bool = False
+    ) -> dict[str, Any]:
+        """The answer; raises what the work raised, RecordingError if it broke or took too long,
+        BusyError if it had no place.
+
+        by : who asks. kept : in the place of whoever drives.
+        """
+        answer = await (self._kept if kept else self._open).do(work, arguments, by)
         if "raised" in answer:
             kind = getattr(errors, answer["raised"])
             again: SamiiRigError = kind.__new__(kind)
@@ -66,14 +61,56 @@ class Desk:
 
     def close(self) -> None:
         """End them."""
-        processes = list((self._pool._processes or {}).values())
-        self._pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:
-            process.kill()
+        self._kept.close()
+        self._open.close()
+
+
+class _Workers:
+    """So many processes. Each is a pool of its own: one that breaks takes no other with it."""
+
+    def __init__(self, many: int, waits: float) -> None:
+        self._places = Places(many, EACH, waits)
+        self._all = [_pool() for _ in range(many)]
+        self._idle = list(self._all)
+
+    async def do(
+        self, work: Callable[..., dict[str, Any]], arguments: tuple[Any, ...], by: str
+    ) -> dict[str, Any]:
+        async with self._places.place(by):
+            pool = self._idle.pop()
+            try:
+                loop = asyncio.get_running_loop()
+                answer = loop.run_in_executor(pool, _answered, work, arguments)
+                return await asyncio.wait_for(answer, WITHIN)
+            except (BrokenProcessPool, TimeoutError, asyncio.CancelledError) as error:
+                # It is broken, or still works on what nobody waits for.
+                _end(pool)
+                self._all.remove(pool)
+                pool = _pool()
+                self._all.append(pool)
+                if isinstance(error, asyncio.CancelledError):
+                    raise
+                raise errors.RecordingError(
+                    f"it took more than {WITHIN:g} s or {MEMORY >> 30} GB; "
+                    "expected a smaller question"
+                ) from error
+            finally:
+                self._idle.append(pool)
+
+    def close(self) -> None:
+        for pool in self._all:
+            _end(pool)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    processes = list((pool._processes or {}).values())
+    pool.shutdown(wait=False, cancel_futures=True)
+    for process in processes:
+        process.kill()
 
 
 def _pool() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(WORKERS, get_context("spawn"), _begin)
+    return ProcessPoolExecutor(1, get_context("spawn"), _begin)
 
 
 def _begin() -> None:
@@ -92,219 +129,3 @@ def _answered(work: Callable[..., dict[str, Any]], arguments: tuple[Any, ...]) -
     except SystemExit as error:
         # Some package's own; it would end whoever waits for this answer.
         return {"raised": "RecordingError", "line": f"it ended its process ({error})"}
-
-
-def rig(rig_toml: str) -> dict[str, Any]:
-    """The rig as data, as a drawing, and how it moves with its sensors (see `motion`)."""
-    import numpy as np
-
-    from samii_rig.report.drawing import draw
-    from samii_rig.rig.load import parse
-    from samii_rig.rig.schema import Rig
-    from samii_rig.serve.motion import motion
-
-    the_rig = parse(Rig, rig_toml, "rig file")
-    moves = motion(the_rig)
-    moving = None
-    if moves is not None:
-        kinds = {e.name: e.kind for e in the_rig.element}
-        moving = {
-            "x": moves.x.tolist(),
-            "element": list(moves.element),
-            "kind": [kinds[name] for name in moves.element],
-            "sensors": list(moves.sensors),
-            "accelerations": list(moves.accelerations),
-            "hz": moves.hz.tolist(),
-            "matrix": np.round(moves.matrix, 5).tolist(),
-        }
-    found = the_rig.model_dump(mode="json", exclude={"device": {"settings"}})
-    return {"rig": found, "drawing": draw(the_rig), "motion": moving, "text": rig_toml}
-
-
-def dry_run(rig_toml: str, name: str, text: str) -> dict[str, Any]:
-    """What an experiment would do: margins, expected errors, one prediction for each run.
-
-    name : of a shipped experiment, or `text` : of its file. No path from a client is ever opened.
-    refused : the line of what limit would be broken, "" if none. text : of the experiment.
-    """
-    from samii_rig.devices.plugins import asked
-    from samii_rig.errors import InputError, LimitError, one_of
-    from samii_rig.rig.load import parse
-    from samii_rig.rig.schema import Rig
-    from samii_rig.run.dryrun import predict
-    from samii_rig.run.experiments import load_experiment, plan_of, shipped
-    from samii_rig.run.setups import setups_of
-    from samii_rig.serve.words import prediction
-
-    the_rig = parse(Rig, rig_toml, "rig file")
-    if bool(name) == bool(text):
-        raise InputError("experiment", "", name, "a name or a text, one of the two")
-    if name:
-        if name not in shipped():
-            raise InputError("experiment", "", name, one_of(name, shipped()))
-        _, text = load_experiment(name, the_rig)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "experiment.toml"
-        file.write_text(text, encoding="utf-8")
-        try:
-            experiment, _ = load_experiment(str(file), the_rig)
-        except SamiiRigError as error:
-            raise _renamed(error, str(file)) from error
-    runs, refused = [], ""
-    for setup in setups_of(experiment, the_rig, rig_toml):
-        plan = plan_of(experiment, setup.rig)
-        with asked(f"experiment {experiment.name!r}", "prediction"):
-            predicted = predict(plan, setup.rig)
-        try:
-            predicted.refuse()
-        except LimitError as error:
-            refused = refused or str(error)
-        about = {"setup": setup.name, "instruction": setup.instruction}
-        runs.append({**about, "segments": len(plan.segments), **prediction(predicted)})
-    return {"experiment": experiment.name, "runs": runs, "refused": refused, "text": text}
-
-
-def _renamed(error: SamiiRigError, file: str) -> SamiiRigError:
-    """The same line with a name that means something to who sent the text."""
-    line = str(error).replace(file, "experiment.toml")
-    again = type(error).__new__(type(error))
-    Exception.__init__(again, line)
-    return again
-
-
-def signals(path: str, names: list[str], start: float, stop: float, pixels: int) -> dict[str, Any]:
-    """Channels of a recording as curves of at most 2 `pixels` points whose outline is whole.
-
-    start, stop : s from the first sample; `stop` 0 for the end.
-    """
-    import numpy as np
-
-    from samii_rig.errors import InputError
-    from samii_rig.record.reader import read_recording
-    from samii_rig.report.decimate import thin
-
-    recording = read_recording(Path(path))
-    known = [c.name for c in recording.channels]
-    for name in names:
-        if name not in known:
-            raise InputError("signals", "channel", name, f"one of {', '.join(known)}")
-    if not 1 <= pixels <= MOST_POINTS // 2:
-        raise InputError("signals", "pixels", pixels, f"1 to {MOST_POINTS // 2}")
-    begin = recording.time[0] if len(recording) else 0
-    t = (recording.time - begin) * 1e-9
-    low, high = np.searchsorted(t, [start, stop if stop > 0 else math.inf])
-    curves = []
-    for name in names or known:
-        column = recording.column(name)
-        channel = recording.channels[column]
-        x, y = thin(t[low:high], recording.values[low:high, column], pixels)
-        curves.append(
-            {
-                "name": name,
-                "unit": channel.unit,
-                "role": channel.role,
-                "time": x.tolist(),
-                "values": y.tolist(),
-            }
-        )
-    first = int(recording.sequence[0]) if len(recording) else 0
-    rate = recording.rate_hz
-    return {
-        "rate_hz": rate,
-        "duration_s": float(t[-1]) if len(t) else 0.0,
-        "curves": curves,
-        "gaps": int((np.diff(recording.sequence) > 1).sum()),
-        "segments": [
-            {
-                "name": s.name,
-                "kind": s.kind,
-                "level": s.level,
-                "unit": s.unit,
-                "start_s": (s.start - first) / rate,
-                "stop_s": (s.stop - first) / rate,
-            }
-            for s in recording.segments
-        ],
-    }
-
-
-def frames(path: str, start: float, length: float) -> dict[str, Any]:
-    """Samples as frames of the live data, one after the other, in base64; the first sample of the
-    recording is number 0, and each stretch between gaps has frames of its own.
-
-    start, length : s by the sample numbers.
-    """
-    import numpy as np
-
-    from samii_rig.errors import InputError
-    from samii_rig.record.reader import read_recording
-    from samii_rig.serve.viewers import decimated, frame, step_of
-
-    recording = read_recording(Path(path))
-    rate, step = recording.rate_hz, step_of(recording.rate_hz)
-    number = recording.sequence - (recording.sequence[0] if len(recording) else 0)
-    # Whole steps, so that one answer goes on where the last one ended.
-    low, high = (math.floor(t * rate / step) * step for t in (start, start + length))
-    begin, end = np.searchsorted(number, [low, high])
-    if (end - begin) * recording.values.shape[1] > MOST_VALUES:
-        raise InputError("frames", "length", length, f"at most {MOST_VALUES:,} values in it")
-    data = []
-    cuts = begin + 1 + np.flatnonzero(np.diff(number[begin:end]) != 1)
-    for first, last in pairwise([begin, *cuts, end]):
-        rows = (last - first) // step * step
-        if rows:
-            values = decimated(recording.values[first : first + rows], step)
-            data.append(frame(values, step, rate, int(number[first])))
-    return {"frames": b64encode(b"".join(data)).decode()}
-
-
-def responses(path: str) -> dict[str, Any]:
-    """The frequency responses logged in a recording, with the half width of their 90 % bands."""
-    from samii_rig.record.reader import read_frequency_responses
-    from samii_rig.serve.words import response
-
-    return {"responses": [response(r) for r in read_frequency_responses(Path(path))]}
-
-
-def report(path: str, diagnosed: bool) -> dict[str, Any]:
-    """The page about a recording, as `samii-rig report` writes it.
-
-    diagnosed : with the diagnosis, made again from the responses that the run logged.
-    """
-    from samii_rig.errors import InputError
-    from samii_rig.record.reader import read_events, read_frequency_responses, read_recording
-    from samii_rig.report.compare import model_curve
-    from samii_rig.report.page import write_report
-    from samii_rig.rig.load import parse
-    from samii_rig.rig.schema import Rig
-
-    recording = read_recording(Path(path))
-    responses = read_frequency_responses(Path(path))
-    the_rig = found = None
-    # Of another version, or imported: the measurement is shown all the same.
-    with suppress(InputError):
-        the_rig = parse(Rig, recording.rig_toml, "the recording's rig file")
-    if diagnosed and responses and the_rig is not None:
-        from samii_rig.diagnose.diagnose import diagnose
-
-        found = diagnose(responses, the_rig, runs=[recording])
-    with tempfile.TemporaryDirectory() as folder:
-        page = write_report(
-            Path(folder) / "report.html",
-            recording,
-            responses,
-            rig=the_rig,
-            model=model_curve(the_rig, responses) if the_rig else None,
-            events=read_events(Path(path)),
-            diagnosis=found,
-        )
-        return {"page": page.read_text(encoding="utf-8")}
-
-
-def comparison(a: str, b: str) -> dict[str, Any]:
-    """How the frequency responses of two recordings differ, in their own uncertainty."""
-    from samii_rig.record.reader import read_frequency_responses
-    from samii_rig.serve.words import compared
-
-    first, second = (read_frequency_responses(Path(p)) for p in (a, b))
-    return {"pairs": compared(first, second)}

@@ -11,11 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from samii_rig.errors import LimitError
 from samii_rig.rig.load import MAX_BYTES
 from samii_rig.run.experiments import fitting
-from samii_rig.serve import desk
-from samii_rig.serve.access import COOKIE, STOP
+from samii_rig.serve import questions
+from samii_rig.serve.access import COOKIE, DRIVES, STOP
 from samii_rig.serve.job import DIAGNOSIS, RESPONSES, SO_FAR
 from samii_rig.serve.lease import EVERY, LASTS
-from samii_rig.serve.rooms import NotThereError, Rooms, operator, person
+from samii_rig.serve.rooms import NotThereError, Rooms, counted, operator, person
 from samii_rig.serve.viewers import MOST_VIEWERS
 
 Answer = dict[str, Any]
@@ -80,15 +80,16 @@ def _describe(router: APIRouter, rooms: Rooms) -> None:
         return {"experiments": found}
 
     @router.post("/dry-run")
-    async def dry_run(asked: Asked) -> Answer:
+    async def dry_run(request: Request, asked: Asked) -> Answer:
         """What an experiment would do: margins to every limit, expected errors, duration."""
-        return await _predicted(rooms, asked)
+        return await _predicted(rooms, request, asked)
 
 
-async def _predicted(rooms: Rooms, asked: Asked) -> Answer:
+async def _predicted(rooms: Rooms, request: Request, asked: Asked) -> Answer:
     """The dry run; in a process beside, as an experiment's module may take seconds to load."""
-    rig_toml = rooms.settings.rig_toml
-    return await rooms.desk.do(desk.dry_run, rig_toml, asked.experiment, asked.experiment_toml)
+    given = (rooms.settings.rig_toml, asked.experiment, asked.experiment_toml)
+    by = counted(request)
+    return await rooms.desk.do(questions.dry_run, *given, by=by, kept=by == DRIVES)
 
 
 def _drive(router: APIRouter, rooms: Rooms) -> None:
@@ -98,7 +99,7 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
         who = rooms.drives(request)
         if not rooms.supervisor.simulated:
             rooms.latch.refuse()
-        planned = await _predicted(rooms, asked)
+        planned = await _predicted(rooms, request, asked)
         if planned["refused"]:
             raise LimitError(planned["refused"])
         # The lease may have gone to another while it was predicted.

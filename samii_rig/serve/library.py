@@ -18,10 +18,10 @@ from samii_rig.index.query import MOST, each_by_name
 from samii_rig.index.query import Query as Asked
 from samii_rig.index.remarks import add_note, read_remarks, set_tags
 from samii_rig.index.store import PRIVATE
-from samii_rig.serve import desk, upload
+from samii_rig.serve import questions, upload
 from samii_rig.serve.access import PLAIN_PAGE
 from samii_rig.serve.driving import Answer, Body
-from samii_rig.serve.rooms import Rooms, operator
+from samii_rig.serve.rooms import Rooms, counted, operator
 
 Short = Annotated[str, Query(max_length=200)]
 BOUNDS = {"limit": {"ge": 1, "le": MOST}, "offset": {"ge": 0, "lt": 2**31}}
@@ -73,10 +73,12 @@ def _search(router: APIRouter, rooms: Rooms) -> None:
         return dict(rooms.index.words())
 
     @router.get("/compare")
-    async def compare(a: Short, b: Short) -> Answer:
+    async def compare(request: Request, a: Short, b: Short) -> Answer:
         """The frequency responses of two recordings, in units of their joint uncertainty."""
         first, second = rooms.entry(a), rooms.entry(b)
-        found = await rooms.desk.do(desk.comparison, str(first[1]), str(second[1]))
+        found = await rooms.desk.do(
+            questions.comparison, str(first[1]), str(second[1]), by=counted(request)
+        )
         return {"a": first[0], "b": second[0], **found}
 
 
@@ -99,39 +101,43 @@ def _look(router: APIRouter, rooms: Rooms) -> None:
 
     @router.get("/recordings/{id_}/signals")
     async def signals(
+        request: Request,
         id_: str,
         channel: Annotated[list[str] | None, Query(max_length=64)] = None,
         start: Annotated[float, Query(ge=0, allow_inf_nan=False)] = 0.0,
         stop: Annotated[float, Query(ge=0, allow_inf_nan=False)] = 0.0,
-        pixels: Annotated[int, Query(ge=1, le=desk.MOST_POINTS // 2)] = 800,
+        pixels: Annotated[int, Query(ge=1, le=questions.MOST_POINTS // 2)] = 800,
     ) -> Answer:
         """Channels as curves of a few points with the outline of the whole; times in s."""
         _, path = rooms.entry(id_)
-        return await rooms.desk.do(desk.signals, str(path), channel or [], start, stop, pixels)
+        given = (str(path), channel or [], start, stop, pixels)
+        return await rooms.desk.do(questions.signals, *given, by=counted(request))
 
     @router.get("/recordings/{id_}/frames", response_class=Response)
     async def frames(
+        request: Request,
         id_: str,
         start: Annotated[float, Query(ge=0, le=1e6)] = 0.0,
         length: Annotated[float, Query(gt=0, le=1e4)] = 10.0,
     ) -> Response:
         """Samples as frames of the live data (see `viewers`), one after the other; times in s."""
         _, path = rooms.entry(id_)
-        found = await rooms.desk.do(desk.frames, str(path), start, length)
+        found = await rooms.desk.do(questions.frames, str(path), start, length, by=counted(request))
         return Response(b64decode(found["frames"]), media_type=MEDIA)
 
     @router.get("/recordings/{id_}/report", response_class=HTMLResponse)
-    async def report(id_: str) -> HTMLResponse:
+    async def report(request: Request, id_: str) -> HTMLResponse:
         """The page about a recording, with the diagnosis if one is kept with it: some seconds."""
         entry, path = rooms.entry(id_)
-        found = await rooms.desk.do(desk.report, str(path), bool(entry.verdict))
+        given = (str(path), bool(entry.verdict))
+        found = await rooms.desk.do(questions.report, *given, by=counted(request))
         return HTMLResponse(found["page"], headers=REPORT_HEADERS)
 
     @router.get("/recordings/{id_}/frf")
-    async def frf(id_: str) -> Answer:
+    async def frf(request: Request, id_: str) -> Answer:
         """The frequency responses that were logged with the run."""
         _, path = rooms.entry(id_)
-        return await rooms.desk.do(desk.responses, str(path))
+        return await rooms.desk.do(questions.responses, str(path), by=counted(request))
 
 
 def _change(router: APIRouter, rooms: Rooms) -> None:

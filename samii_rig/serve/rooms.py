@@ -17,13 +17,14 @@ from samii_rig.errors import GateError, InputError, SamiiRigError
 from samii_rig.index.entry import Entry
 from samii_rig.index.store import Index
 from samii_rig.safety.latch import Latch
-from samii_rig.serve import desk
+from samii_rig.serve import questions
 from samii_rig.serve.access import Person
 from samii_rig.serve.analysis import Analysis
 from samii_rig.serve.desk import Desk
 from samii_rig.serve.foxglove import Foxglove
 from samii_rig.serve.job import RESPONSES
 from samii_rig.serve.lease import Lease
+from samii_rig.serve.places import BusyError
 from samii_rig.serve.settings import Settings
 from samii_rig.serve.supervisor import Supervisor
 from samii_rig.serve.viewers import PERIOD, Viewers
@@ -105,18 +106,20 @@ class Rooms:
             reader.enough()
 
     async def drawn(self) -> dict[str, Any]:
-        """The rig as `desk.rig` gives it. It does not change and takes seconds: all who ask wait
-        for the same."""
+        """The rig as `questions.rig` gives it. It does not change and takes seconds: all who ask
+        wait for the same."""
         found = self._drawn
         if found is None or (found.done() and (found.cancelled() or found.exception())):
-            work = self.desk.do(desk.rig, self.settings.rig_toml)
+            work = self.desk.do(questions.rig, self.settings.rig_toml, by="the page")
             self._drawn = found = asyncio.create_task(work)
         return await asyncio.shield(found)
 
     async def ready(self) -> None:
-        """Have what the first page asks for."""
+        """Have what the first page asks for, and who predicts the first run awake."""
         with _said("the drawing"):
             await self.drawn()
+        with _said("the first prediction"):
+            await self.desk.do(questions.awake, by="the service", kept=True)
 
     def _foxglove(self) -> None:
         """Show Foxglove what is new. It is a display: one that fails is taken away."""
@@ -180,6 +183,12 @@ def person(request: Request | WebSocket) -> Person:
     return found
 
 
+def counted(request: Request) -> str:
+    """As whom the guard counts what is asked: by token, by lease, or by address."""
+    found: str = request.scope["state"]["counted"]
+    return found
+
+
 def operator(request: Request) -> Person:
     """Who asks, if they may change something; ForbiddenError if they are a viewer."""
     who = person(request)
@@ -204,4 +213,5 @@ STATUS: dict[type[SamiiRigError], int] = {
     ForbiddenError: 403,
     GateError: 409,
     InputError: 422,
+    BusyError: 503,
 }

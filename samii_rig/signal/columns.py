@@ -7,6 +7,7 @@ rows behind what was sent: each row is read at another time than the one before.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +22,7 @@ FARTHEST = 5  # samples; a logger that is later has another fault
 # keeps a few per cent. One that is rounded keeps a quarter of its step in the median, and a shift
 # that is seen above that leaves a fifth more.
 LEFT, ROUNDED, SEEN = 0.2, 0.3, 1.2
+ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same
 LOOKED_AT = 1 << 14  # samples about the largest reference: thousands tell a shift, millions cost
 SENT = ("reference", "command")  # roles of columns that are sent, not measured
 
@@ -64,9 +66,94 @@ def shift_of(recording: Recording) -> int:
     return shifts[best] if exact or off[best] < LEFT * none else 0
 
 
-def aligned(recording: Recording) -> tuple[Recording, Finding | None]:
-    """A recording whose rows hold what was sent and measured at one time, and what was done."""
-    m = shift_of(recording)
+def aligned(recordings: Sequence[Recording]) -> list[tuple[Recording, Finding | None]]:
+    """Recordings whose rows hold what was sent and measured at one time, and what was done: by the
+    law of the loop; where that tells nothing, so that all answer the same input alike."""
+    law = "by the loop's own law what was measured stands"
+    own = [_moved(r, shift_of(r), law) for r in recordings]
+    out: list[tuple[Recording, Finding | None]] = []
+    for recording, said in own:
+        first = next((r for r, _ in out if _alike(r, recording)), None)
+        if said is None and first is not None:
+            m = _against(first, recording)
+            said_of = f"beside {first.source or 'another recording'} what was measured stands"
+            recording, said = _moved(recording, m, said_of)
+        out.append((recording, said))
+    return out
+
+
+def _alike(one: Recording, other: Recording) -> bool:
+    """Whether two recordings are of one input, but for its size."""
+    if one.names("command") != other.names("command") or not one.names("command"):
+        return False
+    a, b = _overlap(one, other)
+    name = one.names("command")[0]
+    v, w = one.values[a, one.column(name)], other.values[b, other.column(name)]
+    if v.size <= 2 * FARTHEST or not np.all(np.isfinite(v) & np.isfinite(w)):
+        return False
+    across, powers = float(v @ w), float(v @ v) * float(w @ w)
+    return across > 0 and across**2 > (1 - ALIKE**2) * powers
+
+
+def _overlap(one: Recording, other: Recording) -> tuple[slice, slice]:
+    """Rows of both that are as far from the start of their first segments; none where these are
+    not as long, but for the ends that a shift takes, or have gaps."""
+    a, b = _first(one), _first(other)
+    none = slice(0, 0), slice(0, 0)
+    if a is None or b is None:
+        return none
+    (rows_a, at_a, n_a), (rows_b, at_b, n_b) = a, b
+    if abs(n_a - n_b) > 2 * FARTHEST:
+        return none
+    low = max(at_a, at_b)
+    high = min(at_a + rows_a.stop - rows_a.start, at_b + rows_b.stop - rows_b.start)
+
+    def within(rows: slice, at: int) -> slice:
+        return slice(rows.start + low - at, rows.start + high - at)
+
+    return within(rows_a, at_a), within(rows_b, at_b)
+
+
+def _first(recording: Recording) -> tuple[slice, int, int] | None:
+    """The rows of the first segment, all where none is told, how far they begin behind its start,
+    and its length; None where a row is missing between them."""
+    sequence = recording.sequence
+    if not sequence.size:
+        return None
+    start, stop = int(sequence[0]), int(sequence[-1]) + 1
+    if recording.segments:
+        start, stop = recording.segments[0].start, recording.segments[0].stop
+    a, b = (int(x) for x in np.searchsorted(sequence, [start, stop]))
+    if a == b or sequence[b - 1] - sequence[a] != b - 1 - a:
+        return None
+    return slice(a, b), int(sequence[a]) - start, stop - start
+
+
+def _against(first: Recording, recording: Recording) -> int:
+    """Samples by which the sensors of a recording stand behind those of another of the same input;
+    0 where no shift makes them clearly more alike."""
+    a, b = _overlap(first, recording)
+    command = first.names("command")[0]
+    v, w = first.values[a, first.column(command)], recording.values[b, recording.column(command)]
+    size = float(v @ w) / float(v @ v)
+    inside = slice(FARTHEST, v.size - FARTHEST)
+    names = [n for n in first.names("sensor") if n in recording.names("sensor")]
+    off = np.zeros((len(names), 2 * FARTHEST + 1))
+    for row, name in zip(off, names, strict=True):
+        x = size * first.values[a, first.column(name)]
+        y = recording.values[b, recording.column(name)]
+        x, y = (np.nan_to_num(z - np.nanmean(z)) for z in (x, y))
+        for i, m in enumerate(range(-FARTHEST, FARTHEST + 1)):
+            row[i] = np.mean((np.roll(y, -m) - x)[inside] ** 2)
+    off = off[np.all(off > 0, axis=1)]
+    if not len(off):
+        return 0
+    # A sensor that shows next to nothing but noise has no say.
+    best = int(np.argmin(np.sum(np.log(off), axis=0)))
+    return best - FARTHEST if np.min(off[:, best] / off[:, FARTHEST]) < LEFT else 0
+
+
+def _moved(recording: Recording, m: int, law: str) -> tuple[Recording, Finding | None]:
     if m == 0:
         return recording, None
     sequence = recording.sequence
@@ -86,10 +173,7 @@ def aligned(recording: Recording) -> tuple[Recording, Finding | None]:
         segments=tuple(_within(recording, sequence[kept])),
     )
     late = f"{abs(m)} sample{'s' * (abs(m) > 1)} {'later' if m > 0 else 'earlier'}"
-    text = (
-        f"{recording.source or 'recording'}: by the loop's own law what was measured stands {late} "
-        "than what was sent; set right"
-    )
+    text = f"{recording.source or 'recording'}: {law} {late} than what was sent; set right"
     return moved, Finding("timing", "warning", text)
 
 

@@ -94,7 +94,7 @@ def estimate(
             "estimate", "band", band, "two frequencies in Hz, 0 or more, low below high"
         )
     skews = skews_of(recordings)
-    moved = [aligned(r) for r in recordings]
+    moved = aligned(recordings)
     recordings = [r for r, _ in moved]
     inputs = inputs_of(recordings, input)
     how = How(outputs, method, gaps, band, pooling, nperseg)

@@ -18,6 +18,7 @@ from samii_rig.diagnose.data.measured import Measured, binned
 from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.refit import STEPS, Fitted, Problem, refit
 from samii_rig.diagnose.fit.stated import IN_DATA
+from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model, grid
 from samii_rig.errors import SamiiRigError
@@ -26,6 +27,7 @@ from samii_rig.types import Float
 
 CHANCE = (0.5, 0.4, 0.02)  # before the data: of nothing, one, two effects missing
 FEWER = 0.05  # of each further effect
+MISTAKE = 0.4  # before the data, of each that is in how the records were made
 NEAR = 25.0  # of the logarithm of evidence: explanations further below the best are let go
 FIVE = 5.0  # standard deviations of chi-square beyond which what is left is more than noise
 ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and bins over which it is looked for
@@ -112,12 +114,14 @@ class Explanations:
         return 0.5 * EXACT**2 * gross / self.temperature * max(len(effects) - 1, 0)
 
     def log_prior(self, effects: Iterable[Effect]) -> float:
-        """Before the data: of how many, which rows, which sites of a row."""
+        """Before the data: of how many, which rows, which sites of a row. What is no physics has
+        nothing to do with how much is missing of the rig."""
         effects = tuple(effects)
-        n = len(effects)
+        n = sum(e.physics not in NOT_PHYSICS for e in effects)
         chance = CHANCE[n] if n < len(CHANCE) else CHANCE[-1] * FEWER ** (n - len(CHANCE) + 1)
         each = (math.log(e.weight / self._total[e.physics] / len(self._rows)) for e in effects)
-        return math.log(chance) + math.lgamma(n + 1) + sum(each)
+        mistakes = (len(effects) - n) * math.log(MISTAKE)
+        return math.log(chance) + mistakes + math.lgamma(n + 1) + sum(each)
 
     def temper(self) -> None:
         """Take the temperature of the explanation that fits best, and weigh all anew.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
@@ -22,10 +22,10 @@ from samii_rig.diagnose.fit import forms
 from samii_rig.diagnose.fit.explanations import FIVE, Explanation
 from samii_rig.diagnose.fit.forms import Form
 from samii_rig.diagnose.fit.gap import gap_of
-from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
+from samii_rig.diagnose.fit.refit import Fitted, Problem, counted, refit
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.disturbed import Disturbed
-from samii_rig.diagnose.physics.model import Grid, Loop, grid
+from samii_rig.diagnose.physics.model import Aliases, Grid, Loop, Model, grid
 from samii_rig.diagnose.physics.rows import RESONANT
 from samii_rig.diagnose.result import Band, Gap, Used
 from samii_rig.errors import EstimateError
@@ -33,6 +33,7 @@ from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.noise import Disturbances
 from samii_rig.likelihood.pieces import Piece, Wiring, joined, pieces_of, wiring
 from samii_rig.likelihood.reduce import CYCLES, Left, Records, Reduced, Response, left_by, reduced
+from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned
 from samii_rig.signal.groups import segments_of
@@ -40,8 +41,12 @@ from samii_rig.signal.statistics import octaves
 from samii_rig.types import Complex, Finding, Float, Int, Recording
 
 SHOW, TURN = 9, 10  # one line in ten is kept apart, to show on what was found
-WIDER = 1.1  # of the band that is excited, the band that takes part
-EXCITED = 0.1  # of the largest, an input's amplitude density that excites: 1 % of its power
+# Of the largest, an input's energy in a third of an octave that excites: steps through frequencies,
+# of as many periods each, and steps of the input have that over 2.5 decades.
+EXCITED, PARTS = 0.003, 3
+HARMONIC = 3  # the lowest that a force makes which is alike both ways
+MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
+ALIASES = 16  # sums over aliases that are kept
 HIGHEST = 0.45  # of the rate: aliases of both sides meet above
 MOST_MADE = 6  # times that the likelihood is made about the nominal model
 # Noise units by which a change from the reference may be off between nodes, where it is taken for
@@ -78,7 +83,7 @@ class Whole:
 
         Raises EstimateError where they hold nothing to compare.
         """
-        runs = [aligned(run)[0] for run in runs]
+        runs = [run for run, _ in aligned(runs)]
         wired = wiring(runs, rig, sensors)
         bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
         without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
@@ -91,9 +96,21 @@ class Whole:
         all_, apart = (_records(p, rate, band, step) for p in (joined(levels), levels))
         return cls(rig, all_, wired, tuple(without.items()), apart)
 
+    @property
+    def every(self) -> int:
+        """Samples of the rig for each that was recorded."""
+        return round(self.rig.rate_hz / self.records.rate_hz)
+
     def by_level(self) -> Whole:
         """The same records, the levels not summed up: for what depends on amplitude."""
         return self if self.apart is None else replace(self, records=self.apart)
+
+    def with_harmonics(self) -> Whole:
+        """The same records, with the lines at which a force shows that depends on the level: up to
+        the third harmonics of what is excited."""
+        records, most = self.records, HIGHEST * self.records.rate_hz
+        bands = tuple((low, min(HARMONIC * high, most)) for low, high in records.bands)
+        return replace(self, records=replace(records, bands=bands))
 
     @property
     def sensor(self) -> Int:
@@ -116,8 +133,24 @@ class Whole:
         """The grid beside the imaginary axis, with the aliases of a fit."""
         names = [a.name for a in self.rig.actuator]
         actuator = np.full(self.sensor.size, names.index(self.wired.command))
-        chain = fitted.model.plain(fitted.x)
-        return grid(self.rig, frequency, self.sensor, actuator, chain, sigma, self.loop)
+        model = fitted.model
+
+        def aliases(chain: Chain, few: Float) -> Aliases:
+            key = id(model), fitted.x.tobytes(), few.tobytes()
+            if key not in self._aliases:
+                if len(self._aliases) == ALIASES:
+                    self._aliases.clear()
+                made = Aliases.of(self.rig, chain, few, self.sensor, actuator)
+                self._aliases[key] = model, made
+            return self._aliases[key][1]
+
+        chain = model.plain(fitted.x)
+        return grid(self.rig, frequency, self.sensor, actuator, chain, sigma, self.loop, aliases)
+
+    @cached_property
+    def _aliases(self) -> dict[tuple[int, bytes, bytes], tuple[Model, Aliases]]:
+        """Of the latest fits: one is asked for on several contours."""
+        return {}
 
     def nodes(self, found: Reduced, fitted: Fitted) -> Grid:
         """The nodes of a likelihood."""
@@ -145,9 +178,18 @@ class Whole:
     def disturbed(self, fitted: Fitted) -> Disturbances:
         """What each disturbance of a fit makes in all sensors, the loop around them closed."""
         made = Disturbed.of(fitted.model, fitted.x, self.sensor)
+        lines = np.unique(
+            np.concatenate([self.records.lines(p).frequency for p in self.records.pieces])
+        )
+        known: list[Complex] = []
 
         def at(f: Float) -> Complex:
-            return made.response(f, self.response_at(fitted, f), self.loop)
+            of = np.minimum(np.searchsorted(lines, f), lines.size - 1)
+            if lines.size > MOST_KEPT or not np.array_equal(lines[of], f):
+                return made.response(f, self.response_at(fitted, f), self.loop)
+            if not known:
+                known.append(made.response(lines, self.response_at(fitted, lines), self.loop))
+            return known[0][of]
 
         return at
 
@@ -188,21 +230,29 @@ def _records(
 
 def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float] | None]:
     """Hz, of each piece the band in which its input has more than a small part of the largest
-    density of all; None for one that nothing drives: what is left of a sweep behind a gap."""
-    spectra = [np.abs(np.fft.rfft(p.r)) / math.sqrt(p.r.size) for p in pieces]
-    # The offset's line, and the one that it leaks to, are no excitation.
-    least = EXCITED * max(float(np.max(R[2:])) for R in spectra)
+    energy of all; None for one that nothing drives: what is left of a sweep behind a gap."""
+    each = [_energy(p, rate_hz) for p in pieces]
+    least = EXCITED * max(float(np.max(energy)) for _, energy in each)
     out: list[tuple[float, float] | None] = []
-    for piece, R in zip(pieces, spectra, strict=True):
-        f = np.arange(R.size) * (rate_hz / piece.r.size)
-        on = np.flatnonzero(R[2:] > least) + 2
+    for piece, (edges, energy) in zip(pieces, each, strict=True):
+        on = np.flatnonzero(energy > least)
         if not on.size:
             out.append(None)
             continue
-        lowest, highest = CYCLES * rate_hz / len(piece.z), HIGHEST * rate_hz
-        low, high = max(f[on[0]] / WIDER, lowest), min(WIDER * f[on[-1]], highest)
-        out.append((float(low), float(high)) if high - low > CYCLES * f[1] else None)
+        line = rate_hz / len(piece.z)
+        low, high = max(edges[on[0]], CYCLES * line), min(edges[on[-1] + 1], HIGHEST * rate_hz)
+        out.append((float(low), float(high)) if high - low > CYCLES * line else None)
     return out
+
+
+def _energy(piece: Piece, rate_hz: float) -> tuple[Float, Float]:
+    """Hz of the edges (m + 1,) of parts of an octave, and the input's energy (m,) in each."""
+    power = np.abs(np.fft.rfft(piece.r)) ** 2 / piece.r.size
+    f = np.arange(power.size) * (rate_hz / piece.r.size)
+    # The offset's line, and the one that it leaks to, are no excitation.
+    part = np.floor(PARTS * np.log2(f[2:] / f[2])).astype(np.int64)
+    edges = f[2] * 2 ** (np.arange(part[-1] + 2) / PARTS)
+    return np.asarray(edges), np.asarray(np.bincount(part, power[2:]), np.float64)
 
 
 def _named_in(messages: Sequence[str], places: Iterable[str]) -> dict[str, str]:
@@ -304,25 +354,26 @@ class RecordProblem(Problem):
         goal = self.reduced.slopes((h - self.reduced.reference)[:, :, None])[:, 0]
         return replace(self, reduced=replace(self.reduced, target=goal))
 
-    def form(self, b: Complex, left: Float, directions: Float) -> Form:
+    def forms(self, left: Float, directions: Float) -> Callable[[Complex], Form]:
         """As of `Problem`."""
         p, on = self.reduced.factor.shape[0], self.at.changed
-        by_one, by_j = (np.concatenate([x.real, x.imag], axis=1) for x in (b[on], 1j * b[on]))
-        moved = self._by_node @ np.stack([by_one, by_j], axis=2)
-        K = np.concatenate([moved[:, :, 0].T, moved[:, :, 1].T], axis=1)
-        Q = directions[:p]
-        r = left - directions @ (directions.T @ left)
-        # Rows of the priors are moved by the projection too: kept as the projection's own part.
-        turn = Q.T @ K
-        K_left = np.concatenate([K - Q @ turn, -directions[p:] @ turn])
-        return forms.Dense(K_left, r, 0.0, on)
+        directions = counted(directions)
+        turned = directions.T @ left
+        F, A = self._by_node
+        sides = np.column_stack([left[:p] - directions[:p] @ turned, directions[:p]])
+        pull, *turn = (sides.T @ F).reshape(sides.shape[1], A.shape[0], -1)
+        power = float(left @ left - turned @ turned)
+        along = np.array(turn).reshape(-1, *A.shape[:2])
+        return lambda b: forms.Dense.of(b[on], A, pull, along, power, on)
 
     @cached_property
-    def _by_node(self) -> Float:
-        """(n, p, 2 q) the factor, of the nodes that a part changes: real parts of all sensors, then
-        imaginary ones."""
+    def _by_node(self) -> tuple[Float, Float]:
+        """(p, n 2 q) the factor, of the nodes that a part changes: of each the real parts of all
+        sensors, then imaginary ones; and the products of its columns (n, 2 q, n, 2 q)."""
         F = self.reduced.factor[..., self.at.changed]
-        return np.ascontiguousarray(F.transpose(3, 0, 2, 1)).reshape(F.shape[3], F.shape[0], -1)
+        p, q, _, n = F.shape
+        F = np.ascontiguousarray(F.transpose(0, 3, 2, 1)).reshape(p, -1)
+        return F, (F.T @ F).reshape(n, 2 * q, n, 2 * q)
 
 
 class RecordSearch(Search):

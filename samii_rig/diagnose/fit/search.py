@@ -18,6 +18,7 @@ from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations
 from samii_rig.diagnose.fit.ranking import moved, ranking
 from samii_rig.diagnose.fit.refit import Fitted, refit
 from samii_rig.diagnose.fit.screen import Screen, Start
+from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.types import Float
 
@@ -154,7 +155,8 @@ class Search(Explanations):
     @staticmethod
     def _mixed(effects: Sequence[Effect]) -> bool:
         """Whether these are too many of different physics."""
-        return len(effects) > MIXED and len({e.physics for e in effects}) > 1
+        real = [e.physics for e in effects if e.physics not in NOT_PHYSICS]
+        return len(real) > MIXED and len(set(real)) > 1
 
     def _ahead(self, tried: Sequence[Candidate]) -> list[Candidate]:
         """Those that a few steps of a refit bring farthest, from where these ended.

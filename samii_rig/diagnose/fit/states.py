@@ -20,7 +20,7 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.result import Gap
 from samii_rig.likelihood.pieces import Wiring
-from samii_rig.likelihood.reduce import Left, Reduced
+from samii_rig.likelihood.reduce import Left, Reduced, by_sensor
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, Int
 
@@ -174,6 +174,11 @@ class BothReduced(Reduced):
             np.concatenate([after.reference, before.reference]), factor, target, known,
             (inside[0], inside[1]), after.noise, (differing[0], differing[1]), (after, before),
         )  # fmt: skip
+
+    def slopes(self, dh: Complex) -> Float:
+        """As of `Reduced`."""
+        flat = by_sensor(dh)
+        return np.asarray(self.factor.reshape(-1, len(flat)) @ flat)
 
     def bent(self, d: Complex, middle: Complex) -> float:
         """As of `Reduced`."""

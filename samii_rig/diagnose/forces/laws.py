@@ -86,30 +86,31 @@ def _starved(M: Float, v: Float, p: Float) -> Float:
 
 
 ONE = ((1.0, 0.0),)
+BETWEEN: tuple[Kind, ...] = ("joint", "ground")
 FRICTION = Law(
-    "friction", "coulomb_friction", "dry friction", ("joint", "drive"), ("T_c",), ((1.0, 1.0),),
+    "friction", "coulomb_friction", "dry friction", (*BETWEEN, "drive"), ("T_c",), ((1.0, 1.0),),
     weak=lambda y, _v, p: np.where(y > 0, -p[0], p[1]) * (y != 0), step=steps.friction,
     of_speed=True,
 )  # fmt: skip
 UNEVEN = Law(
-    "uneven", "coulomb_friction", "dry friction that differs by direction", ("joint", "drive"),
+    "uneven", "coulomb_friction", "dry friction that differs by direction", (*BETWEEN, "drive"),
     ("T_c forward", "T_c backward"), ((1.0, 0.0), (0.0, 1.0)), weak=FRICTION.weak,
     step=steps.friction, of_speed=True,
 )  # fmt: skip
 HARDENING = Law(
-    "hardening", "cubic_stiffness", "a spring that hardens", ("joint",), ("k3",), ONE,
+    "hardening", "cubic_stiffness", "a spring that hardens", BETWEEN, ("k3",), ONE,
     weak=lambda y, _v, p: p[0] * p[1] * y**3, fixed=(0.0, -1.0), step=steps.cubic,
 )  # fmt: skip
 SOFTENING = Law(
-    "softening", "cubic_stiffness", "a spring that softens", ("joint",), ("k3",), ONE,
+    "softening", "cubic_stiffness", "a spring that softens", BETWEEN, ("k3",), ONE,
     weak=HARDENING.weak, fixed=(0.0, 1.0), step=steps.cubic,
 )  # fmt: skip
 PLAY = Law(
-    "play", "backlash", "play", ("joint",), ("width",), ONE,
+    "play", "backlash", "play", BETWEEN, ("width",), ONE,
     weak=lambda y, _v, p: p[1] * np.clip(y, -p[0] / 2, p[0] / 2), step=steps.play, scaled=True,
 )  # fmt: skip
 HYSTERESIS = Law(
-    "hysteresis", "hysteresis", "a part that sticks, then slips (Bouc-Wen)", ("joint",),
+    "hysteresis", "hysteresis", "a part that sticks, then slips (Bouc-Wen)", BETWEEN,
     ("T_y", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=lambda y, _v, p: _hysteresis(y, p),
     step=steps.hysteresis,
 )  # fmt: skip

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
+from scipy import signal
 
 from samii_rig.diagnose.fit.records import RecordProblem, Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
@@ -40,18 +41,20 @@ class Moved:
         the slopes of both by the entries `moving` of x."""
         p, seeds = model.numbers(x), model.seeds(x, moving)
         if model.force.law.told is not None:
-            return [_told(piece, model, p, seeds) for piece in self.whole.records.pieces]
+            pieces = self.whole.records.pieces
+            return [_told(piece, model, p, seeds, self.whole.every) for piece in pieces]
         way, wired = self.ways.at(model, x), self.whole.wired
         contour = self.whole.records.exact()
         channels = model.channels(x, contour.s)
+        every = self.whole.every
         out = []
         for piece in self.whole.records.pieces:
             v, times = mean_command(piece)
             if channels is not None:
                 v = contour.record(contour.damped(v) * channels[0], v.size)
             own = []
-            for e in way.force(model, v, p, seeds):
-                y = times * way.sensed.of(e)[:, self.whole.sensor]
+            for e in way.force(model, between(v, every), p, seeds):
+                y = times * way.sensed.of(e)[::every, self.whole.sensor]
                 for name, F in channels[1].items() if channels is not None else ():
                     j = wired.sensors.index(name)
                     y[:, j] = contour.record(contour.damped(y[:, j]) * F, len(y))
@@ -74,18 +77,24 @@ class Moved:
         return replace(self.whole, records=replace(records, pieces=pieces))
 
 
-def _told(piece: Piece, model: ForceModel, p: Float, seeds: Float) -> list[Samples]:
+def _told(piece: Piece, model: ForceModel, p: Float, seeds: Float, every: int) -> list[Samples]:
     """A force on the command alone, of every record by itself: a converter's steps fall differently
     each time."""
     told = model.force.law.told
     assert told is not None
     r = np.zeros((1 + len(seeds), piece.r.size))
     for command in piece.commands:
-        e, slopes = told(command.v, p)
-        r[0] += command.part * e
-        r[1:] += command.part * (slopes @ seeds.T).T
+        e, slopes = told(between(command.v, every), p)
+        all_ = np.concatenate([e[None], (slopes @ seeds.T).T])
+        r += command.part * (all_ if every == 1 else signal.resample_poly(all_, 1, every, axis=1))
     still = np.zeros_like(piece.z)
     return [Samples(own, still) for own in r]
+
+
+def between(v: Float, every: int) -> Float:
+    """(n every,) a command of which every so-manieth sample was recorded: what the band up to half
+    the record's rate makes of it."""
+    return v if every == 1 else np.asarray(signal.resample_poly(v, every, 1))
 
 
 def mean_command(piece: Piece) -> tuple[Float, float]:

@@ -136,7 +136,15 @@ class Reach:
         """(M,) of each piece the command as it is held, after the dead time."""
         rig = self.whole.rig
         delay = rig.actuator[self.actuator].delay + float(dead_time(rig)[self.actuator])
-        return [s.motion(hold_at(s.s, rig.rate_hz, delay)) for s in self.spans]
+        return [s.motion(hold_at(s.s, rig.rate_hz, delay) * self._given(s.s)) for s in self.spans]
+
+    def _given(self, s: Complex) -> Complex:
+        """(n,) what effects on the input do to the command."""
+        out = np.ones(s.size, np.complex128)
+        for effect, theta in zip(self.model.effects, self.model.parts(self.x), strict=True):
+            if effect.factor is not None and effect.factor.kind == "input":
+                out *= effect.factor.value(s, theta)[0]
+        return out
 
     def motion(self, place: Place, *, of_speed: bool) -> list[Float]:
         """(M,) of each piece what drives a force at a place; none where nothing moves there."""
@@ -167,7 +175,7 @@ class Reach:
         for span, band in zip(self.spans, records.bands, strict=True):
             s = span.s
             G = chain.evaluate(s)
-            hold = hold_at(s, rig.rate_hz, rig.actuator[self.actuator].delay)
+            hold = hold_at(s, rig.rate_hz, rig.actuator[self.actuator].delay) * self._given(s)
             seen = sensors_at(rig.sensor, s)[:, on]
             H = G[:, on, self.actuator] * seen * hold[:, None]
             own = len(rig.actuator) if place.own_input else self.actuator

@@ -26,6 +26,7 @@ from samii_rig.diagnose.forces.reach import Reach
 from samii_rig.diagnose.forces.screen import Hope, Looks, scaled, weakly
 from samii_rig.diagnose.forces.table import forces, uneven
 from samii_rig.diagnose.forces.way import Ways
+from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
@@ -45,7 +46,7 @@ AGAIN = 3  # times that the likelihood is made anew about the best explanation
 STILL = 0.5  # standard deviations, a move from one to the next that is none
 RENEWED = 6  # times that the chain through which a force acts is renewed in between
 RIVALS = 4  # linear explanations that forces are held against
-BESIDE = 3  # linear effects that are refitted beside the best force, and the other way round
+BESIDE = 6  # linear effects that are refitted beside the best force, and the other way round
 
 
 class ForceSearch(RecordSearch):
@@ -53,11 +54,14 @@ class ForceSearch(RecordSearch):
 
     def __init__(self, linear: RecordSearch) -> None:
         assert isinstance(linear.whole, Whole)  # of one state
-        self.levels = whole = linear.whole.by_level()
+        self.levels = whole = linear.whole.by_level().with_harmonics()
         self._ways = Ways()
         self.linear = linear
-        nominal = linear.nominal.fitted
-        self.reach = Reach(whole, nominal.model, nominal.x, int(linear.grid.actuator[0]))
+        base = linear.ranked()[0]
+        if any(e.physics not in NOT_PHYSICS for e in base.effects):
+            base = linear.nominal
+        moved = base.fitted
+        self.reach = Reach(whole, moved.model, moved.x, int(linear.grid.actuator[0]))
         self.forces = tuple(forces(whole.rig, self.reach))
         super().__init__(whole, linear.by_line)
         self.use((*linear.table, *self.forces))
@@ -171,8 +175,9 @@ class ForceSearch(RecordSearch):
     def pair(self) -> None:
         """Linear effects beside the best force; each of both must explain what an effect must."""
         best = self.ranked()[0]
-        single = len(best.effects) == 1 and isinstance(best.fitted.model, ForceModel)
-        if not single or self.is_enough():
+        real = [e for e in best.effects if e.physics not in NOT_PHYSICS]
+        single = len(real) == 1 and isinstance(best.fitted.model, ForceModel)
+        if not single:
             return
         plain, rest = self.beside(best)
         assert isinstance(plain, RecordSearch)

@@ -23,7 +23,17 @@ from samii_rig.diagnose.forces.place import Place
 from samii_rig.diagnose.forces.reach import Reach
 from samii_rig.diagnose.physics.effect import Effect, Unknown
 from samii_rig.diagnose.physics.scales import spread
-from samii_rig.rig.schema import ANGLE_SOURCES, SOURCES, Rig, TorsionalSpring
+from samii_rig.rig.schema import (
+    ANGLE_SOURCES,
+    SOURCES,
+    Rig,
+    TorsionalGroundSpring,
+    TorsionalSpring,
+    TranslationalGroundSpring,
+    TranslationalSpring,
+)
+
+Spring = TorsionalSpring | TranslationalSpring | TorsionalGroundSpring | TranslationalGroundSpring
 
 STARTS = 14  # of a strength over its range
 COMPUTED = 0.01  # of a strength: what it was off by where it is hidden in strong forces
@@ -39,6 +49,11 @@ def forces(rig: Rig, reach: Reach) -> Iterator[Effect]:
     order = [e.name for e in rig.element]
     kinds = {e.name: e for e in rig.element}
     for e in rig.element:
+        slides = isinstance(e, TranslationalSpring | TranslationalGroundSpring)
+        if isinstance(e, TorsionalGroundSpring | TranslationalGroundSpring):
+            yield from _between(reach, Place("ground", (e.name,), slides), e)
+        if isinstance(e, TranslationalSpring):
+            yield from _between(reach, Place("joint", (e.name,), slides), e)
         if isinstance(e, TorsionalSpring):
             at = order.index(e.name)
             near: list[tuple[str, ...]] = [
@@ -47,7 +62,7 @@ def forces(rig: Rig, reach: Reach) -> Iterator[Effect]:
                 if 0 <= i < len(order) and isinstance(kinds[order[i]], ANGLE_SOURCES)
             ]
             for across in ((e.name,), *near):
-                yield from _joint(reach, across, e.name)
+                yield from _between(reach, Place("joint", across), e)
     actuator = rig.actuator[reach.actuator]
     source = next(
         (e for e in rig.element if isinstance(e, SOURCES) and e.input == actuator.name), None
@@ -58,31 +73,32 @@ def forces(rig: Rig, reach: Reach) -> Iterator[Effect]:
     yield from _drive(reach, source.name, actuator.name, actuator.unit, turns=turns)
 
 
-def _joint(reach: Reach, across: tuple[str, ...], spring: str) -> Iterator[Effect]:
-    """Forces between both sides of a joint: of its spring alone, or of spring and source."""
-    place = Place("joint", across)
-    other = next((n for n in across if n != spring), "")
+def _between(reach: Reach, place: Place, spring: Spring) -> Iterator[Effect]:
+    """Forces between both sides of a joint, of its spring alone or of spring and source; or between
+    a part and the ground."""
+    name, (of_force, of_way) = spring.name, place.units
+    other = next((n for n in place.across if n != name), "")
     speed, ports = _largest(reach, place, of_speed=True), reach.ports(place, of_speed=True)
     if speed <= 0 or ports is None:
         return
-    torque = np.pi / 4 * speed / float(np.median(ports.y1))
-    yield effect(
-        FRICTION, place, spring, other, (_log("T_c", "N m", RANGE[0] * torque, RANGE[1] * torque),)
-    )
-    turned = reach.ports(place, of_speed=False)
-    if other or turned is None:
+    force = np.pi / 4 * speed / float(np.median(ports.y1))
+    T_c = _log("T_c", of_force, RANGE[0] * force, RANGE[1] * force)
+    yield effect(FRICTION, place, name, other, (T_c,))
+    moved = reach.ports(place, of_speed=False)
+    if other or moved is None:
         return
     top = _largest(reach, place, of_speed=False)
-    doubles = 1 / float(np.median(turned.y1))  # N m/rad
+    doubles = 1 / float(np.median(moved.y1))  # force a way
     k3 = 4 / 3 * doubles / top**2
     for law, most in ((HARDENING, RANGE[1]), (SOFTENING, SOFTEST)):
-        unknown = _log("k3", "N m/rad^3", RANGE[0] * k3, most * k3)
-        yield effect(law, place, spring, "", (unknown,))
-    width = _log("width", "rad", WIDTHS[0] * top, WIDTHS[1] * top)
-    yield effect(PLAY, place, spring, "", (width,), (spring, "k"))
-    T_y = _log("T_y", "N m", RANGE[0] * doubles * top, RANGE[1] * doubles * top)
-    k = _log("k", "N m/rad", RANGE[0] * doubles, RANGE[1] * doubles)
-    yield effect(HYSTERESIS, place, spring, "", (T_y, k))
+        unknown = _log("k3", f"{of_force}/{of_way}^3", RANGE[0] * k3, most * k3)
+        yield effect(law, place, name, "", (unknown,))
+    if spring.k.value > 0:
+        width = _log("width", of_way, WIDTHS[0] * top, WIDTHS[1] * top)
+        yield effect(PLAY, place, name, "", (width,), (name, "k"))
+    T_y = _log("T_y", of_force, RANGE[0] * doubles * top, RANGE[1] * doubles * top)
+    k = _log("k", f"{of_force}/{of_way}", RANGE[0] * doubles, RANGE[1] * doubles)
+    yield effect(HYSTERESIS, place, name, "", (T_y, k))
 
 
 def _drive(reach: Reach, source: str, alias: str, unit: str, *, turns: bool) -> Iterator[Effect]:

@@ -8,14 +8,12 @@ from samii_rig.diagnose.data.measured import DIFFER
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
-from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.result import Band, Diagnosis, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, told
 from samii_rig.errors import EstimateError, SamiiRigError
 
-ALL = 0.99  # of the rig's samples, that a record has
 MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 
 
@@ -115,15 +113,7 @@ def _answer(
 
 def forces_on(search: RecordSearch) -> ForceSearch | None:
     """The search among forces, where one explains the records best; None where none does, or where
-    the rig has no partial fractions in which it could be computed, or where not every sample of
-    the command was recorded."""
-    whole = search.whole
-    best = search.ranked()[0].effects
-    wrong = [e.factor for e in best if e.physics in NOT_PHYSICS and not e.unknowns]
-    if any(f is not None and f.kind == "input" for f in wrong):
-        return None  # a force is computed from the command, which is not as recorded
-    if isinstance(whole, Whole) and whole.records.rate_hz < whole.rig.rate_hz * ALL:
-        return None
+    the rig has no partial fractions in which it could be computed."""
     try:
         return compete_on_records(search)
     except SamiiRigError:

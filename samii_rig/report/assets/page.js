@@ -1,5 +1,5 @@
 "use strict";
-(() => {
+const page = (() => {
   const schemes = {
     light: {
       ink: "#16191d", muted: "#7b8590", grid: "#e3e7ec", panel: "#ffffff", bad: "#b3261e",
@@ -56,13 +56,32 @@
     figure: unpacked(JSON.parse(document.getElementById(div.dataset.figure).textContent)),
     select: document.getElementById(div.dataset.select || ""),
     view: document.getElementById((div.dataset.select || "").replace("select-", "view-")),
+    decibels: document.getElementById((div.dataset.select || "").replace("select-", "decibels-")),
   }));
   // The set that the switches choose; its views stand one after the other.
-  const chosen = ({ figure, select, view }) => {
+  const chosen = ({ figure, select, view, decibels }) => {
     if (!select) return figure;
     const views = view ? view.options.length : 1;
     const set = figure.sets[select.selectedIndex * views + (view ? view.selectedIndex : 0)];
-    return { data: set.data, layout: set.layout || figure.layout };
+    const found = { data: set.data, layout: set.layout || figure.layout };
+    return decibels && decibels.checked ? inDecibels(found) : found;
+  };
+  // The first panel, a gain on a logarithmic axis, as 20 log10 of it.
+  const dB = (v) => 20 * Math.log10(v);
+  const inDecibels = ({ data, layout }) => {
+    const { range, title, tickvals, ticktext, minor, ...axis } = layout.yaxis;
+    const said = title.text.includes("[") ? title.text.replace("[", "[dB re 1 ") : `${title.text} [dB]`;
+    const first = (o, ref) => !o[ref] || o[ref] === "y";
+    return {
+      data: data.map((t) => (!first(t, "yaxis") ? t
+        : { ...t, y: Float32Array.from(t.y, dB), ...(t.hovertemplate ? { hovertemplate: "%{y:.2f} dB" } : {}) })),
+      layout: {
+        ...layout,
+        yaxis: { ...axis, type: "linear", tickmode: "auto", exponentformat: "none", range: range && range.map((v) => 20 * v), title: { ...title, text: said } },
+        annotations: (layout.annotations || []).map((a) => (first(a, "yref") ? { ...a, y: 20 * a.y } : a)),
+        shapes: (layout.shapes || []).map((s) => (first(s, "yref") ? { ...s, y0: dB(s.y0), y1: dB(s.y1) } : s)),
+      },
+    };
   };
   const PAPER = 640; // px: what an A4 page has between its margins
   let paper = false;
@@ -93,7 +112,8 @@
   for (const plot of plots) {
     draw(plot);
     ticks(plot);
-    const { select, view, div } = plot;
+    const { select, view, decibels, div } = plot;
+    if (decibels) decibels.addEventListener("change", () => draw(plot));
     if (view) view.addEventListener("change", () => draw(plot));
     if (!select) continue;
     select.addEventListener("change", () => draw(plot));
@@ -108,4 +128,5 @@
   query.addEventListener("change", () => plots.forEach(draw));
   addEventListener("beforeprint", () => { paper = true; plots.forEach(draw); });
   addEventListener("afterprint", () => { paper = false; plots.forEach(draw); });
+  return { plots, draw };
 })();

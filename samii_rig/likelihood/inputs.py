@@ -1,0 +1,126 @@
+"""A command that was measured, not recorded as it was sent: the loop's law without a meter's noise.
+
+v = u + kp (theta_ref - theta) holds for what was sent. A loop that runs k times as fast as the
+record holds it for T/k. A meter shows the mean of both sides of each edge, so that what it shows is
+half a period of the loop late, and has noise that never drove the rig. That delay tells k; with it
+the rig's own input follows from the law at the record's samples.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samii_rig.types import Float, Recording
+
+NOISE = 0.1  # of what was measured, sd, that may be the meter's
+# Samples further out than so many sd are none of its noise, but edges within a sample; of all
+# samples they may be this part.
+FAR, EDGES = 7.0, 1e-3
+LOUDER = 2.0  # noise among the lines of the command, over that of all lines: no noise above
+BUSY = 0.01  # of the command's largest line, in power, above which a line is the command's
+NEIGHBOURS = np.arange(-3.0, 4.0)  # samples: of a twentieth of the rate they are exact to 1e-7
+ORDER = np.arange(NEIGHBOURS.size, dtype=np.float64)
+ROUNDS, STEP = 4, 1e-3  # of Gauss and Newton, and samples for a slope
+LATEST = 0.5  # samples: of a loop that runs at the record's rate
+WHOLE = 0.02  # samples, from the delay of a loop that runs a whole number of times as fast
+TO_SD = 1.4826  # median of |x| to the standard deviation of a Gaussian x
+
+
+def sent(
+    recording: Recording, command: int, kp: float, theta: Float | None
+) -> tuple[Float, NDArray[np.bool_]]:
+    """(n,) the command as it drove the rig, as near as the recording tells; and where it has an
+    edge within a sample, so that nobody knows when that came.
+
+    command : its column. theta : (n,) of the sensor around which a loop of gain kp is closed.
+    """
+    channel = recording.channels[command]
+    v = np.asarray(recording.values[:, command], np.float64)
+    none = np.zeros(v.size, np.bool_)
+    if not recording.names("reference"):
+        return v, none
+    each = [_shown(recording, v, _law(recording, command, k, theta)) for k in {kp, 0.0}]
+    law, late, off = min(each, key=lambda one: float(np.nansum(one[2] ** 2)))
+    far = _far(off)
+    if not _noise(off, v, far, channel.resolution):
+        return v, none
+    drawn = _filtered(recording, law, _held(late))
+    return np.where(np.isfinite(drawn), drawn, v), far
+
+
+def _law(recording: Recording, command: int, kp: float, theta: Float | None) -> Float:
+    """(n,) u + kp (theta_ref - theta)."""
+    law = np.zeros(recording.sequence.size)
+    for name in recording.names("reference"):
+        column = recording.column(name)
+        alike = recording.channels[column].unit == recording.channels[command].unit
+        law += (1.0 if alike else kp) * recording.values[:, column]
+    return law if theta is None or kp == 0 else law - kp * theta
+
+
+def _shown(recording: Recording, v: Float, law: Float) -> tuple[Float, float, Float]:
+    """The law, how many samples late a meter shows it as v, and what that leaves of v."""
+    late = 0.0
+    for _ in range(ROUNDS):
+        off = v - _filtered(recording, law, _mean(late))
+        slope = _filtered(recording, law, (_mean(late + STEP) - _mean(late - STEP)) / (2 * STEP))
+        known = np.isfinite(off) & np.isfinite(slope)
+        if not known.any() or not np.any(slope[known]):
+            break
+        # Edges say nothing of a delay: they pass within a sample.
+        known &= np.abs(off) <= FAR * _sd(off)
+        late += float(off[known] @ slope[known]) / float(slope[known] @ slope[known])
+        late = min(max(late, 0.0), LATEST)
+    times = round(1 / (2 * late)) if late > 0 else 0
+    if times and abs(late - 1 / (2 * times)) < WHOLE:
+        late = 1 / (2 * times)
+    off = v - _filtered(recording, law, _mean(late))
+    return law, late, np.where(np.isfinite(off), off, np.nan)
+
+
+def _mean(late: float) -> Float:
+    """Weights of neighbouring samples: the mean of a signal now and 2 `late` samples before."""
+    return _weights(np.append(1.0, (2 * late) ** ORDER[1:] / 2))
+
+
+def _held(late: float) -> Float:
+    """The same of the mean over the last 2 `late` samples, which a hold gives."""
+    return _weights((2 * late) ** ORDER / (ORDER + 1))
+
+
+def _weights(moments: Float) -> Float:
+    """Exact for polynomials up to the order of the neighbours."""
+    return np.linalg.solve(np.vander(NEIGHBOURS, increasing=True).T, moments)
+
+
+def _filtered(recording: Recording, x: Float, weights: Float) -> Float:
+    """(n,) sum of neighbours n - j of x (n,), NaN where a row is missing between them."""
+    out = np.full(x.size, np.nan)
+    reach = len(weights) // 2
+    if x.size <= 2 * reach:
+        return out
+    out[reach:-reach] = np.convolve(x, weights, "valid")
+    apart = recording.sequence[2 * reach :] - recording.sequence[: -2 * reach] != 2 * reach
+    out[reach:-reach][apart] = np.nan
+    return out
+
+
+def _sd(off: Float) -> float:
+    return TO_SD * float(np.nanmedian(np.abs(off)))
+
+
+def _far(off: Float) -> NDArray[np.bool_]:
+    return np.asarray(np.abs(off) > FAR * _sd(off))
+
+
+def _noise(off: Float, v: Float, far: NDArray[np.bool_], step: float) -> bool:
+    """Whether what the law leaves of a command is a meter's noise: more than its converter's steps,
+    small, with next to no sample far out, and no louder where the command is."""
+    known = np.isfinite(off) & np.isfinite(v)
+    if not step < _sd(off) < NOISE * float(np.std(v[known])) or np.mean(far) > EDGES:
+        return False
+    rest = np.where(far, 0.0, off)[known]
+    power, own = (np.abs(np.fft.rfft(x - np.mean(x)))[1:] ** 2 for x in (rest, v[known]))
+    busy = own > BUSY * np.max(own)
+    return bool(np.mean(power[busy]) < LOUDER * np.mean(power))

@@ -1,0 +1,95 @@
+"""A command that a meter showed: the loop's own law, held as long as its loop holds it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from samii_rig.likelihood.inputs import sent
+from samii_rig.types import Channel, Float, Recording
+
+RATE, N, KP, STEP = 500.0, 6000, 3.0, 3e-4
+METER = 4e-3  # V, noise of a meter
+
+
+def signal(t: Float) -> Float:
+    return np.sin(2 * np.pi * (0.5 + 1.5 * t) * t) * np.exp(-t / 40)
+
+
+def angle(t: Float) -> Float:
+    return 0.1 * np.sin(2 * np.pi * (0.5 + 1.5 * t) * t - 0.7) * np.exp(-t / 40)
+
+
+def recorded(times: int, kp: float = KP, seed: int = 1) -> Recording:
+    """A loop `times` as fast as the record, its command as a meter shows it."""
+    fast = np.arange(N * times) / (RATE * times)
+    law = signal(fast) - kp * angle(fast)
+    before = np.append(law[0], law[:-1])
+    noise = METER * np.random.default_rng(seed).standard_normal(N)
+    v = (0.5 * (law + before))[::times] + noise
+    t = fast[::times]
+    values = np.column_stack([signal(t), v, angle(t)])
+    channels = (
+        Channel("u", "V", "reference"),
+        Channel("v", "V", "command", -10.0, 10.0, STEP),
+        Channel("theta", "rad", "sensor"),
+    )
+    return Recording(
+        channels, RATE, np.arange(N) * 2_000_000, np.arange(N), values,
+        np.zeros(values.shape, np.uint8), (),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("times", [2, 3, 4, 8])
+@pytest.mark.parametrize("kp", [0.0, KP])
+def test_a_meters_noise_is_gone_and_the_hold_is_the_loops(times: int, kp: float) -> None:
+    run = recorded(times, kp)
+    v, edges = sent(run, 1, kp, run.values[:, 2])
+    # What a hold of T/times gives of a smooth law: its mean over the period before.
+    half = 0.5 / (RATE * times)
+    inner = np.linspace(-half, half, 41)
+    t = np.arange(N) / RATE
+    want = np.mean([signal(t - half + d) - kp * angle(t - half + d) for d in inner], axis=0)
+    inside = slice(5, -5)
+    assert not edges.any()
+    assert np.std((v - want)[inside]) < 2e-4 < METER / 10
+
+
+def test_a_command_that_was_recorded_as_sent_is_left_as_it_is() -> None:
+    run = recorded(1)
+    values = run.values.copy()
+    law = values[:, 0] - KP * values[:, 2]
+    values[:, 1] = np.rint(law / STEP) * STEP
+    run = Recording(
+        run.channels, run.rate_hz, run.time, run.sequence, values, run.quality, run.segments
+    )
+    v, _ = sent(run, 1, KP, values[:, 2])
+    np.testing.assert_array_equal(v, values[:, 1])
+
+
+def test_a_clipped_command_is_no_meters_noise() -> None:
+    run = recorded(2)
+    run.values[:, 1] = np.clip(run.values[:, 1], -0.6, 0.6)
+    v, _ = sent(run, 1, KP, run.values[:, 2])
+    np.testing.assert_array_equal(v, run.values[:, 1])
+
+
+def test_without_a_reference_there_is_no_law() -> None:
+    run = recorded(2)
+    run = Recording(
+        run.channels[1:], run.rate_hz, run.time, run.sequence, run.values[:, 1:],
+        run.quality[:, 1:], (),
+    )  # fmt: skip
+    v, _ = sent(run, 0, KP, run.values[:, 1])
+    np.testing.assert_array_equal(v, run.values[:, 0])
+
+
+def test_an_edge_within_a_sample_is_told() -> None:
+    run = recorded(4, kp=0.0)
+    run.values[3000:, 0] += 0.8
+    run.values[3000, 1] += 0.4
+    run.values[3001:, 1] += 0.8
+    v, edges = sent(run, 1, 0.0, None)
+    assert np.flatnonzero(edges).size > 0
+    assert np.all(np.abs(np.flatnonzero(edges) - 3000) <= 3)
+    assert np.std(v[:2990] - run.values[:2990, 1]) > METER / 2
