@@ -67,6 +67,7 @@ class Whole:
     wired: Wiring
     left_out: tuple[tuple[str, str], ...] = ()
     apart: Records | None = None  # the same, every level by itself
+    asked: bool = False  # whether somebody said which lines count
 
     @classmethod
     def of(
@@ -95,7 +96,7 @@ class Whole:
         step = tuple(steps[n] for n in wired.sensors)
         (rate,) = {run.rate_hz for run in runs}
         all_, apart = (_records(p, rate, band, step) for p in (joined(levels), levels))
-        return cls(rig, all_, wired, tuple(without.items()), apart)
+        return cls(rig, all_, wired, tuple(without.items()), apart, band is not None)
 
     @property
     def every(self) -> int:
@@ -108,7 +109,9 @@ class Whole:
 
     def with_harmonics(self) -> Whole:
         """The same records, with the lines at which a force shows that depends on the level: up to
-        the third harmonics of what is excited."""
+        the third harmonics of what is excited; no others than those that were asked for."""
+        if self.asked:
+            return self
         records, most = self.records, HIGHEST * self.records.rate_hz
         bands = tuple((low, min(HARMONIC * high, most)) for low, high in records.bands)
         return replace(self, records=replace(records, bands=bands))
