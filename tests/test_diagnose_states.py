@@ -289,3 +289,34 @@ def test_a_high_pass_delay_or_lag_of_a_sensor_may_not_be_there():
     for physics, (factor, end) in own.items():
         F, _ = less[physics].factor.value(s, np.array([end]))
         np.testing.assert_allclose(F * factor, 1.0, atol=1e-3)
+
+
+def test_a_part_that_the_state_before_does_not_have_is_free_after_alone():
+    """A brace that only the state after has: its stiffness is a parameter there, with its own
+    tolerance, and moves the response of that state alone."""
+    braced = load_rig("samii_braced")[0]
+    gone = {f"{e}.{s}": 0.0 for e in ("brace", "brace_moment") for s in ("k", "c")}
+    before = Model(with_known(braced, gone, "--known-before"))
+    both = States(before, braced)
+    j = both.keys.index(("brace", "k"))
+    assert j >= before.n
+    assert both.prior[j] == 0.5
+    f = np.geomspace(0.5, 30.0, 30)
+    n = len(braced.sensor)
+    at = [grid(r, f, np.arange(n), np.zeros(n, np.int64)) for r in (braced, before.rig)]
+    whole = BothGrid.of(*at)
+    h, dh = both.gradient(np.zeros(both.n), whole)
+    assert h[:30] == pytest.approx(Model(braced).response(np.zeros(both.after.n), at[0]))
+    assert h[30:] == pytest.approx(before.response(np.zeros(before.n), at[1]))
+    ahead = np.zeros(both.n)
+    ahead[j] = 1e-4
+    slope = (both.response(ahead, whole) - h) / 1e-4
+    assert slope == pytest.approx(dh[:, :, j], abs=1e-3 * np.max(np.abs(dh[:, :, j])))
+    assert np.all(dh[30:, :, j] == 0)
+    assert np.any(dh[:30, :, j] != 0)
+
+
+def test_what_is_known_of_the_state_before_needs_one():
+    done = CliRunner().invoke(app, ["diagnose", "a.mcap", "--known-before", "joint_2.k=1"])
+    assert "--known-before" in str(done.exception)
+    assert "--before and --after beside it" in str(done.exception)

@@ -79,6 +79,10 @@ def diagnose(
             "state after. May be repeated."
         ),
     ] = None,
+    known_before: Annotated[
+        list[str] | None,
+        typer.Option(help="The same of the state before alone. May be repeated."),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -111,7 +115,10 @@ def diagnose(
 
     check_rig(rig)
     check_choice("--gaps", gaps, GAPS)
-    logs, earlier = _states(logs or [], before or [], after or [], each=each, known=bool(known))
+    any_known = bool(known or known_before)
+    logs, earlier = _states(logs or [], before or [], after or [], each=each, known=any_known)
+    if known_before and not earlier:
+        raise InputError("--known-before", "", known_before[0], "--before and --after beside it")
     if not each:
         check_logs([*earlier, *logs])
 
@@ -139,7 +146,8 @@ def diagnose(
         if json:
             say_json({"recordings": said})
         return
-    _together(logs, earlier, rig, tuple(known or ()), (output, gaps, band), out, json=json)
+    stated = (tuple(known or ()), tuple(known_before or ()))
+    _together(logs, earlier, rig, stated, (output, gaps, band), out, json=json)
 
 
 def _states(
@@ -166,13 +174,14 @@ def _together(
     logs: list[Path],
     earlier: list[Path],
     rig: str | None,
-    known: tuple[str, ...],
+    known: tuple[tuple[str, ...], tuple[str, ...]],
     how: tuple[list[str] | None, str, tuple[float, float] | None],
     out: Path | None,
     *,
     json: bool,
 ) -> None:
-    """One diagnosis of all recordings, said, kept and written. earlier : of the state before."""
+    """One diagnosis of all recordings, said, kept and written. earlier : of the state before;
+    known : words of --known and --known-before."""
     from dataclasses import replace
 
     from rich.console import Console
@@ -183,7 +192,7 @@ def _together(
     from samii_rig.report.summary import working
 
     output, gaps, band = how
-    values = stated(known)
+    values, values_before = stated(known[0]), stated(known[1], "--known-before")
     saved = _saved([*earlier, *logs], two=bool(earlier))
     first, second = ([], []) if saved else (read_all(earlier), read_all(logs))
     held = rig_of(saved or [*first, *second], rig)
@@ -201,11 +210,18 @@ def _together(
         if first:
             of_first = estimated(first, None, output, "auto", gaps, band)
             states = State(of_first, first), State(responses, second)
-            found = changed(*states, held[0], known=values, band=band, progress=say)
+            found = changed(
+                *states,
+                held[0],
+                known=values,
+                known_before=values_before,
+                band=band,
+                progress=say,
+            )
         else:
             found = found_by(responses, own_rig, band=band, progress=say, runs=second)
     # A change is no diagnosis of either state's recordings, nor is one of another rig.
-    own = not (first or known or saved) and all(r.rig_toml in ("", held[1]) for r in second)
+    own = not (first or values or saved) and all(r.rig_toml in ("", held[1]) for r in second)
     if own:
         keep_diagnosis(logs, found)
     page = None
@@ -230,7 +246,7 @@ def _together(
         console.print(f"written  {found.model}", soft_wrap=True)
     if page:
         console.print(f"page     {page}", soft_wrap=True)
-    if not (own or first or known or saved):
+    if not (own or first or values or saved):
         console.print("not kept with the recordings: they carry another rig file", soft_wrap=True)
 
 

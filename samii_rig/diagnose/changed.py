@@ -47,6 +47,7 @@ def changed(
     rig: Rig,
     *,
     known: Mapping[str, float] | None = None,
+    known_before: Mapping[str, float] | None = None,
     band: Band | None = None,
     effects: Sequence[Effect] | None = None,
     progress: Progress = lambda _stage: None,
@@ -55,8 +56,8 @@ def changed(
 
     Parameters
     ----------
-    known : parameters of the rig file, by "element.parameter" and in its units, that are known to
-        have these values after.
+    known, known_before : parameters of the rig file, by "element.parameter" and in its units, that
+        are known to have these values after, or before.
     band : Hz, where the model is held against both.
     effects : the table of hypotheses, of what both states have and of what changed; None for the
         whole vocabulary.
@@ -66,20 +67,23 @@ def changed(
     EstimateError where the recordings of a state cannot be used whole.
     """
     with_known(rig, known or {})  # what is wrong is said before the work
+    first_rig = with_known(rig, known_before or {}, "--known-before")
     found = diagnose(
         before.responses,
-        rig,
+        first_rig,
         band=band,
         effects=effects,
         runs=before.runs,
         progress=lambda stage: progress(f"before: {stage}"),
     )
     put_in = found.verdict != "no_mismatch" and found.rig is not None
-    common = common_rig(rig, found.rig) if put_in and found.rig else rig
+    common = common_rig(first_rig, found.rig) if put_in and found.rig else first_rig
     progress("both states")
     first = case_of(before.responses, common, band, effects, before.runs)
+    # What is known of the state before alone is as the rig file has it after.
+    own = _as_in(common, rig, known_before or {})
     second = case_of(
-        after.responses, with_known(common, known or {}), band, effects, after.runs, signed=True
+        after.responses, with_known(own, known or {}), band, effects, after.runs, signed=True
     )
     both, start = _both(first, second, band)
     search = StatesSearch(both, second.search, start.nominal.fitted)
@@ -96,6 +100,20 @@ def changed(
         explained(search.nominal.fitted),
     )
     return replace(answer, before=beside, not_physics=(*beside.told(), *answer.not_physics))
+
+
+def _as_in(common: Rig, rig: Rig, names: Mapping[str, float]) -> Rig:
+    """`common` with these parameters, by "element.parameter", as `rig` has them."""
+    own = {e.name: parameters(e) for e in flattened(rig.element)}
+
+    def element(e: Any) -> Any:
+        asked = [n.rpartition(".")[2] for n in names if n.rpartition(".")[0] == e.name]
+        update: dict[str, Any] = {s: own[e.name][s] for s in asked}
+        if isinstance(e, Branch):
+            update["element"] = tuple(element(x) for x in e.element)
+        return e.model_copy(update=update)
+
+    return common.model_copy(update={"element": tuple(map(element, common.element))})
 
 
 def _named(state: State) -> tuple[str, ...]:

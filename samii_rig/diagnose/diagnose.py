@@ -82,4 +82,5 @@ def case_of(
         low, high = float(lines.frequency[0]), float(lines.frequency[-1])
         effects = table(rig, low, high, signed=signed)
     by_line = Search(rig, seen, at, clean.competing(effects))
+    runs = runs if clean.mend is None else [clean.mend(run) for run in runs]
     return Case(clean, sound, runs, lines, by_line, decide, show)

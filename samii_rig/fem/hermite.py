@@ -37,6 +37,16 @@ def consistent_mass(mu: float, h: float, phi: float = 0.0, J: float = 0.0) -> Fl
     return m
 
 
+def tension(N: tuple[float, float], h: float, phi: float = 0.0) -> Float:
+    """(4, 4) integral of N theta^2, N in N from node 1 to node 2: the geometric stiffness."""
+    k = np.zeros((4, 4))
+    for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+        u = (1 + node) / 2
+        theta = rotation(h * u, h, phi)
+        k += h * weight / 2 * (N[0] + (N[1] - N[0]) * u) * np.outer(theta, theta)
+    return k
+
+
 def shape(x: float, h: float, phi: float = 0.0) -> Float:
     """(4,) the deflection at x m from node 1 for a unit of each coordinate."""
     u = x / h

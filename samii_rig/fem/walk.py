@@ -58,7 +58,6 @@ from samii_rig.rig.schema import (
     VelocitySource,
 )
 from samii_rig.types import Float
-from samii_rig.units import STANDARD_GRAVITY
 
 Row = dict[int, float]  # a linear function of the coordinates: coefficient by coordinate
 
@@ -105,6 +104,7 @@ class Walk:
         self._feedback: list[Feedback] = []
         self._loads: list[Load] = []
         self._places: list[tuple[float, str, Row, Row]] = []
+        self._weight = rig.pull * sum(map(_mass, rig.element))  # N, of what lies beyond
         self.w: Row = {}
         self.theta: Row = {}
         self.x = 0.0
@@ -125,12 +125,15 @@ class Walk:
         feedback: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         """Add one element and go on to its other end."""
-        before = self.theta
+        before, carried = self.theta, self._weight
+        self._weight -= self._rig.pull * _mass(e)
         match e:
             case Beam() | TimoshenkoBeam():
                 self._beam(e)
             case RigidLink():
                 self._body(e.L.value, e.r.value, e.m.value, e.I.value, e.name)
+                turned = self._weight * e.L.value + (carried - self._weight) * e.r.value
+                self._spring(self._nodes[e.name] + 1, turned)
             case LumpedMass():
                 self._body(0.0, 0.0, e.m.value, e.I.value, e.name)
             case Rod():
@@ -191,9 +194,13 @@ class Walk:
         phi, J = _shear(e, h), e.J.value if isinstance(e, TimoshenkoBeam) else 0.0
         k = hermite.stiffness(e.EI.value, h, phi)
         m = hermite.consistent_mass(e.mu.value, h, phi, J)
+        own = self._rig.pull * e.mu.value * h
         for i in range(n):
             at = list(range(first + 2 * i, first + 2 * i + 4))
             self._K.add(at, k)
+            if own:
+                beyond = self._weight + own * (n - i - 1)
+                self._K.add(at, hermite.tension((beyond + own, beyond), h, phi))
             self._M.add(at, m)
             self._C.add(at, e.tau.value * k)
             self._H.add(at, e.eta.value * k)
@@ -285,12 +292,13 @@ class Walk:
 
     def _branch(self, e: Branch, rigid: Collection[str]) -> None:
         self._point(e.name)
-        here = self.w, self.theta, self.x, self._waiting, self._pulling
+        here = self.w, self.theta, self.x, self._waiting, self._pulling, self._weight
         self._waiting, self._pulling = [], []  # no sensor stands on a branch
+        self._weight = self._rig.pull * _mass(e)
         for part in e.element:
             self.over(part, rigid)
         self.tip(e.tip)
-        self.w, self.theta, self.x, self._waiting, self._pulling = here
+        self.w, self.theta, self.x, self._waiting, self._pulling, self._weight = here
 
     def tip(self, end: End) -> None:
         """Fix the end reached as the rig file says."""
@@ -367,9 +375,8 @@ class Walk:
                     theta = self._span[sensor.on][1]
                 else:
                     theta = self._along(sensor, hermite.rotation, {1: 1.0})
-                return {
-                    i: sensor.tilt * STANDARD_GRAVITY * x for i, x in theta.items() if sensor.tilt
-                }
+                g = self._rig.tilt_gravity()
+                return {i: sensor.tilt * g * x for i, x in theta.items() if sensor.tilt}
             case RelativeAngle():
                 return _minus(self._span[sensor.across[-1]][1], self._span[sensor.across[0]][0])
             case Displacement():
@@ -412,6 +419,18 @@ class Walk:
         host = next(e for e in self._rig.element if e.name == sensor.on)
         assert isinstance(host, Beam | TimoshenkoBeam | RigidLink)  # the schema allows no other
         return host
+
+
+def _mass(e: Element) -> float:
+    """kg of an element."""
+    match e:
+        case Beam() | TimoshenkoBeam():
+            return e.mu.value * e.L.value
+        case RigidLink() | LumpedMass():
+            return e.m.value
+        case Branch():
+            return sum(map(_mass, e.element))
+    return 0.0
 
 
 def _shear(e: Beam | TimoshenkoBeam, h: float) -> float:

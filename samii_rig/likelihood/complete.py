@@ -65,7 +65,7 @@ class Complete:
         g = self.white(e)
         X, q = self.rows.X, e.shape[1]
         back = np.einsum("nji,nj->ni", self.root.conj(), g)
-        head = (X.conj().T @ back).real.T.ravel()
+        head = (back.conj().T @ X).real.ravel()
         t = linalg.solve_triangular(self.factor, head, trans="T", check_finite=False)
         d = linalg.solve_triangular(self.factor, t, check_finite=False)
         rest = g - self.white(X @ d.reshape(q, -1).T)
@@ -79,20 +79,21 @@ class Complete:
         own = self.rows.X @ d.reshape(q, -1, parts.shape[1]).transpose(1, 0, 2).reshape(
             -1, q * parts.shape[1]
         )
-        own = own.reshape(n, q, -1)
-        out = np.stack([self.white(own[:, :, j]) for j in range(parts.shape[1])], axis=2)
+        out = self.white(own.reshape(n, q, -1))
         rest = parts[m:].reshape(2, n, q, -1)
         return np.asarray(out + rest[0] + 1j * rest[1])
 
     def white(self, e: Complex) -> Complex:
-        """(n, q) whitened, without nuisances."""
-        white = (self.root @ e[:, :, None])[:, :, 0]
+        """(n, q) or (n, q, p) whitened, without nuisances."""
+        white = self.root @ e.reshape(*e.shape[:2], -1)
         for on, Q in self.nuisances:
-            own = white[on].ravel()
+            own = white[on].reshape(-1, white.shape[2])
             goal = np.concatenate([own.real, own.imag])
             goal -= Q @ (Q.T @ goal)
-            white[on] = (goal[: own.size] + 1j * goal[own.size :]).reshape(-1, e.shape[1])
-        return np.asarray(white, np.complex128)
+            white[on] = (goal[: len(own)] + 1j * goal[len(own) :]).reshape(
+                on.size, *white.shape[1:]
+            )
+        return np.asarray(white.reshape(e.shape), np.complex128)
 
 
 def _columns(N: Complex) -> Float:

@@ -6,6 +6,8 @@ that of the best amplitudes, which for diffuse Gaussian ones is the marginal lik
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.polynomial import legendre
 
@@ -34,20 +36,13 @@ def wander(n: int, k: Int, q: int) -> Complex:
     return out.reshape(k.size, q, -1)
 
 
-def offsets(piece: Piece, k: Int, step: Float, loop: tuple[float, int] | None) -> Complex:
+def offsets(piece: Piece, k: Int, steps: Sequence[Float]) -> Complex:
     """(n_lines, q, 1 or 2) of an input that has an offset, and of a loop's sensor that has one:
     both act from the first sample on.
 
-    step : (m, q) answer to a step of the input. loop : its kp, and the sensor.
+    steps : (m, q) what the sensors show of a step of each.
     """
-    step = step[: piece.r.size]
-    shapes = [step]
-    if loop is not None:
-        kp, entry = loop
-        sensed = -kp * step
-        sensed[:, entry] += 1
-        shapes.append(sensed)
-    return np.stack([np.fft.rfft(y[piece.history :], axis=0)[k] for y in shapes], axis=2)
+    return np.stack([np.fft.rfft(y[piece.history :], axis=0)[k] for y in steps], axis=2)
 
 
 def edges(piece: Piece, k: Int, impulse: Float) -> Complex:

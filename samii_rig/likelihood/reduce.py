@@ -56,7 +56,8 @@ class Reduced:
     """A quadratic form in what a model has on the nodes.
 
     frequency : (b,) Hz of the nodes, s = sigma + 2 pi j f. reference : (b, q).
-    factor : (m, q, 2, b) so that factor . (Re d, Im d) - target (m,) is standard normal noise.
+    factor : (m, q, 2, b) so that factor . (Re d, Im d) - target (m,) is standard normal noise;
+    of one state upper triangular.
     known : directions of d that the records tell anything of, the mean of chi-square.
     inside : chi-square that no d explains, and its mean.
     noise : of a sample. differing : chi-square of levels against each other, and its mean.
@@ -78,9 +79,11 @@ class Reduced:
 
     def slopes(self, dh: Complex) -> Float:
         """(m, p) of derivatives (b, q, p)."""
-        b, q, p = dh.shape
-        flat = np.stack([dh.real, dh.imag]).transpose(2, 0, 1, 3).reshape(2 * q * b, p)
-        return np.asarray(self.factor.reshape(-1, 2 * q * b) @ flat)
+        flat = by_sensor(dh)
+        C = self.factor.reshape(len(flat), -1).T  # upper triangular
+        if flat.shape[1] == 1:
+            return np.asarray(linalg.blas.dtrmv(C, flat[:, 0], lower=1, trans=1)[:, None])
+        return np.asarray(linalg.blas.dtrmm(1.0, C, flat, lower=1, trans_a=1))
 
     @property
     def between(self) -> Float:
@@ -98,6 +101,12 @@ class Reduced:
         at_nodes[:-1] += off / 2
         at_nodes[1:] += off / 2
         return float(np.linalg.norm(self.slopes(at_nodes[:, :, None])))
+
+
+def by_sensor(dh: Complex) -> Float:
+    """(q 2 b, p) of derivatives (b, q, p): of each sensor all real parts, then imaginary ones."""
+    b, q, p = dh.shape
+    return np.stack([dh.real, dh.imag]).transpose(2, 0, 1, 3).reshape(2 * q * b, p)
 
 
 @dataclass(frozen=True)

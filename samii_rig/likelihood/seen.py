@@ -6,7 +6,7 @@ impulse. Neither is computed twice.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -20,23 +20,34 @@ from samii_rig.types import Complex, Float, Int
 class Answers:
     """A reference on its contour.
 
-    H : (M//2 + 1, q). loop : kp and sensor of the loop that H has closed. impulse, step : (m, q)
-    its answers to an impulse and a step of the input.
+    H : (M//2 + 1, q). loop : kp and sensor of the loop that H has closed. impulse : (m, q) its
+    answer to an impulse of the input.
     """
 
     H: Complex
     exact: Contour
     loop: tuple[float, int] | None
     impulse: Float
-    step: Float
+    kept: dict[int, list[Float]] = field(default_factory=dict)
 
     @classmethod
     def of(
         cls, H: Complex, exact: Contour, loop: tuple[float, int] | None, longest: int
     ) -> Answers:
         """longest : samples of any piece, input before it included."""
-        impulse = exact.record(H, min(2 * longest, exact.samples))
-        return cls(H, exact, loop, impulse, exact.predicted(H, np.ones(longest)))
+        return cls(H, exact, loop, exact.record(H, min(2 * longest, exact.samples)))
+
+    def steps(self, n: int) -> list[Float]:
+        """(n, q) what the sensors show of a step of the input, and of the loop's sensor."""
+        if n not in self.kept:
+            each = [self.H]
+            if self.loop is not None:
+                kp, entry = self.loop
+                sensed = -kp * self.H
+                sensed[:, entry] += 1
+                each.append(sensed)
+            self.kept[n] = [self.exact.predicted(H, np.ones(n)) for H in each]
+        return self.kept[n]
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +72,7 @@ class Seen:
         own += [nuisance.past(piece, k, answers.impulse)] if piece.moving else []
         own += [nuisance.unread(piece, k, y, H, exact, loop, step)]
         own += [nuisance.edges(piece, k, answers.impulse)]
-        own += [nuisance.offsets(piece, k, answers.step, loop)]
+        own += [nuisance.offsets(piece, k, answers.steps(piece.r.size))]
         N = np.concatenate(own, axis=2)
         size = np.linalg.norm(N, axis=(0, 1))
         return cls(

@@ -31,6 +31,7 @@ from samii_rig.model.registers import (
     System,
 )
 from samii_rig.model.sensing import source_feed, terms
+from samii_rig.model.weight import Weight, segments
 from samii_rig.rig.axial import turning
 from samii_rig.rig.schema import (
     BEAMS,
@@ -58,7 +59,7 @@ ENDS = {"free": FREE_END, "pinned": PINNED, "clamped": CLAMPED}
 AXIAL_BASE = {"free": FREE_END, "clamped": PINNED}
 TURNING_BASE = {"free": FREE_END, "clamped": GUIDED}
 AXIAL_TIP = {"free": GUIDED, "clamped": CLAMPED}
-WIDTH = 7  # the most parameters that an element has
+WIDTH = 9  # the most parameters that an element has, the tension of a beam among them
 L_OF_BEAM = 2  # place of L among the beams' parameters
 SOURCE_WIDTH = 4 + 6  # the most parameters of a source and of a hydraulic line behind it
 LINE_AT = 4  # place of the line's first among them
@@ -70,7 +71,8 @@ class CompiledChain:
 
     system : of the kernels; what depends on s comes from `factors.bind`.
     parameters : (element, symbol) of every parameter, in the file's order.
-    slots : (n_op, 7) index into `parameters` of each element's parameters, -1 for none.
+    slots : (n_op, 9) index into `parameters` of each element's parameters, -1 for none; from
+        their number on, of the loads of `weight`.
     source_slots : (n_source, 10) the same of each source and of the line behind it;
         source_values the values there.
     fixed, source_fixed : what is added to the parameters there: a beam's part is shorter
@@ -85,6 +87,7 @@ class CompiledChain:
     branches : (element of the kernels, chain, index into `parameters` of its first).
     rigid : indices into `parameters` that cannot change without a new chain, as a sensor or a
         position divides the beam whose length they are.
+    weight : what gravity loads, None without it.
     """
 
     system: System
@@ -105,28 +108,66 @@ class CompiledChain:
     places: tuple[tuple[str, float], ...]
     branches: tuple[tuple[int, CompiledChain, int], ...]
     rigid: frozenset[int]
+    weight: Weight | None = None
 
     def with_values(self, values: Float) -> CompiledChain:
         """The same chain with other values of all parameters; none of `rigid` may change."""
-        padded = np.append(values, 0.0)
+        padded = _padded(values, self.weight)
         pars = padded[self.slots] + self.fixed
         source = padded[self.source_slots] + self.source_fixed
         branches = tuple(
             (e, c.with_values(values[first : first + len(c.parameters)]), first)
             for e, c, first in self.branches
         )
+        if self.weight:
+            self.weight.load(pars, [c.mass() for _, c, _ in branches])
         system = self.system._replace(pars=pars)
         if self.sources:
             dual = np.column_stack([system.source_c[:, :4], source[:, 0]])
             system = system._replace(source_c=dual)
         return replace(self, system=system, values=values, source_values=source, branches=branches)
 
+    def mass(self) -> float:
+        """kg of a chain with a weight."""
+        assert self.weight
+        inner = [c.mass() for _, c, _ in self.branches]
+        return float(np.sum(self.weight.masses(self.system.pars, inner)))
 
-def _kind(element: Element) -> int:
+    def mass_slopes(self) -> Float:
+        """(n_op, n_param) of the masses of a chain with a weight."""
+        assert self.weight
+        by = self._by_values()
+        inner = []
+        for _, c, first in self.branches:
+            own = np.zeros(self.values.size)
+            own[first : first + c.values.size] = c.mass_slopes().sum(axis=0)
+            inner.append(own)
+        return self.weight.mass_slopes(self.system.pars, by, inner)
+
+    def load_slopes(self) -> Float:
+        """(n_load, n_param) of the loads of `weight`, (0, n_param) without one."""
+        if not self.weight:
+            return np.zeros((0, self.values.size))
+        inner = [c.mass() for _, c, _ in self.branches]
+        masses = self.weight.masses(self.system.pars, inner)
+        by = self._by_values()
+        return self.weight.slopes(self.system.pars, by, masses, self.mass_slopes())
+
+    def _by_values(self) -> Float:
+        """(n_op, WIDTH, n_param): 1 where a parameter of an operation is one of the chain's."""
+        return np.asarray(self.slots[:, :, None] == np.arange(self.values.size), dtype=float)
+
+
+def _padded(values: Float, weight: Weight | None) -> Float:
+    """The values, the loads (still 0) and the 0 of what is no parameter."""
+    return np.append(values, np.zeros(1 + (weight.size if weight else 0)))
+
+
+def _kind(element: Element, pull: float) -> int:
     match element:
-        case Beam():
+        case Beam() if pull == 0:
             return BEAM_KIND
-        case TimoshenkoBeam() | Branch() | Rod() | Gear() | Spindle():
+        case Beam() | TimoshenkoBeam() | Branch() | Rod() | Gear() | Spindle():
             return WAVES
         case RigidLink() | LumpedMass():
             return LINK
@@ -155,15 +196,28 @@ def _cuts(rig: Rig, extra: Mapping[str, Sequence[float]]) -> dict[str, list[floa
         for x in wanted:
             if not 0 <= x <= L:
                 raise InputError(element.name, "position", x, f"between 0 and L = {L:g} m")
-        cuts[element.name] = sorted(x for x in wanted if 0 < x < L)
+        inner = sorted(x for x in wanted if 0 < x < L)
+        cuts[element.name] = _in_segments(element, rig.pull, inner)
     return cuts
+
+
+def _in_segments(
+    beam: Beam | TimoshenkoBeam, pull: float, inner: Sequence[float] = ()
+) -> list[float]:
+    """The places `inner` of a beam and those at which its tension is cut into steps."""
+    out = list(inner)
+    for start, stop in pairwise([0.0, *inner, beam.L.value]):
+        out += segments(beam, pull, start, stop)
+    return sorted(out)
 
 
 class _Parts:
     """The elements of the kernels as they are listed, one list for each array."""
 
-    def __init__(self, cuts: Mapping[str, Sequence[float]], inputs: Sequence[str]) -> None:
-        self.cuts, self.inputs = cuts, inputs
+    def __init__(
+        self, cuts: Mapping[str, Sequence[float]], inputs: Sequence[str], pull: float
+    ) -> None:
+        self.cuts, self.inputs, self.pull = cuts, inputs, pull
         self.keys: list[tuple[str, str]] = []
         self.values: list[float] = []
         self.op: list[tuple[int, int, int]] = []  # kind, pair, row
@@ -196,10 +250,12 @@ class _Parts:
         elif isinstance(element, LumpedMass):
             index = [-1, -1, *index]  # a link of no length
         elif isinstance(element, Branch):
-            inner = compile_branch(element)
+            inner = compile_branch(element, self.pull)
             self.keys += inner.parameters
             self.values += list(inner.values)
             self.branches.append((len(self.op), inner, first))
+        if self.pull and isinstance(element, RigidLink):
+            self._moment(element)
         length = element.L.value if isinstance(element, (*BEAMS, RigidLink, Rod)) else 0.0
         inside = self.cuts.get(element.name, ())
         for start, stop in pairwise([0.0, *inside, length]):
@@ -215,8 +271,33 @@ class _Parts:
         if isinstance(element, BEAMS) and inside:
             self.rigid.add(index[L_OF_BEAM])
 
+    def _moment(self, element: Element) -> None:
+        """The moment of gravity on a body, before it."""
+        self.op.append((JUMP, POINTS["gravity_stiffness"].pair, self.rows[JUMP]))
+        self.rows[JUMP] += 1
+        self.kinds.append("gravity_stiffness")
+        self.slots.append([-1] * WIDTH)
+        self.fixed.append([0.0] * WIDTH)
+        self.places.append((element.name, 0.0))
+
+    def weight(self) -> Weight | None:
+        """What gravity loads."""
+        if not self.pull:
+            return None
+        kinds = [kind for kind, _, _ in self.op]
+        bodies = [e for e, kind in enumerate(kinds) if kind == LINK]
+        found = Weight(
+            self.pull,
+            tuple(e for e, kind in enumerate(self.kinds) if kind in ("beam", "timoshenko_beam")),
+            tuple(bodies),
+            tuple(e - 1 if self.kinds[e] == "rigid_link" else -1 for e in bodies),
+            tuple(e for e, _, _ in self.branches),
+        )
+        found.slots(self.slots, len(self.keys))
+        return found
+
     def _op(self, element: Element, slot: list[int], fixed: list[float]) -> None:
-        kind = _kind(element)
+        kind = _kind(element, self.pull)
         pair, row = -1, -1
         if kind in (JUMP, HINGE):
             pair, row = POINTS[element.kind].pair, self.rows[JUMP]
@@ -244,7 +325,7 @@ def compile_chain(rig: Rig, extra: Mapping[str, Sequence[float]] | None = None) 
 
     Raises InputError for a position that does not lie on its beam.
     """
-    parts = _Parts(_cuts(rig, extra or {}), [a.name for a in rig.actuator])
+    parts = _Parts(_cuts(rig, extra or {}), [a.name for a in rig.actuator], rig.pull)
     for element in rig.element:
         parts.add(element)
     term, term_c = terms(rig, parts.places)
@@ -272,10 +353,12 @@ def compile_chain(rig: Rig, extra: Mapping[str, Sequence[float]] | None = None) 
     )
 
 
-def compile_branch(branch: Branch) -> CompiledChain:
+def compile_branch(branch: Branch, pull: float = 0.0) -> CompiledChain:
     """A side chain with its root clamped: sources that move the root by w and theta of 1, and
-    sensors of M and V there, so that its response is the impedance of the branch."""
-    parts = _Parts({}, [])
+    sensors of M and V there, so that its response is the impedance of the branch. pull : gravity
+    along it, as of the chain that it stands on."""
+    beams = [e for e in branch.element if isinstance(e, BEAMS)]
+    parts = _Parts({e.name: _in_segments(e, pull) for e in beams}, [], pull)
     for element in branch.element:
         parts.add(element)
     dual = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -1.0, 0.0]])  # w and theta jump by +1
@@ -301,7 +384,7 @@ def _assemble(
     term_c: Float,
     at_end: tuple[tuple[int, int, int], ...],
 ) -> CompiledChain:
-    values = np.array(parts.values)
+    values, weight = np.array(parts.values), parts.weight()
     slots = np.array(parts.slots, dtype=np.int64)
     fixed = np.array(parts.fixed)
     source_slots = np.array(parts.source_slots, dtype=np.int64).reshape(-1, SOURCE_WIDTH)
@@ -311,15 +394,18 @@ def _assemble(
     for i, kind in enumerate(parts.sources):
         if kind in ("torque_source", "force_source") and source_slots[i, 1] < 0:
             source_fixed[i, 1] = math.inf  # no lag
-    padded = np.append(values, 0.0)
+    padded = _padded(values, weight)
     source_values = padded[source_slots] + source_fixed
     op = np.array(parts.op, dtype=np.int64)
     kinds = np.ascontiguousarray(op[:, 0])
+    pars = padded[slots] + fixed
+    if weight:
+        weight.load(pars, [inner.mass() for _, inner, _ in parts.branches])
     gain = source_values[:, 0] if parts.sources else np.ones(len(dual))  # a branch's are jumps of 1
     return CompiledChain(
         system=System(
             kinds=kinds,
-            pars=padded[slots] + fixed,
+            pars=pars,
             place=np.ascontiguousarray(op[:, 1:]),
             ends=np.array(ends, dtype=np.int64),
             source=np.array(source, dtype=np.int64).reshape(-1, 2),
@@ -345,4 +431,5 @@ def _assemble(
         places=tuple(parts.places),
         branches=tuple(parts.branches),
         rigid=frozenset(parts.rigid),
+        weight=weight,
     )

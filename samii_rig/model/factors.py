@@ -71,8 +71,12 @@ def _matrices(c: CompiledChain, s: Complex) -> Complex:
         elif c.kinds[e] in TRANSFORMERS:
             out[row] = transformer.matrix(c.kinds[e], s, c.system.pars[e])
         else:
-            out[row] = _law(c.kinds[e]).matrix(s, c.system.pars[e])
+            out[row] = _law(c.kinds[e]).matrix(s, _pars(c, e))
     return out
+
+
+def _pars(c: CompiledChain, e: int) -> Float:
+    return timoshenko.full(c.kinds[e], c.system.pars[e])
 
 
 def _law(kind: str) -> ModuleType:
@@ -126,7 +130,7 @@ def add_waves(
         elif c.kinds[e] in TRANSFORMERS:
             by = transformer.gradient(c.kinds[e], x.pars[e], z[row], zh[row])
         else:
-            by = _law(c.kinds[e]).gradient(s, x.pars[e], z[row], zh[row])
+            by = _law(c.kinds[e]).gradient(s, _pars(c, e), z[row], zh[row])
         for m in np.flatnonzero((to >= 0) & (slots >= 0)):
             for source, (_, actuator) in enumerate(x.source):
                 dH[:, :, actuator, to[m]] += x.source_c[source, 4] * by[m, :, :, source]
@@ -145,9 +149,17 @@ def _branch_gradient(inner: CompiledChain, s: Complex, z: Complex, zh: Complex) 
 def differentiate(
     c: CompiledChain, s: Complex, place: np.ndarray, n_wanted: int, n_out: int, n_in: int
 ) -> tuple[Complex, Complex]:
-    """H (n, n_out, n_in) and dH (..., n_wanted) of a compiled chain, `place` as in `add_waves`."""
+    """H (n, n_out, n_in) and dH (..., n_wanted) of a compiled chain, `place` as in `add_waves`.
+
+    The loads of gravity are parameters too while it is computed; what they depend on passes on.
+    """
+    by_load = np.zeros((c.weight.size if c.weight else 0, n_wanted))
+    if len(by_load):
+        wanted = np.flatnonzero(place[:-1] >= 0)
+        by_load[:, place[wanted]] = c.load_slopes()[:, wanted]
+        place = np.concatenate([place[:-1], n_wanted + np.arange(len(by_load)), [-1]])
     H = np.zeros((s.size, n_out, n_in), complex)
-    dH = np.zeros((*H.shape, n_wanted), complex)
+    dH = np.zeros((*H.shape, n_wanted + len(by_load)), complex)
     if s.size:
         f = bind(c, s, slopes=True)
         slots = place[c.slots]
@@ -156,6 +168,8 @@ def differentiate(
             slots[e, 0] = place[first : first + len(inner.parameters)].max()
         z, zh = respond.gradient(c.system, f, s, slots, place[c.source_slots], H, dH)
         add_waves(c, s, place, z, zh, dH)
+    if len(by_load):
+        dH = dH[..., :n_wanted] + dH[..., n_wanted:] @ by_load
     return H, dH
 
 
@@ -180,7 +194,7 @@ def characteristic(c: CompiledChain, s: Complex, clear: bool) -> tuple[Complex, 
     branches = {e for e, _, _ in c.branches}
     for e in c.waves:
         if e not in branches and c.kinds[e] not in TRANSFORMERS:
-            factor, more = _law(c.kinds[e]).scaling(s, c.system.pars[e])
+            factor, more = _law(c.kinds[e]).scaling(s, _pars(c, e))
             mantissa, log = mantissa * factor, log + more
     if not clear:
         return mantissa, log

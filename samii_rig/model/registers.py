@@ -64,7 +64,7 @@ Flag = NDArray[np.bool_]
 class System(NamedTuple):
     """A compiled chain, made by `chain.compile_chain`.
 
-    kinds (n_op,), pars (n_op, 7) : the elements, their parameters in the schema's order.
+    kinds (n_op,), pars (n_op, 9) : the elements, their parameters in the schema's order.
     place (n_op, 2) : of a point element its pair and its row in `Factors.jump`, of WAVES -1
         and its row in `Factors.matrix`.
     ends (2,) : boundary condition of base and tip.

@@ -25,7 +25,6 @@ from samii_rig.rig.schema import (
     Velocity,
 )
 from samii_rig.types import Float, Int
-from samii_rig.units import STANDARD_GRAVITY
 
 
 def source_feed(rig: Rig) -> Float:
@@ -100,7 +99,7 @@ def terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Int, Float]:
                     port = behind[sensor.on]  # a table moves what is behind it
                 add(i, port, w=1.0, theta=arm, factor=ACCELERATION)
                 if sensor.tilt:
-                    add(i, port, theta=sensor.tilt * STANDARD_GRAVITY)
+                    add(i, port, theta=sensor.tilt * rig.tilt_gravity())
     return (
         np.array(term, dtype=np.int64).reshape(-1, 4),
         np.array(term_c, dtype=np.float64).reshape(-1, 4),

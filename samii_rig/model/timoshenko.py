@@ -6,12 +6,10 @@ z' = A z has four waves exp(+-lambda x), lambda^2 from
 
     lambda^4 - lambda^2 (mu s^2/GA + J s^2/EI) + mu s^2 (1 + J s^2/GA)/EI = 0.
 
-U is kept as P, two decays and Q: with the amplitudes (a, b, m, n) = P z of the waves
-(+lambda_1, -lambda_1, +lambda_2, -lambda_2), Re lambda_1 >= Re lambda_2 >= 0, behind the beam
-z = Q (a/E1, E1 b, m/E2, E2 n), E = exp(-lambda L). The kernel scales as it needs, so that
-only decaying factors are left (`sweep.waves`). Where the waves are longer than the beam they
-are nearly alike and P loses digits; there a power series of U stands in Q, its P only sorts
-the states, and E1 = E2 = 1.
+A tension N + N' (x - L/2) (`weight`) adds itself times theta to M'. The power series bears it as
+it is; waves, where they are much shorter than the beam, have that of the middle: J s^2 is then
+J s^2 + N in the equation above. Such a beam of Euler and Bernoulli is one whose shear stiffness is
+beyond all numbers.
 """
 
 from __future__ import annotations
@@ -24,7 +22,11 @@ from samii_rig.types import Complex, Float
 
 LONG = 1.5  # |lambda_1| L from which the waves are used: they lose (lambda L)^-3 at most
 TERMS = 26  # of the power series: 1.5^26/26! < 1e-22
-EI, MU, LENGTH, ETA, TAU, GA, J = range(7)  # places among the parameters
+# The same of a beam with tension, which its waves do not know to change: the series costs two
+# digits at |lambda_1| L = 5, and 5^48/48! < 1e-27.
+TENSE_LONG, TENSE_TERMS = 5.0, 48
+EI, MU, LENGTH, ETA, TAU, GA, J, TENSION, SLOPE = range(9)  # places among the parameters
+RIGID_IN_SHEAR = 1e150  # N, GA of a beam without shear: its reciprocal adds to no other number
 ROWS = 34  # P (16), Q (16), E1, E2
 SORT = np.zeros((4, 4))  # (w, theta, M, V) to (theta, w, M, V): theta leads, as in the sweep
 SORT[0, 1] = SORT[1, 0] = SORT[2, 2] = SORT[3, 3] = 1.0
@@ -44,6 +46,19 @@ class Waves(NamedTuple):
     dual: Complex
 
 
+def full(kind: str, p: Float) -> Float:
+    """The parameters of a beam of either kind, as this module reads them."""
+    if kind != "beam":
+        return p
+    out = p.copy()
+    out[GA] = RIGID_IN_SHEAR
+    return out
+
+
+def _tense(p: Float) -> bool:
+    return bool(p[TENSION] != 0 or p[SLOPE] != 0)
+
+
 def _g(s: Complex, p: Float) -> Complex:
     return np.asarray(1 + 1j * p[ETA] * np.where(s.imag < 0, -1.0, 1.0) + s * p[TAU])
 
@@ -52,7 +67,7 @@ def waves(s: Complex, p: Float) -> Waves:
     """Wave numbers and states of the four waves."""
     g = _g(s, p)
     B, G = p[EI] * g, p[GA] * g
-    m, j = p[MU] * s**2, p[J] * s**2
+    m, j = p[MU] * s**2, p[J] * s**2 + p[TENSION]
     b, c = m / G + j / B, m * (1 + j / G) / B
     root = np.sqrt((m / G - j / B) ** 2 - 4 * m / B)
     root = np.where((root.conj() * b).real < 0, -root, root)
@@ -62,7 +77,8 @@ def waves(s: Complex, p: Float) -> Waves:
     one, two = np.sqrt(big), np.sqrt(other)
     swap = two.real > one.real
     one, two = np.where(swap, two, one), np.where(swap, one, two)
-    long = np.maximum(np.abs(one), np.abs(two)) * p[LENGTH] > LONG
+    reach = TENSE_LONG if _tense(p) else LONG
+    long = np.maximum(np.abs(one), np.abs(two)) * p[LENGTH] > reach
     vectors = np.zeros((s.size, 4, 4), complex)
     for k, x in ((0, one), (2, two)):
         x = np.where(x == 0, 1.0, x)
@@ -87,23 +103,36 @@ def waves(s: Complex, p: Float) -> Waves:
 
 
 def _series(s: Complex, p: Float, z: Complex) -> Complex:
-    """c_k (TERMS, n, 4, m) with z(x) = sum_k (x/L)^k c_k for the states z (n, 4, m) at x = 0."""
+    """c_k (terms, n, 4, m) with z(x) = sum_k (x/L)^k c_k for the states z (n, 4, m) at x = 0."""
     g = _g(s, p)
     L, B, G = p[LENGTH], p[EI] * g, p[GA] * g
-    m, j = p[MU] * s**2, p[J] * s**2
-    out = np.zeros((TERMS, *z.shape), complex)
+    m, j = p[MU] * s**2, p[J] * s**2 + p[TENSION] - p[SLOPE] * L / 2
+    terms = TENSE_TERMS if _tense(p) else TERMS
+    out = np.zeros((terms, *z.shape), complex)
     out[0] = z
-    for k in range(1, TERMS):
+    for k in range(1, terms):
         w, t, M, V = (out[k - 1, :, i] * (L / k) for i in range(4))
         out[k, :, 0] = t - V / G[:, None]
         out[k, :, 1] = M / B[:, None]
         out[k, :, 2] = V + j[:, None] * t
+        if k > 1 and p[SLOPE]:
+            out[k, :, 2] += p[SLOPE] * L**2 / k * out[k - 2, :, 1]
         out[k, :, 3] = -m[:, None] * w
     return out
 
 
 def matrix(s: Complex, p: Float) -> Complex:
-    """(2, ROWS, n) for the kernel, forwards and mirrored: a uniform beam is its own mirror."""
+    """(2, ROWS, n) for the kernel, forwards and mirrored: a uniform beam is its own mirror, one
+    whose tension falls is that of one whose tension rises."""
+    forwards = _matrix(s, p)
+    if p[SLOPE] == 0:
+        return np.stack([forwards, forwards])
+    back = p.copy()
+    back[SLOPE] = -p[SLOPE]
+    return np.stack([forwards, _matrix(s, back)])
+
+
+def _matrix(s: Complex, p: Float) -> Complex:
     w = waves(s, p)
     out = np.zeros((ROWS, s.size), complex)
     P = np.where(w.long[:, None, None], w.dual, SORT)
@@ -117,7 +146,7 @@ def matrix(s: Complex, p: Float) -> Complex:
     out[16:32] = Q.reshape(-1, 16).T
     out[32] = np.where(short, 1.0, np.exp(-w.one * p[LENGTH]))
     out[33] = np.where(short, 1.0, np.exp(-w.two * p[LENGTH]))
-    return np.stack([out, out])
+    return out
 
 
 def scaling(s: Complex, p: Float) -> tuple[Complex, Float]:
@@ -128,26 +157,30 @@ def scaling(s: Complex, p: Float) -> tuple[Complex, Float]:
 
 
 def gradient(s: Complex, p: Float, z: Complex, zh: Complex) -> Complex:
-    """(7, n, n_sensor, n_source) dy/dp at unit sources.
+    """(9, n, n_sensor, n_source) dy/dp at unit sources.
 
     z (n, 8, n_source), zh (n, 8, n_sensor) : states behind (4) and before the beam (4) and
     the sensors' duals. dy/dx_ij = -zh^T J e_i z_j summed over the beam for each entry of A
-    (`gradient`), so all follow from the integrals of w wh, theta thetah, M Mh, V Vh.
+    (`gradient`), so all follow from the integrals of w wh, theta thetah, M Mh, V Vh and of
+    theta thetah times the distance from the middle.
     """
-    full = waves(s, p)
-    integral = np.zeros((4, s.size, zh.shape[2], z.shape[2]), complex)
-    for chosen, take in ((full.long, _long_integrals), (~full.long, _short_integrals)):
+    found = waves(s, p)
+    integral = np.zeros((5, s.size, zh.shape[2], z.shape[2]), complex)
+    for chosen, take in ((found.long, _long_integrals), (~found.long, _short_integrals)):
         if chosen.any():
-            part = Waves(*(x[chosen] for x in full))
+            part = Waves(*(x[chosen] for x in found))
             integral[:, chosen] = take(s[chosen], p, part, z[chosen], zh[chosen])
     w, t, M, V = (z[:, None, i, :] for i in range(4))
     wh, th, Mh, Vh = (zh[:, i, :, None] for i in range(4))
-    ww, tt, MM, VV = integral
-    g = full.g[:, None, None]
+    ww, tt, MM, VV, xtt = integral
+    g = found.g[:, None, None]
     s2 = (s**2)[:, None, None]
-    B, G = p[EI] * g, p[GA] * g
+    B, G, L = p[EI] * g, p[GA] * g, p[LENGTH]
     by_g = MM / (B * g) + VV / (G * g)
     by_L = p[MU] * s2 * w * wh + t * Vh + th * V - M * Mh / B - V * Vh / G + p[J] * s2 * t * th
+    if _tense(p):
+        change = np.where(found.long, 0.0, p[SLOPE])[:, None, None]  # waves know of none
+        by_L += (p[TENSION] + change * L / 2) * t * th - change * tt / 2
     sign = np.where(s.imag < 0, -1.0, 1.0)[:, None, None]
     return np.stack(
         [
@@ -158,13 +191,15 @@ def gradient(s: Complex, p: Float, z: Complex, zh: Complex) -> Complex:
             s[:, None, None] * by_g,
             VV / (G * p[GA]),
             s2 * tt,
+            tt,
+            xtt,
         ]
     )
 
 
 def _long_integrals(s: Complex, p: Float, w: Waves, z: Complex, zh: Complex) -> Complex:
-    """(4, n, n_sensor, n_source): growing waves by their amplitudes behind the beam, decaying
-    ones by those before it."""
+    """(5, n, n_sensor, n_source): growing waves by their amplitudes behind the beam, decaying
+    ones by those before it. The last is 0: waves do not know of a change of tension."""
     L = p[LENGTH]
     a = np.zeros((s.size, 4, z.shape[2]), complex)
     ah = np.zeros((s.size, 4, zh.shape[2]), complex)
@@ -184,17 +219,22 @@ def _long_integrals(s: Complex, p: Float, w: Waves, z: Complex, zh: Complex) -> 
             else:
                 Phi[:, k, m] = (np.exp(-y * L) - np.exp(-x * L)) / (x - y)
     v = w.vectors
-    return np.stack(
-        [np.einsum("nk,nm,nkm,nka,nmb->nba", v[..., i], v[..., i], Phi, a, ah, optimize=True)
-         for i in range(4)]
-    )  # fmt: skip
+    found = [np.einsum("nk,nm,nkm,nka,nmb->nba", v[..., i], v[..., i], Phi, a, ah, optimize=True)
+             for i in range(4)]  # fmt: skip
+    return np.stack([*found, np.zeros_like(found[0])])
 
 
 def _short_integrals(s: Complex, p: Float, w: Waves, z: Complex, zh: Complex) -> Complex:
     c, ch = _series(s, p, z[:, 4:]), _series(s, p, zh[:, 4:])
-    k = np.arange(TERMS)
-    weight = p[LENGTH] / (k[:, None] + k + 1)
-    return np.asarray(np.einsum("knia,kl,lnib->inba", c, weight, ch, optimize=True))
+    k = np.arange(len(c))
+    power = k[:, None] + k
+    weight = p[LENGTH] / (power + 1)
+    found = np.einsum("knia,kl,lnib->inba", c, weight, ch, optimize=True)
+    if p[SLOPE] == 0:
+        return np.concatenate([found, np.zeros_like(found[:1])])
+    from_middle = p[LENGTH] ** 2 * (1 / (power + 2) - 0.5 / (power + 1))
+    turned = np.einsum("kna,kl,lnb->nba", c[:, :, 1], from_middle, ch[:, :, 1], optimize=True)
+    return np.concatenate([found, turned[None]])
 
 
 def end_slopes(s: Complex, p: Float, z: Complex) -> tuple[Complex, Complex]:

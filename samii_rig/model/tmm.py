@@ -34,7 +34,6 @@ from samii_rig.rig.schema import (
     parameters,
 )
 from samii_rig.types import Complex, Float
-from samii_rig.units import STANDARD_GRAVITY
 
 State = Literal["w", "theta", "M", "V"]
 
@@ -151,7 +150,7 @@ class Chain:
             if s.size and place[parameter] >= 0:
                 z = self.field_at(s)[:, :, port]
                 slope, bend = self._end_slopes(s, parameter, z)
-                moved = (s**2)[:, None] * slope + _tilt(sensors[sensor]) * bend
+                moved = (s**2)[:, None] * slope + _tilt(sensors[sensor], self._rig) * bend
                 dH[:, sensor, :, place[parameter]] -= moved
         return H, dH
 
@@ -318,8 +317,8 @@ def _element_with(element: Element, values: Mapping[tuple[str, str], float]) -> 
     return element.model_copy(update=new) if new else element
 
 
-def _tilt(sensor: Sensor) -> float:
-    return sensor.tilt * STANDARD_GRAVITY if isinstance(sensor, Acceleration) else 0.0
+def _tilt(sensor: Sensor, rig: Rig) -> float:
+    return sensor.tilt * rig.tilt_gravity() if isinstance(sensor, Acceleration) else 0.0
 
 
 def _s(frequency_hz: ArrayLike) -> Complex:

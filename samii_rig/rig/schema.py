@@ -58,6 +58,7 @@ from samii_rig.rig.elements import (
     input_unit,
     parameters,
 )
+from samii_rig.rig.pose import Pose, check_gravity, pull
 from samii_rig.rig.sensors import (
     AbsoluteAngle,
     Acceleration,
@@ -72,6 +73,7 @@ from samii_rig.rig.sensors import (
     Velocity,
     places,
 )
+from samii_rig.units import STANDARD_GRAVITY
 
 __all__ = [
     "ANGLE_SOURCES",
@@ -377,6 +379,8 @@ class Rig(Strict):
     """A rig file. Elements stand in the order base to tip.
 
     motion : "lateral" for a chain that bends and turns, "axial" for one that moves along itself.
+    gravity : m/s^2, 0 for none. pose : angle of the straight chain, base to tip, to the way down:
+        0 (if left out) it hangs, 90 deg it is level, 180 deg it stands.
     """
 
     name: str = Field(min_length=1)
@@ -385,6 +389,8 @@ class Rig(Strict):
     base: End
     tip: End
     rate_hz: Positive
+    gravity: NonNegative = 0.0
+    pose: Pose | None = None
     element: Annotated[tuple[Element, ...], Field(min_length=1)]
     sensor: Annotated[tuple[Sensor, ...], Field(min_length=1)]
     actuator: Annotated[tuple[ActuatorSpec, ...], Field(min_length=1)]
@@ -414,6 +420,7 @@ class Rig(Strict):
         inputs = {a.name: a for a in self.actuator}
         _unlike([e.name for e in flattened(self.element)])
         check_motion(self)
+        check_gravity(self)
         for before, e in zip((None, *self.element), self.element, strict=False):
             if isinstance(e, SOURCES):
                 _driven(e, inputs)
@@ -522,6 +529,16 @@ class Rig(Strict):
         if actuator == first.name:
             return self.centring
         return next((a.centring for a in others if a.name == actuator), None)
+
+    @property
+    def pull(self) -> float:
+        """Gravity along the chain, base to tip, m/s^2: negative where it stands."""
+        return pull(self.gravity, self.pose)
+
+    def tilt_gravity(self) -> float:
+        """What a tilting accelerometer reads a rad, m/s^2: `pull`, or with no gravity in the rig
+        file that of a hanging chain."""
+        return self.pull if self.gravity else STANDARD_GRAVITY
 
     def units(self) -> dict[str, str]:
         """Unit of every channel, actuators, sensors and monitors, by name."""

@@ -235,7 +235,10 @@ def _refuse_falling(rig: Rig) -> None:
     Only what stands on a joint can do that. A chain with stiffness and gravity falls without
     swinging: its pole is real, where D, which is real there, changes its sign.
     """
-    if not any(isinstance(e, GravityStiffness) and e.k.value < 0 for e in flattened(rig.element)):
+    stands = rig.pull < 0 or any(
+        isinstance(e, GravityStiffness) and e.k.value < 0 for e in flattened(rig.element)
+    )
+    if not stands:
         return
     s = np.geomspace(LOWEST_FALL, HIGHEST_FALL, FALLS) * rig.rate_hz
     D, _ = Chain(rig).characteristic(s.astype(np.complex128), clear=True)

@@ -15,7 +15,8 @@ from itertools import combinations
 import numpy as np
 
 from samii_rig.diagnose.data.measured import repeated, whole_part
-from samii_rig.diagnose.data.wiring import FEW_LINES, lines_of, named, outputs_of, wired
+from samii_rig.diagnose.data.pace import paced
+from samii_rig.diagnose.data.wiring import FEW_LINES, Mend, lines_of, named, outputs_of, wired
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Verdict
 from samii_rig.errors import EstimateError, InputError
@@ -41,7 +42,8 @@ class Sound:
     """responses : as they may be trusted. told : what was found, in words; lacks : what these
     recordings cannot tell, in words. doubt : why nothing may be named, or None; guessed : the same
     of responses line by line, whole records have it not.
-    units : channels whose unit was mended. mended : whether anything was, in the responses.
+    units : channels whose unit was mended. mended : whether anything was, in the responses alone;
+    mend : of all recordings' columns, the same as in the responses.
     of_lines : of `told`, what concerns responses alone. samples : why segments or channels were
     left out for what their samples are."""
 
@@ -54,6 +56,7 @@ class Sound:
     guessed: Doubt | None = None
     of_lines: frozenset[str] = frozenset()
     samples: tuple[Finding, ...] = ()
+    mend: Mend | None = None
 
     @property
     def sensors(self) -> tuple[str, ...]:
@@ -98,18 +101,20 @@ def sound(
     given = responses
     responses, doubt = _timed(given, told)
     finite, said = _finite(_fine(responses))
-    mended, wiring, units = wired(finite, rig)
-    steady, changed = _steady(mended)
+    paced(finite, rig)
+    found = wired(finite, rig)
+    steady, changed = _steady(found.responses)
     guessed = None
     if not any(repeated(r) for r in steady):
         guessed = Doubt(NO_REPEATS, "repeat each run three times, each from rest", "ambiguous")
     return Sound(
         tuple(steady),
-        tuple(told + said + wiring + changed),
+        tuple(told + said + found.told + changed),
         lacks(steady, rig),
         doubt,
-        units,
-        mended=bool(said or wiring or changed),
+        found.units,
+        mended=bool(said or changed or (found.told and found.mend is None)),
+        mend=found.mend if found.told else None,
         guessed=guessed,
         of_lines=frozenset(estimated(responses, OF_LINES)),
         samples=tuple(

@@ -7,16 +7,16 @@ channels each fit the other's model. All are mended, as they are exactly known.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
-from samii_rig.diagnose.data.confusions import nearest
+from samii_rig.diagnose.physics.confusions import UNITS, nearest
 from samii_rig.model.sampled import sampled_response
-from samii_rig.rig.schema import Rig
-from samii_rig.types import Complex, Float, FrequencyResponse
+from samii_rig.rig.schema import SOURCES, Rig, parameters
+from samii_rig.types import Complex, Float, FrequencyResponse, Recording
 
 POINTS = 300  # lines of a response that are looked at
 UNIT_WITHIN = 1.25  # factor between a channel's gain and a unit; what a rig file may be off by
@@ -28,27 +28,75 @@ MOST_MISFIT = 4.0  # of one line: what is far off in any case
 FEW_LINES = 12  # below which nothing can be told from noise
 
 
-def wired(
-    responses: Sequence[FrequencyResponse], rig: Rig
-) -> tuple[list[FrequencyResponse], list[str], frozenset[str]]:
-    """Channels in the rig file's order, units and signs; what was changed, once for all
-    responses that share it; the channels whose unit was."""
+@dataclass(frozen=True, slots=True)
+class Mend:
+    """What makes columns those of the rig file. source : of each that is changed, by name, the
+    column that holds it and the factor that it is multiplied by."""
+
+    source: Mapping[str, tuple[str, float]]
+
+    def __call__(self, run: Recording) -> Recording:
+        """A recording with these columns mended; others, and columns that it lacks, stay."""
+        values, quality = run.values.copy(), run.quality.copy()
+        have = {c.name for c in run.channels}
+        for name, (column, factor) in self.source.items():
+            if {name, column} <= have:
+                i, j = run.column(name), run.column(column)
+                values[:, i] = factor * run.values[:, j]
+                quality[:, i] = run.quality[:, j]
+        return replace(run, values=values, quality=quality)
+
+
+@dataclass(frozen=True, slots=True)
+class Wired:
+    """Responses with channels in the rig file's order, units and signs.
+
+    told : what was changed, once for all that share it. units : channels whose unit was.
+    mend : the same for their recordings; None where it differs from one response to another.
+    """
+
+    responses: list[FrequencyResponse]
+    told: list[str]
+    units: frozenset[str]
+    mend: Mend | None
+
+
+def wired(responses: Sequence[FrequencyResponse], rig: Rig) -> Wired:
+    """What the ratio of each response to the rig's model tells of units, signs and order."""
     where: dict[str, list[FrequencyResponse]] = {}
-    out, units = [], set()
+    out, units, mends = [], set(), []
     for r in responses:
-        mended, said, gains = _mended(r, rig)
+        mended, said, order, gains = _mended(r, rig)
         out.append(mended)
         units |= {c.name for c, g in zip(r.outputs, gains, strict=True) if abs(g) != 1}
+        mends.append(_columns(r, order, gains))
         for text in said:
             where.setdefault(text, []).append(r)
     told = []
     for text, those in where.items():
         some = f" ({', '.join(dict.fromkeys(named(r) for r in those))})"
         told.append(text + ("" if len(those) == len(responses) else some))
-    return out, told, frozenset(units)
+    alike = all(m == mends[0] for m in mends)
+    return Wired(out, told, frozenset(units), Mend(mends[0]) if mends and alike else None)
 
 
-def _mended(r: FrequencyResponse, rig: Rig) -> tuple[FrequencyResponse, list[str], Float]:
+def _columns(
+    r: FrequencyResponse, order: Sequence[int], gains: Float
+) -> dict[str, tuple[str, float]]:
+    """As of `Mend`. What all channels share is the input's."""
+    names = [c.name for c in r.outputs]
+    if len(names) > 1 and gains[0] != 1 and np.all(gains == gains[0]):
+        out = {c.name: (c.name, 1 / float(gains[0])) for c in r.inputs}
+        gains = np.ones(len(names))
+    else:
+        out = {}
+    each = zip(names, order, gains.tolist(), strict=True)
+    return out | {n: (names[k], g) for n, k, g in each if names[k] != n or g != 1}
+
+
+def _mended(
+    r: FrequencyResponse, rig: Rig
+) -> tuple[FrequencyResponse, list[str], list[int], Float]:
     pick = np.unique(np.linspace(0, r.frequency.size - 1, POINTS).astype(int))
     names = [s.name for s in rig.sensor]
     on = [names.index(c.name) for c in r.outputs]
@@ -66,8 +114,8 @@ def _mended(r: FrequencyResponse, rig: Rig) -> tuple[FrequencyResponse, list[str
         labels = r.outputs
         r = replace(outputs_of(r, order), outputs=labels)
         H = H[:, order]
-    gains, words = _gains(H, model, r)
-    return scaled(r, gains) if words else r, said + words, gains
+    gains, words = _gains(H, model, r, _loose(rig))
+    return scaled(r, gains) if words else r, said + words, order, gains
 
 
 def _ratio(H: Complex, model: Complex) -> Complex:
@@ -76,7 +124,8 @@ def _ratio(H: Complex, model: Complex) -> Complex:
     return np.asarray(np.log(np.where(good, H, np.nan) / np.where(good, model, np.nan)))
 
 
-def _misfit(H: Complex, model: Complex) -> float:
+def misfit(H: Complex, model: Complex) -> float:
+    """Mean squared logarithm of measurement over model, of one line `MOST_MISFIT` at most."""
     log = np.abs(_ratio(H, model)) ** 2
     return float(np.nanmean(np.minimum(log, MOST_MISFIT)))
 
@@ -85,8 +134,8 @@ def _swaps(H: Complex, model: Complex) -> list[tuple[int, int]]:
     """Pairs of outputs that each fit the other's model, the clearest first, none twice."""
     found = []
     for a, b in combinations(range(H.shape[1]), 2):
-        before = (_misfit(H[:, [a]], model[:, [a]]), _misfit(H[:, [b]], model[:, [b]]))
-        after = (_misfit(H[:, [b]], model[:, [a]]), _misfit(H[:, [a]], model[:, [b]]))
+        before = (misfit(H[:, [a]], model[:, [a]]), misfit(H[:, [b]], model[:, [b]]))
+        after = (misfit(H[:, [b]], model[:, [a]]), misfit(H[:, [a]], model[:, [b]]))
         if min(before) > MISFIT and max(after) < SWAPPED * min(before):
             found.append((sum(after), a, b))
     out: list[tuple[int, int]] = []
@@ -96,11 +145,19 @@ def _swaps(H: Complex, model: Complex) -> list[tuple[int, int]]:
     return out
 
 
-def _gains(H: Complex, model: Complex, r: FrequencyResponse) -> tuple[Float, list[str]]:
+def _loose(rig: Rig) -> float:
+    """By what part the gain of a source may be off, by its tolerance."""
+    sources = [e for e in rig.element if isinstance(e, SOURCES)]
+    return max((parameters(e)["K"].tolerance for e in sources), default=0.0)
+
+
+def _gains(
+    H: Complex, model: Complex, r: FrequencyResponse, loose: float
+) -> tuple[Float, list[str]]:
     """Factors (n_out,) that bring every output to the rig file's unit and sign, and words."""
     log = _ratio(H, model)
     n = log.shape[1]
-    unit = [_unit(log[:, k]) for k in range(n)]
+    unit = [_unit(log[:, k], loose) for k in range(n)]
     turned = [_opposite(log[:, k]) for k in range(n)]
     gains, words = np.ones(n), []
     inputs = ", ".join(c.name for c in r.inputs)
@@ -121,8 +178,9 @@ def _gains(H: Complex, model: Complex, r: FrequencyResponse) -> tuple[Float, lis
     return gains, words
 
 
-def _unit(log: Complex) -> float:
-    """The factor between units that all lines of an output share; 1 for none."""
+def _unit(log: Complex, loose: float) -> float:
+    """The factor between units that all lines of an output share; 1 for none, or where two are as
+    near as a drive's gain may be off: these are told apart by the fit."""
     size = log.real[np.isfinite(log)]
     if size.size < FEW_LINES:
         return 1.0
@@ -130,6 +188,10 @@ def _unit(log: Complex) -> float:
     if high - low > 2 * math.log(ALIKE):
         return 1.0
     _, best = nearest(math.exp(float(middle)))
+    reach = math.log(UNIT_WITHIN) + 2 * loose
+    others = [f for u in UNITS for f in (u.factor, 1 / u.factor, 1.0) if f != best]
+    if any(abs(float(middle) - math.log(f)) < reach for f in others):
+        return 1.0
     return best if abs(float(middle) - math.log(best)) < math.log(UNIT_WITHIN) else 1.0
 
 

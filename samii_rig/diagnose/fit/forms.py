@@ -65,33 +65,52 @@ class Lines:
 
 @dataclass(frozen=True, slots=True)
 class Dense:
-    """Of residuals r + K (Re phi, Im phi) that are not one frequency's each.
+    """Of residuals r + K x that are not one frequency's each, x of each frequency Re phi, Im phi.
 
-    K : (p, 2 n) and r (p,), directions projected out. on : of all frequencies, the n that count.
+    square (2 n, 2 n) : K'K. lin (2 n,) : K'r. power : of r. on : of all frequencies, the n that
+    count.
     """
 
-    K: Float
-    r: Float
-    more: float
+    square: Float
+    lin: Float
+    power: float
     on: slice
+
+    @classmethod
+    def of(cls, b: Complex, A: Float, pull: Float, turn: Float, power: float, on: slice) -> Dense:
+        """Of a part that moves the prediction by b phi.
+
+        b : (n, q). A : (n, 2 q, n, 2 q), pull (n, 2 q) and turn (m, n, 2 q) : products of the
+        changes of each frequency (real parts of all sensors, then imaginary ones) with each other,
+        with what is left, and with the directions that are projected out.
+        """
+        n, q = b.shape
+        one, other = (np.concatenate([x.real, x.imag], axis=1) for x in (b, 1j * b))
+        moved = np.stack([one, other], axis=2)
+        half = moved.swapaxes(1, 2) @ A.reshape(n, 2 * q, -1)
+        half = half.reshape(2 * n, n, 2 * q).swapaxes(0, 1) @ moved
+        along = (turn.swapaxes(0, 1) @ moved).swapaxes(0, 1).reshape(len(turn), 2 * n)
+        square = half.swapaxes(0, 1).reshape(2 * n, 2 * n) - along.T @ along
+        return cls(square, (pull[:, None, :] @ moved).ravel(), power, on)
 
     def cost(self, phi: Complex) -> Float:
         """As of `Form`."""
-        left = self._moved(phi) + self.r
-        cost = np.sum(left**2, axis=1) + self.more
+        x = self._parts(phi)
+        cost = self.power + np.sum(x * (x @ self.square + 2 * self.lin), axis=1)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     def normal(self, phi: Complex, d: Complex) -> tuple[Float, Float]:
         """As of `Form`."""
         m, k, n = d.shape
-        left = self._moved(phi) + self.r
-        along = self._moved(d.reshape(m * k, n)).reshape(m, k, -1)
-        g = np.einsum("mkp,mp->mk", along, left)
-        return np.asarray(g), np.asarray(along @ along.swapaxes(1, 2))
+        down = self._parts(phi) @ self.square + self.lin
+        x = self._parts(d.reshape(m * k, n))
+        g = np.einsum("mkp,mp->mk", x.reshape(m, k, -1), down)
+        H = (x @ self.square).reshape(m, k, -1) @ x.reshape(m, k, -1).swapaxes(1, 2)
+        return np.asarray(g), np.asarray(H)
 
-    def _moved(self, phi: Complex) -> Float:
-        phi = phi[:, self.on]
-        return np.asarray(np.concatenate([phi.real, phi.imag], axis=1) @ self.K.T)
+    def _parts(self, phi: Complex) -> Float:
+        """(m, 2 n) real and imaginary parts of phi (m, n_all) side by side."""
+        return np.ascontiguousarray(phi[:, self.on], np.complex128).view(np.float64)
 
 
 def descend(

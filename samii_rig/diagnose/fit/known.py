@@ -16,8 +16,9 @@ WHERE = "--known"
 SHAPE = "ELEMENT.PARAMETER=VALUE, as accelerometer_mass.m=0"
 
 
-def stated(words: Sequence[str]) -> dict[str, float]:
-    """{"element.parameter": value} from `element.parameter=value`, in the rig file's units.
+def stated(words: Sequence[str], where: str = WHERE) -> dict[str, float]:
+    """{"element.parameter": value} from `element.parameter=value`, in the rig file's units. where :
+    the option.
 
     Raises InputError for what is not of this form, a number that is none, or a name twice.
     """
@@ -29,35 +30,36 @@ def stated(words: Sequence[str]) -> dict[str, float]:
         except ValueError:
             value = math.nan
         if not sign or "." not in name or not math.isfinite(value):
-            raise InputError(WHERE, "", word, SHAPE)
+            raise InputError(where, "", word, SHAPE)
         if name in out:
-            raise InputError(WHERE, name, word, "each parameter once")
+            raise InputError(where, name, word, "each parameter once")
         out[name] = value
     return out
 
 
-def with_known(rig: Rig, known: Mapping[str, float]) -> Rig:
-    """The rig with these parameters, by "element.parameter", at these values, exactly.
+def with_known(rig: Rig, known: Mapping[str, float], where: str = WHERE) -> Rig:
+    """The rig with these parameters, by "element.parameter", at these values, exactly. where : the
+    option that states them.
 
     Raises InputError for an element or a parameter that the rig file does not have, or a value
     that no rig can have.
     """
-    data = tables(toml(rig), WHERE)
+    data = tables(toml(rig), where)
     every = {e.name: e for e in flattened(rig.element)}
     rows = {row["name"]: row for row in _flat(data["element"])}
     for name, value in known.items():
         element, _, symbol = name.rpartition(".")
         if element not in every:
-            raise InputError(WHERE, name, element, one_of(element, every))
+            raise InputError(where, name, element, one_of(element, every))
         have = parameters(every[element])
         if symbol not in have:
-            raise InputError(WHERE, name, symbol, one_of(symbol, have))
+            raise InputError(where, name, symbol, one_of(symbol, have))
         rows[element][symbol] = {
             "value": value,
             "unit": have[symbol].unit,
             "source": f"stated as known; in the rig file {have[symbol].value:g}",
         }
-    return checked(Rig, data, WHERE) if known else rig
+    return checked(Rig, data, where) if known else rig
 
 
 def _flat(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from scipy import optimize, stats
 
 from samii_rig.diagnose.fit import forms
-from samii_rig.diagnose.fit.explanations import FIVE, Explanation
+from samii_rig.diagnose.fit.explanations import FIVE, Explanation, threshold
 from samii_rig.diagnose.fit.forms import Form
 from samii_rig.diagnose.fit.gap import gap_of
-from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
+from samii_rig.diagnose.fit.refit import Fitted, Problem, counted, refit
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.disturbed import Disturbed
-from samii_rig.diagnose.physics.model import Grid, Loop, grid
+from samii_rig.diagnose.physics.model import Aliases, Grid, Loop, Model, grid
 from samii_rig.diagnose.physics.rows import RESONANT
 from samii_rig.diagnose.result import Band, Gap, Used
 from samii_rig.errors import EstimateError
@@ -33,6 +33,7 @@ from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.noise import Disturbances
 from samii_rig.likelihood.pieces import Piece, Wiring, joined, pieces_of, wiring
 from samii_rig.likelihood.reduce import CYCLES, Left, Records, Reduced, Response, left_by, reduced
+from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned
 from samii_rig.signal.groups import segments_of
@@ -44,7 +45,10 @@ SHOW, TURN = 9, 10  # one line in ten is kept apart, to show on what was found
 # of as many periods each, and steps of the input have that over 2.5 decades.
 EXCITED, PARTS = 0.003, 3
 HARMONIC = 3  # the lowest that a force makes which is alike both ways
+MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
+ALIASES = 16  # sums over aliases that are kept
 HIGHEST = 0.45  # of the rate: aliases of both sides meet above
+COOLER = 10**0.5  # times less noise from one refit to the next, where a plain one leaves too much
 MOST_MADE = 6  # times that the likelihood is made about the nominal model
 # Noise units by which a change from the reference may be off between nodes, where it is taken for
 # linear, for the likelihood to stand: less than noise makes of one unknown.
@@ -63,6 +67,7 @@ class Whole:
     wired: Wiring
     left_out: tuple[tuple[str, str], ...] = ()
     apart: Records | None = None  # the same, every level by itself
+    asked: bool = False  # whether somebody said which lines count
 
     @classmethod
     def of(
@@ -91,7 +96,7 @@ class Whole:
         step = tuple(steps[n] for n in wired.sensors)
         (rate,) = {run.rate_hz for run in runs}
         all_, apart = (_records(p, rate, band, step) for p in (joined(levels), levels))
-        return cls(rig, all_, wired, tuple(without.items()), apart)
+        return cls(rig, all_, wired, tuple(without.items()), apart, band is not None)
 
     @property
     def every(self) -> int:
@@ -104,7 +109,9 @@ class Whole:
 
     def with_harmonics(self) -> Whole:
         """The same records, with the lines at which a force shows that depends on the level: up to
-        the third harmonics of what is excited."""
+        the third harmonics of what is excited; no others than those that were asked for."""
+        if self.asked:
+            return self
         records, most = self.records, HIGHEST * self.records.rate_hz
         bands = tuple((low, min(HARMONIC * high, most)) for low, high in records.bands)
         return replace(self, records=replace(records, bands=bands))
@@ -130,8 +137,24 @@ class Whole:
         """The grid beside the imaginary axis, with the aliases of a fit."""
         names = [a.name for a in self.rig.actuator]
         actuator = np.full(self.sensor.size, names.index(self.wired.command))
-        chain = fitted.model.plain(fitted.x)
-        return grid(self.rig, frequency, self.sensor, actuator, chain, sigma, self.loop)
+        model = fitted.model
+
+        def aliases(chain: Chain, few: Float) -> Aliases:
+            key = id(model), fitted.x.tobytes(), few.tobytes()
+            if key not in self._aliases:
+                if len(self._aliases) == ALIASES:
+                    self._aliases.clear()
+                made = Aliases.of(self.rig, chain, few, self.sensor, actuator)
+                self._aliases[key] = model, made
+            return self._aliases[key][1]
+
+        chain = model.plain(fitted.x)
+        return grid(self.rig, frequency, self.sensor, actuator, chain, sigma, self.loop, aliases)
+
+    @cached_property
+    def _aliases(self) -> dict[tuple[int, bytes, bytes], tuple[Model, Aliases]]:
+        """Of the latest fits: one is asked for on several contours."""
+        return {}
 
     def nodes(self, found: Reduced, fitted: Fitted) -> Grid:
         """The nodes of a likelihood."""
@@ -159,9 +182,18 @@ class Whole:
     def disturbed(self, fitted: Fitted) -> Disturbances:
         """What each disturbance of a fit makes in all sensors, the loop around them closed."""
         made = Disturbed.of(fitted.model, fitted.x, self.sensor)
+        lines = np.unique(
+            np.concatenate([self.records.lines(p).frequency for p in self.records.pieces])
+        )
+        known: list[Complex] = []
 
         def at(f: Float) -> Complex:
-            return made.response(f, self.response_at(fitted, f), self.loop)
+            of = np.minimum(np.searchsorted(lines, f), lines.size - 1)
+            if lines.size > MOST_KEPT or not np.array_equal(lines[of], f):
+                return made.response(f, self.response_at(fitted, f), self.loop)
+            if not known:
+                known.append(made.response(lines, self.response_at(fitted, lines), self.loop))
+            return known[0][of]
 
         return at
 
@@ -321,30 +353,37 @@ class RecordProblem(Problem):
         """As of `Problem`."""
         return self.reduced.slopes(dh)
 
+    def warmed(self, times: float) -> RecordProblem:
+        """The same with noise of so many times the power."""
+        root, form = math.sqrt(times), self.reduced
+        warm = replace(form, factor=form.factor / root, target=form.target / root)
+        return replace(self, reduced=warm)
+
     def toward(self, h: Complex) -> RecordProblem:
         """As of `Problem`."""
         goal = self.reduced.slopes((h - self.reduced.reference)[:, :, None])[:, 0]
         return replace(self, reduced=replace(self.reduced, target=goal))
 
-    def form(self, b: Complex, left: Float, directions: Float) -> Form:
+    def forms(self, left: Float, directions: Float) -> Callable[[Complex], Form]:
         """As of `Problem`."""
         p, on = self.reduced.factor.shape[0], self.at.changed
-        by_one, by_j = (np.concatenate([x.real, x.imag], axis=1) for x in (b[on], 1j * b[on]))
-        moved = self._by_node @ np.stack([by_one, by_j], axis=2)
-        K = np.concatenate([moved[:, :, 0].T, moved[:, :, 1].T], axis=1)
-        Q = directions[:p]
-        r = left - directions @ (directions.T @ left)
-        # Rows of the priors are moved by the projection too: kept as the projection's own part.
-        turn = Q.T @ K
-        K_left = np.concatenate([K - Q @ turn, -directions[p:] @ turn])
-        return forms.Dense(K_left, r, 0.0, on)
+        directions = counted(directions)
+        turned = directions.T @ left
+        F, A = self._by_node
+        sides = np.column_stack([left[:p] - directions[:p] @ turned, directions[:p]])
+        pull, *turn = (sides.T @ F).reshape(sides.shape[1], A.shape[0], -1)
+        power = float(left @ left - turned @ turned)
+        along = np.array(turn).reshape(-1, *A.shape[:2])
+        return lambda b: forms.Dense.of(b[on], A, pull, along, power, on)
 
     @cached_property
-    def _by_node(self) -> Float:
-        """(n, p, 2 q) the factor, of the nodes that a part changes: real parts of all sensors, then
-        imaginary ones."""
+    def _by_node(self) -> tuple[Float, Float]:
+        """(p, n 2 q) the factor, of the nodes that a part changes: of each the real parts of all
+        sensors, then imaginary ones; and the products of its columns (n, 2 q, n, 2 q)."""
         F = self.reduced.factor[..., self.at.changed]
-        return np.ascontiguousarray(F.transpose(3, 0, 2, 1)).reshape(F.shape[3], F.shape[0], -1)
+        p, q, _, n = F.shape
+        F = np.ascontiguousarray(F.transpose(0, 3, 2, 1)).reshape(p, -1)
+        return F, (F.T @ F).reshape(n, 2 * q, n, 2 * q)
 
 
 class RecordSearch(Search):
@@ -365,7 +404,33 @@ class RecordSearch(Search):
             self._about(fitted)
         else:  # a gross mismatch: the nominal model is weighed where the likelihood stands now
             fitted = refit(fitted.model, self.problem, fitted.x)
+        if self.ratio(fitted) > threshold(self.spread):
+            fitted = self._cooled(fitted)
         self.keep((), fitted)
+
+    def _cooled(self, fitted: Fitted) -> Fitted:
+        """The same, or a better fit: from the parameters of the rig file on, the noise first taken
+        for so large that these fit, then for less and less. Modes that lie near each other lead a
+        plain refit to the wrong one."""
+        model = fitted.model
+        x = np.zeros(model.n)
+        self._about(self._there(model, x))
+        cold = self.problem.expected / max(self._there(model, x).cost, 1.0)
+        steps = int(np.ceil(-np.log(min(cold, 1.0)) / np.log(COOLER)))
+        for k in range(steps, -1, -1):
+            assert isinstance(self.problem, RecordProblem)
+            x = refit(model, self.problem.warmed(COOLER**k), x).x
+            now = self._there(model, x)
+            if not self._stands(now):
+                self._about(now)
+        now = refit(model, self.problem, x)
+        if now.cost < self._there(model, fitted.x).cost:
+            return now
+        self._about(fitted)
+        return refit(model, self.problem, fitted.x)
+
+    def _there(self, model: Model, x: Float) -> Fitted:
+        return refit(model, self.problem, x, far=False, steps=0)
 
     def first(self) -> Fitted:
         """Where the nominal model starts."""

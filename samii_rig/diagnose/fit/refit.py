@@ -7,6 +7,7 @@ optimum the logarithm of the response is fitted first, which has fewer wrong min
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,26 +59,29 @@ class Problem:
         """The same had `h` (n, q) been measured without noise."""
         return Problem(replace(self.data, H=h), self.root, self.at)
 
-    def form(self, b: Complex, left: Float, directions: Float) -> Form:
-        """Chi-square when a part moves the prediction by b phi.
+    def forms(self, left: Float, directions: Float) -> Callable[[Complex], Form]:
+        """Chi-square when a part moves the prediction by b phi, of any b (n, q).
 
         left : residuals of data and priors. directions : orthonormal, that are projected out; rows
         of zeros in them do not count.
         """
-        # |v - Q Q'v|^2 = |v|^2 - |R Q'v|^2, R the identity where all rows count.
-        R = np.linalg.cholesky(2 * np.eye(directions.shape[1]) - directions.T @ directions)
-        directions = directions @ R
-        half = b.size
-        r = (left[:half] + 1j * left[half : 2 * half]).reshape(b.shape)
-        conj = (directions[:half] - 1j * directions[half : 2 * half]).reshape(*b.shape, -1)
-        v = (self.root @ b[:, :, None])[:, :, 0]
-        return forms.Lines(
-            lin=np.sum(r.conj() * v, axis=1),
-            square=np.sum(np.abs(v) ** 2, axis=1),
-            P=np.einsum("nqj,nq->nj", conj, v),
-            power=float(left @ left),
-            q=directions.T @ left,
-        )
+        directions = counted(directions)
+        half = self.data.H.size
+        r = (left[:half] + 1j * left[half : 2 * half]).reshape(self.data.H.shape)
+        conj = (directions[:half] - 1j * directions[half : 2 * half]).reshape(*r.shape, -1)
+        power, q = float(left @ left), directions.T @ left
+
+        def form(b: Complex) -> Form:
+            v = (self.root @ b[:, :, None])[:, :, 0]
+            return forms.Lines(
+                lin=np.sum(r.conj() * v, axis=1),
+                square=np.sum(np.abs(v) ** 2, axis=1),
+                P=np.einsum("nqj,nq->nj", conj, v),
+                power=power,
+                q=q,
+            )
+
+        return form
 
     def residual(self, h: Complex) -> Float:
         """Real whitened residuals (2 n q,) of a prediction."""
@@ -89,6 +93,13 @@ class Problem:
         n, q, m = dh.shape
         J = (self.root @ dh).reshape(n * q, m)  # m = 0: a rig file without tolerances
         return np.concatenate([J.real, J.imag])
+
+
+def counted(directions: Float) -> Float:
+    """Directions D of which |v - Q Q'v|^2 = |v|^2 - |D'v|^2, Q orthonormal but for rows of zeros,
+    which do not count."""
+    R = np.linalg.cholesky(2 * np.eye(directions.shape[1]) - directions.T @ directions)
+    return np.asarray(directions @ R)
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,7 +299,7 @@ def _logarithm(
     best = (x, h, dh, cost)
     damping, current = 1e-2, math.inf
     same = lines is problem
-    y, (hy, dhy) = x, (h, dh) if same else model.gradient(x, lines.at)
+    y, (hy, dhy), moved = x, (h, dh) if same else model.gradient(x, lines.at), False
     for _ in range(LOG_STEPS):
         left = weight * np.log(hy / np.where(d == 0, hy, d))
         slope = (weight / hy)[:, :, None] * dhy
@@ -306,11 +317,14 @@ def _logarithm(
             break
         try:
             hy, dhy = model.gradient(new, lines.at)
-            at = (hy, dhy) if same else model.gradient(new, problem.at)
+            at = hy if same else model.response(new, problem.at)
         except SamiiRigError:
             break
         y = new
-        there = _cost(model, problem, y, at[0])
+        there = _cost(model, problem, y, at)
         if there < best[3]:
-            best = (y, *at, there)
+            best, moved = (y, at, dhy, there), True
+    if moved and not same:
+        h, dh = model.gradient(best[0], problem.at)
+        best = (best[0], h, dh, best[3])
     return best

@@ -161,7 +161,19 @@ class Screen:
 
     def form(self, b: Complex) -> Form:
         """Chi-square as a function of phi."""
-        return self.problem.form(b, self._left_by, self.directions)
+        key = b.tobytes()
+        if key not in self._made:
+            self._made[key] = self._forms(b)
+        return self._made[key]
+
+    @cached_property
+    def _forms(self) -> Callable[[Complex], Form]:
+        return self.problem.forms(self._left_by, self.directions)
+
+    @cached_property
+    def _made(self) -> dict[bytes, Form]:
+        """Forms of parts that were asked for: laws at one place have one."""
+        return {}
 
     @cached_property
     def _left_by(self) -> Float:

@@ -41,6 +41,7 @@ BENT = 3.0  # of the penalty of a nominal parameter above which the refit hides 
 GROSS = 8.0  # chi-square over its mean above which candidates race before they are refitted
 AHEAD, FINALISTS = 5, 5  # steps of that race, and how many go on
 OTHERS = 3  # of other physics than theirs, that go on too
+SWITCHED = 12  # effects without unknowns that race: the nearest as the rig file has the rest
 BROAD = 4  # single effects of different physics that are grown where none is enough
 
 Candidate = tuple[float, tuple[Effect, ...], list[Float]]  # chi-square hoped for, and starts
@@ -146,8 +147,10 @@ class Search(Explanations):
             if model is not None and frozenset(e.key for e in effects) not in self.found:
                 x = moved(base.fitted.model, base.fitted.x, model)
                 x[: model.n_nominal] = 0.0
-                out.append((-math.inf, effects, [x]))
-        return out
+                there = self.refitted_from(effects, x, steps=0)
+                if there is not None:
+                    out.append((there.cost, effects, [x]))
+        return sorted(out, key=lambda one: one[0])[:SWITCHED]
 
     @staticmethod
     def _mixed(effects: Sequence[Effect]) -> bool:

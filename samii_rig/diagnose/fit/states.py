@@ -20,7 +20,7 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.result import Gap
 from samii_rig.likelihood.pieces import Wiring
-from samii_rig.likelihood.reduce import Left, Reduced
+from samii_rig.likelihood.reduce import Left, Reduced, by_sensor
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, Int
 
@@ -69,25 +69,27 @@ class BothGrid(Grid):
 
 
 class States(Model):
-    """A rig before, and the same with effects after; x is the vector of the model before, then the
-    logarithms of the effects' unknowns.
+    """A rig before, and the same with effects after; x is the vector of the model before, then what
+    is free after alone, then the logarithms of the effects' unknowns.
 
-    after : rig file of the state after. It differs from that before by what is known.
+    after : rig file of the state after. It differs from that before by what is known of each.
     """
 
     def __init__(self, before: Model, after: Rig, effects: Sequence[Effect] = ()) -> None:
         super().__init__(after, effects)
         self.before, self.after = before, Model(after, effects)
-        own = self.after.n_nominal
-        n = before.n
-        self.keys = before.keys
-        # Parameters that the state after does not have, or that are known there, are before alone.
-        at = [before.keys.index(key) for key in self.after.keys]
-        self.on = np.array([*at, *range(n, n + self.after.n - own)], np.int64)
-        self.n_nominal, self.n = n, n + self.after.n - own
-        self.prior = np.append(before.prior, self.after.prior[own:])
-        self.lower = np.append(before.lower, self.after.lower[own:])
-        self.upper = np.append(before.upper, self.after.upper[own:])
+        own, n = self.after.n_nominal, before.n
+        # Parameters that a state does not have, or that are known there, are the other's alone.
+        more = [i for i, key in enumerate(self.after.keys) if key not in before.keys]
+        self.keys = (*before.keys, *(self.after.keys[i] for i in more))
+        self.n_nominal = n + len(more)
+        self.n = self.n_nominal + self.after.n - own
+        at = [self.keys.index(key) for key in self.after.keys]
+        self.on = np.array([*at, *range(self.n_nominal, self.n)], np.int64)
+        free = [*more, *range(own, self.after.n)]
+        self.prior = np.append(before.prior, self.after.prior[free])
+        self.lower = np.append(before.lower, self.after.lower[free])
+        self.upper = np.append(before.upper, self.after.upper[free])
 
     def having(self, effects: Sequence[Effect]) -> Model:
         """As of `Model`."""
@@ -172,6 +174,11 @@ class BothReduced(Reduced):
             np.concatenate([after.reference, before.reference]), factor, target, known,
             (inside[0], inside[1]), after.noise, (differing[0], differing[1]), (after, before),
         )  # fmt: skip
+
+    def slopes(self, dh: Complex) -> Float:
+        """As of `Reduced`."""
+        flat = by_sensor(dh)
+        return np.asarray(self.factor.reshape(-1, len(flat)) @ flat)
 
     def bent(self, d: Complex, middle: Complex) -> float:
         """As of `Reduced`."""
@@ -272,7 +279,8 @@ class StatesSearch(RecordSearch):
 
     def first(self) -> Fitted:
         """As of `RecordSearch`."""
-        return replace(self._common, model=self.made(()))
+        model, x = self.made(()), self._common.x
+        return replace(self._common, model=model, x=np.append(x, np.zeros(model.n - x.size)))
 
     def made(self, effects: tuple[Effect, ...]) -> Model:
         """As of `Explanations`."""

@@ -37,6 +37,7 @@ LIMITS = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 SLIPS = (0.03, 0.15, 0.6)  # motion at which a part slips over the largest motion
 WEAK = 1e-3  # of the upper end of a supply's range
 CAP = 1.5  # power of its height, that what a limit cuts off a sine grows with
+AT_ONCE = 8  # changes of all lines that are whitened together
 STRONG = 0.03  # of the motion that drives it, that a force may change to count as weak
 
 
@@ -79,12 +80,13 @@ class Looks:
         joined = self.problem.complete.joined(np.concatenate(sides, axis=1))
         flat = _real(joined.reshape(-1, joined.shape[2]))
         out, ends = [], np.cumsum([side.shape[1] for side in sides])
-        for change in changes:
-            g = _real(self.problem.complete.white(change).ravel())
-            each = np.split(g @ flat, ends[:-1])
-            power = float(g @ g)
-            found = [(-x[0], power - float(x[1:] @ x[1:])) for x in each]
-            out.append(_gains(*np.array(found).T))
+        for first in range(0, len(changes), AT_ONCE):
+            white = self.problem.complete.white(np.stack(changes[first : first + AT_ONCE], axis=2))
+            G = _real(white.reshape(-1, white.shape[2]))
+            for along, power in zip(G.T @ flat, np.sum(G**2, axis=0), strict=True):
+                each = np.split(along, ends[:-1])
+                found = [(-x[0], float(power - x[1:] @ x[1:])) for x in each]
+                out.append(_gains(*np.array(found).T))
         return out
 
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from itertools import combinations
 
 import numpy as np
 
@@ -28,7 +27,6 @@ from samii_rig.types import Complex, Float
 
 Law = Callable[[Complex, Float], tuple[Complex, list[Complex]]]
 
-MOST_SHIFTED = 5  # samples, by which a logger's columns are apart; as `signal.columns` looks for
 # Not physics: wiring, units and signs. They compete with physics and are reported apart.
 NOT_PHYSICS = tuple(row.name for row in PHYSICS.values() if not row.physical)
 
@@ -73,23 +71,12 @@ def gain(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
     return np.full(s.shape, x[0], complex), [np.ones(s.shape, complex)]
 
 
-def minus(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
-    """-1."""
-    return np.full(s.shape, -1.0, complex), []
-
-
 def not_held(s: Complex, _x: Float, rate_hz: float) -> tuple[Complex, list[Complex]]:
     """s T/(1 - exp(-s T)), the inverse of the converter's hold: the input was measured at the
     samples, a smooth signal between them that has no images above half the rate."""
     T = 1 / rate_hz
     inside = np.abs(s.imag) < math.pi / T
     return np.where(inside, s * T / -np.expm1(-s * T), 0.0), []
-
-
-def shifted(s: Complex, _x: Float, seconds: float) -> tuple[Complex, list[Complex]]:
-    """exp(-s t): what was measured stands a whole number of samples behind what was sent. A dead
-    time is no whole number but by chance."""
-    return np.exp(-s * seconds), []
 
 
 def second_order(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
@@ -110,8 +97,6 @@ def effects(rig: Rig, low_hz: float, high_hz: float) -> Iterator[Effect]:
             yield from _tilted(sensor.name)
         if isinstance(sensor, RelativeAngle):
             yield from _encoders(rig, sensor)
-    for a, b in combinations([s.name for s in rig.sensor], 2):
-        yield _swapped(a, b)
 
 
 def _unknown(symbol: str, unit: str, low: float, high: float, n: int = 8) -> Unknown:
@@ -191,18 +176,8 @@ def _input(rig: Rig, name: str, low_hz: float, high_hz: float) -> Iterator[Effec
         unknowns=(_gains(),),
         factor=Factor("input", name, gain),
     )
-    yield Effect(physics="sign_error", site=name, factor=Factor("input", name, minus))
     unheld = partial(not_held, rate_hz=rig.rate_hz)
     yield Effect(physics="input_not_held", site=name, factor=Factor("input", name, unheld))
-    for samples in (n for n in range(-MOST_SHIFTED, MOST_SHIFTED + 1) if n != 0):
-        behind = partial(shifted, seconds=samples / rig.rate_hz)
-        yield Effect(
-            physics="columns_shifted",
-            site=name,
-            factor=Factor("input", name, behind),
-            weight=1 / (2 * MOST_SHIFTED),
-            variant=f"{samples:+d} samples",
-        )
 
 
 Update = Callable[[float], dict[str, object]]
@@ -233,9 +208,6 @@ def _sensor(sensor: SensorBase, low_hz: float, high_hz: float) -> Iterator[Effec
     yield one("sensor_gain", gain, _gains(), lambda g: {"gain": g * sensor.gain})
     corner = _unknown("corner", "Hz", 1e-4 * low_hz, 10 * low_hz)
     yield one("sensor_highpass", highpass, corner, lambda f: {"highpass_hz": f})
-    yield Effect(
-        physics="sign_error", site=sensor.name, factor=Factor("sensor", sensor.name, minus)
-    )
     if delay < times.high:  # earlier by less, the delay of the file is not there
         early = _unknown("tau", "s", max(times.low, delay), times.high)
         yield Effect(
@@ -303,14 +275,3 @@ def _encoders(rig: Rig, sensor: RelativeAngle) -> Iterator[Effect]:
             weight=1 / max(1, len(spans) - 1),
             variant=" ".join(span),
         )
-
-
-def _swapped(a: str, b: str) -> Effect:
-    return Effect(
-        physics="channel_swap",
-        site=a,
-        build=partial(insert.exchanged, a=a, b=b),
-        aliases=(("channel_swap", b),),
-        weight=0.3,
-        variant=b,
-    )

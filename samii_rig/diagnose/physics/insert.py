@@ -110,6 +110,12 @@ def sensor_changed(rig: Rig, name: str, **update: object) -> Rig:
     return rig.model_copy(update={"sensor": sensors})
 
 
+def replaced(rig: Rig, sensor: Any) -> Rig:
+    """The rig with another sensor in place of the one that has its name."""
+    sensors = tuple(sensor if s.name == sensor.name else s for s in rig.sensor)
+    return rig.model_copy(update={"sensor": sensors})
+
+
 def actuator_changed(rig: Rig, name: str, change: Callable[[Any], dict[str, object]]) -> Rig:
     """The rig with other fields of one actuator."""
     actuators = tuple(a.model_copy(update=change(a)) if a.name == name else a for a in rig.actuator)

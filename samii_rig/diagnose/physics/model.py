@@ -93,6 +93,48 @@ class Grid:
         return [self.s + 2j * np.pi * k * self.rate_hz for k in known]
 
 
+@dataclass(frozen=True, slots=True)
+class Aliases:
+    """What a chain's aliases add at a few frequencies (m,) Hz; it is smooth between.
+
+    rest : (m, q) all together. folded : (order, m, q) those of `ORDERS`.
+    """
+
+    few: Float
+    rest: Complex
+    folded: Complex
+
+    @classmethod
+    def of(cls, rig: Rig, chain: Chain, few: Float, sensor: Int, actuator: Int) -> Aliases:
+        """Of a chain of the rig."""
+
+        def term(f: Float) -> Complex:
+            s = np.asarray(2j * np.pi * f, np.complex128)
+            around = _around(rig, s, sensor, actuator)
+            return np.asarray(chain.response(f)[:, sensor, actuator] * around)
+
+        rest = sampled_response(rig, few, chain)[:, sensor, actuator] - term(few)
+        folded = []
+        for k in ORDERS:
+            there = term(np.abs(few + k * rig.rate_hz))
+            folded.append(there if k > 0 else there.conj())
+        return cls(few, rest, np.stack(folded))
+
+    def spread(self, f: Float) -> tuple[Complex, Complex]:
+        """rest and folded at f (n,) Hz."""
+        rest, *folded = (
+            np.stack([np.interp(f, self.few, r) for r in one.T], axis=1)
+            for one in (self.rest, *self.folded)
+        )
+        return rest, np.stack(folded)
+
+
+def _around(rig: Rig, s: Complex, sensor: Int, actuator: Int) -> Complex:
+    """(n, q) hold, filters and delays."""
+    hold = np.stack([hold_at(s, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
+    return np.asarray(sensors_at(rig.sensor, s)[:, sensor] * hold[:, actuator])
+
+
 def grid(
     rig: Rig,
     frequency: Float,
@@ -101,45 +143,22 @@ def grid(
     chain: Chain | None = None,
     sigma: float = 0.0,
     loop: Loop | None = None,
+    aliases: Callable[[Chain, Float], Aliases] | None = None,
 ) -> Grid:
     """The grid of a rig at sorted frequencies, Hz. chain : whose aliases these are, if they are
     not the rig's own. sigma : 1/s, how far beside the imaginary axis.
-    loop : closed around the entries."""
+    loop : closed around the entries. aliases : of a chain at a few frequencies, where they may be
+    known from before."""
     f = np.unique(frequency)
-
-    def around(s: Complex) -> Complex:
-        hold = np.stack([hold_at(s, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
-        return np.asarray(sensors_at(rig.sensor, s)[:, sensor] * hold[:, actuator])
-
     # Aliases hardly change from the imaginary axis to a line beside it.
     few = np.geomspace(f[f > 0][0], f[-1], min(ALIAS_POINTS, f.size))
     few[-1] = f[-1]
     chain = Chain(rig) if chain is None else chain
-
-    def spread(few_: Complex) -> Complex:
-        return np.stack([np.interp(f, few, r) for r in few_.T], axis=1)
-
-    def term(f: Float) -> Complex:
-        s = np.asarray(2j * np.pi * f, np.complex128)
-        return np.asarray(chain.response(f)[:, sensor, actuator] * around(s))
-
-    rest = sampled_response(rig, few, chain)[:, sensor, actuator] - term(few)
-    folded = []
-    for k in ORDERS:
-        there = term(np.abs(few + k * rig.rate_hz))
-        folded.append(spread(there if k > 0 else there.conj()))
+    made = aliases(chain, few) if aliases else Aliases.of(rig, chain, few, sensor, actuator)
+    rest, folded = made.spread(f)
     s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
-    return Grid(
-        f,
-        around(s),
-        spread(rest),
-        np.stack(folded),
-        rig.rate_hz,
-        sensor,
-        actuator,
-        sigma=sigma,
-        loop=loop,
-    )
+    factor = _around(rig, s, sensor, actuator)
+    return Grid(f, factor, rest, folded, rig.rate_hz, sensor, actuator, sigma=sigma, loop=loop)
 
 
 class Model:

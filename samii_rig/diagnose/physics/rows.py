@@ -64,6 +64,9 @@ _ROWS = (
     Physics("common_gain", "a scale of the input", physical=False),
     Physics("time_offset", "a channel that is stamped too early", physical=False),
     Physics("unit_rest", "a unit that is another", physical=False),
+    Physics("unit_error", "a unit that is another, exactly", physical=False),
+    Physics("kind_error", "a sensor of another kind", physical=False),
+    Physics("column_shifted", "a column that stands samples from the others", physical=False),
     Physics("columns_shifted", "columns that stand samples apart", physical=False),
     Physics("input_not_held", "an input that was not held", physical=False),
 )

@@ -1,8 +1,8 @@
 """The table of physics: what may have been left out of a rig file, as data.
 
 Parts at a point are rows of `points`, changes of what the chain is made of are in `bodies`, what a
-rig has less of in `less`, factors in `channels`. A lab adds effects by the entry point
-`samii_rig.effects`.
+rig has less of in `less`, factors in `channels`, what is no physics in `mistakes`. A lab adds
+effects by the entry point `samii_rig.effects`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from importlib.metadata import entry_points
 
 from samii_rig.devices.plugins import asked, named, wrong
-from samii_rig.diagnose.physics import bodies, channels, less, points
+from samii_rig.diagnose.physics import bodies, channels, less, mistakes, points
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.scales import places
 from samii_rig.rig.schema import Rig
@@ -31,6 +31,7 @@ def hypotheses(rig: Rig, low_hz: float, high_hz: float, *, signed: bool = False)
         *bodies.effects(rig, where),
         *less.effects(rig, between=signed),
         *channels.effects(rig, low_hz, high_hz),
+        *mistakes.effects(rig),
         *plugged(rig, low_hz, high_hz),
     ]
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from samii_rig.diagnose.data.confusions import nearest
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.classes import Class
 from samii_rig.diagnose.fit.gap import gap_of
@@ -16,6 +15,7 @@ from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.along import POSITION
 from samii_rig.diagnose.physics.channels import NOT_PHYSICS
+from samii_rig.diagnose.physics.confusions import nearest
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Band, Cause, Gap, Moved, Value
 from samii_rig.diagnose.verdict.judge import MOST_NAMES, Judgement
@@ -80,8 +80,8 @@ def told(judged: Judgement) -> list[str]:
         match effect.physics:
             case "channel_swap":
                 out.append(f"{effect.site} and {effect.aliases[0][1]} are swapped")
-            case "sign_error":
-                out.append(f"{effect.site} has the wrong sign")
+            case "sign_error" | "unit_error" | "kind_error" | "column_shifted" | "columns_shifted":
+                out.append(f"{effect.site} {effect.variant}")
             case "time_offset":
                 ms = found["tau"].times(1e3)
                 out.append(
@@ -92,11 +92,6 @@ def told(judged: Judgement) -> list[str]:
                 out.append(
                     f"{effect.site} was not held between samples but recorded as a meter sees it, "
                     "half a sample from what the rig file states"
-                )
-            case "columns_shifted":
-                out.append(
-                    f"the sensors' columns stand {effect.variant} from {effect.site}: a logger's, "
-                    "as no dead time is a whole number of samples but by chance"
                 )
             case "common_gain":
                 g = found["gain"]

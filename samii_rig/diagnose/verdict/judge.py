@@ -220,6 +220,12 @@ def doubted(judged: Judgement, most: Verdict) -> Judgement:
     return replace(judged, verdict=most) if judged.verdict in SAID else judged
 
 
+def without_causes(judged: Judgement) -> Judgement:
+    """The same where all that is said is no physics: a sensor's gain that is a unit."""
+    said: dict[Verdict, Verdict] = {"named": "no_mismatch", "ambiguous": "unknown"}
+    return replace(judged, verdict=said.get(judged.verdict, judged.verdict))
+
+
 def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
     """The same, but nothing is named that makes data worse which it was not fitted to: beyond what
     chance does, or at all if it is so large that it must show, there too.

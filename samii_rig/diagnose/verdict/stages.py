@@ -10,7 +10,6 @@ from samii_rig.diagnose.data.findings import Doubt, Sound
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.search import Search
-from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.result import Band, Diagnosis, Gap, Used
 from samii_rig.diagnose.verdict import answer
 from samii_rig.diagnose.verdict import judge as verdict
@@ -73,11 +72,14 @@ def told(
     if len(set(case.lines.outputs)) == 1 and len(best.effects) > 1:
         # Trials of four channels say nothing of how often one curve tells several places apart.
         judged = verdict.doubted(judged, "ambiguous")
+    causes = answer.causes_of(judged.classes[0], judged) if judged.verdict in verdict.SAID else ()
+    if not causes:
+        judged = verdict.without_causes(judged)
     missing = judged.verdict != "no_mismatch"
-    if not missing and best.effects and all(e.physics in NOT_PHYSICS for e in best.effects):
+    own = answer.causes_of(judged.classes[0], judged)
+    if not missing and best.effects and not own:
         # The model is held against what was meant to be recorded.
         shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
-    causes = answer.causes_of(judged.classes[0], judged) if judged.verdict in verdict.SAID else ()
     words = list(clean.told)
     if missing or best.effects:
         words += answer.told(judged)
@@ -117,6 +119,6 @@ def told(
         evidence={
             **judged.evidence.plain(),
             "beyond": judged.beyond is not None,
-            "causes": [c.plain() for c in answer.causes_of(judged.classes[0], judged)],
+            "causes": [c.plain() for c in own],
         },
     )

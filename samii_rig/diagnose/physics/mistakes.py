@@ -1,0 +1,141 @@
+"""Mistakes of those who record, as hypotheses: no unknown, no physics, told apart from it.
+
+One table. Each row is a factor on a column that is exactly known, or a sensor that is another. They
+compete with physics in the same search, at the price of what has no unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from samii_rig.diagnose.physics import insert
+from samii_rig.diagnose.physics.confusions import UNITS
+from samii_rig.diagnose.physics.effect import Effect, Factor
+from samii_rig.rig.schema import (
+    AbsoluteAngle,
+    Acceleration,
+    Displacement,
+    RelativeAngle,
+    Rig,
+    Sensor,
+    Velocity,
+)
+from samii_rig.types import Complex, Float
+
+MOST_SHIFTED = 5  # samples, by which a logger's columns are apart; as `signal.columns` looks for
+ORDERS = ("a displacement", "a velocity", "an acceleration")  # by how often it was derived
+ORDER = {AbsoluteAngle: 0, RelativeAngle: 0, Displacement: 0, Velocity: 1, Acceleration: 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """A column that is F(s) times what it is said to be. said : in words, behind its name."""
+
+    physics: str
+    said: str
+    factor: Callable[[Complex], Complex]
+    weight: float = 1.0
+
+
+def scaled(s: Complex, by: float) -> Complex:
+    """A factor that all frequencies share."""
+    return np.full(s.shape, by, complex)
+
+
+def behind(s: Complex, seconds: float) -> Complex:
+    """exp(-s t)."""
+    return np.exp(-s * seconds)
+
+
+def derived(s: Complex, times: int) -> Complex:
+    """s^n; what was integrated says nothing at s = 0."""
+    return np.where(s == 0, 0.0, np.where(s == 0, 1.0, s) ** float(times))
+
+
+def effects(rig: Rig) -> Iterator[Effect]:
+    """Every mistake that this rig's columns allow."""
+    for actuator in rig.actuator:
+        for m in (*_of_any(), *_shifts("columns_shifted", rig.rate_hz)):
+            yield _on("input", actuator.name, m)
+    for sensor in rig.sensor:
+        rows = [*_of_any(), *_of_kind(sensor)]
+        if len(rig.sensor) > 1:
+            rows += _shifts("column_shifted", rig.rate_hz)
+        for m in rows:
+            yield _on("sensor", sensor.name, m)
+        yield from _angles(rig, sensor)
+    for a, b in combinations([s.name for s in rig.sensor], 2):
+        yield Effect(
+            physics="channel_swap",
+            site=a,
+            build=partial(insert.exchanged, a=a, b=b),
+            aliases=(("channel_swap", b),),
+            weight=0.3,
+            variant=b,
+        )
+
+
+def _of_any() -> Iterator[Mistake]:
+    """Of a column of any kind."""
+    yield Mistake("sign_error", "has the wrong sign", partial(scaled, by=-1.0))
+    for unit in UNITS:
+        for by in (unit.factor, 1 / unit.factor):
+            said = f"is {by:.4g} times what it should be: {unit.name}"
+            yield Mistake("unit_error", said, partial(scaled, by=by), 1 / (2 * len(UNITS)))
+
+
+def _shifts(physics: str, rate_hz: float) -> Iterator[Mistake]:
+    """Of a logger: a dead time is no whole number of samples but by chance."""
+    for n in (n for n in range(-MOST_SHIFTED, MOST_SHIFTED + 1) if n != 0):
+        many = f"{abs(n)} sample{'s' * (abs(n) > 1)} {'later' if n > 0 else 'earlier'}"
+        said = f"stands {many} than the other columns: a logger's, or a delay of as much"
+        if physics == "columns_shifted":
+            said = f"stands samples from the sensors' columns, which are {many}: a logger's"
+        law = partial(behind, seconds=n / rate_hz)
+        yield Mistake(physics, said, law, 1 / (2 * MOST_SHIFTED))
+
+
+def _of_kind(sensor: Sensor) -> Iterator[Mistake]:
+    """Of a sensor that measures another derivative of the same motion."""
+    own = ORDER.get(type(sensor))
+    for order, kind in enumerate(ORDERS):
+        if own is not None and order != own:
+            said = f"reads as {kind}, not as {ORDERS[own]}"
+            if not isinstance(sensor, Displacement | Velocity | Acceleration):
+                said = f"reads as {kind} of the angle, not as the angle"
+            yield Mistake("kind_error", said, partial(derived, times=order - own), 0.5)
+
+
+def _on(kind: Any, name: str, m: Mistake) -> Effect:
+    def value(s: Complex, _: Float) -> tuple[Complex, list[Complex]]:
+        return m.factor(s), []
+
+    factor = Factor(kind, name, value)
+    return Effect(m.physics, name, factor=factor, weight=m.weight, variant=m.said)
+
+
+def _angles(rig: Rig, sensor: Sensor) -> Iterator[Effect]:
+    """An angle against the ground for one across parts, and the other way round."""
+    made: Sensor | None = None
+    fields = {k: getattr(sensor, k) for k in sensor.model_fields_set - {"kind", "across", "after"}}
+    if isinstance(sensor, RelativeAngle):
+        made = AbsoluteAngle(kind="absolute_angle", after=sensor.across[-1], **fields)
+        said = f"reads as an angle against the ground, not as one across {sensor.across[0]}"
+    elif isinstance(sensor, AbsoluteAngle):
+        order = [e.name for e in rig.element]
+        acting = [e.name for e in rig.element if getattr(e, "input", None)]
+        span = order[: order.index(sensor.after) + 1] if sensor.after in order else []
+        starts = [order.index(name) for name in acting if name in span]
+        if starts and starts[-1] > 0:
+            across = tuple(span[starts[-1] :])
+            made = RelativeAngle(kind="relative_angle", across=across, **fields)
+            said = f"reads as an angle across {across[0]}, not as one against the ground"
+    if made is not None:
+        build = partial(insert.replaced, sensor=made)
+        yield Effect("kind_error", sensor.name, build=build, weight=0.5, variant=said)

@@ -1,0 +1,43 @@
+"""Chains that hang or stand, in a few lines each."""
+
+from typing import Any
+
+from elements_kit import part
+
+from samii_rig.rig.schema import Rig
+
+G = 9.81  # m/s^2
+SWAY = {"name": "y", "kind": "absolute_angle", "after": "push", "unit": "rad"}
+
+
+def torque(**values: Any) -> dict[str, Any]:
+    return part("torque_source", "push", K=1.0, **values)
+
+
+def hanging(
+    *elements: dict[str, Any], pose: float | None = None, base: str = "pinned", **other: Any
+) -> Rig:
+    """A chain under gravity at `pose`, deg, behind a torque at its base."""
+    data: dict[str, Any] = {
+        "name": "hanging",
+        "base": base,
+        "tip": "free",
+        "rate_hz": 500.0,
+        "gravity": G,
+        "element": [torque(), *elements],
+        "sensor": [SWAY],
+        "actuator": [{"name": "v", "unit": "V", "low": -10.0, "high": 10.0, "deadman": 0.05}],
+    }
+    if pose is not None:
+        data["pose"] = {"value": pose, "unit": "deg"}
+    return Rig.model_validate({**data, **other})
+
+
+def arm(
+    name: str = "arm",
+    L: float = 1.0,
+    r: float = 0.4,
+    m: float = 2.0,
+    I: float = 0.3,  # noqa: E741
+) -> dict[str, Any]:
+    return part("rigid_link", name, L=L, r=r, m=m, I=I)
