@@ -2,7 +2,7 @@
 
     python benchmarks/page_pictures.py [--into docs/images]
 
-A simulated run of the shipped swept sine, 4 times as fast, seen by Chromium: while it goes on at
+A simulated run of the shipped swept sine, twice as fast, seen by Chromium: while it goes on at
 each width in light and dark (service-WIDTH-COLOURS.png; service.png is the one at 1440 in light),
 once a diagnosis of what is known so far stands on the page (service-so-far.png), after a stop
 (service-stopped.png), replayed (service-replay.png); and the report of a whole run (report.png).
@@ -85,7 +85,7 @@ def recorded(browser: Browser, service: Service, into: Path) -> list[str]:
     """A whole run, replayed, and its report."""
     browser.size(*SMALL)
     with service.lease() as lease:
-        id_ = service.start(lease, sweep(duration=20.0, repeats=3))
+        id_ = service.start(lease, sweep(duration=12.0, repeats=3))
         found(lambda: (service.state()["last"] or {}).get("id") == id_, LONG)
     name = service.job(id_)["recording"]
     kept = service.http.get("/api/recordings").json()["recordings"]
@@ -98,6 +98,8 @@ def recorded(browser: Browser, service: Service, into: Path) -> list[str]:
     browser.size(1440, 900)
     browser.click("replay")
     browser.choose("replay-place", "400")
+    browser.until("!window.scope.empty", LONG)
+    browser.value(SETTLES)
     browser.value(SETTLES)
     browser.value("scrollTo(0, 0)")
     browser.value(SETTLES)
@@ -118,7 +120,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         os.environ["SAMII_RIG_STATE"] = str(folder / "state")
-        with Service(folder / "runs", "--pace", "4") as service:
+        with Service(folder / "runs", "--pace", "2") as service:
             warm(service)
             with Browser(folder / "browser") as browser:
                 begun(browser, service)
