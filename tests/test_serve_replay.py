@@ -46,6 +46,8 @@ def test_every_sample_is_shown_and_a_gap_is_one(service: Service, browser: Brows
     opened(browser, GAPPED)
     assert replayed(browser, service.folder / GAPPED) == 18_000
     assert browser.value("scope.samples.gaps") == [9040]
+    # Nothing runs and no state comes: what is shown is the replay, not a run that is over.
+    assert browser.value("[scope.over, motion.over]") == [False, False]
     assert browser.value("scope.samples.value(0, 9039) === scope.samples.value(0, 9039)") is False
 
     # Another speed, from another place: a person's time passes.
@@ -63,6 +65,7 @@ def test_every_sample_is_shown_and_a_gap_is_one(service: Service, browser: Brows
 
     browser.click("replay-end")
     assert browser.value("document.getElementById('replay-row').hidden")
+    assert browser.value("[scope.over, motion.over]") == [True, True]
     browser.until("scope.why === 'No run'")
 
 

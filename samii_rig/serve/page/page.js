@@ -81,8 +81,10 @@ const replay = new Replay({
     motion.hz = null;
     if (JSON.stringify(list) !== JSON.stringify(scope.channels)) channels(list);
     scope.clear(); motion.clear();
+    // Not those of the run that is over; the next state may be long in coming.
+    scope.over = motion.over = false;
   },
-  ended: () => { marked(""); scope.clear(); motion.clear(); },
+  ended: () => { marked(""); scope.clear(); motion.clear(); scope.over = motion.over = !MOVES.includes(state?.running?.phase); },
   said: (text, part) => {
     if (part === undefined) { alarm(text); return; }
     $("replay-state").textContent = text;

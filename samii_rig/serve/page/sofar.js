@@ -46,7 +46,7 @@ export class SoFar {
     $("diagnosis-section").hidden = !run.diagnosis;
     $("h-diagnosis").textContent = "Diagnosis so far";
     const why = run.phase === "analysing" ? " The last one is being made." : failed ? " What makes it has ended; the log of the job says why." : "";
-    if (!d) { this.empty(`None yet: the first is made once a sweep is whole.${why}`); return; }
+    if (!d) { this.empty(`None yet: it is made from what is measured so far.${why}`); return; }
     this.say(d, d.repeats ? "" : "Preliminary, from one sweep: its noise is not known from repeats. ");
     const end = d.certain ? `Certain: ${d.certain}. ` : "";
     const stop = run.stop_when_certain ? (d.certain ? "The run ends after this segment." : "The run ends once it is certain.") : "";
