@@ -45,6 +45,9 @@ SHOW, TURN = 9, 10  # one line in ten is kept apart, to show on what was found
 # of as many periods each, and steps of the input have that over 2.5 decades.
 EXCITED, PARTS = 0.003, 3
 HARMONIC = 3  # the lowest that a force makes which is alike both ways
+# Lines to which harmonics may add: a quadratic form of so many takes 5 s of a core. Many records
+# show a force at the lines of their excitation too.
+MOST_LINES = 12000
 MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
 ALIASES = 16  # sums over aliases that are kept
 HIGHEST = 0.45  # of the rate: aliases of both sides meet above
@@ -113,7 +116,8 @@ class Whole:
         if self.asked:
             return self
         records, most = self.records, HIGHEST * self.records.rate_hz
-        bands = tuple((low, min(HARMONIC * high, most)) for low, high in records.bands)
+        times = min(float(HARMONIC), max(MOST_LINES / records.count, 1.0))
+        bands = tuple((low, min(times * high, most)) for low, high in records.bands)
         return replace(self, records=replace(records, bands=bands))
 
     @property
