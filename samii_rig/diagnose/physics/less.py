@@ -89,7 +89,9 @@ def _part_of(
     bounds = least * whole, whole * (1 + SURELY * first.tolerance)
 
     def values(x: Float, nominal: Values) -> dict[Key, float]:
-        left = max(1 - float(x[0]) / nominal[keys[0]], 0.0)
+        # What is gone already has nothing that could go.
+        have = nominal[keys[0]]
+        left = max(1 - float(x[0]) / have, 0.0) if have > 0 else 0.0
         return {key: nominal[key] * left for key in keys}
 
     yield Effect(
