@@ -53,6 +53,7 @@ class Moved:
             if channels is not None:
                 v = contour.record(contour.damped(v) * channels[0], v.size)
             own = []
+            self.ways.marched += (1 + len(seeds)) * v.size * every
             for e in way.force(model, between(v, every), p, seeds):
                 y = times * way.sensed.of(e)[::every, self.whole.sensor]
                 for name, F in channels[1].items() if channels is not None else ():

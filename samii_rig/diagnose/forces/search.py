@@ -36,10 +36,14 @@ from samii_rig.types import Float
 CLOSER = 2  # times that the best strength is looked at closer
 TIMES = (0.05, 20.0)  # of a strength, one such step
 TRIED = 4  # physics of which a force is refitted
+FEW = 6  # steps of that: it starts from its best strength, and what may win is refitted again
 # Of what an effect must explain, that a force explains to first order to be computed in time:
 # strong ones were seen to gain 3 times as much once refitted, weak ones gain what it says.
 STRONG, WEAK = 0.3, 0.45
 MARCHED = 12  # forces that are computed in time
+# Samples under which forces are computed, those of slopes too: 15 s of a core. The most promising
+# come first.
+MOST_MARCHED = 20_000_000
 LESS = 0.08  # of the largest bound, below which a force is not
 PROMISING = 0.25  # of what the best force gains, at least
 AGAIN = 3  # times that the likelihood is made anew about the best explanation
@@ -101,15 +105,18 @@ class ForceSearch(RecordSearch):
         far: bool = True,
     ) -> Fitted | None:
         """As of `Explanations`; a force is computed in time at every step, and its slopes too."""
-        forced = isinstance(self.model(effects), ForceModel)
-        return super().refitted_from(effects, start, give_up, steps, far=far and not forced)
+        if not isinstance(self.model(effects), ForceModel):
+            return super().refitted_from(effects, start, give_up, steps, far=far)
+        # Every refit of a force is done anew with the likelihood: it goes on from where it ended.
+        return super().refitted_from(effects, start, give_up, min(steps, FEW), far=False)
 
     def settled(self) -> bool:
         """Refit what promises most, and all that may compete again about the best of it, until
         that stands still. Whether it has a force."""
         first = next((e for e in self.ranked() if len(e.effects) == 1), None)
         hopes = self.hopes(self.nominal if first is None else first)
-        self._try(hopes, self.nominal, 0)
+        ahead = 0.0 if first is None else self.nominal.fitted.cost - first.fitted.cost
+        self._try([h for h in hopes if h.own[0] >= STRONG * ahead], self.nominal, 0)
         if first is not None:
             self._try(hopes, first, -1)
         self.temper()
@@ -123,7 +130,7 @@ class ForceSearch(RecordSearch):
             self._through(self.ranked()[0])
             self.temper()
             after = self.ranked()[0]
-            if after.key == best.key and after.fitted.away(best.fitted) < STILL:
+            if self.spent or (after.key == best.key and after.fitted.away(best.fitted) < STILL):
                 break
         self._either_way(self.ranked()[0])
         self.pair()
@@ -133,8 +140,16 @@ class ForceSearch(RecordSearch):
     def _try(self, hopes: Sequence[Hope], base: Explanation, look: int) -> None:
         """Refit the forces that may be the best beside `base`, by the gains of that look."""
         for hope in _worth_while(hopes, self.worth, look):
+            if self.spent:
+                return
             effects = (*base.effects, hope.effect)
-            end = self.refitted(effects, base, np.log(hope.strengths).tolist())
+            best = min(e.fitted.cost for e in self.found.values())
+            model = self.model(effects)
+            if model is None:
+                continue
+            start = moved(base.fitted.model, base.fitted.x, model)
+            start = np.append(start, np.log(hope.strengths))
+            end = self.refitted_from(effects, start, best)
             if end is not None and base.fitted.chi2 - end.chi2 > (
                 self.worth if base.effects else 0
             ):
@@ -144,7 +159,7 @@ class ForceSearch(RecordSearch):
         """Refit it with the chain through which its force acts renewed where each refit ended,
         until that stands still."""
         for _ in range(RENEWED):
-            if not isinstance(best.fitted.model, ForceModel):
+            if self.spent or not isinstance(best.fitted.model, ForceModel):
                 return
             self._ways.renew()
             end = self.refitted(best.effects, best)
@@ -193,6 +208,11 @@ class ForceSearch(RecordSearch):
                 e is None or e.fitted.chi2 - end.chi2 > self.worth for e in alone
             ):
                 self.keep(effects, end)
+
+    @property
+    def spent(self) -> bool:
+        """Whether as many forces were computed as a person waits for."""
+        return self._ways.marched > MOST_MARCHED
 
     def is_enough(self) -> bool:
         """Whether the best explanation leaves no more than noise."""
@@ -287,6 +307,8 @@ def compete_on_records(linear: RecordSearch) -> ForceSearch | None:
 
 def _worth_while(hopes: Sequence[Hope], worth: float, look: int) -> list[Hope]:
     """Those that may be the best: of each physics the first, and the first's at other places."""
+    if not hopes:
+        return []
     ranked = sorted(hopes, key=lambda h: -float(h.own[look]))
     some = [h for h in ranked if h.own[look] > max(worth / 2, PROMISING * ranked[0].own[look])]
     if not some:

@@ -124,6 +124,7 @@ class Ways:
     chain's parameters change of a force is of second order, until `renew` asks for it."""
 
     kept: dict[str, Way] = field(default_factory=dict)
+    marched: int = 0  # samples, under which forces were computed through any of them
     near: Complex | None = None  # poles, which are the same wherever a force acts
 
     def at(self, model: ForceModel, x: Float) -> Way:

@@ -14,6 +14,10 @@ from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, told
 from samii_rig.errors import EstimateError, SamiiRigError
 
+SPENT = (
+    "not every force that may act was computed to the end, as the records are long; fewer of them "
+    "or a narrower band would let it"
+)
 MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 
 
@@ -46,6 +50,8 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
     else:
         first, bands = _at_first(forced)
         looked = _looked(forced)
+        if forced.spent:
+            looked = replace(looked, said=(*looked.said, SPENT))
     return _answer(case, forced or search, first, bands, looked)
 
 
