@@ -2,7 +2,7 @@
 
 Logistic regression of whether all that the most probable explanation names is concealed there, up
 to its class, on its evidence; every weight is held by a normal prior, so that few trials do not
-make it certain.
+make it certain. What tells against an answer never speaks for it, whatever few trials say.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ from samii_rig.prove.trial import Answer, Trial, Truth
 from samii_rig.record.export import replacing
 
 WIDE = 4.0  # standard deviation of a weight before the trials
+# Features that tell against an answer: no weight of theirs is above this, also where the trials
+# hardly have them.
+AGAINST, LEAST = ("left", "held", "two", "more", "unconfirmed"), -0.2
 FEWEST = 40  # trials below which a regression says nothing
 
 
@@ -78,7 +81,9 @@ def fit(
         gradient = -(X.T @ (each * y * special.expit(-score))) + w / WIDE**2
         return float(-np.sum(each * special.log_expit(score)) + 0.5 * w @ w / WIDE**2), gradient
 
-    found = optimize.minimize(loss, np.zeros(len(names)), jac=True, method="BFGS")
+    bounds = [(None, LEAST if name in AGAINST else None) for name in names]
+    start = np.array([LEAST if name in AGAINST else 0.0 for name in names])
+    found = optimize.minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds)
     return dict(zip(names, found.x.tolist(), strict=True))
 
 
