@@ -69,7 +69,7 @@ from samii_rig.serve.access import Tokens
 from samii_rig.serve.sofar import SoFar
 from samii_rig.types import Recording
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "kits"))
 
 from browser_kit import Browser  # found by the line above
 from device_kit import TIMED, installed

@@ -32,7 +32,7 @@ ROOT = Path(__file__).resolve().parent.parent
 MODULES = ("judgement", "gate", "lane", "latest", "readback", "agreement")
 TESTS = ("judgement", "reference", "readback", "agreement", "several", "", "limits", "stuck")
 WANTED = 0.98
-FIRST = {  # "" is tests/test_gate.py
+FIRST = {  # "" is tests/safety/test_gate.py
     "judgement": ("judgement", "reference"),
     "gate": ("several", ""),
     "lane": ("several", ""),
@@ -193,7 +193,7 @@ def change(module: types.ModuleType, tree: ast.Module) -> None:
 
 
 def file(test: str) -> Path:
-    return ROOT / "tests" / f"test_gate{'_' * bool(test)}{test}.py"
+    return ROOT / "tests" / "safety" / f"test_gate{'_' * bool(test)}{test}.py"
 
 
 def passes(session: pytest.Session, item: pytest.Item) -> bool:
