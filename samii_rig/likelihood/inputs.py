@@ -70,7 +70,10 @@ def _shown(recording: Recording, v: Float, law: Float) -> tuple[Float, float, Fl
             break
         # Edges say nothing of a delay: they pass within a sample.
         known &= np.abs(off) <= FAR * _sd(off)
-        late += float(off[known] @ slope[known]) / float(slope[known] @ slope[known])
+        turns = float(slope[known] @ slope[known])
+        if turns == 0:  # at rest for most of the record, and recorded as it was sent
+            break
+        late += float(off[known] @ slope[known]) / turns
         late = min(max(late, 0.0), LATEST)
     times = round(1 / (2 * late)) if late > 0 else 0
     if times and abs(late - 1 / (2 * times)) < WHOLE:

@@ -93,3 +93,14 @@ def test_an_edge_within_a_sample_is_told() -> None:
     assert np.flatnonzero(edges).size > 0
     assert np.all(np.abs(np.flatnonzero(edges) - 3000) <= 3)
     assert np.std(v[:2990] - run.values[:2990, 1]) > METER / 2
+
+
+def test_a_command_that_rests_for_most_of_the_record_is_left_as_it_is() -> None:
+    """Where it rests it is its law exactly, and says nothing of a meter."""
+    run = recorded(1, kp=0.0)
+    run.values[N // 4 :, 0] = 0.0
+    run.values[:, 1] = np.rint(run.values[:, 0] / STEP) * STEP
+    run.values[N // 4 - 5 : N // 4 + 5, 1] += STEP
+    v, edges = sent(run, 1, 0.0, None)
+    np.testing.assert_array_equal(v, run.values[:, 1])
+    assert not edges.any()
