@@ -21,7 +21,7 @@ from samii_rig.errors import InputError, SamiiRigError
 from samii_rig.record.export import replacing
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
-from sim.assumed_modes.parts import setup_of
+from sim.assumed_modes.parts import JOINTS, setup_of
 from sim.assumed_modes.trial import KINDS, Conceals, conceal, logged, save
 
 NAME = "assumed_modes"
@@ -39,9 +39,13 @@ class Plant:
         if kind not in KINDS:
             return f"no trials of kind {kind!r}"
         try:
-            setup_of(parse(Rig, rig_toml, "rig file"), {})
+            rig = parse(Rig, rig_toml, "rig file")
+            setup = setup_of(rig, {})
         except InputError as error:
             return str(error)
+        springs = [p for p in setup.parts if p.kind in JOINTS and p.values["k"] > 0]
+        if kind == "outside" and not springs:
+            return f"{rig.name}: element has no spring that could be another; expected one"
         return ""
 
     def __call__(self, kind: str, seed: int, out: Path, rig_toml: str) -> Path:
