@@ -11,6 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from samii_rig.likelihood.spikes import TO_SD
+from samii_rig.signal.columns import asked
 from samii_rig.types import Float, Recording
 
 NOISE = 0.1  # of what was measured, sd, that may be the meter's
@@ -24,7 +26,6 @@ ORDER = np.arange(NEIGHBOURS.size, dtype=np.float64)
 ROUNDS, STEP = 4, 1e-3  # of Gauss and Newton, and samples for a slope
 LATEST = 0.5  # samples: of a loop that runs at the record's rate
 WHOLE = 0.02  # samples, from the delay of a loop that runs a whole number of times as fast
-TO_SD = 1.4826  # median of |x| to the standard deviation of a Gaussian x
 
 
 def sent(
@@ -51,11 +52,7 @@ def sent(
 
 def _law(recording: Recording, command: int, kp: float, theta: Float | None) -> Float:
     """(n,) u + kp (theta_ref - theta)."""
-    law = np.zeros(recording.sequence.size)
-    for name in recording.names("reference"):
-        column = recording.column(name)
-        alike = recording.channels[column].unit == recording.channels[command].unit
-        law += (1.0 if alike else kp) * recording.values[:, column]
+    law = asked(recording, recording.channels[command].name, kp)
     return law if theta is None or kp == 0 else law - kp * theta
 
 

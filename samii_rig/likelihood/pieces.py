@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood import inputs, spikes
 from samii_rig.rig.schema import Rig
+from samii_rig.signal.columns import proportional
 from samii_rig.signal.groups import segments_of
 from samii_rig.types import Float, Quality, Recording, Segment
 
-ALIKE = 0.02  # part of an input that is not proportional to another, below which it is for all
 SPOILT = Quality.MISSING | Quality.CLIPPED | Quality.STALE
 LEAST_SAMPLES = 256  # fewer say nothing of a structure
 
@@ -200,9 +200,7 @@ def _proportional(one: Piece, other: Piece, *, levels: bool) -> bool:
         return False
     if not levels and one.levels != other.levels:
         return False
-    a, b = float(one.r @ one.r), float(other.r @ other.r)
-    across = float(one.r @ other.r)
-    return across > 0 and across**2 > (1 - ALIKE**2) * a * b
+    return proportional(one.r, other.r)
 
 
 def _turned(group: list[Piece], *, levels: bool) -> Piece:

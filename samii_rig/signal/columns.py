@@ -53,9 +53,7 @@ def shift_of(recording: Recording) -> int:
     def column(name: str) -> Float:
         return np.asarray(recording.values[around, recording.column(name)], np.float64)
 
-    scale = {n: 1.0 if names[n].unit == names[command[0]].unit else kp for n in references}
-    r = sum((scale[n] * column(n) for n in references), np.zeros(around.stop - around.start))
-    theta, rest = column(sensor), column(command[0]) - r
+    theta, rest = column(sensor), column(command[0]) - asked(recording, command[0], kp, around)
     inside = slice(FARTHEST, theta.size - FARTHEST)
     shifts = range(-FARTHEST, FARTHEST + 1)
     off = [float(np.nanmedian(np.abs(rest + kp * np.roll(theta, -m))[inside])) for m in shifts]
@@ -64,6 +62,24 @@ def shift_of(recording: Recording) -> int:
     best, none = int(np.argmin(off)), off[FARTHEST]
     exact = off[best] <= ROUNDED * names[command[0]].resolution and none > SEEN * off[best]
     return shifts[best] if exact or off[best] < LEFT * none else 0
+
+
+def asked(recording: Recording, command: str, kp: float, rows: slice = slice(None)) -> Float:
+    """(n,) u + kp theta_ref in the unit of the command, in these rows: all references, each of a
+    command or of an angle."""
+    unit = recording.channels[recording.column(command)].unit
+    out = np.zeros(recording.sequence[rows].size)
+    for name in recording.names("reference"):
+        column = recording.column(name)
+        alike = recording.channels[column].unit == unit
+        out += (1.0 if alike else kp) * recording.values[rows, column]
+    return out
+
+
+def proportional(v: Float, w: Float) -> bool:
+    """Whether two inputs are one, but for its size."""
+    across, powers = float(v @ w), float(v @ v) * float(w @ w)
+    return across > 0 and across**2 > (1 - ALIKE**2) * powers
 
 
 def aligned(recordings: Sequence[Recording]) -> list[tuple[Recording, Finding | None]]:
@@ -91,8 +107,7 @@ def _alike(one: Recording, other: Recording) -> bool:
     v, w = one.values[a, one.column(name)], other.values[b, other.column(name)]
     if v.size <= 2 * FARTHEST or not np.all(np.isfinite(v) & np.isfinite(w)):
         return False
-    across, powers = float(v @ w), float(v @ v) * float(w @ w)
-    return across > 0 and across**2 > (1 - ALIKE**2) * powers
+    return proportional(v, w)
 
 
 def _overlap(one: Recording, other: Recording) -> tuple[slice, slice]:

@@ -18,7 +18,6 @@ from samii_rig.diagnose.data.measured import Measured, binned
 from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.refit import STEPS, Fitted, Problem, refit
 from samii_rig.diagnose.fit.stated import IN_DATA
-from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model, grid
 from samii_rig.errors import SamiiRigError
@@ -117,7 +116,7 @@ class Explanations:
         """Before the data: of how many, which rows, which sites of a row. What is no physics has
         nothing to do with how much is missing of the rig."""
         effects = tuple(effects)
-        n = sum(e.physics not in NOT_PHYSICS for e in effects)
+        n = sum(e.physical for e in effects)
         chance = CHANCE[n] if n < len(CHANCE) else CHANCE[-1] * FEWER ** (n - len(CHANCE) + 1)
         each = (math.log(e.weight / self._total[e.physics] / len(self._rows)) for e in effects)
         mistakes = (len(effects) - n) * math.log(MISTAKE)

@@ -18,7 +18,6 @@ from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations
 from samii_rig.diagnose.fit.ranking import moved, ranking
 from samii_rig.diagnose.fit.refit import Fitted, refit
 from samii_rig.diagnose.fit.screen import Screen, Start
-from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.types import Float
 
@@ -155,7 +154,7 @@ class Search(Explanations):
     @staticmethod
     def _mixed(effects: Sequence[Effect]) -> bool:
         """Whether these are too many of different physics."""
-        real = [e.physics for e in effects if e.physics not in NOT_PHYSICS]
+        real = [e.physics for e in effects if e.physical]
         return len(real) > MIXED and len(set(real)) > 1
 
     def _ahead(self, tried: Sequence[Candidate]) -> list[Candidate]:

@@ -26,7 +26,6 @@ from samii_rig.diagnose.forces.reach import Reach
 from samii_rig.diagnose.forces.screen import Hope, Looks, scaled, weakly
 from samii_rig.diagnose.forces.table import forces, uneven
 from samii_rig.diagnose.forces.way import Ways
-from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
@@ -62,7 +61,7 @@ class ForceSearch(RecordSearch):
         self._ways = Ways()
         self.linear = linear
         base = linear.ranked()[0]
-        if any(e.physics not in NOT_PHYSICS for e in base.effects):
+        if any(e.physical for e in base.effects):
             base = linear.nominal
         moved = base.fitted
         self.reach = Reach(whole, moved.model, moved.x, int(linear.grid.actuator[0]))
@@ -144,12 +143,7 @@ class ForceSearch(RecordSearch):
                 return
             effects = (*base.effects, hope.effect)
             best = min(e.fitted.cost for e in self.found.values())
-            model = self.model(effects)
-            if model is None:
-                continue
-            start = moved(base.fitted.model, base.fitted.x, model)
-            start = np.append(start, np.log(hope.strengths))
-            end = self.refitted_from(effects, start, best)
+            end = self.refitted(effects, base, np.log(hope.strengths).tolist(), best)
             if end is not None and base.fitted.chi2 - end.chi2 > (
                 self.worth if base.effects else 0
             ):
@@ -190,7 +184,7 @@ class ForceSearch(RecordSearch):
     def pair(self) -> None:
         """Linear effects beside the best force; each of both must explain what an effect must."""
         best = self.ranked()[0]
-        real = [e for e in best.effects if e.physics not in NOT_PHYSICS]
+        real = [e for e in best.effects if e.physical]
         single = len(real) == 1 and isinstance(best.fitted.model, ForceModel)
         if not single:
             return

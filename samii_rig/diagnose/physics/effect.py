@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
+from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.model.tmm import State
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
@@ -113,6 +114,12 @@ class Effect:
     variant: str = ""
     position: float | None = None
     pieces: tuple[str, ...] = ()
+
+    @property
+    def physical(self) -> bool:
+        """Whether it is of the rig, and not of how its records were made."""
+        row = PHYSICS.get(self.physics)
+        return row is None or row.physical
 
     @property
     def name(self) -> tuple[str, str]:

@@ -14,7 +14,6 @@ from samii_rig.diagnose.fit.intervals import values_of
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.along import POSITION
-from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.physics.confusions import nearest
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Band, Cause, Gap, Moved, Value
@@ -33,7 +32,7 @@ def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> t
     values = values_of(chosen, judged.inflation)
     out = []
     for effect, found in zip(first.effects, values, strict=True):
-        if effect.physics in NOT_PHYSICS or unit_of(effect, found):
+        if not effect.physical or unit_of(effect, found):
             continue
         same = {effect.name, *chosen.equivalents(effect)}
         p = share
@@ -120,9 +119,7 @@ def sites(judged: Judgement) -> list[tuple[str, float]]:
     total: dict[str, float] = defaultdict(float)
     for c, share in zip(judged.classes, judged.placed, strict=True):
         for member, part in c.parts():
-            for site in dict.fromkeys(
-                e.site for e in member.effects if e.physics not in NOT_PHYSICS
-            ):
+            for site in dict.fromkeys(e.site for e in member.effects if e.physical):
                 total[site] += share * part
     chosen = {e.site for e in judged.best.effects}
     ranked = sorted(total.items(), key=lambda item: -item[1])

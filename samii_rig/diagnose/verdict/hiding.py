@@ -13,7 +13,6 @@ from scipy import stats
 from samii_rig.diagnose.fit.explanations import Explanation, Explanations
 from samii_rig.diagnose.fit.ranking import moved, place_at
 from samii_rig.diagnose.fit.screen import Screen
-from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Hiding
 from samii_rig.errors import SamiiRigError
@@ -32,7 +31,7 @@ def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
     found: dict[tuple[str, str], Hiding] = {}
     taken = {e.key for e in best.effects}
     for effect in search.table:
-        plain = effect.unknowns and effect.quasi is None and effect.physics not in NOT_PHYSICS
+        plain = effect.unknowns and effect.quasi is None and effect.physical
         if plain and effect.key not in taken and effect.name not in found:
             seen = _smallest(search, best, looks, effect, needed)
             if seen is not None:

@@ -15,7 +15,6 @@ from samii_rig.diagnose.fit.explanations import NEAR, Explanation, threshold
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.stated import IN_DATA, PLACE, TINY, Evidence, probability
-from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.result import Gap, Verdict
 
 NOTHING = 0.2  # probability of nothing missing below which it is called missing
@@ -160,7 +159,7 @@ def _evidence(
 def _as_meant(search: Search, best: Explanation) -> Explanation:
     """The nominal model of what was meant to be recorded: with what is no physics of `best`, which
     no physics gets the credit for."""
-    meant = frozenset(e.key for e in best.effects if e.physics in NOT_PHYSICS)
+    meant = frozenset(e.key for e in best.effects if not e.physical)
     return search.found.get(meant, search.nominal)
 
 
@@ -181,7 +180,7 @@ def _verdict(
 ) -> Verdict:
     # What a refit of the nominal parameters absorbs, at the cost of values that their tolerances
     # make unlikely, is not in the data; what is no physics is told beside the verdict.
-    physics = [e for e in chosen.first.effects if e.physics not in NOT_PHYSICS]
+    physics = [e for e in chosen.first.effects if e.physical]
     if not physics or evidence.drop <= search.worth:
         return "unknown" if _unexplained(evidence, search, decide) else "no_mismatch"
     if evidence.names > MOST_NAMES:
