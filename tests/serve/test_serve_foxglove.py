@@ -187,7 +187,7 @@ def test_a_run_of_the_service_is_seen(tmp_path: Path) -> None:
         assert service.process.stdout is not None
         line = service.process.stdout.readline()
         with client(int(line.rpartition(":")[2])) as ws, service.lease() as lease:
-            service.start(lease, sweep(6.0))
+            service.start(lease, sweep(120.0))  # longer than a busy machine may take to subscribe
             channel = advertised(ws, "/samples")
             subscribe(ws, channel)
             read = decoder(channel)
