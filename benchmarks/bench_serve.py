@@ -64,6 +64,7 @@ from samii_rig.rig.load import load_rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
+from samii_rig.run.order import RunOrder
 from samii_rig.run.priority import PRIORITY
 from samii_rig.serve.access import Tokens
 from samii_rig.serve.sofar import SoFar
@@ -418,7 +419,7 @@ def so_far() -> None:
     plan = experiment.plan(rig)
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "run.mcap"
-        carry_out(rig, rig_toml, text, plan, predict(plan, rig), path, settings={"seed": 1})
+        carry_out(RunOrder(rig, rig_toml, text, plan, predict(plan, rig), {"seed": 1}), path)
         start = next(int(e.payload["start"]) for e in read_events(path) if e.name == "plan")
         begun = time.process_time()
         recording = read_recording(path)

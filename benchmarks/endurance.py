@@ -45,8 +45,9 @@ from samii_rig.record.writer import PARTIAL, RunWriter
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.run import campaign
-from samii_rig.run.campaign import Outcome
 from samii_rig.run.dryrun import DryRun, predict
+from samii_rig.run.order import RunOrder
+from samii_rig.run.outcome import Outcome
 from samii_rig.run.plan import Plan
 from samii_rig.safety.latch import Latch
 from samii_rig.types import Float, Int, SampleBlock
@@ -126,7 +127,7 @@ def timed_run(wire: Wire, plan: Plan, predicted: DryRun, path: Path) -> tuple[Ou
 
     campaign.open_device = opening
     try:
-        return campaign.carry_out(wire.rig, "", "", plan, predicted, path), made[0]
+        return campaign.carry_out(RunOrder(wire.rig, "", "", plan, predicted), path), made[0]
     finally:
         campaign.open_device = opens
 
@@ -281,7 +282,7 @@ class Endured:
         Appender.add_chunk, campaign.RunWriter = add_chunk, opening
         try:
             outcome = campaign.carry_out(
-                self.wire.rig, "", "", self.plan, self.predicted, path, progress=progress
+                RunOrder(self.wire.rig, "", "", self.plan, self.predicted), path, progress=progress
             )
             return outcome.stop.status, outcome.stop.reason
         except SamiiRigError as error:

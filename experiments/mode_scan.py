@@ -14,7 +14,7 @@ from samii_rig.errors import EstimateError, InputError
 from samii_rig.identify.modal import estimate_modes
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Acceleration, AntiAlias, Finite, Name, NonNegative, Rig, Strict
-from samii_rig.run.campaign import Outcome
+from samii_rig.run.outcome import Outcome
 from samii_rig.run.setups import Conclusion, Setup
 
 

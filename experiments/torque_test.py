@@ -17,7 +17,7 @@ from samii_rig.model.sampled import sampled_response
 from samii_rig.model.tmm import Chain
 from samii_rig.record.export import export_response
 from samii_rig.rig.schema import Moment, Name, Rig
-from samii_rig.run.campaign import Outcome
+from samii_rig.run.outcome import Outcome
 from samii_rig.run.plan import Plan
 from samii_rig.run.setups import Conclusion
 from samii_rig.signal.ratio import ratio

@@ -193,22 +193,16 @@ def _recorded(rig: Rig, experiment: str, path: Path) -> Recording:
     from samii_rig.diagnose.fit.rigfile import toml
     from samii_rig.errors import InputError
     from samii_rig.run.campaign import carry_out
-    from samii_rig.run.dryrun import predict
-    from samii_rig.run.experiments import load_experiment, plan_of
-    from samii_rig.run.setups import setups_of
+    from samii_rig.run.order import Order
 
     if rig.device.driver not in (IN_PROCESS, ON_THE_WIRE):
         expected = f"{IN_PROCESS} or {ON_THE_WIRE}: no test moves a real rig"
         raise InputError("fixture recording", "rig.device.driver", rig.device.driver, expected)
-    loaded, text = load_experiment(experiment, rig)
-    setups = setups_of(loaded, rig, toml(rig))
-    if len(setups) != 1:
+    order = Order.named(experiment, rig, toml(rig))
+    if len(order.setups) != 1:
         expected = "an experiment of one run"
-        raise InputError("fixture recording", experiment, f"{len(setups)} runs", expected)
-    (setup,) = setups
-    plan = plan_of(loaded, setup.rig)
-    predicted = predict(plan, setup.rig)
-    outcome = carry_out(setup.rig, setup.rig_toml, text, plan, predicted, path)
+        raise InputError("fixture recording", experiment, f"{len(order.setups)} runs", expected)
+    outcome = carry_out(order.run(0).predict(), path)
     made = outcome.recording
     for array in (made.time, made.sequence, made.values, made.quality):
         array.flags.writeable = False  # other tests get the same one

@@ -24,6 +24,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
+from samii_rig.run.order import RunOrder
 from samii_rig.run.plan import Experiment
 from samii_rig.types import Complex, FrequencyResponse
 
@@ -57,15 +58,10 @@ def carried_out(
         planned = cast("Experiment", planned.model_copy(update={**loudest, **(changes or {})}))
     plan = planned.plan(rig)
     with TemporaryDirectory() as folder:
-        outcome = carry_out(
-            rig,
-            rig_toml,
-            experiment_toml,
-            plan,
-            predict(plan, rig),
-            Path(folder) / "run.mcap",
-            settings={"seed": seed},
+        order = RunOrder(
+            rig, rig_toml, experiment_toml, plan, predict(plan, rig), settings={"seed": seed}
         )
+        outcome = carry_out(order, Path(folder) / "run.mcap")
     if outcome.stop.status != "completed":
         raise DeviceError(f"the run ended {outcome.stop.status}: {outcome.stop.reason}")
     if not outcome.responses:

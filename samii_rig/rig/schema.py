@@ -245,6 +245,11 @@ class Device(Strict):
     driver: str = "simulated"
     settings: dict[str, Any] = Field(default_factory=dict)
 
+    @property
+    def simulated(self) -> bool:
+        """Nothing moves: the rig is computed in this process, and hurts nobody."""
+        return self.driver == "simulated"
+
 
 class Service(Strict):
     """What `samii-rig serve` does with this rig.

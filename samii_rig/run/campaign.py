@@ -6,63 +6,41 @@ import gc
 import json
 import platform
 import sys
-from collections.abc import Callable
-from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from threading import Event
 
 from samii_rig.devices.opening import close_device, open_device
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import SamiiRigError
 from samii_rig.record.reader import read_frequency_responses, read_recording
 from samii_rig.record.writer import RunWriter
-from samii_rig.rig.schema import Rig
 from samii_rig.run.dryrun import DryRun
 from samii_rig.run.ending import finish
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import run
+from samii_rig.run.order import RunOrder
+from samii_rig.run.outcome import Outcome
 from samii_rig.run.pace import LoopSettings
-from samii_rig.run.plan import Plan
 from samii_rig.run.priority import prioritised
 from samii_rig.run.progress import Progress
 from samii_rig.run.sink import Watched, recorded_channels
-from samii_rig.run.space import room_for
-from samii_rig.safety.latch import Latch
+from samii_rig.safety.latch import Cleared, Latch
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import FrequencyResponse, Recording, SampleBlock, StopRecord
+from samii_rig.types import SampleBlock, StopRecord
 
 # What can change a result and is not in the recording otherwise.
 VERSIONS_OF = ("samii-rig", "numpy", "scipy", "numba", "mcap")
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What a run left behind. `trouble` says why there are no responses, "" if there are.
-
-    interrupted : the signal that came at any time before the device was closed, perhaps after
-        the run was done; no other run may follow by itself.
-    """
-
-    path: Path
-    recording: Recording
-    responses: tuple[FrequencyResponse, ...]
-    stop: StopRecord
-    trouble: str
-    interrupted: str = ""
-
-
 def carry_out(
-    rig: Rig,
-    rig_toml: str,
-    experiment_toml: str,
-    plan: Plan,
-    predicted: DryRun,
+    order: RunOrder,
     path: Path,
     *,
-    settings: dict[str, object] | None = None,
-    operator: str = "",
     progress: Callable[[Progress], None] | None = None,
     stop: Event | None = None,
     alive: Callable[[], bool] | None = None,
@@ -70,75 +48,52 @@ def carry_out(
     watch: Callable[[SampleBlock], None] | None = None,
     at_rest: Callable[[StopRecord], None] | None = None,
 ) -> Outcome:
-    """Run `plan` on the rig's device into the recording `path`, estimate, close.
+    """Run the order's plan on the rig's device into the recording `path`, estimate, close.
 
     However the run ends, the recording is whole and says how; what was measured until then
     is estimated where it suffices. A FAULT on a real rig is latched (`samii_rig.safety.latch`), and
-    while one is, nothing is opened. alive, loop : see `samii_rig.run.loop.run`. watch : gets
-    every block after it was recorded, for a display; it must neither wait nor raise. at_rest : is
-    told how the run ended once nothing moves, before the estimate is made and the recording closed.
+    while one is, nothing is opened. progress, stop, alive, loop : see `samii_rig.run.loop.run`.
+    watch : gets every block after it was recorded, for a display; it must neither wait nor raise.
+    at_rest : is told how the run ended once nothing moves, before the estimate is made and the
+    recording closed.
 
-    Raises GateError for a latched fault, DeviceError if the rig does not open or another program
-    drives it, RecordingError if the file cannot be made, and DiskError if the disk has no room or
-    refuses it later; the output is at zero before each of them.
+    Raises LimitError if the order would break a limit, GateError for a latched fault, DeviceError
+    if the rig does not open or another program drives it, RecordingError if the file cannot be
+    made, and DiskError if the disk has no room or refuses it later; the output is at zero before
+    each of them.
     """
-    predicted.refuse()
-    room_for(path, [plan], [rig])
+    order.refuse(path)
+    rig = order.rig
     latch = Latch(rig.name, rig.device.driver)
     latch.refuse()
     # Before any device waits: the samples of a run before are garbage in cycles, which by itself
     # may stay for a hundred runs.
     gc.collect()
-    device = open_device(rig, settings or {})
+    device = open_device(rig, order.settings)
     real = device.metadata.get("clock") != "simulated"
-    cleared = latch.cleared if real else None
     try:
-        notes = {
-            "experiment": plan.experiment,
-            "seed": str(plan.seed),
-            "operator": operator,
-            "started": datetime.now(UTC).isoformat(timespec="seconds"),
-            "device": device.description,
-            "centring": "; ".join(f"{o.centring_sensor} {o.kp!r}" for o in plan.outputs),
-            "predicted_peaks": json.dumps(_peaks(predicted)),
-            **{f"device_{key}": value for key, value in device.metadata.items()},
-            **({f"fault_cleared_{k}": v for k, v in asdict(cleared).items()} if cleared else {}),
-            **versions(),
-        }
+        notes = _notes(order, device, latch.cleared if real else None)
         if real and (tripped := device.metadata.get("tripped")):
             latch.set(tripped)
             latch.refuse()
         with (
             latch.held(device),
             Interrupts() as interrupts,
-            RunWriter(
-                path,
-                recorded_channels(rig, plan, device.sensor.channels),
-                plan.rate_hz,
-                rig_toml=rig_toml,
-                experiment_toml=experiment_toml,
-                metadata=notes,
-            ) as writer,
+            _writer(order, path, device, notes) as writer,
         ):
-            try:
-                with prioritised() if real else nullcontext():
-                    ended = run(
-                        plan,
-                        rig,
-                        device,
-                        writer if watch is None else Watched(writer, watch),
-                        progress,
-                        stop,
-                        alive=alive,
-                        settings=loop,
-                        interrupts=interrupts,
-                        latch=latch.set if real else None,
-                    )
-            except BaseException as error:
-                # Refused before anything moved; the recording says so and is whole.
-                interrupts.ending = True
-                writer.close(StopRecord("failed", _line(error)))
-                raise
+            with _refusal_recorded(writer, interrupts), prioritised() if real else nullcontext():
+                ended = run(
+                    order.plan,
+                    rig,
+                    device,
+                    writer if watch is None else Watched(writer, watch),
+                    progress,
+                    stop,
+                    alive=alive,
+                    settings=loop,
+                    interrupts=interrupts,
+                    latch=latch.set if real else None,
+                )
             if at_rest is not None:
                 at_rest(ended)
             # What the device has learnt meanwhile, as how well its clocks are known.
@@ -151,6 +106,44 @@ def carry_out(
         close_device(device)
     responses = tuple(read_frequency_responses(path))
     return Outcome(path, read_recording(path), responses, ended, trouble, interrupts.came)
+
+
+def _notes(order: RunOrder, device: OpenRig, cleared: Cleared | None) -> dict[str, str]:
+    """What the recording says of the run beside its files, by name."""
+    return {
+        "experiment": order.plan.experiment,
+        "seed": str(order.plan.seed),
+        "operator": order.operator,
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "device": device.description,
+        "centring": "; ".join(f"{o.centring_sensor} {o.kp!r}" for o in order.plan.outputs),
+        "predicted_peaks": json.dumps(_peaks(order.predicted)),
+        **{f"device_{key}": value for key, value in device.metadata.items()},
+        **({f"fault_cleared_{k}": v for k, v in asdict(cleared).items()} if cleared else {}),
+        **versions(),
+    }
+
+
+def _writer(order: RunOrder, path: Path, device: OpenRig, notes: dict[str, str]) -> RunWriter:
+    return RunWriter(
+        path,
+        recorded_channels(order.rig, order.plan, device.sensor.channels),
+        order.plan.rate_hz,
+        rig_toml=order.rig_toml,
+        experiment_toml=order.experiment_toml,
+        metadata=notes,
+    )
+
+
+@contextmanager
+def _refusal_recorded(writer: RunWriter, interrupts: Interrupts) -> Iterator[None]:
+    """What is refused before anything moved has a whole recording too, which says so."""
+    try:
+        yield
+    except BaseException as error:
+        interrupts.ending = True
+        writer.close(StopRecord("failed", _line(error)))
+        raise
 
 
 def versions() -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from datetime import datetime
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
@@ -23,7 +24,7 @@ def fitting(rig: Rig) -> dict[str, Traversable]:
     """Shipped experiments for this rig, by the name under which `load_experiment` finds them:
     its own variants in place of the general ones, and no variant of another rig."""
     files = shipped()
-    own = _slug(rig.name)
+    own = slug(rig.name)
     return {
         name: files.get(f"{name}_{own}", file)
         for name, file in files.items()
@@ -31,8 +32,14 @@ def fitting(rig: Rig) -> dict[str, Traversable]:
     }
 
 
-def _slug(name: str) -> str:
+def slug(name: str) -> str:
+    """A name as a part of a file's: small letters and digits, and one underscore for the rest."""
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+
+
+def recording_stem(rig: Rig, experiment: str) -> str:
+    """Name, without its ending, of a recording that is begun now: time, rig and experiment."""
+    return f"{datetime.now():%Y-%m-%dT%H-%M-%S}_{slug(f'{rig.name}_{experiment}')}"
 
 
 def load_experiment(name: str, rig: Rig) -> tuple[Experiment, str]:
@@ -45,18 +52,23 @@ def load_experiment(name: str, rig: Rig) -> tuple[Experiment, str]:
     InputError if there is none, if its kind is not known, or if a field is wrong.
     """
     files = shipped()
-    own = _slug(rig.name)
+    own = slug(rig.name)
     for candidate in (f"{name}_{own}", name):
         if candidate in files:
-            return _load(files[candidate].read_text("utf-8"), f"{candidate}.toml")
+            return parse_experiment(files[candidate].read_text("utf-8"), f"{candidate}.toml")
     path = Path(name)
     if not path.exists():
         expected = f"the path of an experiment file or {one_of(name, files)}"
         raise InputError("EXPERIMENT", "", name, expected)
-    return _load(read_text(path, "experiment file"), str(path))
+    return parse_experiment(read_text(path, "experiment file"), str(path))
 
 
-def _load(text: str, where: str) -> tuple[Experiment, str]:
+def parse_experiment(text: str, where: str) -> tuple[Experiment, str]:
+    """The experiment of a file's text, and that text with line breaks alone at its lines' ends.
+
+    where : what errors call it. InputError as of `load_experiment`.
+    """
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
     known = kinds()
     kind = tables(text, where).get("experiment")
     if not isinstance(kind, str) or kind not in known:

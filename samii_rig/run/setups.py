@@ -9,8 +9,8 @@ from typing import Protocol, runtime_checkable
 
 from samii_rig.devices.plugins import asked, wrong
 from samii_rig.rig.schema import Rig
-from samii_rig.run.campaign import Outcome
 from samii_rig.run.experiments import origin
+from samii_rig.run.outcome import Outcome
 
 
 @dataclass(frozen=True, slots=True)

@@ -60,7 +60,8 @@ class Analyst:
     def __init__(self, job: Job, recordings: Path) -> None:
         self.job = job
         self._path = recordings / job.request.recording
-        self._setup, self._text, self._plan = planned(job)
+        run = planned(job)
+        self._setup, self._text, self._plan = run.setup, run.experiment_toml, run.plan
         self._so_far = SoFar(self._plan)
         self._start: int | None = None
         self._frequency = _grid(self._plan)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
-from samii_rig.run.experiments import load_experiment, plan_of
+from samii_rig.run.order import Order, PlannedRun
 from samii_rig.run.plan import Plan
-from samii_rig.run.setups import Setup, setups_of
 from samii_rig.serve.job import EXPERIMENT, RIG, Job
 
 
@@ -21,11 +20,9 @@ def averages(plan: Plan, segment: int) -> tuple[int, int]:
     return alike[: segment - 1].count(now), alike.count(now)
 
 
-def planned(job: Job) -> tuple[Setup, str, Plan]:
-    """The rig as the run needs it, the experiment's text and its plan; InputError if they are
-    wrong, RecordingError if they cannot be read."""
+def planned(job: Job) -> PlannedRun:
+    """The run that a job's files ask for; InputError if they are wrong, RecordingError if they
+    cannot be read."""
     rig_toml = (job.folder / RIG).read_text(encoding="utf-8")
     rig = parse(Rig, rig_toml, RIG)
-    experiment, text = load_experiment(str(job.folder / EXPERIMENT), rig)
-    setup = setups_of(experiment, rig, rig_toml)[job.order().setup]
-    return setup, text, plan_of(experiment, setup.rig)
+    return Order.named(str(job.folder / EXPERIMENT), rig, rig_toml).run(job.order().setup)

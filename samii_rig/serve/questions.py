@@ -10,16 +10,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from samii_rig.errors import SamiiRigError
-
 MOST_POINTS = 4000  # of one curve in one answer
 MOST_VALUES = 8_000_000  # of samples in one answer: ten channels at 1 kHz for 13 minutes
 
 
 def awake() -> dict[str, Any]:
     """Nothing; what a prediction needs is loaded, which takes seconds."""
-    import samii_rig.run.dryrun
-    import samii_rig.run.experiments  # noqa: F401
+    import samii_rig.run.order  # noqa: F401
 
     return {}
 
@@ -57,49 +54,33 @@ def dry_run(rig_toml: str, name: str, text: str) -> dict[str, Any]:
     name : of a shipped experiment, or `text` : of its file. No path from a client is ever opened.
     refused : the line of what limit would be broken, "" if none. text : of the experiment.
     """
-    from samii_rig.devices.plugins import asked
     from samii_rig.errors import InputError, LimitError, one_of
     from samii_rig.rig.load import parse
     from samii_rig.rig.schema import Rig
-    from samii_rig.run.dryrun import predict
-    from samii_rig.run.experiments import load_experiment, plan_of, shipped
-    from samii_rig.run.setups import setups_of
+    from samii_rig.run.experiments import shipped
+    from samii_rig.run.order import Order
     from samii_rig.serve.words import prediction
 
     the_rig = parse(Rig, rig_toml, "rig file")
     if bool(name) == bool(text):
         raise InputError("experiment", "", name, "a name or a text, one of the two")
+    if name and name not in shipped():
+        raise InputError("experiment", "", name, one_of(name, shipped()))
     if name:
-        if name not in shipped():
-            raise InputError("experiment", "", name, one_of(name, shipped()))
-        _, text = load_experiment(name, the_rig)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "experiment.toml"
-        file.write_text(text, encoding="utf-8")
-        try:
-            experiment, _ = load_experiment(str(file), the_rig)
-        except SamiiRigError as error:
-            raise _renamed(error, str(file)) from error
+        order = Order.named(name, the_rig, rig_toml)
+    else:
+        order = Order.written(text, "experiment.toml", the_rig, rig_toml)
     runs, refused = [], ""
-    for setup in setups_of(experiment, the_rig, rig_toml):
-        plan = plan_of(experiment, setup.rig)
-        with asked(f"experiment {experiment.name!r}", "prediction"):
-            predicted = predict(plan, setup.rig)
+    for run in order.runs():
+        predicted = run.predict().predicted
         try:
             predicted.refuse()
         except LimitError as error:
             refused = refused or str(error)
-        about = {"setup": setup.name, "instruction": setup.instruction}
-        runs.append({**about, "segments": len(plan.segments), **prediction(predicted)})
-    return {"experiment": experiment.name, "runs": runs, "refused": refused, "text": text}
-
-
-def _renamed(error: SamiiRigError, file: str) -> SamiiRigError:
-    """The same line with a name that means something to who sent the text."""
-    line = str(error).replace(file, "experiment.toml")
-    again = type(error).__new__(type(error))
-    Exception.__init__(again, line)
-    return again
+        about = {"setup": run.setup.name, "instruction": run.setup.instruction}
+        runs.append({**about, "segments": len(run.plan.segments), **prediction(predicted)})
+    asked = {"experiment": order.experiment.name, "text": order.experiment_toml}
+    return {**asked, "runs": runs, "refused": refused}
 
 
 def signals(path: str, names: list[str], start: float, stop: float, pixels: int) -> dict[str, Any]:

@@ -24,11 +24,12 @@ import numpy as np
 
 from samii_rig.errors import GateError, SamiiRigError
 from samii_rig.index.remarks import add_note, set_diagnosis
-from samii_rig.run.campaign import Outcome, carry_out
-from samii_rig.run.dryrun import predict
+from samii_rig.rig.schema import Rig
+from samii_rig.run.campaign import carry_out
+from samii_rig.run.order import PlannedRun, RunOrder
+from samii_rig.run.outcome import Outcome
 from samii_rig.run.plan import Plan
 from samii_rig.run.progress import Progress
-from samii_rig.run.setups import Setup
 from samii_rig.safety.limits import gate_limits
 from samii_rig.serve.following import following
 from samii_rig.serve.job import DIAGNOSIS, LOST_AFTER, Job, JobState
@@ -55,11 +56,11 @@ class Runner:
         live = live_folder() / f"{self.job.id}.live"
         self._set(phase="starting", pid=os.getpid(), live=str(live))
         try:
-            setup, text, plan = planned(self.job)
-            outcome = self._carry_out(setup, text, plan, live)
+            run = planned(self.job)
+            outcome = self._carry_out(run, live)
             self._set(trouble=outcome.trouble)
             self._note()
-            verdict = self._diagnosed(setup, text, outcome)
+            verdict = self._diagnosed(run, outcome)
             self._set(phase="done", verdict=verdict)
         except SamiiRigError as error:
             self._failed(str(error))
@@ -79,65 +80,60 @@ class Runner:
         # A run whose recording could not be closed did not go through, however it had ended.
         self._set(phase="refused", status="failed" if self.state.status else "", error=error)
 
-    def _carry_out(self, setup: Setup, text: str, plan: Plan, live: Path) -> Outcome:
-        predicted = predict(plan, setup.rig)
+    def _carry_out(self, run: PlannedRun, live: Path) -> Outcome:
+        order = run.predict(self.request.settings, self.request.operator)
         if self.job.stops():
             raise GateError("stopped before anything moved")
         self._set(phase="running")
-
-        def watch(block: SampleBlock) -> None:
-            self._note_output(block, plan.actuator)
-            # A display that fails is none of the run's business.
-            with suppress(Exception):
-                if self.live is None:
-                    self.live = LiveWriter(live, block.channels, plan.rate_hz)
-                self.live.samples(block)
-
-        def progress(now: Progress) -> None:
-            if self.live is not None:
-                done, of = averages(plan, now.segment)
-                # JSON says neither "not a number" nor "infinite".
-                about = {"duration": plan.duration, "broadband": math.isinf(now.frequency)}
-                about |= {"averages": done, "of_averages": of}
-                self.live.progress({**_numbers(asdict(now)), **about})
-                self._end_at_rest(now)
-
-        def alive() -> bool:
-            gone = self.live is not None and self.live.silence() > LOST_AFTER
-            if gone and setup.rig.service.when_lost == "stop":
-                self.lost = True
-                self.stop.set()
-            return True
-
-        def at_rest(ended: StopRecord) -> None:
-            # Whoever asked for the stop waits for this, not for the estimate.
-            limits = gate_limits(setup.rig, plan.actuator, plan.kp, plan.centring_sensor)
-            at_zero = abs(self._shown) <= limits.output.slack / 2
-            # A disk that is full for this word may still take the recording's end.
-            with suppress(OSError):
-                self._set(
-                    phase="analysing",
-                    status=ended.status,
-                    reason=self._reason(ended),
-                    at_zero=None if math.isnan(self._shown) else at_zero,
-                    ended=datetime.now(UTC).isoformat(timespec="seconds"),
-                )
-
         return carry_out(
-            setup.rig,
-            setup.rig_toml,
-            text,
-            plan,
-            predicted,
+            order,
             self.path,
-            settings=self.request.settings,
-            operator=self.request.operator,
-            progress=progress,
+            progress=lambda now: self._progress(order.plan, now),
             stop=self.stop,
-            alive=alive,
-            watch=watch,
-            at_rest=at_rest,
+            alive=lambda: self._alive(order.rig),
+            watch=lambda block: self._watch(order.plan, live, block),
+            at_rest=lambda ended: self._at_rest(order, ended),
         )
+
+    def _watch(self, plan: Plan, live: Path, block: SampleBlock) -> None:
+        self._note_output(block, plan.actuator)
+        # A display that fails is none of the run's business.
+        with suppress(Exception):
+            if self.live is None:
+                self.live = LiveWriter(live, block.channels, plan.rate_hz)
+            self.live.samples(block)
+
+    def _progress(self, plan: Plan, now: Progress) -> None:
+        if self.live is not None:
+            done, of = averages(plan, now.segment)
+            # JSON says neither "not a number" nor "infinite".
+            about = {"duration": plan.duration, "broadband": math.isinf(now.frequency)}
+            about |= {"averages": done, "of_averages": of}
+            self.live.progress({**_numbers(asdict(now)), **about})
+            self._end_at_rest(now)
+
+    def _alive(self, rig: Rig) -> bool:
+        """Always: who drives is the service's to know. One that is gone may end the run."""
+        gone = self.live is not None and self.live.silence() > LOST_AFTER
+        if gone and rig.service.when_lost == "stop":
+            self.lost = True
+            self.stop.set()
+        return True
+
+    def _at_rest(self, order: RunOrder, ended: StopRecord) -> None:
+        """Whoever asked for the stop waits for this, not for the estimate."""
+        plan = order.plan
+        limits = gate_limits(order.rig, plan.actuator, plan.kp, plan.centring_sensor)
+        at_zero = abs(self._shown) <= limits.output.slack / 2
+        # A disk that is full for this word may still take the recording's end.
+        with suppress(OSError):
+            self._set(
+                phase="analysing",
+                status=ended.status,
+                reason=self._reason(ended),
+                at_zero=None if math.isnan(self._shown) else at_zero,
+                ended=datetime.now(UTC).isoformat(timespec="seconds"),
+            )
 
     def _note_output(self, block: SampleBlock, actuator: str) -> None:
         """What a sample last said of the output."""
@@ -174,7 +170,7 @@ class Runner:
         if said:
             add_note(self.path, "service", "; ".join(said)[:2000])
 
-    def _diagnosed(self, setup: Setup, text: str, outcome: Outcome) -> str:
+    def _diagnosed(self, run: PlannedRun, outcome: Outcome) -> str:
         """The verdict; "" where there is nothing to tell it from."""
         if not self.request.diagnosis or not outcome.responses:
             return ""
@@ -185,9 +181,10 @@ class Runner:
         from samii_rig.serve.analyst import said
 
         with suppress(SamiiRigError):
-            found = diagnose(outcome.responses, setup.rig, runs=[outcome.recording])
+            found = diagnose(outcome.responses, run.setup.rig, runs=[outcome.recording])
             set_diagnosis(self.path, {**found.plain(), "lines": list(found.lines())})
-            told = {"next_toml": following(found.experiment, text), "final": True}
+            following_toml = following(found.experiment, run.experiment_toml)
+            told = {"next_toml": following_toml, "final": True}
             self.job.tell(DIAGNOSIS, {**said(found), **told})
             return found.verdict
         return ""

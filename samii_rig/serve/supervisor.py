@@ -6,14 +6,12 @@ run and the queue again when it is started anew.
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict, replace
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from samii_rig.index.store import PRIVATE, Index
 from samii_rig.record.recover import recover
 from samii_rig.record.writer import PARTIAL
 from samii_rig.rig.schema import Rig
+from samii_rig.run.experiments import recording_stem
 from samii_rig.serve.job import ID, JOBS, LOG, OVER, Job, JobState, Request, asked_to_stop
 from samii_rig.serve.live import LiveReader
 
@@ -62,7 +61,7 @@ class Supervisor:
     @property
     def simulated(self) -> bool:
         """The rig hurts nobody."""
-        return self._rig.device.driver == "simulated"
+        return self._rig.device.simulated
 
     def add(
         self,
@@ -96,8 +95,7 @@ class Supervisor:
             expected = "false: the runs of an experiment of several are diagnosed together, later"
             raise InputError("order", "stop_when_certain", True, expected)
         settings: dict[str, Any] = {"pace": self._pace} if simulated and self._pace > 0 else {}
-        slug = re.sub(r"[^a-z0-9]+", "_", f"{self._rig.name}_{name}".lower()).strip("_")
-        stem = f"{datetime.now():%Y-%m-%dT%H-%M-%S}_{slug}"
+        stem = recording_stem(self._rig, name)
         made = []
         for i, run in enumerate(predicted):
             own = f"{stem}_{run['setup']}" if run["setup"] else stem

@@ -28,6 +28,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
+from samii_rig.run.order import RunOrder
 
 SAMII, TEXT = load_rig("samii")
 
@@ -171,9 +172,9 @@ def stepped(text: str, folder: Path):
     experiment, experiment_text = load_experiment(str(file), rig)
     plan = experiment.plan(rig)
     path = folder / "step.mcap"
-    done = carry_out(
-        rig, text, experiment_text, plan, predict(plan, rig), path, settings={"seed": 2}
-    )
+    predicted = predict(plan, rig)
+    order = RunOrder(rig, text, experiment_text, plan, predicted, settings={"seed": 2})
+    done = carry_out(order, path)
     assert done.stop.status == "completed"
     return done.recording
 

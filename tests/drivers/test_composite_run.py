@@ -13,6 +13,7 @@ from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Device
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
+from samii_rig.run.order import RunOrder
 
 SLOW = SHORT.model_copy(update={"name": "slow", "low_hz": 3.0, "high_hz": 16.0})
 
@@ -26,7 +27,7 @@ def test_the_moment_over_can_is_that_of_the_rig_in_this_process(tmp_path, monkey
         # Every try is a rig of its own: a FAULT of the last one is not cleared, but left behind.
         monkeypatch.setenv("SAMII_RIG_STATE", str(tmp_path / f"state_{name}"))
         path = tmp_path / f"{name}.mcap"
-        return carry_out(own, "", "", plan, predict(plan, own), path, settings=settings)
+        return carry_out(RunOrder(own, "", "", plan, predict(plan, own), settings), path)
 
     # So long a gap that a loaded machine loses nothing; what it misses shows in the scatter.
     wire = CanWire("--seed", "3", "--drift", "80", rig=str(file))

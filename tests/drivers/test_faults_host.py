@@ -221,9 +221,10 @@ def driven(wire: Wire, path: Path, seconds: float):
 
     from samii_rig.run.campaign import carry_out
     from samii_rig.run.dryrun import predict
+    from samii_rig.run.order import RunOrder
 
     plan = plan_of(wire.rig, seconds)
-    return carry_out(wire.rig, "", "", plan, predict(plan, wire.rig), path)
+    return carry_out(RunOrder(wire.rig, "", "", plan, predict(plan, wire.rig)), path)
 
 
 @pytest.mark.parametrize("error", [28, 5], ids=["full", "I/O error"])

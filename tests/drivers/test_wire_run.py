@@ -12,11 +12,12 @@ from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Device, Rig
 from samii_rig.run.campaign import Outcome, carry_out
 from samii_rig.run.dryrun import predict
+from samii_rig.run.order import RunOrder
 from samii_rig.run.plan import Plan
 
 
 def done(rig: Rig, plan: Plan, path: Path, settings: dict[str, object]) -> Outcome:
-    return carry_out(rig, "", "", plan, predict(plan, rig), path, settings=settings)
+    return carry_out(RunOrder(rig, "", "", plan, predict(plan, rig), settings), path)
 
 
 @pytest.mark.parametrize("node", NODES)

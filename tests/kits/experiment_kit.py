@@ -13,6 +13,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import Outcome, carry_out
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
+from samii_rig.run.order import RunOrder
 from samii_rig.run.plan import Experiment
 from samii_rig.signal.statistics import imag_interval, real_interval
 from samii_rig.types import FrequencyResponse
@@ -47,7 +48,8 @@ def shipped(rig_name: str, name: str, **changes: object) -> tuple[Rig, str, Expe
 def simulate(rig: Rig, text: str, experiment: Experiment, path: Path, seed: int = 1) -> Outcome:
     """The experiment on the simulated rig, whole."""
     plan = experiment.plan(rig)
-    outcome = carry_out(rig, text, "", plan, predict(plan, rig), path, settings={"seed": seed})
+    order = RunOrder(rig, text, "", plan, predict(plan, rig), settings={"seed": seed})
+    outcome = carry_out(order, path)
     assert outcome.stop.status == "completed", outcome.stop.reason
     assert outcome.trouble == ""
     return outcome

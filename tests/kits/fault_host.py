@@ -22,6 +22,7 @@ from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import DryRun, predict
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import _Run
+from samii_rig.run.order import RunOrder
 from samii_rig.run.pace import LoopSettings
 from samii_rig.run.plan import Plan, PlannedSegment
 
@@ -83,7 +84,8 @@ def driven(rig: Rig, path: Path, predicted: DryRun) -> int:
 
     plan = plan_of(rig, 30.0)
     loop = LoopSettings(report=0.02)
-    outcome = carry_out(rig, "", "", plan, predicted, path, progress=progress, loop=loop)
+    order = RunOrder(rig, "", "", plan, predicted)
+    outcome = carry_out(order, path, progress=progress, loop=loop)
     return EXIT[outcome.stop.status]
 
 

@@ -179,7 +179,7 @@ def test_a_run_that_is_stopped_ends_the_scan(done, tmp_path, monkeypatch):
     )
     assert result.exit_code == 130
     assert len(calls) == 2
-    assert [args[5].name for args in calls] == ["scan_01.mcap", "scan_02.mcap"]
+    assert [args[1].name for args in calls] == ["scan_01.mcap", "scan_02.mcap"]
     assert "mode 1: " not in result.output  # of the scan; each run has its own modes
 
 

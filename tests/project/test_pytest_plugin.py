@@ -27,6 +27,7 @@ from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Device, Rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
+from samii_rig.run.order import RunOrder
 
 PAGE = (ROOT / "docs" / "guide" / "ci.md").read_text(encoding="utf-8")
 (SHOWN,) = re.findall(r"```text\n(.*?)```", PAGE, re.S)  # what a failing test shows
@@ -193,7 +194,8 @@ def test_a_run_that_tripped_explains_nothing(tmp_path):
     rig, text = load_rig("samii")
     tripping = rig.model_copy(update={"device": Device(settings={"faults": ["nan theta_2 2"]})})
     plan = SHORT.plan(rig)
-    outcome = carry_out(tripping, text, "", plan, predict(plan, rig), tmp_path / "tripped.mcap")
+    order = RunOrder(tripping, text, "", plan, predict(plan, rig))
+    outcome = carry_out(order, tmp_path / "tripped.mcap")
     assert outcome.stop.status == "tripped"
     with pytest.raises(AssertionError, match=r"tripped\.mcap: the run tripped: .*v_2"):
         assert_no_mismatch(outcome.recording, rig)

@@ -27,6 +27,7 @@ from samii_rig.record.store import write_recording
 from samii_rig.record.writer import RunWriter
 from samii_rig.run import campaign, space
 from samii_rig.run.ending import finish
+from samii_rig.run.order import RunOrder
 from samii_rig.types import StopRecord
 
 HEAD = 20_000  # bytes: more than what stands before the samples, less than a run
@@ -63,7 +64,7 @@ def test_a_run_on_a_disk_that_fills_ends_at_zero_and_says_what_is_left(
 ) -> None:
     path = tmp_path / "run.mcap"
     with full_at(HEAD), pytest.raises(DiskError) as full:
-        campaign.carry_out(RIG, "", "", PLAN, PREDICTED, path)
+        campaign.carry_out(RunOrder(RIG, "", "", PLAN, PREDICTED), path)
     assert device.v == 0.0
     assert not device.live
     said = str(full.value)
@@ -132,7 +133,7 @@ def test_a_plan_without_room_is_refused_before_anything_moves(
     need = space.recording_bytes(PLAN, RIG)
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: Disk(10 * need, 0, need - 1))
     with pytest.raises(DiskError, match=f"{tmp_path} has .* MB free; expected "):
-        campaign.carry_out(RIG, "", "", PLAN, PREDICTED, path)
+        campaign.carry_out(RunOrder(RIG, "", "", PLAN, PREDICTED), path)
     assert not device.written
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: Disk(10 * need, 0, need))
     space.room_for(path, [PLAN], [RIG])
@@ -145,7 +146,7 @@ def test_a_plan_without_room_is_refused_before_anything_moves(
 
 @pytest.mark.usefixtures("device")
 def test_a_recording_takes_no_more_than_is_asked_for(tmp_path: Path) -> None:
-    outcome = campaign.carry_out(RIG, "", "", PLAN, PREDICTED, tmp_path / "run.mcap")
+    outcome = campaign.carry_out(RunOrder(RIG, "", "", PLAN, PREDICTED), tmp_path / "run.mcap")
     assert outcome.path.stat().st_size < space.recording_bytes(PLAN, RIG)
 
 

@@ -24,6 +24,7 @@ from samii_rig.record.recover import recover
 from samii_rig.record.writer import RunWriter
 from samii_rig.run import campaign
 from samii_rig.run.interrupts import PAUSE, Interrupts, one_press_counts
+from samii_rig.run.order import RunOrder
 from samii_rig.run.sink import QueuedSink
 
 
@@ -80,7 +81,7 @@ def test_a_run_whose_recorder_is_ended_fails_at_zero(
     device = FakeDevice()
     monkeypatch.setattr(campaign, "open_device", lambda rig, settings: device.open())
     monkeypatch.setattr(RunWriter, "segment", ends)
-    outcome = campaign.carry_out(RIG, "", "", PLAN, PREDICTED, tmp_path / "run.mcap")
+    outcome = campaign.carry_out(RunOrder(RIG, "", "", PLAN, PREDICTED), tmp_path / "run.mcap")
     assert outcome.stop.status == "failed"
     assert "SystemExit" in outcome.stop.reason
     assert not device.live
@@ -135,6 +136,6 @@ def test_a_zero_that_does_nothing_is_said_although_the_deadman_ends_it(
     monkeypatch.setattr(campaign, "open_device", lambda rig, settings: device.open())
     if not obeys:
         monkeypatch.setattr(device, "zero", lambda: None)
-    stop = campaign.carry_out(RIG, "", "", PLAN, PREDICTED, tmp_path / "run.mcap").stop
+    stop = campaign.carry_out(RunOrder(RIG, "", "", PLAN, PREDICTED), tmp_path / "run.mcap").stop
     assert stop.status == ("completed" if obeys else "failed")
     assert ("after zero(), which did nothing" in stop.reason) is not obeys

@@ -17,6 +17,7 @@ from samii_rig.errors import DeviceError, EstimateError, GateError, InputError
 from samii_rig.record.reader import read_recording
 from samii_rig.run import campaign
 from samii_rig.run.campaign import Outcome, carry_out
+from samii_rig.run.order import RunOrder
 from samii_rig.types import Channel
 
 
@@ -28,7 +29,7 @@ def device(monkeypatch: pytest.MonkeyPatch) -> FakeDevice:
 
 
 def go(path: Path) -> Outcome:
-    return carry_out(RIG, "", "", PLAN, PREDICTED, path)
+    return carry_out(RunOrder(RIG, "", "", PLAN, PREDICTED), path)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Device
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
+from samii_rig.run.order import RunOrder
 
 RIG = load_rig("samii")[0]
 LOOP = DeviceLoop("theta_2", 4.0, 5.0, 2000.0, 0.35)
@@ -23,7 +24,7 @@ LOOP = DeviceLoop("theta_2", 4.0, 5.0, 2000.0, 0.35)
 
 def done(rig, path, experiment=SHORT, **settings):
     plan = experiment.plan(rig)
-    return carry_out(rig, "", "", plan, predict(plan, rig), path, settings=settings)
+    return carry_out(RunOrder(rig, "", "", plan, predict(plan, rig), settings), path)
 
 
 @pytest.fixture(scope="module")

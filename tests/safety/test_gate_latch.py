@@ -19,6 +19,7 @@ from samii_rig.run import campaign
 from samii_rig.run.dryrun import predict
 from samii_rig.run.heartbeat import Pipe
 from samii_rig.run.loop import run
+from samii_rig.run.order import RunOrder
 from samii_rig.run.pace import LoopSettings
 from samii_rig.safety.latch import Latch, state_folder
 
@@ -141,7 +142,7 @@ def carried_out(tmp_path, monkeypatch, device, name="run.mcap", **how):
     monkeypatch.setattr(campaign, "open_device", lambda rig, settings: device.open())
     the_plan = plan(level=0.5, segments=1, duration=0.2)
     predicted = predict(the_plan, RIG)
-    return campaign.carry_out(RIG, "", "", the_plan, predicted, tmp_path / name, **how)
+    return campaign.carry_out(RunOrder(RIG, "", "", the_plan, predicted), tmp_path / name, **how)
 
 
 class Tripping(RealTime):
@@ -165,7 +166,9 @@ def test_a_run_that_trips_latches_and_the_next_one_opens_nothing(tmp_path, monke
     monkeypatch.setattr(campaign, "open_device", never)
     the_plan = plan(level=0.5, segments=1, duration=0.2)
     with pytest.raises(GateError, match=r"over its limit of 0\.35"):
-        campaign.carry_out(RIG, "", "", the_plan, predict(the_plan, RIG), tmp_path / "b.mcap")
+        campaign.carry_out(
+            RunOrder(RIG, "", "", the_plan, predict(the_plan, RIG)), tmp_path / "b.mcap"
+        )
     assert not (tmp_path / "b.mcap").exists()
 
 

@@ -14,6 +14,7 @@ from samii_rig.errors import GateError, LimitError
 from samii_rig.rig.schema import Feedback, Limit
 from samii_rig.run import campaign
 from samii_rig.run.dryrun import predict
+from samii_rig.run.order import RunOrder
 from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.safety.limits import gate_limits
 from samii_rig.types import Quality
@@ -158,7 +159,7 @@ def test_a_plan_that_breaks_a_limit_opens_no_device(tmp_path, monkeypatch):
     monkeypatch.setattr(campaign, "open_device", never)
     plan = plan_of(9.0)
     with pytest.raises(LimitError, match="over its limit of 5 V"):
-        campaign.carry_out(RIG, "", "", plan, predict(plan, RIG), tmp_path / "run.mcap")
+        campaign.carry_out(RunOrder(RIG, "", "", plan, predict(plan, RIG)), tmp_path / "run.mcap")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -31,6 +31,7 @@ from samii_rig.rig.load import load_rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
+from samii_rig.run.order import RunOrder
 from samii_rig.run.plan import Plan
 from samii_rig.serve.analysis import Analysis
 from samii_rig.serve.analyst import Analyst, curves, said
@@ -70,7 +71,7 @@ def made(folder: Path, text: str) -> tuple[Plan, Recording, int]:
     experiment, _ = load_experiment(str(file), RIG)
     plan = experiment.plan(RIG)
     path = folder / "run.mcap"
-    carry_out(RIG, RIG_TOML, text, plan, predict(plan, RIG), path, settings={"seed": 1})
+    carry_out(RunOrder(RIG, RIG_TOML, text, plan, predict(plan, RIG), {"seed": 1}), path)
     start = next(e.payload["start"] for e in read_events(path) if e.name == "plan")
     return plan, read_recording(path), int(start)
 
