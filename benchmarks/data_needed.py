@@ -31,9 +31,9 @@ from samii_rig.prove.score import confidently_wrong, frequency
 from samii_rig.prove.trial import Answer, Trial
 from samii_rig.record.export import replacing
 from samii_rig.record.reader import read_recording
-from samii_rig.rig.elements import parameters
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.elements import parameters
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import FrequencyResponse, Recording
 from samii_rig.workers import workers

@@ -17,7 +17,7 @@ from samii_rig.cli.estimate import (
 )
 
 if TYPE_CHECKING:
-    from samii_rig.rig.pose import Angle
+    from samii_rig.rig.schema.pose import Angle
     from samii_rig.types import FrequencyResponse, Recording
 
 

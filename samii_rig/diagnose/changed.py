@@ -23,8 +23,8 @@ from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case, Progress
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.reduce import Records
-from samii_rig.rig.elements import Branch, flattened, parameters
 from samii_rig.rig.schema import RelativeAngle, Rig
+from samii_rig.rig.schema.elements import Branch, flattened, parameters
 from samii_rig.types import FrequencyResponse, Recording
 
 COMMON = "common_"  # of the names of what both states have beside the rig file

@@ -17,8 +17,8 @@ from collections.abc import Collection, Mapping
 from samii_rig.errors import InputError
 from samii_rig.fem.mechanism import Mechanism
 from samii_rig.fem.walk import Walk
-from samii_rig.rig.elements import ANGLE_SOURCES, flattened
 from samii_rig.rig.schema import Rig, TorsionalSpring
+from samii_rig.rig.schema.elements import ANGLE_SOURCES, flattened
 
 
 def assemble(

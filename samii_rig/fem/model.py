@@ -20,8 +20,8 @@ from scipy.sparse.linalg import splu
 from samii_rig.errors import InputError
 from samii_rig.fem import modal
 from samii_rig.fem.assemble import assemble
-from samii_rig.rig.elements import BEAMS, flattened
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.elements import BEAMS, flattened
 from samii_rig.types import Complex, Float
 
 

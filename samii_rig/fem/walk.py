@@ -18,8 +18,6 @@ from samii_rig.errors import InputError
 from samii_rig.fem import hermite, lagrange
 from samii_rig.fem.drive import Feedback, Load, Prescribed, law
 from samii_rig.fem.mechanism import Mechanism, Places
-from samii_rig.rig.axial import turning
-from samii_rig.rig.elements import End
 from samii_rig.rig.schema import (
     MOTION_SOURCES,
     AbsoluteAngle,
@@ -57,6 +55,8 @@ from samii_rig.rig.schema import (
     Velocity,
     VelocitySource,
 )
+from samii_rig.rig.schema.axial import turning
+from samii_rig.rig.schema.elements import End
 from samii_rig.types import Float
 
 Row = dict[int, float]  # a linear function of the coordinates: coefficient by coordinate

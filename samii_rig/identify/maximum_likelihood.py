@@ -28,8 +28,8 @@ from samii_rig.identify.likelihood import (
 from samii_rig.identify.parameters import Free, Space, changed, space
 from samii_rig.identify.predict import Predictor
 from samii_rig.identify.result import Identification, bounds_met, residuals_of
-from samii_rig.rig.pose import Angle
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.pose import Angle
 from samii_rig.signal.whitening import Fit, goodness
 from samii_rig.types import Float, FrequencyResponse
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 from samii_rig.errors import InputError
 from samii_rig.rig.load import parse
-from samii_rig.rig.pose import Angle
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.pose import Angle
 from samii_rig.types import Recording
 from samii_rig.units import convert
 

@@ -17,8 +17,8 @@ from samii_rig.identify.parameters import Space
 from samii_rig.identify.poses import at_pose
 from samii_rig.model.sampled import hold_response, sampled_response, sensor_response
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.pose import Angle
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.pose import Angle
 from samii_rig.types import Complex, Float
 
 

@@ -32,7 +32,6 @@ from samii_rig.model.registers import (
 )
 from samii_rig.model.sensing import source_feed, terms
 from samii_rig.model.weight import Weight, segments
-from samii_rig.rig.axial import turning
 from samii_rig.rig.schema import (
     BEAMS,
     LINES,
@@ -51,6 +50,7 @@ from samii_rig.rig.schema import (
     TorsionalSpring,
     parameters,
 )
+from samii_rig.rig.schema.axial import turning
 from samii_rig.types import Float, Int
 
 ENDS = {"free": FREE_END, "pinned": PINNED, "clamped": CLAMPED}

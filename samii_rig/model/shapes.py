@@ -23,7 +23,6 @@ from samii_rig.errors import InputError
 from samii_rig.model.modes import undamped
 from samii_rig.model.poles import contour_residues
 from samii_rig.model.tmm import Chain, State
-from samii_rig.rig.elements import BEAMS
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     Acceleration,
@@ -39,6 +38,7 @@ from samii_rig.rig.schema import (
     Sensor,
     Velocity,
 )
+from samii_rig.rig.schema.elements import BEAMS
 from samii_rig.types import Complex, Float
 
 POINTS = 40  # places along each beam

@@ -23,7 +23,6 @@ from samii_rig.errors import InputError
 from samii_rig.model import respond, timoshenko
 from samii_rig.model.chain import L_OF_BEAM, compile_chain
 from samii_rig.model.factors import bind, characteristic, differentiate
-from samii_rig.rig.elements import contradiction, quantities
 from samii_rig.rig.schema import (
     Acceleration,
     Branch,
@@ -33,6 +32,7 @@ from samii_rig.rig.schema import (
     flattened,
     parameters,
 )
+from samii_rig.rig.schema.elements import contradiction, quantities
 from samii_rig.types import Complex, Float
 
 State = Literal["w", "theta", "M", "V"]

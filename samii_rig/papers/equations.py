@@ -87,7 +87,7 @@ EQUATIONS: tuple[Equation, ...] = (
         "2",
         "velocity source of second order (s^2 for the s that is printed)",
         (
-            "samii_rig.rig.elements:AngularVelocitySource2",
+            "samii_rig.rig.schema.elements:AngularVelocitySource2",
             "samii_rig.papers.spring_damper:second_order",
         ),
     ),
@@ -96,7 +96,7 @@ EQUATIONS: tuple[Equation, ...] = (
         2,
         "4, 5",
         "link under gravity, hanging and level",
-        ("samii_rig.rig.elements:GravityStiffness", "samii_rig.papers.torque:closed_form"),
+        ("samii_rig.rig.schema.elements:GravityStiffness", "samii_rig.papers.torque:closed_form"),
     ),
     Equation(
         2,

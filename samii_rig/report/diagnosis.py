@@ -23,8 +23,8 @@ from samii_rig.report.diagnosis_models import curve, refitted_nominal, strengths
 from samii_rig.report.drawing import Suspect, draw
 from samii_rig.report.plots import Curves
 from samii_rig.report.shell import Plot, check_suffix, page_text, put
-from samii_rig.rig.elements import SOURCES, TorsionalSpring, TranslationalSpring
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.elements import SOURCES, TorsionalSpring, TranslationalSpring
 from samii_rig.types import FrequencyResponse, Recording
 
 Band = tuple[float, float]

@@ -24,8 +24,8 @@ from samii_rig.diagnose.result import Cause
 from samii_rig.model.sampled import sampled_response
 from samii_rig.report.compare import ModelCurve
 from samii_rig.report.diagnosis_laws import factor_curve, jump_curve
-from samii_rig.rig.elements import flattened, parameters
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.elements import flattened, parameters
 from samii_rig.types import Complex, Float, FrequencyResponse
 
 STRENGTHS = (0.5, 1.0, 2.0)  # times the cause's own; three points give the Moebius function

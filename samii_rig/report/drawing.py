@@ -10,7 +10,18 @@ from dataclasses import dataclass
 from html import escape
 
 from samii_rig.report.compare import pretty
-from samii_rig.rig.elements import (
+from samii_rig.rig.schema import (
+    AbsoluteAngle,
+    Acceleration,
+    Displacement,
+    Force,
+    Moment,
+    Pressure,
+    RelativeAngle,
+    Rig,
+    Velocity,
+)
+from samii_rig.rig.schema.elements import (
     MOTION_SOURCES,
     SOURCES,
     Beam,
@@ -30,17 +41,6 @@ from samii_rig.rig.elements import (
     TranslationalGroundSpring,
     TranslationalSpring,
     parameters,
-)
-from samii_rig.rig.schema import (
-    AbsoluteAngle,
-    Acceleration,
-    Displacement,
-    Force,
-    Moment,
-    Pressure,
-    RelativeAngle,
-    Rig,
-    Velocity,
 )
 
 # All in user units of the drawing, about a pixel.

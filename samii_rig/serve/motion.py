@@ -15,7 +15,6 @@ import numpy as np
 from samii_rig.errors import SamiiRigError
 from samii_rig.model.sampled import sensor_response
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.elements import BEAMS, RigidLink
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     Acceleration,
@@ -24,6 +23,7 @@ from samii_rig.rig.schema import (
     Rig,
     Sensor,
 )
+from samii_rig.rig.schema.elements import BEAMS, RigidLink
 from samii_rig.types import Complex, Float
 
 LOWEST, HIGHEST, POINTS = 0.3, 0.1, 240  # Hz, of the sample rate, and frequencies between

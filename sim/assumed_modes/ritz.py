@@ -196,7 +196,7 @@ class Mechanism:
 
     def _cylinder(self, part: Part) -> int:
         """The coordinate of the oil's stretch: a spring and, by the leak, one that relaxes
-        (`samii_rig.rig.elements.Cylinder`, k(s) in partial fractions)."""
+        (`samii_rig.rig.schema.elements.Cylinder`, k(s) in partial fractions)."""
         v = part.values
         S0, S1, S2 = (v["A_1"] ** n / v["V_1"] + v["A_2"] ** n / v["V_2"] for n in range(3))
         at = self.joints[part.name] = self._new()

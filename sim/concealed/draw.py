@@ -13,9 +13,9 @@ from typing import Literal
 import numpy as np
 
 from samii_rig.errors import InputError
-from samii_rig.rig.elements import parameters
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.elements import parameters
 from sim.concealed.effects import OUTSIDE, ROWS, Row, clamp_of, places
 from sim.concealed.measure import Errors, draw_errors
 from sim.concealed.modes import Poles, poles_of

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from samii_rig.errors import InputError
-from samii_rig.rig.elements import parameters
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     Acceleration,
@@ -18,6 +17,7 @@ from samii_rig.rig.schema import (
     RelativeAngle,
     Rig,
 )
+from samii_rig.rig.schema.elements import parameters
 
 GRAVITY = 9.80665  # m/s^2, standard gravity
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samii_rig.rig.elements import parameters
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.elements import parameters
 from samii_rig.signal.excitation import schedule_factor
 from samii_rig.types import Complex, Float
 from sim.concealed.assemble import assemble

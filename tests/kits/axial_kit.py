@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from samii_rig.rig.elements import AXIAL, input_unit, quantities
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.elements import AXIAL, input_unit, quantities
 
 KINDS = {word: kind for kind in AXIAL for word in kind.model_fields["kind"].annotation.__args__}
 SECOND = {"omega": 60.0, "zeta": 0.4}

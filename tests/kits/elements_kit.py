@@ -6,7 +6,6 @@ import numpy as np
 from scipy.optimize import brentq
 
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.elements import quantities
 from samii_rig.rig.schema import (
     AngularVelocitySource,
     AngularVelocitySource2,
@@ -26,6 +25,7 @@ from samii_rig.rig.schema import (
     TranslationalGroundSpring,
     TranslationalSpring,
 )
+from samii_rig.rig.schema.elements import quantities
 
 KINDS: dict[str, Any] = {
     c.model_fields["kind"].annotation.__args__[0]: c

@@ -2,9 +2,8 @@
 
 from typing import Any
 
-from samii_rig.rig import elements
 from samii_rig.rig.load import load_rig
-from samii_rig.rig.schema import Rig, TorsionalSpring
+from samii_rig.rig.schema import Rig, TorsionalSpring, elements
 
 SOURCE = ("source", "angular_velocity_source", {"K": 0.5, "p": 150.0})
 Part = tuple[str, str, dict[str, Any]]

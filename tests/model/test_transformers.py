@@ -14,9 +14,8 @@ from samii_rig.model.elements import J, matrix
 from samii_rig.model.modes import natural_frequencies
 from samii_rig.model.realise import realise
 from samii_rig.model.tmm import Chain
-from samii_rig.rig import elements
-from samii_rig.rig.elements import AXIAL, TURNING, input_unit, quantities
-from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema import Rig, elements
+from samii_rig.rig.schema.elements import AXIAL, TURNING, input_unit, quantities
 from samii_rig.safety.limits import gate_limits
 
 F = np.geomspace(0.3, 120.0, 30)

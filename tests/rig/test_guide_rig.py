@@ -11,9 +11,9 @@ from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.errors import InputError
 from samii_rig.model.modes import natural_frequencies
 from samii_rig.record.reader import read_recording
-from samii_rig.rig.elements import AXIAL
 from samii_rig.rig.load import parse, shipped
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.elements import AXIAL
 from samii_rig.run.experiments import load_experiment
 from samii_rig.signal.estimate import estimate
 

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from samii_rig.errors import InputError
-from samii_rig.rig.conversion import in_si
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.conversion import in_si
 from samii_rig.safety.limits import gate_limits
 from samii_rig.units import convert, factor, quantity
 

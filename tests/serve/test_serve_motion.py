@@ -10,8 +10,8 @@ import pytest
 
 from samii_rig.model.sampled import sensor_response
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.elements import BEAMS
 from samii_rig.rig.load import load_rig
+from samii_rig.rig.schema.elements import BEAMS
 from samii_rig.serve import questions
 from samii_rig.serve.motion import BENDS, Motion, motion
 

@@ -19,9 +19,9 @@ from scipy.linalg import eigh
 import sim.concealed
 from samii_rig.errors import InputError
 from samii_rig.model.sampled import sampled_response
-from samii_rig.rig.elements import parameters
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.elements import parameters
 from sim.concealed.assemble import PHASE, assemble
 from sim.concealed.draw import draw_values
 from sim.concealed.modes import poles_of

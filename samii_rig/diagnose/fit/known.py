@@ -8,9 +8,9 @@ from typing import Any
 
 from samii_rig.diagnose.fit.rigfile import toml
 from samii_rig.errors import InputError, one_of
-from samii_rig.rig.elements import flattened
 from samii_rig.rig.load import checked, tables
 from samii_rig.rig.schema import Rig, parameters
+from samii_rig.rig.schema.elements import flattened
 
 WHERE = "--known"
 SHAPE = "ELEMENT.PARAMETER=VALUE, as accelerometer_mass.m=0"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, get_args
 
-from samii_rig.rig.elements import quantities
 from samii_rig.rig.schema import (
     AngularVelocitySource,
     AngularVelocitySource2,
@@ -18,6 +17,7 @@ from samii_rig.rig.schema import (
     Rig,
     TranslationalSpring,
 )
+from samii_rig.rig.schema.elements import quantities
 
 PREFIX = "added_"  # of the names of what is put in
 DISPLACEMENT = 1.475e-5  # m^3/rad, of a vane motor of a joint; C_h is stated for this one

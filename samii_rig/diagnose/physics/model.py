@@ -13,8 +13,8 @@ from samii_rig.diagnose.physics.effect import Effect, Key
 from samii_rig.diagnose.physics.fractional import ChainLike, FractionalChain
 from samii_rig.model.sampled import hold_at, sampled_response, sensors_at
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.elements import flattened
 from samii_rig.rig.schema import Rig, parameters
+from samii_rig.rig.schema.elements import flattened
 from samii_rig.types import Complex, Float, Int
 
 ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smooth between

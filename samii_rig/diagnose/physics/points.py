@@ -21,7 +21,6 @@ from samii_rig.diagnose.physics.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.physics.insert import DISPLACEMENT, VOLUME
 from samii_rig.diagnose.physics.scales import PAIRS, REACH, Places, middle, spread
 from samii_rig.model.tmm import State
-from samii_rig.rig.elements import quantities
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     Branch,
@@ -37,6 +36,7 @@ from samii_rig.rig.schema import (
     TranslationalSpring,
     parameters,
 )
+from samii_rig.rig.schema.elements import quantities
 from samii_rig.types import Complex, Float
 
 Law = Literal["spring", "softness", "column", "damper", "slip", "mass"]

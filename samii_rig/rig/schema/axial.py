@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, get_args
 
-from samii_rig.rig.elements import (
+from samii_rig.rig.schema.elements import (
     AXIAL,
     MOTION_SOURCES,
     TURNING,
@@ -17,10 +17,12 @@ from samii_rig.rig.elements import (
     Spindle,
     TranslationalSpring,
 )
-from samii_rig.rig.sensors import AbsoluteAngle, Moment, RelativeAngle, places
+from samii_rig.rig.schema.sensors import AbsoluteAngle, Moment, RelativeAngle, places
 
 if TYPE_CHECKING:
-    from samii_rig.rig.schema import Element, Rig, Sensor
+    from samii_rig.rig.schema.elements import Element
+    from samii_rig.rig.schema.rig import Rig
+    from samii_rig.rig.schema.sensors import Sensor
 
 ANGULAR = (AbsoluteAngle, Moment, RelativeAngle)  # sensors that read theta or M
 GIVES = (TranslationalSpring, Rod, Cylinder)

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import AfterValidator, Field
 
-from samii_rig.rig.base import Finite, Strict
+from samii_rig.rig.schema.base import Finite, Strict
 from samii_rig.units import convert
 
 if TYPE_CHECKING:
-    from samii_rig.rig.schema import Rig
+    from samii_rig.rig.schema.rig import Rig
 
 LEVEL = 1e-12  # |cos(pose)| below which a chain is level: 90 deg in rad is rounded to 1e-16
 

@@ -11,8 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, get_args
 
-from samii_rig.rig import sensors
-from samii_rig.rig.elements import input_unit
+from samii_rig.rig.schema import sensors
+from samii_rig.rig.schema.elements import input_unit
 from samii_rig.units import convert
 
 Table = dict[str, Any]

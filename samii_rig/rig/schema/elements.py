@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 
-from samii_rig.rig.base import (
+from samii_rig.rig.schema.base import (
     ElementBase,
     Finite,
     Name,

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from samii_rig.rig.base import Finite, Name, NonNegative, Positive, Strict
+from samii_rig.rig.schema.base import Finite, Name, NonNegative, Positive, Strict
 
 
 class AntiAlias(Strict):
