@@ -14,8 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from samii_rig.errors import InputError
-from samii_rig.model.laws import POINTS, SOURCE_LAWS
-from samii_rig.model.registers import (
+from samii_rig.model.kernels.registers import (
     BEAM_KIND,
     CLAMPED,
     FREE_END,
@@ -30,6 +29,7 @@ from samii_rig.model.registers import (
     WAVES,
     System,
 )
+from samii_rig.model.laws import POINTS, SOURCE_LAWS
 from samii_rig.model.sensing import source_feed, terms
 from samii_rig.model.weight import Weight, segments
 from samii_rig.rig.schema import (

@@ -9,10 +9,11 @@ from types import ModuleType
 
 import numpy as np
 
-from samii_rig.model import respond, rod, timoshenko, transformer
+from samii_rig.model import rod, timoshenko, transformer
 from samii_rig.model.chain import LINE_AT, SOURCE_WIDTH, WIDTH, CompiledChain
+from samii_rig.model.kernels import respond
+from samii_rig.model.kernels.registers import Factors
 from samii_rig.model.laws import LINE_FILTERS, POINTS, SOURCE_LAWS
-from samii_rig.model.registers import Factors
 from samii_rig.types import Complex, Float
 
 _TURN = np.array([1.0, -1.0, 1.0, -1.0])  # theta and V of a mirrored chain

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samii_rig.model.registers import M_THETA, THETA_M, V_W, W_V
+from samii_rig.model.kernels.registers import M_THETA, THETA_M, V_W, W_V
 from samii_rig.types import Complex, Float
 
 Clearing = tuple[Complex | float, Float | float]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from samii_rig.model.kernels.registers import ACCELERATION, COMPLIANCE, ONE, THETA_M, VELOCITY
 from samii_rig.model.laws import POINTS
-from samii_rig.model.registers import ACCELERATION, COMPLIANCE, ONE, THETA_M, VELOCITY
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     BEAMS,

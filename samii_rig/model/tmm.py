@@ -20,9 +20,10 @@ from numpy.typing import ArrayLike
 from pydantic import BaseModel
 
 from samii_rig.errors import InputError
-from samii_rig.model import respond, timoshenko
+from samii_rig.model import timoshenko
 from samii_rig.model.chain import L_OF_BEAM, compile_chain
 from samii_rig.model.factors import bind, characteristic, differentiate
+from samii_rig.model.kernels import respond
 from samii_rig.rig.schema import (
     Acceleration,
     Branch,

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from elements_kit import ANGLE, SOURCE, part, rig
 
-from samii_rig.model import waves
+from samii_rig.model.kernels import waves
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import (

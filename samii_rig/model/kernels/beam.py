@@ -8,10 +8,20 @@ from __future__ import annotations
 
 import math
 
-from samii_rig.model.lanes import LANES, get, inverse, norm2, part, put, root, scaled
-from samii_rig.model.registers import BEAM, BETA, DECAY, IS_LONG, LONG, MIXED, PHASE, SHORT, S
-from samii_rig.model.registers import BETA4 as Q
-from samii_rig.model.waves import circle, decay
+from samii_rig.model.kernels.lanes import LANES, get, inverse, norm2, part, put, root, scaled
+from samii_rig.model.kernels.registers import (
+    BEAM,
+    BETA,
+    DECAY,
+    IS_LONG,
+    LONG,
+    MIXED,
+    PHASE,
+    SHORT,
+    S,
+)
+from samii_rig.model.kernels.registers import BETA4 as Q
+from samii_rig.model.kernels.waves import circle, decay
 from samii_rig.types import Float
 
 # |beta| = 1.5 parts the series from the waves. Below, six terms of each series leave 1e-19;

@@ -23,9 +23,9 @@ import math
 
 import numpy as np
 
-from samii_rig.model.beam import stiffness
-from samii_rig.model.lanes import LANES, conj, get, inverse, load, norm2, part, put, scaled
-from samii_rig.model.registers import (
+from samii_rig.model.kernels.beam import stiffness
+from samii_rig.model.kernels.lanes import LANES, conj, get, inverse, load, norm2, part, put, scaled
+from samii_rig.model.kernels.registers import (
     BEAM,
     BETA4,
     IS_LONG,

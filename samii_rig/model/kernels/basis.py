@@ -5,8 +5,8 @@ Rows and form of the columns: see `sweep`.
 
 from __future__ import annotations
 
-from samii_rig.model.lanes import LANES, TINY, conj, get, norm2, part, put, scaled
-from samii_rig.model.registers import (
+from samii_rig.model.kernels.lanes import LANES, TINY, conj, get, norm2, part, put, scaled
+from samii_rig.model.kernels.registers import (
     CLAMPED,
     EXCHANGE,
     FLAG,

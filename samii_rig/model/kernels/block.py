@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from samii_rig.model.basis import boundary
-from samii_rig.model.beam import prepare
-from samii_rig.model.lanes import LANES, get, load, part, put, store
-from samii_rig.model.registers import (
+from samii_rig.model.kernels.basis import boundary
+from samii_rig.model.kernels.beam import prepare
+from samii_rig.model.kernels.lanes import LANES, get, load, part, put, store
+from samii_rig.model.kernels.registers import (
     B_ROWS,
     BEAM,
     BEAM_KIND,
@@ -19,7 +19,7 @@ from samii_rig.model.registers import (
     Work,
     X,
 )
-from samii_rig.model.sweep import step
+from samii_rig.model.kernels.sweep import step
 from samii_rig.types import Complex, Float
 
 

@@ -22,10 +22,10 @@ U^-1 is the U of the mirrored element.
 
 from __future__ import annotations
 
-from samii_rig.model.basis import exchange, restore
-from samii_rig.model.lanes import LANES, TINY, conj, get, norm2, part, pick, put, scaled
-from samii_rig.model.points import hinge, jump, link, spring
-from samii_rig.model.registers import (
+from samii_rig.model.kernels.basis import exchange, restore
+from samii_rig.model.kernels.lanes import LANES, TINY, conj, get, norm2, part, pick, put, scaled
+from samii_rig.model.kernels.points import hinge, jump, link, spring
+from samii_rig.model.kernels.registers import (
     BEAM,
     BEAM_KIND,
     EXCHANGE,

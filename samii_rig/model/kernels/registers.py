@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from samii_rig.model.lanes import LANES, part
+from samii_rig.model.kernels.lanes import LANES, part
 from samii_rig.types import Complex, Float, Int
 
 # Register rows. X: w1 theta1 M1 V1 w2 M2 V2 (complex) and theta2, which is 0 between elements.

@@ -10,15 +10,15 @@ import math
 
 import numpy as np
 
-from samii_rig.model.adjoint import (
+from samii_rig.model.kernels.adjoint import (
     element_parameters,
     element_states,
     keep_waves,
     source_parameters,
 )
-from samii_rig.model.block import block, recall_beam
-from samii_rig.model.lanes import LANES, conj, get, kernel, norm2, part, put, scaled
-from samii_rig.model.registers import (
+from samii_rig.model.kernels.block import block, recall_beam
+from samii_rig.model.kernels.lanes import LANES, conj, get, kernel, norm2, part, put, scaled
+from samii_rig.model.kernels.registers import (
     BEAM_KIND,
     CLAMPED,
     DECAY,
@@ -37,7 +37,7 @@ from samii_rig.model.registers import (
     Z,
     workspace,
 )
-from samii_rig.model.solve import (
+from samii_rig.model.kernels.solve import (
     port_state,
     read_sensors,
     set_factor,

@@ -16,8 +16,8 @@ port. At a port with a jump, z is the value upstream of it.
 
 from __future__ import annotations
 
-from samii_rig.model.lanes import LANES, get, inverse, part, put, scaled, store
-from samii_rig.model.registers import (
+from samii_rig.model.kernels.lanes import LANES, get, inverse, part, put, scaled, store
+from samii_rig.model.kernels.registers import (
     ACCELERATION,
     ALPHA,
     COMPLIANCE,

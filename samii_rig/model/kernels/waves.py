@@ -11,7 +11,7 @@ from typing import Any, cast
 from numba import types
 from numba.extending import intrinsic
 
-from samii_rig.model.lanes import part, pick
+from samii_rig.model.kernels.lanes import part, pick
 
 # x + ROUND - ROUND rounds x to an integer, which stands in the low bits of x + ROUND.
 ROUND = 1.5 * 2.0**52

@@ -2,9 +2,20 @@
 
 from __future__ import annotations
 
-from samii_rig.model.basis import exchange, needs_exchange
-from samii_rig.model.lanes import LANES, TINY, conj, get, inverse, norm2, part, pick, put, scaled
-from samii_rig.model.registers import (
+from samii_rig.model.kernels.basis import exchange, needs_exchange
+from samii_rig.model.kernels.lanes import (
+    LANES,
+    TINY,
+    conj,
+    get,
+    inverse,
+    norm2,
+    part,
+    pick,
+    put,
+    scaled,
+)
+from samii_rig.model.kernels.registers import (
     FLAG,
     M_THETA,
     NUMERATOR,

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from samii_rig.model.block import recall_beam
-from samii_rig.model.gradient import contributions, integrals, point
-from samii_rig.model.lanes import LANES, get, part, scaled, store
-from samii_rig.model.registers import (
+from samii_rig.model.kernels.block import recall_beam
+from samii_rig.model.kernels.gradient import contributions, integrals, point
+from samii_rig.model.kernels.lanes import LANES, get, part, scaled, store
+from samii_rig.model.kernels.registers import (
     BEAM_KIND,
     COMPLIANCE,
     HINGE,
@@ -18,7 +18,7 @@ from samii_rig.model.registers import (
     Work,
     Z,
 )
-from samii_rig.model.solve import port_state
+from samii_rig.model.kernels.solve import port_state
 from samii_rig.types import Complex, Float, Int
 
 
