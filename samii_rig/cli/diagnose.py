@@ -226,7 +226,7 @@ def _together(
         keep_diagnosis(logs, found)
     page = None
     if out is not None:
-        from samii_rig.report.diagnosis import write_diagnosis
+        from samii_rig.report.diagnosis.page import write_diagnosis
 
         found = replace(found, model=_write(out, found))
         page = write_diagnosis(

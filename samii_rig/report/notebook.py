@@ -9,9 +9,10 @@ from plotly import graph_objects
 
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.errors import InputError
-from samii_rig.report import canvas, diagnosis_plots, plots
-from samii_rig.report.diagnosis_laws import QUANTITY, seen
-from samii_rig.report.diagnosis_models import curve, refitted_nominal
+from samii_rig.report import canvas, plots
+from samii_rig.report.diagnosis import plots as diagnosis_plots
+from samii_rig.report.diagnosis.laws import QUANTITY, seen
+from samii_rig.report.diagnosis.models import curve, refitted_nominal
 from samii_rig.report.series import pieces, time_series
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, FrequencyResponse, Recording

@@ -23,7 +23,7 @@ from samii_rig.types import FrequencyResponse, Recording
 
 if TYPE_CHECKING:
     from samii_rig.diagnose.result import Diagnosis
-    from samii_rig.report.diagnosis import Section
+    from samii_rig.report.diagnosis.page import Section
 
 
 def write_report(
@@ -62,7 +62,7 @@ def write_report(
     if diagnosis is not None:
         if rig is None or not responses:
             raise InputError("report", "diagnosis", "without its data", "its rig and responses")
-        from samii_rig.report.diagnosis import section  # loads the model and its compiler
+        from samii_rig.report.diagnosis.page import section  # loads the model and its compiler
 
         found = section(diagnosis, responses, rig, band_hz)
     if modes is None:

@@ -25,7 +25,7 @@ from samii_rig.diagnose.physics.insert import inserted, oscillator
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.errors import InputError
-from samii_rig.report.diagnosis import write_diagnosis
+from samii_rig.report.diagnosis.page import write_diagnosis
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import parameters
 from samii_rig.rig.schema.elements import flattened

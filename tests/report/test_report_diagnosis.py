@@ -20,11 +20,11 @@ from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.result import Band, Cause, Diagnosis, Gap, Trace, Value
 from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw
-from samii_rig.report import diagnosis_words as words
-from samii_rig.report.diagnosis import write_diagnosis
-from samii_rig.report.diagnosis_laws import JUMPS, jump_curve, seen
-from samii_rig.report.diagnosis_models import strengths
-from samii_rig.report.diagnosis_plots import distance
+from samii_rig.report.diagnosis import words as words
+from samii_rig.report.diagnosis.laws import JUMPS, jump_curve, seen
+from samii_rig.report.diagnosis.models import strengths
+from samii_rig.report.diagnosis.page import write_diagnosis
+from samii_rig.report.diagnosis.plots import distance
 from samii_rig.report.drawing import Suspect, draw
 from samii_rig.report.page import write_report
 

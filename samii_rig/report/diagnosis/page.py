@@ -14,12 +14,12 @@ from markupsafe import Markup
 
 from samii_rig.diagnose.result import Cause, Diagnosis, Trace, percent
 from samii_rig.errors import InputError
-from samii_rig.report import diagnosis_plots as figures
-from samii_rig.report import diagnosis_words as words
 from samii_rig.report import facts
 from samii_rig.report.compare import ModelCurve
-from samii_rig.report.diagnosis_laws import QUANTITY, jump_of, seen
-from samii_rig.report.diagnosis_models import curve, refitted_nominal, strengths
+from samii_rig.report.diagnosis import plots as figures
+from samii_rig.report.diagnosis import words as words
+from samii_rig.report.diagnosis.laws import QUANTITY, jump_of, seen
+from samii_rig.report.diagnosis.models import curve, refitted_nominal, strengths
 from samii_rig.report.drawing import Suspect, draw
 from samii_rig.report.plots import Curves
 from samii_rig.report.shell import Plot, check_suffix, page_text, put

@@ -20,7 +20,7 @@ from samii_rig.report.canvas import (
     unpacked,
 )
 from samii_rig.report.compare import ModelCurve
-from samii_rig.report.diagnosis_models import HALF, Strength
+from samii_rig.report.diagnosis.models import HALF, Strength
 from samii_rig.report.plots import (
     DEGREES,
     Curves,

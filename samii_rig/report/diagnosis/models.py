@@ -23,7 +23,7 @@ from samii_rig.diagnose.physics.points import POINTS
 from samii_rig.diagnose.result import Cause
 from samii_rig.model.sampled import sampled_response
 from samii_rig.report.compare import ModelCurve
-from samii_rig.report.diagnosis_laws import factor_curve, jump_curve
+from samii_rig.report.diagnosis.laws import factor_curve, jump_curve
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.elements import flattened, parameters
 from samii_rig.types import Complex, Float, FrequencyResponse

@@ -22,7 +22,7 @@ from samii_rig.diagnose.result import (
     percent,
     sentence,
 )
-from samii_rig.report.diagnosis_laws import Jump, jump_of
+from samii_rig.report.diagnosis.laws import Jump, jump_of
 from samii_rig.report.verdicts import Mark, without_folders
 
 PLAIN = {row.name: row.words for row in PHYSICS.values()}
