@@ -5,7 +5,10 @@ differences, with so many digits that fifty are left: at 10 kHz the SFLR's beam 
 cancels exp(2 beta) = 1e82.
 """
 
+import secrets
+import shutil
 from collections.abc import Callable
+from pathlib import Path
 
 import mpmath as mp
 import numba
@@ -13,7 +16,7 @@ import numpy as np
 import pytest
 from elements_kit import ANGLE, SOURCE, part, rig
 
-from samii_rig.model.kernels import waves
+from samii_rig.model.kernels import lanes, waves
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import (
@@ -271,3 +274,31 @@ def test_the_waves_are_within_two_units_in_the_last_place() -> None:
             true = mp.expj(mp.mpf(value))
             assert abs(u.real - true.real) < 4e-16
             assert abs(u.imag - true.imag) < 4e-16
+
+
+def test_a_kernel_is_compiled_anew_when_a_file_of_its_room_has_changed(monkeypatch):
+    """And else loaded as it was compiled: the number stands for the files."""
+
+    def make(files):
+        def count(x):
+            return x + 1.0 if files > 0 else x
+
+        return count
+
+    first, second = secrets.randbits(40) + 1, secrets.randbits(40) + 1
+    for files, hits in ((first, 0), (first, 1), (second, 0), (second, 1)):
+        monkeypatch.setattr(lanes, "_files", lambda files=files: files)
+        compiled = lanes.kernel(make)
+        assert compiled(1.0) == 2.0
+        assert sum(compiled.stats.cache_hits.values()) == hits
+
+
+def test_the_number_of_a_room_is_that_of_what_stands_in_it(tmp_path, monkeypatch):
+    for file in Path(lanes.__file__).parent.glob("*.py"):
+        shutil.copy(file, tmp_path)
+    before = lanes._files()
+    monkeypatch.setattr(lanes, "__file__", str(tmp_path / "lanes.py"))
+    assert lanes._files() == before
+    with (tmp_path / "sweep.py").open("a") as file:
+        file.write("#\n")
+    assert lanes._files() != before

@@ -9,6 +9,7 @@ overlap and vectorises the loop over the lanes. For the same reason a sign is wr
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -21,13 +22,6 @@ from samii_rig.types import Float
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# numba recompiles a cached function when its own file has changed; these also when that of another
-# kernel has, as they call each other.
-_STAMP = tuple(
-    (file.name, file.stat().st_mtime, file.stat().st_size)
-    for file in sorted(Path(__file__).parent.glob("*.py"))
-)
-
 LANES = 64  # measured: 32 and 128 are 10 % slower, 256 is 40 %
 TINY = 1e-300  # keeps 0/0 from being NaN where a numerator of 0 shall give 0
 
@@ -37,11 +31,22 @@ TINY = 1e-300  # keeps 0/0 from being NaN where a numerator of 0 shall give 0
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
 
-def kernel(function: F) -> F:
-    """Compile by numba, once a machine (cached on disk): what Python calls."""
-    compiled = numba.njit(cache=True, **_OPTIONS)(function)
-    compiled._cache._cache_file._source_stamp = _STAMP
-    return cast(F, compiled)
+def kernel(make: Callable[[int], F]) -> F:
+    """Compile by numba, once a machine (cached on disk): what Python calls.
+
+    make : gives the function, which closes over the number that it gets. numba compiles a cached
+        function anew when its own file has changed, or what it closes over; kernels call each
+        other, so that number stands for the files of all of them.
+    """
+    return cast(F, numba.njit(cache=True, **_OPTIONS)(make(_files())))
+
+
+def _files() -> int:
+    """A number for what stands in the files of this room."""
+    found = hashlib.sha256()
+    for file in sorted(Path(__file__).parent.glob("*.py")):
+        found.update(file.read_bytes())
+    return int.from_bytes(found.digest()[:7], "big")
 
 
 def part(function: F) -> F:
