@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from can_kit import CanWire, moment_rig, patient, until
 
+import drivers.composite.rig as composite
 from samii_rig.devices.opening import open_device
 from samii_rig.devices.protocols import CommandBlock, OpenRig
 from samii_rig.errors import DeviceError, GateError, InputError
@@ -29,7 +30,10 @@ AHEAD = 50  # samples
 def wire(tmp_path_factory) -> Iterator[CanWire]:
     # A slow machine may feed late; how soon the deadman acts is tested in test_wire_faults.py.
     w = CanWire("--seed", "5", rig=str(moment_rig(tmp_path_factory.mktemp("rig"), 0.2)))
-    yield w
+    with pytest.MonkeyPatch.context() as patch:
+        # What a fault leads to does not hang on how well the clocks are known.
+        patch.setattr(composite, "LISTEN", 0.3)
+        yield w
     w.close()
 
 

@@ -6,6 +6,7 @@ import pytest
 from can_kit import CanWire, moment_rig, patient
 from contract import DeviceContract
 
+import drivers.composite.rig as composite
 from samii_rig.devices.opening import open_device
 from samii_rig.devices.protocols import OpenRig
 
@@ -18,7 +19,10 @@ def wire(
     # Nothing waits long for the moment, which is not what is tried here.
     w.settings["ft"]["gap"] = 0.004
     request.cls.wire, request.cls.rig = w, patient(w.rig, 1.0)
-    yield w
+    with pytest.MonkeyPatch.context() as patch:
+        # Nor how well the clocks are known, which takes a second each time it is opened.
+        patch.setattr(composite, "LISTEN", 0.3)
+        yield w
     w.close()
 
 
