@@ -18,6 +18,16 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 ROOT = Path(__file__).resolve().parent.parent
 # What runs a device in real time, on ports whose names the system gives out again.
 KITS = {"wire_kit", "can_kit", "faults_kit"}
+# Files with tests of half a minute: first, so that at the end no worker is left with one alone.
+LONG = {
+    "test_notebooks.py",
+    "test_serve_browser.py",
+    "test_serve_run.py",
+    "test_serve_sofar.py",
+    "test_serve_foxglove.py",
+    "test_diagnose_records.py",
+    "test_diagnose_forces.py",
+}
 # How long an example takes is the machine's affair. The examples are the same in every run, so that
 # a change is judged by what it changed; HYPOTHESIS_PROFILE=explore draws new ones.
 settings.register_profile("same", deadline=None, derandomize=True)
@@ -26,7 +36,8 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Who uses a device in real time is a test in real time."""
+    """Who uses a device in real time is a test in real time; the longest files come first."""
+    items.sort(key=lambda item: item.path.name not in LONG)
     for item in items:
         here = vars(item.getparent(pytest.Module).obj)  # type: ignore[union-attr]
         used = {getattr(thing, "__module__", "") for thing in here.values()}
