@@ -1,7 +1,7 @@
 """The service under viewers and kills.
 
     python benchmarks/bench_serve.py [--viewers 20] [--slow 5] [--stops 15] [--attacked 15]
-        [--pairs 3] [--kills 20] [--seed 1]
+        [--each 0] [--kinds heads tokens] [--pairs 3] [--kills 20] [--seed 1]
 
 Stops: a simulated rig in real time, so many viewers of whom some never read. Prints the machine's
 load, how long a stop takes from the request to its answer and to zero volts, how long an order and
@@ -15,7 +15,10 @@ holds 1,100 half-sent heads at each of the two ports (and opens those that are c
 second), shows 20 wrong tokens and sends 5 heads of 100 kB a second. With a viewer's token it has
 plans of three hours predicted all the time, and the index is overwritten every second. It yields to
 all others where they want a processor: an attacker has one of their own. Where a proxy answers the
-service's port with an error, the listener's figures are what a page gets.
+the service's port with an error, the listener's figures are what a page gets.
+
+Each: so many stops under each of these by itself, and where a proxy answers the service's port with
+503. There the stop is asked at both at once, as the page does.
 
 Pairs: the simulated serial node in real time, a run without viewers and one with them by turns;
 prints how late the loop's sleeps ended in either, and that no sample is missing.
@@ -49,6 +52,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from http.client import HTTPConnection
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -161,8 +165,11 @@ WRONG, LARGE = 20, 5  # wrong tokens and heads of 100 kB a second
 PLANNED = 4  # plans that are asked for at once, of which two are predicted and two wait
 
 
-def attack(url: str, ports: Sequence[int], viewer: str, index: Path) -> None:
-    """All of it at once, until it is killed; it has descriptors enough of its own."""
+ATTACKS = ("heads", "tokens", "large heads", "plans", "index")
+
+
+def attack(url: str, ports: Sequence[int], viewer: str, index: Path, kinds: Sequence[str]) -> None:
+    """All of these kinds at once, until it is killed; it has descriptors enough of its own."""
 
     os.nice(19)
 
@@ -199,24 +206,25 @@ def attack(url: str, ports: Sequence[int], viewer: str, index: Path) -> None:
             await asyncio.sleep(1.0)
 
     async def all_() -> None:
-        work = [damage(), *(plan() for _ in range(PLANNED))]
-        asked = [
-            *work,
-            ask(WRONG, {"authorization": "Bearer wrong"}),
-            ask(LARGE, {"x": "y" * 100_000}),
-        ]
-        await asyncio.gather(*(hold(port) for port in ports), *asked)
+        made = {
+            "heads": lambda: [hold(port) for port in ports],
+            "tokens": lambda: [ask(WRONG, {"authorization": "Bearer wrong"})],
+            "large heads": lambda: [ask(LARGE, {"x": "y" * 100_000})],
+            "plans": lambda: [plan() for _ in range(PLANNED)],
+            "index": lambda: [damage()],
+        }
+        await asyncio.gather(*(one for kind in kinds for one in made[kind]()))
 
     asyncio.run(all_())
 
 
 @contextmanager
-def attacked(service: Service, viewer: str):
-    if not viewer:
+def attacked(service: Service, viewer: str, kinds: Sequence[str]):
+    if not kinds:
         yield
         return
     ports = [int(service.port), int(service.stop_port)]
-    given = (service.url, ports, viewer, service.folder / PRIVATE / FILE)
+    given = (service.url, ports, viewer, service.folder / PRIVATE / FILE, kinds)
     process = get_context("spawn").Process(target=attack, args=given, daemon=True)
     process.start()
     time.sleep(5.0)  # until all are held
@@ -228,21 +236,62 @@ def attacked(service: Service, viewer: str):
         process.join()
 
 
-def stops(arguments: argparse.Namespace, count: int, under_attack: bool) -> None:
+class Proxy(BaseHTTPRequestHandler):
+    """Stands before the service's port and reaches nothing behind it."""
+
+    protocol_version = "HTTP/1.1"
+
+    def do_POST(self) -> None:
+        self.send_error(503)
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@contextmanager
+def refusing():
+    with ThreadingHTTPServer(("127.0.0.1", 0), Proxy) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            yield server.server_port
+        finally:
+            server.shutdown()
+
+
+def ask(port: int | str) -> HTTPConnection:
+    """A stop asked on a line of its own, as that of a page that was idle is."""
+    line = HTTPConnection("127.0.0.1", int(port), timeout=60.0)
+    line.request("POST", "/api/stop")
+    return line
+
+
+def stops(
+    arguments: argparse.Namespace, count: int, kinds: Sequence[str] = (), proxy: bool = False
+) -> None:
     at: dict[str, tuple[list[float], list[float]]] = {"service": ([], []), "listener": ([], [])}
     plain, orders, missing, viewer = [], [], 0, ""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as kept:
         options, more = ["--pace", "1"], {}
-        if under_attack:
+        if kinds:
             tokens = Path(folder) / "tokens.json"
             more = {"token": Tokens(tokens).add("Ada", "operator"), "descriptors": 1024}
             viewer = Tokens(tokens).add("Eve", "viewer")
             options += ["--tokens", str(tokens)]
         service = kept.enter_context(Service(Path(folder) / "runs", *options, **more))
+        # A line that is kept owes its next head, and is closed where the places are taken.
+        service.http = kept.enter_context(
+            httpx.Client(
+                base_url=service.url,
+                headers=service.headers,
+                timeout=60.0,
+                limits=httpx.Limits(max_keepalive_connections=0),
+            )
+        )
         all_ = kept.enter_context(watching(service, arguments.viewers, arguments.slow))
         lease = kept.enter_context(service.lease())
         awake(service, lease)
-        kept.enter_context(attacked(service, viewer))
+        kept.enter_context(attacked(service, viewer, kinds))
+        before = kept.enter_context(refusing()) if proxy else 0
         for i in range(count):
             for v in all_:
                 v.apart = math.inf
@@ -255,22 +304,25 @@ def stops(arguments: argparse.Namespace, count: int, under_attack: bool) -> None
                 service.http.get("/page/page.css")
                 plain.append(1e3 * (time.perf_counter() - start))
                 time.sleep(random.uniform(0.02, 0.06))
-            asked = list(at)[i % 2]
+            asked = "listener" if proxy else list(at)[i % 2]
             port = service.stop_port if asked == "listener" else service.port
             start = time.monotonic()
-            # On a line of its own, as a page's that was idle is.
-            line = HTTPConnection("127.0.0.1", int(port), timeout=60.0)
-            line.request("POST", "/api/stop")
+            refused = ask(before) if proxy else None
+            line = ask(port)
             assert json.load(line.getresponse())["stopped"]
             line.close()
             at[asked][0].append(1e3 * (time.monotonic() - start))
+            if refused:
+                assert refused.getresponse().status == 503
+                refused.close()
             job = ended(service, id_)
             recording = read_recording(Path(folder) / "runs" / job["recording"])
             missing += recording.stop.missing_samples
             v = recording.values[:, recording.column("v_2")]
             zero = recording.sequence[np.flatnonzero(v)[-1] + 1] / recording.rate_hz
             at[asked][1].append(1e3 * (zero + min(v.apart for v in all_) - start))
-    said = "under attack" if under_attack else "not attacked"
+    said = "under attack: " + ", ".join(kinds) if kinds else "not attacked"
+    said += "; a proxy answers the service's port with 503" if proxy else ""
     load = ", ".join(f"{x:.1f}" for x in os.getloadavg())
     print(f"{len(all_)} viewers, {arguments.slow} of them never read; {said}; load {load}")
     for asked, (took, zeros) in at.items():
@@ -468,6 +520,9 @@ def main() -> None:
     parser.add_argument("--slow", type=int, default=5)
     parser.add_argument("--stops", type=int, default=15)
     parser.add_argument("--attacked", type=int, default=15)
+    parser.add_argument("--each", type=int, default=0)
+    every = ("proxy", *ATTACKS)
+    parser.add_argument("--kinds", nargs="+", choices=every, default=every, help="of --each")
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1, help="of the moments of the kills")
@@ -476,9 +531,15 @@ def main() -> None:
     parser.add_argument("--page", action=argparse.BooleanOptionalAction, default=True)
     arguments = parser.parse_args()
     prefer(arguments.autogroup)
-    for count, under_attack in ((arguments.stops, False), (arguments.attacked, True)):
-        if count:
-            stops(arguments, count, under_attack)
+    if arguments.stops:
+        stops(arguments, arguments.stops)
+    if arguments.attacked:
+        stops(arguments, arguments.attacked, ATTACKS)
+    if arguments.each:
+        if "proxy" in arguments.kinds:
+            stops(arguments, arguments.each, proxy=True)
+        for kind in (k for k in arguments.kinds if k != "proxy"):
+            stops(arguments, arguments.each, [kind])
     if arguments.pairs:
         pairs(arguments)
     if arguments.kills:

@@ -95,15 +95,15 @@ def doctor(
     Example: samii-rig doctor --rig my_rig.toml --move
     """
     from samii_rig.cli.arguments import check_rig
+    from samii_rig.files import check_folder
 
     check_rig(rig)
+    if move:
+        check_folder("--out", out)
 
-    from samii_rig.files import check_folder
     from samii_rig.rig.load import load_rig
     from samii_rig.run.doctor import examine
 
-    if move:
-        check_folder("--out", out)
     the_rig, text = load_rig(rig)
     checks = []
 
@@ -142,14 +142,14 @@ def jog(
     Example: samii-rig jog --to 0.05 --rig my_rig.toml
     """
     from samii_rig.cli.arguments import check_rig
+    from samii_rig.files import check_folder
 
     check_rig(rig)
+    check_folder("--out", out)
 
-    from samii_rig.files import check_folder
     from samii_rig.rig.load import load_rig
     from samii_rig.run.session import jog as go
 
-    check_folder("--out", out)
     the_rig, text = load_rig(rig)
     move = go(the_rig, text, to, speed, out)
     code = EXIT.get(move.stop.status, 1)
@@ -190,23 +190,23 @@ def calibrate(
     Example: samii-rig calibrate a_0 --reads 9.81 --reads -9.81 --rig my_rig.toml --to new.toml
     """
     from samii_rig.cli.arguments import check_rig
-
-    check_rig(rig)
-
-    import numpy as np
-
     from samii_rig.cli.common import check_target
     from samii_rig.errors import InputError
     from samii_rig.files import check_folder
+
+    check_rig(rig)
+    check_target("--to", to, (".toml",), [Path(rig)])
+    if to.exists():
+        raise InputError("calibrate", "--to", str(to), "a new name")
+    check_folder("--out", out)
+
+    import numpy as np
+
     from samii_rig.record.export import replacing
     from samii_rig.rig.load import load_rig
     from samii_rig.run import calibrate as c
     from samii_rig.run.session import column, listen, opened
 
-    check_target("--to", to, (".toml",), [Path(rig)])
-    if to.exists():
-        raise InputError("calibrate", "--to", str(to), "a new name")
-    check_folder("--out", out)
     the_rig, text = load_rig(rig)
     if sensor == "null":
         new_text, said = _null(the_rig, text, rig, seconds, out)

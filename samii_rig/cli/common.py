@@ -44,6 +44,10 @@ RigOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, for machines.")]
 Logs = Annotated[list[Path], typer.Argument(help="Recordings (.mcap).", show_default=False)]
 
+# What is drawn, and what samples are exported as, by the file's suffix.
+FIGURES = (".png", ".svg", ".pdf")
+SAMPLES = (".csv", ".parquet", ".mat", ".wav", ".uff", ".unv")
+
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes; by default one a core.")]
 SchedulerOption = Annotated[
     str, typer.Option(help="Address of a dask.distributed scheduler to run on instead.")

@@ -49,8 +49,10 @@ def control(
     Example: samii-rig control --rig samii --out control
     """
     from samii_rig.cli.arguments import check_rig
+    from samii_rig.files import check_folder, make_folder
 
     check_rig(rig)
+    check_folder("--out", out)
 
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -60,11 +62,9 @@ def control(
     from samii_rig.control.pictures import write_pictures
     from samii_rig.control.result import lines, plain, rig_text, step_line
     from samii_rig.control.settle import settling
-    from samii_rig.files import check_folder, make_folder
     from samii_rig.record.reader import read_recording
     from samii_rig.rig.load import load_rig
 
-    check_folder("--out", out)
     the_rig, text = load_rig(rig)
     known = None
     if identified is not None and identified.suffix == ".toml":

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from samii_rig.cli.common import (
+    FIGURES,
     JsonOption,
     Logs,
     check_target,
@@ -93,6 +94,12 @@ def frf(
     check_logs(logs)
     check_choice("--method", method, METHODS)
     check_choice("--gaps", gaps, GAPS)
+    for path in export or ():
+        check_target("--export", path, (".csv", ".npz", ".mat", ".uff"), logs)
+    if save:
+        check_target("--save", save, (".mcap",), logs)
+        if save.exists():
+            raise InputError("--save", "", str(save), "no recording of that name yet")
 
     from rich.console import Console
 
@@ -102,12 +109,6 @@ def frf(
     from samii_rig.report.facts import names
     from samii_rig.report.summary import summary
 
-    for path in export or ():
-        check_target("--export", path, (".csv", ".npz", ".mat", ".uff"), logs)
-    if save:
-        check_target("--save", save, (".mcap",), logs)
-        if save.exists():
-            raise InputError("--save", "", str(save), "no recording of that name yet")
     console = Console(highlight=False)
     recordings = read_all(logs)
     responses = estimated(recordings, input_, output, method, gaps, band)
@@ -177,6 +178,11 @@ def report(
     check_logs(logs)
     check_choice("--method", method, METHODS)
     check_choice("--gaps", gaps, GAPS)
+    page = out or (None if figure else logs[0].with_suffix(".html"))
+    if page is not None:
+        check_target("--out", page, (".html",), logs)
+    for path in figure or ():
+        check_target("--figure", path, FIGURES, logs)
 
     from rich.console import Console
 
@@ -187,11 +193,6 @@ def report(
     from samii_rig.report.page import write_report
     from samii_rig.report.summary import summary, working
 
-    page = out or (None if figure else logs[0].with_suffix(".html"))
-    if page is not None:
-        check_target("--out", page, (".html",), logs)
-    for path in figure or ():
-        check_target("--figure", path, (".png", ".svg", ".pdf"), logs)
     recordings = read_all(logs)
     responses = estimated(recordings, input_, output, method, gaps, band)
     held = rig_of(recordings, rig)

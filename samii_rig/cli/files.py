@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from samii_rig.cli.common import JsonOption, Logs, check_target, say_json
+from samii_rig.cli.common import SAMPLES, JsonOption, Logs, check_target, say_json
 
 if TYPE_CHECKING:
     from samii_rig.record.describe import Description
@@ -47,12 +47,14 @@ def import_(
     Example: samii-rig import recordings/*.txt --map sflr --out runs/sflr
     """
     from samii_rig.cli.arguments import check_logs, check_map
+    from samii_rig.files import check_folder, make_folder
 
     check_map(layout)
     check_logs(files)
+    if layout:
+        check_folder("--out", out)
 
     from samii_rig.errors import InputError
-    from samii_rig.files import check_folder, make_folder
     from samii_rig.record.channel_table import load_channels
     from samii_rig.record.importer import import_file
     from samii_rig.record.maps import load_map, shipped_maps
@@ -66,7 +68,6 @@ def import_(
             f"a map file or one of {', '.join(shipped_maps())}; --describe writes a first one"
         )
         raise InputError("--map", "", "missing", expected)
-    check_folder("--out", out)
     the_map, text = load_map(layout)
     targets = [out / f"{path.stem}.mcap" for path in files]
     for path, target in zip(files, targets, strict=True):
@@ -142,10 +143,14 @@ def export(
 
     Example: samii-rig export runs/run.mcap --out run.csv
     """
-    from samii_rig.record.export_samples import WRITERS, check_suffix, export_samples
+    from samii_rig.cli.arguments import check_logs
+
+    check_logs([log])
+    check_target("--out", out, SAMPLES, [log])
+
+    from samii_rig.record.export_samples import check_suffix, export_samples
     from samii_rig.record.reader import read_recording
 
-    check_target("--out", out, tuple(WRITERS), [log])
     check_suffix(out)
     recording = read_recording(log)
     export_samples(out, recording)
@@ -219,19 +224,19 @@ def recover(
     Example: samii-rig recover runs/broken.mcap.partial
     """
     from samii_rig.cli.arguments import check_logs
-
-    check_logs(logs)
-
-    from dataclasses import asdict
-
     from samii_rig.errors import InputError
     from samii_rig.files import check_file
-    from samii_rig.record.recover import recover as give_back
 
+    check_logs(logs)
     if out:
         if len(logs) > 1:
             raise InputError("--out", "", str(out), "one recording only")
         check_file("--out", out)
+
+    from dataclasses import asdict
+
+    from samii_rig.record.recover import recover as give_back
+
     found = [give_back(path, out) for path in logs]
     if json:
         say_json({"files": [asdict(r) for r in found]})

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from samii_rig.cli.common import JsonOption, Logs, check_target, rig_of, say_json
+from samii_rig.cli.common import FIGURES, JsonOption, Logs, check_target, rig_of, say_json
 from samii_rig.cli.estimate import (
     GAPS,
     METHODS,
@@ -72,20 +72,20 @@ def modes(
     check_logs([*logs, *others])
     check_choice("--method", method, METHODS)
     check_choice("--gaps", gaps, GAPS)
+    wanted = _picked(pick)
+    for option, path, suffixes in (("--out", out, (".html",)), ("--figure", figure, FIGURES)):
+        if path is not None:
+            check_target(option, path, suffixes, [*logs, *others])
 
     from rich.console import Console
 
     from samii_rig.record.export import replacing
-    from samii_rig.report.figures import SUFFIXES, save_figure
+    from samii_rig.report.figures import save_figure
     from samii_rig.report.modes import modes_of, modes_table
     from samii_rig.report.modes_page import modes_page
     from samii_rig.report.modes_plots import picture
     from samii_rig.report.summary import working
 
-    wanted = _picked(pick)
-    for option, path, suffixes in (("--out", out, (".html",)), ("--figure", figure, SUFFIXES)):
-        if path is not None:
-            check_target(option, path, suffixes, [*logs, *others])
     console = Console(highlight=False)
     with ExitStack() as stack:
         # Opened first: a place that cannot be written to is said before the work, not after it.

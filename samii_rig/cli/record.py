@@ -77,6 +77,7 @@ def run(
     from rich.console import Console
 
     from samii_rig.cli.arguments import check_experiment, check_rig
+    from samii_rig.files import check_folder
 
     check_rig(rig)
     check_experiment(experiment)
@@ -85,6 +86,7 @@ def run(
     if describe:
         _describe(experiment, rig)
         return
+    check_folder("--out", out.parent if out else Path("runs"))
     said = Said(
         Console(highlight=False),
         out,
@@ -100,13 +102,12 @@ def run(
 
 def _ordered(experiment: str, rig: str, said: Said, *, dry_run: bool) -> int:
     """Predict, and unless that is all, carry out; the exit code."""
-    from samii_rig.files import check_folder, make_folder
+    from samii_rig.files import make_folder
     from samii_rig.report.summary import working
     from samii_rig.rig.load import load_rig
     from samii_rig.run.experiments import recording_stem
     from samii_rig.run.order import Order, refuse
 
-    check_folder("--out", said.out.parent if said.out else Path("runs"))
     the_rig, rig_text = load_rig(rig)
     order = Order.named(experiment, the_rig, rig_text)
     planned = order.runs()

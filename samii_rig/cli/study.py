@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from samii_rig.cli.common import (
+    FIGURES,
     JsonOption,
     RigOption,
     SchedulerOption,
@@ -47,6 +48,9 @@ def study(
     from samii_rig.cli.arguments import check_rig
 
     check_rig(rig)
+    for option, path, suffixes in (("--out", out, (".csv",)), ("--plot", plot, FIGURES)):
+        if path is not None:
+            check_target(option, path, suffixes)
 
     from samii_rig.errors import InputError
     from samii_rig.model.vary import vary as values_of
@@ -60,15 +64,12 @@ def study(
 
     from samii_rig.model.study import study as modes_over
     from samii_rig.record.export import replacing
-    from samii_rig.report.figures import SUFFIXES, save_figure
+    from samii_rig.report.figures import save_figure
     from samii_rig.report.study import figure, table, write_csv
     from samii_rig.workers import workers as at_work
 
     if plot is not None and len(varied) > 2:
         raise InputError("--plot", "", [v.name for v in varied], "one or two --vary to draw")
-    for option, path, suffixes in (("--out", out, (".csv",)), ("--plot", plot, SUFFIXES)):
-        if path is not None:
-            check_target(option, path, suffixes)
     console = Console(highlight=False)
     columns = BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with ExitStack() as stack:

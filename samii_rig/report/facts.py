@@ -6,6 +6,7 @@ import json
 import math
 import shlex
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -46,10 +47,21 @@ def subtitle(recordings: Sequence[Recording], rig: Rig | None) -> str:
     parts += sorted({r.metadata.get("description", "") for r in recordings} - {""})
     times = sorted({_first(r, "start_time", "started") for r in recordings} - {""})
     if times:
-        parts.append(times[0] if len(times) == 1 else f"{times[0]} to {times[-1]}")
+        parts.append(" to ".join(dict.fromkeys(_instant(t) for t in (times[0], times[-1]))))
     if recordings:
         parts.append(counted(len(recordings), "recording"))
     return " \u00b7 ".join(parts)
+
+
+def _instant(stated: str) -> str:
+    """`2026-11-24 15:22:38 UTC`; as it is stated where that is no instant."""
+    try:
+        at = datetime.fromisoformat(stated)
+    except ValueError:
+        return stated
+    if at.tzinfo is None:
+        return stated.replace("T", " ")
+    return f"{at.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC"
 
 
 def comparison_rows(comparisons: Sequence[Comparison]) -> list[dict[str, str]]:
@@ -181,7 +193,7 @@ def finding_rows(responses: Sequence[FrequencyResponse]) -> list[dict[str, str]]
             "severity": f.severity,
             "kind": f.kind.replace("_", " "),
             "where": " \u00b7 ".join(p for p in (f.channel, f.segment) if p) or "all",
-            "message": without_folders(f.message),
+            "message": pretty(without_folders(f.message)),
         }
         for f in sorted(found, key=lambda f: order.index(f.severity))
     ]

@@ -18,6 +18,7 @@ from samii_rig.report.canvas import (
     shade,
     stacked,
     ticked,
+    unpacked,
 )
 from samii_rig.report.compare import BAND, Comparison, ModelCurve, pretty, telling
 from samii_rig.report.modes import Modes
@@ -27,6 +28,7 @@ from samii_rig.types import Channel, Float, FrequencyResponse, Int
 
 _BINS = 280  # of log-frequency, two points each: the pixels of the panel
 _NOISE_PART = 0.004  # of the lines may lie outside a gain axis
+_LEAST_PHASE = 40.0  # degrees of phase shown, so that a constant looks like one
 DEGREES = "%{y:.1f}\u00b0"
 _LABELS = 4  # more would stand on each other
 
@@ -100,7 +102,6 @@ def bode(
     else:
         figure = stacked(3, titles, 720, weights=(0.46, 0.32, 0.22))
     log_scale(figure["layout"]["yaxis"])
-    figure["layout"]["yaxis2"] |= {"dtick": 90}
     figure["layout"]["yaxis3"] |= {"range": [0, 1.04], "dtick": 0.5}
     anchor: Float | None = None
     for k, c in enumerate(curves):
@@ -123,6 +124,7 @@ def bode(
         line(figure, f, angle, name, "y2", None, legend=False, hover=DEGREES)
     frame(figure, responses)
     fit_gain(figure, responses, output, input, curve)
+    fit_phase(figure)
     worst = telling(comparisons).get((y.name, u.name))
     if worst is not None:
         figure["layout"]["shapes"] = [shade(span) for span in worst.spans_hz]
@@ -184,7 +186,6 @@ def ratio(
     y, u = responses[0].outputs[output], responses[0].inputs[input]
     figure = stacked(2, ["model/measured", "phase [\u00b0]"], 520)
     log_scale(figure["layout"]["yaxis"])
-    figure["layout"]["yaxis2"] |= {"dtick": 45}
     quotients: list[Float] = []
     for k, c in enumerate(curves):
         r = c.response
@@ -205,6 +206,7 @@ def ratio(
         band(figure, f, angle - band_half, angle + band_half, "y2", k)
         line(figure, f, angle, label(r), "y2", k, legend=False, hover="%{y:.1f}\u00b0")
     frame(figure, responses)
+    fit_phase(figure)
     shown = np.concatenate(quotients)
     shown = np.log10(shown[np.isfinite(shown) & (shown > 0)])
     if shown.size:
@@ -236,6 +238,24 @@ def phase_curve(figure: Figure, c: Curves, k: int, i: int, j: int, anchor: Float
     shown = np.where(known, angle, np.nan)
     line(figure, f, shown, label(r), "y2", k, legend=False, hover=DEGREES)
     return anchor
+
+
+def fit_phase(figure: Figure) -> None:
+    """Phase axis, that of the second panel, over what is drawn there, with ticks that suit it."""
+    drawn = [
+        unpacked(trace["y"])
+        for trace in figure["data"]
+        if trace["yaxis"] == "y2" and trace.get("fill") is None
+    ]
+    values = np.concatenate([x[np.isfinite(x)] for x in drawn])
+    if not values.size:
+        return
+    low, high = float(values.min()), float(values.max())
+    if high - low < _LEAST_PHASE:
+        low, high = (low + high - _LEAST_PHASE) / 2, (low + high + _LEAST_PHASE) / 2
+    room = 0.08 * (high - low)
+    step = next((d for d in (10, 30, 45) if (high - low) / d <= 6), 90)
+    figure["layout"]["yaxis2"] |= {"dtick": step, "range": [low - room, high + room]}
 
 
 def frame(figure: Figure, responses: Sequence[FrequencyResponse]) -> None:

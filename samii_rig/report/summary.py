@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import TracebackType
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Protocol, Self
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
@@ -141,7 +143,7 @@ class LiveProgress:
 
 @contextmanager
 def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Callable[[str], None]]:
-    """Say what is being done; what is given says what comes next.
+    """Say what is being done and for how long; what is given says what comes next.
 
     Without a terminal it is one line each, so that who reads a log later, or waits for a pipe,
     sees that it goes on. quiet : say nothing.
@@ -149,11 +151,19 @@ def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Cal
     if quiet:
         yield lambda stage: None
     elif console.is_terminal:
-        with console.status(f"{what} ...") as status:
-            yield lambda stage: status.update(f"{what}: {stage} ...")
+        columns = SpinnerColumn(), TextColumn("{task.description} ..."), TimeElapsedColumn()
+        with Progress(*columns, console=console, transient=True) as shown:
+            task = shown.add_task(what, total=None)
+            yield lambda stage: shown.update(task, description=f"{what}: {stage}")
     else:
+        begun = time.monotonic()
+
+        def say(stage: str) -> None:
+            after = time.monotonic() - begun
+            console.print(f"{what}: {stage} ... (after {after:.0f} s)", highlight=False)
+
         console.print(f"{what} ...", highlight=False)
-        yield lambda stage: console.print(f"{what}: {stage} ...", highlight=False)
+        yield say
 
 
 def summary(

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from samii_rig.report.compare import Comparison, percent, telling
+from samii_rig.report.compare import Comparison, percent, pretty, telling
 from samii_rig.signal.statistics import difference, octaves
 from samii_rig.types import Finding, Float, FrequencyResponse, Recording
 
@@ -190,7 +190,7 @@ def _data(responses: Sequence[FrequencyResponse]) -> list[Verdict]:
 
 def _of_a_kind(found: list[Finding]) -> str:
     more = len(found) - 1
-    text = without_folders(found[0].message).rstrip(".")
+    text = pretty(without_folders(found[0].message)).rstrip(".")
     return f"{text} (and {more} more of this kind)." if more else f"{text}."
 
 

@@ -71,6 +71,9 @@ def parse_experiment(text: str, where: str) -> tuple[Experiment, str]:
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     known = kinds()
     kind = tables(text, where).get("experiment")
+    if kind is None:
+        expected = f"one of {', '.join(sorted(known))}"
+        raise InputError.saying(where, "", f"experiment is missing; expected {expected}")
     if not isinstance(kind, str) or kind not in known:
         raise InputError(where, "experiment", kind, one_of(kind, sorted(known)))
     who = named(known[kind])

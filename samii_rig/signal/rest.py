@@ -69,10 +69,10 @@ def ringing(pieces: Sequence[Piece], channels: Sequence[Channel], highest: float
     if not snr.any():
         return None
     i = int(np.argmax(snr))
+    part = 100.0 * size[i] / max(peak[i], 1e-300)
     message = (
         f"{channels[i + 1].name} still moves by {size[i]:.3g} {channels[i + 1].unit} (rms, "
-        f"{size[i] / max(peak[i], 1e-300):.2%} of its peak) in the last {tail} samples of "
-        f"{pieces[0].name}"
+        f"{part:.2g} % of its peak) in the last {tail} samples of {pieces[0].name}"
     )
     finding = Finding("leakage", "warning", message, channel=channels[i + 1].name)
     return Ringing(finding, _settled_after(ends.mean(axis=0), snr, n) if row else NEVER)

@@ -17,9 +17,11 @@ from fake_device import RIG as TEXT
 from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
+from samii_rig.cli.common import FIGURES, SAMPLES
 from samii_rig.cli.estimate import GAPS, METHODS
 from samii_rig.cli.papers import FORMATS
 from samii_rig.errors import InputError, SamiiRigError, one_of
+from samii_rig.record.export_samples import WRITERS
 from samii_rig.report.figures import SUFFIXES
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
@@ -58,6 +60,24 @@ WRONG = [
     "jog --rig sami",
     "calibrate a_0 --to new.toml --rig sami",
     "clear-fault --name a --reason b --rig sami",
+    # Of files that are there: where the result shall go.
+    "run step --out nodir.txt",
+    "run step --out there.mcap/run.mcap",
+    "frf there.mcap --export nodir/frf.csv",
+    "frf there.mcap --export frf.xls",
+    "frf there.mcap --save there.mcap",
+    "report there.mcap --out nodir/page.html",
+    "report there.mcap --figure bode.gif",
+    "modes there.mcap --out nodir/modes.html",
+    "study --vary joint_1.k=1:2:3 --plot nodir/study.png",
+    "control --out there.mcap",
+    "jog --to 0.05 --out there.mcap",
+    "doctor --move --out there.mcap",
+    "calibrate a_0 --to there.mcap",
+    "import there.mcap --map sflr --out there.mcap",
+    "export there.mcap --out run.xls",
+    "recover there.mcap --out nodir/new.mcap",
+    "diagnose there.mcap --rig samii --out there.mcap",
 ]
 # These ask the rig file for its elements, which takes numpy; the model is not asked.
 WRONG_FOR_THE_RIG = ["study --vary nope", "study --vary joint_1.q=1:2:3"]
@@ -79,6 +99,7 @@ print(json.dumps(found))
     ("lines", "heavy"), [(WRONG, HEAVY), (WRONG_FOR_THE_RIG, set(HEAVY) - {"numpy"})]
 )
 def test_a_wrong_argument_imports_nothing_heavy(tmp_path: Path, lines, heavy) -> None:
+    (tmp_path / "there.mcap").touch()
     code = COUNT.format(lines=lines, heavy=tuple(heavy))
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
@@ -91,6 +112,8 @@ def test_the_words_of_the_options_are_those_of_the_estimate() -> None:
     assert get_args(Method) == METHODS
     assert get_args(Gaps) == GAPS
     assert {f".{name}" for name in FORMATS} == set(SUFFIXES)
+    assert FIGURES == SUFFIXES
+    assert tuple(WRITERS) == SAMPLES
 
 
 @pytest.mark.parametrize(

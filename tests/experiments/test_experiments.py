@@ -239,7 +239,7 @@ def test_a_file_is_loaded_by_its_path(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "experiment is None; expected one of mode_scan, multisine"),
+        ("", "experiment is missing; expected one of mode_scan, multisine"),
         ('experiment = "braced"', "experiment is 'braced'; expected one of mode_scan, multisine"),
         ("experiment = 3", "experiment is 3"),
         ("experiment = ", "valid TOML"),

@@ -85,8 +85,15 @@ def test_a_run_that_begins_ends_a_replay(service: Service, browser: Browser) -> 
         assert browser.value("document.body.classList.contains('replaying')")
         assert violations(browser) == []
         assert browser.text("replay-name") == f"REPLAY of {GAPPED}: not live."
+        browser.click("replay-end")
+        browser.until("!scope.empty && scope.live")
         browser.press("Escape")
         browser.until("document.getElementById('now').textContent.includes('output is at zero')")
+        browser.until("document.getElementById('scope-state').textContent.includes('is over')")
+        # What was said of the run is not said of the recording that is shown after it.
+        browser.click("replay")
+        browser.until("!scope.empty && scope.recorded")
+        browser.until("document.getElementById('scope-state').textContent === ''")
         browser.click("replay-end")
         assert not browser.value("document.body.classList.contains('replaying')")
 

@@ -17,7 +17,6 @@ from samii_rig.report.canvas import (
     packed,
     stacked,
     ticked,
-    unpacked,
 )
 from samii_rig.report.compare import ModelCurve
 from samii_rig.report.diagnosis.models import HALF, Strength
@@ -25,6 +24,7 @@ from samii_rig.report.plots import (
     DEGREES,
     Curves,
     fit_gain,
+    fit_phase,
     frame,
     gain_curve,
     phase_curve,
@@ -39,7 +39,6 @@ AFTER: dict[str, Any] = {"width": 2.2, "color": "@ink", "dash": "dash"}
 _KNOWN = 0.5  # of |x|, a standard deviation from which x says nothing
 _CUTS = (-180.0, -90.0, 0.0, -270.0)  # degrees
 _NEAR_CUT = 40.0
-_LEAST_PHASE = 40.0  # degrees of phase shown, so that a constant looks like one
 _PER_OCTAVE = 4  # bins of the distance between model and measurement
 _FLOOR = 0.1  # of the noise: the lowest distance shown
 
@@ -116,7 +115,7 @@ def _fit(
     frequency: Sequence[Float],
 ) -> None:
     """Axes over the points that are known, and the law."""
-    _fit_phase(figure)
+    fit_phase(figure)
     f = np.concatenate(frequency)
     figure["layout"]["xaxis"] |= ticked(np.log10(f.min()), np.log10(f.max()))
     shown = [np.abs(x)[sd < _KNOWN * np.abs(x)] for x, sd in points]
@@ -130,24 +129,6 @@ def _fit(
         axis = ticked(low - room, high + room)
         axis["ticktext"] = [_power(t) for t in axis["tickvals"]]
         figure["layout"]["yaxis"] |= axis
-
-
-def _fit_phase(figure: Figure) -> None:
-    """Phase axis over the points and the law, with ticks that suit it."""
-    drawn = [
-        unpacked(trace["y"])
-        for trace in figure["data"]
-        if trace["yaxis"] == "y2" and trace.get("fill") is None
-    ]
-    values = np.concatenate([x[np.isfinite(x)] for x in drawn])
-    if not values.size:
-        return
-    low, high = float(values.min()), float(values.max())
-    if high - low < _LEAST_PHASE:
-        low, high = (low + high - _LEAST_PHASE) / 2, (low + high + _LEAST_PHASE) / 2
-    room = 0.08 * (high - low)
-    step = next((d for d in (10, 30, 45) if (high - low) / d <= 6), 90)
-    figure["layout"]["yaxis2"] |= {"dtick": step, "range": [low - room, high + room]}
 
 
 def _power(value: float) -> str:
@@ -171,7 +152,6 @@ def before_after(
     figure = stacked(3, titles, 640, weights=(0.46, 0.27, 0.27))
     log_scale(figure["layout"]["yaxis"])
     log_scale(figure["layout"]["yaxis3"])
-    figure["layout"]["yaxis2"] |= {"dtick": 90}
     anchor: Float | None = None
     for k, c in enumerate(curves):
         gain_curve(figure, c, k, i, j)
@@ -192,6 +172,7 @@ def before_after(
         distances.append(far)
     frame(figure, responses)
     fit_gain(figure, responses, i, j, np.concatenate(shown))
+    fit_phase(figure)
     high = float(np.log10(np.nanmax(np.concatenate(distances))))
     low = float(np.log10(np.nanmin(np.concatenate(distances))))
     figure["layout"]["yaxis3"] |= ticked(min(low, -0.3) - 0.1, max(high, 0.5) + 0.15)

@@ -1,6 +1,7 @@
 // The scope's controls: channels, span, pause, trigger and cursors, all from the keyboard too.
 
 import { remembered } from "/page/kept.js";
+import { LEFT, RIGHT } from "/page/scope.js";
 
 export function controls($, put, scope) {
   remembered($("span"), "span", () => { scope.span = Number($("span").value); scope.arm(); });
@@ -38,7 +39,7 @@ export function controls($, put, scope) {
   canvas.onpointerdown = canvas.onpointermove = (event) => {
     if (!scope.cursors || !event.buttons) return;
     const box = canvas.getBoundingClientRect();
-    const part = Math.min(1, Math.max(0, (event.clientX - box.left - 76) / (box.width - 84)));
+    const part = Math.min(1, Math.max(0, (event.clientX - box.left - LEFT) / (box.width - LEFT - RIGHT)));
     const [a, b] = scope.cursors;
     $(Math.abs(part - a) < Math.abs(part - b) ? "cursor-a" : "cursor-b").value = Math.round(1000 * part);
     cursors();

@@ -34,8 +34,8 @@ export function grid(g, b, low, high, py, about, ink) {
   let last = Infinity;
   for (let k = Math.ceil(low / every); k * every <= high; k++) {
     const y = py(k * every);
-    if (y < b.y + 42 || last - y < 13) continue; // below the name and the unit
-    g.fillText(short(k * every), b.x - 6, Math.min(y + 4, b.y + b.h)); last = y;
+    if (last - y < 13) continue; // no number on another
+    g.fillText(short(k * every), b.x - 6, Math.min(Math.max(y + 4, b.y + 10), b.y + b.h)); last = y;
   }
   const across = (v, colour, dash) => {
     if (v < low || v > high) return;

@@ -115,8 +115,8 @@ export class Motion {
     g.globalAlpha = 1;
     const angles = there && !stale ? about.sensors.map((name, k) => (about.accelerations[k] ? "" : `${name} ${this.milli(there.y[k])}`)).filter(Boolean).join(", ") : "";
     const text = stale ? `Not moving: ${stale}.` : `${paused ? "Paused. " : ""}${w < SMALL ? "" : "Displacements "}× ${this.factor}${w < SMALL ? "" : `. ${angles}`}`;
-    g.font = "600 14px system-ui, sans-serif"; g.textAlign = "right"; g.fillStyle = ink(stale && stale !== "no run" ? "--bad" : "--muted");
-    g.fillText(text, w - 16, 18);
+    g.font = "600 14px system-ui, sans-serif"; g.textAlign = "left"; g.fillStyle = ink(stale && stale !== "no run" ? "--bad" : "--muted");
+    g.fillText(text, 4, 18);
     // To who does not see it, when it changes and not at every frame.
     const plain = stale || paused ? text : `The rig moves, displacements drawn ${this.factor} times as large.`;
     if (plain !== this.text) { this.text = plain; this.said(plain); }

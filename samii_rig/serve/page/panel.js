@@ -22,6 +22,9 @@ function round(re, im, b) {
   return [around(left, right, b.w), around(foot, top, b.h)];
 }
 
+// Over what is measured, or a model that fits would not be seen.
+const modelLast = (a, b) => (a.name === "model") - (b.name === "model");
+
 export class Panel {
   // noted : takes a note that a person writes at a frequency.
   constructor($, put, noted) {
@@ -151,12 +154,12 @@ export class Panel {
       const re = list.map((c) => shown(c.curve, "real").y), im = list.map((c) => shown(c.curve, "imag").y);
       const [x, y] = round(re.flat(), im.flat(), b);
       const cursors = on.map(([name, at]) => ({ name, at: null, points: list.slice(-1).flatMap((c) => { const k = nearest(c.f, at); return k < 0 ? [] : [[re.at(-1)[k], im.at(-1)[k]]]; }) }));
-      const curves = list.map((c, k) => ({ ...c, x: re[k], y: im[k] }));
+      const curves = list.map((c, k) => ({ ...c, x: re[k], y: im[k] })).sort(modelLast);
       diagram(g, b, { title: e.title, unit: about.unit(e.unit), x, y, curves, cursors }, ink);
       drawn.forEach((d, k) => { d.words = re[k].map((v, i) => `${short(v)} ${im[k][i] < 0 ? "−" : "+"} ${short(Math.abs(im[k][i]))}i`); });
     } else {
       const x = this.band(), y = spanned(drawn.flatMap((d) => d.y), about);
-      const curves = list.map((c, k) => ({ ...c, ...bare(drawn[k], c), x: c.f }));
+      const curves = list.map((c, k) => ({ ...c, ...bare(drawn[k], c), x: c.f })).sort(modelLast);
       const seen = list.find((c) => c.name === "measured");
       const hatched = !this.going || this.laid.length ? [] : seen ? [[x[0], seen.f[0]], [seen.f.at(-1), x[1]]] : [x];
       const cursors = on.map(([name, at]) => ({ name, at, points: [] }));

@@ -7,7 +7,7 @@ import { Samples } from "/page/samples.js";
 const EASE = 0.12; // of what is missing, a frame: blocks come four times a second
 const BEFORE = 0.25; // of the span, before the trigger
 const PATIENCE = 1.0; // s after which "auto" runs on without a trigger
-const LEFT = 76;
+export const LEFT = 52, RIGHT = 8; // px beside the curves
 
 export class Scope {
   constructor(canvas, said) {
@@ -32,7 +32,7 @@ export class Scope {
   get lost() { return this.samples.lost; }
 
   // Look for a trigger from what is new on.
-  arm() { this.kept = null; this.at = null; this.looked = this.samples.end ?? 0; this.text = ""; }
+  arm() { this.kept = null; this.at = null; this.looked = this.samples.end ?? 0; this.text = null; }
 
   take(buffer) {
     const frame = this.samples.take(buffer, this.channels.length);
@@ -104,7 +104,7 @@ export class Scope {
     const end = s.end === null ? 0 : s.end / s.rate;
     if (this.edge === null || Math.abs(end - this.edge) > 2) this.edge = end;
     this.edge += EASE * (end - this.edge);
-    const view = this.view(), lanes = this.shown.length || 1, tall = (h - 22) / lanes, width = w - LEFT - 8;
+    const view = this.view(), lanes = this.shown.length || 1, tall = (h - 22) / lanes, width = w - LEFT - RIGHT;
     this.tell(view);
     this.read = [];
     g.font = "13px system-ui, sans-serif"; g.lineJoin = "bevel";
@@ -139,10 +139,19 @@ export class Scope {
   lane(g, view, column, lane, y, w, h) {
     const ink = this.ink, colour = ink(`--c${lane}`), channel = this.channels[column], x = LEFT;
     g.strokeStyle = ink("--line"); g.lineWidth = 1; g.strokeRect(x, y, w, h);
-    g.textAlign = "right"; g.fillStyle = colour;
-    g.fillText(channel ? channel.name : "", x - 8, y + 14);
-    g.fillStyle = ink("--muted");
-    g.fillText(channel ? channel.unit.replace("^2", "²") : "", x - 8, y + 30);
+    this.curve(g, view, column, lane, y, w, h);
+    // Over the curve, with room round it: the edge beside it is the values'.
+    const name = channel ? channel.name : "", unit = channel ? channel.unit.replace("^2", "²") : "";
+    g.font = "600 13px system-ui, sans-serif"; g.textAlign = "left"; g.lineWidth = 5; g.strokeStyle = ink("--panel");
+    const after = x + 12 + g.measureText(name).width;
+    g.strokeText(name, x + 6, y + 14); g.fillStyle = colour; g.fillText(name, x + 6, y + 14);
+    g.font = "13px system-ui, sans-serif"; g.fillStyle = ink("--muted");
+    g.strokeText(unit, after, y + 14); g.fillText(unit, after, y + 14); g.lineWidth = 1;
+  }
+
+  // Grid, zero, limits and curve of a channel, as far as there are samples.
+  curve(g, view, column, lane, y, w, h) {
+    const ink = this.ink, colour = ink(`--c${lane}`), channel = this.channels[column], x = LEFT;
     const rows = view.rows;
     if (!rows || rows.begin === null || !rows.columns[column]) return;
     const values = rows.columns[column], size = rows.length, rate = rows.rate;

@@ -47,7 +47,7 @@ export class SoFar {
     $("h-diagnosis").textContent = "Diagnosis so far";
     const why = run.phase === "analysing" ? " The last one is being made." : failed ? " What makes it has ended; the log of the job says why." : "";
     if (!d) { this.empty(`None yet: it is made from what is measured so far.${why}`); return; }
-    this.say(d, d.repeats ? "" : "Preliminary, from one sweep: its noise is not known from repeats. ");
+    this.say(d, d.repeats ? "" : "Preliminary, from one sweep: its noise is not known from repeats.");
     const end = d.certain ? `Certain: ${d.certain}. ` : "";
     const stop = run.stop_when_certain ? (d.certain ? "The run ends after this segment." : "The run ends once it is certain.") : "";
     $("diagnosis-age").textContent = `${ago(d.age_s)} old, made in ${d.took_s.toFixed(1)} s from ${d.done} of ${d.of} segments, ${
@@ -63,16 +63,18 @@ export class SoFar {
     if (!d || this.job !== last.id) return;
     $("diagnosis-section").hidden = false;
     $("h-diagnosis").textContent = d.final ? "Diagnosis of the last run" : "Diagnosis until the last run ended";
-    this.say(d, d.final ? "" : "Preliminary, and not kept with the recording. ");
+    this.say(d, d.final ? "" : "Preliminary, and not kept with the recording.");
     $("diagnosis-age").textContent = d.final ? `Kept with ${last.recording}. ${last.early ? `The run ended early: ${last.early}.` : ""}`
       : `From ${d.done} of ${d.of} segments, ${hz(d.low_hz)} to ${hz(d.high_hz)} Hz.`;
   }
 
-  say(d, before) {
+  // but : what keeps the answer from being a final one.
+  say(d, but) {
     const { $, put } = this;
     if (!d.verdict) { this.empty(`None: ${d.trouble}`); return; }
     const open = !d.repeats && !d.final && d.verdict === "unknown";
-    $("diagnosis-what").textContent = before + (open ? "No answer yet." : d.lines[0]);
+    $("diagnosis-what").textContent = open ? "No answer yet." : d.lines[0];
+    $("diagnosis-but").textContent = but;
     $("diagnosis-more").textContent = open ? "" : d.lines.slice(1).join(" ");
     $("diagnosis-facts").replaceChildren();
     const facts = { "Chance that nothing is missing": part(d.nothing) };
@@ -89,7 +91,7 @@ export class SoFar {
   empty(text) {
     const { $ } = this;
     $("diagnosis-what").textContent = text;
-    $("diagnosis-more").textContent = $("diagnosis-age").textContent = "";
+    $("diagnosis-but").textContent = $("diagnosis-more").textContent = $("diagnosis-age").textContent = "";
     $("diagnosis-facts").replaceChildren();
     $("next").hidden = true;
   }
