@@ -15,7 +15,7 @@ from samii_rig.likelihood.spikes import TO_SD
 from samii_rig.signal.columns import asked
 from samii_rig.types import Float, Recording
 
-NOISE = 0.1  # of what was measured, sd, that may be the meter's
+NOISE = 0.5  # of what was measured, sd, that may be the meter's: of more the law says nothing
 # Samples further out than so many sd are none of its noise, but edges within a sample; of all
 # samples they may be this part.
 FAR, EDGES = 7.0, 1e-3
@@ -26,6 +26,13 @@ ORDER = np.arange(NEIGHBOURS.size, dtype=np.float64)
 ROUNDS, STEP = 4, 1e-3  # of Gauss and Newton, and samples for a slope
 LATEST = 0.5  # samples: of a loop that runs at the record's rate
 WHOLE = 0.02  # samples, from the delay of a loop that runs a whole number of times as fast
+# Of what is neither the command's converter's nor excitation, the power over that of its steps from
+# which it is a meter's noise; of the largest line, the power that it stays below; the part of the
+# lines, the upper ones, that show it.
+METER, QUIET, UPPER = 9.0, 1e-3, 0.5
+# Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a
+# smaller one that came half a sample earlier is below a hundredth of what the rest makes.
+JUMP, REST = 0.01, 4
 
 
 def sent(
@@ -48,6 +55,53 @@ def sent(
         return v, none
     drawn = _filtered(recording, law, _held(late))
     return np.where(np.isfinite(drawn), drawn, v), far
+
+
+def calibrated(r: Float, step: float) -> Float:
+    """(n,) the input as likely as a meter's white noise on r (n,) leaves it: every line by the part
+    of its power that is not noise (regression calibration: Carroll et al. 2006, Measurement Error
+    in Nonlinear Models, ch. 4). r itself where the meter shows none, or the input is as wide as
+    what was recorded.
+
+    step : of the command's converter, whose rounding is the input's own.
+    """
+    known = np.isfinite(r)
+    if not known.all():
+        return r
+    spectrum = np.fft.rfft(r - np.mean(r))
+    power = np.abs(spectrum) ** 2 / r.size
+    upper = np.sort(power[int((1 - UPPER) * power.size) :])
+    floor = float(np.median(upper)) / np.log(2)
+    white = float(np.mean(upper)) < LOUDER * floor
+    if not white or floor < METER * step**2 / 12 or floor > QUIET * np.max(power):
+        return r
+    part = np.maximum(1 - floor / np.maximum(power, floor), 0.0)
+    return np.asarray(np.fft.irfft(part * spectrum, r.size) + np.mean(r))
+
+
+def jumps(recording: Recording, command: int, kp: float) -> NDArray[np.bool_]:
+    """(n,) where the input left or came to a rest at once, and the sample before: where not every
+    sample of the rig was recorded, nobody knows when between the two.
+
+    command : its column. kp : gain of the loop around it, 0 for none.
+    """
+    found = np.zeros(len(recording.values), np.bool_)
+    if recording.names("reference"):
+        u = asked(recording, recording.channels[command].name, kp)
+    elif kp == 0:
+        u = np.asarray(recording.values[:, command], np.float64)
+    else:
+        return found
+    if u.size <= 2 * REST:
+        return found
+    d = np.diff(u)
+    rests = np.convolve(d == 0, np.ones(REST), "full")[: d.size] == REST  # the REST last ones
+    after = np.append(False, rests[:-1])  # a rest ended just before
+    before = np.append(rests[REST:], np.zeros(REST, np.bool_))  # a rest begins just behind
+    edge = (d != 0) & (np.abs(d) > JUMP * np.nanmax(np.abs(u))) & (after | before)
+    found[1:] |= edge
+    found[:-1] |= edge
+    return found
 
 
 def _law(recording: Recording, command: int, kp: float, theta: Float | None) -> Float:

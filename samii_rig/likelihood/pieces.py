@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood import inputs, spikes
 from samii_rig.rig.schema import Rig
-from samii_rig.signal.columns import proportional
+from samii_rig.signal.columns import is_open, proportional
 from samii_rig.signal.groups import segments_of
 from samii_rig.types import Float, Quality, Recording, Segment
 
@@ -103,7 +103,10 @@ def wiring(
         return Wiring(command, found, "", 0.0)
     if centring.sensor not in found:
         raise EstimateError(f"the loop is closed around {centring.sensor}, which is left out")
-    return Wiring(command, found, centring.sensor, centring.kp)
+    sensor, kp = centring.sensor, centring.kp
+    if all(is_open(recording, command, sensor, kp) for recording in recordings):
+        return Wiring(command, found, "", 0.0)
+    return Wiring(command, found, sensor, kp)
 
 
 def pieces_of(
@@ -132,9 +135,13 @@ def pieces_of(
         whole = np.all(np.isfinite(values) & ~bad, axis=1)
         theta = values[:, 1 + wired.sensors.index(wired.centring)] if wired.kp else None
         values[:, 0], edges = inputs.sent(recording, columns[0], wired.kp, theta)
+        if round(rig.rate_hz / recording.rate_hz) > 1:
+            edges = edges | inputs.jumps(recording, columns[0], wired.kp)
         r = values[:, 0].copy()
         if theta is not None:
             r += wired.kp * theta
+        if not recording.names("reference"):
+            r = inputs.calibrated(r, recording.channels[columns[0]].resolution)
         for segment in segments_of(recording):
             if recording.place(segment) in without:
                 continue

@@ -24,6 +24,7 @@ FARTHEST = 5  # samples; a logger that is later has another fault
 LEFT, ROUNDED, SEEN = 0.2, 0.3, 1.2
 ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same
 LOOKED_AT = 1 << 14  # samples about the largest reference: thousands tell a shift, millions cost
+QUIETER = 0.5  # of a command's fourth differences, those without what a loop would have added
 SENT = ("reference", "command")  # roles of columns that are sent, not measured
 
 
@@ -35,6 +36,24 @@ def centring_of(recording: Recording) -> tuple[str, float] | None:
     except (InputError, KeyError, TypeError):
         return None
     return (str(sensor), float(kp)) if isinstance(kp, int | float) and kp > 0 else None
+
+
+def is_open(recording: Recording, command: str, sensor: str, kp: float) -> bool:
+    """Whether the command does not follow the sensor though the rig file closes a loop around it.
+
+    By the reference; without one, by the sensor's noise, which a loop has in its command.
+    """
+    v = np.asarray(recording.values[:, recording.column(command)], np.float64)
+    back = kp * recording.values[:, recording.column(sensor)]
+
+    def size(x: Float) -> float:
+        known = x[np.isfinite(x)]
+        return float(np.median(np.abs(known))) if known.size else 0.0
+
+    if recording.names("reference"):
+        rest = v - asked(recording, command, kp)
+        return size(rest) < LEFT * size(rest + back)
+    return size(np.diff(v, 4)) < QUIETER * size(np.diff(v + back, 4))
 
 
 def shift_of(recording: Recording) -> int:
