@@ -23,6 +23,11 @@ WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
 AN_OCTAVE, BEHIND = 3.0, 1.0
 UNREAD = 6  # parts in which what is hardly read has a factor of its own
 NEW = 1e-5  # of the largest, a direction in which past inputs still differ
+# Hz of the mains in any country, how far they stray (EN 50160: 1 % for 99.5 % of a year), and their
+# multiples that a rectifier or a motor drive makes of them.
+MAINS, STRAY, MULTIPLES = (50.0, 60.0), 0.01, (1, 2, 3)
+# Over the median of its neighbours, power of a line that stands out: noise does so at one in 4,000.
+STANDS, NEIGHBOURS = 12.0, 20
 
 
 def wander(n: int, k: Int, q: int) -> Complex:
@@ -56,6 +61,48 @@ def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
         y = np.concatenate([np.zeros((edge, q)), impulse[: piece.r.size - edge]])
         out[:, :, j] = np.fft.rfft(y[piece.history :], axis=0)[k]
     return out
+
+
+def hum(left: Complex, k: Int, rate_hz: float, n: int) -> Complex:
+    """(n_lines, q, 4 q m) of m lines of the mains that stand out in some sensor, each sensor's of
+    its own phase and, slowly, of its own swelling.
+
+    left : (n//2 + 1, q) spectrum of what the reference leaves of n samples. k : lines that count.
+    """
+    q = left.shape[1]
+    t = np.linspace(-1, 1, n)
+    out = []
+    for tone in _tones(np.abs(left) ** 2, left, k, rate_hz / n):
+        wave = np.exp(2j * np.pi * tone / n * np.arange(n))
+        shapes = np.stack([wave.real, wave.imag, t * wave.real, t * wave.imag], axis=1)
+        spectra = np.fft.rfft(shapes, axis=0)[k]
+        each = np.zeros((k.size, q, q, 4), complex)
+        for c in range(q):
+            each[:, c, c] = spectra
+        out.append(each.reshape(k.size, q, -1))
+    return np.concatenate(out, axis=2) if out else np.zeros((k.size, q, 0), complex)
+
+
+def _tones(power: Float, left: Complex, k: Int, step: float) -> list[float]:
+    """Where the mains' lines stand, in lines of a spectrum `step` Hz apart."""
+    nyquist = step * (len(power) - 1)
+    found = []
+    for f in sorted({m * mains for mains in MAINS for m in MULTIPLES}):
+        folded = abs(f - 2 * nyquist * round(f / (2 * nyquist)))
+        low, high = ((folded + sign * STRAY * f) / step for sign in (-1, 1))
+        first, last = max(int(np.floor(low)), 1), min(int(np.ceil(high)), len(power) - 2)
+        # Beyond an octave above the band what leaks into it is smooth and small.
+        if first >= last or first > 2 * k[-1] or last < k[0]:
+            continue
+        beside = np.r_[max(first - NEIGHBOURS, 1) : first, last + 1 : last + 1 + NEIGHBOURS]
+        floor = np.median(power[beside[beside < len(power)]], axis=0)
+        over = power[first : last + 1] / np.where(floor > 0, floor, np.inf)
+        at, sensor = np.unravel_index(int(np.argmax(over)), over.shape)
+        if over[at, sensor] > STANDS:
+            a, b, c = left[first + at - 1 : first + at + 2, sensor]
+            # Between the lines: Jacobsen and Kootsookos 2007, IEEE Signal Process. Mag. 24(3).
+            found.append(float(first + at + np.clip(((a - c) / (2 * b - a - c)).real, -0.5, 0.5)))
+    return found
 
 
 def unread(

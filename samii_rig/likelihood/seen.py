@@ -68,7 +68,8 @@ class Seen:
         n, q = piece.z.shape
         H, exact, loop = answers.H, answers.exact, answers.loop
         y = exact.predicted(H, piece.r)[piece.history :]
-        own = [nuisance.wander(n, k, q)]
+        left = np.fft.rfft(piece.z - y, axis=0)
+        own = [nuisance.wander(n, k, q), nuisance.hum(left, k, exact.rate_hz, n)]
         own += [nuisance.past(piece, k, answers.impulse)] if piece.moving else []
         own += [nuisance.unread(piece, k, y, H, exact, loop, step)]
         own += [nuisance.edges(piece, k, answers.impulse)]
@@ -76,7 +77,7 @@ class Seen:
         N = np.concatenate(own, axis=2)
         size = np.linalg.norm(N, axis=(0, 1))
         return cls(
-            np.asarray(np.fft.rfft(piece.z - y, axis=0)[k] / np.sqrt(n)),
+            np.asarray(left[k] / np.sqrt(n)),
             np.asarray(N[:, :, size > 0] / size[size > 0]),
             rounding.of_piece(piece, step, y, exact.rate_hz),
         )
