@@ -92,9 +92,14 @@ def of_piece(piece: Piece, step: Float, y: Float, rate_hz: float) -> tuple[Float
 
 
 def within(piece: Piece, y: Float, step: float, rate_hz: float) -> Float:
-    """(n,) what of the motion y (n,) of a sensor stays within few steps, less its mean."""
+    """(n,) what of the motion y (n,) of a sensor stays within few steps, less its mean: each
+    stretch its own, as a part may rest at another place after it was moved."""
     times = math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
     width = max(int(SHORT * rate_hz), 3)
     high, low = ndimage.maximum_filter1d(y, width), ndimage.minimum_filter1d(y, width)
     still = high - low < FEW * step * times
-    return np.where(still, y - np.mean(y[still]), 0.0) if still.any() else np.zeros(y.size)
+    stretch, count = ndimage.label(still)
+    if count == 0:
+        return np.zeros(y.size)
+    mean = np.append(0.0, ndimage.mean(y, stretch, np.arange(1, count + 1)))
+    return np.where(still, y - mean[stretch], 0.0)
