@@ -30,6 +30,9 @@ from samii_rig.types import Complex, Float, Int
 
 SPACING = 0.2  # nodes, times the distance over which the reference's response turns by 1 rad
 WIDEST = 0.1  # nodes, apart over frequency at most
+# Nodes over lines of the contour, at most, of a change that is free where noise is told: at the
+# lowest lines one a line would leave no noise to be seen.
+SPARE = 0.1
 BELOW = 2**0.5  # the same, below the band: a change of 1/s is linear between them to 3 %
 ENOUGH = 0.75  # lines over unknowns of a change, from which a piece shows its noise by itself
 RIDGES, MORE = 5, 30.0  # tries of a ridge, each so many times the one before
@@ -208,15 +211,22 @@ def left_by(
     return Left(rows.f, np.sum(np.abs(white) ** 2, axis=1), each)
 
 
-def nodes_of(contour: Contour, H: Complex, band: tuple[float, float]) -> Int:
+def nodes_of(
+    contour: Contour, H: Complex, band: tuple[float, float], *, spare: bool = False
+) -> Int:
     """Lines of the contour between which a change of the response is taken for linear.
 
-    H : (M//2 + 1, q) reference on the contour, each sensor in units of its noise.
+    H : (M//2 + 1, q) reference on the contour, each sensor in units of its noise. spare : few of
+    them at the lowest lines, but where the response turns more than a double integrator's.
     """
     f = contour.frequency
     inside = (f >= band[0]) & (f <= band[1])
     turning = np.linalg.norm(np.gradient(H, axis=0), axis=1) / np.linalg.norm(H, axis=1)
-    density = turning / SPACING + 1 / (WIDEST * np.maximum(np.arange(f.size), 1))
+    each = 1 / np.maximum(np.arange(f.size), 1)
+    if spare:
+        density = np.maximum(turning - 2 * each, 0.0) / SPACING + np.minimum(each / WIDEST, SPARE)
+    else:
+        density = turning / SPACING + each / WIDEST
     place = np.cumsum(np.where(inside, np.minimum(density, 1.0), 0.0))
     first, last = np.flatnonzero(inside)[[0, -1]]
     marks = np.arange(place[first], place[last], 1.0)
@@ -298,14 +308,15 @@ def formed(
     """As `reduced`, and the lines that it was made of."""
     smooth, exact = records.smooth(), records.exact()
     H, S = response(exact.s), response(smooth.s)
+    inside = (smooth.frequency > records.band[0]) & (smooth.frequency < records.band[1])
+    shape = S / np.median(np.abs(S[inside]), axis=0)
     if at is None:
-        inside = (smooth.frequency > records.band[0]) & (smooth.frequency < records.band[1])
-        nodes = nodes_of(smooth, S / np.median(np.abs(S[inside]), axis=0), records.band)
+        nodes = nodes_of(smooth, shape, records.band)
     else:
         nodes = np.rint(at * (smooth.samples / smooth.rate_hz)).astype(np.int64)
     seen = records.seen(H, loop)
     rows = _rows(records, _columns(records, smooth, nodes), seen)
-    left, free = _residual(rows)
+    left, free = _residual(rows, _between(nodes, nodes_of(smooth, shape, records.band, spare=True)))
     power = Noise.of(
         *_with_repeats(records, H, seen, rows.f, left, free),
         disturbances=disturbances,
@@ -429,10 +440,20 @@ def _columns(records: Records, contour: Contour, nodes: Int) -> list[Complex]:
     return [out[i] for i in range(len(records.pieces))]
 
 
-def _residual(rows: Rows) -> tuple[Complex, Float]:
+def _between(nodes: Int, few: Int) -> Float:
+    """(b, m) a change on the nodes, of one on few of them, linear between."""
+    return np.stack([np.interp(nodes, few, one) for one in np.eye(few.size)], axis=1)
+
+
+def _residual(rows: Rows, spare: Float) -> tuple[Complex, Float]:
     """What the best change of each sensor in each piece leaves (n, q), and the freedom (n,) that
-    each line has left: pieces that differ by more than noise are not noise."""
+    each line has left: pieces that differ by more than noise are not noise.
+
+    spare : (b, m) the change that is free, on the nodes.
+    """
     n, q = rows.e.shape
+    b = len(spare)
+    rows = replace(rows, X=np.concatenate([rows.X[:, :b] @ spare, rows.X[:, b:] @ spare], axis=1))
     pieces = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
     if min(len(on) for on in pieces) < ENOUGH * rows.X.shape[1]:
         pieces, rows = [np.arange(n)], rows.apart()
