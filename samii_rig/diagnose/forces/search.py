@@ -245,16 +245,20 @@ class ForceSearch(RecordSearch):
         known = moved(old.model, old.x, model)
         low, high = np.array([(u.low, u.high) for u in effect.unknowns]).T
         strengths, times, best = hope.strengths, hope.times, None
+        if effect.quasi.law.told is not None:
+            best = hope  # such a force does not depend on what it does: the first order is all
         for _ in range(1 + CLOSER):
             if not times > 0:
                 break
             times = min(max(times, TIMES[0]), TIMES[1]) if best else times
-            strengths = scaled(effect.quasi.law, strengths, times, self.reach.largest)
-            strengths = np.clip(strengths, low, high)
+            there = scaled(effect.quasi.law, strengths, times, self.reach.largest)
+            there = np.clip(there, low, high)
             try:
-                g = self._force_problem.change(model, np.append(known, np.log(strengths)))
-            except SamiiRigError:
-                break
+                g = self._force_problem.change(model, np.append(known, np.log(there)))
+            except SamiiRigError:  # no rig is stable with so much of it
+                times = math.sqrt(times)
+                continue
+            strengths = there
             own, may, each = looks.gains(g)
             at = int(np.argmax(own))
             times = float(each[at])
