@@ -40,7 +40,10 @@ from samii_rig.signal.groups import segments_of
 from samii_rig.signal.statistics import octaves
 from samii_rig.types import Complex, Finding, Float, Int, Recording
 
-SHOW, TURN = 9, 10  # one line in ten is kept apart, to show on what was found
+TURN = 10  # one line in so many is kept apart, to show on what was found
+# Lines kept apart: by turns of this part, so that of every second, fifth or tenth line, where a
+# multisine has its own, one in ten is kept apart too (Weyl 1916, Math. Ann. 77).
+GOLDEN = (5**0.5 - 1) / 2
 # Of the largest, an input's energy in a third of an octave that excites: steps through frequencies,
 # of as many periods each, and steps of the input have that over 2.5 decades.
 EXCITED, PARTS = 0.003, 3
@@ -275,11 +278,11 @@ def _named_in(messages: Sequence[str], places: Iterable[str]) -> dict[str, str]:
 
 
 def _fitted(k: Int) -> NDArray[np.bool_]:
-    return np.asarray(k % TURN != SHOW)
+    return ~_shown(k)
 
 
 def _shown(k: Int) -> NDArray[np.bool_]:
-    return np.asarray(k % TURN == SHOW)
+    return np.asarray((k * GOLDEN) % 1.0 < 1 / TURN)
 
 
 class Recorded(Protocol):
