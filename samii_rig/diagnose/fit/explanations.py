@@ -105,7 +105,12 @@ class Explanations:
         where the mismatch is gross: they may not live on what models are not exact to."""
         effects = tuple(effects)
         beside = self.inexact(effects, self._gross)
-        return fitted.evidence(self.temperature) + self.log_prior(effects) - beside
+        small = sum(
+            unknown.small(float(fitted.x[at]))
+            for i, e in enumerate(effects)
+            for unknown, at in zip(e.unknowns, fitted.model.own(i), strict=True)
+        )
+        return fitted.evidence(self.temperature) + small + self.log_prior(effects) - beside
 
     def inexact(self, effects: Sequence[Effect], gross: float) -> float:
         """Logarithm of evidence that effects beside the first must be worth on lines where the

@@ -232,7 +232,7 @@ def _properties(name: str, symbols: tuple[str, ...]) -> Iterator[Effect]:
         yield Effect(
             physics="beam_property",
             site=name,
-            unknowns=(Unknown(f"{symbol} ratio", "1", *RATIO, RATIOS),),
+            unknowns=(Unknown(f"{symbol} ratio", "1", *RATIO, RATIOS, ratio=True),),
             parameters=scaled,
             touches=(key,),
             variant=symbol,

@@ -107,7 +107,7 @@ def _unknown(symbol: str, unit: str, low: float, high: float, n: int = 8) -> Unk
 def _gains() -> Unknown:
     """A gain, also one so near 1 that only its derivative shows it."""
     unknown = _unknown("gain", "1", 1e-4, 1e4, 16)
-    return Unknown("gain", "1", unknown.low, unknown.high, (*unknown.starts, 1.0))
+    return Unknown("gain", "1", unknown.low, unknown.high, (*unknown.starts, 1.0), ratio=True)
 
 
 def _corners(symbol: str, low_hz: float, high_hz: float) -> Unknown:

@@ -7,6 +7,7 @@ table is in `vocabulary`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
@@ -22,13 +23,15 @@ if TYPE_CHECKING:
 
 Key = tuple[str, str]
 Values = Mapping[Key, float]
+LEAST = 1e-6  # of the logarithm of a ratio: no record of a structure shows a part in a million
 
 
 @dataclass(frozen=True, slots=True)
 class Unknown:
     """A positive number to be found, log-uniform between `low` and `high` before the data.
 
-    symbol, unit : as reported. starts : values from which a search may begin.
+    symbol, unit : as reported. starts : values from which a search may begin. ratio : 1 is nothing:
+    then the size of its logarithm is log-uniform, as that of every other effect is.
     """
 
     symbol: str
@@ -36,6 +39,15 @@ class Unknown:
     low: float
     high: float
     starts: tuple[float, ...]
+    ratio: bool = False
+
+    def small(self, x: float) -> float:
+        """Logarithm of how much more probable the logarithm x of a ratio is before the data than if
+        it were even between the bounds."""
+        if not self.ratio:
+            return 0.0
+        most = max(math.log(self.high), -math.log(self.low))
+        return math.log(most / (math.log(most / LEAST) * min(max(abs(x), LEAST), most)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -152,7 +152,7 @@ def _stiffness(spring: TorsionalSpring | TranslationalSpring) -> Effect:
     return Effect(
         physics="joint_stiffness",
         site=spring.name,
-        unknowns=(Unknown("k ratio", "1", *RATIO, RATIOS),),
+        unknowns=(Unknown("k ratio", "1", *RATIO, RATIOS, ratio=True),),
         parameters=_times(key),
         touches=(key,),
         jump=Jump(f"beside {spring.name}", x_of),
