@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from samii_rig.likelihood.inputs import sent
+from samii_rig.likelihood.inputs import calibrated, jumps, sent
 from samii_rig.types import Channel, Float, Recording
 
 RATE, N, KP, STEP = 500.0, 6000, 3.0, 3e-4
@@ -104,3 +106,37 @@ def test_a_command_that_rests_for_most_of_the_record_is_left_as_it_is() -> None:
     v, edges = sent(run, 1, 0.0, None)
     np.testing.assert_array_equal(v, run.values[:, 1])
     assert not edges.any()
+
+
+def test_the_noise_of_a_meter_makes_no_response_smaller() -> None:
+    """A line's noise in the input, if it is taken for input, makes the slope on it too small."""
+    rng, n = np.random.default_rng(3), 8000
+    t = np.arange(n) / RATE
+    f = np.arange(2.0, 40.0)
+    r = np.cos(2 * np.pi * f * t[:, None] + f) @ np.geomspace(1, 5e-3, f.size)
+    shown = r + METER * rng.standard_normal(n)
+    made = calibrated(shown, STEP)
+    assert np.std(made - r) < 0.6 * METER
+    lines = np.fft.rfftfreq(n, 1 / RATE)
+    band = (lines >= 34.5) & (lines < 39.5)  # where there is least of it
+    plain, kept = (np.fft.rfft(x)[band] for x in (shown, made))
+    y = np.fft.rfft(r)[band]
+    slope = [abs(np.vdot(x, y)) / np.vdot(x, x).real for x in (plain, kept)]
+    assert abs(slope[1] - 1) < abs(slope[0] - 1)
+    # What a converter rounds drives the rig as it is, and noise up to half the rate may be meant.
+    held = np.rint(r / STEP) * STEP
+    np.testing.assert_array_equal(calibrated(held, STEP), held)
+    wide = rng.standard_normal(n)
+    np.testing.assert_array_equal(calibrated(wide, STEP), wide)
+
+
+def test_jumps_beside_a_rest_are_edges_and_a_sweep_has_none() -> None:
+    run = recorded(1, 0.0)
+    u = np.zeros(N)
+    u[1000:3000] = 0.7 + 0.1 * np.sin(np.arange(2000) / 20)  # from rest, and back to it
+    u[4000:4500] = -0.4
+    values = run.values.copy()
+    values[:, 0] = u
+    found = np.flatnonzero(jumps(replace(run, values=values), 1, 0.0))
+    assert found.tolist() == [999, 1000, 2999, 3000, 3999, 4000, 4499, 4500]
+    assert not jumps(run, 1, 0.0).any()

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from samii_rig.diagnose.fit.records import _fitted, _shown
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.pieces import Piece, pieces_of, wiring
 from samii_rig.likelihood.reduce import Records, left_by, reduced
-from samii_rig.likelihood.rounding import repeating
+from samii_rig.likelihood.rounding import repeating, within
 from samii_rig.rig.load import load_rig
 from samii_rig.types import Channel, Complex, Float, Quality, Recording, Segment
 
@@ -301,3 +302,35 @@ def test_a_record_with_two_commands_is_refused_in_one_line_that_names_both():
         wiring([run], rig)
     assert "\n" not in str(refused.value)
     assert wiring([one], rig).command == "v_2"
+
+
+def test_the_mains_are_no_mismatch_between_lines_too():
+    u, z = noisy(4)
+    t = np.arange(len(z)) / RATE
+    hum = np.column_stack(
+        [0.3 * np.sin(2 * np.pi * 50.013 * t), 0.1 * np.cos(2 * np.pi * 50.013 * t)]
+    )
+    records = [Records((piece(u, x),), RATE, ((0.8, 70.0),)) for x in (z, z + hum)]
+    plain, humming = (
+        left_by(
+            r, lambda s: response(s, poles()),
+            reduced(records[0], lambda s: response(s, poles()), own_alone),
+        )
+        for r in records
+    )  # fmt: skip
+    near = np.abs(plain.frequency - 50) < 2
+    assert np.mean(humming.chi2[near]) / 4 == pytest.approx(1.0, abs=0.25)
+    np.testing.assert_allclose(humming.chi2[~near], plain.chi2[~near], rtol=0.5, atol=1.0)
+
+
+def test_a_part_that_rests_elsewhere_after_a_motion_has_not_moved_within_a_step():
+    y = np.concatenate([np.zeros(500), np.linspace(0, 100, 400), np.full(500, 100.0)])
+    still = within(piece(np.zeros(y.size), y[:, None]), y, 1.0, RATE)
+    assert np.max(np.abs(still)) < 3  # steps, as far as a motion that counts as still
+
+
+@pytest.mark.parametrize("every", [1, 2, 3, 7, 10, 16, 64])
+def test_one_line_in_ten_is_kept_apart_of_any_comb(every: int):
+    k = np.arange(every, 400 * every, every)
+    assert np.mean(_shown(k)) == pytest.approx(0.1, abs=0.03)
+    assert np.array_equal(_fitted(k), ~_shown(k))

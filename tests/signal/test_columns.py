@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from samii_rig.signal.columns import FARTHEST, aligned, shift_of
+from samii_rig.signal.columns import FARTHEST, aligned, is_open, shift_of
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Channel, Recording, Segment
 
@@ -127,3 +127,18 @@ def test_the_estimate_is_that_of_the_columns_in_order_and_says_so():
     assert any(f.kind == "timing" and "set right" in f.message for f in found.findings)
     shared = np.interp(right.frequency, found.frequency, np.angle(found.H[:, 0, 0]))
     np.testing.assert_allclose(shared, np.angle(right.H[:, 0, 0]), atol=0.02)
+
+
+def without_reference(recording: Recording) -> Recording:
+    return replace(recording, channels=recording.channels[1:], values=recording.values[:, 1:])
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_whether_a_loop_ran_is_seen_in_its_command(told: bool):
+    closed = loop(1e-5)  # V: below what the encoder's noise makes of the command
+    values = closed.values.copy()
+    values[:, 1] = values[:, 0]
+    opened = replace(closed, values=values)
+    for run, want in ((closed, False), (opened, True)):
+        seen = run if told else without_reference(run)
+        assert is_open(seen, "v", "theta", KP) is want
