@@ -11,6 +11,7 @@ from samii_rig.rig.schema import (
     ActuatorSpec,
     Displacement,
     Element,
+    Force,
     ForceSource,
     Moment,
     Parameter,
@@ -69,6 +70,7 @@ class Place:
                 rig = insert.inserted(rig, last, self._source(1.0, name, "behind"))
                 if self.kind == "joint":
                     rig = insert.inserted(rig, before, self._source(-1.0, name, "before"))
+                    rig = _read_behind(rig, last, f"{name}_behind")
                 sensor = self._moved(name, before)
             case "flow":
                 sensor = Moment(kind="moment", name=name, after=last, unit="N m")
@@ -100,3 +102,14 @@ class Place:
         if self.slides:
             return ForceSource(kind="force_source", name=own, input=name, K=gain)
         return TorqueSource(kind="torque_source", name=own, input=name, K=gain)
+
+
+def _read_behind(rig: Rig, last: str, name: str) -> Rig:
+    """The rig whose load cells behind a part read all that it passes on, the force beside too."""
+    sensors = (
+        s.model_copy(update={"after": name})
+        if isinstance(s, Moment | Force) and s.after == last
+        else s
+        for s in rig.sensor
+    )
+    return rig.model_copy(update={"sensor": tuple(sensors)})
