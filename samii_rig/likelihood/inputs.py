@@ -65,12 +65,11 @@ def calibrated(r: Float, step: float) -> Float:
 
     step : of the command's converter, whose rounding is the input's own.
     """
-    known = np.isfinite(r)
-    if not known.all():
+    if not np.isfinite(r).all():
         return r
     spectrum = np.fft.rfft(r - np.mean(r))
     power = np.abs(spectrum) ** 2 / r.size
-    upper = np.sort(power[int((1 - UPPER) * power.size) :])
+    upper = power[int((1 - UPPER) * power.size) :]
     floor = float(np.median(upper)) / np.log(2)
     white = float(np.mean(upper)) < LOUDER * floor
     if not white or floor < METER * step**2 / 12 or floor > QUIET * np.max(power):

@@ -33,9 +33,14 @@ STANDS, NEIGHBOURS = 12.0, 20
 def wander(n: int, k: Int, q: int) -> Complex:
     """(n_lines, q, WANDER q) of each sensor's own slow drift."""
     t = np.linspace(-1, 1, n)
-    shapes = legendre.legvander(t, WANDER)[:, 1:]
+    shapes = np.asarray(legendre.legvander(t, WANDER)[:, 1:], np.float64)
+    return _by_sensor(shapes, k, q)
+
+
+def _by_sensor(shapes: Float, k: Int, q: int) -> Complex:
+    """(n_lines, q, q m) of shapes (n, m) in time, each sensor's of its own amplitude."""
     spectra = np.fft.rfft(shapes, axis=0)[k]
-    out = np.zeros((k.size, q, q, WANDER), complex)
+    out = np.zeros((k.size, q, q, shapes.shape[1]), complex)
     for c in range(q):
         out[:, c, c] = spectra
     return out.reshape(k.size, q, -1)
@@ -72,19 +77,16 @@ def hum(left: Complex, k: Int, rate_hz: float, n: int) -> Complex:
     q = left.shape[1]
     t = np.linspace(-1, 1, n)
     out = []
-    for tone in _tones(np.abs(left) ** 2, left, k, rate_hz / n):
+    for tone in _tones(left, k, rate_hz / n):
         wave = np.exp(2j * np.pi * tone / n * np.arange(n))
         shapes = np.stack([wave.real, wave.imag, t * wave.real, t * wave.imag], axis=1)
-        spectra = np.fft.rfft(shapes, axis=0)[k]
-        each = np.zeros((k.size, q, q, 4), complex)
-        for c in range(q):
-            each[:, c, c] = spectra
-        out.append(each.reshape(k.size, q, -1))
+        out.append(_by_sensor(shapes, k, q))
     return np.concatenate(out, axis=2) if out else np.zeros((k.size, q, 0), complex)
 
 
-def _tones(power: Float, left: Complex, k: Int, step: float) -> list[float]:
+def _tones(left: Complex, k: Int, step: float) -> list[float]:
     """Where the mains' lines stand, in lines of a spectrum `step` Hz apart."""
+    power = np.abs(left) ** 2
     nyquist = step * (len(power) - 1)
     found = []
     for f in sorted({m * mains for mains in MAINS for m in MULTIPLES}):

@@ -106,10 +106,7 @@ class Place:
 
 def _read_behind(rig: Rig, last: str, name: str) -> Rig:
     """The rig whose load cells behind a part read all that it passes on, the force beside too."""
-    sensors = (
-        s.model_copy(update={"after": name})
-        if isinstance(s, Moment | Force) and s.after == last
-        else s
-        for s in rig.sensor
-    )
-    return rig.model_copy(update={"sensor": tuple(sensors)})
+    for s in rig.sensor:
+        if isinstance(s, Moment | Force) and s.after == last:
+            rig = insert.sensor_changed(rig, s.name, after=name)
+    return rig

@@ -251,8 +251,8 @@ class ForceSearch(RecordSearch):
             if not times > 0:
                 break
             times = min(max(times, TIMES[0]), TIMES[1]) if best else times
-            there = scaled(effect.quasi.law, strengths, times, self.reach.largest)
-            there = np.clip(there, low, high)
+            law, largest = effect.quasi.law, self.reach.largest
+            there = np.clip(scaled(law, strengths, times, largest), low, high)
             try:
                 g = self._force_problem.change(model, np.append(known, np.log(there)))
             except SamiiRigError:  # no rig is stable with so much of it
