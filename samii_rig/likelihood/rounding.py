@@ -41,6 +41,8 @@ def repeating(spread: float) -> float:
 
     if spread >= 1:
         return 0.0
+    if spread <= (1 - part(0.0)) * WHITE:  # they hardly differ
+        return part(0.0)
     found = optimize.brentq(lambda x: (1 - part(x)) * WHITE + x - spread, 0.0, 1.0)
     return part(float(found))
 

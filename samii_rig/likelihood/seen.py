@@ -70,7 +70,7 @@ class Seen:
         y = exact.predicted(H, piece.r)[piece.history :]
         left = np.fft.rfft(piece.z - y, axis=0)
         own = [nuisance.wander(n, k, q), nuisance.hum(left, k, exact.rate_hz, n)]
-        own += [nuisance.past(piece, k, answers.impulse)] if piece.moving else []
+        own += [nuisance.past(piece, k, answers.impulse)]
         own += [nuisance.unread(piece, k, y, H, exact, loop, step)]
         own += [nuisance.edges(piece, k, answers.impulse)]
         own += [nuisance.offsets(piece, k, answers.steps(piece.r.size))]

@@ -18,7 +18,8 @@ from samii_rig.rig.schema.elements import flattened
 from samii_rig.types import Complex, Float, Int
 
 ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smooth between
-ORDERS = (-1, 1, -2, 2)  # aliases that a factor on a channel changes
+NEAR = (-1, 1)  # aliases that are computed at every frequency: a mode in one may be sharp
+FAR = (-2, 2)  # further ones that a factor on a channel changes
 STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
 FARTHEST = 6.0  # tolerances that a refit moves a nominal parameter at most
 
@@ -53,7 +54,7 @@ class Grid:
     """Frequencies (n,), at s = sigma + 2 pi j f, with what does not change between models there.
 
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
-    folded : (order, n, q) of these the ones of `ORDERS`, or none. rate_hz : of the samples.
+    folded : (order, n, q) of these the ones of `NEAR` and `FAR`, or none. rate_hz : of the samples.
     sensor, actuator : (q,) entries. loop : closed around them, if responses are to the reference.
     sigma : of all, or (n,) of each.
     """
@@ -89,15 +90,17 @@ class Grid:
 
     def orders(self) -> list[Complex]:
         """s (n,) of each order of `folded`."""
-        known = ORDERS[: len(self.folded)]
+        known = (*NEAR, *FAR)[: len(self.folded)]
         return [self.s + 2j * np.pi * k * self.rate_hz for k in known]
 
 
 @dataclass(frozen=True, slots=True)
 class Aliases:
-    """What a chain's aliases add at a few frequencies (m,) Hz; it is smooth between.
+    """What a chain's aliases beyond the nearest add at a few frequencies (m,) Hz.
 
-    rest : (m, q) all together. folded : (order, m, q) those of `ORDERS`.
+    rest : (m, q) all together. folded : (order, m, q) those of `FAR`. Of both what is left without
+    the hold's 1 - e^{-s T}, which all aliases have: that is smooth between the frequencies, and
+    hardly changes from the imaginary axis to a line beside it.
     """
 
     few: Float
@@ -107,26 +110,34 @@ class Aliases:
     @classmethod
     def of(cls, rig: Rig, chain: Chain, few: Float, sensor: Int, actuator: Int) -> Aliases:
         """Of a chain of the rig."""
+        s = np.asarray(2j * np.pi * few, np.complex128)
+        near = sum(_term(rig, chain, s, k, sensor, actuator) for k in (0, *NEAR))
+        rest = sampled_response(rig, few, chain)[:, sensor, actuator] - near
+        folded = np.stack([_term(rig, chain, s, k, sensor, actuator) for k in FAR])
+        held = _held(s, rig.rate_hz)
+        return cls(few, rest / held, folded / held)
 
-        def term(f: Float) -> Complex:
-            s = np.asarray(2j * np.pi * f, np.complex128)
-            around = _around(rig, s, sensor, actuator)
-            return np.asarray(chain.response(f)[:, sensor, actuator] * around)
-
-        rest = sampled_response(rig, few, chain)[:, sensor, actuator] - term(few)
-        folded = []
-        for k in ORDERS:
-            there = term(np.abs(few + k * rig.rate_hz))
-            folded.append(there if k > 0 else there.conj())
-        return cls(few, rest, np.stack(folded))
-
-    def spread(self, f: Float) -> tuple[Complex, Complex]:
-        """rest and folded at f (n,) Hz."""
+    def spread(self, s: Complex, rate_hz: float) -> tuple[Complex, Complex]:
+        """rest and folded at s (n,) rad/s."""
+        f, held = s.imag / (2 * np.pi), _held(s, rate_hz)
         rest, *folded = (
-            np.stack([np.interp(f, self.few, r) for r in one.T], axis=1)
+            held * np.stack([np.interp(f, self.few, r) for r in one.T], axis=1)
             for one in (self.rest, *self.folded)
         )
         return rest, np.stack(folded)
+
+
+def _held(s: Complex, rate_hz: float) -> Complex:
+    return np.asarray(-np.expm1(-s / rate_hz)[:, None])
+
+
+def _term(rig: Rig, chain: Chain, s: Complex, k: int, sensor: Int, actuator: Int) -> Complex:
+    """(n, q) alias k of a chain at s (n,)."""
+    there = s + 2j * np.pi * k * rig.rate_hz
+    # What answers a real input at s* with the conjugate of what it answers at s.
+    upper = there if k >= 0 else there.conj()
+    term = chain.evaluate(upper)[:, sensor, actuator] * _around(rig, upper, sensor, actuator)
+    return np.asarray(term if k >= 0 else term.conj())
 
 
 def _around(rig: Rig, s: Complex, sensor: Int, actuator: Int) -> Complex:
@@ -150,13 +161,14 @@ def grid(
     loop : closed around the entries. aliases : of a chain at a few frequencies, where they may be
     known from before."""
     f = np.unique(frequency)
-    # Aliases hardly change from the imaginary axis to a line beside it.
     few = np.geomspace(f[f > 0][0], f[-1], min(ALIAS_POINTS, f.size))
     few[-1] = f[-1]
     chain = Chain(rig) if chain is None else chain
     made = aliases(chain, few) if aliases else Aliases.of(rig, chain, few, sensor, actuator)
-    rest, folded = made.spread(f)
     s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
+    rest, far = made.spread(s, rig.rate_hz)
+    near = np.stack([_term(rig, chain, s, k, sensor, actuator) for k in NEAR])
+    rest, folded = rest + near.sum(axis=0), np.concatenate([near, far])
     factor = _around(rig, s, sensor, actuator)
     return Grid(f, factor, rest, folded, rig.rate_hz, sensor, actuator, sigma=sigma, loop=loop)
 
