@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import signal
 
 from samii_rig.likelihood.spikes import TO_SD
 from samii_rig.signal.columns import asked
@@ -69,7 +70,10 @@ def calibrated(r: Float, step: float) -> Float:
         return r
     spectrum = np.fft.rfft(r - np.mean(r))
     power = np.abs(spectrum) ** 2 / r.size
-    upper = power[int((1 - UPPER) * power.size) :]
+    # Under a window: a record that is cut ends with an edge, whose lines are no noise.
+    window = signal.windows.hann(r.size, sym=False)
+    apart = np.abs(np.fft.rfft(window * (r - np.mean(r)))) ** 2 / float(window @ window)
+    upper = apart[int((1 - UPPER) * power.size) :]
     floor = float(np.median(upper)) / np.log(2)
     white = float(np.mean(upper)) < LOUDER * floor
     if not white or floor < METER * step**2 / 12 or floor > QUIET * np.max(power):
@@ -78,26 +82,28 @@ def calibrated(r: Float, step: float) -> Float:
     return np.asarray(np.fft.irfft(part * spectrum, r.size) + np.mean(r))
 
 
-def jumps(recording: Recording, command: int, kp: float) -> NDArray[np.bool_]:
+def jumps(recording: Recording, command: int, kp: float, theta: Float | None) -> NDArray[np.bool_]:
     """(n,) where the input left or came to a rest at once, and the sample before: where not every
     sample of the rig was recorded, nobody knows when between the two.
 
-    command : its column. kp : gain of the loop around it, 0 for none.
+    command : its column. kp : gain of the loop around it, 0 for none. theta : (n,) of its sensor.
     """
     found = np.zeros(len(recording.values), np.bool_)
+    still = 0.0  # of a rest, from sample to sample
     if recording.names("reference"):
         u = asked(recording, recording.channels[command].name, kp)
-    elif kp == 0:
-        u = np.asarray(recording.values[:, command], np.float64)
     else:
-        return found
+        u = np.asarray(recording.values[:, command], np.float64)
+        if theta is not None:
+            u, still = u + kp * theta, recording.channels[command].resolution
     if u.size <= 2 * REST:
         return found
     d = np.diff(u)
-    rests = np.convolve(d == 0, np.ones(REST), "full")[: d.size] == REST  # the REST last ones
+    quiet = np.abs(d) <= still
+    rests = np.convolve(quiet, np.ones(REST), "full")[: d.size] == REST  # the REST last ones
     after = np.append(False, rests[:-1])  # a rest ended just before
     before = np.append(rests[REST:], np.zeros(REST, np.bool_))  # a rest begins just behind
-    edge = (d != 0) & (np.abs(d) > JUMP * np.nanmax(np.abs(u))) & (after | before)
+    edge = ~quiet & (np.abs(d) > JUMP * np.nanmax(np.abs(u))) & (after | before)
     found[1:] |= edge
     found[:-1] |= edge
     return found

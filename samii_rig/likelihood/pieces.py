@@ -136,7 +136,7 @@ def pieces_of(
         theta = values[:, 1 + wired.sensors.index(wired.centring)] if wired.kp else None
         values[:, 0], edges = inputs.sent(recording, columns[0], wired.kp, theta)
         if round(rig.rate_hz / recording.rate_hz) > 1:
-            edges = edges | inputs.jumps(recording, columns[0], wired.kp)
+            edges = edges | inputs.jumps(recording, columns[0], wired.kp, theta)
         r = values[:, 0].copy()
         if theta is not None:
             r += wired.kp * theta

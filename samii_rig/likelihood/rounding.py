@@ -1,9 +1,11 @@
 """What a converter's steps add to the noise, known before anything is measured.
 
-A rounding error is white, of step^2/12, where the motion crosses steps. Two things make it more:
-- Under an input that repeats itself the error repeats itself too, but for what noise of sd sigma
-  dithers: of harmonic h of a sawtooth, 6/(pi h)^2 of its power, exp(-(2 pi h sigma/step)^2) is
-  the same in all repeats (Widrow and Kollar 2008, Quantization Noise, ch. 4).
+A rounding error is white, of step^2/12, where noise dithers it or the motion crosses steps in any
+order. Elsewhere it is what the motion makes of it:
+- A motion that repeats itself, within a record or from one to the next, repeats the error too, but
+  for what noise of sd sigma dithers: of harmonic h of a sawtooth, 6/(pi h)^2 of its power,
+  exp(-(2 pi h sigma/step)^2) is the same in all repeats (Widrow and Kollar 2008, Quantization
+  Noise, ch. 4). A motion that rests keeps one error as long as it rests.
 - Where the motion stays within few steps, what is read is not in proportion to it.
 """
 
@@ -16,7 +18,7 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.types import Float
+from samii_rig.types import Float, Int
 
 WHITE = 1 / 12  # of a step, squared
 HARMONIC = np.arange(1.0, 200.0)  # of a sawtooth: all but 0.3 % of its power
@@ -29,6 +31,10 @@ ALIKE = 0.05  # of a rounding error, that repeats itself: repeats do not show it
 # from none to all over the amplitudes within a step.
 LEFT = 0.25
 AROUND = 5  # lines over which the power of what is not read is the mean
+# Of a step, noise sd from which a rounding error is white: the first harmonic of a sawtooth is the
+# same to 0.7 % from here on.
+DITHERED = 0.5
+OFFSETS = 16  # places of a motion in its step, at which its rounding is tried: within 25 % a line
 
 
 def repeating(spread: float) -> float:
@@ -85,23 +91,60 @@ def of_piece(piece: Piece, step: Float, y: Float, rate_hz: float) -> tuple[Float
         return frequency, power
     same = alike(piece, step)
     for i in np.flatnonzero(step > 0):
-        power[:, i] = WHITE * step[i] ** 2 * (1 + len(piece.repeats) * same[i])
-        part = within(piece, y[:, i], float(step[i]), rate_hz)
+        times = 1 + len(piece.repeats) * same[i]
+        still, part = _within(piece, y[:, i], float(step[i]), rate_hz)
+        sd = _noise(piece.z[:, i] - y[:, i], float(step[i]))
+        if sd < DITHERED * step[i]:
+            power[:, i] = times * _made(y[:, i], still, float(step[i]), sd)
+        else:
+            power[:, i] = times * WHITE * step[i] ** 2
         if part.any():
             unread = np.abs(np.fft.rfft(part)) ** 2 / n
             power[:, i] += LEFT * ndimage.uniform_filter1d(unread, AROUND)
     return frequency, power
 
 
+def _noise(left: Float, step: float) -> float:
+    """Sd of the noise that dithers a converter, from what a reference leaves of it (n,)."""
+    power = np.abs(np.fft.rfft(left - np.mean(left))) ** 2 / left.size
+    white = float(np.median(power[power.size // 2 :])) / math.log(2)
+    return math.sqrt(max(white - WHITE * step**2, 0.0))
+
+
+def _made(y: Float, still: Int, step: float, sd: float) -> Float:
+    """(n//2 + 1,) power a sample of the rounding of a motion y (n,) wherever it stands in its step.
+
+    still : (n,) numbers of the stretches that stay within few steps, of which the mean error alone
+    counts, and 0. sd : of the noise that dithers it.
+    """
+    rng = np.random.default_rng(0)
+    power = np.zeros(y.size // 2 + 1)
+    count = int(still.max())
+    for offset in (np.arange(OFFSETS) + 0.5) / OFFSETS:
+        x = y / step + offset + rng.standard_normal(y.size) * (sd / step)
+        error = np.rint(x) - x
+        if count:
+            mean = np.append(0.0, ndimage.mean(error, still, np.arange(1, count + 1)))
+            error = np.where(still > 0, mean[still], error)
+        power += np.abs(np.fft.rfft(error - np.mean(error))) ** 2
+    return power * (step**2 / (OFFSETS * y.size))
+
+
 def within(piece: Piece, y: Float, step: float, rate_hz: float) -> Float:
     """(n,) what of the motion y (n,) of a sensor stays within few steps, less its mean: each
     stretch its own, as a part may rest at another place after it was moved."""
+    return _within(piece, y, step, rate_hz)[1]
+
+
+def _within(piece: Piece, y: Float, step: float, rate_hz: float) -> tuple[Int, Float]:
+    """(n,) numbers of the stretches, 0 elsewhere, and what `within` gives."""
     times = math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
     width = max(int(SHORT * rate_hz), 3)
     high, low = ndimage.maximum_filter1d(y, width), ndimage.minimum_filter1d(y, width)
     still = high - low < FEW * step * times
-    stretch, count = ndimage.label(still)
+    labels, count = ndimage.label(still)
+    stretch = np.asarray(labels, np.int64)
     if count == 0:
-        return np.zeros(y.size)
+        return stretch, np.zeros(y.size)
     mean = np.append(0.0, ndimage.mean(y, stretch, np.arange(1, count + 1)))
-    return np.where(still, y - mean[stretch], 0.0)
+    return stretch, np.asarray(np.where(still, y - mean[stretch], 0.0))

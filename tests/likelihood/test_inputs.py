@@ -134,6 +134,6 @@ def test_jumps_beside_a_rest_are_edges_and_a_sweep_has_none() -> None:
     u[4000:4500] = -0.4
     values = run.values.copy()
     values[:, 0] = u
-    found = np.flatnonzero(jumps(replace(run, values=values), 1, 0.0))
+    found = np.flatnonzero(jumps(replace(run, values=values), 1, 0.0, None))
     assert found.tolist() == [999, 1000, 2999, 3000, 3999, 4000, 4499, 4500]
-    assert not jumps(run, 1, 0.0).any()
+    assert not jumps(run, 1, 0.0, None).any()
