@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import signal
+from scipy import ndimage, signal
 
 from samii_rig.likelihood.spikes import TO_SD
 from samii_rig.signal.columns import asked
@@ -34,6 +34,9 @@ METER, QUIET, UPPER = 9.0, 1e-3, 0.5
 # Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a
 # smaller one that came half a sample earlier is below a hundredth of what the rest makes.
 JUMP, REST = 0.01, 4
+# An input that is smooth on both sides of a jump bends there, in its fourth difference, this many
+# times as much as anywhere within so many samples; a jump of 1 has 3.
+BENT, SMOOTH, OF_ONE = 8.0, 16, 3.0
 
 
 def sent(
@@ -83,8 +86,8 @@ def calibrated(r: Float, step: float) -> Float:
 
 
 def jumps(recording: Recording, command: int, kp: float, theta: Float | None) -> NDArray[np.bool_]:
-    """(n,) where the input left or came to a rest at once, and the sample before: where not every
-    sample of the rig was recorded, nobody knows when between the two.
+    """(n,) where the input jumped, from or to a rest or between two smooth stretches, and the
+    sample before: where not every sample of the rig was recorded, nobody knows when between them.
 
     command : its column. kp : gain of the loop around it, 0 for none. theta : (n,) of its sensor.
     """
@@ -103,10 +106,22 @@ def jumps(recording: Recording, command: int, kp: float, theta: Float | None) ->
     rests = np.convolve(quiet, np.ones(REST), "full")[: d.size] == REST  # the REST last ones
     after = np.append(False, rests[:-1])  # a rest ended just before
     before = np.append(rests[REST:], np.zeros(REST, np.bool_))  # a rest begins just behind
-    edge = ~quiet & (np.abs(d) > JUMP * np.nanmax(np.abs(u))) & (after | before)
+    least = JUMP * np.nanmax(np.abs(u))
+    edge = ~quiet & (np.abs(d) > least) & (after | before)
+    edge[2:-1] |= _bends(np.abs(np.diff(u, 4)), OF_ONE * least)
     found[1:] |= edge
     found[:-1] |= edge
     return found
+
+
+def _bends(bent: Float, least: float) -> NDArray[np.bool_]:
+    """(n,) the first of both fourth differences (n,) that a jump makes largest."""
+    around = np.ones(2 * SMOOTH + 1, np.bool_)
+    around[SMOOTH - REST : SMOOTH + REST + 1] = False  # what the same jump bends
+    beside = ndimage.maximum_filter(bent, footprint=around)
+    pair = np.minimum(bent, np.append(bent[1:], 0.0))
+    highest = pair == ndimage.maximum_filter1d(pair, 2 * REST + 1)
+    return np.asarray(highest & (pair > BENT * beside) & (pair > least / 2))
 
 
 def _law(recording: Recording, command: int, kp: float, theta: Float | None) -> Float:
