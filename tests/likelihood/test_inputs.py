@@ -137,3 +137,32 @@ def test_jumps_beside_a_rest_are_edges_and_a_sweep_has_none() -> None:
     found = np.flatnonzero(jumps(replace(run, values=values), 1, 0.0, None))
     assert found.tolist() == [999, 1000, 2999, 3000, 3999, 4000, 4499, 4500]
     assert not jumps(run, 1, 0.0, None).any()
+
+
+def test_the_end_of_a_cut_sweep_is_no_meters_noise() -> None:
+    t = np.arange(5000) / RATE
+    cut = np.rint(np.sin(2 * np.pi * (1.0 + 1.6 * t) * t) / STEP) * STEP
+    np.testing.assert_array_equal(calibrated(cut, STEP), cut)
+
+
+def test_a_jump_between_two_smooth_stretches_is_an_edge() -> None:
+    run = recorded(1, 0.0)
+    values = run.values.copy()
+    values[:, 0] = np.sin(np.arange(N) / 8)
+    values[2000:, 0] += 0.2
+    found = np.flatnonzero(jumps(replace(run, values=values), 1, 0.0, None))
+    assert found.tolist() == [1999, 2000]
+
+
+def test_without_a_reference_a_closed_loop_rests_within_a_step_of_its_command() -> None:
+    run = recorded(2)
+    u = np.zeros(N)
+    u[1000:3000] = 0.7
+    theta = run.values[:, 2]
+    v = np.rint((u - KP * theta) / STEP) * STEP
+    alone = Recording(
+        (replace(run.channels[1], resolution=STEP),), run.rate_hz, run.time, run.sequence,
+        v[:, None], run.quality[:, 1:2], (),
+    )  # fmt: skip
+    found = np.flatnonzero(jumps(alone, 0, KP, theta))
+    assert found.tolist() == [999, 1000, 2999, 3000]

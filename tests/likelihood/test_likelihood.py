@@ -15,7 +15,7 @@ from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.pieces import Piece, pieces_of, wiring
 from samii_rig.likelihood.reduce import Records, left_by, reduced
-from samii_rig.likelihood.rounding import repeating, within
+from samii_rig.likelihood.rounding import of_piece, repeating, within
 from samii_rig.rig.load import load_rig
 from samii_rig.types import Channel, Complex, Float, Quality, Recording, Segment
 
@@ -128,6 +128,29 @@ def test_an_offset_and_a_slow_wander_of_a_sensor_are_no_mismatch():
     assert float(np.mean(left.chi2)) == pytest.approx(4.0, rel=0.15)
 
 
+def test_how_noise_moves_a_mode_at_both_ends_of_a_record_is_no_change_of_the_mode():
+    """A mode that rings longer than the record leaves as much at all lines as a change does."""
+    a, n, before = poles(4.0, 0.004), 1500, 20_000
+    off = poles(4.0 * 1.0001, 0.004)
+
+    def disturbances(f: Float) -> Complex:
+        H = response(2j * np.pi * f, a)
+        return np.concatenate([own_alone(f), H[:, :, None]], axis=2)
+
+    u, gained = sweep(n), []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        pushed = from_rest(0.02 * rng.standard_normal(before + n), a)[before:]
+        z = from_rest(u, a) + pushed + 1e-3 * rng.standard_normal((n, 2))
+        records = Records((piece(u, z),), RATE, ((0.8, 15.0),))
+        found = reduced(records, lambda s: response(s, a), disturbances)
+        at = found.sigma + 2j * np.pi * found.frequency
+        slope = found.slopes((response(at, off) - found.reference)[:, :, None])[:, 0]
+        gained.append(float(slope @ found.target) ** 2 / float(slope @ slope))
+    # 1 in the mean of chi-square with one degree of freedom, of 30: 0.26.
+    assert np.mean(gained) == pytest.approx(1.0, abs=0.8)
+
+
 def test_a_sensor_in_another_unit_changes_nothing():
     """Offsets and wandering of each are taken out, however large its numbers are."""
     u, z = noisy(7)
@@ -213,6 +236,40 @@ def test_a_rounding_error_repeats_itself_as_far_as_noise_does_not_dither_it(sigm
     a, b = (np.rint(y + sigma * rng.standard_normal(y.size)) for _ in range(2))
     common = float(np.mean((a - y) * (b - y))) * 12
     assert repeating(float(np.var(a - b)) / 2) == pytest.approx(common, abs=0.06)
+
+
+def rounded(y: Float, sigma: float) -> tuple[Float, Float]:
+    """Power of the rounding of a motion in steps, as it is known beforehand and as it was."""
+    rng, each = np.random.default_rng(8), []
+    for place in rng.random(40):
+        x = y + place + sigma * rng.standard_normal(y.size)
+        each.append(np.abs(np.fft.rfft(np.rint(x) - x)) ** 2 / y.size)
+    z = np.rint(y + sigma * rng.standard_normal(y.size))
+    _, known = of_piece(piece(np.zeros(y.size), z[:, None]), np.ones(1), y[:, None], RATE)
+    return known[:, 0], np.mean(each, axis=0)
+
+
+def test_the_rounding_of_a_motion_that_repeats_itself_within_a_record_is_in_its_harmonics():
+    y = 20 * np.sin(2 * np.pi * 20 * np.arange(4000) / 4000)  # 20 periods
+    known, was = rounded(y, 0.0)
+    harmonic = np.arange(20, 2000, 40)  # odd ones
+    np.testing.assert_allclose(known[harmonic], was[harmonic], rtol=1.0, atol=0.02)
+    assert np.mean(known[harmonic]) > 10 / 12
+    assert np.max(known[np.arange(1, 2000, 20)]) < 0.01
+    dithered, _ = rounded(y, 0.6)
+    np.testing.assert_allclose(dithered, 1 / 12)
+
+
+def test_a_part_at_rest_keeps_one_rounding_error_as_long_as_it_rests():
+    y = np.repeat([0.0, 7.3, -4.1, 12.9, 3.2], 800)
+    known, was = rounded(y, 0.02)
+    low = slice(1, 5)
+    assert np.mean(was[low]) > 100 / 12
+    np.testing.assert_allclose(np.mean(known[low]), np.mean(was[low]), rtol=0.4)
+
+
+def test_repeats_that_hardly_differ_have_the_same_rounding_error():
+    assert repeating(0.0) == pytest.approx(1.0, abs=5e-3)
 
 
 def recording(n: int = 2000, level: float = 0.5, repeat: int = 0) -> Recording:

@@ -18,8 +18,9 @@ from samii_rig.rig.schema.elements import flattened
 from samii_rig.types import Complex, Float, Int
 
 ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smooth between
-NEAR = (-1, 1)  # aliases that are computed at every frequency: a mode in one may be sharp
-FAR = (-2, 2)  # further ones that a factor on a channel changes
+# Aliases that are computed at every frequency, as a mode in one may be sharp, and that a factor on
+# a channel changes.
+NEAR = (-1, 1, -2, 2)
 STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
 FARTHEST = 6.0  # tolerances that a refit moves a nominal parameter at most
 
@@ -54,7 +55,7 @@ class Grid:
     """Frequencies (n,), at s = sigma + 2 pi j f, with what does not change between models there.
 
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
-    folded : (order, n, q) of these the ones of `NEAR` and `FAR`, or none. rate_hz : of the samples.
+    folded : (order, n, q) of these the ones of `NEAR`, or none. rate_hz : of the samples.
     sensor, actuator : (q,) entries. loop : closed around them, if responses are to the reference.
     sigma : of all, or (n,) of each.
     """
@@ -90,7 +91,7 @@ class Grid:
 
     def orders(self) -> list[Complex]:
         """s (n,) of each order of `folded`."""
-        known = (*NEAR, *FAR)[: len(self.folded)]
+        known = NEAR[: len(self.folded)]
         return [self.s + 2j * np.pi * k * self.rate_hz for k in known]
 
 
@@ -98,14 +99,12 @@ class Grid:
 class Aliases:
     """What a chain's aliases beyond the nearest add at a few frequencies (m,) Hz.
 
-    rest : (m, q) all together. folded : (order, m, q) those of `FAR`. Of both what is left without
-    the hold's 1 - e^{-s T}, which all aliases have: that is smooth between the frequencies, and
-    hardly changes from the imaginary axis to a line beside it.
+    rest : (m, q) without the hold's 1 - e^{-s T}, which all aliases have: that is smooth between
+    the frequencies, and hardly changes from the imaginary axis to a line beside it.
     """
 
     few: Float
     rest: Complex
-    folded: Complex
 
     @classmethod
     def of(cls, rig: Rig, chain: Chain, few: Float, sensor: Int, actuator: Int) -> Aliases:
@@ -113,18 +112,13 @@ class Aliases:
         s = np.asarray(2j * np.pi * few, np.complex128)
         near = sum(_term(rig, chain, s, k, sensor, actuator) for k in (0, *NEAR))
         rest = sampled_response(rig, few, chain)[:, sensor, actuator] - near
-        folded = np.stack([_term(rig, chain, s, k, sensor, actuator) for k in FAR])
-        held = _held(s, rig.rate_hz)
-        return cls(few, rest / held, folded / held)
+        return cls(few, rest / _held(s, rig.rate_hz))
 
-    def spread(self, s: Complex, rate_hz: float) -> tuple[Complex, Complex]:
-        """rest and folded at s (n,) rad/s."""
-        f, held = s.imag / (2 * np.pi), _held(s, rate_hz)
-        rest, *folded = (
-            held * np.stack([np.interp(f, self.few, r) for r in one.T], axis=1)
-            for one in (self.rest, *self.folded)
-        )
-        return rest, np.stack(folded)
+    def spread(self, s: Complex, rate_hz: float) -> Complex:
+        """(n, q) at s (n,) rad/s."""
+        f = s.imag / (2 * np.pi)
+        between = np.stack([np.interp(f, self.few, r) for r in self.rest.T], axis=1)
+        return np.asarray(_held(s, rate_hz) * between)
 
 
 def _held(s: Complex, rate_hz: float) -> Complex:
@@ -166,11 +160,10 @@ def grid(
     chain = Chain(rig) if chain is None else chain
     made = aliases(chain, few) if aliases else Aliases.of(rig, chain, few, sensor, actuator)
     s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
-    rest, far = made.spread(s, rig.rate_hz)
-    near = np.stack([_term(rig, chain, s, k, sensor, actuator) for k in NEAR])
-    rest, folded = rest + near.sum(axis=0), np.concatenate([near, far])
+    folded = np.stack([_term(rig, chain, s, k, sensor, actuator) for k in NEAR])
+    every = made.spread(s, rig.rate_hz) + folded.sum(axis=0)
     factor = _around(rig, s, sensor, actuator)
-    return Grid(f, factor, rest, folded, rig.rate_hz, sensor, actuator, sigma=sigma, loop=loop)
+    return Grid(f, factor, every, folded, rig.rate_hz, sensor, actuator, sigma=sigma, loop=loop)
 
 
 class Model:
