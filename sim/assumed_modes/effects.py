@@ -171,6 +171,8 @@ def _attached(
     values: Callable[[float], Numbers], start: float, most: float, *, turns: bool = False,
 ) -> Draft:  # fmt: skip
     on, x = _place(rng, setup, setup.turning() if turns else setup.shifting())
+    if turns and setup.part(on).kind == "beam":
+        x = setup.part(on).values["L"]  # the moment that it makes jumps there: see ritz.ORDER
 
     def apply(s: Setup, v: Numbers) -> Setup:
         return s.attached(Attachment(kind, on, x, v))  # type: ignore[arg-type]

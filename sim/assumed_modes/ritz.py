@@ -33,7 +33,8 @@ from sim.assumed_modes.parts import (
 )
 
 # Shapes a beam. With 12 all natural frequencies of SAMII and SFLR below 200 Hz are right to
-# 2e-7; the shapes beyond carry the statics of what is higher.
+# 2e-7; the shapes beyond carry the statics of what is higher. A moment on a beam between its ends
+# is none of theirs: its curvature jumps, and 36 shapes still miss a mode by some per cent.
 ORDER = 12
 FLOOR = 0  # the coordinate that moves with the floor
 
