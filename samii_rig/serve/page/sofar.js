@@ -77,8 +77,9 @@ export class SoFar {
     $("diagnosis-but").textContent = but;
     $("diagnosis-more").textContent = open ? "" : d.lines.slice(1).join(" ");
     $("diagnosis-facts").replaceChildren();
-    const facts = { "Chance that nothing is missing": part(d.nothing) };
-    if (d.causes.length) facts["Chance of the answer"] = part(d.probability);
+    const facts = {};
+    if (d.nothing !== null) facts["Chance that nothing is missing"] = part(d.nothing);
+    if (d.probability && d.causes.length) facts["Chance of the answer"] = part(d.probability);
     if (d.sites.length) facts.Sites = d.sites.map((s) => `${s.site} ${part(s.probability)}`).join(", ");
     for (const [k, v] of Object.entries(facts)) {
       const box = put($("diagnosis-facts"), "div", "");
