@@ -175,7 +175,9 @@ def summary(
 ) -> RenderableType:
     """The verdicts, the modes, and a table of model over measurement, per level and output."""
     responses = sorted(responses, key=lambda r: (not math.isfinite(r.level), r.level))
-    compared = [compare(r, model, band_hz) if model is not None else () for r in responses]
+    compared = [
+        compare(r, model, band_hz, len(responses)) if model is not None else () for r in responses
+    ]
     found = [c for of_one in compared for c in of_one]
     parts: list[RenderableType] = [verdict_line(v) for v in verdicts(recordings, responses, found)]
     if modes:
