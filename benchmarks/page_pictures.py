@@ -84,6 +84,8 @@ def running(browser: Browser, into: Path) -> list[str]:
 def recorded(browser: Browser, service: Service, into: Path) -> list[str]:
     """A whole run, replayed, and its report."""
     browser.size(*SMALL)
+    # What is ordered before a stopped run is over waits for somebody's word.
+    found(lambda: service.state()["running"] is None, LONG)
     with service.lease() as lease:
         id_ = service.start(lease, sweep(duration=12.0, repeats=3))
         found(lambda: (service.state()["last"] or {}).get("id") == id_, LONG)

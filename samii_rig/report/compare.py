@@ -17,7 +17,8 @@ from samii_rig.types import Complex, Float, FrequencyResponse
 BAND = 0.90  # the probability of every interval that is shown
 
 # A model that is the truth is said to differ with this probability at most, over all bands,
-# outputs and levels that are judged together. Third octaves: fine enough to point, wide enough to see a small change.
+# outputs and levels that are judged together. Third octaves: fine enough to point, wide enough to
+# see a small change.
 _CHANCE = 1e-3
 _BANDS_PER_OCTAVE = 3
 
