@@ -71,7 +71,11 @@ export class SoFar {
   // but : what keeps the answer from being a final one.
   say(d, but) {
     const { $, put } = this;
-    if (!d.verdict) { this.empty(`None: ${d.trouble}`); return; }
+    if (!d.verdict) {
+      this.empty(d.final ? `None: ${d.trouble}` : "No answer yet.");
+      $("diagnosis-more").textContent = d.final ? "" : d.trouble;
+      return;
+    }
     const open = !d.repeats && !d.final && d.verdict === "unknown";
     $("diagnosis-what").textContent = open ? "No answer yet." : d.lines[0];
     $("diagnosis-but").textContent = but;
