@@ -67,10 +67,8 @@ def running(browser: Browser, into: Path) -> list[str]:
     browser.colours("light")
     shutil.copy(into / "service-1440-light.png", into / "service.png")
     # Of a run that is over on a busy machine, the last one.
-    browser.until(
-        text("diagnosis-what", ".length > 0 && !") + text("diagnosis-what", ".startsWith('None')"),
-        LONG,
-    )
+    answer = text("diagnosis-what", "")
+    browser.until(f"{answer}.length > 0 && !/^No(ne| answer)/.test({answer})", LONG)
     browser.size(1440, 900)
     browser.value(SETTLES)
     browser.picture(into / "service-so-far.png")
@@ -84,6 +82,8 @@ def running(browser: Browser, into: Path) -> list[str]:
 def recorded(browser: Browser, service: Service, into: Path) -> list[str]:
     """A whole run, replayed, and its report."""
     browser.size(*SMALL)
+    # What is ordered before a stopped run is over waits for somebody's word.
+    found(lambda: service.state()["running"] is None, LONG)
     with service.lease() as lease:
         id_ = service.start(lease, sweep(duration=12.0, repeats=3))
         found(lambda: (service.state()["last"] or {}).get("id") == id_, LONG)

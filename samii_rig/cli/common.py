@@ -106,7 +106,7 @@ def comparisons(
 
     from samii_rig.report.compare import compare
 
-    return [asdict(c) for r in responses if curve for c in compare(r, curve)]
+    return [asdict(c) for r in responses if curve for c in compare(r, curve, among=len(responses))]
 
 
 def response_json(r: FrequencyResponse) -> dict[str, Any]:

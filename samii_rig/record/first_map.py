@@ -51,7 +51,8 @@ def first_map(found: Description) -> str:
     taken: set[str] = set()
     roles = _roles(channels)
     for column in channels:
-        lines += ["", "[[channel]]", *_channel(column, roles[column.name], taken)]
+        driven = "command" in roles.values()
+        lines += ["", "[[channel]]", *_channel(column, roles[column.name], taken, driven)]
     lines += ["", "[segment]", *_segment(path, channels, dividing, roles)]
     return "\n".join(lines) + "\n"
 
@@ -89,7 +90,7 @@ def _roles(channels: list[Column]) -> dict[str, Role]:
     return roles
 
 
-def _channel(column: Column, role: Role, taken: set[str]) -> list[str]:
+def _channel(column: Column, role: Role, taken: set[str], driven: bool) -> list[str]:
     name = re.sub(r"[^A-Za-z0-9]+", "_", column.name).strip("_")[: _MAX_NAME - 4] or "channel"
     if not name[0].isalpha():
         name = f"c_{name}"
@@ -101,7 +102,8 @@ def _channel(column: Column, role: Role, taken: set[str]) -> list[str]:
     asked = "" if column.unit else "  # the file does not say: which is it?"
     lines.append(f"unit = {_quoted(column.unit or '1')}{asked}")
     if role == "sensor":
-        lines.append('role = "sensor"')
+        asked = "" if driven else '  # one must be "command", what drives the rig: is it?'
+        lines.append(f'role = "sensor"{asked}')
     else:
         lines.append(f'role = "{role}"  # by its name: is it?')
     if column.step:

@@ -370,7 +370,8 @@ class RunWriter:
         with self._lock:
             self._open = False
         ended = self._disk.stop()
-        self._pool.shutdown(wait=ended, cancel_futures=not ended)
+        # Nobody waits for them: of two of whom one was ended from outside, the other never ends.
+        self._pool.shutdown(wait=False, cancel_futures=not ended)
         if ended:  # else closing would wait for the thread that hangs in the file
             self._close_file()
 

@@ -16,8 +16,9 @@ from samii_rig.types import Complex, Float, FrequencyResponse
 
 BAND = 0.90  # the probability of every interval that is shown
 
-# A model that is the truth is said to differ with this probability at most, over all bands of
-# one output at one level. Third octaves: fine enough to point, wide enough to see a small change.
+# A model that is the truth is said to differ with this probability at most, over all bands,
+# outputs and levels that are judged together. Third octaves: fine enough to point, wide enough to
+# see a small change.
 _CHANCE = 1e-3
 _BANDS_PER_OCTAVE = 3
 
@@ -138,8 +139,14 @@ def compare(
     response: FrequencyResponse,
     model: ModelCurve,
     band_hz: tuple[float, float] = (0.0, np.inf),
+    among: int = 1,
 ) -> tuple[Comparison, ...]:
-    """One `Comparison` for each output and input that model and measurement share."""
+    """One `Comparison` for each output and input that model and measurement share.
+
+    among : responses that are judged together; the more there are, the further off by chance
+        is the worst of them.
+    """
+    among *= len(response.outputs) * len(response.inputs)
     H = model.like(response)
     beyond = outside(response, H)
     f = response.frequency
@@ -152,7 +159,7 @@ def compare(
             if not use.any():
                 continue
             ratio = H[use, i, j] / measured[use]
-            spans = _different(response, H, i, j, f[use])
+            spans = _different(response, H, i, j, f[use], among)
             found.append(
                 Comparison(
                     y.name,
@@ -202,16 +209,17 @@ def outside(response: FrequencyResponse, H: Complex) -> NDArray[np.bool_]:
 
 
 def _different(
-    response: FrequencyResponse, H: Complex, output: int, input: int, f: Float
+    response: FrequencyResponse, H: Complex, output: int, input: int, f: Float, among: int
 ) -> tuple[tuple[float, float], ...]:
-    """The parts of the band `f` (Hz) in which the model is further off than by chance."""
+    """The parts of the band `f` (Hz) in which the model is further off than the worst of `among`
+    curves is by chance."""
     count = max(1, int(np.ceil(_BANDS_PER_OCTAVE * np.log2(f[-1] / f[0]))))
     edges = f[0] * (f[-1] / f[0]) ** (np.arange(count + 1) / count)
     edges[-1] = np.nextafter(f[-1], np.inf)
     bands = [(float(a), float(b)) for a, b in pairwise(edges)]
     spans: list[tuple[float, float]] = []
     for d in model_difference(response, H, output, input, bands):
-        if d.p_value * count >= _CHANCE:
+        if d.p_value * count * among >= _CHANCE:
             continue
         if spans and spans[-1][1] == d.low_hz:
             spans[-1] = (spans[-1][0], d.high_hz)

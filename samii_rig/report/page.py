@@ -87,7 +87,9 @@ def render(
 ) -> str:
     """The page as text; `responses` in the order in which they are drawn."""
     comparisons = (
-        [] if model is None else [c for r in responses for c in compare(r, model, band_hz)]
+        []
+        if model is None
+        else [c for r in responses for c in compare(r, model, band_hz, len(responses))]
     )
     bode = _bode(responses, model, comparisons, modes)
     time, spectrum = _recorded(recordings, spectrogram_channel)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -30,6 +31,8 @@ _STYLES = {"good": "green", "note": "blue", "warning": "yellow", "bad": "bold re
 _WORDS = {"good": "good", "note": "note", "warning": "look", "bad": "ATTENTION"}
 _MARGIN_CLOSE = 0.2  # of a limit left: shown as close
 _BAR = 30  # characters
+ON = 10.0  # s between lines of a stage that goes on
+KERNELS = logging.getLogger("samii_rig.model.kernels")
 
 
 class ProgressLike(Protocol):
@@ -146,7 +149,8 @@ def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Cal
     """Say what is being done and for how long; what is given says what comes next.
 
     Without a terminal it is one line each, so that who reads a log later, or waits for a pipe,
-    sees that it goes on. quiet : say nothing.
+    sees that it goes on; what only counts on behind a comma, not more often than every `ON` s.
+    quiet : say nothing.
     """
     if quiet:
         yield lambda stage: None
@@ -154,16 +158,40 @@ def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Cal
         columns = SpinnerColumn(), TextColumn("{task.description} ..."), TimeElapsedColumn()
         with Progress(*columns, console=console, transient=True) as shown:
             task = shown.add_task(what, total=None)
-            yield lambda stage: shown.update(task, description=f"{what}: {stage}")
+            with _compiling(
+                lambda stage: shown.update(task, description=f"{what}: {stage}")
+            ) as say:
+                yield say
     else:
-        begun = time.monotonic()
+        begun = due = time.monotonic()
+        last = ""
 
-        def say(stage: str) -> None:
-            after = time.monotonic() - begun
-            console.print(f"{what}: {stage} ... (after {after:.0f} s)", highlight=False)
+        def say_line(stage: str) -> None:
+            nonlocal due, last
+            now, name = time.monotonic(), stage.partition(",")[0]
+            if name != last or now >= due:
+                last, due = name, now + ON
+                console.print(f"{what}: {stage} ... (after {now - begun:.0f} s)", highlight=False)
 
         console.print(f"{what} ...", highlight=False)
+        with _compiling(say_line) as say:
+            yield say
+
+
+@contextmanager
+def _compiling(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
+    """Say it, too, when the kernels are compiled meanwhile."""
+
+    class Heard(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            say(record.getMessage())
+
+    heard = Heard()
+    KERNELS.addHandler(heard)
+    try:
         yield say
+    finally:
+        KERNELS.removeHandler(heard)
 
 
 def summary(
@@ -175,7 +203,9 @@ def summary(
 ) -> RenderableType:
     """The verdicts, the modes, and a table of model over measurement, per level and output."""
     responses = sorted(responses, key=lambda r: (not math.isfinite(r.level), r.level))
-    compared = [compare(r, model, band_hz) if model is not None else () for r in responses]
+    compared = [
+        compare(r, model, band_hz, len(responses)) if model is not None else () for r in responses
+    ]
     found = [c for of_one in compared for c in of_one]
     parts: list[RenderableType] = [verdict_line(v) for v in verdicts(recordings, responses, found)]
     if modes:

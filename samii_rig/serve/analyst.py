@@ -206,7 +206,8 @@ def _diagnosing(line: Connection, rig_toml: str) -> None:
 
 
 def said(found: Diagnosis) -> dict[str, Any]:
-    """A diagnosis as a display shows it. nothing : chance that nothing is missing.
+    """A diagnosis as a display shows it. nothing : chance that nothing is missing, None where no
+    explanation that was tried describes the data: chances among those say nothing then.
 
     probability : of the answer, 0 where there is none.
     """
@@ -225,8 +226,8 @@ def said(found: Diagnosis) -> dict[str, Any]:
     return {
         "verdict": found.verdict,
         "lines": list(found.lines()),
-        "nothing": float(nothing),
-        "probability": float(answer),
+        "nothing": None if found.verdict == "unknown" else float(nothing),
+        "probability": 0.0 if found.verdict == "unknown" else float(answer),
         "causes": plain["causes"],
         "sites": plain["sites"][:SITES],
         "why": found.why,

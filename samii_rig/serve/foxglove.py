@@ -15,6 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 
+from samii_rig.devices.channels import reference_names
 from samii_rig.errors import InputError
 from samii_rig.record.cdr import ENCAPSULATION
 from samii_rig.record.layout import (
@@ -25,6 +26,7 @@ from samii_rig.record.layout import (
     SampleLayout,
     field_names,
 )
+from samii_rig.rig.schema import Rig
 from samii_rig.serve.live import LiveReader
 from samii_rig.types import Channel, Quality, Role
 
@@ -56,41 +58,40 @@ _BODE_SCHEMA = {
 class Foxglove:
     """A server that shows a run. port : 0 for any that is free; `port` says which.
 
+    Channels are made before the server listens: of one made later the SDK tells those who are
+    there before it takes their subscription. So those of the rig stay from run to run, and a run
+    with others gets a server of its own at the same port, to which viewers connect anew.
+
     InputError without the SDK, or for a port that is taken.
     """
 
-    def __init__(self, port: int, name: str) -> None:
+    def __init__(self, port: int, rig: Rig) -> None:
         try:
             import foxglove
         except ModuleNotFoundError as error:
             expected = "it to be installed: pip install samii-rig[foxglove]"
             raise InputError("--foxglove", "", error.name, expected) from error
         self._sdk = foxglove
-        self._context = foxglove.Context()
-        try:
-            self._server = foxglove.start_server(
-                name=name,
-                host=HOST,
-                port=port,
-                capabilities=[],
-                context=self._context,
-                message_backlog_size=BACKLOG,
-            )
-        except (RuntimeError, OverflowError) as error:
-            raise InputError("--foxglove", "", port, f"a free port ({error})") from error
-        self.port = self._server.port
+        self._name, self.port = rig.name, port
+        self._channels = usual_channels(rig)
+        self._server: Any = None
         self._reader: LiveReader | None = None
-        self._samples: Any = None
-        self._bode = foxglove.Channel(BODE, schema=_BODE_SCHEMA, context=self._context)
         self._row, self._zero = 0, 0
         self._seen, self._due = 0, 0.0
-        self._columns = np.dtype([])
+        try:
+            self._listen()
+        except (RuntimeError, OverflowError) as error:
+            raise InputError("--foxglove", "", port, f"a free port ({error})") from error
 
     def show(self, reader: LiveReader | None, responses: Path | None) -> None:
         """Send what is new. responses : the analyst's file of the run that goes on."""
         if reader is not self._reader:
             self._reader = reader
             self._begin(reader)
+        if self._server is None:
+            # Its port is free only a moment after the one before has stopped.
+            with suppress(RuntimeError):
+                self._listen()
         if reader is not None:
             self._send(reader)
         if responses is not None and self._bode.has_sinks():
@@ -98,33 +99,47 @@ class Foxglove:
 
     def close(self) -> None:
         """Everybody is let go."""
-        self._server.stop()
+        if self._server is not None:
+            self._server.stop()
+        self._server = None
+
+    def _listen(self) -> None:
+        # Kept: its channels go with it.
+        self._context = context = self._sdk.Context()
+        fields = field_names(self._channels)
+        n = len(fields)
+        self._columns = np.dtype(
+            [("head", "V4"), ("sequence", "<i8"), ("values", "<f8", n), ("quality", "u1", n)]
+        )
+        text = SampleLayout(self._channels, 1.0).schema_text().encode()  # which has no rate in it
+        self._samples = self._sdk.Channel(
+            SAMPLES,
+            schema=self._sdk.Schema(name=SAMPLES_SCHEMA, encoding=SCHEMA_ENCODING, data=text),
+            message_encoding=MESSAGE_ENCODING,
+            metadata={f"unit.{f}": c.unit for f, c in zip(fields, self._channels, strict=True)},
+            context=context,
+        )
+        self._bode = self._sdk.Channel(BODE, schema=_BODE_SCHEMA, context=context)
+        self._server = self._sdk.start_server(
+            name=self._name,
+            host=HOST,
+            port=self.port,
+            capabilities=[],
+            context=context,
+            message_backlog_size=BACKLOG,
+        )
+        self.port = self._server.port
 
     def _begin(self, reader: LiveReader | None) -> None:
-        """Another run: its channels instead of the last one's."""
-        if self._samples is not None:
-            self._samples.close()
-            self._samples = None
+        """Another run."""
         if reader is None:
             return
         channels = tuple(
             Channel(c["name"], c["unit"], cast(Role, c["role"])) for c in reader.channels
         )
-        layout = SampleLayout(channels, reader.rate_hz)
-        text = layout.schema_text().encode()
-        schema = self._sdk.Schema(name=SAMPLES_SCHEMA, encoding=SCHEMA_ENCODING, data=text)
-        units = {f"unit.{f}": c.unit for f, c in zip(field_names(channels), channels, strict=True)}
-        self._samples = self._sdk.Channel(
-            SAMPLES,
-            schema=schema,
-            message_encoding=MESSAGE_ENCODING,
-            metadata=units,
-            context=self._context,
-        )
-        n = len(channels)
-        self._columns = np.dtype(
-            [("head", "V4"), ("sequence", "<i8"), ("values", "<f8", n), ("quality", "u1", n)]
-        )
+        if channels != self._channels:
+            self._channels = channels
+            self.close()
         self._row = reader.whole
         self._zero = time.time_ns() - round(reader.whole / reader.rate_hz * 1e9)
 
@@ -154,6 +169,24 @@ class Foxglove:
             told = json.loads(path.read_text(encoding="utf-8"))["responses"]
             self._bode.log({"responses": [_plottable(r) for r in told]})
             self._seen, self._due = written, now + AGAIN
+
+
+def usual_channels(rig: Rig) -> tuple[Channel, ...]:
+    """What most devices report of a rig; names, units and roles alone."""
+    units = rig.units()
+    references, commands = list[Channel](), list[Channel]()
+    for actuator in rig.actuator:
+        u, theta_ref = reference_names(rig, actuator.name)
+        loop = rig.centring_of(actuator.name)
+        angle = units[loop.sensor if loop else rig.sensor[0].name]
+        references += [
+            Channel(u, actuator.unit, "reference"),
+            Channel(theta_ref, angle, "reference"),
+        ]
+        commands.append(Channel(actuator.name, actuator.unit, "command"))
+    sensors = (Channel(s.name, s.unit) for s in rig.sensor)
+    monitors = (Channel(m.name, m.unit, "monitor") for m in rig.monitor)
+    return (*references, *commands, *sensors, *monitors)
 
 
 def _plottable(told: dict[str, Any]) -> dict[str, Any]:

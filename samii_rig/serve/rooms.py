@@ -67,7 +67,7 @@ class Rooms:
         self._drawn: asyncio.Task[dict[str, Any]] | None = None
         at = settings.foxglove
         # Last: nothing of ours fails after its port is open.
-        self.foxglove = None if at is None else Foxglove(at, settings.rig.name)
+        self.foxglove = None if at is None else Foxglove(at, settings.rig)
 
     async def work(self) -> None:
         """Look after run, lease and viewers until cancelled."""

@@ -82,14 +82,18 @@ def select(recording: Recording, input: str | None, outputs: Sequence[str] | Non
     by_name = {c.name: c for c in recording.channels}
     if input is None:
         commands = recording.names("command")
+        if not commands:
+            expected = (
+                'one of role "command": what went out to the actuator; a map file says the role'
+            )
+            raise InputError(where, "channels", list(by_name), expected)
         moving = [
             n for n in commands if np.nanmax(np.abs(_column(recording, n)), initial=0.0) > 0.0
         ]
-        if commands and not moving:
+        if not moving:
             raise EstimateError(f"{where}: the input {', '.join(commands)} never moves")
         if len(moving) != 1:
-            found = list(moving or commands)
-            raise InputError(where, "input", found, "the name of the one input to estimate from")
+            raise InputError(where, "input", moving, "the name of the one input to estimate from")
         input = moving[0]
     if outputs is None:
         outputs = [n for n in recording.names("sensor") if n != input]

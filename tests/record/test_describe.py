@@ -118,6 +118,14 @@ def test_without_a_time_the_map_asks_for_the_rate(tmp_path):
     assert import_file(path, chosen).rate_hz == 100.0
 
 
+def test_where_no_column_drives_by_its_name_the_map_asks_which_does(tmp_path):
+    asked = 'one must be "command", what drives the rig: is it?'
+    text = first_map(describe(write(tmp_path, "time,coil,pos\n" + rows("{ms},{u},{y}\n"))))
+    assert text.count(asked) == 2
+    text = first_map(describe(write(tmp_path, "time,command,pos\n" + rows("{ms},{u},{y}\n"))))
+    assert asked not in text
+
+
 def test_matlab_json_and_universal_files(tmp_path, recordings):
     t, u = np.arange(N) / 100, np.arange(N) % 7.0
     mat = tmp_path / "run.mat"

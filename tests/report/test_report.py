@@ -10,6 +10,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from xml.etree import ElementTree
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,6 +19,7 @@ from report_kit import MODES, Page, measured, model, recorded
 from rich.console import Console
 
 from samii_rig.errors import InputError
+from samii_rig.model import kernels
 from samii_rig.report.canvas import halved, packed, restored
 from samii_rig.report.compare import ModelCurve, compare
 from samii_rig.report.decimate import thin
@@ -26,7 +28,7 @@ from samii_rig.report.facts import names
 from samii_rig.report.figures import bode_figure, save_figure
 from samii_rig.report.modes import modes_of_all, rows, sentences
 from samii_rig.report.page import write_report
-from samii_rig.report.summary import LiveProgress, dry_run_summary, progress_line, summary
+from samii_rig.report.summary import LiveProgress, dry_run_summary, progress_line, summary, working
 from samii_rig.report.verdicts import verdicts
 from samii_rig.rig.load import load_rig
 from samii_rig.run.dryrun import DryRun
@@ -367,4 +369,22 @@ def test_progress_lives_on_a_terminal_and_is_one_line_a_segment_elsewhere():
     assert plain.file.getvalue().splitlines() == [
         "1/9 sweep, 2 V, 41 s left",
         "2/9 sweep, 2 V, 41 s left",
+    ]
+
+
+def test_who_waits_sees_what_is_tried_and_that_kernels_are_compiled():
+    said = Console(file=io.StringIO(), width=100)
+    with working(said, "diagnosis") as say:
+        say("what is missing")
+        for tried in range(50):
+            say(f"what is missing, {tried} explanations tried")  # each soon after the other
+        assert kernels.__doc__  # it hears the compiler from then on
+        numba.njit(lambda x: x + 1)(1)
+        say("what cannot be told apart")
+    stages = [line.partition(" (after")[0] for line in said.file.getvalue().splitlines()]
+    assert stages == [
+        "diagnosis ...",
+        "diagnosis: what is missing ...",
+        "diagnosis: compiling the model's kernels, once a machine ...",
+        "diagnosis: what cannot be told apart ...",
     ]

@@ -6,10 +6,12 @@ press; a driver whose zero() does nothing is not called at rest because its dead
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +22,15 @@ from record_kit import CHANNELS, STOP, block
 
 from samii_rig.errors import DiskError
 from samii_rig.record import disk
+from samii_rig.record import writer as writer_module
 from samii_rig.record.recover import recover
 from samii_rig.record.writer import RunWriter
 from samii_rig.run import campaign
 from samii_rig.run.interrupts import PAUSE, Interrupts, one_press_counts
 from samii_rig.run.order import RunOrder
 from samii_rig.run.sink import QueuedSink
+
+raise_in = ctypes.pythonapi.PyThreadState_SetAsyncExc  # an exception in another thread
 
 
 def ends(*_: object) -> None:
@@ -58,6 +63,25 @@ def test_a_disk_that_never_answers_is_given_up(
         writer.event(0, "x")
     held.set()
     writer.abort()
+
+
+@pytest.mark.parametrize("gone", [1, 2])
+def test_compressors_that_are_gone_are_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, gone: int
+) -> None:
+    monkeypatch.setattr(writer_module, "ANSWERS_WITHIN", 0.2)
+    writer = RunWriter(tmp_path / "run.mcap", CHANNELS, RATE)
+    writer.write(block(0, 50))
+    writer.flush()
+    for thread in list(writer._pool._threads)[:gone]:
+        raise_in(ctypes.c_ulong(thread.ident or 0), ctypes.py_object(SystemExit))
+    began = time.monotonic()
+    with suppress(DiskError):  # whoever is left may have done the work
+        writer.write(block(50, 50))
+        writer.close(STOP)
+    writer.abort()
+    assert time.monotonic() - began < 10.0
+    assert recover(writer.partial_path if writer.partial_path.exists() else writer.path).samples
 
 
 @pytest.mark.parametrize("error", [SystemExit(0), MemoryError()])

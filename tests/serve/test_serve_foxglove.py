@@ -25,18 +25,21 @@ pytest.importorskip("foxglove")
 
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
+from websockets.exceptions import ConnectionClosedOK
 from websockets.sync.client import ClientConnection, connect
 
 from samii_rig.errors import InputError
+from samii_rig.rig.load import load_rig
 from samii_rig.serve.access import Tokens
 from samii_rig.serve.analyst import curves
-from samii_rig.serve.foxglove import BODE, Foxglove
+from samii_rig.serve.foxglove import BODE, Foxglove, usual_channels
 from samii_rig.serve.live import LiveReader, LiveWriter
 from samii_rig.serve.rooms import Rooms
 from samii_rig.types import Channel, SampleBlock
+from sim.base import device_channels
 
 CHANNELS = (Channel("u", "V", "reference"), Channel("Theta_2", "rad"))
-AGAIN = 3.0  # s after which a subscription is asked for once more
+SAMII = load_rig("samii")[0]
 MESSAGE = struct.Struct("<BIQ")  # what it is, subscription, ns
 
 
@@ -68,14 +71,14 @@ def received(ws: ClientConnection, timeout: float = WITHIN) -> tuple[int, bytes]
             return when, said[MESSAGE.size :]
 
 
-def first_of(ws: ClientConnection, channel: dict[str, Any]) -> bytes:
-    """The first message of a channel: the SDK says that there is one before it takes subscribers,
-    and on a busy machine the client is the faster one."""
-    for _ in range(round(WITHIN / AGAIN)):
-        subscribe(ws, channel)
-        with suppress(TimeoutError):
-            return received(ws, AGAIN)[1]
-    raise TimeoutError(f"no message of {channel['topic']} within {WITHIN} s")
+def listening(server: Foxglove, reader: LiveReader) -> None:
+    """The run is shown, with its own channels."""
+
+    def shown() -> bool:
+        server.show(reader, None)
+        return server._server is not None
+
+    found(shown, WITHIN)
 
 
 def decoder(channel: dict[str, Any]) -> Any:
@@ -94,7 +97,7 @@ def block(first: int, n: int) -> SampleBlock:
 @pytest.fixture
 def shown(tmp_path: Path) -> Iterator[tuple[Foxglove, LiveWriter, LiveReader]]:
     writer = LiveWriter(tmp_path / "run.live", CHANNELS, 500.0)
-    server = Foxglove(0, "bench")
+    server = Foxglove(0, SAMII)
     yield server, writer, LiveReader(writer.path)
     server.close()
     writer.close()
@@ -104,10 +107,10 @@ def test_every_sample_arrives_by_name_in_order_and_in_time(
     shown: tuple[Foxglove, LiveWriter, LiveReader],
 ) -> None:
     server, writer, reader = shown
-    server.show(reader, None)
+    listening(server, reader)
     with client(server.port) as ws:
         info = json.loads(ws.recv(WITHIN))
-        assert (info["op"], info["name"], info["capabilities"]) == ("serverInfo", "bench", [])
+        assert (info["op"], info["name"], info["capabilities"]) == ("serverInfo", "SAMII", [])
         channel = advertised(ws, "/samples")
         assert channel["metadata"] == {"unit.u": "V", "unit.theta_2": "rad"}
         subscribe(ws, channel)
@@ -124,6 +127,49 @@ def test_every_sample_arrives_by_name_in_order_and_in_time(
     np.testing.assert_array_equal(np.isnan([m.theta_2 for m in messages]), missing)
     assert [bytes(m.quality) for m in messages] == [bytes([0, bool(x)]) for x in missing]
     np.testing.assert_allclose(np.diff([when for when, _ in got]), 2e6, atol=1)
+
+
+def test_who_is_there_before_a_run_sees_it_and_the_next_by_one_subscription(tmp_path: Path) -> None:
+    server = Foxglove(0, SAMII)
+    channels = usual_channels(SAMII)
+    with client(server.port) as ws:
+        subscribe(ws, advertised(ws, "/samples"))
+        found(server._samples.has_sinks, WITHIN)
+        for run in range(2):
+            writer = LiveWriter(tmp_path / f"{run}.live", channels, SAMII.rate_hz)
+            reader = LiveReader(writer.path)
+            server.show(reader, None)
+            n = np.zeros((5, len(channels)))
+            sequence = np.arange(5)
+            writer.samples(SampleBlock(channels, sequence, sequence, n, n.astype(np.uint8)))
+            server.show(reader, None)
+            for _ in range(5):
+                received(ws)
+            server.show(None, None)
+            writer.close()
+    server.close()
+
+
+@pytest.mark.parametrize("name", ["samii", "sflr"])
+def test_a_simulated_rig_reports_what_is_announced_before_its_run(name: str) -> None:
+    rig = load_rig(name)[0]
+    told = [(c.name, c.unit, c.role) for c in device_channels(rig)]
+    assert [(c.name, c.unit, c.role) for c in usual_channels(rig)] == told
+
+
+def test_a_run_with_other_channels_is_announced_whole_at_the_same_port(
+    shown: tuple[Foxglove, LiveWriter, LiveReader],
+) -> None:
+    server, _, reader = shown
+    port = server.port
+    with client(port) as ws:
+        advertised(ws, "/samples")
+        listening(server, reader)
+        with suppress(ConnectionClosedOK):
+            advertised(ws, "/no such topic")
+    assert server.port == port
+    with client(port) as ws:
+        assert advertised(ws, "/samples")["metadata"] == {"unit.u": "V", "unit.theta_2": "rad"}
 
 
 def test_frequency_responses_come_as_curves_by_output(
@@ -154,7 +200,7 @@ def test_a_port_that_is_taken_costs_one_line(
     shown: tuple[Foxglove, LiveWriter, LiveReader],
 ) -> None:
     with pytest.raises(InputError, match="a free port"):
-        Foxglove(shown[0].port, "another")
+        Foxglove(shown[0].port, SAMII)
 
 
 def test_a_failing_foxglove_takes_nothing_down(
@@ -200,9 +246,9 @@ def test_a_run_of_the_service_is_seen(tmp_path: Path) -> None:
         with client(int(line.rpartition(":")[2])) as ws, service.lease() as lease:
             service.start(lease, sweep(120.0))  # longer than a busy machine may take to subscribe
             channel = advertised(ws, "/samples")
+            subscribe(ws, channel)
             read = decoder(channel)
-            messages = [read(first_of(ws, channel))]
-            messages += [read(received(ws)[1]) for _ in range(199)]
+            messages = [read(received(ws)[1]) for _ in range(200)]
             service.http.post("/api/stop")
         sequence = [m.sequence for m in messages]
         assert sequence == list(range(sequence[0], sequence[0] + 200))

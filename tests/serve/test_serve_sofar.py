@@ -204,6 +204,14 @@ def test_what_is_missing_is_told_with_its_chances(swept: tuple[Plan, Recording, 
     assert right["nothing"] == right["probability"] > 0.5
 
 
+def test_without_an_answer_no_chance_is_told(swept: tuple[Plan, Recording, int]) -> None:
+    """Shares of explanations none of which describes the data are no chances."""
+    open_ = replace(diagnose(estimate([swept[1]]), RIG), verdict="unknown")
+    found = said(open_)
+    assert found["nothing"] is None
+    assert found["probability"] == 0.0
+
+
 def test_the_diagnosis_of_the_command_line_is_kept_beside_the_recording(
     swept: tuple[Plan, Recording, int], capsys: pytest.CaptureFixture[str]
 ) -> None:

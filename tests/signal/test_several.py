@@ -224,6 +224,13 @@ def test_an_input_that_drives_nothing_is_named(rng):
         estimate([made], input=list(INPUTS))
 
 
+def test_a_recording_without_a_command_says_which_role_is_wanted(rng):
+    made = recording(bursts(0, rng), "burst")
+    sensors = tuple(replace(c, role="sensor") for c in made.channels)
+    with pytest.raises(InputError, match=r'channels is .*; expected one of role "command"'):
+        estimate([replace(made, channels=sensors)])
+
+
 def test_fewer_experiments_than_inputs_are_refused_in_one_line(rng):
     with pytest.raises(EstimateError, match=r"1 experiment for 2 inputs \(v_1, v_2\); expected 2"):
         estimate([recording(bursts(0, rng, loop=50.0), "burst")])

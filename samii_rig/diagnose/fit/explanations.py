@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -59,7 +59,7 @@ class Explanations:
     """All explanations of one set of lines that were refitted.
 
     lines : those that are fitted. grid : of all frequencies. table : all single effects.
-    found : every explanation that was refitted, by key.
+    found : every explanation that was refitted, by key. counted : is told how many there are.
     """
 
     rig: Rig
@@ -69,6 +69,7 @@ class Explanations:
     found: dict[frozenset[str], Explanation] = field(default_factory=dict)
     problem: Problem = field(init=False)
     temperature: float = 1.0
+    counted: Callable[[int], None] | None = None
     _gross: float = 0.0  # chi-square that the nominal model leaves
     _rows: Counter[str] = field(init=False)
     _total: dict[str, float] = field(init=False)
@@ -228,6 +229,8 @@ class Explanations:
         old = self.found.get(made.key)
         if old is None or made.weight > old.weight:
             self.found[made.key] = made
+        if self.counted is not None:
+            self.counted(len(self.found))
 
     def without(self, whole: Explanation, i: int) -> Explanation | None:
         """`whole` less its effect i, refitted."""

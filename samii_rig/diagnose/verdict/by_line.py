@@ -9,7 +9,7 @@ from samii_rig.diagnose.result import Diagnosis, Used
 from samii_rig.diagnose.verdict import answer
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.force_words import distorted
-from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, told
+from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, counting, told
 
 DIFFER = (
     "levels differ; give the recordings: friction, play, hardening and the like are told from "
@@ -24,7 +24,7 @@ def by_lines(case: Case, progress: Progress) -> Diagnosis:
     nominal = search.nominal.fitted
     first, bands = search.ratio(nominal), answer.bands(search, nominal)
     torn = search.lines.torn()
-    progress("what is missing")
+    search.counted = counting(progress, "what is missing")
     search.run(briefly=torn)
     progress("what cannot be told apart")
     judged = verdict.judge(search, case.decide)

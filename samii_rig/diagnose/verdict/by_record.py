@@ -11,7 +11,7 @@ from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.result import Band, Diagnosis, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
-from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, told
+from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, counting, told
 from samii_rig.errors import EstimateError, SamiiRigError
 
 SPENT = (
@@ -36,7 +36,7 @@ def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | N
 def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis:
     """What whole records say."""
     first, bands = _at_first(search)
-    progress("what is missing")
+    search.counted = counting(progress, "what is missing")
     # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
     search.run(briefly=True)
     progress("amplitude levels")

@@ -25,6 +25,12 @@ ALTERNATIVES = 6
 Progress = Callable[[str], None]
 
 
+def counting(progress: Progress, stage: str) -> Callable[[int], None]:
+    """Say that a stage begins; what is given says how many explanations were tried in it."""
+    progress(stage)
+    return lambda tried: progress(f"{stage}, {tried} explanations tried")
+
+
 @dataclass(frozen=True)
 class Case:
     """What is to be explained.

@@ -10,17 +10,22 @@ overlap and vectorises the loop over the lanes. For the same reason a sign is wr
 from __future__ import annotations
 
 import hashlib
+import logging
 import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import event
 from numba.extending import register_jitable
 
 from samii_rig.types import Float
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+log = logging.getLogger(__name__)
+log.setLevel(logging.INFO)
 
 LANES = 64  # measured: 32 and 128 are 10 % slower, 256 is 40 %
 TINY = 1e-300  # keeps 0/0 from being NaN where a numerator of 0 shall give 0
@@ -29,6 +34,19 @@ TINY = 1e-300  # keeps 0/0 from being NaN where a numerator of 0 shall give 0
 # Of fastmath only contraction to fused multiply-add and freedom of the zero's sign: neither
 # costs digits, and NaN still means NaN.
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
+
+
+class _Told(event.Listener):
+    """Who waits can be told why: half a minute, where the cache on the disk has nothing yet."""
+
+    def on_start(self, event: event.Event) -> None:
+        log.info("compiling the model's kernels, once a machine")
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+
+event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
 
 
 def kernel(make: Callable[[int], F]) -> F:

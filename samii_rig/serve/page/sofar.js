@@ -71,14 +71,19 @@ export class SoFar {
   // but : what keeps the answer from being a final one.
   say(d, but) {
     const { $, put } = this;
-    if (!d.verdict) { this.empty(`None: ${d.trouble}`); return; }
+    if (!d.verdict) {
+      this.empty(d.final ? `None: ${d.trouble}` : "No answer yet.");
+      $("diagnosis-more").textContent = d.final ? "" : d.trouble;
+      return;
+    }
     const open = !d.repeats && !d.final && d.verdict === "unknown";
     $("diagnosis-what").textContent = open ? "No answer yet." : d.lines[0];
     $("diagnosis-but").textContent = but;
     $("diagnosis-more").textContent = open ? "" : d.lines.slice(1).join(" ");
     $("diagnosis-facts").replaceChildren();
-    const facts = { "Chance that nothing is missing": part(d.nothing) };
-    if (d.causes.length) facts["Chance of the answer"] = part(d.probability);
+    const facts = {};
+    if (d.nothing !== null) facts["Chance that nothing is missing"] = part(d.nothing);
+    if (d.probability && d.causes.length) facts["Chance of the answer"] = part(d.probability);
     if (d.sites.length) facts.Sites = d.sites.map((s) => `${s.site} ${part(s.probability)}`).join(", ");
     for (const [k, v] of Object.entries(facts)) {
       const box = put($("diagnosis-facts"), "div", "");
