@@ -59,6 +59,9 @@ def control(
 
     from samii_rig.control.design import Goals, design
     from samii_rig.control.identified import identified as take_in
+    from samii_rig.control.multiloop import line as together_line
+    from samii_rig.control.multiloop import multiloop
+    from samii_rig.control.multiloop import plain as together_plain
     from samii_rig.control.pictures import write_pictures
     from samii_rig.control.result import lines, plain, rig_text, step_line
     from samii_rig.control.settle import settling
@@ -94,6 +97,8 @@ def control(
     target = out / f"{stem}_damped.toml"
     pictures = write_pictures(made, shown, out)
     data = plain(made, shown)
+    together = multiloop(made.plant, made.rig)
+    data["together"] = together_plain(together)
     if not judged:
         target.write_text(rig_text(text, made), encoding="utf-8")
         data["rig_file"] = str(target)
@@ -106,3 +111,5 @@ def control(
         return
     for line in (*lines(made), *map(step_line, shown)):
         console.print(line)
+    if together is not None:
+        console.print(together_line(together))

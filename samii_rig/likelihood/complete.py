@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from samii_rig.likelihood.noise import Disturbances
+from samii_rig.likelihood.pieces import Loops
 from samii_rig.likelihood.reduce import Records, Reduced, Response, Rows, formed, orthonormal
 from samii_rig.types import Complex, Float, Int
 
@@ -44,7 +45,7 @@ class Complete:
         records: Records,
         response: Response,
         disturbances: Disturbances,
-        loop: tuple[float, int] | None = None,
+        loop: Loops = (),
         part: Callable[[Int], NDArray[np.bool_]] | None = None,
     ) -> Complete:
         """As `reduced`."""

@@ -68,8 +68,12 @@ class Contour:
         return np.asarray(y / self._decay(n, y.ndim))
 
     def predicted(self, H: Complex, r: Float) -> Float:
-        """(n, q) what H (M//2 + 1, q) answers to an input r (n,)."""
-        return self.record(H * self.damped(r)[:, None], r.size)
+        """(n, q) what H (M//2 + 1, q) answers to an input r (n,); or H (M//2 + 1, q m), all inputs
+        of the first sensor first, to m inputs r (n, m)."""
+        if r.ndim == 1:
+            return self.record(H * self.damped(r)[:, None], r.size)
+        by_input = H.reshape(len(H), -1, r.shape[1]) @ self.damped(r)[:, :, None]
+        return self.record(by_input[:, :, 0], len(r))
 
     def _decay(self, n: int, axes: int) -> Float:
         decay = np.exp(-self.sigma / self.rate_hz * np.arange(n))

@@ -13,7 +13,7 @@ from numpy.polynomial import legendre
 
 from samii_rig.likelihood import rounding
 from samii_rig.likelihood.contour import Contour
-from samii_rig.likelihood.pieces import Piece
+from samii_rig.likelihood.pieces import Loops, Piece
 from samii_rig.types import Complex, Float, Int
 
 WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
@@ -47,8 +47,8 @@ def _by_sensor(shapes: Float, k: Int, q: int) -> Complex:
 
 
 def offsets(piece: Piece, k: Int, steps: Sequence[Float]) -> Complex:
-    """(n_lines, q, 1 or 2) of an input that has an offset, and of a loop's sensor that has one:
-    both act from the first sample on.
+    """(n_lines, q, m) of every input that has an offset, and of every loop's sensor that has one:
+    all act from the first sample on.
 
     steps : (m, q) what the sensors show of a step of each.
     """
@@ -58,12 +58,13 @@ def offsets(piece: Piece, k: Int, steps: Sequence[Float]) -> Complex:
 def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
     """(n_lines, q, m) of the input's edges, which came some part of a sample earlier or later.
 
-    impulse : (m, q) answer to an impulse of the input.
+    impulse : (m, q) answer to an impulse of the input; (m, q inputs) of several.
     """
     q = piece.z.shape[1]
     out = np.zeros((k.size, q, len(piece.edges)), complex)
-    for j, edge in enumerate(piece.edges):
-        y = np.concatenate([np.zeros((edge, q)), impulse[: piece.r.size - edge]])
+    for j, (edge, of) in enumerate(piece.edges):
+        own = impulse[: len(piece.r) - edge, of :: piece.inputs]
+        y = np.concatenate([np.zeros((edge, q)), own])
         out[:, :, j] = np.fft.rfft(y[piece.history :], axis=0)[k]
     return out
 
@@ -113,7 +114,7 @@ def unread(
     y: Float,
     H: Complex,
     contour: Contour,
-    loop: tuple[float, int] | None,
+    loops: Loops,
     step: Float,
 ) -> Complex:
     """(n_lines, q, m) of motion that a converter hardly reads, as it stays within a step: rounding
@@ -121,7 +122,7 @@ def unread(
     factor depends on the amplitude.
 
     y : (n, q) as the sensors would move without noise. H : (M//2 + 1, q) from the input on the
-    contour. loop : its kp, and the sensor.
+    contour; (M//2 + 1, q m) of m inputs.
     """
     n, q = piece.z.shape
     out = []
@@ -135,9 +136,10 @@ def unread(
             spectrum = np.fft.rfft(np.where(turn == j, part, 0.0))[k]
             seen = np.zeros((k.size, q), complex)
             seen[:, i] = spectrum
-            if loop is not None and loop[1] == i:
-                there = np.round(k * (contour.samples / n)).astype(np.int64)
-                seen -= loop[0] * H[there] * spectrum[:, None]
+            for kp, sensor, of in loops:
+                if sensor == i:
+                    there = np.round(k * (contour.samples / n)).astype(np.int64)
+                    seen -= kp * H[there, of :: piece.inputs] * spectrum[:, None]
             out.append(seen)
     return np.stack(out, axis=2) if out else np.zeros((k.size, q, 0), complex)
 
@@ -146,7 +148,7 @@ def past(piece: Piece, k: Int, impulse: Float) -> Complex:
     """(n_lines, q, m) of motion from before the first input that is known: answers to inputs that
     acted then.
 
-    impulse : (m, q) answer to an impulse of the input.
+    impulse : (m, q) answer to an impulse of the input; (m, q inputs) of several.
     """
     known = piece.history + len(piece.z)
     longest = min(len(piece.z), len(impulse) - known)
@@ -154,8 +156,9 @@ def past(piece: Piece, k: Int, impulse: Float) -> Complex:
     lags = np.unique(np.rint(2 ** np.arange(0, np.log2(longest), 1 / dense)).astype(np.int64))
     spectra = []
     for lag in lags:
-        y = impulse[lag + piece.history : lag + known]
-        spectra.append(np.fft.rfft(y, axis=0)[k])
+        for j in range(piece.inputs):
+            y = impulse[lag + piece.history : lag + known, j :: piece.inputs]
+            spectra.append(np.fft.rfft(y, axis=0)[k])
     return _independent(np.stack(spectra, axis=2))
 
 

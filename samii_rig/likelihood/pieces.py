@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood import inputs, spikes
 from samii_rig.rig.schema import Rig
-from samii_rig.signal.columns import is_open, proportional
+from samii_rig.signal.columns import is_open, of_input, proportional
 from samii_rig.signal.groups import segments_of
 from samii_rig.types import Float, Quality, Recording, Segment
 
@@ -20,9 +21,13 @@ SPOILT = Quality.MISSING | Quality.CLIPPED | Quality.STALE
 LEAST_SAMPLES = 256  # fewer say nothing of a structure
 
 
+Loops = tuple[tuple[float, int, int], ...]
+"""Of each loop that runs kp, the sensor that it reads, the input that it drives."""
+
+
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """r (history + n,) input, z (n, q) sensors."""
+    """r (history + n,) input or (history + n, m) of m inputs, z (n, q) sensors."""
 
     r: Float
     z: Float
@@ -32,7 +37,7 @@ class Samples:
 class Command:
     """What one of the records behind a piece told the rig, and its part in the piece.
 
-    v : (history + n,) as recorded. part : the piece's r and z have so many times this record's.
+    v : as recorded, of the shape of r. part : the piece's r and z have so many times this record's.
     """
 
     v: Float
@@ -47,11 +52,13 @@ class Piece:
     row is c/|c|: the first sum has all of the input and the noise of one record, the others have
     next to no input and tell noise (`repeats`) or what changes with the level (`contrasts`).
 
-    r : (history + n,) input of the loop, or of the rig where none is closed; the rig is at rest
-        before it, unless `moving`. z : (n, q) sensors. history : samples of input before them.
+    r : (history + n,) input of the loop, or of the rig where none is closed; (history + n, m) of a
+        rig of m inputs. The rig is at rest before it, unless `moving`.
+    z : (n, q) sensors. history : samples of input before them.
     levels : as the segments state them, with their unit.
     commands : of all records that the piece is a sum of. struck : spikes of each sensor in them.
-    edges : samples of r at which the input jumps at an instant within them that nobody knows.
+    edges : (sample of r, input) at which that input jumps at an instant within the sample that
+        nobody knows.
     """
 
     name: str
@@ -64,17 +71,44 @@ class Piece:
     contrasts: tuple[Samples, ...] = ()
     commands: tuple[Command, ...] = ()
     struck: tuple[int, ...] = ()
-    edges: tuple[int, ...] = ()
+    edges: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def inputs(self) -> int:
+        """How many inputs the rig has."""
+        return 1 if self.r.ndim == 1 else self.r.shape[1]
+
+
+@dataclass(frozen=True, slots=True)
+class Input:
+    """An input of the rig and the loop around it: v = r - kp theta, if kp is not 0.
+
+    command : its column. centring : the column of theta.
+    """
+
+    command: str
+    centring: str = ""
+    kp: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Wiring:
-    """Which columns are read, and how the loop runs: v = r - kp theta, if kp is not 0."""
+    """Which columns are read. inputs : in the rig file's order."""
 
-    command: str
+    inputs: tuple[Input, ...]
     sensors: tuple[str, ...]
-    centring: str
-    kp: float
+
+    @property
+    def only(self) -> Input:
+        """The input of a rig that has one."""
+        (one,) = self.inputs
+        return one
+
+    @property
+    def loops(self) -> Loops:
+        """Those that run."""
+        each = enumerate(self.inputs)
+        return tuple((x.kp, self.sensors.index(x.centring), j) for j, x in each if x.kp)
 
 
 def wiring(
@@ -82,31 +116,57 @@ def wiring(
 ) -> Wiring:
     """The columns of all recordings that the rig file knows, of `sensors` alone if given.
 
-    Raises EstimateError where they have no sensor or no command in common, where they have several
-    commands, or where the loop is closed around a sensor that is left out.
+    An input is a command that any of them has. Where one has no column of it, it rested there.
+
+    Raises EstimateError where they have no sensor in common or no command, where a loop is closed
+    around a sensor that is left out, or around an input that one of them has no column of.
     """
     known = [s.name for s in rig.sensor]
     common = set.intersection(*({c.name for c in r.channels} for r in recordings))
     asked = common if sensors is None else common & set(sensors)
     found = tuple(n for n in known if n in asked)
-    commands = [a.name for a in rig.actuator if a.name in common]
+    having = [a.name for a in rig.actuator if any(_has(r, a.name) for r in recordings)]
+    # A command that never leaves zero drives nothing.
+    commands = [n for n in having if any(_moves(r, n) for r in recordings)] or having[:1]
     if not found or not commands:
         raise EstimateError("the recordings have no command and no sensor of the rig in common")
-    if len(commands) > 1:
-        raise EstimateError(
-            f"the recordings have {len(commands)} commands, {', '.join(commands)}; expected one, "
-            "as whole records are predicted from a single input"
-        )
-    (command,) = commands
-    centring = rig.centring
+    return Wiring(tuple(_input(recordings, rig, n, common, found) for n in commands), found)
+
+
+def _input(
+    recordings: Sequence[Recording],
+    rig: Rig,
+    command: str,
+    common: Collection[str],
+    found: Collection[str],
+) -> Input:
+    """An input and the loop that runs around it. common : columns of all recordings. found : the
+    sensors that are read."""
+    centring = rig.centring_of(command)
     if centring is None or centring.sensor not in common or rig.feedback:
-        return Wiring(command, found, "", 0.0)
+        return Input(command)
     if centring.sensor not in found:
         raise EstimateError(f"the loop is closed around {centring.sensor}, which is left out")
     sensor, kp = centring.sensor, centring.kp
-    if all(is_open(recording, command, sensor, kp) for recording in recordings):
-        return Wiring(command, found, "", 0.0)
-    return Wiring(command, found, sensor, kp)
+    for recording in recordings:
+        if not _has(recording, command):
+            raise EstimateError(
+                f"{recording.source or 'a recording'} has no column {command}; expected one, as "
+                f"the rig file closes a loop from {sensor} to it"
+            )
+    if all(is_open(of_input(r, command), command, sensor, kp) for r in recordings):
+        return Input(command)
+    return Input(command, sensor, kp)
+
+
+def _has(recording: Recording, name: str) -> bool:
+    return any(c.name == name for c in recording.channels)
+
+
+def _moves(recording: Recording, command: str) -> bool:
+    return _has(recording, command) and bool(
+        np.any(np.nan_to_num(recording.values[:, recording.column(command)]))
+    )
 
 
 def pieces_of(
@@ -128,26 +188,51 @@ def pieces_of(
     step = np.array([steps[n] for n in wired.sensors])
     found: list[Piece] = []
     for recording in recordings:
-        columns = [recording.column(n) for n in (wired.command, *wired.sensors)]
+        columns = [recording.column(n) for n in wired.sensors]
         values = recording.values[:, columns]
         bad = (recording.quality[:, columns] & SPOILT) != 0
-        bad[:, 0] = False  # what went out is known, limited or not
         whole = np.all(np.isfinite(values) & ~bad, axis=1)
-        theta = values[:, 1 + wired.sensors.index(wired.centring)] if wired.kp else None
-        values[:, 0], edges = inputs.sent(recording, columns[0], wired.kp, theta)
-        if round(rig.rate_hz / recording.rate_hz) > 1:
-            edges = edges | inputs.jumps(recording, columns[0], wired.kp, theta)
-        r = values[:, 0].copy()
-        if theta is not None:
-            r += wired.kp * theta
-        if not recording.names("reference"):
-            r = inputs.calibrated(r, recording.channels[columns[0]].resolution)
+        slower = round(rig.rate_hz / recording.rate_hz) > 1
+        each = [_driving(recording, x, values, wired.sensors, slower=slower) for x in wired.inputs]
+        for x in wired.inputs:  # what went out is known, limited or not
+            if _has(recording, x.command):
+                whole &= np.isfinite(recording.values[:, recording.column(x.command)])
+        v, r, edges = (_beside([one[i] for one in each]) for i in range(3))
         for segment in segments_of(recording):
             if recording.place(segment) in without:
                 continue
-            found += _cut(recording, segment, r, values, whole, edges, step)
+            found += _cut(recording, segment, v, r, values, whole, edges, step)
     repeats = _joined(found, levels=False)
     return repeats if apart else joined(repeats)
+
+
+def _driving(
+    recording: Recording, x: Input, values: Float, sensors: Sequence[str], *, slower: bool
+) -> tuple[Float, Float, NDArray[np.bool_]]:
+    """(n,) of an input: the command, what drives its loop, and where it has edges.
+
+    values : (n, q) of the sensors. slower : whether not every sample of the rig was recorded.
+    """
+    if not _has(recording, x.command):
+        still = np.zeros(len(values))
+        return still, still, np.zeros(len(values), np.bool_)
+    recording = of_input(recording, x.command)
+    column = recording.column(x.command)
+    theta = values[:, sensors.index(x.centring)] if x.kp else None
+    v, edges = inputs.sent(recording, column, x.kp, theta)
+    if slower:
+        edges = edges | inputs.jumps(recording, column, x.kp, theta)
+    r = v.copy()
+    if theta is not None:
+        r += x.kp * theta
+    if not recording.names("reference"):
+        r = inputs.calibrated(r, recording.channels[column].resolution)
+    return v, r, edges
+
+
+def _beside(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """(n,) of one input, (n, m) of several."""
+    return each[0] if len(each) == 1 else np.stack(each, axis=1)
 
 
 def joined(pieces: list[Piece]) -> list[Piece]:
@@ -158,14 +243,15 @@ def joined(pieces: list[Piece]) -> list[Piece]:
 def _cut(
     recording: Recording,
     segment: Segment,
+    v: Float,
     r: Float,
     values: Float,
     whole: NDArray[np.bool_],
     edges: NDArray[np.bool_],
     step: Float,
 ) -> list[Piece]:
-    """The stretches of a segment between gaps, each with the input before it. values : of the
-    command, then of the sensors. step : of the sensors' converters."""
+    """The stretches of a segment between gaps, each with the input before it. v, r, edges : of the
+    inputs. values : of the sensors. step : of their converters."""
     a, b = np.searchsorted(recording.sequence, [segment.start, segment.stop])
     jumps = np.flatnonzero(np.diff(recording.sequence) != 1) + 1
     ends = np.unique(np.concatenate([jumps, np.flatnonzero(np.diff(whole.astype(np.int8))) + 1]))
@@ -180,43 +266,59 @@ def _cut(
         name = recording.place(segment)
         part = r[low - history : high]
         level = (segment.level, segment.unit)
-        told = Command(values[low - history : high, 0].copy(), 1.0)
-        z, struck = spikes.mended(values[low:high, 1:], step)
+        told = Command(v[low - history : high].copy(), 1.0)
+        z, struck = spikes.mended(values[low:high], step)
         piece = Piece(name, part, z, history, (level,), moving, commands=(told,))
-        at = tuple(np.flatnonzero(edges[low - history : high]).tolist())
+        own = edges[low - history : high].reshape(high - low + history, -1)
+        at = tuple((int(i), int(j)) for i, j in np.argwhere(own))
         out.append(replace(piece, struck=tuple(struck.tolist()), edges=at))
     return out
 
 
 def _joined(pieces: list[Piece], *, levels: bool) -> list[Piece]:
     """Pieces with proportional inputs, of one level or of any, as one."""
+    scale = _scale(pieces)
     groups: list[list[Piece]] = []
     for piece in pieces:
         for group in groups:
-            if _proportional(group[0], piece, levels=levels):
+            if _proportional(group[0], piece, scale, levels=levels):
                 group.append(piece)
                 break
         else:
             groups.append([piece])
-    return [_turned(group, levels=levels) if len(group) > 1 else group[0] for group in groups]
+    return [
+        _turned(group, scale, levels=levels) if len(group) > 1 else group[0] for group in groups
+    ]
 
 
-def _proportional(one: Piece, other: Piece, *, levels: bool) -> bool:
+def _scale(pieces: Sequence[Piece]) -> Float | None:
+    """(m,) largest rms of each of several inputs, by which their units compare; None of one."""
+    if not pieces or pieces[0].r.ndim == 1:
+        return None
+    size = np.max([np.sqrt(np.mean(p.r**2, axis=0)) for p in pieces], axis=0)
+    return np.where(size > 0, size, 1.0)
+
+
+def _flat(r: Float, scale: Float | None) -> Float:
+    return r if scale is None else (r / scale).ravel()
+
+
+def _proportional(one: Piece, other: Piece, scale: Float | None, *, levels: bool) -> bool:
     alike = (one.r.size, one.history, one.moving) == (other.r.size, other.history, other.moving)
     if not alike:
         return False
     if not levels and one.levels != other.levels:
         return False
-    return proportional(one.r, other.r)
+    return proportional(_flat(one.r, scale), _flat(other.r, scale))
 
 
-def _turned(group: list[Piece], *, levels: bool) -> Piece:
+def _turned(group: list[Piece], scale: Float | None, *, levels: bool) -> Piece:
     first = group[0]
-    c = np.array([p.r @ first.r for p in group])
+    c = np.array([_flat(p.r, scale) @ _flat(first.r, scale) for p in group])
     # The first row of U^T of a Householder reflection that sends c to its own axis.
     U = np.linalg.qr(np.column_stack([c, np.eye(c.size)[:, 1:]]))[0].T
     U[0] *= np.sign(U[0] @ c)
-    r = U @ np.stack([p.r for p in group])
+    r = (U @ np.stack([p.r.ravel() for p in group])).reshape(len(group), *first.r.shape)
     z = np.tensordot(U, np.stack([p.z for p in group]), axes=1)
     others = tuple(Samples(r[i], z[i]) for i in range(1, len(group)))
     return Piece(

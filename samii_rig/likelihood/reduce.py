@@ -24,7 +24,7 @@ from samii_rig.likelihood import rounding
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Disturbances, Noise
-from samii_rig.likelihood.pieces import Piece, Samples
+from samii_rig.likelihood.pieces import Loops, Piece, Samples
 from samii_rig.likelihood.seen import Answers, Seen
 from samii_rig.types import Complex, Float, Int
 
@@ -35,6 +35,9 @@ WIDEST = 0.1  # nodes, apart over frequency at most
 SPARE = 0.1
 BELOW = 2**0.5  # the same, below the band: a change of 1/s is linear between them to 3 %
 ENOUGH = 0.75  # lines over unknowns of a change, from which a piece shows its noise by itself
+# Of an input's largest in any piece, what it does in one that it does not excite: where noise is
+# told no change of its response is free there, which would fit that with its converter's rounding.
+RESTS = 0.01
 RIDGES, MORE = 5, 30.0  # tries of a ridge, each so many times the one before
 CYCLES = (
     5  # in a record, of its lowest line: below, wandering is as large as what polynomials leave
@@ -43,7 +46,8 @@ AT_ONCE = 4096  # lines whose products are formed together: 30 MB at 120 nodes
 SAME = 1e-9  # of the largest, power in a direction that columns do not have
 
 Response = Callable[[Complex], Complex]
-"""(n,) s -> (n, q) of the reference model, from input to sensors."""
+"""(n,) s -> (n, q) of the reference model, from input to sensors; (n, q m) of m inputs, all inputs
+of the first sensor first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +144,7 @@ class Records:
     @property
     def longest(self) -> int:
         """Samples, input before the piece included."""
-        return max(self.least, *(p.r.size for p in self.pieces))
+        return max(self.least, *(len(p.r) for p in self.pieces))
 
     @property
     def count(self) -> int:
@@ -165,12 +169,12 @@ class Records:
 
     def left(self, samples: Samples | Piece, k: Int, H: Complex, contour: Contour) -> Complex:
         """(n, q) lines k of what H (M//2 + 1, q) on `exact` leaves of samples, a sample's power."""
-        y = samples.z - contour.predicted(H, samples.r)[samples.r.size - len(samples.z) :]
+        y = samples.z - contour.predicted(H, samples.r)[len(samples.r) - len(samples.z) :]
         return np.asarray(np.fft.rfft(y, axis=0)[k] / np.sqrt(len(y)))
 
-    def seen(self, H: Complex, loop: tuple[float, int] | None) -> list[Seen]:
+    def seen(self, H: Complex, loop: Loops) -> list[Seen]:
         """Of each piece what H on `exact` leaves, and what else is in it."""
-        answers = Answers.of(H, self.exact(), loop, self.longest)
+        answers = Answers.of(H, self.exact(), loop, self.longest, self.pieces[0].inputs)
         return [Seen.of(p, self.lines(p).k, answers, self.step) for p in self.pieces]
 
 
@@ -191,7 +195,7 @@ def left_by(
     records: Records,
     response: Response,
     noise: Reduced,
-    loop: tuple[float, int] | None = None,
+    loop: Loops = (),
     part: Callable[[Int], NDArray[np.bool_]] | None = None,
 ) -> Left:
     """The lines of all pieces under one model, in units of the noise that `noise` has."""
@@ -241,7 +245,8 @@ def nodes_of(
 class Rows:
     """Lines of all pieces by frequency, each in units of the root of its record's power.
 
-    X : (n, 2 b) what a change on the nodes does. e : (n, q) what the reference leaves.
+    X : (n, 2 b) what a change on the nodes does, (n, 2 b m) of m inputs. e : (n, q) what the
+    reference leaves.
     N : (n, q, m) nuisances of each line's own piece, columns of zeros behind them.
     f : (n,) Hz. k : (n,) numbers of the lines. piece : (n,) which.
     order : (n,) of the lines of all pieces, one after the other, which these are.
@@ -284,14 +289,14 @@ def reduced(
     records: Records,
     response: Response,
     disturbances: Disturbances,
-    loop: tuple[float, int] | None = None,
+    loop: Loops = (),
     part: Callable[[Int], NDArray[np.bool_]] | None = None,
     at: Float | None = None,
 ) -> Reduced:
     """The likelihood of all models near a reference.
 
     disturbances : what each of them makes in all sensors, along frequency.
-    loop : kp and sensor of the loop that `response` has closed. part : which lines of a piece
+    loop : those that `response` has closed. part : which lines of a piece
     count, by their number. at : Hz of the nodes; None for as dense as the reference turns.
     """
     return formed(records, response, disturbances, loop, part, at)[0]
@@ -301,7 +306,7 @@ def formed(
     records: Records,
     response: Response,
     disturbances: Disturbances,
-    loop: tuple[float, int] | None = None,
+    loop: Loops = (),
     part: Callable[[Int], NDArray[np.bool_]] | None = None,
     at: Float | None = None,
 ) -> tuple[Reduced, Rows]:
@@ -425,19 +430,27 @@ def _complex(x: Float) -> Complex:
 
 
 def _columns(records: Records, contour: Contour, nodes: Int) -> list[Complex]:
-    """Of each piece (n_lines, 2 n_nodes); those of one shape are computed together."""
+    """Of each piece (n_lines, 2 n_nodes), of several inputs one beside the other; those of one
+    shape are computed together."""
     out: dict[int, Complex] = {}
     shapes = [
         (p.history, len(p.z), band) for p, band in zip(records.pieces, records.bands, strict=True)
     ]
     for shape in set(shapes):
         own = [i for i, s in enumerate(shapes) if s == shape]
-        X = np.stack([contour.damped(records.pieces[i].r) for i in own])
+        X = [contour.damped(r) for i in own for r in by_input(records.pieces[i].r)]
         lines = records.lines(records.pieces[own[0]])
-        one, turned = columns(contour, X, nodes, *shape[:2], lines.k)
-        for i, a, b in zip(own, one, turned, strict=True):
-            out[i] = np.concatenate([a, b], axis=1)
+        one, turned = columns(contour, np.stack(X), nodes, *shape[:2], lines.k)
+        both = [np.concatenate(ab, axis=1) for ab in zip(one, turned, strict=True)]
+        m = len(both) // len(own)
+        for j, i in enumerate(own):
+            out[i] = both[j] if m == 1 else np.concatenate(both[j * m : (j + 1) * m], axis=1)
     return [out[i] for i in range(len(records.pieces))]
+
+
+def by_input(r: Float) -> Float:
+    """(m, n) of r (n,) or (n, m)."""
+    return r[None] if r.ndim == 1 else r.T
 
 
 def _between(nodes: Int, few: Int) -> Float:
@@ -453,14 +466,31 @@ def _residual(rows: Rows, spare: Float) -> tuple[Complex, Float]:
     """
     n, q = rows.e.shape
     b = len(spare)
-    rows = replace(rows, X=np.concatenate([rows.X[:, :b] @ spare, rows.X[:, b:] @ spare], axis=1))
+    parts = range(0, rows.X.shape[1], b)
+    rows = replace(rows, X=np.concatenate([rows.X[:, i : i + b] @ spare for i in parts], axis=1))
     pieces = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
-    if min(len(on) for on in pieces) < ENOUGH * rows.X.shape[1]:
+    if len(parts) > 2:
+        rows = _excited(rows, pieces, len(parts) // 2)
+    if any(len(on) < ENOUGH * _free(rows.X[on]) for on in pieces):
         pieces, rows = [np.arange(n)], rows.apart()
     left, free = np.zeros((n, q), complex), np.zeros(n)
     for on in pieces:
         left[on], free[on] = _of_piece(rows.take(on))
     return left, free
+
+
+def _excited(rows: Rows, pieces: Sequence[Int], inputs: int) -> Rows:
+    """The same, without what each of several inputs does in a piece in which it rests."""
+    X = rows.X.reshape(len(rows.X), inputs, -1).copy()
+    size = np.array([np.linalg.norm(X[on], axis=(0, 2)) / np.sqrt(len(on)) for on in pieces])
+    for on, rests in zip(pieces, size < RESTS * size.max(axis=0), strict=True):
+        X[np.ix_(on, np.flatnonzero(rests))] = 0.0
+    return replace(rows, X=X.reshape(len(X), -1))
+
+
+def _free(X: Complex) -> int:
+    """Columns that do anything."""
+    return int(np.count_nonzero(np.any(X != 0, axis=0)))
 
 
 def _of_piece(rows: Rows) -> tuple[Complex, Float]:
@@ -498,7 +528,7 @@ class _Form:
 
 def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     """factor, target of `Reduced`, and chi-square of the reference with the best nuisances."""
-    b, q = reference.shape
+    b, q = reference.shape  # q : of each input by itself, where there are several
     L = np.linalg.inv(noise.root(rows.f))
     W = 2 * (L.conj().swapaxes(1, 2) @ L)
     We = (W @ rows.e[:, :, None])[:, :, 0]

@@ -12,7 +12,7 @@ import numpy as np
 
 from samii_rig.likelihood import nuisance, rounding
 from samii_rig.likelihood.contour import Contour
-from samii_rig.likelihood.pieces import Piece
+from samii_rig.likelihood.pieces import Loops, Piece
 from samii_rig.types import Complex, Float, Int
 
 
@@ -20,31 +20,29 @@ from samii_rig.types import Complex, Float, Int
 class Answers:
     """A reference on its contour.
 
-    H : (M//2 + 1, q). loop : kp and sensor of the loop that H has closed. impulse : (m, q) its
-    answer to an impulse of the input.
+    H : (M//2 + 1, q), or (M//2 + 1, q inputs) of several, all inputs of the first sensor first.
+    loops : that H has closed. impulse : (m, q) or (m, q inputs) its answer to an impulse.
     """
 
     H: Complex
     exact: Contour
-    loop: tuple[float, int] | None
+    loops: Loops
+    inputs: int
     impulse: Float
     kept: dict[int, list[Float]] = field(default_factory=dict)
 
     @classmethod
-    def of(
-        cls, H: Complex, exact: Contour, loop: tuple[float, int] | None, longest: int
-    ) -> Answers:
+    def of(cls, H: Complex, exact: Contour, loops: Loops, longest: int, inputs: int = 1) -> Answers:
         """longest : samples of any piece, input before it included."""
-        return cls(H, exact, loop, exact.record(H, min(2 * longest, exact.samples)))
+        return cls(H, exact, loops, inputs, exact.record(H, min(2 * longest, exact.samples)))
 
     def steps(self, n: int) -> list[Float]:
-        """(n, q) what the sensors show of a step of the input, and of the loop's sensor."""
+        """(n, q) what the sensors show of a step of each input, and of each loop's sensor."""
         if n not in self.kept:
-            each = [self.H]
-            if self.loop is not None:
-                kp, entry = self.loop
-                sensed = -kp * self.H
-                sensed[:, entry] += 1
+            each = [self.H[:, j :: self.inputs] for j in range(self.inputs)]
+            for kp, sensor, of in self.loops:
+                sensed = -kp * each[of]
+                sensed[:, sensor] += 1
                 each.append(sensed)
             self.kept[n] = [self.exact.predicted(H, np.ones(n)) for H in each]
         return self.kept[n]
@@ -66,14 +64,14 @@ class Seen:
     def of(cls, piece: Piece, k: Int, answers: Answers, step: Float) -> Seen:
         """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known."""
         n, q = piece.z.shape
-        H, exact, loop = answers.H, answers.exact, answers.loop
+        H, exact = answers.H, answers.exact
         y = exact.predicted(H, piece.r)[piece.history :]
         left = np.fft.rfft(piece.z - y, axis=0)
         own = [nuisance.wander(n, k, q), nuisance.hum(left, k, exact.rate_hz, n)]
         own += [nuisance.past(piece, k, answers.impulse)]
-        own += [nuisance.unread(piece, k, y, H, exact, loop, step)]
+        own += [nuisance.unread(piece, k, y, H, exact, answers.loops, step)]
         own += [nuisance.edges(piece, k, answers.impulse)]
-        own += [nuisance.offsets(piece, k, answers.steps(piece.r.size))]
+        own += [nuisance.offsets(piece, k, answers.steps(len(piece.r)))]
         N = np.concatenate(own, axis=2)
         size = np.linalg.norm(N, axis=(0, 1))
         return cls(

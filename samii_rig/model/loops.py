@@ -66,14 +66,16 @@ class Loops:
 def loops_of(rig: Rig, actuator: str | None = None, kp: float | None = None) -> Loops:
     """The loops of a rig file on `actuator` (its first by default).
 
-    kp : of the centring loop; the rig's own by default. InputError for an unknown actuator.
+    kp : of the centring loop on that actuator; the rig file's by default.
+
+    Raises InputError for an unknown actuator.
     """
     names = [a.name for a in rig.actuator]
     actuator = names[0] if actuator is None else actuator
     if actuator not in names:
         raise InputError(rig.name, "actuator", actuator, f"one of {', '.join(names)}")
     sensors = [s.name for s in rig.sensor]
-    centring = rig.centring
+    centring = rig.centring_of(actuator)
     own = centring.kp if centring else 0.0
     return Loops(
         names.index(actuator),

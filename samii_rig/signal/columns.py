@@ -60,6 +60,8 @@ def shift_of(recording: Recording) -> int:
     """Samples by which what was measured stands behind what was sent; 0 where the law of the loop
     does not tell."""
     centring = centring_of(recording)
+    first = next(iter(recording.names("command")), "")
+    recording = of_input(recording, first)
     names = {c.name: c for c in recording.channels}
     command, references = recording.names("command"), recording.names("reference")
     if centring is None or centring[0] not in names or len(command) != 1 or not references:
@@ -95,6 +97,22 @@ def asked(recording: Recording, command: str, kp: float, rows: slice = slice(Non
     return out
 
 
+def of_input(recording: Recording, command: str) -> Recording:
+    """The same recording, of one input alone: other commands, and references of these, are read
+    beside it. A reference is that of the command that its name ends with."""
+    others = [n for n in recording.names("command") if n != command]
+    if not others:
+        return recording
+    mine = f"_{command}"
+    channels = tuple(
+        c
+        if c.role not in SENT or c.name == command or c.name.endswith(mine)
+        else replace(c, role="monitor")
+        for c in recording.channels
+    )
+    return replace(recording, channels=channels)
+
+
 def proportional(v: Float, w: Float) -> bool:
     """Whether two inputs are one, but for its size."""
     across, powers = float(v @ w), float(v @ v) * float(w @ w)
@@ -122,11 +140,15 @@ def _alike(one: Recording, other: Recording) -> bool:
     if one.names("command") != other.names("command") or not one.names("command"):
         return False
     a, b = _overlap(one, other)
-    name = one.names("command")[0]
-    v, w = one.values[a, one.column(name)], other.values[b, other.column(name)]
-    if v.size <= 2 * FARTHEST or not np.all(np.isfinite(v) & np.isfinite(w)):
+    names = list(one.names("command"))
+    v = one.values[a][:, [one.column(n) for n in names]]
+    w = other.values[b][:, [other.column(n) for n in names]]
+    if len(v) <= 2 * FARTHEST or not np.all(np.isfinite(v) & np.isfinite(w)):
         return False
-    return proportional(v, w)
+    if len(names) > 1:  # each in units of its largest, by which they compare
+        size = np.max(np.abs(np.concatenate([v, w])), axis=0)
+        v, w = (x / np.where(size > 0, size, 1.0) for x in (v, w))
+    return proportional(v.ravel(), w.ravel())
 
 
 def _overlap(one: Recording, other: Recording) -> tuple[slice, slice]:

@@ -9,11 +9,10 @@ import pytest
 from scipy import signal
 
 from samii_rig.diagnose.fit.records import _fitted, _shown
-from samii_rig.errors import EstimateError
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
-from samii_rig.likelihood.pieces import Piece, pieces_of, wiring
+from samii_rig.likelihood.pieces import Input, Piece, Wiring, pieces_of, wiring
 from samii_rig.likelihood.reduce import Records, left_by, reduced
 from samii_rig.likelihood.rounding import of_piece, repeating, within
 from samii_rig.rig.load import load_rig
@@ -288,9 +287,13 @@ def recording(n: int = 2000, level: float = 0.5, repeat: int = 0) -> Recording:
     )
 
 
+def without_loop(wired: Wiring) -> Wiring:
+    return replace(wired, inputs=tuple(Input(x.command) for x in wired.inputs))
+
+
 def test_records_of_proportional_inputs_are_one_with_the_noise_of_one():
     runs = [recording(level=x, repeat=i) for i, x in enumerate((0.5, 0.5, 1.0))]
-    wired = replace(wiring(runs, SAMII), kp=0.0)
+    wired = without_loop(wiring(runs, SAMII))
     (one,) = pieces_of(runs, SAMII, wired)
     assert (len(one.repeats), len(one.contrasts)) == (1, 1)
     power = sum(float(np.sum(r.values[:, 0] ** 2)) for r in runs)
@@ -318,7 +321,7 @@ def test_bursts_in_a_row_are_predicted_however_long_the_rig_rings():
             Segment(f"burst_{i}", "burst", i * n, (i + 1) * n, 1.0, "V", i) for i in range(bursts)
         ),
     )
-    wired = replace(wiring([run], SAMII), kp=0.0)
+    wired = without_loop(wiring([run], SAMII))
     found = pieces_of([run], SAMII, wired)
     assert [(p.moving, len(p.repeats)) for p in found] == [(False, 0), (False, 0), (True, 5)]
     records = Records(tuple(found), RATE, ((0.8, 15.0),) * 3)
@@ -345,8 +348,7 @@ def test_a_gap_and_a_missing_sample_begin_a_piece_that_moves():
     assert [(len(p.z), p.moving) for p in found] == [(700, False), (580, True), (650, True)]
 
 
-def test_a_record_with_two_commands_is_refused_in_one_line_that_names_both():
-    """The second input would otherwise be physics that the model left out."""
+def test_a_record_with_two_commands_has_two_inputs_and_each_has_its_loop():
     rig = load_rig("samii_two_joints")[0]
     one = recording()
     run = replace(
@@ -355,10 +357,8 @@ def test_a_record_with_two_commands_is_refused_in_one_line_that_names_both():
         values=np.column_stack([one.values[:, 0], one.values]),
         quality=np.zeros((len(one), len(one.channels) + 1), np.int64),
     )
-    with pytest.raises(EstimateError, match="have 2 commands, v_2, v_3; expected one") as refused:
-        wiring([run], rig)
-    assert "\n" not in str(refused.value)
-    assert wiring([one], rig).command == "v_2"
+    assert [x.command for x in wiring([run], rig).inputs] == ["v_2", "v_3"]
+    assert wiring([one], rig).only.command == "v_2"
 
 
 def test_the_mains_are_no_mismatch_between_lines_too():

@@ -25,14 +25,23 @@ from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.refit import Fitted, Problem, counted, refit
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.disturbed import Disturbed
-from samii_rig.diagnose.physics.model import Aliases, Grid, Loop, Model, grid
+from samii_rig.diagnose.physics.model import Aliases, Closed, Grid, JointLoops, Loop, Model, grid
 from samii_rig.diagnose.physics.rows import RESONANT
 from samii_rig.diagnose.result import Band, Gap, Used
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.noise import Disturbances
-from samii_rig.likelihood.pieces import Piece, Wiring, joined, pieces_of, wiring
-from samii_rig.likelihood.reduce import CYCLES, Left, Records, Reduced, Response, left_by, reduced
+from samii_rig.likelihood.pieces import Loops, Piece, Wiring, joined, pieces_of, wiring
+from samii_rig.likelihood.reduce import (
+    CYCLES,
+    Left,
+    Records,
+    Reduced,
+    Response,
+    by_input,
+    left_by,
+    reduced,
+)
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned
@@ -47,6 +56,7 @@ GOLDEN = (5**0.5 - 1) / 2
 # Of the largest, an input's energy in a third of an octave that excites: steps through frequencies,
 # of as many periods each, and steps of the input have that over 2.5 decades.
 EXCITED, PARTS = 0.003, 3
+METER = 9.0  # times a converter's rounding, power of an input that is more than that
 HARMONIC = 3  # the lowest that a force makes which is alike both ways
 # Lines to which harmonics may add: a quadratic form of so many takes 5 s of a core. Many records
 # show a force at the lines of their excitation too.
@@ -101,7 +111,9 @@ class Whole:
         steps = {s.name: s.resolution for s in rig.sensor}
         step = tuple(steps[n] for n in wired.sensors)
         (rate,) = {run.rate_hz for run in runs}
-        all_, apart = (_records(p, rate, band, step) for p in (joined(levels), levels))
+        finest = {a.name: a.resolution for a in rig.actuator}
+        rounding = np.array([finest[x.command] ** 2 / 12 for x in wired.inputs])
+        all_, apart = (_records(p, rate, band, step, rounding) for p in (joined(levels), levels))
         return cls(rig, all_, wired, tuple(without.items()), apart, band is not None)
 
     @property
@@ -130,20 +142,27 @@ class Whole:
         return np.array([names.index(n) for n in self.wired.sensors], np.int64)
 
     @property
-    def loop(self) -> Loop | None:
-        """The loop around the sensors."""
-        if not self.wired.kp:
+    def loop(self) -> Closed | None:
+        """The loops around the sensors."""
+        if not self._loop:
             return None
-        return Loop(self.wired.kp, self.wired.sensors.index(self.wired.centring))
+        if len(self.wired.inputs) == 1:
+            return Loop(*self._loop[0][:2])
+        gain = np.zeros((len(self.wired.inputs), self.sensor.size))
+        for kp, sensor, of in self._loop:
+            gain[of, sensor] = kp
+        return JointLoops(gain)
 
     @property
-    def _loop(self) -> tuple[float, int] | None:
-        return (self.loop.kp, self.loop.entry) if self.loop else None
+    def _loop(self) -> Loops:
+        return self.wired.loops
 
     def grid(self, frequency: Float, sigma: float, fitted: Fitted) -> Grid:
         """The grid beside the imaginary axis, with the aliases of a fit."""
         names = [a.name for a in self.rig.actuator]
-        actuator = np.full(self.sensor.size, names.index(self.wired.command))
+        acting = np.array([names.index(x.command) for x in self.wired.inputs], np.int64)
+        sensor = np.repeat(self.sensor, acting.size)
+        actuator = np.tile(acting, self.sensor.size)
         model = fitted.model
 
         def aliases(chain: Chain, few: Float) -> Aliases:
@@ -151,12 +170,12 @@ class Whole:
             if key not in self._aliases:
                 if len(self._aliases) == ALIASES:
                     self._aliases.clear()
-                made = Aliases.of(self.rig, chain, few, self.sensor, actuator)
+                made = Aliases.of(self.rig, chain, few, sensor, actuator)
                 self._aliases[key] = model, made
             return self._aliases[key][1]
 
         chain = model.plain(fitted.x)
-        return grid(self.rig, frequency, self.sensor, actuator, chain, sigma, self.loop, aliases)
+        return grid(self.rig, frequency, sensor, actuator, chain, sigma, self.loop, aliases)
 
     @cached_property
     def _aliases(self) -> dict[tuple[int, bytes, bytes], tuple[Model, Aliases]]:
@@ -230,23 +249,37 @@ def _records(
     rate_hz: float,
     band: tuple[float, float] | None,
     step: tuple[float, ...],
+    rounding: Float,
 ) -> Records:
-    """Those that anything drives."""
-    driven = [(p, b) for p, b in zip(pieces, excited(pieces, rate_hz), strict=True) if b]
+    """Those that anything drives. rounding : (m,) of each input's converter, its power."""
+    bands_of = excited(pieces, rate_hz, rounding)
+    driven = [(p, b) for p, b in zip(pieces, bands_of, strict=True) if b]
     if not driven:
         raise EstimateError("nothing drives the rig for five cycles of any line")
     bands = tuple(band or b for _, b in driven)
     return Records(tuple(p for p, _ in driven), rate_hz, bands, step)
 
 
-def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float] | None]:
-    """Hz, of each piece the band in which its input has more than a small part of the largest
-    energy of all; None for one that nothing drives: what is left of a sweep behind a gap."""
-    each = [_energy(p, rate_hz) for p in pieces]
-    least = EXCITED * max(float(np.max(energy)) for _, energy in each)
+def excited(
+    pieces: Sequence[Piece], rate_hz: float, rounding: Float | None = None
+) -> list[tuple[float, float] | None]:
+    """Hz, of each piece the band in which an input has more than a small part of its largest
+    energy in any; None for one that nothing drives: what is left of a sweep behind a gap.
+
+    rounding : (m,) of several inputs the power of each one's converter; one that never has more is
+    at rest.
+    """
+    each = [[_energy(r, rate_hz) for r in by_input(p.r)] for p in pieces]
+    most = np.max([[np.max(power) for _, power, _ in inputs] for inputs in each], axis=0)
+    still = np.zeros(most.size) if rounding is None or most.size == 1 else METER * rounding
     out: list[tuple[float, float] | None] = []
-    for piece, (edges, energy) in zip(pieces, each, strict=True):
-        on = np.flatnonzero(energy > least)
+    for piece, inputs in zip(pieces, each, strict=True):
+        edges = inputs[0][0]
+        over = [
+            (energy > EXCITED * top) & (energy > floor * lines)
+            for (_, energy, lines), top, floor in zip(inputs, most, still, strict=True)
+        ]
+        on = np.flatnonzero(np.any(over, axis=0))
         if not on.size:
             out.append(None)
             continue
@@ -256,14 +289,16 @@ def excited(pieces: Sequence[Piece], rate_hz: float) -> list[tuple[float, float]
     return out
 
 
-def _energy(piece: Piece, rate_hz: float) -> tuple[Float, Float]:
-    """Hz of the edges (m + 1,) of parts of an octave, and the input's energy (m,) in each."""
-    power = np.abs(np.fft.rfft(piece.r)) ** 2 / piece.r.size
-    f = np.arange(power.size) * (rate_hz / piece.r.size)
+def _energy(r: Float, rate_hz: float) -> tuple[Float, Float, Float]:
+    """Hz of the edges (m + 1,) of parts of an octave, an input's energy (m,) in each, and how many
+    lines it has."""
+    power = np.abs(np.fft.rfft(r)) ** 2 / r.size
+    f = np.arange(power.size) * (rate_hz / r.size)
     # The offset's line, and the one that it leaks to, are no excitation.
     part = np.floor(PARTS * np.log2(f[2:] / f[2])).astype(np.int64)
     edges = f[2] * 2 ** (np.arange(part[-1] + 2) / PARTS)
-    return np.asarray(edges), np.asarray(np.bincount(part, power[2:]), np.float64)
+    energy = np.asarray(np.bincount(part, power[2:]), np.float64)
+    return np.asarray(edges), energy, np.asarray(np.bincount(part), np.float64)
 
 
 def _named_in(messages: Sequence[str], places: Iterable[str]) -> dict[str, str]:

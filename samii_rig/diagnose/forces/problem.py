@@ -60,8 +60,8 @@ class Moved:
                     j = wired.sensors.index(name)
                     y[:, j] = contour.record(contour.damped(y[:, j]) * F, len(y))
                 r = np.zeros(piece.r.size)
-                if wired.kp:
-                    r -= wired.kp * y[:, wired.sensors.index(wired.centring)]
+                for kp, sensor, _ in wired.loops:
+                    r -= kp * y[:, sensor]
                 own.append(Samples(r, y[piece.history :]))
             out.append(own)
         return out

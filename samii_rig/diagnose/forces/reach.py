@@ -180,11 +180,8 @@ class Reach:
             H = G[:, on, self.actuator] * seen * hold[:, None]
             own = len(rig.actuator) if place.own_input else self.actuator
             by_force = H if told else G[:, on, own] * seen
-            if wired.kp:
-                c = wired.sensors.index(wired.centring)
-                by_force = (
-                    by_force - H * (wired.kp * by_force[:, c] / (1 + wired.kp * H[:, c]))[:, None]
-                )
+            for kp, c, _ in wired.loops:
+                by_force = by_force - H * (kp * by_force[:, c] / (1 + kp * H[:, c]))[:, None]
             sensors.append(by_force)
             if told:
                 continue

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.diagnose.physics import insert
-from samii_rig.diagnose.physics.model import Loop, Model
+from samii_rig.diagnose.physics.model import Closed, Model
 from samii_rig.model.sampled import sensor_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import (
@@ -72,9 +72,9 @@ class Disturbed:
         chain = chain.with_values({k: v for k, v in model.values(x).items() if k in known})
         return cls(chain, rig, sensor, len(rig.actuator), tuple(pairs))
 
-    def response(self, f: Float, H: Complex, loop: Loop | None) -> Complex:
-        """(n, q, K) at f (n,) Hz, the sensors' own noises first. H : (n, q) from the input, the
-        loop closed."""
+    def response(self, f: Float, H: Complex, loop: Closed | None) -> Complex:
+        """(n, q, K) at f (n,) Hz, the sensors' own noises first. H : (n, q) from the input, or
+        (n, q m) from m of them, the loop closed."""
         G = self.chain.response(f)[:, self.sensor, self.first :]
         across = [G[:, :, j] - G[:, :, i] for i, j in self.pairs]
         G = np.concatenate([G, *(one[:, :, None] for one in across)], axis=2)
@@ -84,8 +84,8 @@ class Disturbed:
         every = np.concatenate([own, G], axis=2)
         if loop is not None:
             # Whatever the loop's sensor shows goes round it.
-            every = every - loop.kp * H[:, :, None] * every[:, loop.entry, None, :]
-        return np.concatenate([every, H[:, :, None]], axis=2)
+            every = loop.around(H, every)
+        return np.concatenate([every, H.reshape(f.size, q, -1)], axis=2)
 
 
 def _across(element: Element) -> type | None:

@@ -49,6 +49,61 @@ class Loop:
         back = self.kp * dH[:, self.entry, None, :] * self.closed(H)[:, :, None]
         return np.asarray(sensitivity[:, None, None] * (dH - back))
 
+    def around(self, H: Complex, every: Complex) -> Complex:
+        """(n, q, K) what the sensors show of every (n, q, K) that they would show without a loop.
+        H : (n, q), closed."""
+        return np.asarray(every - self.kp * H[:, :, None] * every[:, self.entry, None, :])
+
+
+@dataclass(frozen=True, slots=True)
+class JointLoops:
+    """Proportional loops of a device of m inputs, v_j = r_j - kp_j y_i, closed around the rig.
+
+    Entries (n, q m) are those of all inputs to the first sensor, then to the next. gain : (m, q)
+    K with v = r - K y, so that H becomes H S with S = (I + K H)^-1.
+    """
+
+    gain: Float
+
+    def _apart(self, H: Complex) -> Complex:
+        """(n, q, m, ...) of entries (n, q m, ...)."""
+        m, q = self.gain.shape
+        return H.reshape(len(H), q, m, *H.shape[2:])
+
+    def _sensitivity(self, H: Complex) -> Complex:
+        """S (n, m, m) of H (n, q, m), open."""
+        return np.asarray(np.linalg.inv(np.eye(len(self.gain)) + self.gain @ H))
+
+    def part(self, H: Complex, b: Complex) -> tuple[Complex, Complex]:
+        """As of `Loop`. A part is of rank one, B = u w^T. By Sherman and Morrison H + B x becomes,
+        closed, H S + (I - H S K) B S x/(1 + tr(S K B) x)."""
+        G, B = self._apart(H), self._apart(b)
+        S = self._sensitivity(G)
+        BS = B @ S
+        turned = BS - G @ S @ (self.gain @ BS)
+        c = -np.trace(S @ (self.gain @ B), axis1=1, axis2=2)
+        return np.asarray(turned.reshape(b.shape)), np.asarray(c)
+
+    def closed(self, H: Complex) -> Complex:
+        """(n, q m) to the references from those to the commands."""
+        G = self._apart(H)
+        return np.asarray((G @ self._sensitivity(G)).reshape(H.shape))
+
+    def slopes(self, H: Complex, dH: Complex) -> Complex:
+        """(n, q m, k) derivatives of `closed`: (I - H S K) dH S."""
+        G = self._apart(H)
+        S = self._sensitivity(G)
+        own = np.moveaxis(self._apart(dH), 3, 1) @ S[:, None]
+        out = own - (G @ S)[:, None] @ (self.gain @ own)
+        return np.asarray(np.moveaxis(out, 1, 3).reshape(dH.shape))
+
+    def around(self, H: Complex, every: Complex) -> Complex:
+        """As of `Loop`: (I + H K)^-1 = I - H S K."""
+        return np.asarray(every - self._apart(H) @ (self.gain @ every))
+
+
+Closed = Loop | JointLoops
+
 
 @dataclass(frozen=True, slots=True)
 class Grid:
@@ -56,7 +111,7 @@ class Grid:
 
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
     folded : (order, n, q) of these the ones of `NEAR`, or none. rate_hz : of the samples.
-    sensor, actuator : (q,) entries. loop : closed around them, if responses are to the reference.
+    sensor, actuator : (q,) entries. loop : closed around them, if responses are to the references.
     sigma : of all, or (n,) of each.
     """
 
@@ -68,7 +123,7 @@ class Grid:
     sensor: Int
     actuator: Int
     sigma: float | Float = field(default=0.0, kw_only=True)
-    loop: Loop | None = field(default=None, kw_only=True)
+    loop: Closed | None = field(default=None, kw_only=True)
 
     @property
     def changed(self) -> slice:
@@ -147,7 +202,7 @@ def grid(
     actuator: Int,
     chain: Chain | None = None,
     sigma: float = 0.0,
-    loop: Loop | None = None,
+    loop: Closed | None = None,
     aliases: Callable[[Chain, Float], Aliases] | None = None,
 ) -> Grid:
     """The grid of a rig at sorted frequencies, Hz. chain : whose aliases these are, if they are

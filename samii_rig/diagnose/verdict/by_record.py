@@ -18,6 +18,10 @@ SPENT = (
     "not every force that may act was computed to the end, as the records are long; fewer of them "
     "or a narrower band would let it"
 )
+SEVERAL = (
+    "friction, play, hardening and the like were not looked for, as the recordings have {} inputs "
+    "({}); recordings of one of them alone would show these"
+)
 MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 
 
@@ -52,6 +56,7 @@ def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosi
         looked = _looked(forced)
         if forced.spent:
             looked = replace(looked, said=(*looked.said, SPENT))
+    looked = replace(looked, said=(*looked.said, *_unasked(search)))
     return _answer(case, forced or search, first, bands, looked)
 
 
@@ -65,7 +70,9 @@ def by_samples(
     """The answer, once all linear explanations of the records were tried. first, bands : what the
     refitted nominal model left before, in all and by band."""
     progress("what cannot be told apart")
-    return _answer(case, search, first, bands, _consistent(search, _looked(search)))
+    looked = _consistent(search, _looked(search))
+    looked = replace(looked, said=(*looked.said, *_unasked(search)))
+    return _answer(case, search, first, bands, looked)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +125,21 @@ def _answer(
 
 
 def forces_on(search: RecordSearch) -> ForceSearch | None:
-    """The search among forces, where one explains the records best; None where none does, or where
-    the rig has no partial fractions in which it could be computed."""
+    """The search among forces, where one explains the records best; None where none does, where
+    the rig has no partial fractions in which it could be computed, or where it has several
+    inputs."""
+    if len(search.whole.wired.inputs) > 1:
+        return None
     try:
         return compete_on_records(search)
     except SamiiRigError:
         return None
+
+
+def _unasked(search: RecordSearch) -> tuple[str, ...]:
+    """In words what was not looked for."""
+    names = [x.command for x in search.whole.wired.inputs]
+    return (SEVERAL.format(len(names), ", ".join(names)),) if len(names) > 1 else ()
 
 
 def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
