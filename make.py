@@ -138,14 +138,20 @@ def check(arguments: list[str]) -> None:
 
 
 def tests(arguments: list[str]) -> None:
-    """All tests: those in real time first, one after another and nothing beside them."""
+    """All tests: those in real time first, one after another and nothing beside them.
+
+    What failed of them is tried once more, and told: another program on this machine may have had
+    the cores for longer than a device waits.
+    """
     cores = min(os.cpu_count() or 1, 4)
     pytest: list[str | Path] = [BIN / "pytest", "-q", "--durations=10"]
     workers = ["-n", str(cores), "--dist", "worksteal"]  # neighbours stay together: one fixture
     if arguments:
         call(*pytest, *workers, *arguments)
         return
-    call(*pytest, "-m", "real_time and not slow")
+    if run(*pytest, "-m", "real_time and not slow"):
+        say("what failed in real time is tried once more, alone")
+        call(*pytest, "--last-failed", "-m", "real_time and not slow")
     call(*pytest, *workers, "-m", "not real_time and not slow")
 
 

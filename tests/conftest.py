@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from witness_kit import LATE, Witness
 
 # Of tests side by side each has one thread for linear algebra: matrices are small, and threads that
 # wait for each other on a busy machine take thirty times as long. Read when numpy is imported.
@@ -30,9 +29,6 @@ LONG = {
     "test_diagnose_records.py",
     "test_diagnose_forces.py",
 }
-# Share of the tests in real time that may go without a verdict because the machine was late.
-# Of one test or ten a share would say nothing, so of fewer than MANY it is that of MANY.
-UNJUDGED, MANY = 0.05, 40
 # How long an example takes is the machine's affair. The examples are the same in every run, so that
 # a change is judged by what it changed; HYPOTHESIS_PROFILE=explore draws new ones.
 settings.register_profile("same", deadline=None, derandomize=True)
@@ -65,80 +61,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
     """A device in real time, its host and its test come before the rest of the machine's work, as
     they would at a bench. Processes that the test starts inherit it."""
-    if not _in_real_time(item):
+    if item.get_closest_marker("real_time") is None or sys.platform == "win32":
         return (yield)
     with _one_at_a_time(), _first():
-        _late(item)
-        item.stash[LATEST] = 0.0
         return (yield)
-
-
-def _in_real_time(item: pytest.Item) -> bool:
-    return item.get_closest_marker("real_time") is not None and sys.platform != "win32"
-
-
-# A test in real time has a verdict if the machine was in time itself, which is measured beside it.
-# Counted in one process, as make.py runs them; under xdist each worker counts its own.
-
-WITNESS, LATEST = pytest.StashKey[Witness](), pytest.StashKey[float]()
-ASKED, WITHOUT = pytest.StashKey[set[str]](), pytest.StashKey[dict[str, float]]()
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    config.stash[ASKED], config.stash[WITHOUT] = set(), {}
-
-
-def _late(item: pytest.Item) -> float:
-    """The machine's worst since the test began, s."""
-    stash = item.config.stash
-    if WITNESS not in stash:
-        stash[WITNESS] = Witness()
-    item.stash[LATEST] = max(item.stash.get(LATEST, 0.0), stash[WITNESS].late())
-    return item.stash[LATEST]
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
-    """A failure while the machine was later than a device waits is none of the test."""
-    report = yield
-    if not _in_real_time(item):
-        return report
-    item.config.stash[ASKED].add(item.nodeid)
-    if report.failed and (late := _late(item)) > LATE:
-        item.config.stash[WITHOUT][item.nodeid] = late
-        report.sections.append(("what failed", report.longreprtext))
-        report.outcome = "skipped"
-        reason = f"no verdict: the machine was late by {late * 1e3:.0f} ms"
-        report.longrepr = (*item.reportinfo()[:1], item.reportinfo()[1], reason)
-    return report
-
-
-def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Too many without a verdict are a failure: nothing would be said about the project."""
-    stash = session.config.stash
-    if WITNESS in stash:
-        stash[WITNESS].close()
-    if len(stash[WITHOUT]) > UNJUDGED * max(len(stash[ASKED]), MANY):
-        session.exitstatus = pytest.ExitCode.TESTS_FAILED
-
-
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Which tests had no verdict, how late the machine was, and what they would have said."""
-    config = terminalreporter.config
-    without, asked = config.stash[WITHOUT], len(config.stash[ASKED])
-    if not without:
-        return
-    terminalreporter.section("without a verdict: the machine was late", "=", yellow=True)
-    for report in terminalreporter.stats.get("skipped", []):
-        if report.nodeid in without:
-            terminalreporter.write_line(f"{without[report.nodeid] * 1e3:4.0f} ms  {report.nodeid}")
-            told = dict(report.sections).get("what failed", "").splitlines()
-            for line in [x for x in told if x.startswith("E ")][:3]:
-                terminalreporter.write_line(f"         {line[1:].strip()}")
-    allowed = UNJUDGED * max(asked, MANY)
-    terminalreporter.write_line(
-        f"{len(without)} of {asked} in real time; allowed {allowed:.0f}, more are a failure"
-    )
 
 
 @contextmanager
@@ -147,7 +73,6 @@ def _first() -> Iterator[None]:
     if not hasattr(os, "sched_setscheduler"):  # macOS
         yield
         return
-    gc.freeze()  # a run that ended in this process has put all back
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))

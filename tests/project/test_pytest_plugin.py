@@ -80,6 +80,7 @@ def _modules(done: Done) -> set[str]:
 # The page
 
 
+@pytest.mark.real_time
 def test_the_project_of_the_page_passes_by_the_commands_of_its_workflow_and_container(tmp_path):
     steps = yaml.safe_load(FILES["rig.yml"])["jobs"]["simulated"]["steps"]
     install, test = [step["run"] for step in steps if "run" in step]
@@ -88,21 +89,12 @@ def test_the_project_of_the_page_passes_by_the_commands_of_its_workflow_and_cont
     assert run.endswith("pip install --no-cache-dir samii-rig pytest")
     assert json.loads(start) == test.split() == ["python", "-m", "pytest"]
     project(tmp_path, **{"bench.toml": load_rig("samii")[1]})
-    in_process = ("test_sweep.py", "test_faults.py", "--deselect", f"test_faults.py::{ON_THE_WIRE}")
-    passed(pytest_in(tmp_path, *in_process, "--basetemp=kept"), 2)
+    passed(pytest_in(tmp_path, "test_sweep.py", "test_faults.py", "--basetemp=kept"), 3)
     (tmp_path / "recordings").mkdir()
     completed = min((tmp_path / "kept").rglob("*.mcap"))
     shutil.copy(completed, tmp_path / "recordings" / "last_month.mcap")
     passed(pytest_in(tmp_path, "test_recordings.py"), 1)
     assert {*FILES} == {p.name for p in tmp_path.iterdir() if p.is_file()} - {"bench.toml"}
-
-
-ON_THE_WIRE = "test_a_pulled_cable_ends_the_run"
-
-
-@pytest.mark.real_time
-def test_the_pages_run_on_the_wire_ends_when_the_cable_is_pulled(tmp_path):
-    passed(pytest_in(project(tmp_path), f"test_faults.py::{ON_THE_WIRE}"), 1)
 
 
 SERIAL = {"port": "/dev/ttyACM0", "output_counts_per_unit": 3276.8}
