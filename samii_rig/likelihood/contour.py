@@ -75,6 +75,10 @@ class Contour:
         by_input = H.reshape(len(H), -1, r.shape[1]) @ self.damped(r)[:, :, None]
         return self.record(by_input[:, :, 0], len(r))
 
+    def rounding(self, n: int) -> float:
+        """Of the largest, what double precision is off at the n-th sample."""
+        return float(np.finfo(np.float64).eps * np.exp(self.sigma / self.rate_hz * n))
+
     def _decay(self, n: int, axes: int) -> Float:
         decay = np.exp(-self.sigma / self.rate_hz * np.arange(n))
         return np.asarray(decay.reshape((n,) + (1,) * (axes - 1)), np.float64)

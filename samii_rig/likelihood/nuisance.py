@@ -23,6 +23,7 @@ WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
 AN_OCTAVE, BEHIND = 3.0, 1.0
 UNREAD = 6  # parts in which what is hardly read has a factor of its own
 NEW = 1e-5  # of the largest, a direction in which past inputs still differ
+ROUNDS = 100.0  # over rounding alone, what a response on the contour is off; a mode's 35
 # Hz of the mains in any country, how far they stray (EN 50160: 1 % for 99.5 % of a year), and their
 # multiples that a rectifier or a motor drive makes of them.
 MAINS, STRAY, MULTIPLES = (50.0, 60.0), 0.01, (1, 2, 3)
@@ -144,11 +145,12 @@ def unread(
     return np.stack(out, axis=2) if out else np.zeros((k.size, q, 0), complex)
 
 
-def past(piece: Piece, k: Int, impulse: Float) -> Complex:
+def past(piece: Piece, k: Int, impulse: Float, contour: Contour) -> Complex:
     """(n_lines, q, m) of motion from before the first input that is known: answers to inputs that
     acted then.
 
-    impulse : (m, q) answer to an impulse of the input; (m, q inputs) of several.
+    impulse : (m, q) answer to an impulse of the input; (m, q inputs) of several; from a response
+    on the contour, so that rounding in it grows with time.
     """
     known = piece.history + len(piece.z)
     longest = min(len(piece.z), len(impulse) - known)
@@ -156,9 +158,13 @@ def past(piece: Piece, k: Int, impulse: Float) -> Complex:
     lags = np.unique(np.rint(2 ** np.arange(0, np.log2(longest), 1 / dense)).astype(np.int64))
     spectra = []
     for lag in lags:
+        off = ROUNDS * contour.rounding(int(lag) + known)
         for j in range(piece.inputs):
-            y = impulse[lag + piece.history : lag + known, j :: piece.inputs]
-            spectra.append(np.fft.rfft(y, axis=0)[k])
+            of = impulse[:, j :: piece.inputs]
+            y = of[lag + piece.history : lag + known]
+            # Of what has died out rounding alone would be left, in directions that nothing moves.
+            if lag == 1 or NEW * np.max(np.abs(y)) > off * np.max(np.abs(of)):
+                spectra.append(np.fft.rfft(y, axis=0)[k])
     return _independent(np.stack(spectra, axis=2))
 
 

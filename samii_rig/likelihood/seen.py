@@ -68,7 +68,7 @@ class Seen:
         y = exact.predicted(H, piece.r)[piece.history :]
         left = np.fft.rfft(piece.z - y, axis=0)
         own = [nuisance.wander(n, k, q), nuisance.hum(left, k, exact.rate_hz, n)]
-        own += [nuisance.past(piece, k, answers.impulse)]
+        own += [nuisance.past(piece, k, answers.impulse, exact)]
         own += [nuisance.unread(piece, k, y, H, exact, answers.loops, step)]
         own += [nuisance.edges(piece, k, answers.impulse)]
         own += [nuisance.offsets(piece, k, answers.steps(len(piece.r)))]

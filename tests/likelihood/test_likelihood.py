@@ -9,6 +9,7 @@ import pytest
 from scipy import signal
 
 from samii_rig.diagnose.fit.records import _fitted, _shown
+from samii_rig.likelihood import nuisance
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
@@ -117,6 +118,17 @@ def test_of_a_shifted_mode_nearly_all_sigma_is_kept_in_a_cut_record(off: float):
         there = from_rest(u, poles()) - from_rest(u, poles(4.0 * off))
         kept.append((before - after) / (np.sum(there**2) / sd**2))
     assert 0.81 < np.mean(kept) < 1.15  # of chi-square: 0.9 of sigma, and no more than there is
+
+
+@pytest.mark.parametrize("damping", [0.02, 0.05, 0.2])
+def test_a_past_of_one_mode_has_its_two_states_however_long_it_rings(damping: float):
+    """Where the mode has died out, rounding of the contour is left: it is no past."""
+    exact = Contour.over(3000, RATE, EXACT)
+    H = response(exact.s, poles(4.0, damping))
+    u = np.zeros(3000)
+    one = piece(u, np.zeros((3000, H.shape[1])))
+    found = nuisance.past(one, np.arange(12, 225), exact.record(H, exact.samples), exact)
+    assert found.shape[2] == 2
 
 
 def test_an_offset_and_a_slow_wander_of_a_sensor_are_no_mismatch():
