@@ -19,6 +19,9 @@ from samii_rig.types import Float, Quality, Recording, Segment
 
 SPOILT = Quality.MISSING | Quality.CLIPPED | Quality.STALE
 LEAST_SAMPLES = 256  # fewer say nothing of a structure
+# Samples of a piece: a longer stretch is several, so that work grows as its length does. A minute
+# at 1 kHz, in which all that rings comes to rest or is well told.
+LONGEST = 2**16
 
 
 Loops = tuple[tuple[float, int, int], ...]
@@ -257,21 +260,24 @@ def _cut(
     ends = np.unique(np.concatenate([jumps, np.flatnonzero(np.diff(whole.astype(np.int8))) + 1]))
     out = []
     for start, stop in pairwise([0, *ends.tolist(), len(r)]):
-        low, high = max(start, int(a)), min(stop, int(b))
-        if high - low < LEAST_SAMPLES or not whole[low]:
+        first, last = max(start, int(a)), min(stop, int(b))
+        if last - first < LEAST_SAMPLES or not whole[first]:
             continue
-        history = min(low - start, high - low)
-        # Whatever came before the history may still ring.
-        moving = low > history
-        name = recording.place(segment)
-        part = r[low - history : high]
-        level = (segment.level, segment.unit)
-        told = Command(v[low - history : high].copy(), 1.0)
-        z, struck = spikes.mended(values[low:high], step)
-        piece = Piece(name, part, z, history, (level,), moving, commands=(told,))
-        own = edges[low - history : high].reshape(high - low + history, -1)
-        at = tuple((int(i), int(j)) for i, j in np.argwhere(own))
-        out.append(replace(piece, struck=tuple(struck.tolist()), edges=at))
+        parts = -(-(last - first) // LONGEST)
+        cuts = np.linspace(first, last, parts + 1).astype(np.int64).tolist()
+        for low, high in pairwise(cuts):
+            history = min(low - start, high - low)
+            # Whatever came before the history may still ring.
+            moving = low > history
+            name = recording.place(segment)
+            part = r[low - history : high]
+            level = (segment.level, segment.unit)
+            told = Command(v[low - history : high].copy(), 1.0)
+            z, struck = spikes.mended(values[low:high], step)
+            piece = Piece(name, part, z, history, (level,), moving, commands=(told,))
+            own = edges[low - history : high].reshape(high - low + history, -1)
+            at = tuple((int(i), int(j)) for i, j in np.argwhere(own))
+            out.append(replace(piece, struck=tuple(struck.tolist()), edges=at))
     return out
 
 

@@ -122,7 +122,8 @@ class Records:
 
     bands : Hz, of the lines of each that take part. steps : of each sensor's converter, none where
     they are not known. least : samples for which the contours are long
-    enough at least, so that those of other records are the same.
+    enough at least, so that those of other records are the same. driven : Hz up to which the
+        input is more than noise, so that a change of the response shows.
     """
 
     pieces: tuple[Piece, ...]
@@ -130,6 +131,13 @@ class Records:
     bands: tuple[tuple[float, float], ...]
     steps: tuple[float, ...] = ()
     least: int = 0
+    driven: float = np.inf
+
+    @property
+    def changing(self) -> tuple[float, float]:
+        """Hz between which a change of the response shows."""
+        low, high = self.band
+        return low, min(high, self.driven)
 
     @property
     def band(self) -> tuple[float, float]:
@@ -316,12 +324,14 @@ def formed(
     inside = (smooth.frequency > records.band[0]) & (smooth.frequency < records.band[1])
     shape = S / np.median(np.abs(S[inside]), axis=0)
     if at is None:
-        nodes = nodes_of(smooth, shape, records.band)
+        nodes = nodes_of(smooth, shape, records.changing)
     else:
         nodes = np.rint(at * (smooth.samples / smooth.rate_hz)).astype(np.int64)
     seen = records.seen(H, loop)
     rows = _rows(records, _columns(records, smooth, nodes), seen)
-    left, free = _residual(rows, _between(nodes, nodes_of(smooth, shape, records.band, spare=True)))
+    left, free = _residual(
+        rows, _between(nodes, nodes_of(smooth, shape, records.changing, spare=True))
+    )
     power = Noise.of(
         *_with_repeats(records, H, seen, rows.f, left, free),
         disturbances=disturbances,

@@ -133,7 +133,7 @@ class Whole:
         records, most = self.records, HIGHEST * self.records.rate_hz
         times = min(float(HARMONIC), max(MOST_LINES / records.count, 1.0))
         bands = tuple((low, min(times * high, most)) for low, high in records.bands)
-        return replace(self, records=replace(records, bands=bands))
+        return replace(self, records=replace(records, bands=bands, driven=records.band[1]))
 
     @property
     def sensor(self) -> Int:

@@ -113,11 +113,14 @@ class ForceSearch(RecordSearch):
         """Refit what promises most, and all that may compete again about the best of it, until
         that stands still. Whether it has a force."""
         first = next((e for e in self.ranked() if len(e.effects) == 1), None)
-        hopes = self.hopes(self.nominal if first is None else first)
         ahead = 0.0 if first is None else self.nominal.fitted.cost - first.fitted.cost
+        # Without what is wrong with the data itself nothing can be seen of a force beside it.
+        mistaken = first is not None and not any(e.physical for e in first.effects)
+        both = [self.nominal] if first is None or mistaken else [self.nominal, first]
+        hopes = self.hopes(both)
         self._try([h for h in hopes if h.own[0] >= STRONG * ahead], self.nominal, 0)
         if first is not None:
-            self._try(hopes, first, -1)
+            self._try(self.hopes([first]) if mistaken else hopes, first, -1)
         self.temper()
         for _ in range(AGAIN):
             best = self.ranked()[0]
@@ -212,18 +215,16 @@ class ForceSearch(RecordSearch):
         """Whether the best explanation leaves no more than noise."""
         return self.ratio(self.ranked()[0].fitted) < threshold(self.spread)
 
-    def hopes(self, other: Explanation) -> list[Hope]:
-        """Every force that may explain as much as an effect must beside the nominal parameters, or
-        beside another explanation, with what it gains beside both."""
-        nominal = self.nominal
-        bases = {e.key: e for e in (nominal, other)}.values()
+    def hopes(self, bases: Sequence[Explanation]) -> list[Hope]:
+        """Every force that may explain as much as an effect must beside the first of some
+        explanations, or beside the last, with what it gains beside each."""
         screens = tuple(Screen.of(self._force_problem, e.fitted) for e in bases)
         looks = Looks(self._force_problem, screens)
         hopes = weakly(self.forces, self.reach, looks)
         most = max((float(np.max(h.may)) for h in hopes), default=0.0)
         some = [h for h in hopes if self._matters(h, most)][:MARCHED]
-        found = [self._closer(h, looks, nominal) for h in some]
-        # Beside the nominal parameters alone it must do as much as a linear effect did.
+        found = [self._closer(h, looks, bases[0]) for h in some]
+        # Beside the first it must do as much as what the last has more did.
         ahead = screens[0].base.cost - min(look.base.cost for look in screens)
         return [
             h
@@ -235,10 +236,10 @@ class ForceSearch(RecordSearch):
         may = float(np.max(hope.may))
         return may > max((WEAK if hope.weak else STRONG) * self.worth, LESS * most)
 
-    def _closer(self, hope: Hope, looks: Looks, nominal: Explanation) -> Hope | None:
+    def _closer(self, hope: Hope, looks: Looks, base: Explanation) -> Hope | None:
         """The same, computed in time where the first order leads, and closer to its best."""
-        effect, old = hope.effect, nominal.fitted
-        model = self.model((effect,))
+        effect, old = hope.effect, base.fitted
+        model = self.model((*base.effects, effect))
         assert effect.quasi is not None
         if not isinstance(model, ForceModel):
             return None
