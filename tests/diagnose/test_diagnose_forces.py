@@ -61,6 +61,18 @@ def test_a_hardening_joint_is_named_from_one_sweep_that_ends_with_its_record(tmp
     assert found.with_causes[0] < found.threshold < found.nominal[0]
 
 
+def test_a_force_is_named_beside_a_column_that_stands_late(tmp_path: Path):
+    """The column alone is a hundred times what the force is, and no place for it."""
+    (run,) = cut_sweeps(tmp_path, f"cubic_stiffness joint_1 k3={HARD / 2:g}", design=ONE)
+    values, late = run.values.copy(), run.column("a_2")
+    values[:, late] = np.roll(values[:, late], 1)
+    few = [e for e in table(SAMII, 0.5, 20.0) if e.physics in (*FEW, "column_shifted")]
+    runs = [replace(run, values=values)]
+    found = diagnose(estimate(runs), SAMII, runs=runs, effects=few)
+    assert [(c.physics, c.site) for c in found.causes] == [("cubic_stiffness", "joint_1")]
+    assert any(words.startswith("a_2 stands") for words in found.not_physics)
+
+
 def test_a_valve_that_lags_is_no_force(tmp_path: Path):
     found = found_in(cut_sweeps(tmp_path, "actuator_lag joint_2_source p=150", design=ONE))
     assert [c.physics for c in found.causes] == ["actuator_lag"]

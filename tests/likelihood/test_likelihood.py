@@ -9,7 +9,7 @@ import pytest
 from scipy import signal
 
 from samii_rig.diagnose.fit.records import _fitted, _shown
-from samii_rig.likelihood import nuisance
+from samii_rig.likelihood import nuisance, pieces
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
@@ -129,6 +129,40 @@ def test_a_past_of_one_mode_has_its_two_states_however_long_it_rings(damping: fl
     one = piece(u, np.zeros((3000, H.shape[1])))
     found = nuisance.past(one, np.arange(12, 225), exact.record(H, exact.samples), exact)
     assert found.shape[2] == 2
+
+
+def test_a_long_stretch_is_several_pieces_with_the_input_before_each(monkeypatch):
+    whole = recording()
+    wired = without_loop(wiring([whole], SAMII))
+    monkeypatch.setattr(pieces, "LONGEST", len(whole) // 3)
+    found = pieces_of([whole], SAMII, wired)
+    assert sum(len(p.z) for p in found) == len(whole)
+    assert [p.history > 0 for p in found] == [False, True, True, True]
+    v = whole.values[:, whole.column("v_2")]
+    end = 0
+    for p in found:
+        end += len(p.z)
+        np.testing.assert_array_equal(p.r, v[end - len(p.r) : end])
+
+
+def test_above_what_is_driven_noise_that_is_in_the_input_too_is_no_response():
+    """Behind a loop that runs faster than the record the input has some of a sensor's noise."""
+    a, left = poles(), {}
+    for driven in (15.0, np.inf):
+        each = []
+        for seed in range(6):
+            u, z = noisy(seed)
+            noise = z - from_rest(u, a)
+            part = signal.sosfilt(
+                signal.butter(4, 15.0, "high", fs=RATE, output="sos"), noise[:, 0]
+            )
+            one = piece(u + 0.1 * part, z)
+            records = Records((one,), RATE, ((0.8, 45.0),), driven=driven)
+            found = reduced(records, lambda s: response(s, a), own_alone)
+            each.append(float(found.target @ found.target) / found.known)
+        left[driven] = np.mean(each)
+    assert left[15.0] == pytest.approx(1.0, abs=0.15)
+    assert left[np.inf] > 1.5
 
 
 def test_an_offset_and_a_slow_wander_of_a_sensor_are_no_mismatch():
