@@ -63,9 +63,9 @@ def test_a_hardening_joint_is_named_from_one_sweep_that_ends_with_its_record(tmp
 
 def test_a_force_is_named_beside_a_column_that_stands_late(tmp_path: Path):
     """The column alone is a hundred times what the force is, and no place for it."""
-    (run,) = cut_sweeps(tmp_path, f"cubic_stiffness joint_1 k3={HARD / 2:g}", design=ONE)
+    (run,) = cut_sweeps(tmp_path, f"cubic_stiffness joint_1 k3={HARD / 3:g}", design=ONE)
     values, late = run.values.copy(), run.column("a_2")
-    values[:, late] = np.roll(values[:, late], 1)
+    values[:, late] = np.roll(values[:, late], 3)
     few = [e for e in table(SAMII, 0.5, 20.0) if e.physics in (*FEW, "column_shifted")]
     runs = [replace(run, values=values)]
     found = diagnose(estimate(runs), SAMII, runs=runs, effects=few)
