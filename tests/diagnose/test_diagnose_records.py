@@ -79,7 +79,9 @@ def test_a_segment_in_which_a_sensor_freezes_is_left_out_and_told(nothing: list[
 
 
 def test_a_valve_that_lags_is_named_though_every_sweep_ends_with_its_record(tmp_path: Path):
-    found = found_in(cut_sweeps(tmp_path, SLOW_VALVE))
+    runs = cut_sweeps(tmp_path, SLOW_VALVE)
+    few = [e for e in table(SAMII, 0.5, 40.0) if e.site in ("joint_2_source", "joint_2", "v_2")]
+    found = diagnose(estimate(runs), SAMII, runs=runs, effects=few)
     names = {(c.physics, c.site) for c in found.causes}
     names |= {n for c in found.causes for n in c.equivalents}
     assert found.verdict in ("named", "ambiguous")

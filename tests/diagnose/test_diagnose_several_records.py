@@ -30,7 +30,10 @@ def test_where_nothing_is_missing_two_inputs_say_so(how):
     assert any("have 2 inputs (v_2, v_3)" in words for words in found.not_physics)
 
 
-@pytest.mark.parametrize("how", HOW)
+@pytest.mark.parametrize(
+    "how",
+    [pytest.param("in turn", marks=pytest.mark.slow), "together"],  # half a minute each
+)
 def test_a_dead_time_of_one_input_is_named_there_and_not_at_the_other(how):
     found = found_in(recorded(late("v_3", 1e-3), HOW[how]()))
     assert found.verdict == "named"

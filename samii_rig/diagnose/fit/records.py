@@ -463,7 +463,7 @@ class RecordSearch(Search):
             assert isinstance(self.problem, RecordProblem)
             x = refit(model, self.problem.warmed(COOLER**k), x).x
             now = self._there(model, x)
-            if not self._stands(now):
+            if not self._stands(now, COOLER**k):
                 self._about(now)
         now = refit(model, self.problem, x)
         if now.cost < self._there(model, fitted.x).cost:
@@ -484,12 +484,13 @@ class RecordSearch(Search):
         between = self.whole.between(self.reduced, fitted)
         self._between = between, fitted.model.response(fitted.x, between)
 
-    def _stands(self, fitted: Fitted) -> bool:
-        """Whether a fit changes the response as linearly between nodes as the likelihood has it."""
+    def _stands(self, fitted: Fitted, times: float = 1.0) -> bool:
+        """Whether a fit changes the response as linearly between nodes as the likelihood has it, to
+        noise of so many times the power."""
         between, reference = self._between
         d = fitted.model.response(fitted.x, self.problem.at) - self.reduced.reference
         middle = fitted.model.response(fitted.x, between) - reference
-        return self.reduced.bent(d, middle) < BETWEEN
+        return self.reduced.bent(d, middle) < BETWEEN * math.sqrt(times)
 
     @property
     def reduced(self) -> Reduced:
