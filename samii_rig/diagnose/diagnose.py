@@ -58,6 +58,8 @@ def diagnose(
     """
     progress("nominal model")
     case = case_of(responses, rig, band, effects, runs)
+    if runs:
+        progress("nominal model of whole records")
     search = on_records(case, band)
     return by_lines(case, progress) if search is None else by_records(case, search, progress)
 

@@ -370,8 +370,7 @@ class Diagnosis:
         sure = min(c.probability for c in self.causes)
         return (
             f"Probability {percent(sure)}; {on} chi-square per degree of freedom "
-            f"falls from {before:.3g} to {after:.3g}, {self.gap.value:.0%} of the gap to the noise "
-            f"({self.gap.low:.0%} to {self.gap.high:.0%})."
+            f"falls from {before:.3g} to {after:.3g}, {_of_gap(self.gap)}."
         )
 
     def _next(self) -> str:
@@ -424,3 +423,10 @@ def _said(cause: Cause) -> str:
     numbers = ", ".join(f"{k} = {v.value:.3g} {v.unit}" for k, v in cause.parameters.items())
     said = f"{cause.physics.replace('_', ' ')} at {cause.site}"
     return f"{said} ({numbers})" if numbers else said
+
+
+def _of_gap(gap: Gap) -> str:
+    value, low, high = (f"{x:.0%}" for x in (gap.value, gap.low, gap.high))
+    if low == high == "100%":
+        return "all of the gap to the noise"
+    return f"{value} of the gap to the noise ({low} to {high})"

@@ -290,3 +290,8 @@ def test_a_gross_effect_brings_no_small_one_with_it():
     gives = noiseless(in_series(perfect, "joint_2_source", 700.0), f, relative=3.7e-4)
     found = diagnose([redraw(gives, gives.H, np.random.default_rng(1))], perfect)
     assert [c.physics for c in found.causes] == ["velocity_feedback"]
+
+
+def test_a_gap_that_is_closed_to_the_percent_is_told_without_an_interval():
+    assert _of_gap(Gap(0.9991, 0.998, 1.001)) == "all of the gap to the noise"
+    assert _of_gap(Gap(0.962, 0.91, 1.004)) == "96% of the gap to the noise (91% to 100%)"
