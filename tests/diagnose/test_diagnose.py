@@ -25,6 +25,7 @@ from samii_rig.diagnose.fit.rigfile import toml
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics import vocabulary
 from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.result import Gap, _of_gap
 from samii_rig.diagnose.verdict.locate import locate, moebius
 from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw
