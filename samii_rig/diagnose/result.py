@@ -103,6 +103,13 @@ class Gap:
     low: float
     high: float
 
+    def words(self) -> str:
+        """How much of what the model left beyond noise the causes account for; an interval where
+        it says more than the value."""
+        value, low, high = map(percent, (self.value, self.low, self.high))
+        between = "" if low == high else f" (90 % interval {low} to {high})"
+        return f"they account for {value} of what the model missed{between}"
+
 
 @dataclass(frozen=True, slots=True)
 class Moved:
@@ -370,8 +377,7 @@ class Diagnosis:
         sure = min(c.probability for c in self.causes)
         return (
             f"Probability {percent(sure)}; {on} chi-square per degree of freedom "
-            f"falls from {before:.3g} to {after:.3g}, {self.gap.value:.0%} of the gap to the noise "
-            f"({self.gap.low:.0%} to {self.gap.high:.0%})."
+            f"falls from {before:.3g} to {after:.3g} (noise alone: 1); {self.gap.words()}."
         )
 
     def _next(self) -> str:
