@@ -70,6 +70,22 @@ class DiskError(RecordingError):
     exit_code = 6
 
 
+class RecordedError(RecordingError):
+    """The run is over and its recording is closed and whole; what follows did not go.
+
+    path : of the recording. exit_code : that of a run that did not go through, if it did not.
+    """
+
+    exit_code = 7
+
+    def __init__(self, path: object, status: str, why: str) -> None:
+        super().__init__(
+            f"the run is over ({status}) and its recording is whole: {path}; it was not evaluated: "
+            f"{why}; samii-rig report makes it up"
+        )
+        self.exit_code = {"stopped": 130, "tripped": 5, "failed": 6}.get(status, 7)
+
+
 class EstimateError(SamiiRigError):
     """The data do not allow the estimate that was asked for; the line says what is missing."""
 

@@ -31,7 +31,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     epilog="Exit codes: 0 done, 1 a file holds nothing, 2 bad input, 3 a recording is damaged, "
     "4 the plan would break a limit, 5 the safety gate tripped, 6 the device or the disk failed, "
-    "130 stopped.",
+    "7 recorded but not evaluated, 130 stopped.",
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )

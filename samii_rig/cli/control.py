@@ -55,7 +55,6 @@ def control(
     check_folder("--out", out)
 
     from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     from samii_rig.control.design import Goals, design
     from samii_rig.control.identified import identified as take_in
@@ -66,6 +65,7 @@ def control(
     from samii_rig.control.result import lines, plain, rig_text, step_line
     from samii_rig.control.settle import settling
     from samii_rig.record.reader import read_recording
+    from samii_rig.report.summary import working
     from samii_rig.rig.load import load_rig
 
     the_rig, text = load_rig(rig)
@@ -79,9 +79,8 @@ def control(
     recordings = [read_recording(path) for path in steps or ()]
     make_folder("--out", out)
     console = Console(highlight=False, soft_wrap=True)
-    columns = TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True, disable=json) as bar:
-        task = bar.add_task("modes", total=1.0)
+    with working(console, "control", quiet=json) as say:
+        say("modes")
         made = design(
             the_rig,
             sensor=sensor,
@@ -90,7 +89,7 @@ def control(
             draws=draws,
             seed=seed,
             known=known,
-            progress=lambda what, part: bar.update(task, description=what, completed=part),
+            progress=say,
         )
         shown = [settling(r, made.feedback.sensor) for r in recordings]
     stem = (identified or Path(rig)).stem

@@ -106,10 +106,11 @@ def identify(
             console.print(method_table(by))
         return
     in_pose = _in_poses(recordings, at, output, gaps, band)
-    with working(console, "identifying", quiet=json):
+    with working(console, "identifying", quiet=json) as say:
         found = maximum_likelihood(
             [response for response, _ in in_pose], held[0], free or uncertain(held[0]),
             prior=not free, band=band, poses=[one for _, one in in_pose],
+            progress=say,
         )  # fmt: skip
     if json:
         say_json(found.plain())

@@ -93,13 +93,18 @@ def modes(
         recordings, compared = read_all(logs), read_all(others)
         held = rig_of(recordings, rig)
         with working(console, "modes", quiet=json) as say:
+            say("frequency responses")
             responses = _ordered(estimated(recordings, input_, output, method, gaps, band))
             beside: Sequence[FrequencyResponse] = ()
             if compared:
                 beside = _ordered(estimated(compared, input_, output, method, gaps, band))
-            say("poles and shapes")
             found, lost = modes_of(
-                responses, held[0] if held else None, band=band, pick=wanted, against=beside
+                responses,
+                held[0] if held else None,
+                band=band,
+                pick=wanted,
+                against=beside,
+                progress=say,
             )
         if not found:
             raise InputError.saying("modes", "", "; ".join(lost))

@@ -12,7 +12,7 @@ import typer
 
 from samii_rig.cli.common import comparisons, response_json
 from samii_rig.cli.predicted import prediction
-from samii_rig.errors import InputError
+from samii_rig.errors import InputError, RecordedError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -74,15 +74,25 @@ class Done:
 
 def one_run(order: RunOrder, path: Path, said: Said, *, diagnosis: bool) -> Done:
     """One run with its page, and its summary on the console."""
+    from samii_rig.run.campaign import NO_MEMORY
+
+    outcome = _driven(order, path, said)
+    try:
+        return _evaluated(order, outcome, said, diagnosis=diagnosis)
+    except MemoryError as error:
+        raise RecordedError(path, outcome.stop.status, NO_MEMORY) from error
+
+
+def _evaluated(order: RunOrder, outcome: Outcome, said: Said, *, diagnosis: bool) -> Done:
+    """What is said of a run that is over."""
     from samii_rig.cli.diagnose import keep_diagnosis
     from samii_rig.report.compare import model_curve
     from samii_rig.report.modes import modes_of_all
 
-    outcome = _driven(order, path, said)
     curve = model_curve(order.rig, outcome.responses)
     found = _diagnosed(order.rig, outcome, said) if diagnosis else None
     if found:
-        keep_diagnosis([path], found)
+        keep_diagnosis([outcome.path], found)
     modes = modes_of_all(outcome.responses, order.rig) if said.report or not said.json else ()
     page = _page(order.rig, outcome, curve, found, modes) if said.report else None
     done = Done(outcome, order.predicted, curve, page, found)

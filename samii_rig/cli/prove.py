@@ -138,11 +138,13 @@ class _Order:
 
 def _made(out: Path, order: _Order, workers: int | None, scheduler: str, quiet: bool) -> list[str]:
     """Carry out what is asked for; what failed, in words."""
-    import sys
     import time
 
+    from rich.console import Console
+
+    from samii_rig.progress import Counted
     from samii_rig.prove.campaign import Campaign, carry_out, claim
-    from samii_rig.prove.progress import Progress
+    from samii_rig.report.summary import working
     from samii_rig.workers import workers as at_work
 
     if not order.jobs:
@@ -152,9 +154,15 @@ def _made(out: Path, order: _Order, workers: int | None, scheduler: str, quiet: 
     claim(out, made)
     campaign: Campaign = Campaign(out, order.rigs, keep=order.keep)
     until = time.monotonic() + 3600 * order.hours if order.hours else float("inf")
-    with at_work(workers, scheduler) as executor:
-        say = Progress(len(order.jobs), None if quiet else sys.stderr)
-        return carry_out(campaign, order.jobs, executor, say, until)
+    with (
+        working(Console(stderr=True, highlight=False), "proof", quiet=quiet) as say,
+        at_work(workers, scheduler) as executor,
+    ):
+
+        def told(done: int, failed: int) -> None:
+            say(Counted("trials", done, len(order.jobs), f"{failed} failed" if failed else ""))
+
+        return carry_out(campaign, order.jobs, executor, told, until)
 
 
 # Options that say where and how fast, not which trials.

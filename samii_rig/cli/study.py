@@ -60,30 +60,29 @@ def study(
     varied = [values_of(the_rig, given) for given in vary]
 
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from samii_rig.model.study import study as modes_over
+    from samii_rig.progress import Counted
     from samii_rig.record.export import replacing
     from samii_rig.report.figures import save_figure
     from samii_rig.report.study import figure, table, write_csv
+    from samii_rig.report.summary import working
     from samii_rig.workers import workers as at_work
 
     if plot is not None and len(varied) > 2:
         raise InputError("--plot", "", [v.name for v in varied], "one or two --vary to draw")
     console = Console(highlight=False)
-    columns = BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     with ExitStack() as stack:
         # Opened first: a place that cannot be written to is said before the work, not after it.
         parts = [stack.enter_context(replacing(p)) if p else None for p in (out, plot)]
-        bar = stack.enter_context(Progress(*columns, console=console, transient=True, disable=json))
+        say = stack.enter_context(working(console, "study", quiet=json))
         executor = stack.enter_context(at_work(workers, scheduler))
-        task = bar.add_task("points", total=None)
         found = modes_over(
             text,
             varied,
             band or (0.0, the_rig.rate_hz / 10),
             executor,
-            lambda done, of: bar.update(task, completed=done, total=of),
+            lambda done, of: say(Counted("points", done, of)),
         )
         if parts[0]:
             write_csv(parts[0], found)

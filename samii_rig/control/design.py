@@ -17,7 +17,7 @@ stiffness at either end of its range.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ from samii_rig.control.plants import inside as draws_inside
 from samii_rig.control.plants import uncertain as draws_uncertain
 from samii_rig.errors import InputError
 from samii_rig.model.loops import Loops, loops_of
+from samii_rig.progress import Counted, Progress
 from samii_rig.rig.schema import Acceleration, Feedback, Rig
 from samii_rig.safety.limits import find_actuator, gate_limits
 from samii_rig.types import Float
@@ -45,7 +46,6 @@ ROUNDS = 2  # of that
 AUTHORITY = 0.4
 SIMPLEX = 0.1  # first step of the simplex search, in log of corner and gain
 
-Progress = Callable[[str, float], None]
 """Called with what is being done and the part that is done, 0 to 1."""
 
 
@@ -137,7 +137,7 @@ def design(
     InputError for an unknown sensor or actuator, or one that the rig cannot damp.
     """
     goals = goals or Goals()
-    say = progress or (lambda what, part: None)
+    say = progress or (lambda _stage: None)
     first = rig.actuator[0].name if actuator is None else actuator
     find_actuator(rig, first, rig.name)
     own = [f for f in rig.feedback if f.actuator == first]
@@ -152,7 +152,7 @@ def design(
     trials: list[Trial] = []
     if not own:
         for n in [poles] if poles else range(1, MOST_POLES + 1):
-            say(f"low-pass of {n} pole{'s'[: n > 1]}", (n - 1) / MOST_POLES)
+            say(f"low-pass of {n} pole{'s'[: n > 1]}")
             trials.append(_best(bare, first, chosen, n, nominal, at_corners, goals))
             if trials[-1].reserve >= 1.0:
                 break
@@ -209,7 +209,7 @@ def _plants(
 ) -> list[Plant]:
     out = []
     for i, (name, changed) in enumerate(values.items()):
-        say(what, i / len(values))
+        say(Counted(what, i, len(values)))
         out.append(plant(name, with_values(rig, changed), loops))
     return out
 

@@ -20,9 +20,10 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.insert import PREFIX
 from samii_rig.diagnose.result import Before, Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
-from samii_rig.diagnose.verdict.stages import Case, Progress
+from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.reduce import Records
+from samii_rig.progress import Progress, ahead
 from samii_rig.rig.schema import RelativeAngle, Rig
 from samii_rig.rig.schema.elements import Branch, flattened, parameters
 from samii_rig.types import FrequencyResponse, Recording
@@ -74,24 +75,30 @@ def changed(
         band=band,
         effects=effects,
         runs=before.runs,
-        progress=lambda stage: progress(f"before: {stage}"),
+        progress=lambda stage: progress(ahead("before: ", stage)),
     )
     put_in = found.verdict != "no_mismatch" and found.rig is not None
     common = common_rig(first_rig, found.rig) if put_in and found.rig else first_rig
     progress("both states")
-    first = case_of(before.responses, common, band, effects, before.runs)
+    first = case_of(before.responses, common, band, effects, before.runs, progress=progress)
     # What is known of the state before alone is as the rig file has it after.
     own = _as_in(common, rig, known_before or {})
     second = case_of(
-        after.responses, with_known(own, known or {}), band, effects, after.runs, signed=True
+        after.responses,
+        with_known(own, known or {}),
+        band,
+        effects,
+        after.runs,
+        signed=True,
+        progress=progress,
     )
     both, start = _both(first, second, band)
     search = StatesSearch(both, second.search, start.nominal.fitted)
     nominal = search.nominal.fitted
     at_first, bands = search.ratio(nominal), search.bands(nominal)
-    progress("what changed")
+    search.begin("what changed")
     search.run()
-    answer = by_samples(second, search, at_first, bands, progress)
+    answer = by_samples(second, search, at_first, bands)
     beside = Before(
         found.verdict,
         found.causes if put_in else (),

@@ -20,7 +20,8 @@ from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_line import by_lines
 from samii_rig.diagnose.verdict.by_record import by_records, on_records
-from samii_rig.diagnose.verdict.stages import Case, Progress
+from samii_rig.diagnose.verdict.stages import Case
+from samii_rig.progress import Progress
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
 
@@ -50,18 +51,17 @@ def diagnose(
     responses : from `samii_rig.signal.estimate`, all levels and experiments together.
     band : Hz, where the model is held against them.
     effects : the table of hypotheses; None for the whole vocabulary.
-    progress : is told each stage as it begins.
+    progress : is told each stage as it begins, and what is tried in it, as
+        `samii_rig.progress.Counted`.
     runs : the recordings that the responses come from. With them every sample counts, the start
         and the end of each record too; without them, the responses line by line.
 
     Raises InputError and EstimateError as `samii_rig.identify.data.collect` does.
     """
     progress("nominal model")
-    case = case_of(responses, rig, band, effects, runs)
-    if runs:
-        progress("nominal model of whole records")
+    case = case_of(responses, rig, band, effects, runs, progress=progress)
     search = on_records(case, band)
-    return by_lines(case, progress) if search is None else by_records(case, search, progress)
+    return by_lines(case) if search is None else by_records(case, search)
 
 
 def case_of(
@@ -72,6 +72,7 @@ def case_of(
     runs: Sequence[Recording],
     *,
     signed: bool = False,
+    progress: Progress = lambda _stage: None,
 ) -> Case:
     """What is to be explained, the nominal model refitted; arguments as of `diagnose`, `signed` as
     of `table`."""
@@ -83,6 +84,6 @@ def case_of(
     if effects is None:
         low, high = float(lines.frequency[0]), float(lines.frequency[-1])
         effects = table(rig, low, high, signed=signed)
-    by_line = Search(rig, seen, at, clean.competing(effects))
+    by_line = Search(rig, seen, at, clean.competing(effects), progress=progress)
     runs = runs if clean.mend is None else [clean.mend(run) for run in runs]
     return Case(clean, sound, runs, lines, by_line, decide, show)

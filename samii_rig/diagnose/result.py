@@ -103,6 +103,13 @@ class Gap:
     low: float
     high: float
 
+    def words(self) -> str:
+        """How much of what the model left beyond noise the causes account for; an interval where
+        it says more than the value."""
+        value, low, high = map(percent, (self.value, self.low, self.high))
+        between = "" if low == high else f" (90 % interval {low} to {high})"
+        return f"they account for {value} of what the model missed{between}"
+
 
 @dataclass(frozen=True, slots=True)
 class Moved:
@@ -370,7 +377,7 @@ class Diagnosis:
         sure = min(c.probability for c in self.causes)
         return (
             f"Probability {percent(sure)}; {on} chi-square per degree of freedom "
-            f"falls from {before:.3g} to {after:.3g}, {_of_gap(self.gap)}."
+            f"falls from {before:.3g} to {after:.3g} (noise alone: 1); {self.gap.words()}."
         )
 
     def _next(self) -> str:
@@ -423,10 +430,3 @@ def _said(cause: Cause) -> str:
     numbers = ", ".join(f"{k} = {v.value:.3g} {v.unit}" for k, v in cause.parameters.items())
     said = f"{cause.physics.replace('_', ' ')} at {cause.site}"
     return f"{said} ({numbers})" if numbers else said
-
-
-def _of_gap(gap: Gap) -> str:
-    value, low, high = (f"{x:.0%}" for x in (gap.value, gap.low, gap.high))
-    if low == high == "100%":
-        return "all of the gap to the noise"
-    return f"{value} of the gap to the noise ({low} to {high})"

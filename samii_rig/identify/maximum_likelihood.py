@@ -28,6 +28,7 @@ from samii_rig.identify.likelihood import (
 from samii_rig.identify.parameters import Free, Space, changed, space
 from samii_rig.identify.predict import Predictor
 from samii_rig.identify.result import Identification, bounds_met, residuals_of
+from samii_rig.progress import Progress, counted
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
 from samii_rig.signal.whitening import Fit, goodness
@@ -112,6 +113,7 @@ def identify(
     spread: float = SPREAD,
     seed: int = 1,
     poses: Sequence[Angle | None] = (),
+    progress: Progress = lambda _stage: None,
 ) -> Identification:
     """Maximum likelihood, or maximum posterior, estimate of `free` from `responses`.
 
@@ -123,6 +125,7 @@ def identify(
     band : Hz. outputs : the channels to use, default all that were measured.
     poses : of the rig in each response, if they differ: one set of parameters for all.
     starts : the first is the rig file's values, the others are drawn within `spread` of them.
+    progress : is told how many of them are done.
 
     Raises
     ------
@@ -139,20 +142,27 @@ def identify(
         starts=starts,
         spread=spread,
         seed=seed,
+        progress=progress,
     )
 
 
 def solve(
-    posed: Problem, *, starts: int = STARTS, spread: float = SPREAD, seed: int = 1
+    posed: Problem,
+    *,
+    starts: int = STARTS,
+    spread: float = SPREAD,
+    seed: int = 1,
+    progress: Progress = lambda _stage: None,
 ) -> Identification:
     """`identify` for a problem that is already set up."""
     rng = np.random.default_rng(seed)
     n = posed.space.start.size
     ends = []
-    for i in range(starts):
+    for i in counted(range(starts), progress, "starts"):
         x = np.log1p(rng.uniform(-spread, spread, n)) if i else np.zeros(n)
         ends.append(posed.from_start(np.clip(x, posed.space.lower, posed.space.upper)))
     best = min(ends, key=lambda end: end.cost)
+    progress("best of them")
     reached = sum(1 for end in ends if end.cost <= best.cost * (1 + SAME) + SAME)
     return _result(posed, posed.polished(best), starts, reached)
 

@@ -11,9 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
+from samii_rig.progress import duration
 from samii_rig.record.events import Event
 from samii_rig.report.compare import Comparison, percent, pretty
-from samii_rig.report.verdicts import counted, duration, without_folders
+from samii_rig.report.verdicts import counted, without_folders
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
 

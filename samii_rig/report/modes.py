@@ -16,6 +16,7 @@ from rich.text import Text
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.modal.match import Known, Pair, known_of, model_modes, pairs
 from samii_rig.modal.modes import LEVEL, ModalModel, Mode, Value, find_modes
+from samii_rig.progress import Progress, counted
 from samii_rig.report.facts import names
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse
@@ -71,11 +72,12 @@ def modes_of(
     outputs: Sequence[str] | None = None,
     pick: Sequence[float] = (),
     against: Sequence[FrequencyResponse] = (),
+    progress: Progress = lambda _stage: None,
 ) -> tuple[tuple[Modes, ...], tuple[str, ...]]:
     """Modes of each response, and why others have none.
 
     against : responses of another recording; each level is held against its like, or the
-        last one where there is none.
+        last one where there is none. progress : is told which response is looked at.
     Raises what `find_modes` raises for a band, an output or a pick that there is not.
     """
     out, lost = [], []
@@ -83,8 +85,12 @@ def modes_of(
     if rig is not None and responses:
         top = max(float(r.frequency[-1]) for r in responses)
         known = model_modes(rig, min(top, band[1]) if band else top)
-    others = [find_modes(r, rig, band=band, outputs=outputs) for r in against]
-    for r, name in zip(responses, names(responses), strict=True):
+    others = [
+        find_modes(r, rig, band=band, outputs=outputs)
+        for r in counted(against, progress, "poles and shapes of the other")
+    ]
+    every = list(zip(responses, names(responses), strict=True))
+    for r, name in counted(every, progress, "poles and shapes", lambda one: one[1]):
         try:
             found = find_modes(r, rig, band=band, outputs=outputs, pick=pick)
         except EstimateError as error:

@@ -17,11 +17,12 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from samii_rig.progress import Counted, Pace, duration
 from samii_rig.report.compare import Comparison, ModelCurve, compare, percent, pretty
 from samii_rig.report.facts import names
 from samii_rig.report.modes import Modes, modes_table
 from samii_rig.report.plots import unit
-from samii_rig.report.verdicts import Verdict, duration, verdicts
+from samii_rig.report.verdicts import Verdict, verdicts
 from samii_rig.types import FrequencyResponse, Recording
 
 if TYPE_CHECKING:  # it compiles the model, which showing needs not
@@ -31,7 +32,7 @@ _STYLES = {"good": "green", "note": "blue", "warning": "yellow", "bad": "bold re
 _WORDS = {"good": "good", "note": "note", "warning": "look", "bad": "ATTENTION"}
 _MARGIN_CLOSE = 0.2  # of a limit left: shown as close
 _BAR = 30  # characters
-ON = 10.0  # s between lines of a stage that goes on
+ON = 5.0  # s between lines of a stage that goes on
 KERNELS = logging.getLogger("samii_rig.model.kernels")
 
 
@@ -149,9 +150,11 @@ def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Cal
     """Say what is being done and for how long; what is given says what comes next.
 
     Without a terminal it is one line each, so that who reads a log later, or waits for a pipe,
-    sees that it goes on; what only counts on behind a comma, not more often than every `ON` s.
+    sees that it goes on; what is counted (`samii_rig.progress.Counted`), not more often than every
+    `ON` s, with the time left.
     quiet : say nothing.
     """
+    pace = Pace()
     if quiet:
         yield lambda stage: None
     elif console.is_terminal:
@@ -159,7 +162,7 @@ def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Cal
         with Progress(*columns, console=console, transient=True) as shown:
             task = shown.add_task(what, total=None)
             with _compiling(
-                lambda stage: shown.update(task, description=f"{what}: {stage}")
+                lambda stage: shown.update(task, description=f"{what}: {pace.words(stage)}")
             ) as say:
                 yield say
     else:
@@ -168,10 +171,13 @@ def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Cal
 
         def say_line(stage: str) -> None:
             nonlocal due, last
-            now, name = time.monotonic(), stage.partition(",")[0]
+            now, words = time.monotonic(), pace.words(stage)
+            name = stage.stage if isinstance(stage, Counted) else stage.partition(",")[0]
             if name != last or now >= due:
                 last, due = name, now + ON
-                console.print(f"{what}: {stage} ... (after {now - begun:.0f} s)", highlight=False)
+                console.print(
+                    f"{what}: {words} ... (after {duration(now - begun)})", highlight=False
+                )
 
         console.print(f"{what} ...", highlight=False)
         with _compiling(say_line) as say:

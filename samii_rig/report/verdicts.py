@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from samii_rig.progress import duration
 from samii_rig.report.compare import Comparison, percent, pretty, telling
 from samii_rig.signal.statistics import difference, octaves
 from samii_rig.types import Finding, Float, FrequencyResponse, Recording
@@ -202,17 +203,6 @@ def without_folders(message: str) -> str:
 def counted(number: int, what: str) -> str:
     """`3 sweeps`, `1 sweep`."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
-def duration(seconds: float) -> str:
-    """`48 s`, `3 min 20 s`, `1 h 5 min`."""
-    whole = round(seconds)
-    if whole < 120:
-        return f"{seconds:.3g} s" if seconds < 10 else f"{whole} s"
-    minutes, rest = divmod(whole, 60)
-    if minutes < 120:
-        return f"{minutes} min {rest} s" if rest else f"{minutes} min"
-    return f"{minutes // 60} h {minutes % 60} min"
 
 
 def _relative_sigma(response: FrequencyResponse) -> Float:

@@ -16,7 +16,7 @@ from threading import Event
 
 from samii_rig.devices.opening import close_device, open_device
 from samii_rig.devices.protocols import OpenRig
-from samii_rig.errors import SamiiRigError
+from samii_rig.errors import RecordedError, RecordingError, SamiiRigError
 from samii_rig.record.reader import read_frequency_responses, read_recording
 from samii_rig.record.writer import RunWriter
 from samii_rig.run.dryrun import DryRun
@@ -34,6 +34,7 @@ from samii_rig.signal.estimate import estimate
 from samii_rig.types import SampleBlock, StopRecord
 
 # What can change a result and is not in the recording otherwise.
+NO_MEMORY = "there is no memory left"
 VERSIONS_OF = ("samii-rig", "numpy", "scipy", "numba", "mcap")
 
 
@@ -59,8 +60,8 @@ def carry_out(
 
     Raises LimitError if the order would break a limit, GateError for a latched fault, DeviceError
     if the rig does not open or another program drives it, RecordingError if the file cannot be
-    made, and DiskError if the disk has no room or refuses it later; the output is at zero before
-    each of them.
+    made, and DiskError if the disk has no room or refuses it later; RecordedError if the recording
+    is closed and cannot be read back; the output is at zero before each of them.
     """
     order.refuse(path)
     rig = order.rig
@@ -104,8 +105,20 @@ def carry_out(
             finish(writer, ended)
     finally:
         close_device(device)
-    responses = tuple(read_frequency_responses(path))
-    return Outcome(path, read_recording(path), responses, ended, trouble, interrupts.came)
+    with _recorded(path, ended):
+        responses = tuple(read_frequency_responses(path))
+        return Outcome(path, read_recording(path), responses, ended, trouble, interrupts.came)
+
+
+@contextmanager
+def _recorded(path: Path, ended: StopRecord) -> Iterator[None]:
+    """RecordedError instead of what else would be taken for a run that left nothing."""
+    try:
+        yield
+    except (RecordingError, OSError) as error:
+        raise RecordedError(path, ended.status, str(error)) from error
+    except MemoryError as error:
+        raise RecordedError(path, ended.status, NO_MEMORY) from error
 
 
 def _notes(order: RunOrder, device: OpenRig, cleared: Cleared | None) -> dict[str, str]:

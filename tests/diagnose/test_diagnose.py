@@ -25,7 +25,6 @@ from samii_rig.diagnose.fit.rigfile import toml
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics import vocabulary
 from samii_rig.diagnose.physics.model import Model, grid
-from samii_rig.diagnose.result import Gap, _of_gap
 from samii_rig.diagnose.verdict.locate import locate, moebius
 from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw
@@ -291,8 +290,3 @@ def test_a_gross_effect_brings_no_small_one_with_it():
     gives = noiseless(in_series(perfect, "joint_2_source", 700.0), f, relative=3.7e-4)
     found = diagnose([redraw(gives, gives.H, np.random.default_rng(1))], perfect)
     assert [c.physics for c in found.causes] == ["velocity_feedback"]
-
-
-def test_a_gap_that_is_closed_to_the_percent_is_told_without_an_interval():
-    assert _of_gap(Gap(0.9991, 0.998, 1.001)) == "all of the gap to the noise"
-    assert _of_gap(Gap(0.962, 0.91, 1.004)) == "96% of the gap to the noise (91% to 100%)"

@@ -9,6 +9,7 @@ from identify_kit import noiseless, samii
 from samii_rig.diagnose.diagnose import diagnose, table
 from samii_rig.diagnose.fit.rigfile import toml
 from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.result import Gap
 from samii_rig.fem.model import Fem
 from samii_rig.fem.reduce import reduce
 from samii_rig.identify.bootstrap import redraw
@@ -140,3 +141,22 @@ def test_a_plain_compliance_stays_the_simplest_form() -> None:
     names = {(cause.physics, cause.site), *cause.equivalents}
     assert ("hydraulic_compressibility", "joint_2_source") in names
     assert "omega" not in cause.parameters
+
+
+@pytest.mark.parametrize(
+    ("gap", "said"),
+    [
+        (Gap(1.0, 0.9999, 1.0001), "they account for over 99.9 % of what the model missed"),
+        (
+            Gap(0.97, 0.95, 0.98),
+            "they account for 97 % of what the model missed (90 % interval 95 % to 98 %)",
+        ),
+        (
+            Gap(0.9996, 0.98, 1.0),
+            "they account for over 99.9 % of what the model missed "
+            "(90 % interval 98 % to over 99.9 %)",
+        ),
+    ],
+)
+def test_a_closed_gap_is_said_once_and_never_as_a_hundred_percent(gap, said):
+    assert gap.words() == said

@@ -16,6 +16,7 @@ from samii_rig.diagnose.fit.records import RecordProblem, Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.diagnose.result import Diagnosis
+from samii_rig.progress import Counted
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
 
@@ -41,6 +42,19 @@ def test_where_nothing_is_missing_it_says_so_and_what_could_hide(nothing: list[R
     assert 1e-3 < hiding["added_mass", "link_3_6"].size < 5.0
     assert "What could hide: " in found.lines()[2]
     assert "a mass under" in found.lines()[2]
+
+
+def test_who_waits_is_told_what_is_tried_in_every_stage(nothing: list[Recording]):
+    said: list[str] = []
+    diagnose(estimate(nothing), SAMII, runs=nothing, progress=said.append)
+    stages = list(dict.fromkeys(s.stage if isinstance(s, Counted) else s for s in said))
+    assert stages[0] == "nominal model"
+    assert "nominal model of whole records, fit 1 of at most 6" in stages
+    assert stages.index("nominal model of whole records") < stages.index("what is missing")
+    assert stages[-1] == "what cannot be told apart"
+    tried = [s for s in said if isinstance(s, Counted) and s.stage == "what is missing"]
+    assert len(tried) > 3
+    assert all(s.done < s.of and " at " in s.at for s in tried)
 
 
 def with_column(run: Recording, name: str, values: np.ndarray) -> Recording:

@@ -184,10 +184,16 @@ def test_recordings_are_held_one_by_one_and_all_that_fail_are_named(run, few, tm
 
 
 def test_no_recording_is_not_a_pass(tmp_path):
-    with pytest.raises(AssertionError, match="no recording in"):
-        assert_still_explained("samii", tmp_path)
     with pytest.raises(AssertionError, match="no recording in nothing"):
         assert_still_explained("samii")
+    with pytest.raises(AssertionError, match=r"1 of 1 .*\s+lost\.mcap"):
+        assert_still_explained("samii", tmp_path / "lost.mcap")
+
+
+@pytest.mark.parametrize("folder", ["", "recordings"])
+def test_a_project_that_has_no_recordings_yet_skips_and_says_where_they_go(folder, tmp_path):
+    with pytest.raises(pytest.skip.Exception, match=r"no recording yet in .*put some \.mcap there"):
+        assert_still_explained("samii", tmp_path / folder)
 
 
 def test_a_run_that_tripped_explains_nothing(tmp_path):

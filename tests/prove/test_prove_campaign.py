@@ -7,7 +7,6 @@ whole way to an answer, and is not done twice.
 
 from __future__ import annotations
 
-import io
 import subprocess
 import sys
 from collections import Counter
@@ -18,7 +17,6 @@ import pytest
 
 from samii_rig.errors import InputError
 from samii_rig.prove import campaign, jobs, outcomes
-from samii_rig.prove.progress import Progress
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.shipped import shipped
 from samii_rig.workers import workers
@@ -111,18 +109,6 @@ def test_none_is_begun_after_the_time_is_up(tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as pool:
         assert campaign.carry_out(broken, todo, pool, until=-1.0) == []
     assert outcomes.collected(tmp_path)[1] == []
-
-
-def test_the_time_left_is_that_of_the_pace_so_far() -> None:
-    now = [0.0]
-    to = io.StringIO()
-    say = Progress(100, to, lambda: now[0])
-    now[0] = 100.0
-    say(10, 1)
-    now[0] = 101.0
-    say(11, 1)  # too soon for another line
-    assert to.getvalue().split("\n")[0].rstrip() == "10 of 100 trials, 15 min 00 s left, 1 failed"
-    assert to.getvalue().count("\n") == 1
 
 
 @pytest.mark.parametrize(

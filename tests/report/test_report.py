@@ -20,6 +20,7 @@ from rich.console import Console
 
 from samii_rig.errors import InputError
 from samii_rig.model import kernels
+from samii_rig.progress import Counted
 from samii_rig.report.canvas import halved, packed, restored
 from samii_rig.report.compare import ModelCurve, compare
 from samii_rig.report.decimate import thin
@@ -377,7 +378,7 @@ def test_who_waits_sees_what_is_tried_and_that_kernels_are_compiled():
     with working(said, "diagnosis") as say:
         say("what is missing")
         for tried in range(50):
-            say(f"what is missing, {tried} explanations tried")  # each soon after the other
+            say(Counted("what is missing", tried, 50, within="round 1"))  # each soon after
         assert kernels.__doc__  # it hears the compiler from then on
         numba.njit(lambda x: x + 1)(1)
         say("what cannot be told apart")

@@ -13,7 +13,14 @@ from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
 from samii_rig.devices.protocols import CommandBlock
-from samii_rig.errors import DeviceError, EstimateError, GateError, InputError
+from samii_rig.errors import (
+    DeviceError,
+    EstimateError,
+    GateError,
+    InputError,
+    RecordedError,
+    RecordingError,
+)
 from samii_rig.record.reader import read_recording
 from samii_rig.run import campaign
 from samii_rig.run.campaign import Outcome, carry_out
@@ -55,6 +62,33 @@ def test_an_estimate_that_fails_leaves_a_whole_recording(
     assert outcome.responses == ()
     assert read_recording(tmp_path / "run.mcap").stop.status == "completed"
     assert not list(tmp_path.glob("*.partial"))
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (MemoryError(), "there is no memory left"),
+        (RecordingError("it cannot be read"), "it cannot be read"),
+    ],
+)
+@pytest.mark.usefixtures("device")
+def test_a_whole_recording_that_cannot_be_read_back_is_told_by_a_code_of_its_own(
+    error: Exception, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(path: Path, **_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(campaign, "read_recording", fails)
+    with pytest.raises(RecordedError, match=words) as failed:
+        go(tmp_path / "run.mcap")
+    assert failed.value.exit_code == 7
+    assert str(tmp_path / "run.mcap") in str(failed.value)
+    assert read_recording(tmp_path / "run.mcap").stop.status == "completed"
+
+
+@pytest.mark.parametrize(("status", "code"), [("completed", 7), ("tripped", 5), ("stopped", 130)])
+def test_a_run_that_did_not_go_through_keeps_its_code(status: str, code: int) -> None:
+    assert RecordedError("run.mcap", status, "no memory").exit_code == code
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from scipy import stats
@@ -21,6 +22,7 @@ from samii_rig.diagnose.fit.stated import IN_DATA
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model, grid
 from samii_rig.errors import SamiiRigError
+from samii_rig.progress import Progress, counted
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Float
 
@@ -32,6 +34,8 @@ FIVE = 5.0  # standard deviations of chi-square beyond which what is left is mor
 ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and bins over which it is looked for
 UNEXPLAINED = 3e-4  # chance that noise alone leaves more than the threshold
 EXACT = 4e-4  # of the mismatch: what beams, sensors and integrators are modelled to
+
+T = TypeVar("T")
 
 
 def threshold(spread: float) -> float:
@@ -54,12 +58,19 @@ class Explanation:
         return frozenset(e.key for e in self.effects)
 
 
+def named(effects: Iterable[Effect]) -> str:
+    """Some effects, in words."""
+    every = [f"{e.physics.replace('_', ' ')} at {e.site}" for e in effects]
+    return " and ".join(every) or "nothing"
+
+
 @dataclass
 class Explanations:
     """All explanations of one set of lines that were refitted.
 
     lines : those that are fitted. grid : of all frequencies. table : all single effects.
-    found : every explanation that was refitted, by key. counted : is told how many there are.
+    found : every explanation that was refitted, by key. progress : is told what is tried in each
+    round of a `stage`.
     """
 
     rig: Rig
@@ -69,7 +80,9 @@ class Explanations:
     found: dict[frozenset[str], Explanation] = field(default_factory=dict)
     problem: Problem = field(init=False)
     temperature: float = 1.0
-    counted: Callable[[int], None] | None = None
+    progress: Progress = lambda _stage: None
+    stage: str = "nominal model"
+    _round: int = 0
     _gross: float = 0.0  # chi-square that the nominal model leaves
     _rows: Counter[str] = field(init=False)
     _total: dict[str, float] = field(init=False)
@@ -85,6 +98,19 @@ class Explanations:
         nominal = refit(model, self.problem, x)
         self.rebin(nominal)
         self.keep((), refit(model, self.problem, nominal.x))
+
+    def begin(self, stage: str) -> None:
+        """Say that a stage begins."""
+        self.stage, self._round = stage, 0
+        self.progress(stage)
+
+    def each(self, parts: Sequence[T], name: Callable[[T], str] = lambda _: "") -> Iterator[T]:
+        """The parts of one round of the stage, each said before it is tried. How many rounds there
+        will be nobody knows."""
+        if len(parts) > 1:
+            self._round += 1
+        within = f"round {max(self._round, 1)}"
+        return counted(parts, self.progress, self.stage, name, within)
 
     def use(self, table: Sequence[Effect]) -> None:
         """Another table, with a prior even over the rows of that."""
@@ -229,8 +255,6 @@ class Explanations:
         old = self.found.get(made.key)
         if old is None or made.weight > old.weight:
             self.found[made.key] = made
-        if self.counted is not None:
-            self.counted(len(self.found))
 
     def without(self, whole: Explanation, i: int) -> Explanation | None:
         """`whole` less its effect i, refitted."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from itertools import product
 
 import numpy as np
@@ -18,7 +18,7 @@ ModelOf = Callable[[tuple[Effect, ...]], Model | None]
 
 
 def ranking(
-    look: Screen, table: Sequence[Effect], base: tuple[Effect, ...], model_of: ModelOf
+    look: Screen, table: Iterable[Effect], base: tuple[Effect, ...], model_of: ModelOf
 ) -> list[tuple[float, Effect, list[Start]]]:
     """How far chi-square should fall with each effect of `table` beside those of `base`, and one
     or two starts for its refit; the largest first.

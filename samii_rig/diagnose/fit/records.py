@@ -65,6 +65,7 @@ MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
 ALIASES = 16  # sums over aliases that are kept
 HIGHEST = 0.45  # of the rate: aliases of both sides meet above
 COOLER = 10**0.5  # times less noise from one refit to the next, where a plain one leaves too much
+NOMINAL = "nominal model of whole records"
 MOST_MADE = 6  # times that the likelihood is made about the nominal model
 # Noise units by which a change from the reference may be off between nodes, where it is taken for
 # linear, for the likelihood to stand: less than noise makes of one unknown.
@@ -433,13 +434,22 @@ class RecordSearch(Search):
 
     def __init__(self, whole: Recorded, by_line: Search) -> None:
         self.whole, self.by_line = whole, by_line
-        super().__init__(by_line.rig, by_line.lines, by_line.grid, by_line.table)
+        super().__init__(
+            by_line.rig,
+            by_line.lines,
+            by_line.grid,
+            by_line.table,
+            progress=by_line.progress,
+            stage=NOMINAL,
+        )
 
     def __post_init__(self) -> None:
         self.use(self.table)
         fitted = self.first()
         self._about(fitted)
-        for _ in range(MOST_MADE):
+        self.begin(NOMINAL)
+        for made in range(MOST_MADE):
+            self.progress(f"{NOMINAL}, fit {made + 1} of at most {MOST_MADE}")
             fitted = refit(fitted.model, self.problem, fitted.x)
             if self._stands(fitted):
                 break
@@ -459,7 +469,8 @@ class RecordSearch(Search):
         self._about(self._there(model, x))
         cold = self.problem.expected / max(self._there(model, x).cost, 1.0)
         steps = int(np.ceil(-np.log(min(cold, 1.0)) / np.log(COOLER)))
-        for k in range(steps, -1, -1):
+        warm = range(steps, -1, -1)
+        for k in self.each(warm, lambda _: "less noise each time"):
             assert isinstance(self.problem, RecordProblem)
             x = refit(model, self.problem.warmed(COOLER**k), x).x
             now = self._there(model, x)

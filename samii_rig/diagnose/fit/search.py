@@ -9,12 +9,12 @@ with every other in its place.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations
+from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, named
 from samii_rig.diagnose.fit.ranking import moved, ranking
 from samii_rig.diagnose.fit.refit import Fitted, refit
 from samii_rig.diagnose.fit.screen import Screen, Start
@@ -121,7 +121,7 @@ class Search(Explanations):
             tried = self._ahead([*tried, *self._switches(base)])
         best = min((e.fitted.cost for e in self.found.values()), default=math.inf)
         reached = base.fitted.cost
-        for predicted, effects, starts_ in tried:
+        for predicted, effects, starts_ in self.each(tried, lambda one: named(one[1])):
             if base.fitted.cost - predicted < SHARE * (base.fitted.cost - reached):
                 continue
             end: Fitted | None = None
@@ -164,7 +164,7 @@ class Search(Explanations):
         what a screen about them says of a cure does not rank it.
         """
         ends = []
-        for _, effects, starts in tried:
+        for _, effects, starts in self.each(tried, lambda one: named(one[1])):
             for x in starts:
                 end = self.refitted_from(effects, x, steps=AHEAD)
                 if end is not None:
@@ -182,7 +182,8 @@ class Search(Explanations):
         """How far chi-square should fall with each further effect, and one or two starts for its
         refit; the largest first."""
         look = Screen.of(self.problem, base.fitted)
-        return ranking(look, self.table, base.effects, self.model)
+        every = self.each(self.table, lambda e: named([e]))
+        return ranking(look, every, base.effects, self.model)
 
     def saturate(self, physics: str) -> None:
         """Every place of one physics at once, taken away again one by one while that is better.
@@ -193,7 +194,7 @@ class Search(Explanations):
         if not 2 <= len(effects) <= MOST_SATURATED:
             return
         ends = []
-        for tenth in WEAK:
+        for tenth in self.each(WEAK, lambda _: named(effects[:1]) + " and everywhere else"):
             start = [
                 math.log(u.starts[tenth * len(u.starts) // 10]) for e in effects for u in e.unknowns
             ]
@@ -224,7 +225,7 @@ class Search(Explanations):
             best = self.ranked()[0]
             if len(best.effects) < 2:
                 return
-            for i in range(len(best.effects)):
+            for i in self.each(range(len(best.effects)), _without(best)):
                 self.without(best, i)
             if self.ranked()[0].key == best.key:
                 return
@@ -233,7 +234,8 @@ class Search(Explanations):
         """Every effect of `whole` taken out, and every other tried in its place, about where
         `whole` left the rest."""
         enough = whole.fitted.cost + 4 * NEAR * self.temperature
-        for i, gone in enumerate(whole.effects):
+        for i in self.each(range(len(whole.effects)), _without(whole)):
+            gone = whole.effects[i]
             base = self.bare(whole, i)
             if base is None:
                 continue
@@ -313,10 +315,15 @@ class Search(Explanations):
             if still:
                 break
         self.found.clear()
-        for e in {e.key: e for e in (*keep, best, nominal)}.values():
+        again = list({e.key: e for e in (*keep, best, nominal)}.values())
+        for e in self.each(again, lambda e: named(e.effects)):
             end = self.refitted(e.effects, e)
             if end is not None:
                 self.keep(e.effects, end)
+
+
+def _without(whole: Explanation) -> Callable[[int], str]:
+    return lambda i: f"another in place of {named(whole.effects[i : i + 1])}"
 
 
 def _each_physics(ranked: Sequence[Explanation]) -> Iterator[Explanation]:

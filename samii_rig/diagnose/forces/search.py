@@ -14,7 +14,7 @@ from copy import copy
 
 import numpy as np
 
-from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, threshold
+from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, named, threshold
 from samii_rig.diagnose.fit.ranking import moved, ranking
 from samii_rig.diagnose.fit.records import RecordSearch, Whole
 from samii_rig.diagnose.fit.refit import STEPS, Fitted
@@ -79,7 +79,8 @@ class ForceSearch(RecordSearch):
     def _only(self, some: Sequence[Explanation]) -> None:
         """Refit some explanations, and forget all others."""
         self.found = {}
-        for e in {e.key: e for e in some}.values():
+        again = list({e.key: e for e in some}.values())
+        for e in self.each(again, lambda e: named(e.effects)):
             end = self.refitted(e.effects, e, far=False)
             if end is not None:
                 self.keep(e.effects, end)
@@ -141,7 +142,8 @@ class ForceSearch(RecordSearch):
 
     def _try(self, hopes: Sequence[Hope], base: Explanation, look: int) -> None:
         """Refit the forces that may be the best beside `base`, by the gains of that look."""
-        for hope in _worth_while(hopes, self.worth, look):
+        some = _worth_while(hopes, self.worth, look)
+        for hope in self.each(some, lambda h: named([h.effect])):
             if self.spent:
                 return
             effects = (*base.effects, hope.effect)
@@ -223,7 +225,8 @@ class ForceSearch(RecordSearch):
         hopes = weakly(self.forces, self.reach, looks)
         most = max((float(np.max(h.may)) for h in hopes), default=0.0)
         some = [h for h in hopes if self._matters(h, most)][:MARCHED]
-        found = [self._closer(h, looks, bases[0]) for h in some]
+        each = self.each(some, lambda h: named([h.effect]))
+        found = [self._closer(h, looks, bases[0]) for h in each]
         # Beside the first it must do as much as what the last has more did.
         ahead = screens[0].base.cost - min(look.base.cost for look in screens)
         return [

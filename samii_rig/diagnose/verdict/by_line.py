@@ -9,7 +9,7 @@ from samii_rig.diagnose.result import Diagnosis, Used
 from samii_rig.diagnose.verdict import answer
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.force_words import distorted
-from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, counting, told
+from samii_rig.diagnose.verdict.stages import Case, Shown, told
 
 DIFFER = (
     "levels differ; give the recordings: friction, play, hardening and the like are told from "
@@ -17,16 +17,16 @@ DIFFER = (
 )
 
 
-def by_lines(case: Case, progress: Progress) -> Diagnosis:
+def by_lines(case: Case) -> Diagnosis:
     """What the lines of all responses say; nothing is named where levels differ by more than noise,
     as linear effects bend towards what no linear rig does."""
     search, show = case.search, case.show
     nominal = search.nominal.fitted
     first, bands = search.ratio(nominal), answer.bands(search, nominal)
     torn = search.lines.torn()
-    search.counted = counting(progress, "what is missing")
+    search.begin("what is missing")
     search.run(briefly=torn)
-    progress("what cannot be told apart")
+    search.begin("what cannot be told apart")
     judged = verdict.judge(search, case.decide)
     nominal, best = search.nominal.fitted, judged.best
     there = search.grid.at(show.frequency, show.level)

@@ -11,7 +11,7 @@ from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.result import Band, Diagnosis, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
-from samii_rig.diagnose.verdict.stages import Case, Progress, Shown, counting, told
+from samii_rig.diagnose.verdict.stages import Case, Shown, told
 from samii_rig.errors import EstimateError, SamiiRigError
 
 SPENT = (
@@ -37,18 +37,20 @@ def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | N
         return None
 
 
-def by_records(case: Case, search: RecordSearch, progress: Progress) -> Diagnosis:
+def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     """What whole records say."""
     first, bands = _at_first(search)
-    search.counted = counting(progress, "what is missing")
+    search.begin("what is missing")
     # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
     search.run(briefly=True)
-    progress("amplitude levels")
+    search.begin("amplitude levels")
     forced = forces_on(search)
     if forced is None or not (case.search.lines.torn() or forced.is_enough()):
+        search.begin("what is missing, in pairs")
         search.run()
+        search.begin("amplitude levels")
         forced = None if forced is None else forces_on(search)
-    progress("what cannot be told apart")
+    search.begin("what cannot be told apart")
     if forced is None:
         looked = _consistent(search, _looked(search))
     else:
@@ -65,11 +67,10 @@ def by_samples(
     search: RecordSearch,
     first: float,
     bands: tuple[Band, ...],
-    progress: Progress,
 ) -> Diagnosis:
     """The answer, once all linear explanations of the records were tried. first, bands : what the
     refitted nominal model left before, in all and by band."""
-    progress("what cannot be told apart")
+    search.begin("what cannot be told apart")
     looked = _consistent(search, _looked(search))
     looked = replace(looked, said=(*looked.said, *_unasked(search)))
     return _answer(case, search, first, bands, looked)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.findings import Doubt, Sound
@@ -21,14 +21,6 @@ from samii_rig.diagnose.verdict.plan import next_experiment
 from samii_rig.types import FrequencyResponse, Recording
 
 ALTERNATIVES = 6
-
-Progress = Callable[[str], None]
-
-
-def counting(progress: Progress, stage: str) -> Callable[[int], None]:
-    """Say that a stage begins; what is given says how many explanations were tried in it."""
-    progress(stage)
-    return lambda tried: progress(f"{stage}, {tried} explanations tried")
 
 
 @dataclass(frozen=True)
