@@ -28,6 +28,7 @@ from samii_rig.cli.estimate import (
 from samii_rig.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from concurrent.futures import Executor
 
     from rich.console import Console
@@ -83,6 +84,13 @@ def diagnose(
         list[str] | None,
         typer.Option(help="The same of the state before alone. May be repeated."),
     ] = None,
+    pose: Annotated[
+        list[str] | None,
+        typer.Option(
+            help='The rig\'s angle to the way down in each recording, in their order, as "30 deg" '
+            "[default: that of the rig file which each carries]."
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -107,7 +115,8 @@ def diagnose(
     """Locate what differs between rig file and recordings, name it, model it, show the gain.
 
     Says which explanations the data do not tell apart, and which experiment would. With --before
-    and --after: what changed between two states of the rig.
+    and --after: what changed between two states of the rig. Recordings in several poses share one
+    set of parameters.
 
     Example: samii-rig diagnose runs/*.mcap --rig samii --out diagnosis
     """
@@ -117,6 +126,9 @@ def diagnose(
     check_choice("--gaps", gaps, GAPS)
     any_known = bool(known or known_before)
     logs, earlier = _states(logs or [], before or [], after or [], each=each, known=any_known)
+    if pose and (earlier or each):
+        what = "recordings of one state, diagnosed together: no --before, --after or --each"
+        raise InputError("--pose", "", pose[0], what)
     if known_before and not earlier:
         raise InputError("--known-before", "", known_before[0], "--before and --after beside it")
     if not each:
@@ -147,7 +159,8 @@ def diagnose(
             say_json({"recordings": said})
         return
     stated = (tuple(known or ()), tuple(known_before or ()))
-    _together(logs, earlier, rig, stated, (output, gaps, band), out, json=json)
+    how_ = (output, gaps, band)
+    _together(logs, earlier, rig, stated, how_, out, poses=pose or (), json=json)
 
 
 def _states(
@@ -178,10 +191,11 @@ def _together(
     how: tuple[list[str] | None, str, tuple[float, float] | None],
     out: Path | None,
     *,
+    poses: Sequence[str],
     json: bool,
 ) -> None:
     """One diagnosis of all recordings, said, kept and written. earlier : of the state before;
-    known : words of --known and --known-before."""
+    known : words of --known and --known-before; poses : words of --pose."""
     from dataclasses import replace
 
     from rich.console import Console
@@ -189,6 +203,8 @@ def _together(
     from samii_rig.diagnose.changed import State, changed
     from samii_rig.diagnose.diagnose import diagnose as found_by
     from samii_rig.diagnose.fit.known import stated, with_known
+    from samii_rig.diagnose.posed import in_poses, one_pose, same_rig, sorted_by_pose
+    from samii_rig.identify.poses import at_pose, poses_of
     from samii_rig.report.summary import working
 
     output, gaps, band = how
@@ -198,21 +214,38 @@ def _together(
     held = rig_of(saved or [*first, *second], rig)
     if held is None:
         raise without_rig()
-    own_rig = with_known(held[0], values)
+    if saved and poses:
+        what = "recordings: several poses are held against the model by their samples"
+        raise InputError("LOGS", "", saved[0].source, what)
+    at = poses_of(second, held[0], poses)
+    if first:
+        every = [*poses_of(first, held[0], ()), *at]
+        at = [one_pose(every, "--before", "both states in one pose")]
+    the_rig = at_pose(held[0], at[0]) if at else held[0]
+    own_rig = with_known(the_rig, values)
     console = Console(highlight=False)
     with working(console, "diagnosis", quiet=json) as say:
         say("frequency responses")
+        each = []
+        if len(set(at)) > 1:
+            each = sorted_by_pose(
+                second, at, lambda of: estimated(list(of), None, output, "auto", gaps, band)
+            )
         responses = (
             tuple(r for file in saved for r in chosen(file, output))
             if saved
+            else each[0].responses
+            if each
             else estimated(second, None, output, "auto", gaps, band)
         )
-        if first:
+        if each:
+            found = in_poses(each, own_rig, band=band, progress=say)
+        elif first:
             of_first = estimated(first, None, output, "auto", gaps, band)
             states = State(of_first, first), State(responses, second)
             found = changed(
                 *states,
-                held[0],
+                the_rig,
                 known=values,
                 known_before=values_before,
                 band=band,
@@ -221,7 +254,8 @@ def _together(
         else:
             found = found_by(responses, own_rig, band=band, progress=say, runs=second)
     # A change is no diagnosis of either state's recordings, nor is one of another rig.
-    own = not (first or values or saved) and all(r.rig_toml in ("", held[1]) for r in second)
+    alike = all(r.rig_toml in ("", held[1]) or same_rig(r.rig_toml, held[0]) for r in second)
+    own = not (first or values or saved) and alike
     if own:
         keep_diagnosis(logs, found)
     page = None

@@ -25,6 +25,7 @@ from samii_rig.errors import EstimateError, InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from samii_rig.rig.schema import Rig
     from samii_rig.signal.choose import Method
     from samii_rig.signal.gather import Gaps
     from samii_rig.types import FrequencyResponse, Recording
@@ -194,17 +195,16 @@ def report(
     from samii_rig.report.summary import summary, working
 
     recordings = read_all(logs)
-    responses = estimated(recordings, input_, output, method, gaps, band)
     held = rig_of(recordings, rig)
+    in_pose = _of_one_pose(recordings, held[0] if held else None) if diagnosis else None
+    responses = estimated(recordings, input_, output, method, gaps, band)
     curve = model_curve(held[0], responses) if held else None
     console, found = Console(highlight=False), None
-    if diagnosis:
+    if in_pose is not None:
         from samii_rig.diagnose.diagnose import diagnose
 
-        if held is None:
-            raise without_rig()
         with working(console, "diagnosis", quiet=json) as say:
-            found = diagnose(responses, held[0], band=band, progress=say, runs=recordings)
+            found = diagnose(responses, in_pose, band=band, progress=say, runs=recordings)
     modes = modes_of_all(responses, held[0] if held else None)
     written = []
     if page is not None:
@@ -228,6 +228,17 @@ def report(
     console.print(summary(recordings, responses, curve, band or ALL, modes))
     for path in written:
         console.print(f"written  {path}", soft_wrap=True)
+
+
+def _of_one_pose(recordings: list[Recording], rig: Rig | None) -> Rig:
+    """The rig in the pose of recordings that are to be diagnosed; InputError for several."""
+    from samii_rig.diagnose.posed import one_pose
+    from samii_rig.identify.poses import at_pose, poses_of
+
+    if rig is None:
+        raise without_rig()
+    expected = "recordings in one pose; samii-rig diagnose takes those of several"
+    return at_pose(rig, one_pose(poses_of(recordings, rig, ()), "--diagnosis", expected))
 
 
 def read_all(logs: list[Path]) -> list[Recording]:

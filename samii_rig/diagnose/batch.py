@@ -13,14 +13,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.posed import in_poses, sorted_by_pose
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.errors import InputError, SamiiRigError
+from samii_rig.identify.poses import poses_of
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.estimate import estimate
 from samii_rig.signal.gather import Gaps
+from samii_rig.types import FrequencyResponse, Recording
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +37,7 @@ class How:
 
 
 def together(logs: Sequence[Path], how: How) -> Diagnosis:
-    """The diagnosis of recordings of one rig.
+    """The diagnosis of recordings of one rig, each in the pose of the rig file that it carries.
 
     Raises InputError where there is no rig file, RecordingError, EstimateError.
     """
@@ -44,8 +46,12 @@ def together(logs: Sequence[Path], how: How) -> Diagnosis:
     if not text:
         raise InputError("--rig", "", None, "a rig: these recordings carry none")
     rig = parse(Rig, text, "the rig file")
-    responses = estimate(recordings, outputs=how.outputs, gaps=how.gaps, band=how.band)
-    return diagnose(responses, rig, band=how.band, runs=recordings)
+
+    def estimated(runs: Sequence[Recording]) -> Sequence[FrequencyResponse]:
+        return estimate(runs, outputs=how.outputs, gaps=how.gaps, band=how.band)
+
+    each = sorted_by_pose(recordings, poses_of(recordings, rig, ()), estimated)
+    return in_poses(each, rig, band=how.band)
 
 
 def each(

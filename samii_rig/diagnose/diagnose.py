@@ -16,6 +16,7 @@ from samii_rig.diagnose.fit.classes import without_twins
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import grid
+from samii_rig.diagnose.physics.poses import weighty
 from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_line import by_lines
@@ -28,11 +29,20 @@ from samii_rig.types import FrequencyResponse, Recording
 TWIN_POINTS = 40
 
 
-def table(rig: Rig, low_hz: float, high_hz: float, *, signed: bool = False) -> list[Effect]:
+def table(
+    rig: Rig,
+    low_hz: float,
+    high_hz: float,
+    *,
+    signed: bool = False,
+    poses: Sequence[Rig] = (),
+) -> list[Effect]:
     """All effects that the table knows on this rig, structural twins as one. signed : with what a
-    rig has less of, see `vocabulary.hypotheses`."""
+    rig has less of, see `vocabulary.hypotheses`. poses : the rig in each of several; twins in all
+    of them are one."""
     f = np.geomspace(low_hz, high_hz, TWIN_POINTS)
-    return without_twins(rig, hypotheses(rig, low_hz, high_hz, signed=signed), f)
+    every = weighty(hypotheses(rig, low_hz, high_hz, signed=signed), rig, poses=bool(poses))
+    return without_twins(rig, every, f, poses)
 
 
 def diagnose(

@@ -304,7 +304,7 @@ def test_a_part_that_the_state_before_does_not_have_is_free_after_alone():
     f = np.geomspace(0.5, 30.0, 30)
     n = len(braced.sensor)
     at = [grid(r, f, np.arange(n), np.zeros(n, np.int64)) for r in (braced, before.rig)]
-    whole = BothGrid.of(*at)
+    whole = BothGrid.of(at)
     h, dh = both.gradient(np.zeros(both.n), whole)
     assert h[:30] == pytest.approx(Model(braced).response(np.zeros(both.after.n), at[0]))
     assert h[30:] == pytest.approx(before.response(np.zeros(before.n), at[1]))

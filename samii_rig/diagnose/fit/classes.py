@@ -12,6 +12,7 @@ from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.refit import Problem, refit
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Model
+from samii_rig.diagnose.physics.poses import in_pose
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig
 
@@ -150,26 +151,15 @@ def _plainest_first(members: Sequence[Explanation]) -> list[int]:
     return [first, *(i for i in range(len(members)) if i != first)]
 
 
-def without_twins(rig: Rig, table: Sequence[Effect], frequency: np.ndarray) -> list[Effect]:
-    """The table with effects that are the same by structure as one, its names as aliases."""
+def without_twins(
+    rig: Rig, table: Sequence[Effect], frequency: np.ndarray, poses: Sequence[Rig] = ()
+) -> list[Effect]:
+    """The table with effects that are the same by structure as one, its names as aliases. poses :
+    the rig in each of several, in all of which they are to be the same."""
     kept: list[tuple[Effect, np.ndarray]] = []
     for effect in table:
-        trial = Model(rig, (effect,))
-        x = np.zeros(trial.n)
-        x[trial.n_nominal :] = [math.log(u.starts[len(u.starts) // 2]) for u in effect.unknowns]
-        h = trial.chain.with_values(trial.values(x)).response(frequency)
-        if effect.factor is not None:
-            F = effect.factor.value(2j * np.pi * frequency, trial.parts(x)[0])[0]
-            names = [
-                c.name for c in (rig.actuator if effect.factor.kind == "input" else rig.sensor)
-            ]
-            on = names.index(effect.factor.channel)
-            part = (
-                (slice(None), slice(None), on)
-                if effect.factor.kind == "input"
-                else (slice(None), on)
-            )
-            h[part] *= F[:, None]
+        each = [(at, in_pose(effect, at)) for at in poses] or [(rig, effect)]
+        h = np.stack([_at_start(at, own, frequency) for at, own in each])
         for i, (other, response) in enumerate(kept):
             if len(other.unknowns) == len(effect.unknowns) and _same(h, response):
                 names_ = tuple(dict.fromkeys((*other.aliases, *effect.names)))
@@ -179,6 +169,23 @@ def without_twins(rig: Rig, table: Sequence[Effect], frequency: np.ndarray) -> l
         else:
             kept.append((effect, h))
     return [effect for effect, _ in kept]
+
+
+def _at_start(rig: Rig, effect: Effect, frequency: np.ndarray) -> np.ndarray:
+    """The response of a rig with an effect, from the middle of where its refit starts."""
+    trial = Model(rig, (effect,))
+    x = np.zeros(trial.n)
+    x[trial.n_nominal :] = [math.log(u.starts[len(u.starts) // 2]) for u in effect.unknowns]
+    h = trial.chain.with_values(trial.values(x)).response(frequency)
+    if effect.factor is not None:
+        F = effect.factor.value(2j * np.pi * frequency, trial.parts(x)[0])[0]
+        names = [c.name for c in (rig.actuator if effect.factor.kind == "input" else rig.sensor)]
+        on = names.index(effect.factor.channel)
+        part = (
+            (slice(None), slice(None), on) if effect.factor.kind == "input" else (slice(None), on)
+        )
+        h[part] *= F[:, None]
+    return np.asarray(h)
 
 
 def _same(a: np.ndarray, b: np.ndarray) -> bool:

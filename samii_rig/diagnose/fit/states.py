@@ -6,66 +6,37 @@ sum is exact: the nodes of both likelihoods stand one behind the other, and a mo
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
 
 from samii_rig.diagnose.fit.records import RecordSearch, Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.fit.summed import Stacked, Summed
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.result import Gap
 from samii_rig.likelihood.pieces import Wiring
-from samii_rig.likelihood.reduce import Left, Reduced, by_sensor
+from samii_rig.likelihood.reduce import Left, Reduced
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, Int
 
-RANK = 1e-10  # of the largest, a direction of rounding alone
-
 
 @dataclass(frozen=True, slots=True)
-class BothGrid(Grid):
-    """The rows of the state after, `split` of them, then those of the state before."""
+class BothGrid(Stacked):
+    """The rows of the state after, then those of the state before."""
 
-    split: int = field(kw_only=True)
-
-    @classmethod
-    def of(cls, after: Grid, before: Grid) -> BothGrid:
-        """Two grids as one."""
-        each = (after, before)
-        return cls(
-            frequency=np.concatenate([g.frequency for g in each]),
-            factor=np.concatenate([g.factor for g in each]),
-            aliases=np.concatenate([g.aliases for g in each]),
-            folded=np.concatenate([g.folded for g in each], axis=1),
-            rate_hz=after.rate_hz,
-            sensor=after.sensor,
-            actuator=after.actuator,
-            sigma=np.concatenate([np.full(g.frequency.size, g.sigma) for g in each]),
-            loop=after.loop,
-            split=after.frequency.size,
-        )
+    @property
+    def split(self) -> int:
+        """How many are of the state after."""
+        return self.sizes[0]
 
     @property
     def changed(self) -> slice:
         """As of `Grid`."""
         return slice(0, self.split)
-
-    def parts(self) -> tuple[Grid, Grid]:
-        """After, before."""
-        sigma = np.broadcast_to(self.sigma, self.frequency.shape)
-        after, before = (
-            Grid(
-                self.frequency[own], self.factor[own], self.aliases[own], self.folded[:, own],
-                self.rate_hz, self.sensor, self.actuator, sigma=sigma[own], loop=self.loop,
-            )
-            for own in (slice(0, self.split), slice(self.split, None))
-        )  # fmt: skip
-        return after, before
 
 
 class States(Model):
@@ -146,56 +117,6 @@ def _before(fitted: Fitted) -> Fitted:
     return replace(fitted, model=model.before, x=fitted.x[: model.before.n])
 
 
-@dataclass(frozen=True, slots=True)
-class BothReduced(Reduced):
-    """The likelihoods of two states, summed. each : after, before."""
-
-    each: tuple[Reduced, Reduced]
-
-    @classmethod
-    def of(cls, after: Reduced, before: Reduced, *, alike: bool) -> BothReduced:
-        """alike : what no model explains is free at every node, and the same in both states, which
-        have the same nodes."""
-        (m, q, _, a), (n, _, _, b) = after.factor.shape, before.factor.shape
-        factor = np.zeros((m + n, q, 2, a + b))
-        factor[:m, :, :, :a] = after.factor
-        factor[m:, :, :, a:] = before.factor
-        target = np.concatenate([after.target, before.target])
-        known = after.known + before.known
-        inside = tuple(x + y for x, y in zip(after.inside, before.inside, strict=True))
-        differing = tuple(x + y for x, y in zip(after.differing, before.differing, strict=True))
-        if alike:
-            common = (factor[..., :a] + factor[..., a:]).reshape(m + n, -1)
-            rest, rank = _beside(common)
-            factor = (rest.T @ factor.reshape(m + n, -1)).reshape(-1, q, 2, a + b)
-            target, known = rest.T @ target, known - rank
-        return cls(
-            np.concatenate([after.frequency, before.frequency]), after.sigma,
-            np.concatenate([after.reference, before.reference]), factor, target, known,
-            (inside[0], inside[1]), after.noise, (differing[0], differing[1]), (after, before),
-        )  # fmt: skip
-
-    def slopes(self, dh: Complex) -> Float:
-        """As of `Reduced`."""
-        flat = by_sensor(dh)
-        return np.asarray(self.factor.reshape(-1, len(flat)) @ flat)
-
-    def bent(self, d: Complex, middle: Complex) -> float:
-        """As of `Reduced`."""
-        after, before = self.each
-        n = after.frequency.size
-        return math.hypot(after.bent(d[:n], middle[: n - 1]), before.bent(d[n:], middle[n - 1 :]))
-
-
-def _beside(columns: Float) -> tuple[Float, int]:
-    """Orthonormal directions (m, m - rank) that no column (m, n) has, and the rank."""
-    scale = np.linalg.norm(columns, axis=0)
-    Q, R, _ = linalg.qr(columns / np.where(scale > 0, scale, 1.0), pivoting=True)
-    size = np.abs(np.diagonal(R))
-    rank = int(np.count_nonzero(size > RANK * size[0]))
-    return np.asarray(Q[:, rank:]), rank
-
-
 @dataclass(frozen=True)
 class Both:
     """The records of two states.
@@ -228,33 +149,35 @@ class Both:
         """As of `Recorded`."""
         return self.after.left_out + self.before.left_out
 
-    def about(self, fitted: Fitted) -> BothReduced:
+    def about(self, fitted: Fitted) -> Summed:
         """As of `Recorded`."""
         before = self.before.about(_before(fitted))
         after = self.after.about(_after(fitted), before.frequency if self.alike else None)
-        return BothReduced.of(after, before, alike=self.alike)
+        return Summed.of([after, before], alike=self.alike)
 
     def nodes(self, found: Reduced, fitted: Fitted) -> Grid:
         """As of `Recorded`."""
         after, before = _parts(found)
         return BothGrid.of(
-            self.after.nodes(after, _after(fitted)), self.before.nodes(before, _before(fitted))
+            [self.after.nodes(after, _after(fitted)), self.before.nodes(before, _before(fitted))]
         )
 
     def between(self, found: Reduced, fitted: Fitted) -> Grid:
         """As of `Recorded`."""
         after, before = _parts(found)
-        return BothGrid.of(
-            self.after.between(after, _after(fitted)), self.before.between(before, _before(fitted))
+        each = (
+            self.after.between(after, _after(fitted)),
+            self.before.between(before, _before(fitted)),
         )
+        return BothGrid.of(each)
 
     def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
         """As of `Recorded`, of the state after: there a change shows."""
         return self.after.left(_after(fitted), _parts(noise)[0], shown=shown)
 
 
-def _parts(found: Reduced) -> tuple[Reduced, Reduced]:
-    assert isinstance(found, BothReduced)
+def _parts(found: Reduced) -> tuple[Reduced, ...]:
+    assert isinstance(found, Summed)
     return found.each
 
 

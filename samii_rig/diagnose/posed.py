@@ -1,0 +1,178 @@
+"""`in_poses`: one rig, recorded in several poses, and one set of parameters for all of them.
+
+poses = poses_of(recordings, rig, ["0 deg", "75 deg"])
+found = in_poses(sorted_by_pose(recordings, poses, estimate), rig)
+found.verdict, found.causes, found.lines()
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from samii_rig.diagnose.data.findings import Sound
+from samii_rig.diagnose.diagnose import case_of, diagnose, table
+from samii_rig.diagnose.fit.poses import InPoses, PosesSearch
+from samii_rig.diagnose.fit.records import Whole
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.result import Diagnosis
+from samii_rig.diagnose.verdict.by_record import by_samples
+from samii_rig.diagnose.verdict.stages import Case, Progress
+from samii_rig.errors import EstimateError, InputError
+from samii_rig.identify.poses import at_pose
+from samii_rig.rig.load import parse
+from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.pose import Angle
+from samii_rig.types import FrequencyResponse, Recording
+
+Band = tuple[float, float]
+FORCES = (
+    "friction, play, hardening and the like were not looked for, as the recordings are in several "
+    "poses; those of one pose alone would show these"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class InPose:
+    """The recordings in one pose and their responses, by `samii_rig.signal.estimate`."""
+
+    pose: Angle
+    responses: Sequence[FrequencyResponse]
+    runs: Sequence[Recording]
+
+    @property
+    def told(self) -> str:
+        """The pose in words."""
+        return _told(self.pose)
+
+
+def _told(pose: Angle) -> str:
+    return f"{math.degrees(pose.value):.4g} deg"
+
+
+def sorted_by_pose(
+    recordings: Sequence[Recording],
+    poses: Sequence[Angle],
+    estimated: Callable[[Sequence[Recording]], Sequence[FrequencyResponse]],
+) -> list[InPose]:
+    """The recordings of each pose, in order of appearance. poses : of each recording; estimated :
+    responses of those of one pose."""
+    out = []
+    for pose in dict.fromkeys(poses):
+        own = [r for r, at in zip(recordings, poses, strict=True) if at == pose]
+        out.append(InPose(pose, estimated(own), own))
+    return out
+
+
+def one_pose(poses: Sequence[Angle], option: str, expected: str) -> Angle:
+    """The pose of recordings that have one; InputError of an option where they have several."""
+    first, *others = dict.fromkeys(poses)
+    if others:
+        raise InputError(option, "pose", ", ".join(_told(p) for p in (first, *others)), expected)
+    return first
+
+
+def same_rig(toml: str, rig: Rig) -> bool:
+    """Whether a rig file is that of a rig but for the pose."""
+    try:
+        other = parse(Rig, toml, "the rig file of a recording")
+    except InputError:
+        return False
+    return bool(rig.gravity) and at_pose(other, None) == at_pose(rig, None)
+
+
+def in_poses(
+    each: Sequence[InPose],
+    rig: Rig,
+    *,
+    band: Band | None = None,
+    effects: Sequence[Effect] | None = None,
+    progress: Progress = lambda _stage: None,
+) -> Diagnosis:
+    """What `rig` leaves out, as far as the recordings of all poses tell together.
+
+    Parameters
+    ----------
+    each : the recordings of each pose; those of one pose alone are for `diagnose`.
+    band, effects, progress : as of `diagnose`.
+
+    Raises InputError and EstimateError as `diagnose` does; EstimateError where the recordings of a
+    pose cannot be used whole, or not together.
+    """
+    rigs = [at_pose(rig, one.pose) for one in each]
+    if len(each) == 1:
+        (one,) = each
+        return diagnose(
+            one.responses, rigs[0], band=band, effects=effects, progress=progress, runs=one.runs
+        )
+    progress("nominal model")
+    if effects is None:
+        effects = table(rigs[0], *_measured(each, band), poses=rigs)
+    cases = [
+        case_of(one.responses, own, band, effects, one.runs)
+        for one, own in zip(each, rigs, strict=True)
+    ]
+    records = _together(each, cases, rigs, band)
+    first = cases[0]
+    for case in cases[1:]:
+        effects = case.clean.competing(effects)
+    first.search.use(first.clean.competing(effects))
+    search = PosesSearch(records, first.search, rigs)
+    nominal = search.nominal.fitted
+    at_first, bands = search.ratio(nominal), search.bands(nominal)
+    progress("what is missing")
+    search.run()
+    whole = replace(first, clean=_of_all([case.clean for case in cases]))
+    found = by_samples(whole, search, at_first, bands, progress)
+    poses = ", ".join(one.told for one in each)
+    said = f"one set of parameters in {len(each)} poses ({poses})"
+    if found.rig is not None or found.traces:
+        said += "; the curves and the new rig file are of the first"
+    return replace(found, not_physics=(said, *found.not_physics, FORCES))
+
+
+def _measured(each: Sequence[InPose], band: Band | None) -> Band:
+    """Hz, of the lines that take part."""
+    low, high = band or (0.0, math.inf)
+    f = [float(x) for one in each for r in one.responses for x in r.frequency if low <= x <= high]
+    f = [x for x in f if x > 0]
+    if not f:  # is told by `case_of` as of any band
+        return 1.0, 10.0
+    return min(f), max(f)
+
+
+def _together(
+    each: Sequence[InPose], cases: Sequence[Case], rigs: Sequence[Rig], band: Band | None
+) -> InPoses:
+    """The records of all poses.
+
+    Raises EstimateError where those of one cannot be used whole, or have other channels.
+    """
+    common = [
+        name for name in cases[0].clean.sensors if all(name in c.clean.sensors for c in cases)
+    ]
+    wholes = []
+    for one, case, rig in zip(each, cases, rigs, strict=True):
+        clean = case.clean
+        where = f"the recordings in pose {one.told}"
+        if case.search.lines.torn() or clean.mended or clean.doubt:
+            why = (*clean.told, "they depend on the level as no linear rig does")[0]
+            raise EstimateError(f"{where} cannot be fitted with the others: {why}")
+        try:
+            wholes.append(Whole.of(case.runs, rig, band, common, clean.samples))
+        except EstimateError as error:
+            raise EstimateError(f"{where} cannot be fitted with the others: {error}") from error
+        if wholes[-1].wired != wholes[0].wired:
+            raise EstimateError(f"{where} have other commands, loops or sensors than the first")
+    return InPoses(tuple(wholes))
+
+
+def _of_all(each: Sequence[Sound]) -> Sound:
+    """What was found in the recordings of all poses."""
+    return replace(
+        each[0],
+        told=tuple(dict.fromkeys(words for one in each for words in one.told)),
+        lacks=tuple(dict.fromkeys(words for one in each for words in one.lacks)),
+        of_lines=frozenset().union(*(one.of_lines for one in each)),
+    )
