@@ -18,9 +18,10 @@ from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
-from samii_rig.diagnose.verdict.stages import Case, Progress
+from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.identify.poses import at_pose
+from samii_rig.progress import Progress
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
@@ -110,7 +111,7 @@ def in_poses(
     if effects is None:
         effects = table(rigs[0], *_measured(each, band), poses=rigs)
     cases = [
-        case_of(one.responses, own, band, effects, one.runs)
+        case_of(one.responses, own, band, effects, one.runs, progress=progress)
         for one, own in zip(each, rigs, strict=True)
     ]
     records = _together(each, cases, rigs, band)
@@ -121,10 +122,10 @@ def in_poses(
     search = PosesSearch(records, first.search, rigs)
     nominal = search.nominal.fitted
     at_first, bands = search.ratio(nominal), search.bands(nominal)
-    progress("what is missing")
+    search.begin("what is missing")
     search.run()
     whole = replace(first, clean=_of_all([case.clean for case in cases]))
-    found = by_samples(whole, search, at_first, bands, progress)
+    found = by_samples(whole, search, at_first, bands)
     poses = ", ".join(one.told for one in each)
     said = f"one set of parameters in {len(each)} poses ({poses})"
     if found.rig is not None or found.traces:

@@ -203,7 +203,7 @@ def test_the_command_line_judges_a_rig_that_has_a_loop_in_three_lines(made, tmp_
     call = ["control", "--rig", str(path), "--draws", "2", "--out", str(tmp_path / "out")]
     result = CliRunner().invoke(app, call)
     assert result.exit_code == 0, result.output
-    said = [line for line in result.output.splitlines() if line.strip()]
+    said = [line for line in result.stdout.splitlines() if line.strip()]
     assert len(said) == 3
     assert "reached" in said[2]
     names = {p.name for p in (tmp_path / "out").iterdir()}
