@@ -79,7 +79,7 @@ def control(
     recordings = [read_recording(path) for path in steps or ()]
     make_folder("--out", out)
     console = Console(highlight=False, soft_wrap=True)
-    with working(console, "control", quiet=json) as say:
+    with working(Console(stderr=True, highlight=False), "control", quiet=json) as say:
         say("modes")
         made = design(
             the_rig,

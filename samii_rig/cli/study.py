@@ -75,7 +75,9 @@ def study(
     with ExitStack() as stack:
         # Opened first: a place that cannot be written to is said before the work, not after it.
         parts = [stack.enter_context(replacing(p)) if p else None for p in (out, plot)]
-        say = stack.enter_context(working(console, "study", quiet=json))
+        say = stack.enter_context(
+            working(Console(stderr=True, highlight=False), "study", quiet=json)
+        )
         executor = stack.enter_context(at_work(workers, scheduler))
         found = modes_over(
             text,
