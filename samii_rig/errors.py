@@ -8,6 +8,7 @@ class's `exit_code`; anything else that escapes is a defect of ours.
 from collections.abc import Iterable
 from difflib import get_close_matches
 
+NO_MEMORY = "there is no memory left"
 MAX_SHOWN = 80  # characters of a wrong value that fit on the line beside the rest
 
 

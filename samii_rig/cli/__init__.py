@@ -29,7 +29,7 @@ def _command() -> int:
     from typer.exceptions import TyperException
 
     from samii_rig.cli.app import app
-    from samii_rig.errors import DiskError, SamiiRigError
+    from samii_rig.errors import NO_MEMORY, DiskError, SamiiRigError
     from samii_rig.files import DISK_ERRORS
 
     try:
@@ -43,7 +43,7 @@ def _command() -> int:
     except (Abort, KeyboardInterrupt):
         return 130
     except MemoryError:
-        print("samii-rig: there is no memory left", file=sys.stderr)
+        print(f"samii-rig: {NO_MEMORY}", file=sys.stderr)
         return 1
     except BrokenPipeError:
         # The reader of our output went away (`samii-rig ... | head`): not an error.

@@ -21,6 +21,7 @@ from samii_rig.cli.estimate import (
     BandOption,
     GapsOption,
     OutputOption,
+    PoseOption,
     RigOverride,
     estimated,
     read_all,
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from samii_rig.diagnose.result import Diagnosis
     from samii_rig.record.reader import SavedResponses
     from samii_rig.signal.gather import Gaps
-    from samii_rig.types import FrequencyResponse
+    from samii_rig.types import FrequencyResponse, Recording
 
 
 class Spread(TyperCommand):
@@ -84,13 +85,7 @@ def diagnose(
         list[str] | None,
         typer.Option(help="The same of the state before alone. May be repeated."),
     ] = None,
-    pose: Annotated[
-        list[str] | None,
-        typer.Option(
-            help='The rig\'s angle to the way down in each recording, in their order, as "30 deg" '
-            "[default: that of the rig file which each carries]."
-        ),
-    ] = None,
+    pose: PoseOption = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -224,27 +219,22 @@ def _together(
     the_rig = at_pose(held[0], at[0]) if at else held[0]
     own_rig = with_known(the_rig, values)
     console = Console(highlight=False)
+
+    def of(runs: Sequence[Recording]) -> Sequence[FrequencyResponse]:
+        return estimated(list(runs), None, output, "auto", gaps, band)
+
     with working(console, "diagnosis", quiet=json) as say:
         say("frequency responses")
-        each = []
-        if len(set(at)) > 1:
-            each = sorted_by_pose(
-                second, at, lambda of: estimated(list(of), None, output, "auto", gaps, band)
+        if saved:
+            responses: Sequence[FrequencyResponse] = tuple(
+                r for file in saved for r in chosen(file, output)
             )
-        responses = (
-            tuple(r for file in saved for r in chosen(file, output))
-            if saved
-            else each[0].responses
-            if each
-            else estimated(second, None, output, "auto", gaps, band)
-        )
-        if each:
-            found = in_poses(each, own_rig, band=band, progress=say)
+            found = found_by(responses, own_rig, band=band, progress=say)
         elif first:
-            of_first = estimated(first, None, output, "auto", gaps, band)
-            states = State(of_first, first), State(responses, second)
+            responses = of(second)
             found = changed(
-                *states,
+                State(of(first), first),
+                State(responses, second),
                 the_rig,
                 known=values,
                 known_before=values_before,
@@ -252,7 +242,9 @@ def _together(
                 progress=say,
             )
         else:
-            found = found_by(responses, own_rig, band=band, progress=say, runs=second)
+            each = sorted_by_pose(second, at, of)
+            responses = each[0].responses
+            found = in_poses(each, own_rig, band=band, progress=say)
     # A change is no diagnosis of either state's recordings, nor is one of another rig.
     alike = all(r.rig_toml in ("", held[1]) or same_rig(r.rig_toml, held[0]) for r in second)
     own = not (first or values or saved) and alike

@@ -59,6 +59,13 @@ GapsOption = Annotated[
 BandOption = Annotated[
     tuple[float, float] | None, typer.Option(help="Lowest and highest frequency, Hz.")
 ]
+PoseOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        help='The rig\'s angle to the way down in each recording, in their order, as "30 deg" '
+        "[default: that of the rig file which each carries]."
+    ),
+]
 
 
 def frf(

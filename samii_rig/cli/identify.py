@@ -11,6 +11,7 @@ from samii_rig.cli.estimate import (
     GAPS,
     BandOption,
     GapsOption,
+    PoseOption,
     RigOverride,
     estimated,
     read_all,
@@ -45,13 +46,7 @@ def identify(
             "zero or mode shape ratio counts."
         ),
     ] = None,
-    pose: Annotated[
-        list[str] | None,
-        typer.Option(
-            help='The rig\'s angle to the way down in each recording, in their order, as "30 deg" '
-            "[default: that of the rig file which each carries]."
-        ),
-    ] = None,
+    pose: PoseOption = None,
     gaps: GapsOption = "refuse",
     band: BandOption = None,
     json: JsonOption = False,
@@ -126,8 +121,10 @@ def _in_poses(
     band: tuple[float, float] | None,
 ) -> list[tuple[FrequencyResponse, Angle]]:
     """Responses with the pose of their recordings; those of one pose are pooled."""
-    found = []
-    for pose in dict.fromkeys(at):
-        alike = [r for r, own in zip(recordings, at, strict=True) if own == pose]
-        found += [(r, pose) for r in estimated(alike, None, output, "auto", gaps, band)]
-    return found
+    from samii_rig.identify.poses import by_pose
+
+    return [
+        (r, pose)
+        for pose, alike in by_pose(recordings, at)
+        for r in estimated(alike, None, output, "auto", gaps, band)
+    ]

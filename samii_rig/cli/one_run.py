@@ -12,7 +12,7 @@ import typer
 
 from samii_rig.cli.common import comparisons, response_json
 from samii_rig.cli.predicted import prediction
-from samii_rig.errors import InputError, RecordedError
+from samii_rig.errors import NO_MEMORY, InputError, RecordedError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -74,8 +74,6 @@ class Done:
 
 def one_run(order: RunOrder, path: Path, said: Said, *, diagnosis: bool) -> Done:
     """One run with its page, and its summary on the console."""
-    from samii_rig.run.campaign import NO_MEMORY
-
     outcome = _driven(order, path, said)
     try:
         return _evaluated(order, outcome, said, diagnosis=diagnosis)

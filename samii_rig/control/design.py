@@ -29,7 +29,7 @@ from samii_rig.control.plants import inside as draws_inside
 from samii_rig.control.plants import uncertain as draws_uncertain
 from samii_rig.errors import InputError
 from samii_rig.model.loops import Loops, loops_of
-from samii_rig.progress import Counted, Progress
+from samii_rig.progress import Progress, counted
 from samii_rig.rig.schema import Acceleration, Feedback, Rig
 from samii_rig.safety.limits import find_actuator, gate_limits
 from samii_rig.types import Float
@@ -45,8 +45,6 @@ ROUNDS = 2  # of that
 # limit is left to the reference and the centring.
 AUTHORITY = 0.4
 SIMPLEX = 0.1  # first step of the simplex search, in log of corner and gain
-
-"""Called with what is being done and the part that is done, 0 to 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,11 +205,8 @@ def _accelerometer(rig: Rig, name: str | None) -> str:
 def _plants(
     rig: Rig, values: dict[str, Values], loops: Loops, say: Progress, what: str
 ) -> list[Plant]:
-    out = []
-    for i, (name, changed) in enumerate(values.items()):
-        say(Counted(what, i, len(values)))
-        out.append(plant(name, with_values(rig, changed), loops))
-    return out
+    every = counted(list(values.items()), say, what)
+    return [plant(name, with_values(rig, changed), loops) for name, changed in every]
 
 
 def _best(

@@ -132,12 +132,9 @@ def _both(first: Case, second: Case, band: Band | None) -> tuple[Both, RecordSea
     common = [name for name in first.clean.sensors if name in second.clean.sensors]
     wholes = []
     for name, case in (("before", first), ("after", second)):
-        clean = case.clean
-        if case.search.lines.torn() or clean.mended or clean.doubt:
-            why = (*clean.told, "they depend on the level as no linear rig does")[0]
+        if why := case.not_whole():
             raise EstimateError(f"the recordings {name} cannot be compared sample by sample: {why}")
-        search = case.search
-        wholes.append(Whole.of(case.runs, search.rig, band, common, clean.samples))
+        wholes.append(Whole.of(case.runs, case.search.rig, band, common, case.clean.samples))
     if wholes[0].wired != wholes[1].wired:
         raise EstimateError("the two states have no command and no sensor in common")
     longest = max(w.records.longest for w in wholes)

@@ -20,7 +20,7 @@ from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError, InputError
-from samii_rig.identify.poses import at_pose
+from samii_rig.identify.poses import at_pose, by_pose
 from samii_rig.progress import Progress
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
@@ -59,11 +59,7 @@ def sorted_by_pose(
 ) -> list[InPose]:
     """The recordings of each pose, in order of appearance. poses : of each recording; estimated :
     responses of those of one pose."""
-    out = []
-    for pose in dict.fromkeys(poses):
-        own = [r for r, at in zip(recordings, poses, strict=True) if at == pose]
-        out.append(InPose(pose, estimated(own), own))
-    return out
+    return [InPose(pose, estimated(own), own) for pose, own in by_pose(recordings, poses)]
 
 
 def one_pose(poses: Sequence[Angle], option: str, expected: str) -> Angle:
@@ -155,13 +151,11 @@ def _together(
     ]
     wholes = []
     for one, case, rig in zip(each, cases, rigs, strict=True):
-        clean = case.clean
         where = f"the recordings in pose {one.told}"
-        if case.search.lines.torn() or clean.mended or clean.doubt:
-            why = (*clean.told, "they depend on the level as no linear rig does")[0]
+        if why := case.not_whole():
             raise EstimateError(f"{where} cannot be fitted with the others: {why}")
         try:
-            wholes.append(Whole.of(case.runs, rig, band, common, clean.samples))
+            wholes.append(Whole.of(case.runs, rig, band, common, case.clean.samples))
         except EstimateError as error:
             raise EstimateError(f"{where} cannot be fitted with the others: {error}") from error
         if wholes[-1].wired != wholes[0].wired:

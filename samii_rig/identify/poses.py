@@ -33,6 +33,16 @@ def at_pose(rig: Rig, pose: Angle | None) -> Rig:
     return rig.model_copy(update={"pose": pose}) if rig.gravity else rig
 
 
+def by_pose(
+    recordings: Sequence[Recording], poses: Sequence[Angle]
+) -> list[tuple[Angle, list[Recording]]]:
+    """The recordings of each pose, in order of appearance. poses : of each recording."""
+    out: dict[Angle, list[Recording]] = {}
+    for recording, pose in zip(recordings, poses, strict=True):
+        out.setdefault(pose, []).append(recording)
+    return list(out.items())
+
+
 def poses_of(recordings: Sequence[Recording], rig: Rig, given: Sequence[str]) -> list[Angle]:
     """The pose of each recording: as `given`, else that of the rig file that it carries, if
     that has gravity, else that of `rig`.

@@ -156,14 +156,15 @@ def past(piece: Piece, k: Int, impulse: Float, contour: Contour) -> Complex:
     longest = min(len(piece.z), len(impulse) - known)
     dense = BEHIND if piece.history else AN_OCTAVE
     lags = np.unique(np.rint(2 ** np.arange(0, np.log2(longest), 1 / dense)).astype(np.int64))
+    each = [impulse[:, j :: piece.inputs] for j in range(piece.inputs)]
+    largest = [ROUNDS / NEW * np.max(np.abs(of)) for of in each]
     spectra = []
     for lag in lags:
-        off = ROUNDS * contour.rounding(int(lag) + known)
-        for j in range(piece.inputs):
-            of = impulse[:, j :: piece.inputs]
+        off = contour.rounding(int(lag) + known)
+        for of, most in zip(each, largest, strict=True):
             y = of[lag + piece.history : lag + known]
             # Of what has died out rounding alone would be left, in directions that nothing moves.
-            if lag == 1 or NEW * np.max(np.abs(y)) > off * np.max(np.abs(of)):
+            if lag == 1 or np.max(np.abs(y)) > off * most:
                 spectra.append(np.fft.rfft(y, axis=0)[k])
     return _independent(np.stack(spectra, axis=2))
 

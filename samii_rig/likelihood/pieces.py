@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -255,30 +255,36 @@ def _cut(
 ) -> list[Piece]:
     """The stretches of a segment between gaps, each with the input before it. v, r, edges : of the
     inputs. values : of the sensors. step : of their converters."""
+    name, level = recording.place(segment), (segment.level, segment.unit)
+    out = []
+    for start, low, high in _stretches(recording, segment, whole):
+        history = min(low - start, high - low)
+        # Whatever came before the history may still ring.
+        moving = low > history
+        part = r[low - history : high]
+        told = Command(v[low - history : high].copy(), 1.0)
+        z, struck = spikes.mended(values[low:high], step)
+        piece = Piece(name, part, z, history, (level,), moving, commands=(told,))
+        own = edges[low - history : high].reshape(high - low + history, -1)
+        at = tuple((int(i), int(j)) for i, j in np.argwhere(own))
+        out.append(replace(piece, struck=tuple(struck.tolist()), edges=at))
+    return out
+
+
+def _stretches(
+    recording: Recording, segment: Segment, whole: NDArray[np.bool_]
+) -> Iterator[tuple[int, int, int]]:
+    """Rows of a segment without a gap, `LONGEST` at most: from which row on there is none, the
+    first, and the one behind the last."""
     a, b = np.searchsorted(recording.sequence, [segment.start, segment.stop])
     jumps = np.flatnonzero(np.diff(recording.sequence) != 1) + 1
     ends = np.unique(np.concatenate([jumps, np.flatnonzero(np.diff(whole.astype(np.int8))) + 1]))
-    out = []
-    for start, stop in pairwise([0, *ends.tolist(), len(r)]):
+    for start, stop in pairwise([0, *ends.tolist(), len(whole)]):
         first, last = max(start, int(a)), min(stop, int(b))
-        if last - first < LEAST_SAMPLES or not whole[first]:
-            continue
-        parts = -(-(last - first) // LONGEST)
-        cuts = np.linspace(first, last, parts + 1).astype(np.int64).tolist()
-        for low, high in pairwise(cuts):
-            history = min(low - start, high - low)
-            # Whatever came before the history may still ring.
-            moving = low > history
-            name = recording.place(segment)
-            part = r[low - history : high]
-            level = (segment.level, segment.unit)
-            told = Command(v[low - history : high].copy(), 1.0)
-            z, struck = spikes.mended(values[low:high], step)
-            piece = Piece(name, part, z, history, (level,), moving, commands=(told,))
-            own = edges[low - history : high].reshape(high - low + history, -1)
-            at = tuple((int(i), int(j)) for i, j in np.argwhere(own))
-            out.append(replace(piece, struck=tuple(struck.tolist()), edges=at))
-    return out
+        if last - first >= LEAST_SAMPLES and whole[first]:
+            parts = -(-(last - first) // LONGEST)
+            cuts = np.linspace(first, last, parts + 1).astype(np.int64).tolist()
+            yield from ((start, low, high) for low, high in pairwise(cuts))
 
 
 def _joined(pieces: list[Piece], *, levels: bool) -> list[Piece]:

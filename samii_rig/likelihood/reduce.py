@@ -122,8 +122,8 @@ class Records:
 
     bands : Hz, of the lines of each that take part. steps : of each sensor's converter, none where
     they are not known. least : samples for which the contours are long
-    enough at least, so that those of other records are the same. driven : Hz up to which the
-        input is more than noise, so that a change of the response shows.
+    enough at least, so that those of other records are the same. driven : Hz up to which the input
+    is more than noise, so that a change of the response shows.
     """
 
     pieces: tuple[Piece, ...]

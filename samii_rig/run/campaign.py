@@ -16,7 +16,7 @@ from threading import Event
 
 from samii_rig.devices.opening import close_device, open_device
 from samii_rig.devices.protocols import OpenRig
-from samii_rig.errors import RecordedError, RecordingError, SamiiRigError
+from samii_rig.errors import NO_MEMORY, RecordedError, RecordingError, SamiiRigError
 from samii_rig.record.reader import read_frequency_responses, read_recording
 from samii_rig.record.writer import RunWriter
 from samii_rig.run.dryrun import DryRun
@@ -34,7 +34,6 @@ from samii_rig.signal.estimate import estimate
 from samii_rig.types import SampleBlock, StopRecord
 
 # What can change a result and is not in the recording otherwise.
-NO_MEMORY = "there is no memory left"
 VERSIONS_OF = ("samii-rig", "numpy", "scipy", "numba", "mcap")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from samii_rig.diagnose.fit.records import RecordSearch, Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
-from samii_rig.diagnose.fit.summed import Stacked, Summed
+from samii_rig.diagnose.fit.summed import Stacked, Summed, parts_of
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.physics.poses import in_pose
@@ -70,11 +70,6 @@ def _each(fitted: Fitted) -> list[Fitted]:
     return [replace(fitted, model=one) for one in model.each]
 
 
-def _parts(found: Reduced) -> tuple[Reduced, ...]:
-    assert isinstance(found, Summed)
-    return found.each
-
-
 @dataclass(frozen=True)
 class InPoses:
     """The records of each pose, of the same commands and sensors."""
@@ -108,17 +103,17 @@ class InPoses:
 
     def nodes(self, found: Reduced, fitted: Fitted) -> Grid:
         """As of `Recorded`."""
-        each = zip(self.each, _parts(found), _each(fitted), strict=True)
+        each = zip(self.each, parts_of(found), _each(fitted), strict=True)
         return Stacked.of([whole.nodes(part, own) for whole, part, own in each])
 
     def between(self, found: Reduced, fitted: Fitted) -> Grid:
         """As of `Recorded`."""
-        each = zip(self.each, _parts(found), _each(fitted), strict=True)
+        each = zip(self.each, parts_of(found), _each(fitted), strict=True)
         return Stacked.of([whole.between(part, own) for whole, part, own in each])
 
     def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
         """As of `Recorded`, of all poses, by frequency."""
-        each = zip(self.each, _parts(noise), _each(fitted), strict=True)
+        each = zip(self.each, parts_of(noise), _each(fitted), strict=True)
         found = [whole.left(own, part, shown=shown) for whole, part, own in each]
         f = np.concatenate([one.frequency for one in found])
         order = np.argsort(f, kind="stable")

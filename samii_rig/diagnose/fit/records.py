@@ -434,14 +434,8 @@ class RecordSearch(Search):
 
     def __init__(self, whole: Recorded, by_line: Search) -> None:
         self.whole, self.by_line = whole, by_line
-        super().__init__(
-            by_line.rig,
-            by_line.lines,
-            by_line.grid,
-            by_line.table,
-            progress=by_line.progress,
-            stage=NOMINAL,
-        )
+        one = by_line
+        super().__init__(one.rig, one.lines, one.grid, one.table, progress=one.progress)
 
     def __post_init__(self) -> None:
         self.use(self.table)

@@ -14,7 +14,7 @@ import numpy as np
 from samii_rig.diagnose.fit.records import RecordSearch, Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
-from samii_rig.diagnose.fit.summed import Stacked, Summed
+from samii_rig.diagnose.fit.summed import Stacked, Summed, parts_of
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.result import Gap
@@ -157,14 +157,14 @@ class Both:
 
     def nodes(self, found: Reduced, fitted: Fitted) -> Grid:
         """As of `Recorded`."""
-        after, before = _parts(found)
+        after, before = parts_of(found)
         return BothGrid.of(
             [self.after.nodes(after, _after(fitted)), self.before.nodes(before, _before(fitted))]
         )
 
     def between(self, found: Reduced, fitted: Fitted) -> Grid:
         """As of `Recorded`."""
-        after, before = _parts(found)
+        after, before = parts_of(found)
         each = (
             self.after.between(after, _after(fitted)),
             self.before.between(before, _before(fitted)),
@@ -173,12 +173,7 @@ class Both:
 
     def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
         """As of `Recorded`, of the state after: there a change shows."""
-        return self.after.left(_after(fitted), _parts(noise)[0], shown=shown)
-
-
-def _parts(found: Reduced) -> tuple[Reduced, ...]:
-    assert isinstance(found, Summed)
-    return found.each
+        return self.after.left(_after(fitted), parts_of(noise)[0], shown=shown)
 
 
 class StatesSearch(RecordSearch):

@@ -109,6 +109,12 @@ class Summed(Reduced):
         return math.hypot(*(one.bent(d[own], middle[gap]) for one, own, gap in each))
 
 
+def parts_of(found: Reduced) -> tuple[Reduced, ...]:
+    """The likelihoods of which one is the sum."""
+    assert isinstance(found, Summed)
+    return found.each
+
+
 def _added(pairs: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return sum(a for a, _ in pairs), sum(b for _, b in pairs)
 

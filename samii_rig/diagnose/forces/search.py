@@ -70,6 +70,7 @@ class ForceSearch(RecordSearch):
         self.use((*linear.table, *self.forces))
 
     def __post_init__(self) -> None:
+        self.stage = self.linear.stage
         self.use(self.table)
         ranked = self.linear.ranked()
         self._about(ranked[0].fitted)

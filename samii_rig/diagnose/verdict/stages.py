@@ -40,6 +40,14 @@ class Case:
     decide: Measured | None
     show: Measured
 
+    def not_whole(self) -> str:
+        """Why these records cannot be held sample by sample against others of one linear rig; ""
+        where they can."""
+        clean = self.clean
+        if not (self.search.lines.torn() or clean.mended or clean.doubt):
+            return ""
+        return (*clean.told, "they depend on the level as no linear rig does")[0]
+
 
 @dataclass(frozen=True)
 class Shown:
