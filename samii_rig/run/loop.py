@@ -213,10 +213,13 @@ class _Run:
             self.gate.stop("the plan is done", self.clock.now())
             self._report_segments()
             return "completed", f"all {len(self.plan.segments)} segments done"
-        if interrupts.reason:
-            return "stopped", f"stopped by {interrupts.reason}"
-        if stop.is_set():
-            return "stopped", "stopped on request"
+        if interrupts.reason or stop.is_set():
+            by = interrupts.reason
+            reason = f"stopped by {by}" if by else "stopped on request"
+            self._zero(reason)
+            # The stop may have come in the tick in which a segment's last sample did.
+            self._report_segments()
+            return "stopped", reason
         self._send()
         self._report_segments()
         self.due = self._wait(self.due + round(self.tick * 1e9))

@@ -105,6 +105,19 @@ def test_a_stop_event_ends_at_zero():
     assert sink.events[-1][1]["status"] == "stopped"
 
 
+def test_a_segment_whose_last_sample_is_there_is_recorded_however_soon_the_stop_comes():
+    asked = threading.Event()
+
+    def enough(now):
+        if now.segment == 2:
+            asked.set()
+
+    stop, _, sink = go(stop=asked, progress=enough, settings=LoopSettings(report=0.0))
+    assert (stop.status, stop.reason) == ("stopped", "stopped on request")
+    assert [s.name for s in sink.segments] == ["burst_0"]
+    assert sink.column("sequence")[-1] >= sink.segments[0].stop
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_at_zero_with_a_whole_recording(number):
     def spoil(block):
