@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from samii_rig.cli.common import JsonOption, Logs, rig_of, say_json, without_rig
+from samii_rig.cli.common import JsonOption, rig_of, say_json, without_rig
 from samii_rig.cli.estimate import (
     GAPS,
     BandOption,
@@ -16,15 +17,33 @@ from samii_rig.cli.estimate import (
     estimated,
     read_all,
 )
+from samii_rig.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from samii_rig.rig.schema.pose import Angle
     from samii_rig.types import FrequencyResponse, Recording
 
 
 def identify(
-    logs: Logs,
+    logs: Annotated[
+        list[Path] | None, typer.Argument(help="Recordings (.mcap).", show_default=False)
+    ] = None,
     rig: RigOverride = None,
+    modes: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Modes that modes --save kept, in place of recordings; with --rig. May be repeated"
+        ),
+    ] = None,
+    use: Annotated[
+        str,
+        typer.Option(
+            help="Of --modes: residues (all), shapes (no calibrated input needed), or poles "
+            "(frequencies and damping alone)."
+        ),
+    ] = "residues",
     free: Annotated[
         list[str] | None,
         typer.Option(
@@ -54,14 +73,23 @@ def identify(
     """Identify parameters by maximum likelihood, with intervals and what cannot be known.
 
     All channels and levels count, in units of their noise. A model that does not fit is said so.
-    Recordings in several poses share one set of parameters (docs/identify.md).
+    Recordings in several poses share one set of parameters (docs/identify.md). With --modes:
+    from measured modes, weighted by the covariance of their poles and residues.
 
     Example: samii-rig identify runs/*.mcap --free joint_1.k --free joint_2.k
     """
     from samii_rig.cli.arguments import check_choice, check_logs, check_rig
 
     check_choice("--method", method, ("likelihood", "1", "2"))
+    check_choice("--use", use, ("residues", "shapes", "poles"))
     check_rig(rig)
+    if modes:
+        given = {"LOGS": logs, "--output": output, "--pose": pose, "--band": band}
+        given["--method"] = None if method == "likelihood" else [method]
+        _of_modes(modes, given, rig, free or (), use, json=json)
+        return
+    if not logs:
+        raise InputError.saying("LOGS", "", "missing; expected recordings (.mcap) or --modes FILE")
     check_logs(logs)
     check_choice("--gaps", gaps, GAPS)
 
@@ -69,7 +97,6 @@ def identify(
 
     from rich.console import Console
 
-    from samii_rig.errors import InputError
     from samii_rig.identify import methods
     from samii_rig.identify.maximum_likelihood import identify as maximum_likelihood
     from samii_rig.identify.parameters import uncertain
@@ -128,3 +155,43 @@ def _in_poses(
         for pose, alike in by_pose(recordings, at)
         for r in estimated(alike, None, output, "auto", gaps, band)
     ]
+
+
+def _of_modes(
+    files: list[Path],
+    given: Mapping[str, object],
+    rig: str | None,
+    free: Sequence[str],
+    use: str,
+    *,
+    json: bool,
+) -> None:
+    """From saved modes. given : options that are for recordings alone."""
+    from typing import cast
+
+    from rich.console import Console
+
+    from samii_rig.identify.from_modes import Use, identify_modes
+    from samii_rig.identify.parameters import uncertain
+    from samii_rig.identify.table import from_modes_table
+    from samii_rig.modal.saved import saved_modes
+    from samii_rig.report.summary import working
+    from samii_rig.rig.load import load_rig
+
+    for option, value in given.items():
+        if value:
+            shown = value if isinstance(value, tuple) else str(value[0])  # type: ignore[index]
+            raise InputError(option, "", shown, "none beside --modes: it is for recordings")
+    if rig is None:
+        raise InputError("--rig", "", None, "a rig: saved modes carry none")
+    saved = [level for path in files for level in saved_modes(path)]
+    console = Console(highlight=False)
+    own = load_rig(rig)[0]
+    with working(console, "identifying", quiet=json):
+        found = identify_modes(
+            saved, own, free or uncertain(own), prior=not free, use=cast("Use", use)
+        )
+    if json:
+        say_json(found.plain())
+    else:
+        console.print(from_modes_table(found))

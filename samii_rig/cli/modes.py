@@ -52,6 +52,13 @@ def modes(
             "exists."
         ),
     ] = None,
+    save: Annotated[
+        Path | None,
+        typer.Option(
+            help="The modes as data (.json), with residues and covariance, for identify --modes; "
+            "replaced if it exists."
+        ),
+    ] = None,
     input_: InputOption = None,
     output: OutputOption = None,
     method: MethodOption = "auto",
@@ -73,9 +80,16 @@ def modes(
     check_choice("--method", method, METHODS)
     check_choice("--gaps", gaps, GAPS)
     wanted = _picked(pick)
-    for option, path, suffixes in (("--out", out, (".html",)), ("--figure", figure, FIGURES)):
+    files = (
+        ("--out", out, (".html",)),
+        ("--figure", figure, FIGURES),
+        ("--save", save, (".json",)),
+    )
+    for option, path, suffixes in files:
         if path is not None:
             check_target(option, path, suffixes, [*logs, *others])
+
+    from json import dumps
 
     from rich.console import Console
 
@@ -89,7 +103,9 @@ def modes(
     console = Console(highlight=False)
     with ExitStack() as stack:
         # Opened first: a place that cannot be written to is said before the work, not after it.
-        page, drawn = (stack.enter_context(replacing(p)) if p else None for p in (out, figure))
+        page, drawn, kept = (
+            stack.enter_context(replacing(p)) if p else None for p in (out, figure, save)
+        )
         recordings, compared = read_all(logs), read_all(others)
         held = rig_of(recordings, rig)
         with working(console, "modes", quiet=json) as say:
@@ -113,7 +129,9 @@ def modes(
             page.write_text(text, encoding="utf-8")
         if drawn is not None:
             save_figure(drawn, picture(found[-1].response, found[-1].found))
-    written = [str(p) for p in (out, figure) if p]
+        if kept is not None:
+            kept.write_text(dumps({"modes": [m.plain() for m in found]}), encoding="utf-8")
+    written = [str(p) for p in (out, figure, save) if p]
     if json:
         say_json({"modes": [m.plain() for m in found], "without": list(lost), "written": written})
         return

@@ -7,6 +7,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from samii_rig.identify.from_modes import FromModes
 from samii_rig.identify.methods import Found
 from samii_rig.identify.modal import Modes
 from samii_rig.identify.result import Identification, Residual
@@ -15,6 +16,25 @@ from samii_rig.modal.modes import Value
 
 def summary_table(found: Identification) -> RenderableType:
     """The verdict in words, parameters with 90 % intervals, what is left per channel."""
+    return Group(*_said(found), _channels(found))
+
+
+def from_modes_table(found: FromModes) -> RenderableType:
+    """The same of modes: what is left mode by mode."""
+    table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
+    columns = ("level", "mode, Hz", "model", "damping, %", "model", "left, in units of the noise")
+    for column in columns:
+        table.add_column(column)
+    for m in found.modes:
+        hz = f"{m.frequency_hz:.5g}", f"{m.model_hz:.5g}"
+        damping = f"{100 * m.damping:.3g}", f"{100 * m.model_damping:.3g}"
+        table.add_row(m.level, *hz, *damping, f"{m.ratio**0.5:.2f}")
+    lost = [Text(f"Not in the model, and left out: {words}.") for words in found.without]
+    return Group(*lost, *_said(found.found), table)
+
+
+def _said(found: Identification) -> list[RenderableType]:
+    """The verdict in words, and the parameters."""
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     table.add_column("parameter", no_wrap=True)
     for column in ("identified", "90 % interval", "change"):
@@ -31,7 +51,7 @@ def summary_table(found: Identification) -> RenderableType:
             found.units[i],
         )
     said = (Text(line) for line in found.sentences())
-    return Group(*said, Text(""), table, Text(""), _channels(found))
+    return [*said, Text(""), table, Text("")]
 
 
 def _channels(found: Identification) -> Table:

@@ -80,25 +80,43 @@ def scales(a: Complex, units: Sequence[str]) -> Float:
 
 def mac_matrix(found: ModalModel, known: Sequence[Known]) -> Float:
     """(n_mode, n_known) MAC of each mode with each other, NaN where it cannot be said."""
-    out = np.full((len(found.modes), len(known)), np.nan)
+    return _alike([m.shape for m in found.modes], found.outputs, found.units, known)
+
+
+def _alike(
+    shapes: Sequence[Complex], outputs: Sequence[str], units: Sequence[str], known: Sequence[Known]
+) -> Float:
+    out = np.full((len(shapes), len(known)), np.nan)
     for j, other in enumerate(known):
-        at = [k for k, name in enumerate(found.outputs) if name in other.shape]
+        at = [k for k, name in enumerate(outputs) if name in other.shape]
         if not at:
             continue
-        b = np.array([other.shape[found.outputs[k]] for k in at])
-        units = [found.units[k] for k in at]
-        out[:, j] = [mac(m.shape[at], b, units) for m in found.modes]
+        b = np.array([other.shape[outputs[k]] for k in at])
+        own = [units[k] for k in at]
+        out[:, j] = [mac(shape[at], b, own) for shape in shapes]
     return out
 
 
 def pairs(found: ModalModel, known: Sequence[Known]) -> tuple[Pair, ...]:
     """The pairs that lie closest in frequency and shape together, each mode once at most."""
-    if not (found.modes and known):
+    f = [m.frequency_hz.value for m in found.modes]
+    return paired(f, [m.shape for m in found.modes], found.outputs, found.units, known)
+
+
+def paired(
+    hz: Sequence[float],
+    shapes: Sequence[Complex],
+    outputs: Sequence[str],
+    units: Sequence[str],
+    known: Sequence[Known],
+) -> tuple[Pair, ...]:
+    """The same of modes at `hz` with shapes (n_out,) at `outputs` of `units`."""
+    if not (len(hz) and known):
         return ()
-    f = np.array([m.frequency_hz.value for m in found.modes])
+    f = np.asarray(hz)
     g = np.array([k.frequency_hz for k in known])
     off = np.abs(np.log(f[:, None] / g[None, :]))
-    alike = mac_matrix(found, known)
+    alike = _alike(shapes, outputs, units, known)
     never = (off > FAR) | (alike < ALIKE)
     cost = off / APART + np.where(np.isnan(alike), 0.0, 1 - alike)
     worst = float(np.max(cost)) * (len(f) + len(g)) + 1.0

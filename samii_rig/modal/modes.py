@@ -103,6 +103,8 @@ class ModalModel:
     unresolved : Hz of resonances that a stepped sine's grid steps over: no modes.
     fit : chi-square of the whole model; intervals are wider by `inflation` where it is refused.
     frequency : (n,) Hz. prediction : (n, n_out, n_in) of the model there, hold and filters in.
+    residues : (n_mode, n_out, n_in) rad/s times output over input, each entry by itself.
+    covariance : of all modes' poles and residues together, in the order of `saved.numbers`.
     of : what the poles are those of, in words. divided : what was divided out, in words.
     closed_loop : whether a reference is the input, and a loop around the rig is in the poles.
     """
@@ -113,6 +115,8 @@ class ModalModel:
     inputs: tuple[str, ...]
     background: Complex
     unresolved: tuple[float, ...]
+    residues: Complex
+    covariance: Float
     fit: Fit
     inflation: float
     diagram: Diagram
@@ -145,7 +149,10 @@ class ModalModel:
             "inflation": self.inflation,
             "false_alarm": FALSE_ALARM,
             "unresolved_hz": list(self.unresolved),
-            "modes": [_plain(m, self.outputs) for m in self.modes],
+            "modes": [
+                _plain(m, R, self.outputs) for m, R in zip(self.modes, self.residues, strict=True)
+            ],
+            "covariance": self.covariance.tolist(),
         }
 
 
@@ -215,6 +222,7 @@ def _modal_model(
     rest = np.delete(model.pairs, chosen) if chosen else model.pairs
     units = {c.name: c.unit for c in d.response.outputs}
     n_in = len(d.inputs)
+    residues = model.residues()[:, chosen].T * d.scale
     return ModalModel(
         modes=tuple(modes),
         outputs=d.outputs,
@@ -222,6 +230,8 @@ def _modal_model(
         inputs=d.inputs,
         background=np.concatenate([rest, model.real]).astype(np.complex128) * d.scale,
         unresolved=tuple(unresolved),
+        residues=residues.reshape(len(chosen), len(d.outputs), n_in),
+        covariance=_covariance(model, chosen) * (d.scale * inflation) ** 2,
         fit=found.fit,
         inflation=inflation,
         diagram=poles,
@@ -235,6 +245,19 @@ def _modal_model(
         divided=d.divided,
         closed_loop=_roles(d) == {"reference"},
     )
+
+
+def _covariance(model: Rational, chosen: Sequence[int]) -> Float:
+    """Of the poles and residues of these pairs, in units of scale: pole by pole Re, Im, then those
+    of each entry's residue."""
+    n, size = model.coefficients.shape
+    at = [
+        first + part
+        for m in chosen
+        for first in (2 * m, *(model.n_poles + k * size + 2 * m for k in range(n)))
+        for part in (0, 1)
+    ]
+    return np.asarray(model.covariance[np.ix_(at, at)])
 
 
 def _roles(d: Lines) -> set[str]:
@@ -310,7 +333,7 @@ def _of(d: Lines) -> str:
     return f"poles of {named}: of what lies between them"
 
 
-def _plain(m: Mode, outputs: Sequence[str]) -> dict[str, Any]:
+def _plain(m: Mode, residues: Complex, outputs: Sequence[str]) -> dict[str, Any]:
     low, high = m.frequency_hz.interval()
     least, most = m.damping.interval()
     real, imag = m.shape_interval()
@@ -333,6 +356,7 @@ def _plain(m: Mode, outputs: Sequence[str]) -> dict[str, Any]:
             }
             for k, name in enumerate(outputs)
         },
+        "residues": np.stack([residues.real, residues.imag], axis=-1).tolist(),
         "participation": [[float(x.real), float(x.imag)] for x in m.participation],
         "complexity": m.complexity,
     }

@@ -119,7 +119,7 @@ def mode_shape(
     rig = chain.rig
     if not (np.isfinite(start) and start.imag > 0):
         raise InputError("mode shape", "at", at, "Hz above 0, or a pole with Im s > 0 in rad/s")
-    p = _root(chain, start)
+    p = root(chain, start)
     if positions is None:
         positions = {
             e.name: np.linspace(0, e.L.value, POINTS + 1).tolist()
@@ -166,7 +166,7 @@ def mode_shape(
     )
 
 
-def _root(chain: Chain, start: complex) -> complex:
+def root(chain: Chain, start: complex) -> complex:
     """The root of the determinant next to `start`, by the secant method."""
     reference = float(chain.characteristic([start], clear=True)[1][0])
 
