@@ -85,6 +85,27 @@ class Drive(NamedTuple):
     memory: float
 
 
+class Guide(NamedTuple):
+    """Dry friction of a guide on a body that slides, held over one inner step.
+
+    force : N, 0 for none. row, row_extra : as of `Tables`, of sensor values from a force on the
+    body. push : (2, n) what a force of 1 N adds to its states in one step. speed, own : (2, n) the
+    body's speed from the states of the output and of the force. gain : m/s that 1 N makes of it in
+    one step. x : (2, n) states of the force; held : (1,) the force of this step; both are changed
+    in place.
+    """
+
+    force: float
+    row: Float
+    row_extra: Float
+    push: Float
+    speed: Float
+    own: Float
+    gain: float
+    x: Float
+    held: Float
+
+
 class State(NamedTuple):
     """All that the loop carries from one call to the next; arrays, changed in place.
 
@@ -121,6 +142,51 @@ def rest(tables: Tables) -> State:
         np.zeros(5),
         np.zeros(5, dtype=np.int64),
     )
+
+
+def free(tables: Tables) -> Guide:
+    """No friction."""
+    m, _, n = tables.row.shape
+    none = np.zeros((2, n))
+    x, held = np.zeros((2, n)), np.zeros(1)
+    return Guide(0.0, np.zeros((m, 2, n)), np.zeros(m), none, none, none, 1.0, x, held)
+
+
+@njit(cache=True)
+def _rub(t: Tables, g: Guide, s: State, before: float, both: float) -> None:
+    """Set the guide's force of one step: what stops the body by its end, as far as it can.
+
+    Coulomb's law at the end of the step (Moreau 1988), so that a body that sticks stays where it
+    is. before, both : the input on both sides of its change.
+    """
+    speed = 0.0
+    for q in range(s.x.shape[1]):
+        a, b = t.decay[0, q], t.decay[1, q]
+        re = a * s.x[0, q] - b * s.x[1, q] + t.old[0, q] * before + t.new[0, q] * both
+        im = b * s.x[0, q] + a * s.x[1, q] + t.old[1, q] * before + t.new[1, q] * both
+        speed += g.speed[0, q] * re + g.speed[1, q] * im
+        re, im = a * g.x[0, q] - b * g.x[1, q], b * g.x[0, q] + a * g.x[1, q]
+        speed += g.own[0, q] * re + g.own[1, q] * im
+    g.held[0] = min(max(-speed / g.gain, -g.force), g.force)
+
+
+@njit(cache=True)
+def _slide(t: Tables, g: Guide) -> None:
+    """Move the states of the guide's force on by one step."""
+    for q in range(g.x.shape[1]):
+        re = t.decay[0, q] * g.x[0, q] - t.decay[1, q] * g.x[1, q]
+        im = t.decay[1, q] * g.x[0, q] + t.decay[0, q] * g.x[1, q]
+        g.x[0, q] = re + g.push[0, q] * g.held[0]
+        g.x[1, q] = im + g.push[1, q] * g.held[0]
+
+
+@njit(cache=True)
+def rubbed(g: Guide, i: int) -> float:
+    """What sensor i reads of the guide's force."""
+    y = g.row_extra[i] * g.held[0]
+    for k in range(g.x.shape[1]):
+        y += g.row[i, 0, k] * g.x[0, k] + g.row[i, 1, k] * g.x[1, k]
+    return float(y)
 
 
 @njit(cache=True)
@@ -225,13 +291,17 @@ def _friction(d: Drive, speed: float, u: float) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def sense(t: Tables, c: Converters, s: State, noise: Float, values: Float, quality: Flags) -> None:
+def sense(
+    t: Tables, c: Converters, g: Guide, s: State, noise: Float, values: Float, quality: Flags
+) -> None:
     """Read all sensors at the state's sample into values and quality, (m,). noise : (m,)."""
     sample = s.flag[SAMPLE]
     slot = sample % s.early.shape[0]
     for i in range(t.ahead.shape[0]):
         if t.ahead[i] == 0:
             y = _read(t, s, i, s.number[APPLIED], 0.0, s.number[EXTRA])
+            if g.force > 0.0:
+                y += rubbed(g, i)
         else:
             y = s.early[slot, i]
         y, q = _convert(c, i, sample, y, noise[i])
@@ -242,7 +312,7 @@ def sense(t: Tables, c: Converters, s: State, noise: Float, values: Float, quali
 
 
 @njit(cache=True)
-def move(t: Tables, d: Drive, s: State, v: float, disturbance: Float) -> None:
+def move(t: Tables, d: Drive, g: Guide, s: State, v: float, disturbance: Float) -> None:
     """Put v out at the state's sample and go on to the next. disturbance : (inner,)."""
     m = t.ahead.shape[0]
     slots = s.early.shape[0]
@@ -261,10 +331,14 @@ def move(t: Tables, d: Drive, s: State, v: float, disturbance: Float) -> None:
             push = share * old + (1.0 - share) * new + extra
             pull, number[SPEED] = _friction(d, number[SPEED], push)
             extra += pull
+        if g.force > 0.0:
+            _rub(t, g, s, old + extra, new + extra)
         for i in range(m):
             if t.ahead[i] > 0 and (j + t.ahead[i]) % t.inner == 0:
                 at = (sample + (j + t.ahead[i]) // t.inner) % slots
                 s.early[at, i] = _read(t, s, i, old, new, extra)
+                if g.force > 0.0:
+                    s.early[at, i] += rubbed(g, i)
         both = new + extra
         before = old + extra
         for q in range(s.x.shape[1]):
@@ -272,6 +346,8 @@ def move(t: Tables, d: Drive, s: State, v: float, disturbance: Float) -> None:
             im = t.decay[1, q] * s.x[0, q] + t.decay[0, q] * s.x[1, q]
             s.x[0, q] = re + t.old[0, q] * before + t.new[0, q] * both
             s.x[1, q] = im + t.old[1, q] * before + t.new[1, q] * both
+        if g.force > 0.0:
+            _slide(t, g)
         number[APPLIED], number[EXTRA] = new, extra
     s.flag[SAMPLE] = sample + 1
 
@@ -283,6 +359,7 @@ def advance(
     k: Control,
     f: Filters,
     d: Drive,
+    g: Guide,
     s: State,
     u: Float,
     theta_ref: Float,
@@ -300,7 +377,7 @@ def advance(
     none = np.zeros(max(t.ahead.shape[0], t.inner))
     for n in range(u.shape[0]):
         y = values[n, SENSORS:]
-        sense(t, c, s, noise[n] if noise.shape[0] > 0 else none, y, quality[n, SENSORS:])
+        sense(t, c, g, s, noise[n] if noise.shape[0] > 0 else none, y, quality[n, SENSORS:])
         if given[n]:
             s.number[LAST_REF] = theta_ref[n]
         reference = u[n] if given[n] else 0.0
@@ -308,4 +385,4 @@ def advance(
         v, limited = _command(c, k, f, s, reference, ref, given[n] != 0, y)
         values[n, U], values[n, THETA_REF], values[n, V] = reference, ref, v
         quality[n, U], quality[n, THETA_REF], quality[n, V] = 0, 0, limited
-        move(t, d, s, v, disturbance[n] if disturbance.shape[0] > 0 else none)
+        move(t, d, g, s, v, disturbance[n] if disturbance.shape[0] > 0 else none)

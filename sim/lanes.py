@@ -24,6 +24,7 @@ from sim.kernel import (
     Converters,
     Drive,
     Filters,
+    Guide,
     State,
     _command,
     _convert,
@@ -44,6 +45,7 @@ class Lane(NamedTuple):
     control: Control
     filters: Filters
     drive: Drive
+    guide: Guide
     state: State
 
 
@@ -111,4 +113,4 @@ def advance(
                 lane.filters.memory[:] = 0.0
                 values[n, 2 * k + j], quality[n, 2 * k + j] = 0.0, LIMITED
             pushed = disturbance[j, n] if disturbance.shape[0] > 0 else none
-            move(lane.tables, lane.drive, lane.state, values[n, 2 * k + j], pushed)
+            move(lane.tables, lane.drive, lane.guide, lane.state, values[n, 2 * k + j], pushed)

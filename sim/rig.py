@@ -29,6 +29,7 @@ from samii_rig.rig.schema import Rig
 from sim import kernel
 from sim.base import SimulatedRig, device_channels
 from sim.electronics import check_block, control, converters, drive, filters, references
+from sim.guide import check_guide, guided
 from sim.plant import tabulate
 from sim.settings import SimSettings, read_settings
 from sim.several import SimulatedOutputs
@@ -41,7 +42,11 @@ class SimulatedDevice(SimulatedRig):
         super().__init__(rig, settings)
         (spec,) = rig.actuator
         self.name = spec.name
-        self._tables = tabulate(rig, self.realisation, settings.inner)
+        if any(settings.guide_friction.values()):
+            self._tables, self._guide = guided(rig, settings)
+        else:
+            self._tables = tabulate(rig, self.realisation, settings.inner)
+            self._guide = kernel.free(self._tables)
         self._converters = converters(rig, settings)
         self._drive = drive(rig, settings)
         self._state = kernel.rest(self._tables)
@@ -89,6 +94,7 @@ class SimulatedDevice(SimulatedRig):
             self._control,
             self._filters,
             self._drive,
+            self._guide,
             self._state,
             u,
             theta_ref,
@@ -103,7 +109,7 @@ class SimulatedDevice(SimulatedRig):
 
 def check_rig(rig: Rig, settings: Mapping[str, object]) -> None:
     """InputError for a wrong setting, or a channel with the name of a reference."""
-    read_settings(rig, settings)
+    check_guide(rig, read_settings(rig, settings))
     device_channels(rig)
 
 
@@ -113,6 +119,7 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
     InputError for an unknown or wrong setting, or a chain that cannot be simulated.
     """
     chosen = read_settings(rig, settings)
+    check_guide(rig, chosen)
     device: SimulatedDevice | SimulatedOutputs
     device = (
         SimulatedDevice(rig, chosen) if len(rig.actuator) == 1 else SimulatedOutputs(rig, chosen)

@@ -38,6 +38,8 @@ class SimSettings(Strict):
         actuator's unit. An ideal velocity source does not feel a torque beside it, so the
         friction acts inside the drive: speed' = p (v - friction sign(speed) - speed), stuck
         at zero speed while |v| is smaller. The best linear response then depends on the level.
+    guide_friction : dry friction, N, of the guide of a mass that slides, by the mass's name. The
+        force stops the mass where it can and opposes its speed else. One mass may have it.
     hum : by sensor name.
     stuck, nan : by sensor name, s from which the sensor repeats its last value, or gives NaN.
     pace : times real time at which simulated time passes at most, for who wants to watch; 0 for
@@ -52,6 +54,7 @@ class SimSettings(Strict):
     band_hz: Positive | None = None
     disturbance_rms: NonNegative = 0.0
     coulomb_friction: NonNegative = 0.0
+    guide_friction: dict[Name, NonNegative] = Field(default_factory=dict)
     hum: dict[Name, Hum] = Field(default_factory=dict)
     stuck: dict[Name, NonNegative] = Field(default_factory=dict)
     nan: dict[Name, NonNegative] = Field(default_factory=dict)

@@ -37,6 +37,7 @@ class SimulatedOutputs(SimulatedRig):
             kernel.Control(0, 0.0, 0.0, np.inf, np.inf, self._patience()),
             filters(rig, ()),
             drive(rig, settings, i),
+            kernel.free(tables),
             kernel.rest(tables),
         )
 

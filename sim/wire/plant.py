@@ -13,6 +13,7 @@ from samii_rig.rig.schema import Rig
 from sim import kernel
 from sim.base import UNRELATED, realised
 from sim.electronics import converters, drive
+from sim.guide import check_guide, guided
 from sim.plant import tabulate
 from sim.settings import SimSettings
 from sim.wire.protocol import RAILS
@@ -118,7 +119,12 @@ class Plant:
             )
             for m in rig.monitor
         }
-        self._tables = tabulate(rig, made, settings.inner)
+        check_guide(rig, settings)
+        if any(settings.guide_friction.values()):
+            self._tables, self._guide = guided(rig, settings)
+        else:
+            self._tables = tabulate(rig, made, settings.inner)
+            self._guide = kernel.free(self._tables)
         self._converters = converters(rig, settings)
         self._drive = drive(rig, settings)
         m = len(rig.sensor)
@@ -130,13 +136,15 @@ class Plant:
     def rest(self) -> None:
         """Everything still, as at the start."""
         self._state = kernel.rest(self._tables)
+        self._guide.x[:] = 0.0
+        self._guide.held[:] = 0.0
 
     def sense(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Counts of the encoders and of the analogue inputs at this sample."""
         s, m = self._settings, len(self._values)
         noise = self._rng.standard_normal(m) if s.noise else self._still
         t, c, values = self._tables, self._converters, self._values
-        kernel.sense(t, c, self._state, noise, values, self._quality)
+        kernel.sense(t, c, self._guide, self._state, noise, values, self._quality)
         counts: dict[bool, dict[int, int]] = {True: {}, False: dict(self._usual)}
         for i, is_encoder, w in self._places:
             n = round(float(values[i]) * w.counts_per_unit + w.offset)
@@ -149,14 +157,14 @@ class Plant:
         pushed = s.disturbance_rms > 0.0
         disturbance = self._rng.standard_normal(s.inner) if pushed else self._still
         v = (dac - self._wired.null) / out
-        kernel.move(self._tables, self._drive, self._state, v, disturbance)
+        kernel.move(self._tables, self._drive, self._guide, self._state, v, disturbance)
 
     def load(self, i: int) -> float:
         """What is at sensor i at the sample to come, without noise and converter."""
         t, s = self._tables, self._state
         applied, extra = s.number[kernel.APPLIED], s.number[kernel.EXTRA]
         inputs = t.row_old[i] * applied + t.row_extra[i] * extra
-        return float((t.row[i] * s.x).sum() + inputs)
+        return float((t.row[i] * s.x).sum() + inputs + kernel.rubbed(self._guide, i))
 
 
 def _filled(counts: Mapping[int, int]) -> tuple[int, ...]:
