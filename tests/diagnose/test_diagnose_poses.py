@@ -88,6 +88,8 @@ def test_a_spring_to_the_ground_and_a_weight_are_told_apart_by_a_second_pose(cha
     hidden = [in_pose(RIG, pose, i, change(3.0)) for i, pose in enumerate(POSES, 1)]
     alone = in_poses(hidden[:1], RIG, effects=HELD)
     assert {(is_, "elbow"), (is_not, "elbow")} <= names(alone)
+    assert "at 90 deg to the way down too, and give both, each with --pose" in alone.experiment
+    assert alone.gain > 5
     both = in_poses(hidden, RIG, effects=HELD)
     assert both.verdict == "named"
     assert (is_, "elbow") in names(both)

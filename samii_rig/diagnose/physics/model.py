@@ -11,6 +11,7 @@ import numpy as np
 from samii_rig.diagnose.physics.causal import CausalChain
 from samii_rig.diagnose.physics.effect import Effect, Key
 from samii_rig.diagnose.physics.fractional import ChainLike, FractionalChain
+from samii_rig.diagnose.physics.poses import turned
 from samii_rig.model.sampled import hold_at, sampled_response, sensors_at
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig, parameters
@@ -261,7 +262,8 @@ class Model:
 
     def under(self, change: Callable[[Rig], Rig]) -> Model:
         """The same effects in a rig that was changed."""
-        return Model(change(self.rig), self.effects)
+        rig = change(self.rig)
+        return Model(rig, [turned(e, self.rig, rig) for e in self.effects])
 
     def chain_of(self, rig: Rig) -> ChainLike:
         """The chain of a rig, as the effects have it."""

@@ -31,9 +31,18 @@ def _by_itself(effect: Effect) -> Effect:
 def in_pose(effect: Effect, rig: Rig) -> Effect:
     """An effect as it is in the pose of a rig, its unknowns those of a chain that hangs: the
     stiffness of gravity is k cos(pose)."""
-    if effect.physics != OF_WEIGHT or rig.gravity == 0:
+    return _times(effect, rig.pull / rig.gravity) if rig.gravity else effect
+
+
+def turned(effect: Effect, old: Rig, new: Rig) -> Effect:
+    """An effect with the unknowns that it has in the pose of one rig, in that of another."""
+    return _times(effect, new.pull / old.pull) if old.pull and new.pull != old.pull else effect
+
+
+def _times(effect: Effect, part: float) -> Effect:
+    """The same, a stiffness of gravity so many times what it was."""
+    if effect.physics != OF_WEIGHT:
         return effect
-    part = rig.pull / rig.gravity
 
     def parameters(x: Float, nominal: Values) -> dict[Key, float]:
         return {key: part * v for key, v in effect.parameters(x, nominal).items()}

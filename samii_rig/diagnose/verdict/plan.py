@@ -24,6 +24,7 @@ from samii_rig.rig.schema import (
     TorsionalGroundSpring,
     TranslationalGroundSpring,
 )
+from samii_rig.rig.schema.pose import Angle
 from samii_rig.types import Complex, Float
 
 Change = Callable[[Rig], Rig]
@@ -116,6 +117,13 @@ def _experiments(search: Search) -> Iterator[tuple[str, Change, Float]]:
         lambda r: r,
         np.geomspace(low / WIDER, low, POINTS // 2),
     )
+    if rig.gravity:
+        degrees = 90.0 if rig.pull > 0.5 * rig.gravity else 0.0
+        yield (
+            f"record it at {degrees:.0f} deg to the way down too, and give both, each with --pose",
+            _leaning(degrees),
+            inside,
+        )
     mass = sum(e.m.value for e in rig.element if isinstance(e, RigidLink | LumpedMass))
     tip = rig.element[-1].name
     for e in rig.element:
@@ -130,6 +138,11 @@ def _experiments(search: Search) -> Iterator[tuple[str, Change, Float]]:
     for e in rig.element:
         if isinstance(e, RigidLink | Beam) and e.name not in worn and e.L.value > 0:
             yield (f"put another accelerometer on {e.name}", _watched(e.name, e.L.value), inside)
+
+
+def _leaning(degrees: float) -> Change:
+    pose = Angle(value=math.radians(degrees), unit="rad", written="deg")
+    return lambda rig: rig.model_copy(update={"pose": pose})
 
 
 def _braced(name: str) -> Change:
