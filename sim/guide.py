@@ -1,5 +1,9 @@
 """Dry friction of a guide: a force on a body that slides, which stops it or opposes its speed.
 
+Its error falls with the inner step: where one or two masses stick a tenth to a third of the time,
+0.4 to 0.6 % of the largest displacement with 8 steps a sample and 0.04 to 0.08 % with 64, against
+an integration that is exact between two stops.
+
 The chain is linear beside it, so the force moves a plant of its own, as one more output would, and
 every sensor reads the sum. A hidden velocity of the body is what the force looks at.
 """
@@ -8,8 +12,11 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+import numpy as np
+
 from samii_rig.model.realise import Realisation, realise
-from samii_rig.rig.schema import ForceSource, Parameter, Rig, Velocity
+from samii_rig.model.tmm import Chain
+from samii_rig.rig.schema import ForceSource, Parameter, Rig, Velocity, parameters
 from samii_rig.rig.settings import wrong
 from sim.kernel import Guide
 from sim.plant import Tables, tabulate
@@ -18,6 +25,9 @@ from sim.settings import SimSettings
 HIDDEN = "guide_of_the_simulated_rig"  # the force's element and input, and the body's velocity
 SETTING = "guide_friction"
 SLIDES = "mass"  # kind of the elements that a guide holds
+# Of the acceleration F/m, what a force makes of a body that its source holds: 0 but for rounding,
+# where a beam's end mass has 0.3 and more.
+HELD = 1e-6
 
 
 def check_guide(rig: Rig, settings: SimSettings) -> None:
@@ -32,6 +42,13 @@ def check_guide(rig: Rig, settings: SimSettings) -> None:
         raise wrong(rig, SETTING, ", ".join(rubs), "one body with friction")
     if rubs and len(rig.actuator) > 1:
         raise wrong(rig, SETTING, ", ".join(rubs), "none with several outputs")
+    for name in rubs:
+        s = np.array([1j * np.pi * rig.rate_hz])
+        mobility = Chain(_with_force(rig, name)).evaluate(s)[0, -1, -1]
+        mass = next(parameters(e)["m"].value for e in rig.element if e.name == name)
+        if abs(mobility * s[0] * mass) < HELD:
+            what = "a mass that gives way: friction does nothing where a source sets the motion"
+            raise wrong(rig, SETTING, name, what)
 
 
 def guided(rig: Rig, settings: SimSettings) -> tuple[Tables, Guide]:

@@ -38,12 +38,12 @@ def identify(
         ),
     ] = None,
     use: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="Of --modes: residues (all), shapes (no calibrated input needed), or poles "
-            "(frequencies and damping alone)."
+            "(frequencies and damping alone) [default: residues]"
         ),
-    ] = "residues",
+    ] = None,
     free: Annotated[
         list[str] | None,
         typer.Option(
@@ -81,17 +81,20 @@ def identify(
     from samii_rig.cli.arguments import check_choice, check_logs, check_rig
 
     check_choice("--method", method, ("likelihood", "1", "2"))
-    check_choice("--use", use, ("residues", "shapes", "poles"))
+    check_choice("--gaps", gaps, GAPS)
+    check_choice("--use", use or "residues", ("residues", "shapes", "poles"))
     check_rig(rig)
     if modes:
         given = {"LOGS": logs, "--output": output, "--pose": pose, "--band": band}
         given["--method"] = None if method == "likelihood" else [method]
-        _of_modes(modes, given, rig, free or (), use, json=json)
+        given["--gaps"] = None if gaps == "refuse" else [gaps]
+        _of_modes(modes, given, rig, free or (), use or "residues", json=json)
         return
+    if use:
+        raise InputError("--use", "", use, "--modes FILE beside it: it is of modes")
     if not logs:
         raise InputError.saying("LOGS", "", "missing; expected recordings (.mcap) or --modes FILE")
     check_logs(logs)
-    check_choice("--gaps", gaps, GAPS)
 
     from typing import cast
 
@@ -184,6 +187,9 @@ def _of_modes(
             raise InputError(option, "", shown, "none beside --modes: it is for recordings")
     if rig is None:
         raise InputError("--rig", "", None, "a rig: saved modes carry none")
+    for i, path in enumerate(files):
+        if path.resolve() in [other.resolve() for other in files[:i]]:
+            raise InputError("--modes", "", str(path), "each file once, or its noise counts twice")
     saved = [level for path in files for level in saved_modes(path)]
     console = Console(highlight=False)
     own = load_rig(rig)[0]

@@ -37,7 +37,11 @@ CIRCLE = 0.005  # of |a|, radius around a pole: modes 1 % apart are still two
 ANGLES = 16
 SAME = 1e-6  # of |a|, distance of two followed poles that have become one
 SUBSTEPS = 64  # into which a step is cut at most, where poles move too far to be followed
-NO_RIG = "nothing divided out: no rig file"
+UNDIVIDED = "nothing divided out"
+TESTS = 1e-9  # part of one number's chi-square that the parameters leave, from which it tests them
+UNTESTED = (
+    "Nothing tests the model: the modes are no more numbers than the parameters that they set."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,18 +63,26 @@ class ModeLeft:
 @dataclass(frozen=True, slots=True)
 class FromModes:
     """found : parameters, with the test of the fit. use : what of the modes was fitted.
-    modes : what is left of each. without : those that the model does not have, in words."""
+    modes : what is left of each. without : those that the model does not have, in words.
+    tested : whether the modes are more numbers than the parameters need."""
 
     found: Identification
     use: Use
     modes: tuple[ModeLeft, ...]
     without: tuple[str, ...]
+    tested: bool
 
     def plain(self) -> dict[str, object]:
         """Numbers and words as plain data, for machines."""
         names = ("level", "frequency_hz", "damping", "model_hz", "model_damping", "ratio")
         rows = [{name: getattr(m, name) for name in names} for m in self.modes]
-        return {**self.found.plain(), "use": self.use, "modes": rows, "without": list(self.without)}
+        found = {**self.found.plain(), "verdict": list(self.sentences())}
+        return {**found, "use": self.use, "modes": rows, "without": list(self.without)}
+
+    def sentences(self) -> tuple[str, ...]:
+        """The verdict in words, as of an identification."""
+        fit, *rest = self.found.sentences()
+        return UNTESTED if not self.tested else fit, *rest
 
 
 def identify_modes(
@@ -137,7 +149,7 @@ def _check(saved: SavedModes, rig: Rig, use: Use) -> None:
         for name in names:
             if name not in have:
                 raise InputError(saved.where, word, name, f"of {rig.name} {one_of(name, have)}")
-    if use != "poles" and saved.divided == NO_RIG:
+    if use != "poles" and saved.divided.startswith(UNDIVIDED):
         what = "`samii-rig modes --rig` beforehand, or --use poles: a hold turns residues"
         raise InputError(saved.where, "divided", saved.divided, what)
 
@@ -329,11 +341,12 @@ def _result(fitted: _Problem, rig: Rig, x: Float, use: Use, without: tuple[str, 
     r, J = fitted.at(x)
     n, free = fitted.n, fitted.space
     left = _left(fitted, x)
-    s, vt = np.linalg.svd(J, full_matrices=False)[1:]
+    u, own, vt = np.linalg.svd(J, full_matrices=False)
     # A direction that nothing holds is known at least to lie within the bounds.
-    s = np.maximum(s, 1 / np.max(free.upper - free.lower))
+    s = np.maximum(own, 1 / np.max(free.upper - free.lower))
     cov = (vt.T / s**2) @ vt
-    taken = float(np.trace(J[:n] @ cov @ J[:n].T))
+    tests = np.linalg.eigvalsh(np.eye(n) - (u[:n] * (own / s) ** 2) @ u[:n].T)
+    tests = np.clip(tests[tests > TESTS], 0.0, 1.0)
     start = fitted.at(np.zeros(x.size))[0]
     at_bound, on_top = bounds_met(free, x)
     outputs = [name for b in fitted.blocks for name in b.saved.outputs]
@@ -345,8 +358,8 @@ def _result(fitted: _Problem, rig: Rig, x: Float, use: Use, without: tuple[str, 
         values=free.values(x),
         log_covariance=cov,
         prior_sd=free.prior_sd,
-        fit=_fit(r[:n], taken),
-        start_fit=_fit(start[:n], 0.0),
+        fit=_fit(r[:n], tests),
+        start_fit=_fit(start[:n], np.ones(n)),
         residuals=(),
         identifiability=identifiability(J[:n], free.names, outputs),
         at_bound=at_bound,
@@ -355,13 +368,17 @@ def _result(fitted: _Problem, rig: Rig, x: Float, use: Use, without: tuple[str, 
         prediction=(),
         on_top=on_top,
     )
-    return FromModes(found, use, left, without)
+    return FromModes(found, use, left, without, bool(tests.size))
 
 
-def _fit(r: Float, taken: float) -> Fit:
-    """taken : degrees of freedom of the parameters."""
-    chi2, dof = float(r @ r), max(r.size - taken, 1e-9)
-    return Fit(chi2 / max(dof, 1.0), float(stats.chi2.sf(chi2, dof)), r.size)
+def _fit(r: Float, tests: Float) -> Fit:
+    """Chi-square is a sum of squares of variances `tests`, 0 to 1: below 1 where a parameter with a
+    prior takes part of it. Its distribution is that of a chi-square with the same mean and variance
+    (Satterthwaite, Biometrics Bulletin 2, 1946). Without any of them it is 1 and holds."""
+    if not tests.size:
+        return Fit(1.0, 1.0, r.size)
+    chi2, mean, unit = float(r @ r), float(np.sum(tests)), float(np.sum(tests**2) / np.sum(tests))
+    return Fit(chi2 / mean, float(stats.chi2.sf(chi2 / unit, mean / unit)), r.size)
 
 
 def _left(fitted: _Problem, x: Float) -> tuple[ModeLeft, ...]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
@@ -16,7 +18,7 @@ from samii_rig.modal.modes import Value
 
 def summary_table(found: Identification) -> RenderableType:
     """The verdict in words, parameters with 90 % intervals, what is left per channel."""
-    return Group(*_said(found), _channels(found))
+    return Group(*_said(found, found.sentences()), _channels(found))
 
 
 def from_modes_table(found: FromModes) -> RenderableType:
@@ -30,10 +32,10 @@ def from_modes_table(found: FromModes) -> RenderableType:
         damping = f"{100 * m.damping:.3g}", f"{100 * m.model_damping:.3g}"
         table.add_row(m.level, *hz, *damping, f"{m.ratio**0.5:.2f}")
     lost = [Text(f"Not in the model, and left out: {words}.") for words in found.without]
-    return Group(*lost, *_said(found.found), table)
+    return Group(*lost, *_said(found.found, found.sentences()), table)
 
 
-def _said(found: Identification) -> list[RenderableType]:
+def _said(found: Identification, sentences: Sequence[str]) -> list[RenderableType]:
     """The verdict in words, and the parameters."""
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     table.add_column("parameter", no_wrap=True)
@@ -50,7 +52,7 @@ def _said(found: Identification) -> list[RenderableType]:
             f"{100 * (found.values[i] / found.start[i] - 1):+.1f} %",
             found.units[i],
         )
-    said = (Text(line) for line in found.sentences())
+    said = (Text(line) for line in sentences)
     return [*said, Text(""), table, Text("")]
 
 

@@ -20,6 +20,7 @@ from samii_rig.modal.modes import ModalModel
 from samii_rig.types import Complex, Float
 
 RANK = 1e-10  # smallest over largest eigenvalue of the correlations, below which they are singular
+EVEN = 1e-6  # of 1, difference of a correlation and its mirror image that is rounding
 WHAT = "a file of `samii-rig modes --save`"
 
 
@@ -78,7 +79,7 @@ def of_model(found: ModalModel) -> SavedModes:
 
 
 def saved_modes(path: Path) -> tuple[SavedModes, ...]:
-    """The modes that a file holds, level by level.
+    """The modes that a file holds, level by level; a level that shows none is left out.
 
     Raises InputError, in one line, for what is no such file.
     """
@@ -89,7 +90,11 @@ def saved_modes(path: Path) -> tuple[SavedModes, ...]:
     rows = data.get("modes") if isinstance(data, dict) else None
     if not isinstance(rows, list) or not rows:
         raise InputError(str(path), "modes", type(rows).__name__, f"modes, {WHAT}")
-    return tuple(_level(f"{path}: modes[{i}]", row) for i, row in enumerate(rows))
+    levels = [_level(f"{path}: modes[{i}]", row) for i, row in enumerate(rows)]
+    found = tuple(level for level in levels if level.poles.size)
+    if not found:
+        raise InputError(str(path), "modes", "none at any level", "one mode or more")
+    return found
 
 
 def _level(where: str, row: Any) -> SavedModes:
@@ -111,7 +116,8 @@ def _level(where: str, row: Any) -> SavedModes:
     except (KeyError, TypeError, ValueError) as error:
         what = f"{type(error).__name__} {error}"
         raise InputError(where, "", what, f"poles, residues and covariance of {WHAT}") from error
-    _check(saved)
+    if saved.poles.size:
+        _check(saved)
     return saved
 
 
@@ -125,10 +131,7 @@ def _complex(pairs: Sequence[Any]) -> Complex:
 
 
 def _check(saved: SavedModes) -> None:
-    m = len(saved.poles)
-    if not m:
-        raise InputError(saved.where, "modes", "none", "one mode or more")
-    shape = (m, len(saved.outputs), len(saved.inputs))
+    shape = (len(saved.poles), len(saved.outputs), len(saved.inputs))
     if saved.residues.shape != shape or len(saved.units) != shape[1]:
         raise InputError(saved.where, "residues", saved.residues.shape, f"the shape {shape}")
     y, C = saved.numbers(), saved.covariance
@@ -140,7 +143,9 @@ def _check(saved: SavedModes) -> None:
         bad = complex(saved.poles[int(np.argmin(saved.poles.imag))])
         raise InputError(saved.where, "pole", bad, "an imaginary part above 0")
     sd = np.sqrt(np.maximum(np.diag(C), 0.0))
-    values = np.linalg.eigvalsh(C / np.outer(sd, sd)) if np.all(sd > 0) else np.zeros(1)
-    if not values[0] > RANK * values[-1]:
+    scaled = C / np.outer(sd, sd) if np.all(sd > 0) else np.zeros((1, 1))
+    values = np.linalg.eigvalsh(scaled)
+    even = np.allclose(scaled, scaled.T, rtol=0.0, atol=EVEN)
+    if not (even and values[0] > RANK * values[-1]):
         what = "a covariance, symmetric and positive definite"
-        raise InputError(saved.where, "covariance", "singular", what)
+        raise InputError(saved.where, "covariance", "singular" if even else "not symmetric", what)

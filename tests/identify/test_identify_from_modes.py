@@ -118,6 +118,44 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.1)
 
 
+def test_as_many_parameters_as_numbers_are_found_but_test_nothing():
+    rig = load_rig("one_mass")[0]
+    saved = of_model(find_modes(drawn(rig, 3, band=(1.0, 60.0)), rig))
+    found = identify_modes([saved], rig, ["spring.k", "spring.c"], use="poles")
+    assert [m.model_hz for m in found.modes] == pytest.approx([m.frequency_hz for m in found.modes])
+    assert found.found.fit.holds
+    assert not found.tested
+    assert found.sentences()[0].startswith("Nothing tests the model")
+    assert found.plain()["verdict"] == list(found.sentences())
+    more = identify_modes([saved], rig, ["spring.k"], use="poles")
+    assert more.tested
+    assert more.sentences()[0].startswith("The model fits")
+
+
+def test_the_test_of_the_fit_holds_with_priors_that_take_part_of_it():
+    """The truth drawn from the tolerances, the modes from their covariance: p is even in 0 to 1."""
+    rig, rng, names = load_rig("one_mass")[0], np.random.default_rng(8), ["spring.k", "spring.c"]
+    saved = of_model(find_modes(drawn(rig, 3, band=(1.0, 60.0)), rig))
+    tolerance = {(e.name, s): p.tolerance for e in rig.element for s, p in parameters(e).items()}
+    # A noise as large as the tolerances, so that both count.
+    sd = [0.02, 0.3]
+    C = np.diag(np.array([sd[1] * abs(saved.poles[0].real), sd[0] * abs(saved.poles[0])]) ** 2)
+    C = np.pad(C, (0, 2)) + np.diag([0, 0, *np.diag(saved.covariance)[2:]])
+    p = []
+    for _ in range(60):
+        true = off(
+            rig, {n: np.exp(tolerance[tuple(n.split("."))] * rng.standard_normal()) for n in names}
+        )
+        a = poles(true, 60.0).pole
+        pole = a[a.imag > 0][:1] + np.sqrt(C[0, 0]) * rng.standard_normal()
+        pole = pole + 1j * np.sqrt(C[1, 1]) * rng.standard_normal()
+        one = replace(saved, poles=pole, covariance=C)
+        p.append(identify_modes([one], rig, names, use="poles", prior=True).found.fit.p_value)
+    # The mean of 60 even numbers: 0.5 +- 0.037; three of these, and the law is approximate.
+    assert np.mean(p) == pytest.approx(0.5, abs=0.12)
+    assert np.mean(np.array(p) < 0.1) < 0.25
+
+
 def test_two_levels_know_more_than_one():
     saved = of_model(measured())
     one, two = (identify_modes([saved] * n, samii(), FREE).found for n in (1, 2))
@@ -205,6 +243,7 @@ def damaged(path: Path, change) -> None:
         (lambda row: row["modes"][0]["residues"].pop(), "expected poles, residues and covariance"),
         (lambda row: row["covariance"][0].__setitem__(0, -1.0), "positive definite"),
         (lambda row: row["modes"][1]["pole"].__setitem__(1, -3.0), "an imaginary part above 0"),
+        (lambda row: row["covariance"][0].__setitem__(3, 1e9), "not symmetric"),
         (lambda row: row.__setitem__("modes", []), "one mode or more"),
         (lambda row: row.__setitem__("units", ["rad"]), "the shape (3, 4, 1)"),
     ],
@@ -216,6 +255,14 @@ def test_a_damaged_file_of_modes_is_refused_in_one_line(kept, change, said):
     assert str(error.value).startswith(str(kept))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_level_that_shows_no_mode_is_left_out_of_a_file(kept):
+    data = json.loads(kept.read_text())
+    data["modes"].insert(0, {**data["modes"][0], "modes": [], "covariance": []})
+    kept.write_text(json.dumps(data))
+    (read,) = saved_modes(kept)
+    assert len(read.poles) == 3
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"modes": []}', "\x00"])
@@ -249,6 +296,9 @@ def test_the_command_line_identifies_from_modes(kept):
         ("--modes {0} --rig samii --pose 30deg", "none beside --modes"),
         ("--modes {0} --rig samii --band 1 20", "none beside --modes"),
         ("--modes {0} --rig samii --method 2", "none beside --modes"),
+        ("--modes {0} --rig samii --gaps exclude", "none beside --modes"),
+        ("--modes {0} --modes {0} --rig samii", "each file once"),
+        ("a.mcap --use poles", "--modes FILE beside it"),
         ("--modes {0} --rig samii --use shape", "did you mean shapes?"),
         ("--modes {0}x --rig samii", "a file of `samii-rig modes --save`"),
     ],

@@ -1,13 +1,16 @@
 """Dry friction of a guide in the simulated rig.
 
 Plan: closed forms (a mass that swings out, one that slides steadily, one that sticks); an
-integrator written by hand; no friction is the linear rig; what is set wrongly; the diagnosis.
+integrator written by hand, and one that is exact between stops; no friction is the linear rig; what
+is set wrongly; the diagnosis.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
+from scipy.optimize import brentq
 
 from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.diagnose.diagnose import diagnose
@@ -44,7 +47,7 @@ def run(rig: Rig, u: Float, **settings: object) -> dict[str, Float]:
     """Every column of an open loop, without noise."""
     device = open_rig(rig, {"seed": 1, "noise": False, **settings})
     far = 1e9
-    device.actuator.configure(DeviceLoop("x", 0.0, far, far, far))
+    device.actuator.configure(DeviceLoop(rig.sensor[0].name, 0.0, far, far, far))
     device.actuator.write(CommandBlock(0, u, 0 * u))
     device.clock.sleep(len(u) / rig.rate_hz)
     values = device.sensor.read().values
@@ -122,6 +125,75 @@ def test_a_carriage_that_goes_to_and_fro_does_as_an_integrator_written_by_hand()
     off = np.max(np.abs(x - expected))
     assert off < 2e-3 * np.max(np.abs(expected))
     assert np.max(np.abs(linear["x"] - expected)) > 20 * off
+
+
+def from_stop_to_stop(u: Float, T: float, force: float) -> tuple[Float, Float]:
+    """x_1 in m and the speed of mass_2 of two masses, dry friction on mass_2.
+
+    Exact between two stops: each phase slides to one side or sticks, is linear, and ends where a
+    root is found.
+    """
+    k, c, m, K, p = (12e3, 8e3), (8.0, 5.0), (1.5, 0.8), 6.0, 2 * np.pi * 120.0
+    A = np.zeros((6, 6))  # x_1, v_1, x_2, v_2, the coil's force, and 1
+    A[0, 1] = A[2, 3] = 1.0
+    A[1, :5] = np.array([-k[0] - k[1], -c[0] - c[1], k[1], c[1], 1.0]) / m[0]
+    A[3, :4] = np.array([k[1], c[1], -k[1], -c[1]]) / m[1]
+    A[4, 4] = -p
+    z, side, out = np.array([0, 0, 0, 0, 0, 1.0]), 0, []
+    for volts in u:
+        out.append((z[0], z[3]))
+        A[4, 5], left = p * K * volts, T
+        while left > 0:
+            free = A[3].copy()  # acceleration of mass_2 without friction
+            if side == 0 and m[1] * abs(free @ z) > force:
+                side = int(np.sign(free @ z))
+            M = A.copy()
+            M[3] = 0.0 if side == 0 else free
+            M[3, 5] -= side * force / m[1]
+
+            def until(t, M=M, z=z, side=side, free=free):
+                y = expm(M * t) @ z
+                return side * y[3] if side else force - m[1] * abs(free @ y)
+
+            times = np.linspace(0.0, left, 9)
+            ends = [t for t in times[1:] if until(t) < 0]
+            if not ends:
+                z, left = expm(M * left) @ z, 0.0
+                break
+            first = times[list(times).index(ends[0]) - 1]
+            t = brentq(until, max(first, 1e-9 * T), ends[0], xtol=1e-15)
+            z, left = expm(M * t) @ z, left - t
+            if side:
+                z[3], side = 0.0, 0
+            else:
+                side = int(np.sign(free @ z))
+    return np.array(out).T
+
+
+def test_a_mass_that_sticks_and_slides_does_as_an_integration_that_is_exact_between_stops():
+    rig, n = bench("two_masses"), np.arange(300)
+    u = sum(0.35 * np.sin(2 * np.pi * f * n / rig.rate_hz + f) for f in (3.1, 7.3, 11.9, 17.0))
+    v = run(rig, u)["v"]  # as the converter rounds it
+    x, speed = from_stop_to_stop(v, 1 / rig.rate_hz, FORCE)
+    assert np.mean(speed == 0) > 0.1
+    off = [
+        np.max(np.abs(run(rig, u, guide_friction={"mass_2": FORCE}, inner=inner)["x_1"] - x))
+        for inner in (8, 64)
+    ]
+    assert off[0] < 0.01 * np.max(np.abs(x))
+    assert off[1] < 0.3 * off[0]
+
+
+def test_friction_of_a_mass_whose_motion_a_source_sets_is_refused():
+    rig = load_rig("carriage")[0]
+    rigid = rig.model_copy(
+        update={
+            "element": tuple(e for e in rig.element if e.name != "belt"),
+            "sensor": tuple(s for s in rig.sensor if s.name != "F"),
+        }
+    )
+    with pytest.raises(InputError, match="a mass that gives way"):
+        check_rig(rigid, {"guide_friction": {"carriage": 1.0}})
 
 
 @pytest.mark.parametrize(
