@@ -24,7 +24,7 @@ from samii_rig.modal.lines import Lines, lines_of
 from samii_rig.modal.participation import Factored, factored
 from samii_rig.modal.plscf import Coefficients
 from samii_rig.modal.rational import Rational
-from samii_rig.modal.selection import FALSE_ALARM, Selected, fixed, lines_under, select
+from samii_rig.modal.selection import FALSE_ALARM, Selected, fixed, lines_under, select, widened
 from samii_rig.modal.stabilisation import Diagram, diagram
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.whitening import Fit
@@ -103,8 +103,9 @@ class ModalModel:
     unresolved : Hz of resonances that a stepped sine's grid steps over: no modes.
     fit : chi-square of the whole model; intervals are wider by `inflation` where it is refused.
     frequency : (n,) Hz. prediction : (n, n_out, n_in) of the model there, hold and filters in.
-    residues : (n_mode, n_out, n_in) rad/s times output over input, each entry by itself.
-    covariance : of all modes' poles and residues together, in the order of `saved.numbers`.
+    poles, residues : (n_mode,) rad/s and (n_mode, n_out, n_in) rad/s times output over input, each
+        entry by itself, of the model with poles above the band, proven or not.
+    covariance : of both, of all modes together, in the order of `saved.numbers`.
     of : what the poles are those of, in words. divided : what was divided out, in words.
     closed_loop : whether a reference is the input, and a loop around the rig is in the poles.
     """
@@ -115,6 +116,7 @@ class ModalModel:
     inputs: tuple[str, ...]
     background: Complex
     unresolved: tuple[float, ...]
+    poles: Complex
     residues: Complex
     covariance: Float
     fit: Fit
@@ -149,9 +151,9 @@ class ModalModel:
             "inflation": self.inflation,
             "false_alarm": FALSE_ALARM,
             "unresolved_hz": list(self.unresolved),
-            "modes": [
-                _plain(m, R, self.outputs) for m, R in zip(self.modes, self.residues, strict=True)
-            ],
+            "modes": [_plain(m, self.outputs) for m in self.modes],
+            "poles": _pairs(self.poles),
+            "residues": _pairs(self.residues),
             "covariance": self.covariance.tolist(),
         }
 
@@ -222,7 +224,8 @@ def _modal_model(
     rest = np.delete(model.pairs, chosen) if chosen else model.pairs
     units = {c.name: c.unit for c in d.response.outputs}
     n_in = len(d.inputs)
-    residues = model.residues()[:, chosen].T * d.scale
+    wide, own = _wide(d, model, chosen)
+    residues = wide.residues()[:, own].T * d.scale
     return ModalModel(
         modes=tuple(modes),
         outputs=d.outputs,
@@ -230,8 +233,9 @@ def _modal_model(
         inputs=d.inputs,
         background=np.concatenate([rest, model.real]).astype(np.complex128) * d.scale,
         unresolved=tuple(unresolved),
+        poles=wide.pairs[own] * d.scale,
         residues=residues.reshape(len(chosen), len(d.outputs), n_in),
-        covariance=_covariance(model, chosen) * (d.scale * inflation) ** 2,
+        covariance=_covariance(wide, own) * (d.scale * inflation) ** 2,
         fit=found.fit,
         inflation=inflation,
         diagram=poles,
@@ -245,6 +249,21 @@ def _modal_model(
         divided=d.divided,
         closed_loop=_roles(d) == {"reference"},
     )
+
+
+def _wide(d: Lines, model: Rational, chosen: Sequence[int]) -> tuple[Rational, list[int]]:
+    """The model with poles above the band, and where its chosen pairs are; the model itself where
+    they do not stay what they were, or are known to nothing."""
+    try:
+        wide = widened(d, model) if chosen else model
+    except np.linalg.LinAlgError:  # the lines do not bear them
+        wide = model
+    a = model.pairs[list(chosen)]
+    own = [int(np.argmin(np.abs(wide.pairs - one))) for one in a]
+    moved = len(set(own)) < len(own) or np.any(np.abs(wide.pairs[own] - a) > np.abs(a.real))
+    if moved or not np.all(np.diag(_covariance(wide, own)) > 0):
+        return model, list(chosen)
+    return wide, own
 
 
 def _covariance(model: Rational, chosen: Sequence[int]) -> Float:
@@ -334,7 +353,12 @@ def _of(d: Lines) -> str:
     return f"poles of {named}: of what lies between them"
 
 
-def _plain(m: Mode, residues: Complex, outputs: Sequence[str]) -> dict[str, Any]:
+def _pairs(values: Complex) -> list[Any]:
+    """Real and imaginary part of each, as plain data."""
+    return list(np.stack([values.real, values.imag], axis=-1).tolist())
+
+
+def _plain(m: Mode, outputs: Sequence[str]) -> dict[str, Any]:
     low, high = m.frequency_hz.interval()
     least, most = m.damping.interval()
     real, imag = m.shape_interval()
@@ -357,7 +381,6 @@ def _plain(m: Mode, residues: Complex, outputs: Sequence[str]) -> dict[str, Any]
             }
             for k, name in enumerate(outputs)
         },
-        "residues": np.stack([residues.real, residues.imag], axis=-1).tolist(),
         "participation": [[float(x.real), float(x.imag)] for x in m.participation],
         "complexity": m.complexity,
     }

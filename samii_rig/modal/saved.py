@@ -72,7 +72,7 @@ def of_model(found: ModalModel) -> SavedModes:
         inputs=found.inputs,
         closed_loop=found.closed_loop,
         divided=found.divided,
-        poles=np.array([m.pole for m in found.modes], np.complex128),
+        poles=found.poles,
         residues=found.residues,
         covariance=found.covariance,
     )
@@ -99,7 +99,6 @@ def saved_modes(path: Path) -> tuple[SavedModes, ...]:
 
 def _level(where: str, row: Any) -> SavedModes:
     try:
-        modes = row["modes"]
         saved = SavedModes(
             where=where,
             level=float(row["level"]),
@@ -109,11 +108,11 @@ def _level(where: str, row: Any) -> SavedModes:
             inputs=tuple(map(str, row["inputs"])),
             closed_loop=bool(row["closed_loop"]),
             divided=str(row["divided"]),
-            poles=_complex([m["pole"] for m in modes]),
-            residues=_complex([m["residues"] for m in modes]),
+            poles=_complex(row["poles"]),
+            residues=_complex(row["residues"]),
             covariance=np.array(row["covariance"], float),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (IndexError, KeyError, TypeError, ValueError) as error:
         what = f"{type(error).__name__} {error}"
         raise InputError(where, "", what, f"poles, residues and covariance of {WHAT}") from error
     if saved.poles.size:

@@ -103,6 +103,19 @@ def judged(d: Lines, model: Rational, grid: Complex) -> Selected:
                     grid.size)  # fmt: skip
 
 
+def widened(d: Lines, model: Rational) -> Rational:
+    """The model with poles above the band, proven or not.
+
+    Where none is proven, what lies there leaves no more than noise of any line; but a residue is
+    known better than a line, takes what is left, and is off by more than its covariance says.
+    """
+    top = abs(d.s[-1])
+    above = np.any(np.abs(model.pairs) > top) or np.any(np.abs(model.real) > top)
+    if above or model.pairs.size >= _most(d):
+        return model
+    return refine(d.s, d.G, d.W, d.scale, np.append(model.pairs, _beyond(d)), model.real)
+
+
 def places(d: Lines) -> Complex:
     """Poles that no resonance in the band falls between, each over `NARROW` lines at least."""
     low, high = abs(d.s[0]), abs(d.s[-1])

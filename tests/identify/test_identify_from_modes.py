@@ -48,7 +48,8 @@ def measured() -> ModalModel:
 
 def exact(rig, of: SavedModes) -> SavedModes:
     """The modes that a rig has, as if they had been measured without noise."""
-    fitted = identify_modes([of], rig, ["joint_1.k"]).modes
+    first = next(f"{e.name}.{s}" for e in rig.element for s in parameters(e))
+    fitted = identify_modes([of], rig, [first]).modes
     found = poles(rig, 60.0).pole
     a = np.array([found[np.argmin(abs(found - 2 * np.pi * m.model_hz * 1j))] for m in fitted])
     z = 0.01 * np.abs(a)[:, None] * np.exp(2j * np.pi * np.arange(32) / 32)
@@ -156,6 +157,19 @@ def test_the_test_of_the_fit_holds_with_priors_that_take_part_of_it():
     assert np.mean(np.array(p) < 0.1) < 0.25
 
 
+@pytest.mark.parametrize("seed", [3010, 3019, 3024, 3039])
+def test_residues_hold_their_covariance_where_no_pole_above_the_band_is_proven(seed):
+    """The coil's lag at 120 Hz lies above a band that ends at 60 Hz. In these draws it is less
+    than the noise of any line; without poles up there chi-square of residues was 2.2 to 4.1."""
+    rig = load_rig("two_masses")[0]
+    model = find_modes(drawn(rig, seed, band=(1.0, 60.0)), rig)
+    assert model.model.n_poles == 4
+    saved = of_model(model)
+    d = saved.numbers() - exact(rig, saved).numbers()
+    # 12 numbers of variance 1: 2.2 at one in a hundred.
+    assert d @ np.linalg.solve(saved.covariance, d) / d.size < 2.2
+
+
 def test_two_levels_know_more_than_one():
     saved = of_model(measured())
     one, two = (identify_modes([saved] * n, samii(), FREE).found for n in (1, 2))
@@ -239,12 +253,13 @@ def damaged(path: Path, change) -> None:
     [
         (lambda row: row.pop("covariance"), "KeyError 'covariance'"),
         (lambda row: row["covariance"].pop(), "covariance"),
-        (lambda row: row["modes"][0].pop("residues"), "KeyError 'residues'"),
-        (lambda row: row["modes"][0]["residues"].pop(), "expected poles, residues and covariance"),
+        (lambda row: row.pop("residues"), "KeyError 'residues'"),
+        (lambda row: row["residues"][0].pop(), "expected poles, residues and covariance"),
+        (lambda row: row.__setitem__("poles", 3.0), "expected poles, residues and covariance"),
         (lambda row: row["covariance"][0].__setitem__(0, -1.0), "positive definite"),
-        (lambda row: row["modes"][1]["pole"].__setitem__(1, -3.0), "an imaginary part above 0"),
+        (lambda row: row["poles"][1].__setitem__(1, -3.0), "an imaginary part above 0"),
         (lambda row: row["covariance"][0].__setitem__(3, 1e9), "not symmetric"),
-        (lambda row: row.__setitem__("modes", []), "one mode or more"),
+        (lambda row: row.__setitem__("poles", []), "one mode or more"),
         (lambda row: row.__setitem__("units", ["rad"]), "the shape (3, 4, 1)"),
     ],
 )
@@ -259,7 +274,7 @@ def test_a_damaged_file_of_modes_is_refused_in_one_line(kept, change, said):
 
 def test_a_level_that_shows_no_mode_is_left_out_of_a_file(kept):
     data = json.loads(kept.read_text())
-    data["modes"].insert(0, {**data["modes"][0], "modes": [], "covariance": []})
+    data["modes"].insert(0, {**data["modes"][0], "poles": [], "residues": [], "covariance": []})
     kept.write_text(json.dumps(data))
     (read,) = saved_modes(kept)
     assert len(read.poles) == 3
