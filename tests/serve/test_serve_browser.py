@@ -164,6 +164,7 @@ def test_a_run_tells_what_it_knows_while_it_goes_on(
             browser.until(AT_ZERO)
         # What was measured until then stays, as of a run that is over.
         browser.until("document.getElementById('frf-about').textContent.startsWith('Last run')")
+        assert "goes on" not in browser.text("frf-about")
         service.kill()
         browser.until("document.getElementById('motion').ariaLabel.includes('not live')")
     assert browser.errors == []
