@@ -17,6 +17,7 @@ Progress = Callable[[str], None]
 T = TypeVar("T")
 
 SOON = 1.0  # s of work before a time left is more than a guess
+LEAST = 0.1  # s: the shortest time that is told
 
 
 class Counted(str):
@@ -80,10 +81,11 @@ class Pace:
 
 
 def duration(seconds: float) -> str:
-    """`48 s`, `3 min 20 s`, `1 h 5 min`."""
+    """`0.1 s` and less, `7.4 s`, `48 s`, `3 min 20 s`, `1 h 5 min`."""
     whole = round(seconds)
     if whole < 120:
-        return f"{seconds:.3g} s" if seconds < 10 else f"{whole} s"
+        # Less than a tenth of a second is told to nobody's use.
+        return f"{max(seconds, LEAST):.2g} s" if seconds < 9.95 else f"{whole} s"
     minutes, rest = divmod(whole, 60)
     if minutes < 120:
         return f"{minutes} min {rest} s" if rest else f"{minutes} min"

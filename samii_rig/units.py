@@ -185,6 +185,17 @@ def quantity(unit: str) -> str:
     return found[0].quantity if found else ""
 
 
+def others(unit: str) -> str:
+    """`, or mm, um, in, ft`: the names of other units of the same quantity; "" for none."""
+    wanted = {meaning.dimension for meaning in _meanings(unit)}
+    names = [
+        name
+        for name, meant in _NAMED.items()
+        if name != unit and any(m.dimension in wanted for m in meant)
+    ]
+    return f", or {', '.join(names)}" if names else ""
+
+
 def _pairs(given: str, wanted: str) -> Iterator[tuple[Unit, Unit]]:
     for a, b in product(_meanings(given), _meanings(wanted)):
         if a.dimension == b.dimension:

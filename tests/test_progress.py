@@ -57,6 +57,10 @@ def test_who_only_shows_words_has_them_and_a_part_of_more_keeps_its_count() -> N
     assert ahead("before: ", "nominal model") == "before: nominal model"
 
 
-@pytest.mark.parametrize(("s", "said"), [(0.2, "0.2 s"), (48, "48 s"), (200, "3 min 20 s")])
+@pytest.mark.parametrize(
+    ("s", "said"),
+    [(0.000293, "0.1 s"), (0.2, "0.2 s"), (7.45, "7.5 s"), (9.97, "10 s"), (48, "48 s"),
+     (200, "3 min 20 s")],
+)  # fmt: skip
 def test_durations_are_said_as_people_say_them(s: float, said: str) -> None:
     assert duration(s) == said

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from samii_rig.diagnose.batch import How
     from samii_rig.diagnose.result import Diagnosis
     from samii_rig.record.reader import SavedResponses
+    from samii_rig.rig.schema import Rig
     from samii_rig.signal.gather import Gaps
     from samii_rig.types import FrequencyResponse, Recording
 
@@ -268,12 +269,26 @@ def _together(
         return
     for line in found.lines():
         console.print(line, soft_wrap=True)
+    if found.verdict == "unknown" and not first and (exact := _lengths(own_rig)):
+        console.print(
+            f"exact    The rig file gives {', '.join(exact)} no tolerance. If one may be wrong, "
+            f"free it: samii-rig identify with the same recordings, --rig and --free {exact[0]}",
+            soft_wrap=True,
+        )
     if found.model:
         console.print(f"written  {found.model}", soft_wrap=True)
     if page:
         console.print(f"page     {page}", soft_wrap=True)
     if not (own or first or values or saved):
         console.print("not kept with the recordings: they carry another rig file", soft_wrap=True)
+
+
+def _lengths(rig: Rig) -> list[str]:
+    """Lengths without a tolerance: what is taken for exact, and measured wrong most easily."""
+    from samii_rig.rig.schema.base import parameters
+
+    return [f"{e.name}.L" for e in rig.element
+            if (p := parameters(e).get("L")) and not p.tolerance and p.value]  # fmt: skip
 
 
 def _saved(logs: list[Path], *, two: bool) -> list[SavedResponses]:

@@ -194,6 +194,7 @@ def report(
 
     from rich.console import Console
 
+    from samii_rig.progress import ahead
     from samii_rig.record.reader import read_events
     from samii_rig.report.compare import model_curve
     from samii_rig.report.figures import bode_figure, save_figure
@@ -201,34 +202,42 @@ def report(
     from samii_rig.report.page import write_report
     from samii_rig.report.summary import summary, working
 
-    recordings = read_all(logs)
-    held = rig_of(recordings, rig)
-    in_pose = _of_one_pose(recordings, held[0] if held else None) if diagnosis else None
-    responses = estimated(recordings, input_, output, method, gaps, band)
-    curve = model_curve(held[0], responses) if held else None
     console, found = Console(highlight=False), None
-    if in_pose is not None:
-        from samii_rig.diagnose.diagnose import diagnose
+    with working(console, "report", quiet=json) as say:
+        say("recordings")
+        recordings = read_all(logs)
+        held = rig_of(recordings, rig)
+        in_pose = _of_one_pose(recordings, held[0] if held else None) if diagnosis else None
+        say("frequency responses")
+        responses = estimated(recordings, input_, output, method, gaps, band)
+        curve = model_curve(held[0], responses) if held else None
+        if in_pose is not None:
+            from samii_rig.diagnose.diagnose import diagnose
 
-        with working(console, "diagnosis", quiet=json) as say:
-            found = diagnose(responses, in_pose, band=band, progress=say, runs=recordings)
-    modes = modes_of_all(responses, held[0] if held else None)
-    written = []
-    if page is not None:
-        write_report(
-            page,
-            recordings,
-            responses,
-            rig=held[0] if held else None,
-            model=curve,
-            band_hz=band or ALL,
-            events=[event for path in logs for event in read_events(path)],
-            diagnosis=found,
-            modes=modes,
-        )
-        written.append(page)
-    for path in figure or ():
-        written.append(save_figure(path, bode_figure(responses, curve)))
+            found = diagnose(
+                responses, in_pose, band=band, runs=recordings,
+                progress=lambda stage: say(ahead("diagnosis: ", stage)),
+            )  # fmt: skip
+        say("modes")
+        modes = modes_of_all(responses, held[0] if held else None)
+        written = []
+        if page is not None:
+            say("the page")
+            write_report(
+                page,
+                recordings,
+                responses,
+                rig=held[0] if held else None,
+                model=curve,
+                band_hz=band or ALL,
+                events=[event for path in logs for event in read_events(path)],
+                diagnosis=found,
+                modes=modes,
+            )
+            written.append(page)
+        for path in figure or ():
+            say(f"the figure {path.name}")
+            written.append(save_figure(path, bode_figure(responses, curve)))
     if json:
         say_json({"written": written, "model_over_measurement": comparisons(responses, curve)})
         return

@@ -64,10 +64,11 @@ def import_(
         _describe(files, write_map, json=json)
         return
     if not layout:
-        expected = (
-            f"a map file or one of {', '.join(shipped_maps())}; --describe writes a first one"
+        said = (
+            f"missing; expected a map file or one of {', '.join(shipped_maps())}; "
+            "--describe says what a file holds and writes a first one"
         )
-        raise InputError("--map", "", "missing", expected)
+        raise InputError.saying("--map", "", said)
     the_map, text = load_map(layout)
     targets = [out / f"{path.stem}.mcap" for path in files]
     for path, target in zip(files, targets, strict=True):

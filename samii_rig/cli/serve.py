@@ -93,8 +93,8 @@ def serve(
         from samii_rig.serve.app import serve as run
         from samii_rig.serve.settings import Settings
     except ModuleNotFoundError as error:
-        expected = "it to be installed: pip install samii-rig[serve]"
-        raise InputError("samii-rig serve", "", error.name, expected) from error
+        said = f"needs {error.name}, which is not installed; pip install 'samii-rig[serve]'"
+        raise InputError.saying("samii-rig serve", "", said) from error
     known = Tokens(tokens) if tokens else None
     if new_token is not None:
         if known is None:

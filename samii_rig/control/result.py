@@ -150,12 +150,18 @@ def distribution(judgements: Sequence[Judgement]) -> dict[str, Any]:
         "stable": sum(j.outside == 0 for j in judgements),
         **{
             what: {
-                f"{part:g} %": float(np.percentile([getattr(j, what) for j in judgements], part))
+                f"{part:g} %": _percentile([getattr(j, what) for j in judgements], part)
                 for part in PARTS
             }
             for what in SHOWN
         },
     }
+
+
+def _percentile(values: Sequence[float], part: float) -> float:
+    """Between its two neighbours linearly; a margin without end is one, not the lack of one."""
+    low, high = (float(np.percentile(values, part, method=m)) for m in ("lower", "higher"))
+    return low if low == high else float(np.percentile(values, part))
 
 
 def _number(x: float) -> str:

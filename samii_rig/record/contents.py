@@ -105,7 +105,7 @@ def check_start(data: memoryview) -> None:
     if not scan.has_magic(data, 0):
         if MCAP0_MAGIC.startswith(data[: scan.MAGIC_SIZE]):
             raise RecordingError("it ends before the first record of an MCAP file")
-        raise ForeignError("it does not begin as an MCAP file")
+        raise ForeignError("it does not begin as an MCAP file; expected a recording (.mcap)")
 
 
 def read_contents(data: memoryview, stop: int, *, strict: bool) -> Contents:

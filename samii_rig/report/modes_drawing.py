@@ -34,7 +34,8 @@ def motions(all_modes: Sequence[Modes]) -> list[tuple[str, Markup]]:
 
 
 def motion(m: Modes, i: int) -> str:
-    """An SVG of mode i along the chain; "" without a mode of the model to draw between sensors."""
+    """An SVG of mode i along the chain; "" without a mode of the model to draw between sensors, and
+    of a chain that has no length."""
     mode, held = m.found.modes[i], m.of_model(i)
     seen = placed(m.found, mode, held[0]) if held else None
     if held is None or seen is None:
@@ -42,6 +43,8 @@ def motion(m: Modes, i: int) -> str:
     known, (at, w, _) = held[0], seen
     keep = np.concatenate([np.diff(known.x) > 0, [True]])  # elements without length share a place
     x, curve = known.x[keep], known.w[keep]
+    if len(x) < 2:  # masses on springs have no length: all of them share one place
+        return ""
     size = float(max(np.abs(curve).max(), np.abs(w).max()))
     across = _EDGE + (_WIDTH - 2 * _EDGE) * (x - x[0]) / (x[-1] - x[0])
     places = _EDGE + (_WIDTH - 2 * _EDGE) * (at - x[0]) / (x[-1] - x[0])

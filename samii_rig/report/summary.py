@@ -30,6 +30,7 @@ if TYPE_CHECKING:  # it compiles the model, which showing needs not
 
 _STYLES = {"good": "green", "note": "blue", "warning": "yellow", "bad": "bold red"}
 _WORDS = {"good": "good", "note": "note", "warning": "look", "bad": "ATTENTION"}
+_WHERE = 20  # characters of a segment's name that fit beside the rest; what tells is its end
 _MARGIN_CLOSE = 0.2  # of a limit left: shown as close
 _BAR = 30  # characters
 ON = 5.0  # s between lines of a stage that goes on
@@ -214,6 +215,8 @@ def summary(
     ]
     found = [c for of_one in compared for c in of_one]
     parts: list[RenderableType] = [verdict_line(v) for v in verdicts(recordings, responses, found)]
+    notes = dict.fromkeys(f.message for r in responses for f in r.findings if f.severity == "note")
+    parts += [Text.assemble((f"{'note':<9} ", _STYLES["note"]), message) for message in notes]
     if modes:
         parts += [Text(""), modes_table(modes)]
     if found:
@@ -262,7 +265,7 @@ def dry_run_summary(predicted: DryRun) -> RenderableType:
             value,
             f"{m.limit:g} {pretty(m.unit)}",
             Text(percent(m.margin), style=style),
-            m.segment,
+            m.segment if len(m.segment) <= _WHERE else f"\u2026{m.segment[1 - _WHERE :]}",
             Text("OVER", style=style) if m.margin < 0 else "",
         )
     channels = list(dict.fromkeys(b.channel for b in predicted.bands))
@@ -273,15 +276,19 @@ def dry_run_summary(predicted: DryRun) -> RenderableType:
     for b in predicted.bands:
         by = f"{b.input}, " if b.input else ""
         key = f"{by}{b.level:g} {b.level_unit}, {b.low_hz:.3g}\u2013{b.high_hz:.3g} Hz"
-        rows.setdefault(key, {})[b.channel] = f"{100 * b.relative:.2g} %"
+        seen = b.relative < 1.0  # an error larger than the response itself has no size
+        rows.setdefault(key, {})[b.channel] = f"{100 * b.relative:.2g} %" if seen else "not seen"
     for key, cells in rows.items():
         errors.add_row(key, *(cells.get(c, "") for c in channels))
+    below: list[RenderableType] = [Text(""), errors]
+    if any(b.relative >= 1.0 for b in predicted.bands):
+        below.append(Text("not seen: the noise is larger than what comes there"))
     takes = duration(predicted.duration)
     if predicted.shortest < predicted.duration:
         takes = f"{duration(predicted.shortest)} to {takes}"
     head = Text(f"The plan takes {takes}. Predicted by the model:")
     refused = any(m.margin < 0 for m in predicted.margins)  # then nothing will be measured
-    return Group(head, margins, Text(""), errors) if rows and not refused else Group(head, margins)
+    return Group(head, margins, *(below if rows and not refused else ()))
 
 
 def show_dry_run(predicted: DryRun, console: Console | None = None) -> None:

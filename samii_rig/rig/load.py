@@ -16,6 +16,7 @@ from pydantic.fields import FieldInfo
 from samii_rig.errors import InputError, one_of
 from samii_rig.files import open_file, reason
 from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema.base import Parameter
 from samii_rig.rig.shipped import FOLDER
 from samii_rig.rig.shipped import names_in as names_in
 from samii_rig.rig.shipped import shipped as shipped
@@ -77,8 +78,18 @@ def tables(text: str, where: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         why = str(error) or "nested too deep"
-        said = f"is not valid TOML: {why[0].lower()}{why[1:]}"
+        said = f"is not valid TOML: {why[0].lower()}{why[1:]}{_decimal_comma(why, text)}"
         raise InputError.saying(where, "", said) from error
+
+
+def _decimal_comma(why: str, text: str) -> str:
+    """A hint where the line that `why` names has a number with a comma in place of its point."""
+    named = re.search(r"at line (\d+)", why)
+    lines = text.split("\n")
+    if named is None or int(named[1]) > len(lines):
+        return ""
+    comma = re.search(r"=\s*([-+]?\d+),(\d+)\s*[,}#]?", lines[int(named[1]) - 1])
+    return f"; did you mean {comma[1]}.{comma[2]} for {comma[1]},{comma[2]}?" if comma else ""
 
 
 def parse(model: type[Model], text: str, where: str) -> Model:
@@ -157,8 +168,17 @@ def _one_line(
             lacking = [str(loc[-1]) for loc in missing if loc[:-1] == beside]
             known = [k for k in _fields_at(model, beside) if k not in _given(data, beside)]
             near = one_of(first["loc"][-1], known) if known else "no more than there is"
+            if model is Rig and field == "experiment":
+                said = "is an experiment's file; expected a rig file"
+                return InputError.saying(where, "", said)
             expected = " or ".join(lacking) or near
             return InputError.saying(where, field, f"no such field; expected {expected}")
+        case "model_type":
+            whole = first["ctx"]["class_name"] == Parameter.__name__
+            table = '{ value = ..., unit = "...", source = "..." }' if whole else "a table, { ... }"
+            return InputError(where, field, first["input"], table)
+        case "tuple_type" | "list_type":
+            return InputError(where, field, first["input"], "a list, in brackets: [ ... ]")
         case "union_tag_not_found":
             return InputError.saying(where, field, "has no kind; expected one, as in the docs")
         case "union_tag_invalid":

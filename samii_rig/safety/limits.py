@@ -158,13 +158,17 @@ class GateLimits:
         )
 
 
+# An experiment that is made for one rig is run on another, or --rig is forgotten.
+_OTHERWISE = "; name it in a copy of the experiment's file, or another rig by --rig"
+
+
 def find_actuator(rig: Rig, name: str, where: str) -> ActuatorSpec:
     """The actuator called `name`; InputError if the rig has none of that name."""
     for actuator in rig.actuator:
         if actuator.name == name:
             return actuator
     names = ", ".join(a.name for a in rig.actuator)
-    raise InputError(where, "actuator", name, f"an actuator of {rig.name}: {names}")
+    raise InputError(where, "actuator", name, f"an actuator of {rig.name}: {names}{_OTHERWISE}")
 
 
 def gate_limits(

@@ -149,7 +149,7 @@ def test_what_is_no_recording_is_called_none(tmp_path: Path) -> None:
     for command in ("report", "frf", "diagnose"):
         code, said = call(command, text)
         assert code != 0
-        assert said == f"{text}: it does not begin as an MCAP file"
+        assert said == f"{text}: it does not begin as an MCAP file; expected a recording (.mcap)"
 
 
 def test_a_cut_recording_is_recovered(log: Path, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from samii_rig.control.design import Goals, design, lowpass
 from samii_rig.control.identified import identified
 from samii_rig.control.margins import margins
 from samii_rig.control.plants import corners, judge, plant, stiffnesses, uncertain, with_values
-from samii_rig.control.result import lines, lowpass_numbers, plain, rig_text
+from samii_rig.control.result import distribution, lines, lowpass_numbers, plain, rig_text
 from samii_rig.control.settle import settle_time, settling
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.model.loops import loops_of, unstable_count
@@ -211,3 +212,19 @@ def test_the_command_line_judges_a_rig_that_has_a_loop_in_three_lines(made, tmp_
     data = json.loads((tmp_path / "out" / "control.json").read_text())
     assert data["reached"] is True
     assert data["nominal"]["damping"] == pytest.approx(made.nominal.damping)
+
+
+@dataclass
+class Judged:
+    damping: float
+    gain_db: float
+    phase_deg: float
+    outside: int = 0
+
+
+def test_a_margin_without_end_is_one_in_the_percentiles() -> None:
+    judged = [Judged(0.1, 6.0, phase) for phase in (40.0, math.inf, math.inf, math.inf)]
+    phase = distribution(judged)["phase_deg"]  # type: ignore[arg-type]
+    assert phase["95 %"] == math.inf
+    assert phase["50 %"] == math.inf
+    assert not any(math.isnan(x) for x in phase.values())

@@ -18,6 +18,7 @@ from samii_rig.modal.modes import find_modes
 from samii_rig.plain import plain
 from samii_rig.report.modes import modes_of
 from samii_rig.report.modes_drawing import motions
+from samii_rig.rig.load import load_rig
 from samii_rig.types import Channel
 
 F = np.linspace(1.0, 40.0, 400)
@@ -135,6 +136,14 @@ def test_the_measured_points_lie_on_the_drawn_shapes_and_move_with_them():
             x = float(mark.get("cx"))
             curve = [np.interp(x, frame[:, 0], frame[:, 1]) for frame in frames]
             np.testing.assert_allclose(heights, curve, atol=0.02 * 150)  # of the drawing's height
+
+
+def test_masses_on_springs_have_no_length_to_draw() -> None:
+    rig, _ = load_rig("two_masses")
+    all_modes, lost = modes_of([drawn(rig, 3, n=200)], rig)
+    assert lost == ()
+    assert len(all_modes[0].found.modes) == 2
+    assert motions(all_modes) == []
 
 
 @pytest.mark.parametrize(

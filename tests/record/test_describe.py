@@ -230,7 +230,7 @@ def test_from_the_command_line_to_a_recording(tmp_path):
     assert told["files"][0]["format"]["delimiter"] == ";"
     again = run(app, ["import", str(path), "--write-map", str(chosen)])
     assert "expected the name of a new file" in str(again.exception)
-    assert "--map is 'missing'" in str(run(app, ["import", str(path)]).exception)
+    assert "--map: missing; expected a map file" in str(run(app, ["import", str(path)]).exception)
     file = write(tmp_path, "", "afile")
     blocked = run(app, ["import", str(path), "--map", str(chosen), "--out", str(file)])
     assert "expected a folder to write to" in str(blocked.exception)

@@ -288,9 +288,11 @@ def test_a_dry_run_says_its_margins_and_errors():
     band = BandError("theta_2", 4.0, "V", 1.0, 2.0, 1e-5, 0.013)
     peaks_ = np.zeros((1, 1))
 
+    def run(*margins):
+        return DryRun(95.0, 95.0, ("v_2",), ("V",), peaks_, 0.0, margins, (band,))
+
     def shown(*margins):
-        run = DryRun(95.0, 95.0, ("v_2",), ("V",), peaks_, 0.0, margins, (band,))
-        return printed(dry_run_summary(run))
+        return printed(dry_run_summary(run(*margins)))
 
     said = shown(over, margin)
     for part in ("95 s", "33 m/s\u00b2", "-10 %", "20 %", "OVER"):
@@ -300,6 +302,13 @@ def test_a_dry_run_says_its_margins_and_errors():
     for part in ("1\u20132 Hz", "1.3 %"):
         assert part in said
     assert "OVER" not in said
+    assert "not seen" not in said
+    band = replace(band, relative=1.1e38)  # the noise is all that will be there
+    margin = replace(margin, segment="swept_sine_beam_on_shaker_1_2")
+    said = printed(dry_run_summary(replace(run(margin), bands=(band,))))
+    assert "not seen" in said
+    assert "e+" not in said
+    assert "shaker_1_2" in said  # what tells one segment from the next
 
 
 def test_a_dry_run_has_one_row_a_channel_and_tells_a_bound_from_a_peak():

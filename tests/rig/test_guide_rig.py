@@ -52,6 +52,19 @@ def test_a_heavier_mass_is_named_as_the_guide_says(tmp_path: Path) -> None:
         assert says in GUIDE
 
 
+def test_the_guide_holds_the_heavier_recording_alone_against_the_file() -> None:
+    """With the first one beside it no single cause explains both."""
+    made = re.search(r"--rig heavier.toml --out (\S+)", GUIDE)
+    assert made
+    assert f"samii-rig diagnose {made[1]} --rig bench.toml" in GUIDE
+
+
+def test_the_files_to_start_from_are_where_the_guide_copies_them_from() -> None:
+    copied = re.findall(r"^    cp (\S+) \S+$", GUIDE, re.MULTILINE)
+    assert len(copied) == 2
+    assert all((ROOT / path).is_file() for path in copied)
+
+
 def test_every_bench_and_kind_of_the_tables_exists() -> None:
     benches = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \| a? ?\w", GUIDE, re.MULTILINE)
     names = [name for cell in benches for name in re.findall(r"`(\w+)`", cell)]

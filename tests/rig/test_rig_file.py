@@ -91,6 +91,22 @@ def test_samii_carries_table_ii_of_paper_1() -> None:
         ("rate_hz", "rate", r"rate: no such field; expected rate_hz"),
         ('tip = "free"', "", r"tip: missing; expected one of"),
         ('tip = "free"', 'tip = "free"\ntop = 1', r"top: no such field"),
+        (
+            "value = 150.0",
+            'value = "150"',
+            r"\.p\.value is '150'; expected a valid number",
+        ),
+        (
+            "value = 150.0",
+            "value = true",
+            r"\.p\.value is True; expected a valid number",
+        ),
+        ("value = 150.0", "value = 150,0", r"TOML.*; did you mean 150.0 for 150,0\?$"),
+        (
+            'tip = "free"',
+            'tip = "free"\nexperiment = "swept_sine"',
+            r"my.toml: is an experiment's file; expected a rig file$",
+        ),
     ],
 )
 def test_a_mistake_is_named_with_field_value_and_remedy(old: str, new: str, says: str) -> None:

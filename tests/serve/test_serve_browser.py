@@ -29,6 +29,13 @@ DRAWN = """
 AT_ZERO = "document.getElementById('now').textContent.includes('The output is at zero.')"
 
 
+# What came of *Plan* is seen without scrolling, where it was pressed.
+IN_VIEW = """
+(() => { const r = document.getElementById('planned').getBoundingClientRect();
+  return r.height > 0 && r.top >= 0 && r.bottom <= innerHeight; })()
+"""
+
+
 @pytest.fixture(scope="module")
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     with Browser(tmp_path_factory.mktemp("browser")) as opened:
@@ -56,6 +63,9 @@ def test_an_afternoon_at_the_page(
         type_into(browser, "text", "'[0.2]', '[9.0]'")
         browser.click("plan")
         browser.until("document.getElementById('planned').textContent.includes('Refused')")
+        browser.size(1440, 900)
+        browser.until(IN_VIEW)
+        browser.call("Emulation.clearDeviceMetricsOverride")
         type_into(browser, "text", "'[9.0]', '[0.1]'")
         assert not browser.value("document.getElementById('changed').hidden")
         browser.click("plan")
@@ -154,6 +164,7 @@ def test_a_run_tells_what_it_knows_while_it_goes_on(
             browser.until(AT_ZERO)
         # What was measured until then stays, as of a run that is over.
         browser.until("document.getElementById('frf-about').textContent.startsWith('Last run')")
+        assert "goes on" not in browser.text("frf-about")
         service.kill()
         browser.until("document.getElementById('motion').ariaLabel.includes('not live')")
     assert browser.errors == []

@@ -10,7 +10,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from samii_rig.units import convert
+from samii_rig.units import convert, others
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -32,7 +32,7 @@ class Parameter(Strict):
     written : the unit that the file gives it in, if that is not `unit`; see `shown`.
     """
 
-    value: Finite
+    value: Annotated[Finite, Field(strict=True)]  # neither "300" nor true
     unit: str
     tolerance: NonNegative = 0.0
     source: str = Field(min_length=1)
@@ -70,7 +70,7 @@ class Quantity:
             return None
         made = converted(parameter, self.unit)
         if made is None:
-            raise ValueError(f"unit {parameter.unit!r}; expected {self.unit!r}")
+            raise ValueError(f"unit {parameter.unit!r}; expected {self.unit!r}{others(self.unit)}")
         refusal = self.refusal(made.value)
         if refusal:
             raise ValueError(refusal)

@@ -34,6 +34,8 @@ export function diagram(g, b, { title, unit, x, y, logarithmic, curves, hatched 
     if (px(v) - right < 26) continue; // no number on another
     g.fillText(short(at), px(v), b.y + b.h + 14); right = px(v);
   }
+  // The unit of the axis, where no number stands.
+  if (logarithmic && b.x + b.w - right > 34) { g.textAlign = "right"; g.fillText("Hz", b.x + b.w, b.y + b.h + 14); }
   g.save(); g.beginPath(); g.rect(b.x, b.y, b.w, b.h); g.clip();
   for (const [from, to] of hatched) hatch(g, Math.max(b.x, px(from)), Math.min(b.x + b.w, px(to)), b, ink);
   for (const c of curves) {

@@ -16,7 +16,7 @@ import { keep, kept, sized, themed } from "/page/kept.js";
 const $ = (id) => document.getElementById(id);
 const scope = new Scope($("scope"), (text) => { $("scope-state").textContent = text; });
 const motion = new Motion($("motion"), scope, (text) => { $("motion").setAttribute("aria-label", text); });
-let lease = "", beating = 0, state = null, job = "", wanted = true, anew = "";
+let lease = "", beating = 0, state = null, job = "", wanted = true, anew = "", unlisted = false;
 
 const REFUSED = [401, 403, 409]; // by the service itself
 const GONE = "The service does not answer.";
@@ -179,7 +179,10 @@ function show(s) {
   soFar.show(s);
   notes.about(s);
   why.show(s);
-  if (before && l && (!before.last || before.last.id !== l.id)) recordings.find();
+  if (unlisted || (before && l && (!before.last || before.last.id !== l.id))) {
+    unlisted = false;
+    recordings.find().catch(() => { unlisted = true; }); // the service is gone: with its next state
+  }
 }
 
 // A run that no operator's page watches over, as after the service was started anew.

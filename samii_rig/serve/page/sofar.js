@@ -34,7 +34,7 @@ export class SoFar {
     this.panel.set(data, Boolean(run));
     if (!data) return;
     const said = data.responses.map((r) => `${r.level} ${r.unit}: ${hz(r.low_hz)} to ${hz(r.high_hz)} Hz, ${
-      r.going_on ? "goes on" : `${r.n} ${r.n > 1 ? "repeats" : "sweep"}`}`).join("; ");
+      r.going_on ? (run ? "goes on" : "cut off") : `${r.n} ${r.n > 1 ? "repeats" : "sweep"}`}`).join("; ");
     const of = `${data.done} of ${data.of} segments whole`;
     $("frf-about").textContent = `${run ? "" : "Last run. "}${of}. ${said || "Nothing measured yet"}.${
       data.trouble ? ` The newest part: ${data.trouble}.` : ""}`;
