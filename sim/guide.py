@@ -18,7 +18,8 @@ from samii_rig.model.realise import Realisation, realise
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import ForceSource, Parameter, Rig, Velocity, parameters
 from samii_rig.rig.settings import wrong
-from sim.kernel import Guide
+from sim.base import UNRELATED
+from sim.kernel import Guide, free
 from sim.plant import Tables, tabulate
 from sim.settings import SimSettings
 
@@ -51,10 +52,18 @@ def check_guide(rig: Rig, settings: SimSettings) -> None:
             raise wrong(rig, SETTING, name, what)
 
 
-def guided(rig: Rig, settings: SimSettings) -> tuple[Tables, Guide]:
-    """Tables of the output of a rig whose guide has friction, and that of the guide."""
+def tables_of(rig: Rig, made: Realisation, settings: SimSettings) -> tuple[Tables, Guide]:
+    """Tables of the one output of a rig, realised as `made`, and its guide, with friction or
+    without."""
+    if any(settings.guide_friction.values()):
+        return _guided(rig, settings)
+    tables = tabulate(rig, made, settings.inner)
+    return tables, free(tables)
+
+
+def _guided(rig: Rig, settings: SimSettings) -> tuple[Tables, Guide]:
     ((body, force),) = settings.guide_friction.items()
-    made = _realised(rig.model_dump_json(exclude={"device", "service"}), body, settings.band_hz)
+    made = _realised(rig.model_dump_json(exclude=UNRELATED), body, settings.band_hz)
     both = _with_force(rig, body)
     drive, push = (tabulate(both, made, settings.inner, i) for i in range(2))
     m = len(rig.sensor)
@@ -82,6 +91,7 @@ def guided(rig: Rig, settings: SimSettings) -> tuple[Tables, Guide]:
 
 @lru_cache(maxsize=4)
 def _realised(rig_json: str, body: str, band_hz: float | None) -> Realisation:
+    # Added to a rig that was checked: no rig file may have this output.
     return realise(_with_force(Rig.model_validate_json(rig_json), body), band_hz)
 
 

@@ -29,8 +29,7 @@ from samii_rig.rig.schema import Rig
 from sim import kernel
 from sim.base import SimulatedRig, device_channels
 from sim.electronics import check_block, control, converters, drive, filters, references
-from sim.guide import check_guide, guided
-from sim.plant import tabulate
+from sim.guide import check_guide, tables_of
 from sim.settings import SimSettings, read_settings
 from sim.several import SimulatedOutputs
 
@@ -42,11 +41,7 @@ class SimulatedDevice(SimulatedRig):
         super().__init__(rig, settings)
         (spec,) = rig.actuator
         self.name = spec.name
-        if any(settings.guide_friction.values()):
-            self._tables, self._guide = guided(rig, settings)
-        else:
-            self._tables = tabulate(rig, self.realisation, settings.inner)
-            self._guide = kernel.free(self._tables)
+        self._tables, self._guide = tables_of(rig, self.realisation, settings)
         self._converters = converters(rig, settings)
         self._drive = drive(rig, settings)
         self._state = kernel.rest(self._tables)

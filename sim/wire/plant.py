@@ -13,8 +13,7 @@ from samii_rig.rig.schema import Rig
 from sim import kernel
 from sim.base import UNRELATED, realised
 from sim.electronics import converters, drive
-from sim.guide import check_guide, guided
-from sim.plant import tabulate
+from sim.guide import check_guide, tables_of
 from sim.settings import SimSettings
 from sim.wire.protocol import RAILS
 
@@ -120,11 +119,7 @@ class Plant:
             for m in rig.monitor
         }
         check_guide(rig, settings)
-        if any(settings.guide_friction.values()):
-            self._tables, self._guide = guided(rig, settings)
-        else:
-            self._tables = tabulate(rig, made, settings.inner)
-            self._guide = kernel.free(self._tables)
+        self._tables, self._guide = tables_of(rig, made, settings)
         self._converters = converters(rig, settings)
         self._drive = drive(rig, settings)
         m = len(rig.sensor)
