@@ -11,6 +11,7 @@ residual of the best d, smoothed along frequency: a transient is in A, and does 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -211,7 +212,7 @@ def left_by(
     if part is not None:
         rows = rows.take(np.flatnonzero(part(rows.k)))
     both = np.concatenate([rows.e[:, :, None], rows.N], axis=2)
-    both = np.sqrt(2) * noise.noise.whitened(rows.f, both)
+    both = np.sqrt(2) * noise.noise.whitened(rows.f, rows.piece, both)
     white = both[:, :, 0]
     for on, m in rows.each():
         N = both[on][:, :, 1 : 1 + m].reshape(-1, m)
@@ -219,7 +220,7 @@ def left_by(
         goal = _real(white[on].ravel())
         goal -= Q @ (Q.T @ goal)
         white[on] = _complex(goal).reshape(on.size, -1)
-    each = noise.noise.scaled(rows.f, white) / 2
+    each = noise.noise.scaled(rows.f, rows.piece, white) / 2
     return Left(rows.f, np.sum(np.abs(white) ** 2, axis=1), each)
 
 
@@ -328,15 +329,22 @@ def formed(
     else:
         nodes = np.rint(at * (smooth.samples / smooth.rate_hz)).astype(np.int64)
     seen = records.seen(H, loop)
-    rows = _rows(records, _columns(records, smooth, nodes), seen)
-    left, free = _residual(
-        rows, _between(nodes, nodes_of(smooth, shape, records.changing, spare=True))
-    )
-    power = Noise.of(
-        *_with_repeats(records, H, seen, rows.f, left, free),
-        disturbances=disturbances,
-        known=rounding.added([s.rounding for s in seen]),
-    )
+    free = _between(nodes, nodes_of(smooth, shape, records.changing, spare=True))
+
+    known = rounding.Added.of([s.rounding for s in seen])
+
+    def told(with_past: Records) -> tuple[Rows, Noise]:
+        rows = _rows(records, _columns(with_past, smooth, nodes), seen)
+        return rows, Noise.of(
+            *_with_repeats(records, H, seen, rows, *_residual(rows, free)),
+            disturbances=disturbances,
+            known=known,
+        )
+
+    rows, power = told(records)
+    with_past = _with_past(records, rows, seen, power)
+    if with_past is not None:
+        rows, power = told(with_past)
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
     rows = rows.take(np.flatnonzero(counted))
     form = _quadratic(rows, power, S[nodes])
@@ -355,18 +363,36 @@ def formed(
     return made, rows
 
 
+def _with_past(records: Records, rows: Rows, seen: Sequence[Seen], noise: Noise) -> Records | None:
+    """The same records, with what moved the rig before each piece as far as its lines show that;
+    None where nothing did."""
+    root = np.linalg.inv(noise.root(rows.f, rows.piece))
+    W = 2 * (root.conj().swapaxes(1, 2) @ root)
+    pieces = []
+    for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
+        on = np.flatnonzero(rows.piece == i)
+        found = own.past.likely(rows.e[on], own.N[:, :, own.beside], W[on])
+        if found is not None:
+            piece = own.past.before(piece, math.sqrt(len(piece.z)) * found)  # lines are a sample's
+        pieces.append(piece)
+    if all(a is b for a, b in zip(pieces, records.pieces, strict=True)):
+        return None
+    return replace(records, pieces=tuple(pieces))
+
+
 def _with_repeats(
-    records: Records, H: Complex, seen: Sequence[Seen], f: Float, left: Complex, free: Float
-) -> tuple[Float, Complex, Float]:
-    """Frequency, lines and freedom of all that tells noise: what repeats differ by, too."""
-    every = [(f, left, free)]
-    for piece, own in zip(records.pieces, seen, strict=True):
+    records: Records, H: Complex, seen: Sequence[Seen], rows: Rows, left: Complex, free: Float
+) -> tuple[Float, Complex, Float, Int]:
+    """Frequency, lines, freedom and piece of all that tells noise: what repeats differ by, too."""
+    every = [(rows.f, left, free, rows.piece)]
+    for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
         if np.any(rounding.alike(piece, records.step) > rounding.ALIKE):
             continue
-        every += _beside(records, piece, piece.repeats, H, own)
-    f, left, free = (np.concatenate(x) for x in zip(*every, strict=True))
+        for f, e, some in _beside(records, piece, piece.repeats, H, own):
+            every.append((f, e, some, np.full(f.size, i)))
+    f, left, free, which = (np.concatenate(x) for x in zip(*every, strict=True))
     order = np.argsort(f, kind="stable")
-    return f[order], left[order], free[order]
+    return f[order], left[order], free[order], which[order]
 
 
 def _beside(
@@ -387,11 +413,11 @@ def _differing(
 ) -> tuple[float, float]:
     """Chi-square of the levels against each other, and its mean."""
     total = count = 0.0
-    for piece, own in zip(records.pieces, seen, strict=True):
+    for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
         every = _beside(records, piece, piece.contrasts, H, own)
         if every:
-            left = np.stack([e for _, e, _ in every], axis=2)
-            total += 2 * float(np.sum(np.abs(noise.whitened(every[0][0], left)) ** 2))
+            f, left = every[0][0], np.stack([e for _, e, _ in every], axis=2)
+            total += 2 * float(np.sum(np.abs(noise.whitened(f, np.full(f.size, i), left)) ** 2))
             count += 2.0 * left.shape[1] * sum(float(np.sum(free)) for _, _, free in every)
     return total, count
 
@@ -539,7 +565,7 @@ class _Form:
 def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     """factor, target of `Reduced`, and chi-square of the reference with the best nuisances."""
     b, q = reference.shape  # q : of each input by itself, where there are several
-    L = np.linalg.inv(noise.root(rows.f))
+    L = np.linalg.inv(noise.root(rows.f, rows.piece))
     W = 2 * (L.conj().swapaxes(1, 2) @ L)
     We = (W @ rows.e[:, :, None])[:, :, 0]
     M = _products(rows.X, W)
