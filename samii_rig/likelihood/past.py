@@ -77,30 +77,6 @@ class Past:
         lag, of = np.array(at).T
         return cls(shapes / size, lag, of, piece.inputs, impulses / size, size)
 
-    def likely(self, e: Complex, N: Complex, W: Complex) -> Float | None:
-        """(m,) amplitudes that lines e (n, q) show beside other nuisances N (n, q, m); None where
-        they show none.
-
-        As large as those that are seen all of the past's impulses may have been: a direction that
-        noise hides is not taken for motion. W : (n, q, q) twice the inverse of the noise.
-        """
-        m = self.shapes.shape[2]
-        every = np.concatenate([self.shapes * self.strength, N], axis=2)
-        flat = every.reshape(-1, every.shape[2])
-        square = (flat.conj().T @ (W @ every).reshape(flat.shape)).real
-        head = (flat.conj().T @ (W @ e[:, :, None]).ravel()).real
-        turn, values = _directions(square[m:, m:])
-        others = turn / np.sqrt(values)
-        across = square[:m, m:] @ others
-        own = square[:m, :m] - across @ across.T
-        pull = head[:m] - across @ (others.T @ head[m:])
-        turn, values = _directions(own)
-        shown = float(np.sum((turn.T @ pull) ** 2 / values))
-        if shown < SHOWN + values.size:
-            return None
-        power = (shown - values.size) / float(np.trace(own))
-        return np.asarray(self.strength * np.linalg.solve(own + np.eye(m) / power, pull))
-
     def motion(self, piece: Piece, amplitudes: Float, impulse: Float) -> Float:
         """(n, q) what is left of it in a piece. impulse : as of `of_piece`."""
         out = np.zeros(piece.z.shape)
@@ -116,6 +92,33 @@ class Past:
         np.add.at(r, (most - self.lags, self.of), self.impulses @ amplitudes)
         r = r[:, 0] if piece.r.ndim == 1 else r
         return replace(piece, r=np.concatenate([r, piece.r]), history=most + piece.history)
+
+
+def likely(shapes: Complex, strength: Float, e: Complex, N: Complex, W: Complex) -> Float | None:
+    """(m,) amplitudes of the past's shapes (n, q, m) that lines e (n, q) show beside nuisances
+    N (n, q, p); None where they show none.
+
+    As large as those that are seen all of the past's impulses may have been: a direction that
+    noise hides is not taken for motion.
+
+    strength : (m,) as of `Past`. W : (n, q, q) twice the inverse of the noise.
+    """
+    m = shapes.shape[2]
+    every = np.concatenate([shapes * strength, N], axis=2)
+    flat = every.reshape(-1, every.shape[2])
+    square = (flat.conj().T @ (W @ every).reshape(flat.shape)).real
+    head = (flat.conj().T @ (W @ e[:, :, None]).ravel()).real
+    turn, values = _directions(square[m:, m:])
+    others = turn / np.sqrt(values)
+    across = square[:m, m:] @ others
+    own = square[:m, :m] - across @ across.T
+    pull = head[:m] - across @ (others.T @ head[m:])
+    turn, values = _directions(own)
+    shown = float(np.sum((turn.T @ pull) ** 2 / values))
+    if shown < SHOWN + values.size:
+        return None
+    power = (shown - values.size) / float(np.trace(own))
+    return np.asarray(strength * np.linalg.solve(own + np.eye(m) / power, pull))
 
 
 def _independent(shapes: Complex) -> Float:

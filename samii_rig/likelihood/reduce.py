@@ -25,6 +25,7 @@ from samii_rig.likelihood import rounding
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Disturbances, Noise
+from samii_rig.likelihood.past import likely
 from samii_rig.likelihood.pieces import Loops, Piece, Samples
 from samii_rig.likelihood.seen import Answers, Seen
 from samii_rig.types import Complex, Float, Int
@@ -342,7 +343,7 @@ def formed(
         )
 
     rows, power = told(records)
-    with_past = _with_past(records, rows, seen, power)
+    with_past = _with_past(records, rows, seen, power, free)
     if with_past is not None:
         rows, power = told(with_past)
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
@@ -363,21 +364,52 @@ def formed(
     return made, rows
 
 
-def _with_past(records: Records, rows: Rows, seen: Sequence[Seen], noise: Noise) -> Records | None:
-    """The same records, with what moved the rig before each piece as far as its lines show that;
-    None where nothing did."""
+def _with_past(
+    records: Records, rows: Rows, seen: Sequence[Seen], noise: Noise, spare: Float
+) -> Records | None:
+    """The same records, with what moved the rig before each piece as far as its lines show that,
+    whatever the change of the response is; None where nothing did.
+
+    spare : as of `_residual`.
+    """
     root = np.linalg.inv(noise.root(rows.f, rows.piece))
     W = 2 * (root.conj().swapaxes(1, 2) @ root)
-    pieces = []
-    for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
-        on = np.flatnonzero(rows.piece == i)
-        found = own.past.likely(rows.e[on], own.N[:, :, own.beside], W[on])
-        if found is not None:
-            piece = own.past.before(piece, math.sqrt(len(piece.z)) * found)  # lines are a sample's
-        pieces.append(piece)
+    pieces = list(records.pieces)
+    rows, groups = _grouped(rows, spare)
+    for on in groups:
+        one = rows.take(on)
+        Q = orthonormal(_real(one.X))
+        own = [(i, seen[i]) for i in np.unique(one.piece)]
+        at = np.cumsum([0, *(s.N.shape[2] for _, s in own)])
+        N = _beyond(Q, one.N[:, :, : at[-1]])
+        past = [np.arange(s.past.shapes.shape[2]) + j for j, (_, s) in zip(at, own, strict=False)]
+        beside = [
+            np.arange(s.beside.start, s.beside.stop) + j for j, (_, s) in zip(at, own, strict=False)
+        ]
+        found = likely(
+            N[:, :, np.concatenate(past)],
+            np.concatenate([s.past.strength for _, s in own]),
+            _beyond(Q, one.e[:, :, None])[:, :, 0],
+            N[:, :, np.concatenate(beside)],
+            W[on],
+        )
+        if found is None:
+            continue
+        first = 0
+        for (i, s), which in zip(own, past, strict=True):
+            amplitudes = found[first : first + which.size]
+            first += which.size
+            piece = pieces[i]  # lines are a sample's
+            pieces[i] = s.past.before(piece, math.sqrt(len(piece.z)) * amplitudes)
     if all(a is b for a, b in zip(pieces, records.pieces, strict=True)):
         return None
     return replace(records, pieces=tuple(pieces))
+
+
+def _beyond(Q: Float, x: Complex) -> Complex:
+    """Lines (n, q, m) less what is along directions Q (2 n, p) of each sensor."""
+    flat = _real(x.reshape(len(x), -1))
+    return _complex(flat - Q @ (Q.T @ flat)).reshape(x.shape)
 
 
 def _with_repeats(
@@ -500,7 +532,17 @@ def _residual(rows: Rows, spare: Float) -> tuple[Complex, Float]:
 
     spare : (b, m) the change that is free, on the nodes.
     """
+    rows, groups = _grouped(rows, spare)
     n, q = rows.e.shape
+    left, free = np.zeros((n, q), complex), np.zeros(n)
+    for on in groups:
+        left[on], free[on] = _of_piece(rows.take(on))
+    return left, free
+
+
+def _grouped(rows: Rows, spare: Float) -> tuple[Rows, list[Int]]:
+    """Of a change that is free, and the lines that show it together: each piece's by themselves
+    where they are enough."""
     b = len(spare)
     parts = range(0, rows.X.shape[1], b)
     rows = replace(rows, X=np.concatenate([rows.X[:, i : i + b] @ spare for i in parts], axis=1))
@@ -508,11 +550,8 @@ def _residual(rows: Rows, spare: Float) -> tuple[Complex, Float]:
     if len(parts) > 2:
         rows = _excited(rows, pieces, len(parts) // 2)
     if any(len(on) < ENOUGH * _free(rows.X[on]) for on in pieces):
-        pieces, rows = [np.arange(n)], rows.apart()
-    left, free = np.zeros((n, q), complex), np.zeros(n)
-    for on in pieces:
-        left[on], free[on] = _of_piece(rows.take(on))
-    return left, free
+        return rows.apart(), [np.arange(len(rows.e))]
+    return rows, pieces
 
 
 def _excited(rows: Rows, pieces: Sequence[Int], inputs: int) -> Rows:

@@ -12,7 +12,7 @@ import numpy as np
 
 from samii_rig.likelihood import nuisance, rounding
 from samii_rig.likelihood.contour import Contour
-from samii_rig.likelihood.past import Past
+from samii_rig.likelihood.past import Past, likely
 from samii_rig.likelihood.pieces import Loops, Piece
 from samii_rig.types import Complex, Float, Int
 
@@ -95,7 +95,7 @@ def _before(past: Past, e: Complex, wander: Complex, impulse: Float, piece: Piec
     taken for noise."""
     power = np.median(np.abs(e) ** 2, axis=0)
     W = np.diag(1 / np.where(power > 0, power, 1.0))
-    found = past.likely(e, wander, np.broadcast_to(W, (len(e), *W.shape)))
+    found = likely(past.shapes, past.strength, e, wander, np.broadcast_to(W, (len(e), *W.shape)))
     if found is None:
         return np.zeros(piece.z.shape)
     return past.motion(piece, found, impulse)
