@@ -25,6 +25,9 @@ from samii_rig.types import Complex, Float, Int
 # what is left of the motion of every mode is a sum of their answers. Behind inputs that are known
 # only what rings longest is left, of few modes: one to an octave.
 AN_OCTAVE, BEHIND = 3.0, 1.0
+# Of a contour, how far the answer to an impulse is known: what rings before its cause, as filters
+# are known to half the rate only, stands at its end and grows to there.
+AS_FAR = 0.6
 NEW = 1e-5  # of the largest, a direction in which past inputs still differ
 SAME = 1e-9  # of the largest, power in a direction that columns do not have
 # Of chi-square, motion from before a piece whose change shows: 10 noise units, of which a tenth
@@ -55,19 +58,19 @@ class Past:
         (m, q inputs) of several; from a response on the contour, so that rounding in it grows with
         time."""
         known = piece.history + len(piece.z)
-        longest = min(len(piece.z), len(impulse) - known)
+        longest = min(len(piece.z), int(AS_FAR * contour.samples) - known)
         dense = BEHIND if piece.history else AN_OCTAVE
         lags = np.unique(np.rint(2 ** np.arange(0, np.log2(longest), 1 / dense)).astype(np.int64))
         each = [impulse[:, j :: piece.inputs] for j in range(piece.inputs)]
-        largest = [ROUNDS / NEW * np.max(np.abs(one)) for one in each]
+        largest = [np.max(np.abs(one[: contour.samples // 2]), axis=0) for one in each]
         spectra, at = [], []
         for lag in lags:
-            off = contour.rounding(int(lag) + known)
+            off = ROUNDS / NEW * contour.rounding(int(lag) + known)
             for j, (one, most) in enumerate(zip(each, largest, strict=True)):
                 y = one[lag + piece.history : lag + known]
                 # Of what has died out rounding alone would be left, in directions that nothing
                 # moves.
-                if lag == 1 or np.max(np.abs(y)) > off * most:
+                if lag == 1 or np.any(np.max(np.abs(y), axis=0) > off * most):
                     spectra.append(np.fft.rfft(y, axis=0)[k])
                     at.append((int(lag), j))
         answers = np.stack(spectra, axis=2)
