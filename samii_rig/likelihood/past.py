@@ -38,25 +38,27 @@ ROUNDS = 100.0  # over rounding alone, what a response on the contour is off; a 
 
 @dataclass(frozen=True, slots=True)
 class Past:
-    """shapes : (n_lines, q, m) of motion from before the first input that is known.
+    """shapes : (n_lines, q, m) of motion from before the first input that is known, of size 1.
 
     lags : (p,) samples before it, of impulses of the inputs `of` (p,), a rig of `inputs` has.
-    impulses : (p, m) of them, of which the shapes are the answers. strength : (m,) of the answer to
-    impulses in each shape's direction that are of size 1 where each is seen as well as all others.
+    likely : (n_lines, q, m) the same, independent and of sd 1 beforehand, if what acted before was
+    as strong as what is known. impulses : (p, m) that make them.
     """
 
     shapes: Complex
     lags: Int
     of: Int
     inputs: int
+    likely: Complex
     impulses: Float
-    strength: Float
 
     @classmethod
-    def of_piece(cls, piece: Piece, k: Int, impulse: Float, contour: Contour) -> Past:
+    def of_piece(
+        cls, piece: Piece, k: Int, impulse: Float, contour: Contour, strength: Float
+    ) -> Past:
         """k : (n,) numbers of the lines. impulse : (m, q) answer to an impulse of the input;
         (m, q inputs) of several; from a response on the contour, so that rounding in it grows with
-        time."""
+        time. strength : (inputs,) rms of what is known."""
         known = piece.history + len(piece.z)
         longest = min(len(piece.z), int(AS_FAR * contour.samples) - known)
         dense = BEHIND if piece.history else AN_OCTAVE
@@ -73,12 +75,21 @@ class Past:
                 if lag == 1 or np.any(np.max(np.abs(y), axis=0) > off * most):
                     spectra.append(np.fft.rfft(y, axis=0)[k])
                     at.append((int(lag), j))
-        answers = np.stack(spectra, axis=2)
-        impulses = _independent(answers)
-        shapes = np.asarray(answers @ impulses)
-        size = np.linalg.norm(shapes, axis=(0, 1))
         lag, of = np.array(at).T
-        return cls(shapes / size, lag, of, piece.inputs, impulses / size, size)
+        answers = np.stack(spectra, axis=2)
+        size, turn = _independent(answers)
+        shapes = np.asarray(answers @ (turn.T / size[:, None]))
+        # As if one had acted from each to the next, all of one sign.
+        sd = strength[of] * np.maximum(lag * (2 ** (1 / dense) - 1), 1.0)
+        root, values, own = np.linalg.svd(turn * (size * sd), full_matrices=False)
+        return cls(
+            shapes / np.linalg.norm(shapes, axis=(0, 1)),
+            lag,
+            of,
+            piece.inputs,
+            np.asarray(shapes @ (root * values)),
+            sd[:, None] * own.T,
+        )
 
     def motion(self, piece: Piece, amplitudes: Float, impulse: Float) -> Float:
         """(n, q) what is left of it in a piece. impulse : as of `of_piece`."""
@@ -97,17 +108,12 @@ class Past:
         return replace(piece, r=np.concatenate([r, piece.r]), history=most + piece.history)
 
 
-def likely(shapes: Complex, strength: Float, e: Complex, N: Complex, W: Complex) -> Float | None:
-    """(m,) amplitudes of the past's shapes (n, q, m) that lines e (n, q) show beside nuisances
-    N (n, q, p); None where they show none.
-
-    As large as those that are seen all of the past's impulses may have been: a direction that
-    noise hides is not taken for motion.
-
-    strength : (m,) as of `Past`. W : (n, q, q) twice the inverse of the noise.
+def likely(shapes: Complex, e: Complex, N: Complex, W: Complex) -> Float | None:
+    """(m,) amplitudes of shapes (n, q, m), of sd 1 beforehand, that lines e (n, q) show beside
+    nuisances N (n, q, p); None where they show none. W : (n, q, q) twice the inverse of the noise.
     """
     m = shapes.shape[2]
-    every = np.concatenate([shapes * strength, N], axis=2)
+    every = np.concatenate([shapes, N], axis=2)
     flat = every.reshape(-1, every.shape[2])
     square = (flat.conj().T @ (W @ every).reshape(flat.shape)).real
     head = (flat.conj().T @ (W @ e[:, :, None]).ravel()).real
@@ -116,23 +122,20 @@ def likely(shapes: Complex, strength: Float, e: Complex, N: Complex, W: Complex)
     across = square[:m, m:] @ others
     own = square[:m, :m] - across @ across.T
     pull = head[:m] - across @ (others.T @ head[m:])
-    turn, values = _directions(own)
-    shown = float(np.sum((turn.T @ pull) ** 2 / values))
-    if shown < SHOWN + values.size:
-        return None
-    power = (shown - values.size) / float(np.trace(own))
-    return np.asarray(strength * np.linalg.solve(own + np.eye(m) / power, pull))
+    found = np.linalg.solve(own + np.eye(m), pull)
+    return np.asarray(found) if float(found @ pull) > SHOWN else None
 
 
-def _independent(shapes: Complex) -> Float:
-    """(p, m) the directions in which shapes (n, q, p) really differ."""
+def _independent(shapes: Complex) -> tuple[Float, Float]:
+    """Sizes (p,) of shapes (n, q, p) and, in units of these, the directions (m, p) in which they
+    really differ."""
     n, q, p = shapes.shape
     scale = np.linalg.norm(shapes, axis=(0, 2))
     flat = (shapes / scale[:, None]).reshape(n * q, p)
     rows = np.concatenate([flat.real, flat.imag])
     size = np.linalg.norm(rows, axis=0)
     _, values, turn = np.linalg.svd(rows / size, full_matrices=False)
-    return np.asarray(turn[values > NEW * values[0]].T / size[:, None])
+    return size, np.asarray(turn[values > NEW * values[0]])
 
 
 def _directions(square: Float) -> tuple[Float, Float]:

@@ -185,7 +185,9 @@ class Records:
     def seen(self, H: Complex, loop: Loops) -> list[Seen]:
         """Of each piece what H on `exact` leaves, and what else is in it."""
         answers = Answers.of(H, self.exact(), loop, self.longest, self.pieces[0].inputs)
-        return [Seen.of(p, self.lines(p).k, answers, self.step) for p in self.pieces]
+        rms = [np.sqrt(np.mean(by_input(p.r) ** 2, axis=1)) for p in self.pieces]
+        strength = np.max(rms, axis=0)
+        return [Seen.of(p, self.lines(p).k, answers, self.step, strength) for p in self.pieces]
 
 
 @dataclass(frozen=True, slots=True)
@@ -380,25 +382,23 @@ def _with_past(
         one = rows.take(on)
         Q = orthonormal(_real(one.X))
         own = [(i, seen[i]) for i in np.unique(one.piece)]
-        at = np.cumsum([0, *(s.N.shape[2] for _, s in own)])
-        N = _beyond(Q, one.N[:, :, : at[-1]])
-        past = [np.arange(s.past.shapes.shape[2]) + j for j, (_, s) in zip(at, own, strict=False)]
-        beside = [
-            np.arange(s.beside.start, s.beside.stop) + j for j, (_, s) in zip(at, own, strict=False)
-        ]
+        past, beside, first = [], [], 0
+        for i, s in own:
+            shapes = np.zeros((*one.e.shape, s.past.likely.shape[2]), complex)
+            shapes[one.piece == i] = s.past.likely
+            past.append(shapes)
+            beside.append(one.N[:, :, first + s.beside.start : first + s.beside.stop])
+            first += s.N.shape[2] if len(own) > 1 else 0
         found = likely(
-            N[:, :, np.concatenate(past)],
-            np.concatenate([s.past.strength for _, s in own]),
+            _beyond(Q, np.concatenate(past, axis=2)),
             _beyond(Q, one.e[:, :, None])[:, :, 0],
-            N[:, :, np.concatenate(beside)],
+            _beyond(Q, np.concatenate(beside, axis=2)),
             W[on],
         )
         if found is None:
             continue
-        first = 0
-        for (i, s), which in zip(own, past, strict=True):
-            amplitudes = found[first : first + which.size]
-            first += which.size
+        for i, s in own:
+            amplitudes, found = np.split(found, [s.past.impulses.shape[1]])
             piece = pieces[i]  # lines are a sample's
             pieces[i] = s.past.before(piece, math.sqrt(len(piece.z)) * amplitudes)
     if all(a is b for a, b in zip(pieces, records.pieces, strict=True)):

@@ -66,13 +66,14 @@ class Seen:
     rounding: tuple[Float, Float]
 
     @classmethod
-    def of(cls, piece: Piece, k: Int, answers: Answers, step: Float) -> Seen:
-        """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known."""
+    def of(cls, piece: Piece, k: Int, answers: Answers, step: Float, strength: Float) -> Seen:
+        """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known.
+        strength : (inputs,) rms of what is known to act."""
         n, q = piece.z.shape
         H, exact = answers.H, answers.exact
         y = exact.predicted(H, piece.r)[piece.history :]
         left = np.fft.rfft(piece.z - y, axis=0)
-        past = Past.of_piece(piece, k, answers.impulse, exact)
+        past = Past.of_piece(piece, k, answers.impulse, exact, strength)
         own = [nuisance.wander(n, k, q), nuisance.hum(left, k, exact.rate_hz, n)]
         if np.any(step > 0):  # what a converter reads is the whole motion
             y = y + _before(past, left[k], own[0], answers.impulse, piece)
@@ -95,7 +96,7 @@ def _before(past: Past, e: Complex, wander: Complex, impulse: Float, piece: Piec
     taken for noise."""
     power = np.median(np.abs(e) ** 2, axis=0)
     W = np.diag(1 / np.where(power > 0, power, 1.0))
-    found = likely(past.shapes, past.strength, e, wander, np.broadcast_to(W, (len(e), *W.shape)))
+    found = likely(past.likely, e, wander, np.broadcast_to(W, (len(e), *W.shape)))
     if found is None:
         return np.zeros(piece.z.shape)
     return past.motion(piece, found, impulse)

@@ -146,7 +146,8 @@ def test_a_past_of_one_mode_has_its_two_states_however_long_it_rings(damping: fl
     H = response(exact.s, poles(4.0, damping))
     u = np.zeros(3000)
     one = piece(u, np.zeros((3000, H.shape[1])))
-    found = Past.of_piece(one, np.arange(12, 225), exact.record(H, exact.samples), exact)
+    impulse = exact.record(H, exact.samples)
+    found = Past.of_piece(one, np.arange(12, 225), impulse, exact, np.ones(1))
     assert found.shapes.shape[2] == 2
 
 
