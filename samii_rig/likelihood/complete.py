@@ -50,7 +50,7 @@ class Complete:
     ) -> Complete:
         """As `reduced`."""
         found, rows = formed(records, response, disturbances, loop, part)
-        root = np.sqrt(2) * np.linalg.inv(found.noise.root(rows.f))
+        root = np.sqrt(2) * np.linalg.inv(found.noise.root(rows.f, rows.piece))
         each = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
         nuisances = tuple((on, _columns(root[on] @ rows.N[on])) for on in each)
         m = found.factor.shape[0]

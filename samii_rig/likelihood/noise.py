@@ -19,10 +19,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 from scipy.special import gammaln
 
+from samii_rig.errors import EstimateError
 from samii_rig.types import Complex, Float, Int
 
 # Degrees of freedom for each sensor in a block of lines, and its width over its frequency, at
@@ -44,8 +46,19 @@ LITTLE = 0.02  # of a line's freedom: one with less says nothing
 Disturbances = Callable[[Float], Complex]
 """f (n,) Hz -> (n, q, K), what each of K disturbances of power 1 makes in each of q sensors; the
 first q are the sensors' own noises."""
-Known = Callable[[Float], Float]
-"""f (n,) Hz -> (n, q), power of each sensor's own noise that is known beforehand."""
+
+
+class Known(Protocol):
+    """Power of each sensor's own noise that is known beforehand."""
+
+    @property
+    def group(self) -> Int:
+        """(p,) of each piece: those of one group have the same."""
+        ...
+
+    def __call__(self, f: Float, group: Int) -> Float:
+        """(n, q) at f (n,) Hz in pieces of groups (n,)."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,31 +79,52 @@ class Noise:
 
     @classmethod
     def of(
-        cls, f: Float, left: Complex, free: Float, disturbances: Disturbances, known: Known
+        cls,
+        f: Float,
+        left: Complex,
+        free: Float,
+        piece: Int,
+        disturbances: Disturbances,
+        known: Known,
     ) -> Noise:
-        """From lines (n, q) of noise at increasing f (n,), each with its freedom (n,)."""
+        """From lines (n, q) of noise at increasing f (n,), each with its freedom (n,) and the
+        number of its piece (n,).
+
+        Raises EstimateError where no line has any.
+        """
         some = free > LITTLE
-        f, left, free = f[some], left[some], free[some]
-        once, which = np.unique(f, return_inverse=True)
+        if not some.any():
+            raise EstimateError("the records are too short: what is fitted leaves no noise to see")
+        f, left, free, piece = f[some], left[some], free[some], piece[some]
+        at, group, which = _once(f, known.group[piece])
+        once, back = np.unique(at, return_inverse=True)
         u = disturbances(once)
-        bins = _bins(once, u)
+        alike = _bins(once, u)[back] * (group.max(initial=0) + 1) + group
+        _, middle, bins = np.unique(alike, return_index=True, return_inverse=True)
         S, w = _gathered(left, free, bins[which])
-        middle = np.searchsorted(bins, np.arange(bins[-1] + 1))
         corners = _corners(once)
         scale = np.sqrt(np.einsum("nq,n->q", np.abs(left) ** 2, 1 / free) / f.size)
         scale = np.where(scale > 0, scale, 1.0)
         S = S / (scale[:, None] * scale)
-        u = u[middle] / scale[:, None]
-        power = _powers(u, S, w, _colours(once[middle], corners), known(once[middle]))
-        alike = np.eye(left.shape[1], dtype=np.complex128)[None]
-        plain = cls(disturbances, known, corners, power, np.zeros(0), alike)
-        return plain._about(f, left, free)
+        u = u[back[middle]] / scale[:, None]
+        own = known(at[middle], group[middle])
+        power = _powers(u, S, w, _colours(at[middle], corners), own)
+        plain = cls(
+            disturbances,
+            known,
+            corners,
+            power,
+            np.zeros(0),
+            np.eye(left.shape[1], dtype=np.complex128)[None],
+        )
+        return plain._about(f, left, free, piece)
 
-    def _about(self, f: Float, left: Complex, free: Float) -> Noise:
+    def _about(self, f: Float, left: Complex, free: Float, piece: Int) -> Noise:
         """The same, what the sum does not give by blocks."""
         q = left.shape[1]
-        own = self.disturbances(f)[:, :, :q] * np.sqrt(self.known(f))[:, None, :]
-        both = self.whitened(f, np.concatenate([left[:, :, None], own], axis=2))
+        sure = np.sqrt(self.known(f, self.known.group[piece]))
+        own = self.disturbances(f)[:, :, :q] * sure[:, None, :]
+        both = self.whitened(f, piece, np.concatenate([left[:, :, None], own], axis=2))
         white, sure = both[:, :, 0], both[:, :, 1:]
         starts = _blocks(f, free, FREEDOM * q)
         each = [slice(a, b) for a, b in pairwise([*starts, f.size])]
@@ -106,30 +140,38 @@ class Noise:
         about = (turn * np.maximum(values, least)[:, None, :]) @ turn.conj().swapaxes(1, 2)
         return replace(self, edges=f[starts[1:]], about=about)
 
-    def covariance(self, f: Float) -> Complex:
-        """(n, q, q) at f (n,)."""
-        L = self.root(f)
+    def covariance(self, f: Float, piece: Int) -> Complex:
+        """(n, q, q) at f (n,) in pieces (n,)."""
+        L = self.root(f, piece)
         return np.asarray(L @ L.conj().swapaxes(1, 2))
 
-    def whitened(self, f: Float, e: Complex) -> Complex:
-        """(n, q, m) in units of the noise, of lines e (n, q, m) at f (n,)."""
-        return np.asarray(np.linalg.solve(self.root(f), e))
+    def whitened(self, f: Float, piece: Int, e: Complex) -> Complex:
+        """(n, q, m) in units of the noise, of lines e (n, q, m) at f (n,) of pieces (n,)."""
+        return np.asarray(np.linalg.solve(self.root(f, piece), e))
 
-    def scaled(self, f: Float, white: Complex) -> Float:
+    def scaled(self, f: Float, piece: Int, white: Complex) -> Float:
         """(n, q) power of each sensor over its own noise's, of `whitened` lines (n, q)."""
-        L = self.root(f)
+        L = self.root(f, piece)
         plain = (L @ white[:, :, None])[:, :, 0]
         return np.asarray(np.abs(plain) ** 2 / np.sum(np.abs(L) ** 2, axis=2))
 
-    def root(self, f: Float) -> Complex:
-        """(n, q, q) L with L L^H = C at f (n,)."""
-        once, which = np.unique(f, return_inverse=True)
-        u, p = self.disturbances(once), _colours(once, self.corners) @ self.power.T
-        p[:, : u.shape[1]] += self.known(once)
+    def root(self, f: Float, piece: Int) -> Complex:
+        """(n, q, q) L with L L^H = C at f (n,) in pieces (n,)."""
+        at, group, which = _once(f, self.known.group[piece])
+        once, back = np.unique(at, return_inverse=True)
+        u, p = self.disturbances(once)[back], _colours(at, self.corners) @ self.power.T
+        p[:, : u.shape[1]] += self.known(at, group)
         plain = (u * p[:, None, :]) @ u.conj().swapaxes(1, 2)
-        block = np.searchsorted(self.edges, once, side="right")
+        block = np.searchsorted(self.edges, at, side="right")
         roots = np.linalg.cholesky(self.about)[block]
         return np.asarray((_cholesky(plain) @ roots)[which])
+
+
+def _once(f: Float, group: Int) -> tuple[Float, Int, Int]:
+    """Frequencies (m,), increasing, and groups (m,) that differ, and which of them each of (n,)
+    is."""
+    both, which = np.unique(f + 1j * group, return_inverse=True)
+    return both.real.copy(), both.imag.astype(np.int64), which
 
 
 def _along(sure: Complex, directions: Complex) -> Float:

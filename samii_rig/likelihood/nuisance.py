@@ -17,13 +17,7 @@ from samii_rig.likelihood.pieces import Loops, Piece
 from samii_rig.types import Complex, Float, Int
 
 WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
-# Samples before a piece at which an unknown input may have acted: three to an octave, so that
-# what is left of the motion of every mode is a sum of their answers. Behind inputs that are known
-# only what rings longest is left, of few modes: one to an octave.
-AN_OCTAVE, BEHIND = 3.0, 1.0
 UNREAD = 6  # parts in which what is hardly read has a factor of its own
-NEW = 1e-5  # of the largest, a direction in which past inputs still differ
-ROUNDS = 100.0  # over rounding alone, what a response on the contour is off; a mode's 35
 # Hz of the mains in any country, how far they stray (EN 50160: 1 % for 99.5 % of a year), and their
 # multiples that a rectifier or a motor drive makes of them.
 MAINS, STRAY, MULTIPLES = (50.0, 60.0), 0.01, (1, 2, 3)
@@ -127,8 +121,8 @@ def unread(
     """
     n, q = piece.z.shape
     out = []
-    for i in np.flatnonzero(step > 0):
-        part = rounding.within(piece, y[:, i], float(step[i]), contour.rate_hz)
+    for i in np.flatnonzero(step > 0).tolist():
+        part = rounding.within(piece, i, y[:, i], float(step[i]), contour.rate_hz)
         grown = np.cumsum(part**2)
         if grown[-1] <= 0:
             continue
@@ -143,39 +137,3 @@ def unread(
                     seen -= kp * H[there, of :: piece.inputs] * spectrum[:, None]
             out.append(seen)
     return np.stack(out, axis=2) if out else np.zeros((k.size, q, 0), complex)
-
-
-def past(piece: Piece, k: Int, impulse: Float, contour: Contour) -> Complex:
-    """(n_lines, q, m) of motion from before the first input that is known: answers to inputs that
-    acted then.
-
-    impulse : (m, q) answer to an impulse of the input; (m, q inputs) of several; from a response
-    on the contour, so that rounding in it grows with time.
-    """
-    known = piece.history + len(piece.z)
-    longest = min(len(piece.z), len(impulse) - known)
-    dense = BEHIND if piece.history else AN_OCTAVE
-    lags = np.unique(np.rint(2 ** np.arange(0, np.log2(longest), 1 / dense)).astype(np.int64))
-    each = [impulse[:, j :: piece.inputs] for j in range(piece.inputs)]
-    largest = [ROUNDS / NEW * np.max(np.abs(of)) for of in each]
-    spectra = []
-    for lag in lags:
-        off = contour.rounding(int(lag) + known)
-        for of, most in zip(each, largest, strict=True):
-            y = of[lag + piece.history : lag + known]
-            # Of what has died out rounding alone would be left, in directions that nothing moves.
-            if lag == 1 or np.max(np.abs(y)) > off * most:
-                spectra.append(np.fft.rfft(y, axis=0)[k])
-    return _independent(np.stack(spectra, axis=2))
-
-
-def _independent(shapes: Complex) -> Complex:
-    """The directions (n, q, m) in which shapes (n, q, p) really differ."""
-    n, q, p = shapes.shape
-    scale = np.linalg.norm(shapes, axis=(0, 2))
-    flat = (shapes / scale[:, None]).reshape(n * q, p)
-    rows = np.concatenate([flat.real, flat.imag])
-    size = np.linalg.norm(rows, axis=0)
-    _, values, turn = np.linalg.svd(rows / size, full_matrices=False)
-    kept = turn[values > NEW * values[0]].T / size[:, None]
-    return np.asarray(shapes @ kept)

@@ -11,6 +11,7 @@ residual of the best d, smoothed along frequency: a transient is in A, and does 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,6 +25,7 @@ from samii_rig.likelihood import rounding
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Disturbances, Noise
+from samii_rig.likelihood.past import likely
 from samii_rig.likelihood.pieces import Loops, Piece, Samples
 from samii_rig.likelihood.seen import Answers, Seen
 from samii_rig.types import Complex, Float, Int
@@ -183,7 +185,9 @@ class Records:
     def seen(self, H: Complex, loop: Loops) -> list[Seen]:
         """Of each piece what H on `exact` leaves, and what else is in it."""
         answers = Answers.of(H, self.exact(), loop, self.longest, self.pieces[0].inputs)
-        return [Seen.of(p, self.lines(p).k, answers, self.step) for p in self.pieces]
+        rms = [np.sqrt(np.mean(by_input(p.r) ** 2, axis=1)) for p in self.pieces]
+        strength = np.max(rms, axis=0)
+        return [Seen.of(p, self.lines(p).k, answers, self.step, strength) for p in self.pieces]
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +215,7 @@ def left_by(
     if part is not None:
         rows = rows.take(np.flatnonzero(part(rows.k)))
     both = np.concatenate([rows.e[:, :, None], rows.N], axis=2)
-    both = np.sqrt(2) * noise.noise.whitened(rows.f, both)
+    both = np.sqrt(2) * noise.noise.whitened(rows.f, rows.piece, both)
     white = both[:, :, 0]
     for on, m in rows.each():
         N = both[on][:, :, 1 : 1 + m].reshape(-1, m)
@@ -219,7 +223,7 @@ def left_by(
         goal = _real(white[on].ravel())
         goal -= Q @ (Q.T @ goal)
         white[on] = _complex(goal).reshape(on.size, -1)
-    each = noise.noise.scaled(rows.f, white) / 2
+    each = noise.noise.scaled(rows.f, rows.piece, white) / 2
     return Left(rows.f, np.sum(np.abs(white) ** 2, axis=1), each)
 
 
@@ -328,15 +332,22 @@ def formed(
     else:
         nodes = np.rint(at * (smooth.samples / smooth.rate_hz)).astype(np.int64)
     seen = records.seen(H, loop)
-    rows = _rows(records, _columns(records, smooth, nodes), seen)
-    left, free = _residual(
-        rows, _between(nodes, nodes_of(smooth, shape, records.changing, spare=True))
-    )
-    power = Noise.of(
-        *_with_repeats(records, H, seen, rows.f, left, free),
-        disturbances=disturbances,
-        known=rounding.added([s.rounding for s in seen]),
-    )
+    free = _between(nodes, nodes_of(smooth, shape, records.changing, spare=True))
+
+    known = rounding.Added.of([s.rounding for s in seen])
+
+    def told(with_past: Records) -> tuple[Rows, Noise]:
+        rows = _rows(records, _columns(with_past, smooth, nodes), seen)
+        return rows, Noise.of(
+            *_with_repeats(records, H, seen, rows, *_residual(rows, free)),
+            disturbances=disturbances,
+            known=known,
+        )
+
+    rows, power = told(records)
+    with_past = _with_past(records, rows, seen, power, free)
+    if with_past is not None:
+        rows, power = told(with_past)
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
     rows = rows.take(np.flatnonzero(counted))
     form = _quadratic(rows, power, S[nodes])
@@ -355,18 +366,65 @@ def formed(
     return made, rows
 
 
+def _with_past(
+    records: Records, rows: Rows, seen: Sequence[Seen], noise: Noise, spare: Float
+) -> Records | None:
+    """The same records, with what moved the rig before each piece as far as its lines show that,
+    whatever the change of the response is; None where nothing did.
+
+    spare : as of `_residual`.
+    """
+    root = np.linalg.inv(noise.root(rows.f, rows.piece))
+    W = 2 * (root.conj().swapaxes(1, 2) @ root)
+    pieces = list(records.pieces)
+    rows, groups = _grouped(rows, spare)
+    for on in groups:
+        one = rows.take(on)
+        Q = orthonormal(_real(one.X))
+        own = [(i, seen[i]) for i in np.unique(one.piece)]
+        past, beside, first = [], [], 0
+        for i, s in own:
+            shapes = np.zeros((*one.e.shape, s.past.likely.shape[2]), complex)
+            shapes[one.piece == i] = s.past.likely
+            past.append(shapes)
+            beside.append(one.N[:, :, first + s.beside.start : first + s.beside.stop])
+            first += s.N.shape[2] if len(own) > 1 else 0
+        found = likely(
+            _beyond(Q, np.concatenate(past, axis=2)),
+            _beyond(Q, one.e[:, :, None])[:, :, 0],
+            _beyond(Q, np.concatenate(beside, axis=2)),
+            W[on],
+        )
+        if found is None:
+            continue
+        for i, s in own:
+            amplitudes, found = np.split(found, [s.past.impulses.shape[1]])
+            piece = pieces[i]  # lines are a sample's
+            pieces[i] = s.past.before(piece, math.sqrt(len(piece.z)) * amplitudes)
+    if all(a is b for a, b in zip(pieces, records.pieces, strict=True)):
+        return None
+    return replace(records, pieces=tuple(pieces))
+
+
+def _beyond(Q: Float, x: Complex) -> Complex:
+    """Lines (n, q, m) less what is along directions Q (2 n, p) of each sensor."""
+    flat = _real(x.reshape(len(x), -1))
+    return _complex(flat - Q @ (Q.T @ flat)).reshape(x.shape)
+
+
 def _with_repeats(
-    records: Records, H: Complex, seen: Sequence[Seen], f: Float, left: Complex, free: Float
-) -> tuple[Float, Complex, Float]:
-    """Frequency, lines and freedom of all that tells noise: what repeats differ by, too."""
-    every = [(f, left, free)]
-    for piece, own in zip(records.pieces, seen, strict=True):
+    records: Records, H: Complex, seen: Sequence[Seen], rows: Rows, left: Complex, free: Float
+) -> tuple[Float, Complex, Float, Int]:
+    """Frequency, lines, freedom and piece of all that tells noise: what repeats differ by, too."""
+    every = [(rows.f, left, free, rows.piece)]
+    for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
         if np.any(rounding.alike(piece, records.step) > rounding.ALIKE):
             continue
-        every += _beside(records, piece, piece.repeats, H, own)
-    f, left, free = (np.concatenate(x) for x in zip(*every, strict=True))
+        for f, e, some in _beside(records, piece, piece.repeats, H, own):
+            every.append((f, e, some, np.full(f.size, i)))
+    f, left, free, which = (np.concatenate(x) for x in zip(*every, strict=True))
     order = np.argsort(f, kind="stable")
-    return f[order], left[order], free[order]
+    return f[order], left[order], free[order], which[order]
 
 
 def _beside(
@@ -387,11 +445,11 @@ def _differing(
 ) -> tuple[float, float]:
     """Chi-square of the levels against each other, and its mean."""
     total = count = 0.0
-    for piece, own in zip(records.pieces, seen, strict=True):
+    for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
         every = _beside(records, piece, piece.contrasts, H, own)
         if every:
-            left = np.stack([e for _, e, _ in every], axis=2)
-            total += 2 * float(np.sum(np.abs(noise.whitened(every[0][0], left)) ** 2))
+            f, left = every[0][0], np.stack([e for _, e, _ in every], axis=2)
+            total += 2 * float(np.sum(np.abs(noise.whitened(f, np.full(f.size, i), left)) ** 2))
             count += 2.0 * left.shape[1] * sum(float(np.sum(free)) for _, _, free in every)
     return total, count
 
@@ -474,7 +532,17 @@ def _residual(rows: Rows, spare: Float) -> tuple[Complex, Float]:
 
     spare : (b, m) the change that is free, on the nodes.
     """
+    rows, groups = _grouped(rows, spare)
     n, q = rows.e.shape
+    left, free = np.zeros((n, q), complex), np.zeros(n)
+    for on in groups:
+        left[on], free[on] = _of_piece(rows.take(on))
+    return left, free
+
+
+def _grouped(rows: Rows, spare: Float) -> tuple[Rows, list[Int]]:
+    """Of a change that is free, and the lines that show it together: each piece's by themselves
+    where they are enough."""
     b = len(spare)
     parts = range(0, rows.X.shape[1], b)
     rows = replace(rows, X=np.concatenate([rows.X[:, i : i + b] @ spare for i in parts], axis=1))
@@ -482,11 +550,8 @@ def _residual(rows: Rows, spare: Float) -> tuple[Complex, Float]:
     if len(parts) > 2:
         rows = _excited(rows, pieces, len(parts) // 2)
     if any(len(on) < ENOUGH * _free(rows.X[on]) for on in pieces):
-        pieces, rows = [np.arange(n)], rows.apart()
-    left, free = np.zeros((n, q), complex), np.zeros(n)
-    for on in pieces:
-        left[on], free[on] = _of_piece(rows.take(on))
-    return left, free
+        return rows.apart(), [np.arange(len(rows.e))]
+    return rows, pieces
 
 
 def _excited(rows: Rows, pieces: Sequence[Int], inputs: int) -> Rows:
@@ -539,7 +604,7 @@ class _Form:
 def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     """factor, target of `Reduced`, and chi-square of the reference with the best nuisances."""
     b, q = reference.shape  # q : of each input by itself, where there are several
-    L = np.linalg.inv(noise.root(rows.f))
+    L = np.linalg.inv(noise.root(rows.f, rows.piece))
     W = 2 * (L.conj().swapaxes(1, 2) @ L)
     We = (W @ rows.e[:, :, None])[:, :, 0]
     M = _products(rows.X, W)

@@ -6,13 +6,15 @@ order. Elsewhere it is what the motion makes of it:
   for what noise of sd sigma dithers: of harmonic h of a sawtooth, 6/(pi h)^2 of its power,
   exp(-(2 pi h sigma/step)^2) is the same in all repeats (Widrow and Kollar 2008, Quantization
   Noise, ch. 4). A motion that rests keeps one error as long as it rests.
-- Where the motion stays within few steps, what is read is not in proportion to it.
+- Where the motion stays within few steps, what is read is not in proportion to it, but for noise
+  that dithers it: of the sawtooth's first harmonic exp(-2 (pi sigma/step)^2) is left.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage, optimize
@@ -34,6 +36,10 @@ AROUND = 5  # lines over which the power of what is not read is the mean
 # Of a step, noise sd from which a rounding error is white: the first harmonic of a sawtooth is the
 # same to 0.7 % from here on.
 DITHERED = 0.5
+UNSEEN = 0.05  # of a staircase's error, what dithering leaves of it that nobody sees
+# Times by which what rounding adds may differ between pieces of one group, and how many groups are
+# told apart at most: each has bins of its own.
+APART, GROUPS = 1.5, 8
 OFFSETS = 16  # places of a motion in its step, at which its rounding is tried: within 25 % a line
 
 
@@ -63,20 +69,54 @@ def alike(piece: Piece, step: Float) -> Float:
     return out
 
 
-def added(each: Sequence[tuple[Float, Float]]) -> Callable[[Float], Float]:
-    """f (n,) Hz -> (n, q) power a sample of each sensor's rounding, in all pieces the largest.
+@dataclass(frozen=True)
+class Added:
+    """What rounding adds to pieces, in groups that it adds alike to.
 
-    each : of every piece, as `of_piece` has it.
+    group : (p,) of each piece. each : of every group, for each of its pieces, Hz (m,) and power a
+    sample (m, q) of each sensor's rounding; the largest counts.
     """
 
-    def at(f: Float) -> Float:
-        out = np.zeros((f.size, each[0][1].shape[1]))
-        for frequency, power in each:
-            more = np.stack([np.interp(f, frequency, p) for p in power.T], axis=1)
-            out = np.maximum(out, more)
+    group: Int
+    each: tuple[tuple[tuple[Float, Float], ...], ...]
+
+    @classmethod
+    def of(cls, each: Sequence[tuple[Float, Float]]) -> Added:
+        """each : of every piece, as `of_piece` has it."""
+        f = max((x[0] for x in each), key=len)
+        level = np.stack([_at(f, x) for x in each])
+        largest = np.max(level, axis=(0, 1))
+        level = np.log(np.maximum(level, 1e-3 * np.where(largest > 0, largest, 1.0)))
+        apart = math.log(APART)
+        while True:
+            first: list[int] = []
+            group = []
+            for i, one in enumerate(level):
+                near = [j for j, k in enumerate(first) if np.max(np.abs(one - level[k])) < apart]
+                if not near:
+                    first.append(i)
+                group.append(near[0] if near else len(first) - 1)
+            if len(first) <= GROUPS:
+                break
+            apart *= 2
+        members = tuple(
+            tuple(x for x, g in zip(each, group, strict=True) if g == j) for j in range(len(first))
+        )
+        return cls(np.array(group, np.int64), members)
+
+    def __call__(self, f: Float, group: Int) -> Float:
+        """(n, q) power a sample at f (n,) Hz in pieces of groups (n,)."""
+        q = self.each[0][0][1].shape[1]
+        out = np.zeros((f.size, q))
+        for j, members in enumerate(self.each):
+            on = group == j
+            for one in members:
+                out[on] = np.maximum(out[on], _at(f[on], one))
         return out
 
-    return at
+
+def _at(f: Float, of: tuple[Float, Float]) -> Float:
+    return np.stack([np.interp(f, of[0], p) for p in of[1].T], axis=1)
 
 
 def of_piece(piece: Piece, step: Float, y: Float, rate_hz: float) -> tuple[Float, Float]:
@@ -92,8 +132,8 @@ def of_piece(piece: Piece, step: Float, y: Float, rate_hz: float) -> tuple[Float
     same = alike(piece, step)
     for i in np.flatnonzero(step > 0):
         times = 1 + len(piece.repeats) * same[i]
-        still, part = _within(piece, y[:, i], float(step[i]), rate_hz)
         sd = _noise(piece.z[:, i] - y[:, i], float(step[i]))
+        still, part = _within(piece, y[:, i], float(step[i]), sd, rate_hz)
         if sd < DITHERED * step[i]:
             power[:, i] = times * _made(y[:, i], still, float(step[i]), sd)
         else:
@@ -130,21 +170,23 @@ def _made(y: Float, still: Int, step: float, sd: float) -> Float:
     return power * (step**2 / (OFFSETS * y.size))
 
 
-def within(piece: Piece, y: Float, step: float, rate_hz: float) -> Float:
-    """(n,) what of the motion y (n,) of a sensor stays within few steps, less its mean: each
-    stretch its own, as a part may rest at another place after it was moved."""
-    return _within(piece, y, step, rate_hz)[1]
+def within(piece: Piece, i: int, y: Float, step: float, rate_hz: float) -> Float:
+    """(n,) what of the motion y (n,) of sensor i stays within few steps and is not read in
+    proportion, less its mean: each stretch its own, as a part may rest at another place after it
+    was moved."""
+    return _within(piece, y, step, _noise(piece.z[:, i] - y, step), rate_hz)[1]
 
 
-def _within(piece: Piece, y: Float, step: float, rate_hz: float) -> tuple[Int, Float]:
-    """(n,) numbers of the stretches, 0 elsewhere, and what `within` gives."""
+def _within(piece: Piece, y: Float, step: float, sd: float, rate_hz: float) -> tuple[Int, Float]:
+    """(n,) numbers of the stretches, 0 elsewhere, and what `within` gives. sd : of the noise."""
     times = math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
     width = max(int(SHORT * rate_hz), 3)
     high, low = ndimage.maximum_filter1d(y, width), ndimage.minimum_filter1d(y, width)
     still = high - low < FEW * step * times
     labels, count = ndimage.label(still)
     stretch = np.asarray(labels, np.int64)
-    if count == 0:
+    seen = math.exp(-2 * (math.pi * sd / step) ** 2)
+    if count == 0 or seen < UNSEEN:
         return stretch, np.zeros(y.size)
     mean = np.append(0.0, ndimage.mean(y, stretch, np.arange(1, count + 1)))
-    return stretch, np.asarray(np.where(still, y - mean[stretch], 0.0))
+    return stretch, np.asarray(np.where(still, seen * (y - mean[stretch]), 0.0))

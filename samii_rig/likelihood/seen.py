@@ -12,6 +12,7 @@ import numpy as np
 
 from samii_rig.likelihood import nuisance, rounding
 from samii_rig.likelihood.contour import Contour
+from samii_rig.likelihood.past import Past, likely
 from samii_rig.likelihood.pieces import Loops, Piece
 from samii_rig.types import Complex, Float, Int
 
@@ -52,30 +53,56 @@ class Answers:
 class Seen:
     """Lines of a piece.
 
-    e : (n, q) what the reference leaves, a sample's power. N : (n, q, m) nuisances, of size 1 each.
+    e : (n, q) what the reference leaves, a sample's power. N : (n, q, m) nuisances, of size 1 each;
+    the first are the past's. beside : those that are no past: an offset that acts from the first
+    sample on rings as that does.
     rounding : as `rounding.of_piece` has it.
     """
 
     e: Complex
     N: Complex
+    past: Past
+    beside: slice
     rounding: tuple[Float, Float]
 
     @classmethod
-    def of(cls, piece: Piece, k: Int, answers: Answers, step: Float) -> Seen:
-        """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known."""
+    def of(cls, piece: Piece, k: Int, answers: Answers, step: Float, strength: Float) -> Seen:
+        """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known.
+        strength : (inputs,) rms of what is known to act."""
         n, q = piece.z.shape
         H, exact = answers.H, answers.exact
         y = exact.predicted(H, piece.r)[piece.history :]
         left = np.fft.rfft(piece.z - y, axis=0)
+        past = Past.of_piece(piece, k, answers.impulse, exact, strength)
         own = [nuisance.wander(n, k, q), nuisance.hum(left, k, exact.rate_hz, n)]
-        own += [nuisance.past(piece, k, answers.impulse, exact)]
+        if np.any(step > 0):  # what a converter reads is the whole motion
+            y = y + _before(past, left[k], own[0], answers.impulse, piece)
         own += [nuisance.unread(piece, k, y, H, exact, answers.loops, step)]
         own += [nuisance.edges(piece, k, answers.impulse)]
-        own += [nuisance.offsets(piece, k, answers.steps(len(piece.r)))]
-        N = np.concatenate(own, axis=2)
-        size = np.linalg.norm(N, axis=(0, 1))
+        steps = nuisance.offsets(piece, k, answers.steps(len(piece.r)))
+        beside, steps = _of_size_one(np.concatenate(own, axis=2)), _of_size_one(steps)
+        first = past.shapes.shape[2]
         return cls(
             np.asarray(left[k] / np.sqrt(n)),
-            np.asarray(N[:, :, size > 0] / size[size > 0]),
+            np.concatenate([past.shapes, beside, steps], axis=2),
+            past,
+            slice(first, first + beside.shape[2]),
             rounding.of_piece(piece, step, y, exact.rate_hz),
         )
+
+
+def _before(past: Past, e: Complex, wander: Complex, impulse: Float, piece: Piece) -> Float:
+    """(n, q) motion from before a piece that lines e (n_lines, q) show, each sensor's median
+    taken for noise."""
+    power = np.median(np.abs(e) ** 2, axis=0)
+    W = np.diag(1 / np.where(power > 0, power, 1.0))
+    found = likely(past.likely, e, wander, np.broadcast_to(W, (len(e), *W.shape)))
+    if found is None:
+        return np.zeros(piece.z.shape)
+    return past.motion(piece, found, impulse)
+
+
+def _of_size_one(shapes: Complex) -> Complex:
+    """Shapes (n, q, m) that are any, each of size 1."""
+    size = np.linalg.norm(shapes, axis=(0, 1))
+    return np.asarray(shapes[:, :, size > 0] / size[size > 0])

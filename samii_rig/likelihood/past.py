@@ -1,0 +1,149 @@
+"""What moved the rig before the first input of a piece that is known.
+
+The motion that is left of it is a sum of answers to impulses at samples before the piece, of
+amplitudes a that nobody knows. With H = S + d these are answers of S and of d:
+
+    P(H) a = P(S) a + P(d) a.
+
+The first is a nuisance. The second grows with time where d shifts a mode, and is as large as the
+motion itself. It is known as far as a is, from what the reference leaves of the piece: an input
+before the piece, to which a change d of the response answers as to all others. (Variable
+projection with Kaufman's slope: Golub and Pereyra 2003, Inverse Problems 19.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from samii_rig.likelihood.contour import Contour
+from samii_rig.likelihood.pieces import Piece
+from samii_rig.types import Complex, Float, Int
+
+# Samples before a piece at which an unknown input may have acted: three to an octave, so that
+# what is left of the motion of every mode is a sum of their answers. Behind inputs that are known
+# only what rings longest is left, of few modes: one to an octave.
+AN_OCTAVE, BEHIND = 3.0, 1.0
+# Of a contour, how far the answer to an impulse is known: what rings before its cause, as filters
+# are known to half the rate only, stands at its end and grows to there.
+AS_FAR = 0.6
+NEW = 1e-5  # of the largest, a direction in which past inputs still differ
+SAME = 1e-9  # of the largest, power in a direction that columns do not have
+# Of chi-square, motion from before a piece whose change shows: 10 noise units, of which a tenth
+# makes one.
+SHOWN = 100.0
+ROUNDS = 100.0  # over rounding alone, what a response on the contour is off; a mode's 35
+
+
+@dataclass(frozen=True, slots=True)
+class Past:
+    """shapes : (n_lines, q, m) of motion from before the first input that is known, of size 1.
+
+    lags : (p,) samples before it, of impulses of the inputs `of` (p,), a rig of `inputs` has.
+    likely : (n_lines, q, m) the same, independent and of sd 1 beforehand, if what acted before was
+    as strong as what is known. impulses : (p, m) that make them.
+    """
+
+    shapes: Complex
+    lags: Int
+    of: Int
+    inputs: int
+    likely: Complex
+    impulses: Float
+
+    @classmethod
+    def of_piece(
+        cls, piece: Piece, k: Int, impulse: Float, contour: Contour, strength: Float
+    ) -> Past:
+        """k : (n,) numbers of the lines. impulse : (m, q) answer to an impulse of the input;
+        (m, q inputs) of several; from a response on the contour, so that rounding in it grows with
+        time. strength : (inputs,) rms of what is known."""
+        known = piece.history + len(piece.z)
+        longest = min(len(piece.z), int(AS_FAR * contour.samples) - known)
+        dense = BEHIND if piece.history else AN_OCTAVE
+        lags = np.unique(np.rint(2 ** np.arange(0, np.log2(longest), 1 / dense)).astype(np.int64))
+        each = [impulse[:, j :: piece.inputs] for j in range(piece.inputs)]
+        largest = [np.max(np.abs(one[: contour.samples // 2]), axis=0) for one in each]
+        spectra, at = [], []
+        for lag in lags:
+            off = ROUNDS / NEW * contour.rounding(int(lag) + known)
+            for j, (one, most) in enumerate(zip(each, largest, strict=True)):
+                y = one[lag + piece.history : lag + known]
+                # Of what has died out rounding alone would be left, in directions that nothing
+                # moves.
+                if lag == 1 or np.any(np.max(np.abs(y), axis=0) > off * most):
+                    spectra.append(np.fft.rfft(y, axis=0)[k])
+                    at.append((int(lag), j))
+        lag, of = np.array(at).T
+        answers = np.stack(spectra, axis=2)
+        size, turn = _independent(answers)
+        shapes = np.asarray(answers @ (turn.T / size[:, None]))
+        # As if one had acted from each to the next, all of one sign.
+        sd = strength[of] * np.maximum(lag * (2 ** (1 / dense) - 1), 1.0)
+        root, values, own = np.linalg.svd(turn * (size * sd), full_matrices=False)
+        return cls(
+            shapes / np.linalg.norm(shapes, axis=(0, 1)),
+            lag,
+            of,
+            piece.inputs,
+            np.asarray(shapes @ (root * values)),
+            sd[:, None] * own.T,
+        )
+
+    def motion(self, piece: Piece, amplitudes: Float, impulse: Float) -> Float:
+        """(n, q) what is left of it in a piece. impulse : as of `of_piece`."""
+        out = np.zeros(piece.z.shape)
+        for lag, j, a in zip(self.lags, self.of, self.impulses @ amplitudes, strict=True):
+            first = int(lag) + piece.history
+            out += a * impulse[first : first + len(out), j :: self.inputs]
+        return out
+
+    def before(self, piece: Piece, amplitudes: Float) -> Piece:
+        """The piece with impulses of such amplitudes (m,) before it."""
+        most = int(self.lags.max())
+        r = np.zeros((most, self.inputs))
+        np.add.at(r, (most - self.lags, self.of), self.impulses @ amplitudes)
+        r = r[:, 0] if piece.r.ndim == 1 else r
+        return replace(piece, r=np.concatenate([r, piece.r]), history=most + piece.history)
+
+
+def likely(shapes: Complex, e: Complex, N: Complex, W: Complex) -> Float | None:
+    """(m,) amplitudes of shapes (n, q, m), of sd 1 beforehand, that lines e (n, q) show beside
+    nuisances N (n, q, p); None where they show none. W : (n, q, q) twice the inverse of the noise.
+    """
+    m = shapes.shape[2]
+    every = np.concatenate([shapes, N], axis=2)
+    flat = every.reshape(-1, every.shape[2])
+    square = (flat.conj().T @ (W @ every).reshape(flat.shape)).real
+    head = (flat.conj().T @ (W @ e[:, :, None]).ravel()).real
+    turn, values = _directions(square[m:, m:])
+    others = turn / np.sqrt(values)
+    across = square[:m, m:] @ others
+    own = square[:m, :m] - across @ across.T
+    pull = head[:m] - across @ (others.T @ head[m:])
+    found = np.linalg.solve(own + np.eye(m), pull)
+    return np.asarray(found) if float(found @ pull) > SHOWN else None
+
+
+def _independent(shapes: Complex) -> tuple[Float, Float]:
+    """Sizes (p,) of shapes (n, q, p) and, in units of these, the directions (m, p) in which they
+    really differ."""
+    n, q, p = shapes.shape
+    scale = np.linalg.norm(shapes, axis=(0, 2))
+    flat = (shapes / scale[:, None]).reshape(n * q, p)
+    rows = np.concatenate([flat.real, flat.imag])
+    size = np.linalg.norm(rows, axis=0)
+    _, values, turn = np.linalg.svd(rows / size, full_matrices=False)
+    return size, np.asarray(turn[values > NEW * values[0]])
+
+
+def _directions(square: Float) -> tuple[Float, Float]:
+    """(m, k) in which a matrix (m, m) of products is regular, and its values (k,) there."""
+    if not len(square):
+        return square, np.zeros(0)
+    # Each in units of its own size: a metre and a metre a second squared are of one kind here.
+    size = np.sqrt(np.maximum(np.diagonal(square), np.finfo(np.float64).tiny))
+    values, turn = np.linalg.eigh(square / np.outer(size, size))
+    kept = values > SAME * values[-1]
+    return turn[:, kept] / size[:, None], values[kept]
