@@ -166,7 +166,7 @@ class OutputsContract:
     def test_each_keeps_its_own_output_limit_and_says_so(
         self, bench: OutputsBench, limited: int
     ) -> None:
-        most = [math.inf] * bench.k
+        most = [one.output.max for one in bench.limits]
         most[limited] = bench.size[limited] / 2
         bench.configure(0.0, max_output=most)
         u = np.stack([bench.wave(0.2, j) for j in range(bench.k)], axis=1)

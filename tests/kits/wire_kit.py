@@ -94,10 +94,10 @@ class Wire:
         return "".join(rows)
 
 
-def slow_deadman(folder: Path) -> Path:
-    """The shipped rig with a deadman of 0.2 s."""
+def slow_deadman(folder: Path, rig: str = "samii") -> Path:
+    """A shipped rig with a deadman of 0.2 s."""
     path = folder / "slow.toml"
-    path.write_text(load_rig("samii")[1].replace("deadman = 0.05", "deadman = 0.2"))
+    path.write_text(load_rig(rig)[1].replace("deadman = 0.05", "deadman = 0.2"))
     return path
 
 
