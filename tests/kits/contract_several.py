@@ -89,6 +89,8 @@ class OutputsContract:
             np.testing.assert_allclose(v[:, j], u[:, j] - output.kp * theta, atol=2 * bench.step)
 
     def test_each_loop_follows_its_own_set_point(self, bench: OutputsBench) -> None:
+        if not all(o.kp for o in bench.outputs):
+            pytest.skip("it closes no loop")
         bench.configure(1.0)
         ref = np.stack(
             [bench.wave(0.3, j) / o.kp * (1 + j) / bench.k for j, o in enumerate(bench.outputs)],
