@@ -23,7 +23,7 @@ import pytest
 if TYPE_CHECKING:
     from samii_rig.diagnose.result import Diagnosis
     from samii_rig.rig.schema import Device, Rig
-    from samii_rig.types import Recording
+    from samii_rig.types import FrequencyResponse, Recording
 
 MARKER = "samii_rig"
 IN_PROCESS, ON_THE_WIRE = "simulated", "simulated_node"  # entry points of samii_rig.devices
@@ -41,13 +41,15 @@ class _Asked:
     wire: bool = False
     faults: str | Sequence[str] = ()
     settings: dict[str, Any] = field(default_factory=dict)
+    pose: str = ""
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Declare the marker, and a place for recordings."""
     config.addinivalue_line(
         "markers",
-        f"{MARKER}(rig='samii', experiment='swept_sine', wire=False, faults=(), settings={{}}): "
+        f"{MARKER}(rig='samii', experiment='swept_sine', wire=False, faults=(), settings={{}}, "
+        "pose=''): "
         "what the fixtures `rig` and `recording` simulate; files are found from the root folder",
     )
     config.stash[_KEPT] = {}
@@ -61,11 +63,14 @@ def rig(request: pytest.FixtureRequest) -> Rig:
     by the name or path of a rig file, with `indirect=True`.
     """
     from samii_rig.rig.load import load_rig
+    from samii_rig.rig.pose import posed
 
     with _one_line():
         asked = _asked(request)
         named = str(getattr(request, "param", asked.rig))
         loaded, _ = load_rig(_found(named, request.config))
+        if asked.pose:
+            loaded = posed(loaded, asked.pose, f"marker {MARKER}, pose")
     return loaded.model_copy(update={"device": _simulated(loaded.device, asked)})
 
 
@@ -97,7 +102,8 @@ def assert_no_mismatch(
 ) -> Diagnosis:
     """Pass if the rig file explains these recordings, taken together, to the noise.
 
-    recordings : one or several, or their paths. rig : or the name or path of a rig file.
+    recordings : one or several, or their paths; each is held in the pose that its own rig file
+    has. rig : or the name or path of a rig file.
     band : Hz, where the model is held against them.
 
     Returns the diagnosis. AssertionError with verdict, causes, chi-square and threshold if anything
@@ -258,13 +264,25 @@ def _diagnosed(
 ) -> tuple[Diagnosis, str]:
     """What the rig leaves out of them, and its name."""
     from samii_rig.diagnose.diagnose import diagnose
+    from samii_rig.diagnose.posed import in_poses, sorted_by_pose
+    from samii_rig.identify.poses import poses_of
     from samii_rig.rig.load import load_rig
+    from samii_rig.rig.pose import at_pose
     from samii_rig.signal.estimate import estimate
 
     held = load_rig(str(rig))[0] if isinstance(rig, str | Path) else rig
-    # As `samii-rig diagnose` does: a segment with a gap is left out, and that is said.
-    responses = estimate(recordings, gaps="exclude", band=band)
-    return diagnose(responses, held, band=band, runs=recordings), held.name
+    poses = poses_of(recordings, held, ())
+
+    def responses(runs: Sequence[Recording]) -> Sequence[FrequencyResponse]:
+        # As `samii-rig diagnose` does: a segment with a gap is left out, and that is said.
+        return estimate(runs, gaps="exclude", band=band)
+
+    if len(set(poses)) > 1:
+        each = sorted_by_pose(recordings, poses, responses)
+        return in_poses(each, held, band=band), held.name
+    if poses:
+        held = at_pose(held, poses[0])
+    return diagnose(responses(recordings), held, band=band, runs=recordings), held.name
 
 
 def _lines(found: Diagnosis, rig: str, recordings: str) -> list[str]:

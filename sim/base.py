@@ -7,8 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from samii_rig.devices.channels import reference_names
-from samii_rig.errors import InputError
+from samii_rig.devices.channels import reference_channels
 from samii_rig.model.realise import Realisation, realise
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Flags, Float, Int, SampleBlock
@@ -121,22 +120,8 @@ def device_channels(rig: Rig) -> tuple[Channel, ...]:
 
     Of several actuators u and theta_ref of each, see `reference_names`, and then all commands.
     """
-    units = rig.units()
-    references = []
-    for spec in rig.actuator:
-        loop = rig.centring_of(spec.name)
-        centring = loop.sensor if loop else rig.sensor[0].name
-        names = reference_names(rig, spec.name)
-        for name in names:
-            if name in units:
-                raise InputError(rig.name, "name", name, "another; the references have this name")
-        drives = "the excitation" if len(rig.actuator) == 1 else f"the excitation of {spec.name}"
-        references += [
-            Channel(names[0], spec.unit, "reference", description=f"reference of {drives}"),
-            Channel(names[1], units[centring], "reference", description=f"reference of {centring}"),
-        ]
     return (
-        *references,
+        *reference_channels(rig),
         *(
             Channel(
                 a.name,

@@ -50,7 +50,7 @@ class Lane(NamedTuple):
 
 
 @njit(cache=True)
-def _sense(lanes: tuple[Lane, ...], noise: Float, values: Float, quality: Flags) -> None:
+def sense_all(lanes: tuple[Lane, ...], noise: Float, values: Float, quality: Flags) -> None:
     """Read all sensors into values and quality, (m,). noise : (m,)."""
     c, s = lanes[0].converters, lanes[0].state
     sample = s.flag[SAMPLE]
@@ -91,7 +91,7 @@ def advance(
     none = np.zeros(max(m, lanes[0].tables.inner))
     for n in range(u.shape[0]):
         y = values[n, 3 * k :]
-        _sense(lanes, noise[n] if noise.shape[0] > 0 else none, y, quality[n, 3 * k :])
+        sense_all(lanes, noise[n] if noise.shape[0] > 0 else none, y, quality[n, 3 * k :])
         tripped = False
         for j in range(k):
             lane = lanes[j]

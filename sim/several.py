@@ -10,6 +10,7 @@ import numpy as np
 
 from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.errors import DeviceError
+from samii_rig.model.realise import Realisation
 from samii_rig.rig.schema import Rig
 from sim import kernel
 from sim.base import SimulatedRig
@@ -19,27 +20,33 @@ from sim.plant import tabulate
 from sim.settings import SimSettings
 
 
+def plant_of(
+    rig: Rig, made: Realisation, settings: SimSettings, i: int, patience: int = -1
+) -> Lane:
+    """What output i moves, at rest, its loop open."""
+    tables = tabulate(rig, made, settings.inner, i)
+    return Lane(
+        tables,
+        converters(rig, settings, i),
+        kernel.Control(0, 0.0, 0.0, np.inf, np.inf, patience),
+        filters(rig, ()),
+        drive(rig, settings, i),
+        kernel.free(tables),
+        kernel.rest(tables),
+    )
+
+
 class SimulatedOutputs(SimulatedRig):
     """Actuators, sensor and clock of a simulated rig with several outputs."""
 
     def __init__(self, rig: Rig, settings: SimSettings) -> None:
         super().__init__(rig, settings)
         self.names = tuple(a.name for a in rig.actuator)
-        self._lanes = tuple(self._lane(i) for i in range(len(rig.actuator)))
-        self._queue: list[tuple[CommandBlock, ...]] = []
-
-    def _lane(self, i: int) -> Lane:
-        rig, settings = self._rig, self._settings
-        tables = tabulate(rig, self.realisation, settings.inner, i)
-        return Lane(
-            tables,
-            converters(rig, settings, i),
-            kernel.Control(0, 0.0, 0.0, np.inf, np.inf, self._patience()),
-            filters(rig, ()),
-            drive(rig, settings, i),
-            kernel.free(tables),
-            kernel.rest(tables),
+        self._lanes = tuple(
+            plant_of(rig, self.realisation, settings, i, self._patience())
+            for i in range(len(rig.actuator))
         )
+        self._queue: list[tuple[CommandBlock, ...]] = []
 
     def configure(self, loops: tuple[DeviceLoop, ...]) -> None:
         """Set loops and limits; DeviceError while one is closed or if it cannot be closed."""

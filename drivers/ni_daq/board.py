@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from drivers.ni_daq.output import AnalogueOutput
+from drivers.ni_daq.output import Playout
 from drivers.ni_daq.settings import NiSettings
 from drivers.sensing import taken
+from samii_rig.devices.channels import reference_channels
 from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Flags, Float, Int, Quality, SampleBlock
@@ -25,19 +26,18 @@ WITHIN = 10.0  # s that one call of the driver may take
 class Board:
     """The sensor. Times are the board's: its count of samples over its rate.
 
-    tasks : the analogue one first. Its first row is the read-back, where there is an output.
+    tasks : the analogue one first. Its first rows are the read-backs of the outputs.
     """
 
     def __init__(
-        self, rig: Rig, settings: NiSettings, tasks: list[Any], output: AnalogueOutput | None
+        self, rig: Rig, settings: NiSettings, tasks: list[Any], output: Playout | None
     ) -> None:
         own = (*rig.sensor, *rig.monitor)
         self._settings, self._tasks, self._output = settings, tasks, output
         self._rate = settings.rate(rig)
         self.latency = (0.0, settings.latency)
-        self._spec = rig.actuator[0]
-        centring = rig.centring.sensor if rig.centring else rig.sensor[0].name
-        self._angle = [x.name for x in own].index(centring) if output and rig.sensor else 0
+        self._specs = rig.actuator
+        self._wires = settings.output.wires(rig) if settings.output else ()
         self.channels = tuple(
             Channel(
                 x.name,
@@ -52,18 +52,19 @@ class Board:
         )
         self._inputs = self.channels
         if output:
-            spec, unit = self._spec, rig.units()[centring]
             self.channels = (
-                Channel("u", spec.unit, "reference", description="reference of the excitation"),
-                Channel("theta_ref", unit, "reference", description=f"reference of {centring}"),
-                Channel(
-                    spec.name,
-                    spec.unit,
-                    "command",
-                    spec.low,
-                    spec.high,
-                    spec.resolution,
-                    "read back, in steps of its resolution",
+                *reference_channels(rig),
+                *(
+                    Channel(
+                        spec.name,
+                        spec.unit,
+                        "command",
+                        spec.low,
+                        spec.high,
+                        spec.resolution,
+                        "read back, in steps of its resolution",
+                    )
+                    for spec in self._specs
                 ),
                 *self._inputs,
             )
@@ -128,26 +129,25 @@ class Board:
         quality[~np.isfinite(out)] = Quality.MISSING
         return out, quality
 
-    def _driven(self, output: AnalogueOutput, raw: Float) -> tuple[Float, Flags]:
-        """The same with u, theta_ref and v before them, one sample behind: at its instant an
-        input still sees the output as it was."""
+    def _driven(self, output: Playout, raw: Float) -> tuple[Float, Flags]:
+        """The same with the references and the outputs before them, one sample behind: at its
+        instant an input still sees the output as it was."""
         joined = raw if self._held is None else np.concatenate([self._held, raw], axis=1)
         self._held = joined[:, -1:]
-        values, quality = self._scaled(joined[1:])
-        output.look(float(np.abs(values[:, self._angle]).max()))
+        k = len(self._wires)
+        values, quality = self._scaled(joined[k:])
+        most = np.abs(values).max(axis=0).tolist()
+        output.look(dict(zip([c.name for c in self._inputs], most, strict=True)))
         n = joined.shape[1] - 1
         told = output.told(self._count, n)
-        o, step = self._settings.output, self._spec.resolution
-        assert o is not None
-        v = (joined[0, 1:] - o.null) / o.volts_per_unit
-        v = np.rint(v / step) * step if step else v
-        flags = np.zeros((n, 3), np.uint8)
-        flags[told[:, 2] != 0.0, 2] = Quality.LIMITED
-        flags[~np.isfinite(v), 2] = Quality.MISSING
-        return (
-            np.column_stack([told[:, :2], v, values[:n]]),
-            np.column_stack([flags, quality[:n]]),
-        )
+        columns, flags = np.empty((n, 3 * k)), np.zeros((n, 3 * k), np.uint8)
+        for j, (w, spec) in enumerate(zip(self._wires, self._specs, strict=True)):
+            v, step = (joined[j, 1:] - w.null) / w.volts_per_unit, spec.resolution
+            v = np.rint(v / step) * step if step else v
+            columns[:, 2 * j : 2 * j + 2], columns[:, 2 * k + j] = told[:, j, :2], v
+            flags[told[:, j, 2] != 0.0, 2 * k + j] = Quality.LIMITED
+            flags[~np.isfinite(v), 2 * k + j] = Quality.MISSING
+        return np.column_stack([columns, values[:n]]), np.column_stack([flags, quality[:n]])
 
     def _run(self) -> None:
         """The reader: whatever ends it is trouble, and so never only silence."""
@@ -157,7 +157,7 @@ class Board:
                 now = time.monotonic_ns()
                 if not n:
                     if self._output:
-                        self._output.look(0.0)
+                        self._output.look({})
                     continue
                 got = [np.atleast_2d(t.read(n, timeout=WITHIN)) for t in self._tasks]
                 raw = np.concatenate(got).astype(float)

@@ -1,6 +1,8 @@
-"""The analogue output: a buffer that the board plays out, one sample at each of its inputs'.
+"""The analogue outputs: a buffer that the board plays out, one sample at each of its inputs'.
 
-There is no loop in a board, so there is none here: v = u. Three things end the output, each by
+All outputs are channels of one task: one start, one buffer, one null. So what ends one ends all.
+
+There is no loop in a board, so there is none here: v = u. Three things end the outputs, each by
 itself: the gate's zero(), a look every 2 ms at deadman, angle and the play-out (with this program
 alive), and the board's watchdog or an interlock (with it dead or hung, or a null that the board
 does not take).
@@ -12,16 +14,16 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from drivers.ni_daq.settings import NiSettings, Output
+from drivers.ni_daq.settings import NiSettings, Output, Wire
 from drivers.ni_daq.watchdog import SquareWave, Watchdog
 from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.errors import DeviceError
-from samii_rig.rig.schema import ActuatorSpec
+from samii_rig.rig.schema import Rig
 from samii_rig.types import Float
 
 BUFFER = 10.0  # s of samples that the board's buffer holds
@@ -34,28 +36,30 @@ WRITE = 0.02  # s that a write may wait for room
 TAKEN = 0.05  # s that zero() waits for a look that is under way
 
 
-class AnalogueOutput:
-    """The actuator. Sample numbers are the board's, as its inputs count them.
+class Playout:
+    """What all outputs of a board are. Sample numbers are the board's, as its inputs count them.
 
     acquired : how many samples the inputs have taken.
     """
 
-    def __init__(
-        self, ni: Any, settings: NiSettings, o: Output, spec: ActuatorSpec, rate: float
-    ) -> None:
-        self._ni, self._s, self._o, self._rate = ni, settings, o, rate
-        self.name = spec.name
-        self.deadman = spec.deadman if o.watchdog or o.interlock else None
+    def __init__(self, ni: Any, settings: NiSettings, o: Output, rig: Rig) -> None:
+        self._ni, self._s, self._rate = ni, settings, rig.rate_hz
+        self._own = tuple(a.name for a in rig.actuator)
+        self._wires = o.wires(rig)
+        self._inputs = {x.name for x in (*rig.sensor, *rig.monitor)}
+        held = [a.deadman for a in rig.actuator if a.deadman is not None]
+        known = len(held) == len(self._own) and bool(o.watchdog or o.interlock)
+        self.deadman = min(held) if known else None
         self._not_null = self._ended = ""
         self._lock = threading.RLock()
         self._task: Any = None  # plays out while configured
-        self._loop: DeviceLoop | None = None
+        self._loops: tuple[DeviceLoop, ...] = ()
         self._live = self._dead = False
         self._next = 0  # sample that the next write begins with
-        self._last = self._ref = 0.0
+        self._last = self._ref = np.zeros(len(self._own))
         self._fed = 0.0
-        # By sample: u, theta_ref and whether v is another one.
-        self._told: dict[int, tuple[float, float, bool]] = {}
+        # By sample, (k, 3): u, theta_ref and whether v is another one.
+        self._told: dict[int, Float] = {}
         self.acquired: Callable[[], int] = lambda: 0
         self.watchdog: Watchdog | None = None
         self._wave: SquareWave | None = None
@@ -65,8 +69,9 @@ class AnalogueOutput:
         self._null()
         if self.trouble:
             raise DeviceError(self.trouble)
-        if o.watchdog and spec.deadman is not None:
-            self.watchdog = Watchdog(ni, o.watchdog, settings.at(o.channel), o.null, spec.deadman)
+        if o.watchdog and self.deadman is not None:
+            nulls = {settings.at(w.channel): w.null for w in self._wires}
+            self.watchdog = Watchdog(ni, o.watchdog, nulls, self.deadman)
         if o.interlock:
             try:
                 self._wave = SquareWave(ni, settings.at(o.interlock.line))
@@ -76,24 +81,19 @@ class AnalogueOutput:
 
     @property
     def trouble(self) -> str:
-        """Why the output may not be at null, or what ended it; "" if nothing."""
+        """Why the outputs may not be at null, or what ended it; "" if nothing."""
         return self._not_null or self._ended or (self.watchdog.trouble if self.watchdog else "")
 
-    # Actuator
+    # For the actuators
 
-    def configure(self, loop: DeviceLoop) -> None:
+    def take_limits(self, loops: tuple[DeviceLoop, ...]) -> None:
         """Set the limits, and play out null; DeviceError for a loop, or while it is live."""
-        if loop.kp != 0.0 or loop.feedback:
-            raise DeviceError(
-                f"{self.name}: a board that plays out a buffer closes no loop; take [centring] and "
-                "[[feedback]] out of the rig file, or let a serial node drive"
-            )
-        numbers = (loop.max_output, loop.max_rate, loop.max_angle)
-        if not all(x >= 0.0 for x in numbers):
-            raise DeviceError(f"{self.name}: negative or missing number in {loop}")
+        self._one_for_each(loops)
+        for name, loop in zip(self._own, loops, strict=True):
+            self._check_loop(name, loop)
         with self._lock:
             if self._live:
-                raise DeviceError(f"{self.name}: the output is live")
+                raise DeviceError(f"{', '.join(self._own)}: the output is live")
             self._rest(dead=False)
             if self._not_null:
                 raise DeviceError(self._not_null)
@@ -102,36 +102,43 @@ class AnalogueOutput:
             except Exception as error:
                 self._rest(dead=True)
                 raise DeviceError(f"{self._s.board}: the output does not start: {error}") from error
-            self._loop = loop
+            self._loops = loops
 
-    def write(self, block: CommandBlock) -> None:
-        """Queue reference samples; feeds the deadman. What comes too late, or while the output is
-        ended, is ignored."""
-        u, ref = block.u, block.theta_ref
-        if u.shape != ref.shape or u.ndim != 1:
-            raise DeviceError(f"{self.name}: u and theta_ref of a block differ in length")
-        if not (np.isfinite(u).all() and np.isfinite(ref).all()):
-            raise DeviceError(f"{self.name}: a reference sample is not a finite number")
+    def queue(self, blocks: tuple[CommandBlock, ...]) -> None:
+        """Queue reference samples; feeds the deadman. What comes too late, or while the outputs
+        are ended, is ignored."""
+        self._one_for_each(blocks)
+        for name, block in zip(self._own, blocks, strict=True):
+            if block.u.shape != block.theta_ref.shape or block.u.ndim != 1:
+                raise DeviceError(f"{name}: u and theta_ref of a block differ in length")
+            if not (np.isfinite(block.u).all() and np.isfinite(block.theta_ref).all()):
+                raise DeviceError(f"{name}: a reference sample is not a finite number")
+        if len({(b.first, len(b)) for b in blocks}) != 1:
+            raise DeviceError(f"{', '.join(self._own)}: references of different samples")
+        first = blocks[0].first
+        u = np.stack([b.u for b in blocks], axis=1)
+        ref = np.stack([b.theta_ref for b in blocks], axis=1)
         with self._lock:
-            late = max(0, self._next - block.first)
+            late = max(0, self._next - first)
             if self._task is None or late >= len(u):
                 return
-            if block.first + len(u) - self.acquired() > BUFFER * self._rate:
-                raise DeviceError(f"{self.name}: a reference further ahead than {BUFFER:g} s")
+            if first + len(u) - self.acquired() > BUFFER * self._rate:
+                said = f"a reference further ahead than {BUFFER:g} s"
+                raise DeviceError(f"{', '.join(self._own)}: {said}")
             try:
                 if self.watchdog is not None:
                     self.watchdog.feed()
                 if self._wave is not None:
                     self._wave.edge()
                 self._live, self._fed = True, time.monotonic()
-                self._fill(block.first)
+                self._fill(first)
                 self._play(u[late:], ref[late:])
             except Exception as error:
                 self._rest(dead=True)
                 raise DeviceError(f"{self._s.board}: the output has ended: {error}") from error
 
     def zero(self) -> None:
-        """Output at null, nothing queued. What the board does not take, its watchdog or the
+        """All outputs at null, nothing queued. What the board does not take, its watchdog or the
         interlock ends."""
         taken = self._lock.acquire(timeout=TAKEN)
         try:
@@ -150,14 +157,15 @@ class AnalogueOutput:
 
     # For the reader of the inputs
 
-    def look(self, angle: float) -> None:
-        """What a device does by itself: deadman, angle, null ahead. angle : largest |theta| that
-        is new."""
+    def look(self, most: Mapping[str, float]) -> None:
+        """What a device does by itself: deadman, angles, null ahead. most : largest |value| of each
+        input that is new; empty where nothing is."""
         with self._lock:
-            if self._task is None or self._loop is None:
+            if self._task is None or not self._loops:
                 return
             late = self._live and time.monotonic() - self._fed > PART * (self.deadman or 0.0)
-            if late or not angle <= self._loop.max_angle:
+            far = not all(most.get(x.sensor, 0.0) <= x.max_angle for x in self._loops)
+            if late or far:
                 self._rest(dead=True)
                 return
             try:
@@ -172,11 +180,12 @@ class AnalogueOutput:
             self._rest(dead=True)
 
     def told(self, first: int, n: int) -> Float:
-        """(n, 3): u and theta_ref of the samples from `first`, and whether v is another one."""
+        """(n, k, 3): u and theta_ref of the samples from `first`, and whether v is another one."""
         with self._lock:
-            nothing = (0.0, self._ref, self._dead)
+            k = len(self._own)
+            nothing = np.column_stack([np.zeros(k), self._ref, np.full(k, self._dead)])
             rows = [self._told.pop(first + i, nothing) for i in range(n)]
-        return np.array(rows, dtype=float).reshape(n, 3)
+        return np.array(rows, dtype=float).reshape(n, k, 3)
 
     # The board
 
@@ -191,7 +200,8 @@ class AnalogueOutput:
                     self._ni.constants.RegenerationMode.DONT_ALLOW_REGENERATION
                 )
                 task.out_stream.output_buf_size = math.ceil(BUFFER * self._rate)
-                task.write(np.full(n, self._o.null), auto_start=False, timeout=WRITE)
+                nulls = np.array([w.null for w in self._wires])
+                task.write(_data(np.tile(nulls, (n, 1))), auto_start=False, timeout=WRITE)
                 task.control(self._ni.constants.TaskMode.TASK_COMMIT)
                 before = self.acquired()
                 until = time.monotonic() + 1.0
@@ -199,7 +209,8 @@ class AnalogueOutput:
                     pass
                 task.start()
                 if first != before and self.acquired() == first:
-                    self._task, self._next, self._last, self._ref = task, first + n, 0.0, 0.0
+                    self._task, self._next = task, first + n
+                    self._last = self._ref = np.zeros(len(self._own))
                     self._told.clear()
                     return
             except BaseException:
@@ -210,8 +221,8 @@ class AnalogueOutput:
 
     def _made(self) -> Any:
         task = self._ni.Task()
-        o, mode = self._o, self._ni.constants.AcquisitionType.CONTINUOUS
-        task.ao_channels.add_ao_voltage_chan(self._s.at(o.channel), min_val=o.low, max_val=o.high)
+        mode = self._ni.constants.AcquisitionType.CONTINUOUS
+        self._add(task, self._wires)
         size = math.ceil(BUFFER * self._rate)
         task.timing.cfg_samp_clk_timing(
             self._rate, source=self._s.clock, sample_mode=mode, samps_per_chan=size
@@ -222,24 +233,47 @@ class AnalogueOutput:
         """Rest up to this sample: u = 0."""
         if upto > self._next:
             n = upto - self._next
-            self._play(np.zeros(n), np.full(n, self._ref))
+            self._play(np.zeros((n, len(self._own))), np.tile(self._ref, (n, 1)))
 
     def _play(self, u: Float, ref: Float) -> None:
-        assert self._loop is not None
-        o, most, step = self._o, self._loop.max_output, self._loop.max_rate / self._rate
-        ends = sorted((x - o.null) / o.volts_per_unit for x in (o.low, o.high))
-        low, high = max(-most, ends[0]), min(most, ends[1])
-        v = np.empty_like(u)
-        for i, wanted in enumerate(u.tolist()):
-            least, largest = max(self._last - step, low), min(self._last + step, high)
-            v[i] = self._last = min(max(wanted, least), largest)
-        volts = o.null + o.volts_per_unit * v
-        self._task.write(volts, auto_start=False, timeout=WRITE)
-        changed = (v != u).tolist()
-        for i, row in enumerate(zip(u.tolist(), ref.tolist(), changed, strict=True)):
+        """References (n, k), each output within its own limits."""
+        kept = [
+            _kept(w, loop, loop.max_rate / self._rate, last, u[:, j])
+            for j, (w, loop, last) in enumerate(
+                zip(self._wires, self._loops, self._last.tolist(), strict=True)
+            )
+        ]
+        v = np.stack(kept, axis=1)
+        volts = [w.null + w.volts_per_unit * x for w, x in zip(self._wires, kept, strict=True)]
+        self._task.write(_data(np.stack(volts, axis=1)), auto_start=False, timeout=WRITE)
+        self._last = v[-1]
+        for i, row in enumerate(np.stack([u, ref, v != u], axis=2)):
             self._told[self._next + i] = row
         self._next += len(u)
-        self._ref = float(ref[-1])
+        self._ref = ref[-1]
+
+    def _add(self, task: Any, wires: Sequence[Wire]) -> None:
+        """Outputs as channels of one task."""
+        for w in wires:
+            channel = self._s.at(w.channel)
+            task.ao_channels.add_ao_voltage_chan(channel, min_val=w.low, max_val=w.high)
+
+    def _one_for_each(self, given: Sequence[object]) -> None:
+        if len(given) != len(self._own):
+            said = f"{len(given)} given, one for each is needed"
+            raise DeviceError(f"{', '.join(self._own)}: {said}")
+
+    def _check_loop(self, name: str, loop: DeviceLoop) -> None:
+        """DeviceError for one that a board cannot close, or limits that it cannot keep."""
+        if loop.kp != 0.0 or loop.feedback:
+            raise DeviceError(
+                f"{name}: a board that plays out a buffer closes no loop; take [centring] and "
+                "[[feedback]] out of the rig file, or let a serial node drive"
+            )
+        if not all(x >= 0.0 for x in (loop.max_output, loop.max_rate, loop.max_angle)):
+            raise DeviceError(f"{name}: negative or missing number in {loop}")
+        if loop.sensor not in self._inputs:
+            raise DeviceError(f"{name}: no input {loop.sensor!r} whose angle ends it")
 
     def _rest(self, *, dead: bool) -> None:
         """At null, whatever state the task is in."""
@@ -252,24 +286,48 @@ class AnalogueOutput:
             self._told = {n: row for n, row in self._told.items() if n < taken}
 
     def _null(self) -> None:
-        """One sample of null, on demand; unless it is taken the watchdog is left to expire. The
-        interlock opens in any case."""
-        o, task = self._o, None
-        try:
-            task = self._ni.Task()
-            task.ao_channels.add_ao_voltage_chan(
-                self._s.at(o.channel), min_val=o.low, max_val=o.high
-            )
-            task.write(o.null, auto_start=True, timeout=WRITE)
-        except Exception as error:
-            line = " ".join(str(error).split())
-            self._not_null = f"{self._s.board}: the output could not be set to null: {line}"
-        else:
-            self._not_null = ""
-        finally:
-            _closed(task)
+        """One sample of every null, on demand; unless all are taken the watchdog is left to expire.
+        The interlock opens in any case."""
+        self._not_null = self._put(self._wires)
+        if self._not_null and len(self._wires) > 1:
+            # A board that refuses one channel refuses the task of all: the others go by themselves.
+            for w in self._wires:
+                self._put((w,))
         if self.watchdog is not None:
             self.watchdog.rest(at_null=not self._not_null)
+
+    def _put(self, wires: Sequence[Wire]) -> str:
+        """These outputs' nulls; what NI-DAQmx said if it did not take them, else ""."""
+        task, nulls = None, [w.null for w in wires]
+        try:
+            task = self._ni.Task()
+            self._add(task, wires)
+            # NI-DAQmx wants a number for one channel, a list for several.
+            data = nulls[0] if len(nulls) == 1 else nulls
+            task.write(data, auto_start=True, timeout=WRITE)
+        except Exception as error:
+            line = " ".join(str(error).split())
+            names = "" if len(self._wires) == 1 else f" of {', '.join(self._own)}"
+            return f"{self._s.board}: the output{names} could not be set to null: {line}"
+        finally:
+            _closed(task)
+        return ""
+
+
+def _kept(w: Wire, loop: DeviceLoop, step: float, last: float, u: Float) -> Float:
+    """(n,) of the references u within an output's limits, from its `last` value on."""
+    ends = sorted((x - w.null) / w.volts_per_unit for x in (w.low, w.high))
+    low, high = max(-loop.max_output, ends[0]), min(loop.max_output, ends[1])
+    v = np.empty_like(u)
+    for i, wanted in enumerate(u.tolist()):
+        least, largest = max(last - step, low), min(last + step, high)
+        v[i] = last = min(max(wanted, least), largest)
+    return v
+
+
+def _data(volts: Float) -> Float:
+    """(n, k) as NI-DAQmx wants it: (n,) for one channel, a row each for several."""
+    return volts[:, 0].copy() if volts.shape[1] == 1 else np.ascontiguousarray(volts.T)
 
 
 def describe(o: Output, deadman: float | None) -> dict[str, str]:

@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from drivers.ni_daq.actuators import AnalogueOutput, AnalogueOutputs
 from drivers.ni_daq.board import Board
-from drivers.ni_daq.output import BUFFER, AnalogueOutput, describe
+from drivers.ni_daq.output import BUFFER, describe
 from drivers.ni_daq.settings import NiSettings, read_settings
 from drivers.sensing import NoOutput
 from samii_rig.devices.clock import MonotonicClock
@@ -23,7 +24,7 @@ MODULES = ("constants", "types", "system", "system.watchdog")
 
 @dataclass(frozen=True, slots=True)
 class NiRig(OpenRig):
-    """Ends the output at null, then the board's tasks."""
+    """Ends the outputs at null, then the board's tasks."""
 
     parts: contextlib.ExitStack
 
@@ -33,7 +34,7 @@ class NiRig(OpenRig):
 
 
 def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
-    """The board of the settings, sampling, its output at null.
+    """The board of the settings, sampling, its outputs at null.
 
     InputError for a wrong setting or where nidaqmx is not installed, DeviceError for what NI-DAQmx
     refuses.
@@ -48,11 +49,12 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
         raise InputError(rig.name, "device.driver", "ni_daq", expected) from error
     with contextlib.ExitStack() as parts:
         try:
-            output = None
+            output: AnalogueOutput | AnalogueOutputs | None = None
             if s.output is not None:
-                output = AnalogueOutput(ni, s, s.output, rig.actuator[0], rig.rate_hz)
+                kind = AnalogueOutput if len(rig.actuator) == 1 else AnalogueOutputs
+                output = kind(ni, s, s.output, rig)
                 parts.callback(output.close)
-            tasks = _tasks(ni, s, s.rate(rig), parts)
+            tasks = _tasks(ni, s, rig, parts)
             if output is not None:
                 inputs = tasks[0].in_stream
                 output.acquired = lambda: int(inputs.total_samp_per_chan_acquired)
@@ -80,7 +82,7 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
         )
 
 
-def _tasks(ni: Any, s: NiSettings, rate: float, parts: contextlib.ExitStack) -> list[Any]:
+def _tasks(ni: Any, s: NiSettings, rig: Rig, parts: contextlib.ExitStack) -> list[Any]:
     """The inputs' tasks, started; the analogue one last, as its sample clock is that of all."""
 
     def made() -> Any:
@@ -89,10 +91,9 @@ def _tasks(ni: Any, s: NiSettings, rate: float, parts: contextlib.ExitStack) -> 
         return task
 
     analogue = made()
-    o = s.output
-    if o is not None:
-        readback = s.at(o.readback or f"_{o.channel}_vs_aognd")
-        analogue.ai_channels.add_ai_voltage_chan(readback, min_val=o.low, max_val=o.high)
+    rate = s.rate(rig)
+    for w in s.output.wires(rig) if s.output else ():
+        analogue.ai_channels.add_ai_voltage_chan(s.at(w.measured), min_val=w.low, max_val=w.high)
     for a in s.analogue.values():
         analogue.ai_channels.add_ai_voltage_chan(s.at(a.input), min_val=a.low, max_val=a.high)
     size = math.ceil(BUFFER * rate)

@@ -41,12 +41,10 @@ class Interlock(Strict):
     reason: str = Field(min_length=1)
 
 
-class Output(Strict):
+class Wire(Strict):
     """volts = null + volts_per_unit value at an output such as ao0, of the range low to high.
 
     readback : the input that measures it; left out, the board's own channel _ao0_vs_aognd.
-    watchdog : name of the device (of a chassis, the chassis) whose watchdog timer puts the output
-        to null. interlock : what does it instead. Without either no gate arms it.
     """
 
     channel: str = Field(min_length=1)
@@ -55,8 +53,38 @@ class Output(Strict):
     low: Finite = -10.0
     high: Finite = 10.0
     readback: str = ""
+
+    @property
+    def measured(self) -> str:
+        """The channel of its read-back."""
+        return self.readback or f"_{self.channel}_vs_aognd"
+
+
+class Output(Strict):
+    """The outputs, and what ends all of them when this program is dead.
+
+    channel, volts_per_unit, null, low, high, readback : of the rig's only output, see `Wire`.
+    channels : of each, by actuator name, where the rig has several.
+    watchdog : name of the device (of a chassis, the chassis) whose watchdog timer puts the outputs
+        to null. interlock : what does it instead. Without either no gate arms them.
+    """
+
+    channel: str = ""
+    volts_per_unit: Finite = 1.0
+    null: Finite = 0.0
+    low: Finite = -10.0
+    high: Finite = 10.0
+    readback: str = ""
+    channels: dict[Name, Wire] = Field(default_factory=dict)
     watchdog: str = ""
     interlock: Interlock | None = None
+
+    def wires(self, rig: Rig) -> tuple[Wire, ...]:
+        """Of each actuator, in the rig file's order; of settings that were checked."""
+        if self.channels:
+            return tuple(self.channels[a.name] for a in rig.actuator)
+        own = Wire.model_fields
+        return (Wire(**{name: getattr(self, name) for name in own}),)
 
 
 class NiSettings(Strict):
@@ -123,15 +151,34 @@ def check_rig(rig: Rig, given: Mapping[str, object]) -> None:
 
 
 def _check_output(rig: Rig, s: NiSettings, o: Output) -> None:
-    if len(rig.actuator) != 1:
-        raise InputError(rig.name, "actuator", len(rig.actuator), "one; the board drives one")
     if s.rate(rig) != rig.rate_hz:
         raise wrong(rig, "rate_hz", s.rate_hz, f"{rig.rate_hz:g}, the rig's, with an output")
-    if o.volts_per_unit == 0.0:
-        raise wrong(rig, "output.volts_per_unit", 0.0, "another number than 0")
-    if not o.low < o.null < o.high:
-        raise wrong(rig, "output.null", o.null, f"between low, {o.low:g}, and high, {o.high:g}")
-    spec = rig.actuator[0]
-    if (o.watchdog or o.interlock) and spec.deadman is None:
-        expected = "the time of the watchdog or the interlock, such as 0.05"
-        raise InputError(rig.name, f"actuator[{spec.name}].deadman", None, expected)
+    names = [a.name for a in rig.actuator]
+    if not o.channels:
+        if len(names) > 1:
+            expected = f"{', '.join(names)}, each with its channel"
+            raise wrong(rig, "output.channels", [], expected)
+        if not o.channel:
+            raise wrong(rig, "output.channel", "", "the name of the output, such as ao0")
+    elif given := sorted(o.model_fields_set & set(Wire.model_fields)):
+        expected = "left out: output.channels has it for each"
+        raise wrong(rig, f"output.{given[0]}", getattr(o, given[0]), expected)
+    elif sorted(o.channels) != sorted(names):
+        raise wrong(rig, "output.channels", sorted(o.channels), f"{', '.join(names)}, each once")
+    wires = o.wires(rig)
+    for spec, w in zip(rig.actuator, wires, strict=True):
+        where = f"output.channels.{spec.name}" if o.channels else "output"
+        if w.volts_per_unit == 0.0:
+            raise wrong(rig, f"{where}.volts_per_unit", 0.0, "another number than 0")
+        if not w.low < w.null < w.high:
+            between = f"between low, {w.low:g}, and high, {w.high:g}"
+            raise wrong(rig, f"{where}.null", w.null, between)
+        if (o.watchdog or o.interlock) and spec.deadman is None:
+            expected = "the time of the watchdog or the interlock, such as 0.05"
+            raise InputError(rig.name, f"actuator[{spec.name}].deadman", None, expected)
+    for what, seen in (
+        ("channel", [s.at(w.channel) for w in wires]),
+        ("readback", [s.at(w.measured) for w in wires]),
+    ):
+        if len(set(seen)) < len(seen):
+            raise wrong(rig, f"output.channels, {what}", seen, "one of its own for each")

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import contextlib
 import threading
+from collections.abc import Mapping
 from typing import Any
 
 OFTEN = 5  # resets in its time, while the output rests
@@ -14,18 +15,21 @@ WAIT = 0.02  # s that an edge may wait to be written
 class Watchdog:
     """A running timer, from before any other task of the device, as NI asks.
 
-    While the output rests at null the timer is reset in here; from `feed` on, which the gate's own
+    nulls : V, by the whole name of each output's channel, to which it puts them all.
+    While the outputs rest at null the timer is reset in here; from `feed` on, which the gate's own
     calls come to, it is left to them. trouble : what ended the resets, "" if nothing did.
     """
 
-    def __init__(self, ni: Any, device: str, channel: str, volts: float, seconds: float) -> None:
+    def __init__(self, ni: Any, device: str, nulls: Mapping[str, float], seconds: float) -> None:
         self._resting, self.trouble = True, ""
         self._seconds = seconds
         self._task = ni.system.watchdog.WatchdogTask(device, timeout=seconds)
         try:
             kind = ni.constants.WatchdogAOExpirState.VOLTAGE
-            state = ni.types.AOExpirationState(channel, volts, kind)
-            self._task.cfg_watchdog_ao_expir_states([state])
+            states = [
+                ni.types.AOExpirationState(name, volts, kind) for name, volts in nulls.items()
+            ]
+            self._task.cfg_watchdog_ao_expir_states(states)
             self._task.start()
         except BaseException:
             self._task.close()

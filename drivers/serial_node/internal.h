@@ -18,7 +18,9 @@ enum {
     F_NULL = 64,
     F_SUPPLY = 128
 };
-enum { HEADER = 8, CRC = 4, SAMPLES_HEAD = 14 };
+enum { HEADER = 8, CRC = 4, SAMPLES_HEAD = 14, REPORTED = 9 };
+/* Bytes of CONFIGURE and of a STREAM's sample, for each output; of HELLO, and of it for each more. */
+enum { LIMITS = 24, REFERENCE = 6, HELLO_ONE = 62, HELLO_MORE = 14 };
 
 /* Send a payload whose body of n bytes stands behind HEADER bytes, with CRC bytes free after it. A
  * frame that finds no room is dropped whole; its number shows the host that it is missing. */
@@ -30,10 +32,13 @@ void send_answer(node_t *node, uint8_t type, uint8_t code);
 /* Go to a state, and say so if it is another one. */
 void node_change(node_t *node, uint8_t state, uint8_t reason);
 
-/* Null from now on: nothing queued, the loop open. */
+/* All outputs at null from now on: nothing queued, the loops open. */
 void node_to_null(node_t *node, uint8_t state, uint8_t reason);
 
-/* Whether the output follows the loop. */
+/* Whether the outputs follow their loops. */
 int node_active(const node_t *node);
+
+/* The protocol's version that this node speaks. */
+uint8_t node_version(const node_t *node);
 
 #endif

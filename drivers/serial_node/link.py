@@ -77,7 +77,7 @@ class Link:
                 if self._other is not None:
                     raise DeviceError(
                         f"{self.name}: the node speaks protocol version {self._other.version}, "
-                        "this driver version 1; install the firmware that belongs to it"
+                        "this driver versions 1 and 2; install the firmware that belongs to it"
                     )
                 if self.trouble:
                     raise DeviceError(self.trouble)
@@ -105,7 +105,8 @@ class Link:
         assert self._hello is not None
         with self._writing:
             self._seq = (self._seq + 1) % WORD
-            self._put(frame(kind, self._hello.boot, self._seq, body))
+            hello = self._hello
+            self._put(frame(kind, hello.boot, self._seq, body, hello.version))
             return self._seq
 
     def request(self, kind: Type, body: bytes = b"") -> Code:
@@ -164,6 +165,11 @@ class Link:
                 self._last = message
             case Answer(type=Type.STREAM):
                 self.refused += 1
+            case OtherVersion() if self._hello is not None:
+                self._fail(
+                    f"{self.name}: the node speaks protocol version {message.version} now; its "
+                    "firmware was changed; start a new run"
+                )
             case Reboot():
                 self._fail(
                     f"{self.name}: the node has rebooted (boot {message.boot}); its output is at "

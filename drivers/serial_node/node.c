@@ -5,6 +5,19 @@
 
 #include <string.h>
 
+/* A frame of samples is never longer than a payload: the array has a negative size if it were. */
+typedef char frame_fits[HEADER + SAMPLES_HEAD + CRC +
+                                    NODE_MAX_BATCH * (REPORTED * NODE_MAX_OUTPUTS +
+                                                      4u * NODE_MAX_ENCODERS + 2u * NODE_MAX_ADCS) <=
+                                NODE_MAX_PAYLOAD
+                            ? 1
+                            : -1];
+
+uint8_t node_version(const node_t *node)
+{
+    return node->config.n_output == 1 ? NODE_VERSION_ONE : NODE_VERSION_SEVERAL;
+}
+
 void node_change(node_t *node, uint8_t state, uint8_t reason)
 {
     uint8_t before = node->state;
@@ -20,7 +33,9 @@ void node_to_null(node_t *node, uint8_t state, uint8_t reason)
         node->queue[i].full = 0;
     }
     node->queued = 0;
-    node->last_v = 0;
+    for (unsigned o = 0; o < NODE_MAX_OUTPUTS; o++) {
+        node->loop[o].last_v = 0;
+    }
     if (state == NODE_DEAD || state == NODE_TRIPPED) {
         node->configured = 0;
     }
@@ -55,35 +70,50 @@ static int64_t clamp(int64_t x, int64_t low, int64_t high)
     return x < low ? low : x > high ? high : x;
 }
 
-/* What this sample's inputs say is wrong: flags, and a reason to trip while the output is live. */
+static void flag_all(const node_t *node, uint8_t *flags, uint8_t flag)
+{
+    for (unsigned o = 0; o < node->config.n_output; o++) {
+        flags[o] = (uint8_t)(flags[o] | flag);
+    }
+}
+
+/* What this sample's inputs say is wrong: flags of each output, and a reason to trip while they are
+ * live. One output's reason is that of all. */
 static uint8_t judge(node_t *node, const int32_t *encoders, const int16_t *adcs, uint8_t *flags)
 {
-    uint8_t reason = 0, e = node->encoder;
+    uint8_t reason = 0;
+    uint16_t watched = 0;
+    for (unsigned o = 0; o < node->config.n_output; o++) {
+        watched = (uint16_t)(watched | node->loop[o].adc_mask);
+    }
     node->adc_out = 0;
     for (unsigned i = 0; i < node->config.n_adc; i++) {
         if (adcs[i] == INT16_MIN || adcs[i] == INT16_MAX) {
-            *flags |= F_ADC;
-            if (node->adc_mask >> i & 1u) {
+            flag_all(node, flags, F_ADC);
+            if (watched >> i & 1u) {
                 node->adc_out = 1;
                 reason = ADC;
             }
         }
     }
-    if (node->configured && distance(encoders[e], node->centre) > node->max_angle) {
-        *flags |= F_ANGLE;
-        reason = ANGLE;
-    }
-    if (node->configured && node->seen &&
-        distance(encoders[e], node->last_encoder[e]) > node->max_jump) {
-        *flags |= F_JUMP;
-        reason = JUMP;
+    for (unsigned o = 0; o < node->config.n_output && node->configured; o++) {
+        const node_loop *loop = &node->loop[o];
+        int32_t angle = encoders[loop->encoder];
+        if (distance(angle, loop->centre) > loop->max_angle) {
+            flags[o] |= F_ANGLE;
+            reason = ANGLE;
+        }
+        if (node->seen && distance(angle, node->last_encoder[loop->encoder]) > loop->max_jump) {
+            flags[o] |= F_JUMP;
+            reason = JUMP;
+        }
     }
     memcpy(node->last_encoder, encoders, sizeof encoders[0] * node->config.n_encoder);
     node->seen = 1;
     return reason;
 }
 
-static void report(node_t *node, uint32_t clock_us, int16_t u, uint8_t flags,
+static void report(node_t *node, uint32_t clock_us, const int16_t *u, const uint8_t *flags,
                    const int32_t *encoders, const int16_t *adcs)
 {
     if (node->batch_n == 0) {
@@ -92,11 +122,12 @@ static void report(node_t *node, uint32_t clock_us, int16_t u, uint8_t flags,
         node->batch_length = HEADER + SAMPLES_HEAD;
     }
     uint8_t *p = node->batch + node->batch_length;
-    put16(p, (uint16_t)node->last_v);
-    put16(p + 2, (uint16_t)u);
-    put32(p + 4, (uint32_t)node->last_ref);
-    p[8] = flags;
-    p += 9;
+    for (unsigned o = 0; o < node->config.n_output; o++, p += REPORTED) {
+        put16(p, (uint16_t)node->loop[o].last_v);
+        put16(p + 2, (uint16_t)u[o]);
+        put32(p + 4, (uint32_t)node->loop[o].last_ref);
+        p[8] = flags[o];
+    }
     for (unsigned i = 0; i < node->config.n_encoder; i++, p += 4) {
         put32(p, (uint32_t)encoders[i]);
     }
@@ -118,13 +149,25 @@ static void report(node_t *node, uint32_t clock_us, int16_t u, uint8_t flags,
     }
 }
 
-int16_t node_sample(node_t *node, uint32_t clock_us, const int32_t *encoders,
-                    const int16_t *adcs, int emergency)
+/* The next output of one loop, from its reference u; whether it is another than the loop's. */
+static int follow(node_loop *loop, const node_output *o, int16_t u, const int32_t *encoders)
 {
-    uint8_t flags = 0, reason = judge(node, encoders, adcs, &flags);
+    int64_t most = loop->max_output, step = loop->max_step;
+    int64_t wanted = u + scaled(loop->kp_q16, (int64_t)loop->last_ref - encoders[loop->encoder]);
+    int64_t v = clamp(wanted, loop->last_v - step, loop->last_v + step);
+    v = clamp(clamp(v, -most, most), o->dac_low - o->null_counts, o->dac_high - o->null_counts);
+    loop->last_v = (int32_t)v;
+    return v != wanted;
+}
+
+void node_sample(node_t *node, uint32_t clock_us, const int32_t *encoders, const int16_t *adcs,
+                 int emergency, int16_t *counts)
+{
+    const node_config *c = &node->config;
+    uint8_t flags[NODE_MAX_OUTPUTS] = {0}, reason = judge(node, encoders, adcs, flags);
     node->emergency = emergency != 0;
     if (node->emergency) {
-        flags |= F_EMERGENCY;
+        flag_all(node, flags, F_EMERGENCY);
         node_to_null(node, NODE_TRIPPED, EMERGENCY);
     }
     if (node_active(node) || node->queued > 0) {
@@ -134,13 +177,15 @@ int16_t node_sample(node_t *node, uint32_t clock_us, const int32_t *encoders,
         }
     }
     node_slot *slot = &node->queue[node->sample % NODE_QUEUE];
-    int16_t u = 0;
+    int16_t u[NODE_MAX_OUTPUTS] = {0};
     if (slot->full) {
         slot->full = 0;
         node->queued--;
-        u = slot->u;
-        node->last_ref = slot->theta_ref;
-        flags |= F_REFERENCE;
+        for (unsigned o = 0; o < c->n_output; o++) {
+            u[o] = slot->u[o];
+            node->loop[o].last_ref = slot->theta_ref[o];
+        }
+        flag_all(node, flags, F_REFERENCE);
         node_change(node, NODE_LIVE, STARTED);
     } else if (node->state == NODE_LIVE) {
         node_change(node, NODE_DRY, RAN_DRY);
@@ -149,22 +194,20 @@ int16_t node_sample(node_t *node, uint32_t clock_us, const int32_t *encoders,
         node_to_null(node, NODE_TRIPPED, reason);
     }
     if (node_active(node)) {
-        flags |= F_SUPPLY;
-        const node_config *c = &node->config;
-        int64_t most = node->max_output, step = node->max_step;
-        int64_t wanted =
-            u + scaled(node->kp_q16, (int64_t)node->last_ref - encoders[node->encoder]);
-        int64_t v = clamp(wanted, node->last_v - step, node->last_v + step);
-        v = clamp(clamp(v, -most, most), c->dac_low - c->null_counts, c->dac_high - c->null_counts);
-        flags |= v != wanted ? F_LIMITED : 0;
-        node->last_v = (int32_t)v;
+        flag_all(node, flags, F_SUPPLY);
+        for (unsigned o = 0; o < c->n_output; o++) {
+            if (follow(&node->loop[o], &c->output[o], u[o], encoders)) {
+                flags[o] |= F_LIMITED;
+            }
+        }
     } else {
-        flags |= F_NULL;
-        flags |= node->state == NODE_IDLE ? 0 : F_LIMITED;
+        flag_all(node, flags, node->state == NODE_IDLE ? F_NULL : F_NULL | F_LIMITED);
     }
     report(node, clock_us, u, flags, encoders, adcs);
     node->sample++;
-    return (int16_t)(node->last_v + node->config.null_counts);
+    for (unsigned o = 0; o < c->n_output; o++) {
+        counts[o] = (int16_t)(node->loop[o].last_v + c->output[o].null_counts);
+    }
 }
 
 void node_init(node_t *node, const node_config *config, uint16_t boot)

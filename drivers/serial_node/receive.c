@@ -1,29 +1,41 @@
 #include "frame.h"
 #include "internal.h"
 
+/* Whether these limits are no wider than the node's own for that output. */
+static int within(const node_config *c, const node_output *o, const uint8_t *b)
+{
+    int32_t max_angle = signed32(get32(b + 12)), max_jump = signed32(get32(b + 16));
+    return b[0] < c->n_encoder && b[1] == 0 && get16(b + 2) >> c->n_adc == 0 &&
+           get16(b + 8) <= o->max_output && get16(b + 10) <= o->max_step && max_angle >= 0 &&
+           max_jump >= 0 && max_jump <= o->max_jump;
+}
+
+/* Loop and limits of all outputs, or of none. */
 static uint8_t configure(node_t *node, const uint8_t *b)
 {
-    uint16_t mask = get16(b + 2), max_output = get16(b + 8), max_step = get16(b + 10);
-    int32_t max_angle = signed32(get32(b + 12)), max_jump = signed32(get32(b + 16));
+    const node_config *c = &node->config;
     if (node_active(node)) {
         return NOT_NULL;
     }
     if (node->state == NODE_TRIPPED) {
         return STATE;
     }
-    if (b[0] >= node->config.n_encoder || b[1] != 0 || mask >> node->config.n_adc != 0 ||
-        max_output > node->config.max_output || max_step > node->config.max_step ||
-        max_angle < 0 || max_jump < 0 || max_jump > node->config.max_jump) {
-        return LIMIT;
+    for (unsigned o = 0; o < c->n_output; o++) {
+        if (!within(c, &c->output[o], b + LIMITS * o)) {
+            return LIMIT;
+        }
     }
-    node->encoder = b[0];
-    node->adc_mask = mask;
-    node->kp_q16 = signed32(get32(b + 4));
-    node->max_output = max_output;
-    node->max_step = max_step;
-    node->max_angle = max_angle;
-    node->max_jump = max_jump;
-    node->centre = node->last_ref = signed32(get32(b + 20));
+    for (unsigned o = 0; o < c->n_output; o++, b += LIMITS) {
+        node_loop *loop = &node->loop[o];
+        loop->encoder = b[0];
+        loop->adc_mask = get16(b + 2);
+        loop->kp_q16 = signed32(get32(b + 4));
+        loop->max_output = get16(b + 8);
+        loop->max_step = get16(b + 10);
+        loop->max_angle = signed32(get32(b + 12));
+        loop->max_jump = signed32(get32(b + 16));
+        loop->centre = loop->last_ref = signed32(get32(b + 20));
+    }
     node->configured = 1;
     node_to_null(node, NODE_IDLE, CONFIGURED);
     return OK;
@@ -43,15 +55,18 @@ static uint8_t stream(node_t *node, const uint8_t *b)
     if (last >= NODE_QUEUE) {
         return QUEUE;
     }
-    for (uint32_t i = 0; i < n; i++) {
+    b += 5;
+    for (uint32_t i = 0; i < n; i++, b += REFERENCE * node->config.n_output) {
         uint32_t sample = first + i;
         if (sample - node->sample >= NODE_QUEUE) {
             continue;
         }
         node_slot *slot = &node->queue[sample % NODE_QUEUE];
         node->queued = (uint16_t)(node->queued + (slot->full ? 0u : 1u));
-        slot->u = signed16(get16(b + 5 + 6 * i));
-        slot->theta_ref = signed32(get32(b + 7 + 6 * i));
+        for (unsigned o = 0; o < node->config.n_output; o++) {
+            slot->u[o] = signed16(get16(b + REFERENCE * o));
+            slot->theta_ref[o] = signed32(get32(b + REFERENCE * o + 2));
+        }
         slot->full = 1;
         accepted++;
     }
@@ -71,8 +86,8 @@ static uint8_t clear(node_t *node)
     return OK;
 }
 
-/* Whether a body of n bytes is as long as its type has it. */
-static int length_fits(uint8_t type, const uint8_t *body, size_t n)
+/* Whether a body of n bytes is as long as its type has it, for so many outputs. */
+static int length_fits(uint8_t type, const uint8_t *body, size_t n, size_t outputs)
 {
     switch (type) {
     case IDENTIFY:
@@ -80,9 +95,9 @@ static int length_fits(uint8_t type, const uint8_t *body, size_t n)
     case CLEAR:
         return n == 0;
     case CONFIGURE:
-        return n == 24;
+        return n == LIMITS * outputs;
     case STREAM:
-        return n >= 5 && body[4] >= 1 && n == 5u + 6u * body[4];
+        return n >= 5 && body[4] >= 1 && n == 5u + REFERENCE * outputs * body[4];
     default:
         return 0;
     }
@@ -102,8 +117,8 @@ static int handle(node_t *node, const uint8_t *p, size_t n)
         send_hello(node);
         return 1;
     }
-    if (p[0] != NODE_VERSION || !length_fits(type, body, n - HEADER - CRC) ||
-        get16(p + 2) != node->boot || seq - node->host_seq - 1u >= 0x7FFFFFFFu) {
+    if (p[0] != node_version(node) ||
+        !length_fits(type, body, n - HEADER - CRC, node->config.n_output) || get16(p + 2) != node->boot || seq - node->host_seq - 1u >= 0x7FFFFFFFu) {
         return 0;
     }
     node->host_seq = seq;

@@ -1,9 +1,7 @@
-"""A rig behind a serial I/O node: volts and radians on this side, counts on the other."""
+"""A rig behind a serial I/O node: what it samples, and how it is opened."""
 
 from __future__ import annotations
 
-import contextlib
-import math
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -14,63 +12,38 @@ import numpy as np
 from drivers.sensing import taken
 from drivers.serial_node.continuity import Continuity
 from drivers.serial_node.link import KEPT, Link
-from drivers.serial_node.settings import Input, SerialSettings, check_node, read_settings
-from drivers.serial_node.wire import (
-    HALF,
-    MAX_STREAM,
-    Code,
-    Event,
-    Flag,
-    Hello,
-    State,
-    Type,
-    configure_body,
-    reason_text,
-    stream_body,
-)
+from drivers.serial_node.outputs import OneOutput, Outputs
+from drivers.serial_node.settings import SerialSettings, check_node, read_settings
+from drivers.serial_node.wire import Event, Flag, Hello, State, Type, reason_text
+from samii_rig.devices.channels import centring_name, reference_channels
 from samii_rig.devices.clock import MonotonicClock
-from samii_rig.devices.protocols import CommandBlock, DeviceEvent, DeviceLoop, OpenRig
+from samii_rig.devices.protocols import DeviceEvent, OpenRig
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Flags, Int, Quality, SampleBlock
 
-Q16 = 1 << 16
-MOST32 = HALF - 1
 RAILS = (-(1 << 15), (1 << 15) - 1)  # where an ADC is out of its range
 TELL_EVERY = 0.25  # s between two events that count the line's faults
 TRIPPED = "the node had tripped while no program was there"
-REFUSALS = {
-    Code.NOT_NULL: "its output is not at null",
-    Code.LIMIT: "a number is beyond the node's own hard limits",
-    Code.STATE: "it has tripped, or its deadman has ended the run",
-    Code.CAUSE: "the cause of its trip is still there (emergency input, or an input out of range)",
-}
 
 
 class SerialNode:
-    """Actuator and sensor of one node.
+    """The sensor of one node: what its outputs and inputs were, in the rig file's units."""
 
-    Every frame to the node is sent inside `configure`, `write` or `zero`, so a stream cannot
-    outlive the gate that calls them.
-    """
-
-    def __init__(self, rig: Rig, settings: SerialSettings, link: Link, hello: Hello) -> None:
-        spec = rig.actuator[0]
-        self.name, self.deadman = spec.name, spec.deadman
-        self._rig, self._settings, self._link, self._hello = rig, settings, link, hello
+    def __init__(
+        self, rig: Rig, settings: SerialSettings, link: Link, hello: Hello, outputs: Outputs
+    ) -> None:
+        self._settings, self._link, self._hello = settings, link, hello
+        self._outputs = outputs.wired
         self._inputs = [
             (s.name in settings.encoder, (settings.encoder | settings.adc)[s.name])
             for s in (*rig.sensor, *rig.monitor)
         ]
-        centring = rig.centring.sensor if rig.centring else rig.sensor[0].name
-        self._angle = self._encoder(centring)
-        self.channels = _channels(rig, settings, centring)
+        self.channels = _channels(rig, settings)
+        reported = [("v", "<i2"), ("u", "<i2"), ("theta_ref", "<i4"), ("flags", "u1")]
         self._layout = np.dtype(
             [
-                ("v", "<i2"),
-                ("u", "<i2"),
-                ("theta_ref", "<i4"),
-                ("flags", "u1"),
+                ("output", reported, (len(hello.outputs),)),
                 ("encoder", "<i4", (hello.n_encoder,)),
                 ("adc", "<i2", (hello.n_adc,)),
             ]
@@ -81,77 +54,6 @@ class SerialNode:
         self._arrivals: deque[tuple[int, int]] = deque(maxlen=KEPT)
         # The way back is at most the whole round.
         self.latency = (0.0, link.round_trip)
-
-    # Actuator
-
-    def configure(self, loop: DeviceLoop) -> None:
-        """Set loop and limits; DeviceError if the node cannot or will not keep them."""
-        if loop.feedback:
-            raise DeviceError(
-                f"{self.name}: the serial node has no filters, so it cannot run the feedback "
-                f"{loop.feedback[0].name}; take [[feedback]] out of the rig file"
-            )
-        numbers = (loop.max_output, loop.max_rate, loop.max_angle)
-        if not math.isfinite(loop.kp) or not all(x >= 0.0 for x in numbers):
-            raise DeviceError(f"{self.name}: negative or missing number in {loop}")
-        x, out = self._encoder(loop.sensor), self._settings.output_counts_per_unit
-        kp = round(loop.kp * out / x.counts_per_unit * Q16)
-        if abs(kp) > MOST32:
-            raise DeviceError(f"{self.name}: kp = {loop.kp:g} is beyond what the node can count")
-        jump = self._settings.max_jump
-        scale = abs(x.counts_per_unit)
-        most = _counts(loop.max_output * abs(out))
-        if most > self._hello.max_output:
-            limit = self._hello.max_output / abs(out)
-            raise DeviceError(
-                f"{self.name}: a limit of {loop.max_output:g} is beyond the node's own hard limit "
-                f"of {limit:.4g}"
-            )
-        body = configure_body(
-            encoder=x.index,
-            adc_mask=self._watched(),
-            kp_q16=kp,
-            max_output=most,
-            # The node's own step may be the tighter one: then it limits, and says so.
-            max_step=min(
-                _counts(loop.max_rate * abs(out) / self._rig.rate_hz), self._hello.max_step
-            ),
-            max_angle=_counts(loop.max_angle * scale),
-            max_jump=min(self._hello.max_jump, _counts((jump or math.inf) * scale)),
-            centre=x.offset,
-        )
-        self._angle = x
-        code = self._link.request(Type.CONFIGURE, body)
-        if code is Code.STATE:
-            # Latched. Whoever configures has been told to go on by a person.
-            code = self._link.request(Type.CLEAR)
-            code = code or self._link.request(Type.CONFIGURE, body)
-        if code:
-            why = REFUSALS.get(code, code.name)
-            raise DeviceError(f"{self.name}: the node refuses its limits: {why}")
-
-    def write(self, block: CommandBlock) -> None:
-        """Stream reference samples; what comes too late or while tripped, the node ignores."""
-        if block.u.shape != block.theta_ref.shape or block.u.ndim != 1:
-            raise DeviceError(f"{self.name}: u and theta_ref of a block differ in length")
-        if not (np.isfinite(block.u).all() and np.isfinite(block.theta_ref).all()):
-            raise DeviceError(f"{self.name}: a reference sample is not a finite number")
-        u = np.rint(block.u * self._settings.output_counts_per_unit)
-        ref = np.rint(block.theta_ref * self._angle.counts_per_unit + self._angle.offset)
-        if np.abs(u).max(initial=0.0) > RAILS[1] or np.abs(ref).max(initial=0.0) > MOST32:
-            raise DeviceError(f"{self.name}: a reference sample is beyond what the node can count")
-        counts, angles = u.astype(np.int64).tolist(), ref.astype(np.int64).tolist()
-        for i in range(0, len(counts), MAX_STREAM):
-            part = slice(i, i + MAX_STREAM)
-            self._link.send(Type.STREAM, stream_body(block.first + i, counts[part], angles[part]))
-
-    def zero(self) -> None:
-        """Output to null. If the port does not take that, the node's deadman does it."""
-        # No silence: the port's end is what read() raises next.
-        with contextlib.suppress(DeviceError):
-            self._link.send(Type.ZERO)
-
-    # Sensor
 
     def read(self) -> SampleBlock:
         """All samples since the last call. DeviceError, after the last one that came, when the
@@ -181,13 +83,15 @@ class SerialNode:
         values = np.empty((len(raw), len(self.channels)))
         quality = np.zeros((len(raw), len(self.channels)), dtype=np.uint8)
         if self._settings.supply:
-            self._check_supply(raw["flags"])
-        out = self._settings.output_counts_per_unit
-        values[:, 0], values[:, 2] = raw["u"] / out, raw["v"] / out
-        x = self._angle
-        values[:, 1] = (raw["theta_ref"].astype(np.int64) - x.offset) / x.counts_per_unit
-        quality[(raw["flags"] & Flag.LIMITED) != 0, 2] = Quality.LIMITED
-        for i, (is_encoder, x) in enumerate(self._inputs, start=3):
+            self._check_supply(raw["output"]["flags"][:, 0])
+        k = len(self._outputs)
+        for j, w in enumerate(self._outputs):
+            own = raw["output"][:, w.output.index]
+            values[:, 2 * j], values[:, 2 * k + j] = w.volts(own["u"]), w.volts(own["v"])
+            angle = own["theta_ref"].astype(np.int64) - w.angle.offset
+            values[:, 2 * j + 1] = angle / w.angle.counts_per_unit
+            quality[(own["flags"] & Flag.LIMITED) != 0, 2 * k + j] = Quality.LIMITED
+        for i, (is_encoder, x) in enumerate(self._inputs, start=3 * k):
             counts = raw["encoder" if is_encoder else "adc"][:, x.index].astype(np.int64)
             values[:, i] = (counts - x.offset) / x.counts_per_unit
             ends = (values[:, i] <= self.channels[i].low) | (values[:, i] >= self.channels[i].high)
@@ -221,7 +125,7 @@ class SerialNode:
         }
 
     def _check_supply(self, flags: Flags) -> None:
-        """The line is on while the output is live, and off at null."""
+        """The line is on while the outputs are live, and off at null."""
         live, on = (flags & Flag.NULL) == 0, (flags & Flag.SUPPLY) != 0
         if (live != on).any():
             self._line.trouble = (
@@ -229,44 +133,32 @@ class SerialNode:
                 "does its firmware have one (device.settings.supply)?"
             )
 
-    def _encoder(self, sensor: str) -> Input:
-        if sensor not in self._settings.encoder:
-            raise DeviceError(f"{self.name}: no encoder {sensor!r} to close the loop on")
-        return self._settings.encoder[sensor]
-
-    def _watched(self) -> int:
-        """The analogue inputs that trip the node when out of range: those with a limit."""
-        return sum(
-            1 << x.index for name, x in self._settings.adc.items() if any(self._rig.limits_on(name))
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class SerialRig(OpenRig):
-    """Releases the port after the output is at null."""
+    """Releases the port after the outputs are at null."""
 
     node: SerialNode
     link: Link
 
     def close(self) -> None:
-        """Output to null, port free."""
+        """Outputs to null, port free."""
         self.actuator.zero()
         self.metadata.update(self.node.counts)
         self.link.close()
 
 
 def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
-    """The rig behind the node at `settings["port"]`, its output at null.
+    """The rig behind the node at `settings["port"]`, its outputs at null.
 
     InputError for a wrong setting or a node that is not the rig's, DeviceError if it does not
     open; one line each, with the remedy.
     """
     chosen = read_settings(rig, settings)
-    centring = rig.centring.sensor if rig.centring else rig.sensor[0].name
-    if centring not in chosen.encoder:
-        raise InputError(
-            rig.name, "device.settings.encoder", sorted(chosen.encoder), f"{centring} among them"
-        )
+    for spec in rig.actuator:
+        centring, where = centring_name(rig, spec.name), "device.settings.encoder"
+        if centring not in chosen.encoder:
+            raise InputError(rig.name, where, sorted(chosen.encoder), f"{centring} among them")
     link = Link(chosen.port, chosen.baud)
     try:
         hello = link.identify(chosen.baud)
@@ -281,9 +173,10 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
     except BaseException:
         link.close()
         raise
-    node = SerialNode(rig, chosen, link, hello)
+    outputs = Outputs(rig, chosen, link, hello)
+    node = SerialNode(rig, chosen, link, hello, outputs)
     return SerialRig(
-        node,
+        outputs if len(rig.actuator) > 1 else OneOutput(outputs),
         node,
         MonotonicClock(),
         f"serial node {hello.serial} at {chosen.port}, firmware {hello.firmware}",
@@ -294,7 +187,7 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
             "firmware": hello.firmware,
             "serial": hello.serial,
             "boot": str(hello.boot),
-            "null_counts": str(hello.null),
+            "null_counts": ", ".join(str(w.own.null) for w in outputs.wired),
             "device_settings": chosen.model_dump_json(),
             **({"supply": "on only while the output is live"} if chosen.supply else {}),
             **({"tripped": TRIPPED} if hello.state is State.TRIPPED else {}),
@@ -309,32 +202,31 @@ def _change(event: Event) -> dict[str, str | int | float]:
     return {"state": state, "reason": reason_text(event.reason), "sample": event.sample}
 
 
-def _counts(x: float) -> int:
-    """Rounded down, so that a limit stays one; at most what 32 bits hold."""
-    return math.floor(min(x, MOST32) + 1e-9)
-
-
-def _channels(rig: Rig, settings: SerialSettings, centring: str) -> tuple[Channel, ...]:
-    """Columns: u, theta_ref, v under the actuator's name, the sensors in the rig's order."""
-    spec, unit = rig.actuator[0], rig.units()[centring]
+def _channels(rig: Rig, settings: SerialSettings) -> tuple[Channel, ...]:
+    """Columns: references, the output of each actuator, the sensors in the rig's order."""
     inputs = settings.encoder | settings.adc
-    step = 1.0 / abs(settings.output_counts_per_unit)
-    return (
-        Channel("u", spec.unit, "reference", description="reference of the excitation"),
-        Channel("theta_ref", unit, "reference", description=f"reference of {centring}"),
+    commands = (
         Channel(
-            spec.name, spec.unit, "command", spec.low, spec.high, step, "as put out by the node"
-        ),
-        *(
-            Channel(
-                s.name,
-                s.unit,
-                "sensor" if s in rig.sensor else "monitor",
-                s.low,
-                s.high,
-                1.0 / abs(inputs[s.name].counts_per_unit),
-                s.calibration,
-            )
-            for s in (*rig.sensor, *rig.monitor)
-        ),
+            spec.name,
+            spec.unit,
+            "command",
+            spec.low,
+            spec.high,
+            1.0 / abs(o.counts_per_unit),
+            "as put out by the node",
+        )
+        for spec, o in zip(rig.actuator, settings.outputs(rig), strict=True)
     )
+    sensors = (
+        Channel(
+            s.name,
+            s.unit,
+            "sensor" if s in rig.sensor else "monitor",
+            s.low,
+            s.high,
+            1.0 / abs(inputs[s.name].counts_per_unit),
+            s.calibration,
+        )
+        for s in (*rig.sensor, *rig.monitor)
+    )
+    return *reference_channels(rig), *commands, *sensors

@@ -12,7 +12,7 @@ static void tx_byte(node_t *node, uint8_t byte)
 void send_frame(node_t *node, uint8_t type, uint8_t *payload, size_t n)
 {
     size_t length = HEADER + n + CRC;
-    payload[0] = (uint8_t)NODE_VERSION;
+    payload[0] = node_version(node);
     payload[1] = type;
     put16(payload + 2, node->boot);
     put32(payload + 4, node->seq++);
@@ -28,28 +28,43 @@ void send_frame(node_t *node, uint8_t type, uint8_t *payload, size_t n)
     tx_byte(node, 0);
 }
 
+/* What the converter of an output can do, and the node's own limits: 10 bytes. */
+static void put_output(uint8_t *p, const node_output *o)
+{
+    put16(p, (uint16_t)o->dac_low);
+    put16(p + 2, (uint16_t)o->dac_high);
+    put16(p + 4, (uint16_t)o->null_counts);
+    put16(p + 6, o->max_output);
+    put16(p + 8, o->max_step);
+}
+
 void send_hello(node_t *node)
 {
-    uint8_t payload[HEADER + 64 + CRC];
+    uint8_t payload[HEADER + HELLO_ONE + 1 + HELLO_MORE * (NODE_MAX_OUTPUTS - 1) + CRC];
     uint8_t *p = payload + HEADER;
     const node_config *c = &node->config;
+    const node_output *first = &c->output[0];
     put32(p, c->period_ns);
     put16(p + 4, c->deadman_ms);
     p[6] = c->n_encoder;
     p[7] = c->n_adc;
     p[8] = c->batch;
     p[9] = node->state;
-    put16(p + 10, (uint16_t)c->dac_low);
-    put16(p + 12, (uint16_t)c->dac_high);
-    put16(p + 14, (uint16_t)c->null_counts);
-    put16(p + 16, c->max_output);
-    put16(p + 18, c->max_step);
+    put_output(p + 10, first);
     put16(p + 20, (uint16_t)NODE_QUEUE);
-    put32(p + 22, (uint32_t)c->max_jump);
+    put32(p + 22, (uint32_t)first->max_jump);
     put32(p + 26, node->host_seq);
     memcpy(p + 30, c->firmware, sizeof c->firmware);
     memcpy(p + 46, c->serial, sizeof c->serial);
-    send_frame(node, HELLO, payload, 62);
+    size_t n = HELLO_ONE;
+    if (c->n_output > 1) {
+        p[n++] = c->n_output;
+        for (unsigned o = 1; o < c->n_output; o++, n += HELLO_MORE) {
+            put_output(p + n, &c->output[o]);
+            put32(p + n + 10, (uint32_t)c->output[o].max_jump);
+        }
+    }
+    send_frame(node, HELLO, payload, n);
 }
 
 void send_event(node_t *node, uint8_t reason)

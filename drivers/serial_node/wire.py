@@ -1,4 +1,7 @@
-"""Frames and messages of the serial I/O node, protocol version 1 (docs/serial-node.md)."""
+"""Frames and messages of the serial I/O node, protocol versions 1 and 2 (docs/serial-node.md).
+
+A node with one output speaks version 1, a node with several version 2.
+"""
 
 from __future__ import annotations
 
@@ -10,34 +13,20 @@ from enum import IntEnum, IntFlag
 
 from cobs import cobs
 
-VERSION = 1
+ONE, SEVERAL = 1, 2  # versions, of a node with one output and with several
 MAX_PAYLOAD = 512  # bytes of a frame before COBS
 MAX_ENCODED = MAX_PAYLOAD + MAX_PAYLOAD // 254 + 1
-MAX_STREAM = 64  # samples that this driver puts in one STREAM; 401 bytes
+MAX_STREAM = 64  # references that this driver puts in one STREAM, of all outputs; 401 bytes
 WORD, HALF = 1 << 32, 1 << 31
 
 _HEAD = struct.Struct("<BBHI")
 _CRC = struct.Struct("<I")
 _HELLO = struct.Struct("<IHBBBBhhhHHHiI16s16s")
-_HELLO_NUMBERS = (
-    "period_ns",
-    "deadman_ms",
-    "n_encoder",
-    "n_adc",
-    "batch",
-    "state",
-    "dac_low",
-    "dac_high",
-    "null",
-    "max_output",
-    "max_step",
-    "queue",
-    "max_jump",
-    "host_seq",
-)
+_OUTPUT = struct.Struct("<hhhHHi")  # of HELLO in version 2, of each output beside the first
 _SAMPLES = struct.Struct("<IIBBHH")
 _EVENT = struct.Struct("<IBB")
 _CONFIGURE = struct.Struct("<BBHiHHiii")
+REPORTED = 9  # bytes of one output in a sample of SAMPLES
 OVERHEAD = _HEAD.size + _SAMPLES.size + _CRC.size  # bytes of a SAMPLES frame beside its samples
 
 
@@ -111,8 +100,20 @@ def reason_text(code: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
+class Limits:
+    """One output of a node and the node's own limits of it; counts are counted from `null`."""
+
+    dac_low: int
+    dac_high: int
+    null: int
+    max_output: int
+    max_step: int
+    max_jump: int
+
+
+@dataclass(frozen=True, slots=True)
 class Hello:
-    """What a node says of itself; counts of the output are counted from `null`."""
+    """What a node says of itself."""
 
     boot: int
     period_ns: int
@@ -121,16 +122,21 @@ class Hello:
     n_adc: int
     batch: int
     state: State
-    dac_low: int
-    dac_high: int
-    null: int
-    max_output: int
-    max_step: int
     queue: int
-    max_jump: int
     host_seq: int
     firmware: str
     serial: str
+    outputs: tuple[Limits, ...]
+
+    @property
+    def version(self) -> int:
+        """Of the protocol that it speaks."""
+        return ONE if len(self.outputs) == 1 else SEVERAL
+
+    @property
+    def sample_bytes(self) -> int:
+        """Of one sample in SAMPLES."""
+        return REPORTED * len(self.outputs) + 4 * self.n_encoder + 2 * self.n_adc
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,9 +188,9 @@ class Reboot:
 Message = Hello | Samples | Event | Answer | OtherVersion | Reboot
 
 
-def frame(kind: Type, boot: int, seq: int, body: bytes = b"") -> bytes:
+def frame(kind: Type, boot: int, seq: int, body: bytes = b"", version: int = ONE) -> bytes:
     """A frame to the node. It begins with a delimiter, which ends whatever was cut short."""
-    payload = _HEAD.pack(VERSION, kind, boot, seq) + body
+    payload = _HEAD.pack(version, kind, boot, seq) + body
     stuffed: bytes = cobs.encode(payload + _CRC.pack(zlib.crc32(payload)))
     return b"\0" + stuffed + b"\0"
 
@@ -200,16 +206,17 @@ def configure_body(
     max_jump: int,
     centre: int,
 ) -> bytes:
-    """Of CONFIGURE; all in counts, a step and a jump a sample."""
+    """Of CONFIGURE, for one output; all in counts, a step and a jump a sample. Those of several
+    outputs follow each other."""
     return _CONFIGURE.pack(
         encoder, 0, adc_mask, kp_q16, max_output, max_step, max_angle, max_jump, centre
     )
 
 
-def stream_body(first: int, u: Sequence[int], theta_ref: Sequence[int]) -> bytes:
-    """Of STREAM; counts, at most MAX_STREAM of them."""
+def stream_body(first: int, u: Sequence[int], theta_ref: Sequence[int], outputs: int = 1) -> bytes:
+    """Of STREAM; counts, at most MAX_STREAM of them: of each sample those of all outputs."""
     pairs = b"".join(struct.pack("<hi", a, b) for a, b in zip(u, theta_ref, strict=True))
-    return struct.pack("<IB", first % WORD, len(u)) + pairs
+    return struct.pack("<IB", first % WORD, len(u) // outputs) + pairs
 
 
 @dataclass(slots=True)
@@ -228,6 +235,7 @@ class Decoder:
     received: int = 0
     _boot: int | None = None
     _next: int = 0
+    _version: int = ONE
     _layout: int = 0
     _rx: bytearray = field(default_factory=bytearray)
 
@@ -251,20 +259,20 @@ class Decoder:
             self.corrupt += 1
             return None
         version, kind, boot, seq = _HEAD.unpack_from(payload)
-        if version != VERSION:
+        if version not in (ONE, SEVERAL) or (self._boot is not None and version != self._version):
             return OtherVersion(version)
         body = payload[_HEAD.size : -_CRC.size]
         if self._boot is not None and boot != self._boot:
             return Reboot(boot)
-        message = self._parse(kind, boot, body)
+        message = self._parse(version, kind, boot, body)
         if message is None:
             self.corrupt += 1
             return None
         if self._boot is None:
             if not isinstance(message, Hello):
                 return None  # Nothing before HELLO can be read.
-            self._boot, self._next = boot, seq
-            self._layout = 9 + 4 * message.n_encoder + 2 * message.n_adc
+            self._boot, self._next, self._version = boot, seq, version
+            self._layout = message.sample_bytes
         ahead = (seq - self._next) % WORD
         if ahead >= HALF:
             self.stale += 1
@@ -287,14 +295,10 @@ class Decoder:
         crc: int = _CRC.unpack_from(payload, len(payload) - _CRC.size)[0]
         return bytes(payload) if crc == zlib.crc32(payload[: -_CRC.size]) else None
 
-    def _parse(self, kind: int, boot: int, body: bytes) -> Message | None:
+    def _parse(self, version: int, kind: int, boot: int, body: bytes) -> Message | None:
         n = len(body)
-        if kind == Type.HELLO and n == _HELLO.size and body[9] <= max(State):
-            x = _HELLO.unpack(body)
-            text = [t.rstrip(b"\0").decode("ascii", "replace") for t in x[14:]]
-            numbers = dict(zip(_HELLO_NUMBERS, x[:14], strict=True))
-            state = State(numbers.pop("state"))
-            return Hello(boot=boot, state=state, firmware=text[0], serial=text[1], **numbers)
+        if kind == Type.HELLO:
+            return _hello(version, boot, body)
         if kind == Type.SAMPLES and n > _SAMPLES.size:
             head = _SAMPLES.unpack_from(body)
             if head[2] and (not self._layout or n == _SAMPLES.size + head[2] * self._layout):
@@ -306,3 +310,34 @@ class Decoder:
         if kind == Type.ANSWER and n == _EVENT.size:
             return Answer(*_EVENT.unpack(body))
         return None
+
+
+def _hello(version: int, boot: int, body: bytes) -> Hello | None:
+    """In version 2 the outputs beside the first follow, after the number of all; else None."""
+    more = body[_HELLO.size :]
+    if len(body) < _HELLO.size or body[9] > max(State):
+        return None
+    if (version == SEVERAL) != (len(more) > 0):
+        return None
+    if more and (more[0] < 2 or len(more) != 1 + _OUTPUT.size * (more[0] - 1)):
+        return None
+    x = _HELLO.unpack_from(body)
+    period, deadman, n_encoder, n_adc, batch, state = x[:6]
+    low, high, null, most, step, queue, jump, host_seq = x[6:14]
+    firmware, serial = (t.rstrip(b"\0").decode("ascii", "replace") for t in x[14:])
+    own = Limits(low, high, null, most, step, jump)
+    outputs = own, *(Limits(*o) for o in _OUTPUT.iter_unpack(more[1:]))
+    return Hello(
+        boot,
+        period,
+        deadman,
+        n_encoder,
+        n_adc,
+        batch,
+        State(state),
+        queue,
+        host_seq,
+        firmware,
+        serial,
+        outputs,
+    )

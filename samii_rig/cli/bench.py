@@ -176,6 +176,9 @@ def calibrate(
         list[float] | None,
         typer.Option(help="The true value, once for the offset, twice for gain and offset."),
     ] = None,
+    actuator: Annotated[
+        str, typer.Option(help="Whose null is sought [default: the first of the rig file].")
+    ] = "",
     seconds: Annotated[float, typer.Option(help="Of each measurement.", min=0.1, max=60.0)] = 2.0,
     yes: Annotated[
         bool, typer.Option("--yes", help="Do not ask; the rig is as it is said.")
@@ -209,7 +212,7 @@ def calibrate(
 
     the_rig, text = load_rig(rig)
     if sensor == "null":
-        new_text, said = _null(the_rig, text, rig, seconds, out)
+        new_text, said = _null(the_rig, text, rig, seconds, out, actuator)
     else:
         known = reads or [0.0]
         if len(known) > 2:
@@ -238,21 +241,28 @@ def calibrate(
     typer.echo(f"written    {to}")
 
 
-def _null(rig: Rig, text: str, where: str, seconds: float, out: Path) -> tuple[str, str]:
+def _null(
+    rig: Rig, text: str, where: str, seconds: float, out: Path, actuator: str
+) -> tuple[str, str]:
     from samii_rig.errors import DeviceError, InputError
     from samii_rig.record.reader import read_recording
     from samii_rig.run import calibrate as c
     from samii_rig.run.session import still
-    from samii_rig.safety.limits import gate_limits
+    from samii_rig.safety.limits import find_actuator, gate_limits
 
-    if rig.centring is None:
+    spec = find_actuator(rig, actuator or rig.actuator[0].name, "calibrate")
+    name, loop = spec.name, rig.centring_of(spec.name)
+    if loop is None:
         raise InputError(rig.name, "centring", None, "a sensor that shows the joint standing still")
-    sensor, name = rig.centring.sensor, rig.actuator[0].name
-    turning = gate_limits(rig, name, rig.centring.kp, sensor).turning
+    sensor = loop.sensor
+    beside = tuple(a.name for a in rig.actuator if a.name != name)
+    turning = gate_limits(rig, name, loop.kp, sensor, beside=beside).turning
     if turning == 0.0:
         raise InputError(rig.name, "null", sensor, f"an angle whose speed follows from {name}")
-    per_unit = float(rig.device.settings.get("output_counts_per_unit", 0.0))
-    move = still(rig, text, seconds, out)
+    settings = rig.device.settings
+    own = settings.get("output", {}).get(name)  # its line in a table of several
+    per_unit = float(own["counts_per_unit"] if own else settings.get("output_counts_per_unit", 0.0))
+    move = still(rig, text, seconds, out, name)
     if move.stop.status != "completed":
         raise DeviceError(f"{move.stop.status}: {move.stop.reason}")
     recording = read_recording(move.recording)
@@ -260,15 +270,17 @@ def _null(rig: Rig, text: str, where: str, seconds: float, out: Path) -> tuple[s
     theta = segment.values[:, segment.column(sensor)]
     volts = c.null_volts(theta, rig.rate_hz, turning)
     # What the node holds, where the rig file does not say it.
-    told = recording.metadata.get("device_null_counts", "0")
-    old = int(rig.device.settings.get("null", told))
+    held = recording.metadata.get("device_null_counts", "").split(",")
+    at = [a.name for a in rig.actuator].index(name)
+    told = int(held[at]) if at < len(held) and held[at].strip() else 0
+    old = int((own or settings).get("null", told))
     new = old + round(volts * per_unit)
-    unit = rig.actuator[0].unit
+    whose = "the joint stands" if len(rig.actuator) == 1 else f"the joint of {name} stands"
     said = (
-        f"the joint stands still at {volts:.4g} {unit}; null {old} -> {new} counts\n"
+        f"{whose} still at {volts:.4g} {spec.unit}; null {old} -> {new} counts\n"
         "the node holds its null itself: store it there too, or it is refused as another one's"
     )
-    return c.rewritten_null(text, where, new), said
+    return c.rewritten_null(text, where, new, name if own else ""), said
 
 
 def clear_fault(

@@ -51,6 +51,13 @@ def run(
             help="Seed of the simulated rig's noise [default: drawn, and recorded]", min=0
         ),
     ] = None,
+    pose: Annotated[
+        str | None,
+        typer.Option(
+            help='The pose the rig stands in, from the way down, such as "30 deg"; recorded '
+            "[default: the rig file's]"
+        ),
+    ] = None,
     operator: Annotated[str, typer.Option(help="Who stands at the rig; recorded.")] = "",
     heartbeat: Annotated[
         float | None,
@@ -97,18 +104,21 @@ def run(
         diagnosis=not no_diagnosis,
         json=json,
     )
-    raise typer.Exit(_ordered(experiment, rig, said, dry_run=dry_run))
+    raise typer.Exit(_ordered(experiment, rig, said, pose, dry_run=dry_run))
 
 
-def _ordered(experiment: str, rig: str, said: Said, *, dry_run: bool) -> int:
+def _ordered(experiment: str, rig: str, said: Said, pose: str | None, *, dry_run: bool) -> int:
     """Predict, and unless that is all, carry out; the exit code."""
     from samii_rig.files import make_folder
     from samii_rig.report.summary import working
     from samii_rig.rig.load import load_rig
+    from samii_rig.rig.pose import posed, posed_text
     from samii_rig.run.experiments import recording_stem
     from samii_rig.run.order import Order, refuse
 
     the_rig, rig_text = load_rig(rig)
+    if pose is not None:
+        the_rig, rig_text = posed(the_rig, pose), posed_text(rig_text, pose)
     order = Order.named(experiment, the_rig, rig_text)
     planned = order.runs()
     with working(said.console, "predicting the run", quiet=said.json):

@@ -2,35 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 from samii_rig.errors import InputError
 from samii_rig.rig.load import parse
+from samii_rig.rig.pose import at_pose as at_pose
+from samii_rig.rig.pose import posed
+from samii_rig.rig.pose import read_pose as read_pose
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
 from samii_rig.types import Recording
-from samii_rig.units import convert
 
 HANGING = Angle(value=0.0, unit="rad")
-_WRITTEN = re.compile(r"\s*([-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(\S+)\s*")
-
-
-def read_pose(text: str) -> Angle:
-    """A pose as people write it, "30 deg" or "0.5rad"; InputError for anything else."""
-    found = _WRITTEN.fullmatch(text)
-    try:
-        value = convert(float(found[1]), found[2], "rad") if found else None
-    except ValueError:  # "1.2.3"
-        value = None
-    if value is None or not found:
-        raise InputError("--pose", "", text, 'an angle with its unit, for example "30 deg"')
-    return Angle(value=value, unit="rad", written="" if found[2] == "rad" else found[2])
-
-
-def at_pose(rig: Rig, pose: Angle | None) -> Rig:
-    """The rig in another pose; one without gravity has none."""
-    return rig.model_copy(update={"pose": pose}) if rig.gravity else rig
 
 
 def by_pose(
@@ -50,9 +33,8 @@ def poses_of(recordings: Sequence[Recording], rig: Rig, given: Sequence[str]) ->
     Raises InputError for another number of poses than of recordings, for one that is no angle, and
     for poses of a rig without gravity.
     """
-    if given and rig.gravity == 0:
-        expected = f"none, as {rig.name} has no gravity: expected gravity = 9.81 in the rig file"
-        raise InputError("--pose", "", given[0], expected)
+    if given:
+        posed(rig, given[0])
     if given and len(given) != len(recordings):
         expected = f"one --pose for each of {len(recordings)} recordings, in their order"
         raise InputError("--pose", "", f"{len(given)} poses", expected)

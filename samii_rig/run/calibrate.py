@@ -68,12 +68,8 @@ def rewritten(text: str, where: str, sensor: str, new: Wiring) -> str:
 
     InputError if the input does not stand on one line `NAME = { ... }`.
     """
-    row = re.compile(rf"^({re.escape(sensor)}\s*=\s*\{{)(.*)(\}}[^}}]*)$", re.MULTILINE)
-    found = [m for m in row.finditer(text) if "counts_per_unit" in m[2]]
-    if len(found) != 1:
-        expected = f"one line {sensor} = {{ index = ..., counts_per_unit = ... }}"
-        raise InputError(where, f"device.settings, {sensor}", len(found), expected)
-    inside = found[0][2]
+    found = _row(text, where, sensor)
+    inside = found[2]
     inside = re.sub(
         r"counts_per_unit\s*=\s*[^,}]+?(\s*)(,|$)",
         lambda m: f"counts_per_unit = {new.counts_per_unit!r}{m[1]}{m[2]}",
@@ -83,11 +79,30 @@ def rewritten(text: str, where: str, sensor: str, new: Wiring) -> str:
         inside = re.sub(r"offset\s*=\s*[-\d_]+", f"offset = {new.offset}", inside)
     else:
         inside = f"{inside.rstrip()}, offset = {new.offset} "
-    return _checked(text[: found[0].start(2)] + inside + text[found[0].end(2) :], where)
+    return _checked(text[: found.start(2)] + inside + text[found.end(2) :], where)
 
 
-def rewritten_null(text: str, where: str, null: int) -> str:
-    """The rig file's text with `null` of [device.settings] replaced or added."""
+def _row(text: str, where: str, name: str) -> re.Match[str]:
+    """The one line `NAME = { ... }` of an input or an output; its inside is group 2."""
+    row = re.compile(rf"^({re.escape(name)}\s*=\s*\{{)(.*)(\}}[^}}]*)$", re.MULTILINE)
+    found = [m for m in row.finditer(text) if "counts_per_unit" in m[2]]
+    if len(found) != 1:
+        expected = f"one line {name} = {{ index = ..., counts_per_unit = ... }}"
+        raise InputError(where, f"device.settings, {name}", len(found), expected)
+    return found[0]
+
+
+def rewritten_null(text: str, where: str, null: int, actuator: str = "") -> str:
+    """The rig file's text with `null` of [device.settings] replaced or added; of an `actuator` with
+    a line of its own in the table of outputs, there.
+
+    InputError if there is no such table, or no such line.
+    """
+    if actuator:
+        found = _row(text, where, actuator)
+        inside, n = re.subn(r"\bnull\s*=\s*-?\d+", f"null = {null}", found[2])
+        inside = inside if n else f"{inside.rstrip()}, null = {null} "
+        return _checked(text[: found.start(2)] + inside + text[found.end(2) :], where)
     head = "[device.settings]"
     if text.count(head) != 1:
         raise InputError(where, head, text.count(head), "one such table to hold null")

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from samii_rig.devices.channels import centring_name
 from samii_rig.devices.protocols import CommandBlock, OpenRig, Reports
 from samii_rig.errors import DeviceError, GateError, SamiiRigError
 from samii_rig.rig.schema import Rig
@@ -44,17 +45,30 @@ def own_protections(rig: Rig, ask: Callable[[str], None]) -> Iterator[Check]:
 
 
 def _output(rig: Rig, block: SampleBlock) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) output, and (n,) whether the device itself holds it where it was not asked to be."""
-    i = [c.name for c in block.channels].index(rig.actuator[0].name)
-    return block.values[:, i], (block.quality[:, i] & Quality.LIMITED) != 0
+    """(n,) the output that is furthest from null, and (n,) whether the device itself holds all of
+    them where they were not asked to be."""
+    names = [c.name for c in block.channels]
+    at = [names.index(a.name) for a in rig.actuator]
+    return (
+        np.abs(block.values[:, at]).max(axis=1),
+        ((block.quality[:, at] & Quality.LIMITED) != 0).all(axis=1),
+    )
 
 
 def _armed(rig: Rig, device: OpenRig) -> tuple[Gate, int]:
-    """A gate that is armed with the loop open, and the newest sample's number; GateError, or the
+    """A gate that is armed with all loops open, and the newest sample's number; GateError, or the
     device's DeviceError, if it is refused."""
-    name = rig.actuator[0].name
-    sensor = rig.centring.sensor if rig.centring else rig.sensor[0].name
-    limits = gate_limits(rig, name, 0.0, sensor)
+    names = [a.name for a in rig.actuator]
+    limits = tuple(
+        gate_limits(
+            rig,
+            name,
+            0.0,
+            centring_name(rig, name),
+            beside=tuple(other for other in names if other != name),
+        )
+        for name in names
+    )
     gate = Gate(device.actuator, limits, device.sensor.channels, lambda _: None)
     block = listen(device, LOOK)
     gate.observe(block, device.clock.now())
@@ -72,7 +86,8 @@ def _deadman(rig: Rig, device: OpenRig) -> Check:
         gate.start(device.clock.now())
         first = newest + 1 + math.ceil(AHEAD * rig.rate_hz)
         rest = np.zeros(math.floor((MAX_AHEAD - 2 * AHEAD) * rig.rate_hz))
-        gate.write(CommandBlock(first, rest, rest), device.clock.now())
+        blocks = tuple(CommandBlock(first, rest, rest) for _ in rig.actuator)
+        gate.write(blocks, device.clock.now())
     except GateError as error:
         return Check.failed(what, error)
     block = listen(device, deadman + MAX_AHEAD + LATER + FLIGHT)

@@ -152,11 +152,12 @@ def pulse(rig: Rig, rig_toml: str, folder: Path, actuator: str) -> Move:
         return _moved(rig, rig_toml, device, u, 0.0 * u, Output(actuator, 0.0, loop.sensor), folder)
 
 
-def still(rig: Rig, rig_toml: str, seconds: float, folder: Path) -> Move:
-    """The output live at zero with the loop open: what moves now, the valve's null moves."""
-    assert rig.centring is not None
+def still(rig: Rig, rig_toml: str, seconds: float, folder: Path, actuator: str) -> Move:
+    """An output live at zero with its loop open: what moves now, its valve's null moves."""
+    loop = rig.centring_of(actuator)
+    assert loop is not None
     u = np.zeros(round(seconds * rig.rate_hz))
-    output = Output(rig.actuator[0].name, 0.0, rig.centring.sensor)
+    output = Output(actuator, 0.0, loop.sensor)
     with opened(rig) as device:
         return _moved(rig, rig_toml, device, u, u, output, folder)
 

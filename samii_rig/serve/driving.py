@@ -28,10 +28,12 @@ class Body(BaseModel):
 
 
 class Asked(Body):
-    """An experiment: the name of a shipped one, or the text of a file."""
+    """An experiment: the name of a shipped one, or the text of a file. pose : that the rig stands
+    in, such as "30 deg"; without it that of the rig file."""
 
     experiment: Annotated[str, Field(max_length=80)] = ""
     experiment_toml: Annotated[str, Field(max_length=min(MAX_BYTES, 48_000))] = ""
+    pose: Annotated[str, Field(max_length=40)] = ""
 
 
 class Start(Asked):
@@ -87,9 +89,19 @@ def _describe(router: APIRouter, rooms: Rooms) -> None:
 
 async def _predicted(rooms: Rooms, request: Request, asked: Asked) -> Answer:
     """The dry run; in a process beside, as an experiment's module may take seconds to load."""
-    given = (rooms.settings.rig_toml, asked.experiment, asked.experiment_toml)
+    given = (rooms.settings.rig_toml, asked.experiment, asked.experiment_toml, asked.pose)
     by = counted(request)
     return await rooms.desk.do(questions.dry_run, *given, by=by, kept=by == DRIVES)
+
+
+async def _posed(rooms: Rooms, request: Request, pose: str) -> str:
+    """The rig file's text in a pose; as it is without one."""
+    if not pose:
+        return rooms.settings.rig_toml
+    by = counted(request)
+    given = (rooms.settings.rig_toml, pose)
+    found = await rooms.desk.do(questions.in_pose, *given, by=by, kept=by == DRIVES)
+    return str(found["text"])
 
 
 def _drive(router: APIRouter, rooms: Rooms) -> None:
@@ -100,6 +112,7 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
         if not rooms.supervisor.simulated:
             rooms.latch.refuse()
         planned = await _predicted(rooms, request, asked)
+        rig_toml = await _posed(rooms, request, asked.pose)
         if planned["refused"]:
             raise LimitError(planned["refused"])
         # The lease may have gone to another while it was predicted.
@@ -112,6 +125,7 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
             diagnosis=asked.diagnosis,
             seed=asked.seed,
             stop_when_certain=asked.stop_when_certain,
+            rig_toml=rig_toml,
         )
         return {"jobs": [rooms.supervisor.plain(j) for j in jobs]}
 

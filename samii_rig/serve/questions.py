@@ -48,10 +48,18 @@ def rig(rig_toml: str) -> dict[str, Any]:
     return {"rig": found, "drawing": draw(the_rig), "motion": moving, "text": rig_toml}
 
 
-def dry_run(rig_toml: str, name: str, text: str) -> dict[str, Any]:
+def in_pose(rig_toml: str, pose: str) -> dict[str, Any]:
+    """The text of the rig file in a pose, such as "30 deg"."""
+    from samii_rig.rig.pose import posed_text
+
+    return {"text": posed_text(rig_toml, pose, "pose")}
+
+
+def dry_run(rig_toml: str, name: str, text: str, pose: str = "") -> dict[str, Any]:
     """What an experiment would do: margins, expected errors, one prediction for each run.
 
     name : of a shipped experiment, or `text` : of its file. No path from a client is ever opened.
+    pose : that the rig stands in, "" for that of its file.
     refused : the line of what limit would be broken, "" if none. text : of the experiment.
     """
     from samii_rig.errors import InputError, LimitError, one_of
@@ -61,6 +69,8 @@ def dry_run(rig_toml: str, name: str, text: str) -> dict[str, Any]:
     from samii_rig.run.order import Order
     from samii_rig.serve.words import prediction
 
+    if pose:
+        rig_toml = str(in_pose(rig_toml, pose)["text"])
     the_rig = parse(Rig, rig_toml, "rig file")
     if bool(name) == bool(text):
         raise InputError("experiment", "", name, "a name or a text, one of the two")

@@ -73,11 +73,13 @@ class Supervisor:
         diagnosis: bool,
         seed: int | None,
         stop_when_certain: bool = False,
+        rig_toml: str = "",
     ) -> list[Job]:
         """Queue the runs of an experiment, one job each; InputError if that cannot be,
         GateError while the queue is held.
 
-        predicted : of each run its `setup`, `instruction` and `duration_s`.
+        predicted : of each run its `setup`, `instruction` and `duration_s`. rig_toml : the rig file
+        in the pose of these runs, "" as it is.
         """
         simulated = self.simulated
         waiting = self.queue()
@@ -111,7 +113,8 @@ class Supervisor:
                 stop_when_certain=stop_when_certain,
                 settings={**settings, **with_seed},
             )
-            made.append(Job.make(self._jobs, request, self._rig_toml, experiment_toml))
+            own_toml = rig_toml or self._rig_toml
+            made.append(Job.make(self._jobs, request, own_toml, experiment_toml))
             self._open.append(made[-1])
         # Who starts anew, with nothing left to wait for, has looked.
         self.held = ""

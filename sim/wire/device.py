@@ -21,7 +21,7 @@ from pydantic import Field
 from samii_rig.devices.opening import open_device
 from samii_rig.devices.protocols import OpenRig
 from samii_rig.diagnose.fit.rigfile import toml
-from samii_rig.errors import DeviceError, InputError
+from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Device, Rig, Strict
 from samii_rig.rig.settings import checked
 from sim.wire.faults import script
@@ -62,10 +62,8 @@ class Wired(OpenRig):
 
 
 def check_rig(rig: Rig, settings: Mapping[str, object]) -> None:
-    """InputError for a wrong setting, an unknown fault, or a rig with several outputs."""
+    """InputError for a wrong setting, an unknown fault, or more outputs than a node has."""
     chosen = checked(NodeSettings, rig, {**rig.device.settings, **settings})
-    if len(rig.actuator) != 1:
-        raise InputError(rig.name, "actuator", len(rig.actuator), "one; the node has one output")
     driver = Device(driver="serial_node", settings=chosen.node) if chosen.node else Device()
     script(rig, board(rig.model_copy(update={"device": driver})), chosen.faults)
 

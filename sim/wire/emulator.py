@@ -20,23 +20,24 @@ import socket
 import struct
 import subprocess
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import NamedTuple
 
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.run.priority import prioritised
-from sim.wire.protocol import WORD, NodeConfig
+from sim.wire.protocol import MAX_OUTPUTS, WORD, NodeConfig, OutputConfig
 
 QEMU = "qemu-system-arm"
 MACHINE = "netduinoplus2"  # the one board with an STM32F405 in QEMU 7.2
 WITHIN = 20.0  # s until an image that says nothing hangs; a sample takes 0.2 ms
 SILENT = 0.05  # s in which one that was made to hang says nothing
 N_ENCODER, N_ADC = 4, 8  # of node.h
-TOLD = struct.Struct("<IHBBBxhhhHHi16s16sIHxx")  # node_config, first sample, boot
+# node_config, first sample, boot
+TOLD = struct.Struct(f"<IHBBBBxx{'hhhHHxxi' * MAX_OUTPUTS}16s16sIHxx")
 INPUTS = struct.Struct(f"<II{N_ENCODER}i{N_ADC}hBBxx")
-OUTPUTS = struct.Struct("<IIhHBBxx")
+OUTPUTS = struct.Struct(f"<II{MAX_OUTPUTS}hHBBxx")
 READ = 1 << 16  # bytes
 # What the image is told to do to itself: board_qemu.c.
 WRONG = {"reset": 1, "hang": 2, "fault": 3, "supply": 4, "stack": 5}
@@ -49,13 +50,13 @@ KEY_START, KEY_FEED = 0xCCCC, 0xAAAA
 class Outputs(NamedTuple):
     """What the board says at the end of a sample.
 
-    went : bytes that it has sent since its start. handler : whether its handler of what is wrong
-    says it, after which it runs no samples.
+    went : bytes that it has sent since its start. counts : of each output. handler : whether its
+    handler of what is wrong says it, after which it runs no samples.
     """
 
     went: int
     samples: int
-    counts: int
+    counts: tuple[int, ...]
     boot: int
     supply: int
     handler: int
@@ -145,6 +146,7 @@ class Emulator:
             )
         self.wire, self._control = (self._accepted(s) for s in listening)
         self.watchdog = Watchdog()
+        self._outputs = 1  # of the node that it is told to be
         self._line = b""
         self.sent = self.came = 0
         self._arrived = b""
@@ -177,9 +179,11 @@ class Emulator:
         while select.select([self.wire], [], [], 0.0)[0]:
             self.wire.recv(READ)  # of the boot before
         self._arrived = b""
-        numbers = c.period_ns, c.deadman_ms, c.n_encoder, c.n_adc, c.batch, c.dac_low, c.dac_high
-        more = c.null, c.max_output, c.max_step, c.max_jump, c.firmware, c.serial
-        os.write(self._to, TOLD.pack(*numbers, *more, sample, boot))
+        self._outputs = len(c.outputs)
+        numbers = c.period_ns, c.deadman_ms, self._outputs, c.n_encoder, c.n_adc, c.batch
+        more = (*c.outputs, *(OutputConfig(),) * (MAX_OUTPUTS - self._outputs))
+        limits = [x for o in more for x in astuple(o)]
+        os.write(self._to, TOLD.pack(*numbers, *limits, c.firmware, c.serial, sample, boot))
         self.booted = True
 
     def reset(self) -> None:
@@ -230,7 +234,11 @@ class Emulator:
             self._arrived += data
             if not data and self._from not in ready:
                 return None
-        said = Outputs(*OUTPUTS.unpack(os.read(self._from, OUTPUTS.size)))
+        went, samples, *counts, boot, supply, handler = OUTPUTS.unpack(
+            os.read(self._from, OUTPUTS.size)
+        )
+        put = tuple(counts[: self._outputs])
+        said = Outputs(went, samples, put, boot, supply, handler)
         self._listen()
         return said
 

@@ -41,7 +41,8 @@ def _rail(rig: Rig, board: Board, f: Fault) -> str:
 
 
 def _stray(rig: Rig, board: Board, _f: Fault) -> str:
-    return f"stray {round(STRAY * rig.actuator[0].high * board.output_counts_per_unit)}"
+    spec = rig.actuator[0]
+    return f"stray {round(STRAY * spec.high * board.output[spec.name].counts_per_unit)}"
 
 
 def _always(command: str) -> Callable[[Rig, Board, Fault], str]:

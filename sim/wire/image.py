@@ -28,11 +28,12 @@ class ImageNode(Node):
         super().__init__(config, boot, sample)
         self._wrong = ""  # what the image is told to do at the next sample
         self._ended, self._silent = False, 0  # it runs no samples any more, for so many
-        self._held, self._on = config.null, False
+        nulls = tuple(o.null for o in config.outputs)
+        self._held, self._on = nulls, False
         self._out = bytearray()
         self._emulator.boot(config, told, sample)
         said = self._emulator.outputs(WITHIN)
-        if said is None or said != (0, 0, config.null, boot, 0, 0):
+        if said is None or said != (0, 0, nulls, boot, 0, 0):
             raise DeviceError(f"the image does not start at null: {said}")
 
     def wrong(self, what: str) -> None:
@@ -58,8 +59,8 @@ class ImageNode(Node):
 
     def take(
         self, clock_us: int, encoders: tuple[int, ...], adcs: tuple[int, ...], emergency: bool
-    ) -> int:
-        """One sample; the counts to put out."""
+    ) -> tuple[int, ...]:
+        """One sample; the counts to put out of each output."""
         if self._ended:
             return self._no_sample()
         wrong, self._wrong = self._wrong, ""
@@ -88,8 +89,8 @@ class ImageNode(Node):
         self._out += data
         return self._held
 
-    def _no_sample(self) -> int:
-        """The converter holds what it held, until the watchdog resets the chip."""
+    def _no_sample(self) -> tuple[int, ...]:
+        """The converters hold what they held, until the watchdog resets the chip."""
         self._silent += 1
         dog = self._emulator.watchdog
         if dog.started and self._silent * self.config.period_ns * 1e-9 >= dog.seconds:

@@ -19,11 +19,11 @@ from sim.wire.protocol import (
     QUEUE,
     RAILS,
     TX,
-    VERSION,
     WORD,
     Code,
     Flag,
     NodeConfig,
+    OutputConfig,
     Reason,
     State,
     Type,
@@ -32,7 +32,7 @@ from sim.wire.protocol import (
 
 @dataclass(slots=True)
 class Loop:
-    """What CONFIGURE sets."""
+    """What CONFIGURE sets for one output, and what that output did last."""
 
     encoder: int = 0
     adc_mask: int = 0
@@ -42,6 +42,8 @@ class Loop:
     max_angle: int = 0
     max_jump: int = 0
     centre: int = 0
+    theta_ref: int = 0
+    v: int = 0
 
 
 @dataclass(slots=True)
@@ -49,8 +51,9 @@ class Node:
     """One node since its boot number `boot`.
 
     sample : number of the next sample. state, rejected, host_seq : as the protocol has them.
-    fed : sample at which the deadman was fed last. stray : counts by which the converter is
-    off what it was told, relay : whether the supply line works: defects that a test can have.
+    loops : one for each output. fed : sample at which the deadman was fed last. stray : counts by
+    which an output's converter is off what it was told, relay : whether the supply line works:
+    defects that a test can have.
     """
 
     config: NodeConfig
@@ -61,14 +64,12 @@ class Node:
     rejected: int = 0
     seq: int = 0
     host_seq: int = 0
-    loop: Loop = field(default_factory=Loop)
-    queue: dict[int, tuple[int, int]] = field(default_factory=dict)
+    loops: list[Loop] = field(default_factory=list)
+    queue: dict[int, tuple[int, ...]] = field(default_factory=dict)
     age: int = 0
     fed: int = 0
-    v: int = 0
-    stray: int = 0
+    stray: dict[int, int] = field(default_factory=dict)
     relay: bool = True
-    theta_ref: int = 0
     encoders: tuple[int, ...] | None = None
     emergency: bool = False
     adc_out: bool = False
@@ -78,7 +79,13 @@ class Node:
     tx: bytearray = field(default_factory=bytearray)
 
     def __post_init__(self) -> None:
+        self.loops = [Loop() for _ in self.config.outputs]
         self._hello()
+
+    @property
+    def v(self) -> tuple[int, ...]:
+        """Counts of each output less its null."""
+        return tuple(loop.v for loop in self.loops)
 
     # Bytes
 
@@ -100,7 +107,7 @@ class Node:
         return out
 
     def _send(self, kind: Type, body: bytes) -> None:
-        payload = struct.pack("<BBHI", VERSION, kind, self.boot, self.seq) + body
+        payload = struct.pack("<BBHI", self.config.version, kind, self.boot, self.seq) + body
         self.seq = (self.seq + 1) % WORD
         payload += struct.pack("<I", zlib.crc32(payload))
         n = len(payload)
@@ -120,19 +127,19 @@ class Node:
         if not 12 <= len(p) <= MAX_PAYLOAD or p[-4:] != struct.pack("<I", zlib.crc32(p[:-4])):
             return False
         version, kind, boot, seq = struct.unpack_from("<BBHI", p)
-        body = p[8:-4]
+        body, k = p[8:-4], len(self.loops)
         if kind == Type.IDENTIFY and not body:
             self._hello()
             return True
         fits = (
             not body
             if kind in (Type.ZERO, Type.CLEAR)
-            else len(body) == 24
+            else len(body) == 24 * k
             if kind == Type.CONFIGURE
-            else kind == Type.STREAM and len(body) > 5 and len(body) == 5 + 6 * body[4]
+            else kind == Type.STREAM and len(body) > 5 and len(body) == 5 + 6 * k * body[4]
         )
         newer = 0 < (seq - self.host_seq) % WORD < HALF
-        if not (version == VERSION and fits and boot == self.boot and newer):
+        if not (version == self.config.version and fits and boot == self.boot and newer):
             return False
         self.host_seq = seq
         code = self._act(Type(kind), body)
@@ -175,30 +182,38 @@ class Node:
             c.firmware,
             c.serial,
         )
+        if c.beside:
+            body += struct.pack("<B", len(c.outputs))
+        for o in c.beside:
+            numbers = o.dac_low, o.dac_high, o.null, o.max_output, o.max_step, o.max_jump
+            body += struct.pack("<hhhHHi", *numbers)
         self._send(Type.HELLO, body)
 
     # Requests
 
     def _configure(self, body: bytes) -> Code:
-        encoder, zero, mask, kp, most, step, angle, jump, centre = struct.unpack("<BBHiHHiii", body)
         if self.live:
             return Code.NOT_NULL
         if self.state == State.TRIPPED:
             return Code.STATE
-        c = self.config
-        good = (
-            encoder < c.n_encoder
-            and zero == 0
-            and mask < 1 << c.n_adc
-            and most <= c.max_output
-            and step <= c.max_step
-            and angle >= 0
-            and 0 <= jump <= c.max_jump
-        )
-        if not good:
-            return Code.LIMIT
-        self.loop = Loop(encoder, mask, kp, most, step, angle, jump, centre)
-        self.theta_ref = centre
+        asked = []
+        for o, numbers in zip(
+            self.config.outputs, struct.iter_unpack("<BBHiHHiii", body), strict=True
+        ):
+            encoder, zero, mask, kp, most, step, angle, jump, centre = numbers
+            good = (
+                encoder < self.config.n_encoder
+                and zero == 0
+                and mask < 1 << self.config.n_adc
+                and most <= o.max_output
+                and step <= o.max_step
+                and angle >= 0
+                and 0 <= jump <= o.max_jump
+            )
+            if not good:
+                return Code.LIMIT
+            asked.append(Loop(encoder, mask, kp, most, step, angle, jump, centre, centre))
+        self.loops = asked
         self.configured = True
         self._to_null(State.IDLE, Reason.CONFIGURED)
         return Code.OK
@@ -213,10 +228,11 @@ class Node:
         if last >= QUEUE:
             return Code.QUEUE
         code = Code.OK
-        for i, pair in enumerate(struct.iter_unpack("<hi", body[5:])):
+        layout = f"<{'hi' * len(self.loops)}"
+        for i, pairs in enumerate(struct.iter_unpack(layout, body[5:])):
             number = (first + i) % WORD
             if (number - self.sample) % WORD < QUEUE:
-                self.queue[number] = pair
+                self.queue[number] = pairs
             else:
                 code = Code.LATE
         self.age, self.fed = 0, self.sample
@@ -226,7 +242,7 @@ class Node:
 
     @property
     def live(self) -> bool:
-        """Whether the output follows the loop."""
+        """Whether the outputs follow their loops."""
         return self.state in (State.LIVE, State.DRY)
 
     @property
@@ -236,74 +252,85 @@ class Node:
 
     def take(
         self, clock_us: int, encoders: tuple[int, ...], adcs: tuple[int, ...], emergency: bool
-    ) -> int:
-        """One sample; the counts to put out."""
-        flags, reason = self._judge(encoders, adcs)
+    ) -> tuple[int, ...]:
+        """One sample; the counts to put out of each output."""
+        common, own, reason = self._judge(encoders, adcs)
         self.emergency = emergency
         if emergency:
-            flags |= Flag.EMERGENCY
+            common |= Flag.EMERGENCY
             self._to_null(State.TRIPPED, Reason.EMERGENCY)
         if self.live or self.queue:
             self.age += 1
             if self.age >= self.config.deadman_ms * 1_000_000 // self.config.period_ns:
                 self._to_null(State.DEAD, Reason.DEADMAN)
-        u = 0
+        u = [0] * len(self.loops)
         if self.sample in self.queue:
-            u, self.theta_ref = self.queue.pop(self.sample)
-            flags |= Flag.REFERENCE
+            pairs = self.queue.pop(self.sample)
+            u = list(pairs[::2])
+            for loop, ref in zip(self.loops, pairs[1::2], strict=True):
+                loop.theta_ref = ref
+            common |= Flag.REFERENCE
             self._change(State.LIVE, Reason.STARTED)
         elif self.state == State.LIVE:
             self._change(State.DRY, Reason.RAN_DRY)
         if self.live and reason:
             self._to_null(State.TRIPPED, reason)
         if self.live:
-            wanted = self._wanted(u, encoders)
-            self.v = self._limited(wanted)
-            flags |= Flag.LIMITED if self.v != wanted else 0
-            flags |= Flag.SUPPLY if self.supply else 0
+            common |= Flag.SUPPLY if self.supply else 0
+            for j, (loop, o) in enumerate(zip(self.loops, self.config.outputs, strict=True)):
+                wanted = self._wanted(loop, u[j], encoders)
+                loop.v = self._limited(loop, o, wanted)
+                own[j] |= Flag.LIMITED if loop.v != wanted else 0
         else:
-            flags |= Flag.NULL | (0 if self.state == State.IDLE else Flag.LIMITED)
-        self._report(clock_us, u, flags, encoders, adcs)
+            common |= Flag.NULL | (0 if self.state == State.IDLE else Flag.LIMITED)
+        held = [v + self.stray.get(j, 0) for j, v in enumerate(self.v)]
+        told = zip(held, u, [loop.theta_ref for loop in self.loops], own, strict=True)
+        rows = [struct.pack("<hhiB", v, x, ref, common | flags) for v, x, ref, flags in told]
+        self._report(clock_us, b"".join(rows), encoders, adcs)
         self.sample = (self.sample + 1) % WORD
-        return self.v + self.stray + self.config.null
+        return tuple(v + o.null for v, o in zip(held, self.config.outputs, strict=True))
 
-    def _wanted(self, u: int, encoders: tuple[int, ...]) -> int:
-        error = self.theta_ref - encoders[self.loop.encoder]
-        return u + ((self.loop.kp_q16 * error + (1 << 15)) >> 16)
+    @staticmethod
+    def _wanted(loop: Loop, u: int, encoders: tuple[int, ...]) -> int:
+        error = loop.theta_ref - encoders[loop.encoder]
+        return u + ((loop.kp_q16 * error + (1 << 15)) >> 16)
 
-    def _limited(self, wanted: int) -> int:
-        c, step, most = self.config, self.loop.max_step, self.loop.max_output
-        v = min(max(wanted, self.v - step), self.v + step)
+    @staticmethod
+    def _limited(loop: Loop, o: OutputConfig, wanted: int) -> int:
+        step, most = loop.max_step, loop.max_output
+        v = min(max(wanted, loop.v - step), loop.v + step)
         v = min(max(v, -most), most)
-        return min(max(v, c.dac_low - c.null), c.dac_high - c.null)
+        return min(max(v, o.dac_low - o.null), o.dac_high - o.null)
 
-    def _judge(self, encoders: tuple[int, ...], adcs: tuple[int, ...]) -> tuple[int, int]:
-        flags, reason = 0, 0
+    def _judge(
+        self, encoders: tuple[int, ...], adcs: tuple[int, ...]
+    ) -> tuple[int, list[int], int]:
+        """Flags of all outputs, flags of each, and a reason to trip: one output's ends all."""
+        common, own, reason = 0, [0] * len(self.loops), 0
         self.adc_out = False
         for i, a in enumerate(adcs):
             if a in RAILS:
-                flags |= Flag.ADC
-                if self.loop.adc_mask >> i & 1:
+                common |= Flag.ADC
+                if any(loop.adc_mask >> i & 1 for loop in self.loops):
                     self.adc_out, reason = True, Reason.ADC
-        if self.configured:
-            theta = encoders[self.loop.encoder]
-            if abs(theta - self.loop.centre) > self.loop.max_angle:
-                flags, reason = flags | Flag.ANGLE, Reason.ANGLE
-            before = theta if self.encoders is None else self.encoders[self.loop.encoder]
-            if abs(theta - before) > self.loop.max_jump:
-                flags, reason = flags | Flag.JUMP, Reason.JUMP
+        for j, loop in enumerate(self.loops if self.configured else ()):
+            theta = encoders[loop.encoder]
+            if abs(theta - loop.centre) > loop.max_angle:
+                own[j], reason = own[j] | Flag.ANGLE, Reason.ANGLE
+            before = theta if self.encoders is None else self.encoders[loop.encoder]
+            if abs(theta - before) > loop.max_jump:
+                own[j], reason = own[j] | Flag.JUMP, Reason.JUMP
         self.encoders = encoders
-        return flags, reason
+        return common, own, reason
 
     def _report(
-        self, clock: int, u: int, flags: int, encoders: tuple[int, ...], adcs: tuple[int, ...]
+        self, clock: int, outputs: bytes, encoders: tuple[int, ...], adcs: tuple[int, ...]
     ) -> None:
         c = self.config
         if not self.batch:
             self.batch_head = self.sample, clock
-        layout = f"<hhiB{c.n_encoder}i{c.n_adc}h"
-        held = self.v + self.stray
-        self.batch.append(struct.pack(layout, held, u, self.theta_ref, flags, *encoders, *adcs))
+        inputs = struct.pack(f"<{c.n_encoder}i{c.n_adc}h", *encoders, *adcs)
+        self.batch.append(outputs + inputs)
         if len(self.batch) == c.batch:
             numbers = len(self.batch), self.state, self.rejected, len(self.queue)
             head = struct.pack("<IIBBHH", *self.batch_head, *numbers)
@@ -314,7 +341,8 @@ class Node:
 
     def _to_null(self, state: State, reason: int) -> None:
         self.queue.clear()
-        self.v = 0
+        for loop in self.loops:
+            loop.v = 0
         if state in (State.DEAD, State.TRIPPED):
             self.configured = False
         self._change(state, reason)

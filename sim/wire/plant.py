@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,14 +13,15 @@ from samii_rig.errors import InputError
 from samii_rig.rig.schema import Rig
 from sim import kernel
 from sim.base import UNRELATED, realised
-from sim.electronics import converters, drive
 from sim.guide import check_guide, tables_of
+from sim.lanes import sense_all
 from sim.settings import SimSettings
-from sim.wire.protocol import RAILS
+from sim.several import plant_of
+from sim.wire.protocol import MAX_OUTPUTS, RAILS
 
 MOST_COUNTS = 32_000  # to which the end of an analogue sensor's range is scaled
 FINE = 1e-5  # rad, a step of an encoder whose rig file states none
-NULL = 37  # counts at which the simulated valve stands still
+NULLS = 37, -12, 20  # counts at which each output's simulated valve stands still
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,14 +34,22 @@ class Wiring:
 
 
 @dataclass(frozen=True, slots=True)
+class Put:
+    """Where an actuator begins on the node: counts = null + value counts_per_unit."""
+
+    index: int
+    counts_per_unit: float
+    null: int
+
+
+@dataclass(frozen=True, slots=True)
 class Board:
-    """The wiring of all sensors and of the output. supply : the valve has one only while the node's
+    """The wiring of all sensors and outputs. supply : the valves have one only while the node's
     supply line is on."""
 
     encoder: dict[str, Wiring]
     adc: dict[str, Wiring]
-    output_counts_per_unit: float
-    null: int = NULL
+    output: dict[str, Put]
     supply: bool = False
 
     @property
@@ -60,9 +70,20 @@ class Board:
             }
             for kind, wired in (("encoder", self.encoder), ("adc", self.adc))
         }
-        out = self.output_counts_per_unit
         more = {"supply": True} if self.supply else {}
-        return {"port": port, "output_counts_per_unit": out, "null": self.null, **tables, **more}
+        return {"port": port, **self._outputs(), **tables, **more}
+
+    def _outputs(self) -> dict[str, object]:
+        """Of one output as it has always been, of several a table."""
+        first, *beside = self.output.values()
+        if not beside and first.index == 0:
+            return {"output_counts_per_unit": first.counts_per_unit, "null": first.null}
+        return {
+            "output": {
+                name: {"index": o.index, "counts_per_unit": o.counts_per_unit, "null": o.null}
+                for name, o in self.output.items()
+            }
+        }
 
 
 def board(rig: Rig) -> Board:
@@ -74,9 +95,7 @@ def board(rig: Rig) -> Board:
                 {str(k): Wiring(**w) for k, w in given.get(kind, {}).items()}
                 for kind in ("encoder", "adc")
             )
-            out = float(given["output_counts_per_unit"])
-            null, supply = int(given.get("null", NULL)), bool(given.get("supply", False))
-            return Board(enc, adc, out, null, supply)
+            return Board(enc, adc, _stated(rig, given), bool(given.get("supply", False)))
         except (KeyError, TypeError, ValueError) as error:
             where = "device.settings"
             raise InputError.saying(rig.name, where, f"not a serial node's: {error}") from error
@@ -93,12 +112,36 @@ def board(rig: Rig) -> Board:
     for m in rig.monitor:
         end = max((abs(x) for x in (m.low, m.high) if math.isfinite(x)), default=2 * abs(m.usual))
         analogue[m.name] = Wiring(len(analogue), MOST_COUNTS / (end or 1.0))
-    spec = rig.actuator[0]
-    return Board(encoder, analogue, 1.0 / (spec.resolution or spec.high / MOST_COUNTS))
+    if len(rig.actuator) > MAX_OUTPUTS:
+        expected = f"at most {MAX_OUTPUTS}, the outputs of a node"
+        raise InputError(rig.name, "actuator", len(rig.actuator), expected)
+    outputs = {
+        spec.name: Put(i, 1.0 / (spec.resolution or spec.high / MOST_COUNTS), NULLS[i])
+        for i, spec in enumerate(rig.actuator)
+    }
+    return Board(encoder, analogue, outputs)
+
+
+def _stated(rig: Rig, given: Mapping[str, Any]) -> dict[str, Put]:
+    """The outputs of a serial node's settings; KeyError, TypeError or ValueError for none."""
+    if "output" not in given:
+        (spec,) = rig.actuator
+        counts, null = float(given["output_counts_per_unit"]), int(given.get("null", NULLS[0]))
+        return {spec.name: Put(0, counts, null)}
+    table = {str(name): dict(o) for name, o in given["output"].items()}
+    made = {}
+    for spec in rig.actuator:
+        o = table[spec.name]
+        i = int(o["index"])
+        made[spec.name] = Put(i, float(o["counts_per_unit"]), int(o.get("null", NULLS[i])))
+    return made
 
 
 class Plant:
-    """The rig's realised model with its converters, one sample at a time."""
+    """The rig's realised model with its converters, one sample at a time.
+
+    The chain is linear, so each output moves a plant of its own and a sensor reads the sum.
+    """
 
     def __init__(self, rig: Rig, wired: Board, settings: SimSettings) -> None:
         self._wired, self._settings = wired, settings
@@ -119,9 +162,12 @@ class Plant:
             for m in rig.monitor
         }
         check_guide(rig, settings)
-        self._tables, self._guide = tables_of(rig, made, settings)
-        self._converters = converters(rig, settings)
-        self._drive = drive(rig, settings)
+        self._lanes = tuple(plant_of(rig, made, settings, i) for i in range(len(rig.actuator)))
+        if len(self._lanes) == 1:
+            tables, guide = tables_of(rig, made, settings)
+            (lane,) = self._lanes
+            self._lanes = (lane._replace(tables=tables, guide=guide),)
+        self._outputs = [wired.output[a.name] for a in rig.actuator]
         m = len(rig.sensor)
         self._values, self._quality = np.zeros(m), np.zeros(m, dtype=np.uint8)
         self._still = np.zeros(max(m, settings.inner))
@@ -130,36 +176,47 @@ class Plant:
 
     def rest(self) -> None:
         """Everything still, as at the start."""
-        self._state = kernel.rest(self._tables)
-        self._guide.x[:] = 0.0
-        self._guide.held[:] = 0.0
+        self._lanes = tuple(lane._replace(state=kernel.rest(lane.tables)) for lane in self._lanes)
+        for lane in self._lanes:
+            lane.guide.x[:] = 0.0
+            lane.guide.held[:] = 0.0
 
     def sense(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Counts of the encoders and of the analogue inputs at this sample."""
         s, m = self._settings, len(self._values)
         noise = self._rng.standard_normal(m) if s.noise else self._still
-        t, c, values = self._tables, self._converters, self._values
-        kernel.sense(t, c, self._guide, self._state, noise, values, self._quality)
+        values = self._values
+        if len(self._lanes) == 1:
+            (one,) = self._lanes
+            kernel.sense(
+                one.tables, one.converters, one.guide, one.state, noise, values, self._quality
+            )
+        else:
+            sense_all(self._lanes, noise, values, self._quality)
         counts: dict[bool, dict[int, int]] = {True: {}, False: dict(self._usual)}
         for i, is_encoder, w in self._places:
             n = round(float(values[i]) * w.counts_per_unit + w.offset)
             counts[is_encoder][w.index] = n if is_encoder else min(max(n, RAILS[0]), RAILS[1])
         return _filled(counts[True]), _filled(counts[False])
 
-    def move(self, dac: int) -> None:
-        """Put counts out and go on to the next sample."""
-        s, out = self._settings, self._wired.output_counts_per_unit
+    def move(self, dac: Sequence[int]) -> None:
+        """Put counts out of each of the node's outputs and go on to the next sample."""
+        s = self._settings
         pushed = s.disturbance_rms > 0.0
-        disturbance = self._rng.standard_normal(s.inner) if pushed else self._still
-        v = (dac - self._wired.null) / out
-        kernel.move(self._tables, self._drive, self._guide, self._state, v, disturbance)
+        for lane, o in zip(self._lanes, self._outputs, strict=True):
+            disturbance = self._rng.standard_normal(s.inner) if pushed else self._still
+            v = (dac[o.index] - o.null) / o.counts_per_unit
+            kernel.move(lane.tables, lane.drive, lane.guide, lane.state, v, disturbance)
 
     def load(self, i: int) -> float:
         """What is at sensor i at the sample to come, without noise and converter."""
-        t, s = self._tables, self._state
-        applied, extra = s.number[kernel.APPLIED], s.number[kernel.EXTRA]
-        inputs = t.row_old[i] * applied + t.row_extra[i] * extra
-        return float((t.row[i] * s.x).sum() + inputs + kernel.rubbed(self._guide, i))
+        total = 0.0
+        for lane in self._lanes:
+            t, s = lane.tables, lane.state
+            applied, extra = s.number[kernel.APPLIED], s.number[kernel.EXTRA]
+            inputs = t.row_old[i] * applied + t.row_extra[i] * extra
+            total += float((t.row[i] * s.x).sum() + inputs + kernel.rubbed(lane.guide, i))
+        return total
 
 
 def _filled(counts: Mapping[int, int]) -> tuple[int, ...]:

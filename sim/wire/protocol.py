@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
-VERSION = 1
+VERSION_ONE, VERSION_SEVERAL = 1, 2  # of a node with one output, and with several
+MAX_OUTPUTS = 3
 MAX_PAYLOAD = 512  # bytes of a frame before COBS
 MAX_ENCODED = MAX_PAYLOAD + MAX_PAYLOAD // 254 + 1
 QUEUE = 256  # samples of reference
@@ -80,8 +81,20 @@ class Flag(IntFlag):
 
 
 @dataclass(frozen=True, slots=True)
+class OutputConfig:
+    """What an output is. Its limits are hard; it is counted from `null`."""
+
+    dac_low: int = -32768
+    dac_high: int = 32767
+    null: int = 0
+    max_output: int = 32767
+    max_step: int = 32767
+    max_jump: int = (1 << 31) - 1
+
+
+@dataclass(frozen=True, slots=True)
 class NodeConfig:
-    """What the board is. Its limits are hard; outputs are counted from `null`."""
+    """What the board is, with the numbers of its first output; `beside` are its others."""
 
     period_ns: int
     deadman_ms: int
@@ -96,3 +109,22 @@ class NodeConfig:
     max_jump: int = (1 << 31) - 1
     firmware: bytes = b"simulated 1"
     serial: bytes = b"SIM-0001"
+    beside: tuple[OutputConfig, ...] = ()
+
+    @property
+    def outputs(self) -> tuple[OutputConfig, ...]:
+        """All of them."""
+        first = OutputConfig(
+            self.dac_low,
+            self.dac_high,
+            self.null,
+            self.max_output,
+            self.max_step,
+            self.max_jump,
+        )
+        return first, *self.beside
+
+    @property
+    def version(self) -> int:
+        """The protocol's, that a node with these outputs speaks."""
+        return VERSION_SEVERAL if self.beside else VERSION_ONE

@@ -15,7 +15,8 @@ Commands, one a line, on standard input or in a script (each with its time in s 
     drift NAME COUNTS    it reads so much more every second
     freeze NAME 0|1      it repeats one value, or no longer
     supply 0|1       the node's supply line is broken, or works again (no image has that)
-    stray COUNTS     the converter holds so much more than the node puts out (no image has that)
+    stray COUNTS [OUTPUT]  the converter of an output, or of the first, holds so much more than the
+                     node puts out (no image has that)
     image WHAT       of a node that is an image: it hangs, faults, ... (sim/wire/emulator.py)
     history          one line of JSON: what the output did
     quit
@@ -38,6 +39,7 @@ from pathlib import Path
 
 import numpy as np
 
+from samii_rig.devices.channels import centring_name
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Rig
 from sim.settings import SimSettings
@@ -45,8 +47,8 @@ from sim.wire.emulator import WRONG, Emulator
 from sim.wire.image import ImageNode
 from sim.wire.line import FAULTS, Line
 from sim.wire.node import Node
-from sim.wire.plant import Board, Plant, board
-from sim.wire.protocol import RAILS, WORD, NodeConfig
+from sim.wire.plant import NULLS, Board, Plant, board
+from sim.wire.protocol import RAILS, WORD, NodeConfig, OutputConfig
 
 KEPT = 20_000  # samples of the output's history
 MAX_JUMP = 0.05  # rad a sample of the first encoder beyond which the node trips
@@ -72,15 +74,17 @@ class WireRig:
         self._plant = Plant(rig, self.board, settings)
         n_encoder = 1 + max((w.index for w in self.board.encoder.values()), default=-1)
         n_adc = 1 + max((w.index for w in self.board.adc.values()), default=-1)
-        first = next(iter(self.board.encoder.values()))
+        first, *beside = self._outputs(rig)
         self._config = NodeConfig(
             period_ns=round(1e9 / rig.rate_hz),
             deadman_ms=round((rig.actuator[0].deadman or 0.05) * 1e3),
             n_encoder=n_encoder,
             n_adc=n_adc,
-            null=self.board.null,
-            max_jump=round(MAX_JUMP * abs(first.counts_per_unit)),
+            null=first.null,
+            max_jump=first.max_jump,
+            beside=tuple(beside),
         )
+        self._nulls = tuple(o.null for o in self._config.outputs)
         self._emulator = Emulator(image) if image else None
         self._node = self._booted(1, 0)
         self.pace = 1.0  # of real time in one second of the node's clock
@@ -98,10 +102,11 @@ class WireRig:
         self._offset: dict[str, float] = {}
         self._drift: dict[str, float] = {}
         self._frozen: dict[str, int | None] = {}
-        self._stray, self._relay = 0, True
+        self._stray: dict[int, int] = {}
+        self._relay = True
         self._taken = 0  # samples since boot
         self._told = 0  # sample at which a command was carried out last
-        self._history: deque[tuple[int, int, int]] = deque(maxlen=KEPT)
+        self._history: deque[tuple[int, tuple[int, ...], int]] = deque(maxlen=KEPT)
         self._master = self._slave = -1
         self.port = ""
         self.plug()
@@ -180,6 +185,19 @@ class WireRig:
         """The rig as the node's board sees it."""
         return rig
 
+    def _outputs(self, rig: Rig) -> list[OutputConfig]:
+        """What the node has, up to the last one that an actuator is wired to."""
+        encoders = self.board.encoder
+        usual = next(iter(encoders.values()))
+        n = 1 + max(o.index for o in self.board.output.values())
+        made = [OutputConfig(null=NULLS[i]) for i in range(n)]
+        for a in rig.actuator:
+            put = self.board.output[a.name]
+            angle = encoders.get(centring_name(rig, a.name), usual)
+            jump = round(MAX_JUMP * abs(angle.counts_per_unit))
+            made[put.index] = OutputConfig(null=put.null, max_jump=jump)
+        return made
+
     def _ports(self) -> list[int]:
         return [self._master]
 
@@ -197,8 +215,9 @@ class WireRig:
         dac = self._node.take(clock, encoders, adcs, self._emergency)
         self._taken += 1
         dumped = self.board.supply and not self._node.supply
-        self._plant.move(self._config.null if dumped else dac)
-        self._history.append((sample, dac - self._config.null, time.monotonic_ns()))
+        self._plant.move(self._nulls if dumped else dac)
+        v = tuple(d - null for d, null in zip(dac, self._nulls, strict=True))
+        self._history.append((sample, v, time.monotonic_ns()))
 
     def _spoilt(
         self, encoders: tuple[int, ...], adcs: tuple[int, ...]
@@ -267,7 +286,7 @@ class WireRig:
                     if what == "rest":
                         self._emergency, self._jump, self._rails = False, 0, set()
                         self._offset, self._drift, self._frozen = {}, {}, {}
-                        self._stray, self._relay = 0, True
+                        self._stray, self._relay = {}, True
                         self._plant.rest()
                         self._history.clear()
                         self._late, self._stalled = 0, 0.0
@@ -290,8 +309,8 @@ class WireRig:
                         self._frozen[name] = None
                 case ["supply", level] if self._emulator is None:
                     self._relay = bool(int(level))
-                case ["stray", counts] if self._emulator is None:
-                    self._stray = int(counts)
+                case ["stray", counts, *output] if self._emulator is None and len(output) <= 1:
+                    self._stray = {int(output[0]) if output else 0: int(counts)}
                 case ["image", what] if isinstance(self._node, ImageNode) and what in WRONG:
                     self._node.wrong(what)
                 case ["history"]:
@@ -311,10 +330,13 @@ class WireRig:
     def history(self) -> dict[str, object]:
         """What the output did. fed : sample at which a stream was accepted last; told : the next
         one when a command came last; live : the last sample with another output than null, and its
-        time on the system's monotonic clock; most : the largest output kept; late : ns by which
-        this process was late at most."""
-        node, live = self._node, [h for h in self._history if h[1] != 0]
-        last = live[-1] if live else (-1, 0, 0)
+        time on the system's monotonic clock; ended : the last such sample of each output; most :
+        the largest output kept; late : ns by which this process was late at most; v : the output
+        that is furthest from null."""
+        node, live = self._node, [h for h in self._history if any(h[1])]
+        last = live[-1] if live else (-1, (), 0)
+        n = len(self._nulls)
+        ended = [max((h[0] for h in live if h[1][j]), default=-1) for j in range(n)]
         return {
             "sample": node.sample,
             "state": node.state.name,
@@ -322,11 +344,12 @@ class WireRig:
             "rejected": node.rejected,
             "fed": node.fed,
             "told": self._told,
-            "most": max((abs(h[1]) for h in self._history), default=0),
+            "most": max((abs(v) for h in self._history for v in h[1]), default=0),
             "live": last[0],
             "live_ns": last[2],
             "late": self._late,
-            "v": self._history[-1][1] if self._history else 0,
+            "ended": ended,
+            "v": max(self._history[-1][1], key=abs) if self._history else 0,
         }
 
     @staticmethod

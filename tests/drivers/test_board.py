@@ -12,7 +12,7 @@ import pytest
 import wire_fuzz_kit
 from board_kit import image, made
 from chip_kit import SECTOR
-from node_kit import CONFIG, Host
+from node_kit import CONFIG, CONFIGS, Host
 
 from drivers.serial_node.wire import Type, configure_body, frame, stream_body
 from samii_rig.errors import DeviceError, InputError
@@ -56,21 +56,24 @@ def compared(emulator: Emulator, config: NodeConfig, seed: int, steps: int) -> s
         adcs = tuple(rng.randrange(-999, 999) for _ in range(3))
         rail = rng.random() < 0.002
         inputs = (encoder, -encoder), ((32767, *adcs[1:]) if rail else adcs), rng.random() < 0.002
-        assert node.take(2000 * i % 2**32, *inputs) - config.null == node.v
+        counts = node.take(2000 * i % 2**32, *inputs)
+        nulls = [o.null for o in config.outputs]
+        assert [c - null for c, null in zip(counts, nulls, strict=True)] == list(node.v)
         node.transmit()
         seen.add(int(node.state))
     return seen
 
 
-def test_the_image_does_what_the_simulated_node_does_byte_for_byte(emulator):
-    seen = set().union(*(compared(emulator, CONFIG, seed, STEPS) for seed in range(3)))
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda c: f"{len(c.outputs)} outputs")
+def test_the_image_does_what_the_simulated_node_does_byte_for_byte(emulator, config):
+    seen = set().union(*(compared(emulator, config, seed, STEPS) for seed in range(3)))
     assert seen == {0, 1, 2, 3, 4}, "a state that was never reached is not compared"
 
 
 def test_a_difference_is_seen(emulator, monkeypatch):
     node = ImageNode(emulator, CONFIG, 5)
     node.take(0, (0, 0), (0, 0, 0), False)
-    monkeypatch.setattr(Node, "_wanted", lambda self, u, encoders: u + 1)
+    monkeypatch.setattr(Node, "_wanted", lambda self, loop, u, encoders: u + 1)
     with pytest.raises(DeviceError, match="the image is not the simulated node at sample"):
         live(node)
 
@@ -89,7 +92,7 @@ def live(node: ImageNode) -> None:
     first = node.sample
     node.receive(frame(Type.STREAM, node.boot, 2, stream_body(first, [1000] * 60, [0] * 60)))
     for _ in range(3):
-        assert node.take(0, (0, 0), (0, 0, 0), False) == 1000 + CONFIG.null
+        assert node.take(0, (0, 0), (0, 0, 0), False) == (1000 + CONFIG.null,)
     assert node.supply
 
 
@@ -101,7 +104,7 @@ def test_a_processor_that_goes_wrong_is_at_null_when_the_watchdog_has_reset_it(e
     node.wrong(way)
     held = [node.take(0, (0, 0), (0, 0, 0), False)]
     # A handler puts null out at once; what hangs holds its output until the watchdog acts.
-    assert held[0] == CONFIG.null + (1000 if way == "hang" else 0)
+    assert held[0] == (CONFIG.null + (1000 if way == "hang" else 0),)
     assert node.supply == (way == "hang")
     assert emulator.watchdog.feeds == fed, "it was fed by what is wrong"
     while node.boot == 7:
@@ -110,7 +113,7 @@ def test_a_processor_that_goes_wrong_is_at_null_when_the_watchdog_has_reset_it(e
     assert not node.supply
     # What the old host still sends is of the wrong boot.
     node.receive(frame(Type.STREAM, 7, 3, stream_body(0, [1000] * 60, [0] * 60)))
-    assert [node.take(0, (0, 0), (0, 0, 0), False) for _ in range(40)] == [CONFIG.null] * 40
+    assert [node.take(0, (0, 0), (0, 0, 0), False) for _ in range(40)] == [(CONFIG.null,)] * 40
     live(node)
 
 

@@ -13,6 +13,7 @@ import pytest
 from chip_kit import (
     ADC_SELECT,
     BSRR,
+    DAC_1_SELECT,
     DAC_RESET,
     DAC_SELECT,
     GPIOA,
@@ -27,6 +28,7 @@ from chip_kit import (
     TIM3_CNT,
     TIM5_CNT,
     Chip,
+    Dac,
     library,
 )
 
@@ -196,7 +198,8 @@ def test_its_pins_are_those_of_the_wiring_table(boots):
     ):
         assert {chip.mode(port, p) for p in pins} == {mode}
     page = (Path(__file__).resolve().parents[2] / "docs" / "guide" / "board.md").read_text()
-    for name in ("PA2", "PA3", "PA15", "PB0", "PB1", "PB3", "PB12", "PB13", "PB14", "PB15"):
+    assert chip.mode(GPIOB, DAC_1_SELECT) == 0, "left alone by a board with one output"
+    for name in ("PA2", "PA3", "PA15", "PB0", "PB1", "PB3", "PB5", "PB12", "PB13", "PB14", "PB15"):
         assert f"| {name} |" in page
     for name in ("PC4", "PC5", "PC6", "PC7"):
         assert f"| {name} |" in page
@@ -312,3 +315,132 @@ def test_a_reset_clamps_the_output_and_the_next_boot_is_at_null(live, boots):
     again.receive(old)
     again.tick(60)
     assert (again.dac.volts, again.pins[SUPPLY]) == (AT_NULL, 0)
+
+
+# Two outputs: what ends one ends both
+
+
+NULL_1 = -12  # counts, of the second output
+BOTH = [DAC_SELECT, DAC_1_SELECT]
+AT_NULLS = [AT_NULL, pytest.approx(NULL_1 / PER_VOLT)]
+
+
+@pytest.fixture(scope="module")
+def made_two(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("two")
+    return library(folder, NULL_COUNTS=NULL, OUTPUTS=2, NULL_COUNTS_1=NULL_1, MAX_OUTPUT_1=10000)
+
+
+@pytest.fixture
+def pair(made_two: Path, tmp_path: Path) -> Pair:
+    own = tmp_path / "two.so"
+    shutil.copy(made_two, own)
+    return Pair(Chip(own))
+
+
+class Pair:
+    """A chip with two outputs, live at 2 V and at -1 V."""
+
+    def __init__(self, chip: Chip) -> None:
+        self.chip, self.decoder, self.seq = chip, Decoder(), 0
+        self.got: list[object] = []
+        assert self.volts == AT_NULLS
+        assert chip.pins[SUPPLY] == 0
+        self.run()
+        second = {**LOOP, "encoder": 1, "max_output": 10000, "adc_mask": 0}
+        self.ask(Type.CONFIGURE, configure_body(**LOOP) + configure_body(**second))
+        self.run()
+        assert [m.code for m in self.got if isinstance(m, Answer)] == [Code.OK]
+        first = chip.register[TIM5_CNT] // 2000
+        pairs = [6554, -3277] * 30
+        for part in (0, 30):
+            self.ask(Type.STREAM, stream_body(first + part, pairs, [0] * 60, 2))
+        self.run(3)
+        assert self.volts == [
+            pytest.approx((6554 + NULL) / PER_VOLT),
+            pytest.approx((NULL_1 - 3277) / PER_VOLT),
+        ]
+        assert chip.pins[SUPPLY] == 1
+
+    def ask(self, kind: Type, body: bytes = b"") -> None:
+        self.seq += 1
+        hello = next(m for m in self.got if isinstance(m, Hello))
+        self.chip.receive(frame(kind, hello.boot, self.seq, body, hello.version))
+
+    def run(self, n: int = 1) -> None:
+        for _ in range(n):
+            self.chip.tick()
+            self.chip.register[TIM5_CNT] += 2000
+        self.got += self.decoder.feed(bytes(self.chip.sent))
+        self.chip.sent.clear()
+
+    @property
+    def volts(self) -> list[float]:
+        return [dac.volts for dac in self.chip.dacs.values()]
+
+
+def test_two_outputs_are_at_null_from_reset_on_and_say_what_they_are(pair):
+    hello = next(m for m in pair.got if isinstance(m, Hello))
+    assert [(o.null, o.max_output) for o in hello.outputs] == [(NULL, 32767), (NULL_1, 10000)]
+    assert {pair.chip.mode(GPIOB, pin) for pin in BOTH} == {1}
+
+
+def test_no_stream_ends_both_at_null_in_one_sample(pair):
+    n = 0
+    while pair.volts != AT_NULLS:
+        assert not any(v == null for v, null in zip(pair.volts, AT_NULLS, strict=True))
+        pair.run()
+        n += 1
+    assert 3 + n == DEADMAN_MS // PERIOD_MS + 1
+    assert pair.chip.pins[SUPPLY] == 0
+
+
+@pytest.mark.parametrize("counter", [TIM2_CNT, TIM3_CNT])
+def test_a_jump_of_either_encoder_ends_both_in_its_sample(pair, counter):
+    pair.chip.register[counter] = 1001
+    pair.run()
+    assert pair.volts == AT_NULLS
+    assert pair.chip.pins[SUPPLY] == 0
+
+
+@pytest.mark.parametrize("stuck", BOTH)
+def test_either_converter_that_holds_something_else_ends_both_within_three_samples(pair, stuck):
+    pair.chip.dacs[stuck].stuck = True
+    pair.ask(Type.ZERO)
+    pair.run(2)
+    before = pair.chip.feeds
+    pair.run(3)
+    assert pair.volts == [0.0, 0.0]
+    assert pair.chip.pins[SUPPLY] == 0
+    assert pair.chip.feeds <= before + 1
+
+
+@pytest.mark.parametrize("bus", [True, False])
+def test_a_fault_puts_both_nulls_out_before_the_supply_goes(pair, bus):
+    pair.chip.spi = bus
+    pair.chip.frame = b"\x30"
+    pair.chip.wrong()
+    assert pair.volts == (AT_NULLS if bus else [0.0, 0.0])
+    assert pair.chip.pins[SUPPLY] == 0
+    writes = pair.chip.writes
+    supply = max(i for i, w in enumerate(writes) if w[0] == GPIOC + BSRR)
+    for pin in BOTH:
+        assert max(i for i, w in enumerate(writes) if w == (GPIOB + BSRR, 1 << pin)) < supply
+
+
+@pytest.mark.parametrize("missing", BOTH)
+def test_either_converter_that_does_not_start_leaves_both_at_ground(
+    made_two, tmp_path, missing, monkeypatch
+):
+    own, shift = tmp_path / "two.so", Dac.shift
+    shutil.copy(made_two, own)
+    built: list[Dac] = []
+    monkeypatch.setattr(
+        Dac, "shift", lambda d, data: None if d is built[BOTH.index(missing)] else shift(d, data)
+    )
+    init = Dac.__init__
+    monkeypatch.setattr(Dac, "__init__", lambda d: (built.append(d), init(d))[1])
+    chip = Chip(own)
+    assert [d.volts for d in chip.dacs.values()] == [0.0, 0.0]
+    assert (chip.pins[SUPPLY], chip.pins[DAC_RESET]) == (0, 0)
+    assert not chip.sent

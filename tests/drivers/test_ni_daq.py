@@ -56,7 +56,7 @@ def test_encoders_and_inputs_are_taken_on_one_sample_clock(ni, device):
     assert ("ci", "/Dev1/ai/SampleClock") in ni.calls
     # The clock begins when all others wait for it.
     assert ni.calls[-2:] == [("start", "ci"), ("start", "ai")]
-    ni.out, ni.volts, ni.theta = 0.0, 1.5, -0.75
+    ni.outs, ni.volts, ni.theta = [0.0, 0.0], 1.5, [-0.75, 0.0]
     until(lambda: (device.sensor.read().values == [1.0, 10.0]).all(axis=1).any())
     when, sequence, values, quality = taken(device)
     np.testing.assert_allclose(values, np.tile([1.0, 10.0], (len(values), 1)))
@@ -77,7 +77,7 @@ def test_an_input_at_its_end_is_clipped_and_what_is_no_number_missing(ni, device
     until(lambda: (device.sensor.read().quality[:, 1] == Quality.CLIPPED).any())
     ni.volts = float("nan")
     until(lambda: (device.sensor.read().quality[:, 1] == Quality.MISSING).any())
-    ni.out, ni.theta = 0.0, 5.0
+    ni.outs, ni.theta = [0.0, 0.0], [5.0, 0.0]
     until(lambda: (device.sensor.read().quality[:, 0] == Quality.CLIPPED).any())
 
 

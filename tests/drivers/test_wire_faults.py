@@ -366,7 +366,7 @@ def test_a_node_that_is_not_the_rigs_is_refused(wire, field, value):
 
 @pytest.mark.parametrize(
     ("answer", "said"),
-    [(b"", "nothing answers"), (b"\x55\xaa\x00\x80" * 9, "baud"), ("version", "version 2")],
+    [(b"", "nothing answers"), (b"\x55\xaa\x00\x80" * 9, "baud"), ("version", "version 3")],
 )
 def test_what_is_no_node_of_this_version_is_named(wire, monkeypatch, answer, said):
     from serial_frames_kit import raw
@@ -374,7 +374,7 @@ def test_what_is_no_node_of_this_version_is_named(wire, monkeypatch, answer, sai
     monkeypatch.setattr("drivers.serial_node.link.HELLO_WITHIN", 0.4)
     master, slave = os.openpty()
     if answer == "version":
-        answer = raw(2, 1, 1, 0, b"a hello of the future")
+        answer = raw(3, 1, 1, 0, b"a hello of the future")
     monkeypatch.setattr("serial.Serial.reset_input_buffer", lambda _: os.write(master, answer))
     import tty
 

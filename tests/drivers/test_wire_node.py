@@ -59,7 +59,8 @@ class Desk:
         """The counts that n samples put out, without the null."""
         out = []
         for _ in range(n):
-            out.append(self.node.take(0, (self.theta,), (self.adc,), self.emergency) - CONFIG.null)
+            (counts,) = self.node.take(0, (self.theta,), (self.adc,), self.emergency)
+            out.append(counts - CONFIG.null)
             self.got += self.decoder.feed(self.node.transmit())
         return out
 
@@ -243,4 +244,4 @@ def test_limits_are_not_changed_while_the_output_is_live():
 def test_nothing_moves_before_it_is_configured():
     node = Node(CONFIG, 1)
     node.receive(frame(Type.STREAM, 1, 1, stream_body(0, [1000] * 9, [0] * 9)))
-    assert [node.take(0, (0,), (0,), False) for _ in range(9)] == [CONFIG.null] * 9
+    assert [node.take(0, (0,), (0,), False) for _ in range(9)] == [(CONFIG.null,)] * 9

@@ -51,6 +51,7 @@ SECTOR, SECTOR_BYTES = 0x0806_0000, 1 << 17
 RESET = {RCC_CR: 0x83, 0x4002_3804: 0x2400_3010, PWR_CR: 1 << 14}
 RESET |= {GPIOA: 0xA800_0000, GPIOB: 0x280, GPIOA + 0xC: 0x6400_0000, GPIOB + 0xC: 0x100}
 SUPPLY, EMERGENCY, DAC_RESET, DAC_SELECT, ADC_SELECT = 4, 5, 1, 0, 12
+DAC_1_SELECT = 5  # of the second output; on port B, as those before it but SUPPLY and EMERGENCY
 
 
 def library(folder: Path, **numbers: int) -> Path:
@@ -138,9 +139,9 @@ class Chip:
         self.flash = bytearray(b"\xff" * SECTOR_BYTES) if flash is None else flash
         self.keys: list[int] = []
         self.writes: list[tuple[int, int]] = []
-        self.dac, self.adc = Dac(), Adc()
+        self.dacs, self.adc = {DAC_SELECT: Dac(), DAC_1_SELECT: Dac()}, Adc()
         # In reset all pins float, and resistors pull these down: docs/guide/board.md.
-        self.pins = {SUPPLY: 0, DAC_RESET: 0, DAC_SELECT: 1, ADC_SELECT: 1}
+        self.pins = {SUPPLY: 0, DAC_RESET: 0, DAC_SELECT: 1, DAC_1_SELECT: 1, ADC_SELECT: 1}
         self.frame, self.emergency, self.sent = b"", False, bytearray()
         self.arrived = bytearray()
         self.calls: list[Callable[..., object]] = [
@@ -191,10 +192,12 @@ class Chip:
         elif address in (GPIOB + BSRR, GPIOC + BSRR):
             for pin in range(16):
                 if value >> pin & 1 or value >> 16 + pin & 1:
-                    self._pin(pin, value >> pin & 1)
+                    self._pin(address, pin, value >> pin & 1)
             return
         elif address == SPI_DR:
-            chip = self.adc if not self.pins[ADC_SELECT] else self.dac
+            chosen = [pin for pin in (ADC_SELECT, *self.dacs) if not self.pins[pin]]
+            assert len(chosen) <= 1, "two converters on the bus at once"
+            chip = self._selected(*chosen) if chosen else self.dac
             self.register[SPI_DR] = chip.answer(len(self.frame))
             self.frame += bytes([value])
             return
@@ -202,14 +205,27 @@ class Chip:
             self.sent.append(value)
         self.register[address] = value
 
-    def _pin(self, pin: int, level: int) -> None:
-        if pin in (DAC_SELECT, ADC_SELECT):
+    @property
+    def dac(self) -> Dac:
+        """The first output's converter."""
+        return self.dacs[DAC_SELECT]
+
+    def _selected(self, pin: int) -> Dac | Adc:
+        return self.adc if pin == ADC_SELECT else self.dacs[pin]
+
+    def _pin(self, port: int, pin: int, level: int) -> None:
+        if port == GPIOC + BSRR:
+            if pin == SUPPLY:
+                self.pins[pin] = level
+            return
+        if pin in (ADC_SELECT, *self.dacs):
             if level and not self.pins[pin]:
-                (self.dac if pin == DAC_SELECT else self.adc).shift(self.frame)
+                self._selected(pin).shift(self.frame)
             self.frame = b""
         self.pins[pin] = level
         if pin == DAC_RESET and not level:
-            self.dac.reset()
+            for dac in self.dacs.values():
+                dac.reset()
 
     def mode(self, port: int, pin: int) -> int:
         """0 an input, 1 an output, 2 a peripheral's."""

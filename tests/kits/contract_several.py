@@ -89,6 +89,8 @@ class OutputsContract:
             np.testing.assert_allclose(v[:, j], u[:, j] - output.kp * theta, atol=2 * bench.step)
 
     def test_each_loop_follows_its_own_set_point(self, bench: OutputsBench) -> None:
+        if not all(o.kp for o in bench.outputs):
+            pytest.skip("it closes no loop")
         bench.configure(1.0)
         ref = np.stack(
             [bench.wave(0.3, j) / o.kp * (1 + j) / bench.k for j, o in enumerate(bench.outputs)],
@@ -166,7 +168,7 @@ class OutputsContract:
     def test_each_keeps_its_own_output_limit_and_says_so(
         self, bench: OutputsBench, limited: int
     ) -> None:
-        most = [math.inf] * bench.k
+        most = [one.output.max for one in bench.limits]
         most[limited] = bench.size[limited] / 2
         bench.configure(0.0, max_output=most)
         u = np.stack([bench.wave(0.2, j) for j in range(bench.k)], axis=1)

@@ -1,7 +1,7 @@
 """A stand-in for nidaqmx and a board behind it: sample clock, buffer, watchdog, in real time.
 
 Only what NI documents is there, with the names of the package; what a board refuses it refuses in
-NI's words. The output turns an encoder.
+NI's words. An output turns an encoder: ao0 ctr0, ao1 ctr1.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 
-TURN = 0.5  # rad/s that one volt at ao0 turns ctr0
+TURN = 0.5  # rad/s that one volt at an output turns its encoder
+PLACES = 2  # outputs, and encoders
 HOLD = 0.1  # s after the last edge at port0/line0 that the interlock stays closed
 UNDERFLOW = "-200290: The generation has stopped to prevent the regeneration of old samples."
 EXPIRED = "-200678: Writing failed, because the watchdog timer expired."
@@ -27,16 +28,18 @@ CONSTANTS = SimpleNamespace(
 
 
 class Board:
-    """One sample clock. `out` is the voltage at the terminal, `volts` that at all inputs but the
-    read-back; `broken` says which task's calls fail: ai, ci, ao (what is played out), null (a
-    single value), do (the line), made (that there is a task at all)."""
+    """One sample clock. `outs` are the voltages at the terminals, `out` that at ao0, `volts` that
+    at all inputs but the read-backs; `broken` says which task's calls fail: ai, ci, ao (what is
+    played out), null (a single value), do (the line), made (that there is a task at all), or the
+    name of an output's channel. stray : V by which a terminal is off."""
 
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.rate, self.begun, self.k = 500.0, 0.0, 0
-        self.out, self.stray = 3.0, 0.0  # a board keeps its last voltage
-        self.volts, self.theta = 0.5, 0.0
-        self.seen: list[tuple[float, float]] = []  # at each sample: output before it, angle
+        self.outs, self.strays = [3.0, -2.0], [0.0] * PLACES  # a board keeps its last voltages
+        self.volts, self.theta = 0.5, [0.0] * PLACES
+        # At each sample: outputs before it, angles.
+        self.seen: list[tuple[list[float], list[float]]] = []
         self.player: Task | None = None
         self.tasks: list[Task] = []
         self.watchdog: Watchdog | None = None
@@ -46,6 +49,18 @@ class Board:
         self.calls: list[tuple[str, str]] = []
         self.error = "-50405: No transfer is in progress\nbecause the board is gone."
 
+    @property
+    def out(self) -> float:
+        return self.outs[0]
+
+    @property
+    def stray(self) -> float:
+        return self.strays[0]
+
+    @stray.setter
+    def stray(self, volts: float) -> None:
+        self.strays[0] = volts
+
     def advance(self) -> None:
         """Up to now."""
         now = time.monotonic()
@@ -53,11 +68,13 @@ class Board:
         due = int((now - self.begun) * self.rate) if self.begun else 0
         while self.k < due:
             self._watch(self.begun + self.k / self.rate)
-            self.seen.append((self.out + self.stray, self.theta))
+            off = [v + more for v, more in zip(self.outs, self.strays, strict=True)]
+            self.seen.append((off, list(self.theta)))
             self.k += 1
             if self.player is not None:
                 self.player.edge()
-            self.theta += TURN * self.out / self.rate
+            for i, v in enumerate(self.outs):
+                self.theta[i] += TURN * v / self.rate
         if w is not None:
             self._watch(now)
 
@@ -69,13 +86,15 @@ class Board:
     def _watch(self, now: float) -> None:
         w = self.watchdog
         if w is not None and w.running and not w.expired and now - w.reset > w.timeout:
-            w.expired, self.out, self.player = True, w.volts, None
+            w.expired, self.player = True, None
+            for place, volts in w.states.items():
+                self.outs[place] = volts
 
-    def check(self, kind: str) -> None:
+    def check(self, kind: str, rows: list[str] | tuple[()] = ()) -> None:
         self.advance()
         if self.watchdog is not None and self.watchdog.expired:
             raise RuntimeError(EXPIRED)
-        if kind in self.broken:
+        if kind in self.broken or self.broken & set(rows):
             raise RuntimeError(self.error)
 
 
@@ -85,7 +104,7 @@ class Task:
     def __init__(self) -> None:
         self.board.check("made")
         self.kind, self.open, self.rows, self.given = "", True, [], 0
-        self.buffer: list[float] = []
+        self.buffer: list[list[float]] = []  # a row of all channels for each sample
         self.error, self.timed = "", False
         chans = {
             "ai": ("ai_channels", "add_ai_voltage_chan"),
@@ -132,14 +151,18 @@ class Task:
     def edge(self) -> None:
         """The sample clock, where this task plays out."""
         if self.buffer:
-            self.board.out = self.buffer.pop(0)
+            self.put(self.buffer.pop(0))
         else:
             self.error, self.board.player = UNDERFLOW, None
+
+    def put(self, volts: list[float]) -> None:
+        for name, v in zip(self.rows, volts, strict=True):
+            self.board.outs[place(name)] = v
 
     def write(self, data, auto_start, timeout) -> None:
         b = self.board
         with b.lock:
-            b.check(self.kind)
+            b.check(self.kind, self.rows)
             if self.error:
                 raise RuntimeError(self.error)
             if self.kind == "do":
@@ -150,10 +173,17 @@ class Task:
             elif not self.timed:
                 assert auto_start
                 assert b.player is None, "the output is reserved by what plays out"
-                b.out = float(data)
+                # A number for one channel, a list for several.
+                assert np.ndim(data) == (len(self.rows) > 1)
+                self.put(np.atleast_1d(data).tolist())
             else:
                 assert np.isfinite(data).all()
-                self.buffer += np.asarray(data).tolist()
+                assert np.ndim(data) == (1 if len(self.rows) == 1 else 2)
+                each = np.atleast_2d(data)
+                assert len(each) == len(self.rows), (
+                    "-200524: the data of another number of channels"
+                )
+                self.buffer += each.T.tolist()
 
     def read(self, n: int, timeout: float):
         b = self.board
@@ -162,8 +192,10 @@ class Task:
             part = b.seen[self.given : self.given + n]
             self.given += n
             if self.kind == "ci":
-                return [theta for _, theta in part]
-            rows = [[v if "ao0" in name else b.volts for v, _ in part] for name in self.rows]
+                return [theta[place(self.rows[0])] for _, theta in part]
+            rows = [
+                [v[place(name)] if "ao" in name else b.volts for v, _ in part] for name in self.rows
+            ]
             return rows if len(rows) > 1 else rows[0]
 
     def close(self) -> None:
@@ -172,6 +204,11 @@ class Task:
             self.open = False
             if self.board.player is self:
                 self.board.player = None  # the terminal keeps its voltage
+
+
+def place(name: str) -> int:
+    """Of an output, a read-back or a counter."""
+    return next(i for i in range(PLACES) if f"ao{i}" in name or f"ctr{i}" in name)
 
 
 class OutStream:
@@ -197,20 +234,25 @@ class Watchdog:
     board: Board
 
     def __init__(self, device_name: str, timeout: float) -> None:
-        self.name, self.timeout, self.volts = device_name, timeout, np.nan
+        self.name, self.timeout = device_name, timeout
+        self.states: dict[int, float] = {}
         self.running = self.expired = False
         self.reset = 0.0
         self.board.watchdog = self
 
     def cfg_watchdog_ao_expir_states(self, states) -> None:
-        ((channel, self.volts, kind),) = states
-        assert channel.endswith("/ao0")
-        assert kind == "voltage"
+        for channel, volts, kind in states:
+            assert kind == "voltage"
+            self.states[place(channel)] = volts
 
     def start(self) -> None:
         assert not any(t.open for t in self.board.tasks), "-201477: tasks are reserved"
-        assert not np.isnan(self.volts)
+        assert self.states
         self.running, self.reset = True, time.monotonic()
+
+    @property
+    def volts(self) -> float:
+        return self.states[0]
 
     def reset_timer(self) -> None:
         with self.board.lock:
@@ -234,7 +276,7 @@ def installed(monkeypatch) -> Board:
 
     def reset_device() -> None:
         board.resets += 1
-        board.out, board.watchdog = 0.0, None
+        board.outs, board.watchdog = [0.0] * PLACES, None
 
     modules = {name: ModuleType(f"nidaqmx.{name}") for name in ("types", "system")}
     modules["constants"] = CONSTANTS

@@ -11,13 +11,14 @@ import struct
 import subprocess
 import sys
 import zlib
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import pytest
 from cobs import cobs
 
 from sim.wire.node import Node
-from sim.wire.protocol import NodeConfig, Type
+from sim.wire.protocol import MAX_OUTPUTS, NodeConfig, OutputConfig, Type
 
 SOURCE = Path(__file__).resolve().parents[2] / "drivers" / "serial_node"
 WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror"]
@@ -57,23 +58,30 @@ def build(folder: Path) -> ctypes.CDLL:
     assert made.returncode == 0, made.stderr
     c = ctypes.CDLL(str(library))
     c.node_size.restype = c.node_tx.restype = ctypes.c_size_t
-    c.node_sample.restype = ctypes.c_int16
+    c.node_sample.restype = None
     return c
 
 
-class _Config(ctypes.Structure):
+class _Output(ctypes.Structure):
     _fields_ = (
-        ("period_ns", ctypes.c_uint32),
-        ("deadman_ms", ctypes.c_uint16),
-        ("n_encoder", ctypes.c_uint8),
-        ("n_adc", ctypes.c_uint8),
-        ("batch", ctypes.c_uint8),
         ("dac_low", ctypes.c_int16),
         ("dac_high", ctypes.c_int16),
         ("null", ctypes.c_int16),
         ("max_output", ctypes.c_uint16),
         ("max_step", ctypes.c_uint16),
         ("max_jump", ctypes.c_int32),
+    )
+
+
+class _Config(ctypes.Structure):
+    _fields_ = (
+        ("period_ns", ctypes.c_uint32),
+        ("deadman_ms", ctypes.c_uint16),
+        ("n_output", ctypes.c_uint8),
+        ("n_encoder", ctypes.c_uint8),
+        ("n_adc", ctypes.c_uint8),
+        ("batch", ctypes.c_uint8),
+        ("output", _Output * MAX_OUTPUTS),
         ("firmware", ctypes.c_uint8 * 16),
         ("serial", ctypes.c_uint8 * 16),
     )
@@ -84,9 +92,12 @@ class CompiledNode:
 
     def __init__(self, c: ctypes.CDLL, config: NodeConfig, boot: int, sample: int) -> None:
         self._c, self._node = c, ctypes.create_string_buffer(c.node_size())
-        values = [getattr(config, name) for name, _ in _Config._fields_[:-2]]
+        outputs = (_Output * MAX_OUTPUTS)(*(_Output(*astuple(o)) for o in config.outputs))
+        self._n = len(config.outputs)
+        numbers = config.period_ns, config.deadman_ms, self._n, config.n_encoder, config.n_adc
         text = [(ctypes.c_uint8 * 16)(*x) for x in (config.firmware, config.serial)]
-        c.node_init(self._node, ctypes.byref(_Config(*values, *text)), ctypes.c_uint16(boot))
+        told = _Config(*numbers, config.batch, outputs, *text)
+        c.node_init(self._node, ctypes.byref(told), ctypes.c_uint16(boot))
         c.node_at(self._node, ctypes.c_uint32(sample))
 
     def receive(self, data: bytes) -> None:
@@ -103,14 +114,21 @@ class CompiledNode:
 
     def take(
         self, clock_us: int, encoders: tuple[int, ...], adcs: tuple[int, ...], emergency: bool
-    ) -> int:
+    ) -> tuple[int, ...]:
         e, a = (ctypes.c_int32 * 4)(*encoders), (ctypes.c_int16 * 8)(*adcs)
-        return int(self._c.node_sample(self._node, ctypes.c_uint32(clock_us), e, a, int(emergency)))
+        counts = (ctypes.c_int16 * MAX_OUTPUTS)()
+        clock = ctypes.c_uint32(clock_us)
+        self._c.node_sample(self._node, clock, e, a, int(emergency), counts)
+        return tuple(counts[: self._n])
 
 
 CONFIG = NodeConfig(
     2_000_000, 50, 2, 3, null=37, max_output=20000, max_step=9000, max_jump=5000, dac_low=-15000
 )
+SECOND = OutputConfig(-9000, 20000, -12, 15000, 8000, 4000)
+THIRD = OutputConfig(null=0, max_output=30000, max_jump=2**31 - 1)
+# Nodes with one output, with two, and with as many as there are.
+CONFIGS = (CONFIG, replace(CONFIG, beside=(SECOND,)), replace(CONFIG, beside=(SECOND, THIRD)))
 
 
 def frame(kind, boot, seq, body=b"", version=1):
@@ -132,7 +150,8 @@ class Host:
         )[0]
         self.seq = (self.seq + rng.choices([1, 0, -3, 2**30], [40, 1, 1, 0.2])[0]) % 2**32
         boot = self.node.boot if rng.random() < 0.97 else rng.randrange(2**16)
-        version = 1 if rng.random() < 0.98 else rng.randrange(256)
+        own = self.node.config.version
+        version = own if rng.random() < 0.98 else rng.choice([1, 2, rng.randrange(256)])
         data = frame(kind, boot, self.seq, self.body(kind), version)
         if rng.random() < 0.15:
             data = damaged(rng, data)
@@ -143,31 +162,37 @@ class Host:
         if rng.random() < 0.03:
             return rng.randbytes(rng.randrange(700))
         if kind == Type.CONFIGURE:
-            usual = rng.random() < 0.8
-            return struct.pack(
-                "<BBHiHHiii",
-                rng.randrange(2 if usual else 256),
-                0 if usual else rng.randrange(3),
-                rng.choice([0, 5, 7] if usual else [8, 65535]),
-                rng.choice([0, 32942, -70000, 2**31 - 1, -(2**31), rng.randrange(-(2**20), 2**20)]),
-                rng.choice([20000, 5000, 0] if usual else [20001]),
-                rng.choice([9000, 300, 0] if usual else [65535]),
-                rng.choice([2**31 - 1, 40000, 100] if usual else [-1]),
-                rng.choice([5000, 900] if usual else [5001, -1]),
-                rng.choice([0, 100, -(2**31)]),
+            bad = rng.randrange(len(node.config.outputs)) if rng.random() < 0.2 else -1
+            return b"".join(
+                self.limits(o, usual=j != bad) for j, o in enumerate(node.config.outputs)
             )
         if kind == Type.STREAM:
-            n = rng.choice([1, 5, 10, 30, 64])
+            n = rng.choice([1, 5, 10, 30, 64]) // len(node.config.outputs) or 1
             first = (
                 node.sample + rng.choices([0, 3, 20, 200, 250, -10, -(2**31)], [9] * 4 + [1] * 3)[0]
             )
             body = struct.pack("<IB", first % 2**32, n)
-            for _ in range(n):
+            for _ in range(n * len(node.config.outputs)):
                 body += struct.pack(
                     "<hi", rng.randrange(-9000, 9000), rng.choice([0, 500, -(2**31), 2**31 - 1])
                 )
             return body
         return b""
+
+    def limits(self, o: OutputConfig, *, usual: bool) -> bytes:
+        rng = self.rng
+        return struct.pack(
+            "<BBHiHHiii",
+            rng.randrange(2 if usual else 256),
+            0 if usual else rng.randrange(3),
+            rng.choice([0, 5, 7] if usual else [8, 65535]),
+            rng.choice([0, 32942, -70000, 2**31 - 1, -(2**31), rng.randrange(-(2**20), 2**20)]),
+            rng.choice([o.max_output, 5000, 0] if usual else [o.max_output + 1]),
+            rng.choice([min(9000, o.max_step), 300, 0] if usual else [65535]),
+            rng.choice([2**31 - 1, 40000, 100] if usual else [-1]),
+            rng.choice([min(5000, o.max_jump), 900] if usual else [-1]),
+            rng.choice([0, 100, -(2**31)]),
+        )
 
 
 def damaged(rng: random.Random, data: bytes) -> bytes:

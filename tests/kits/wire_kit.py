@@ -24,6 +24,7 @@ class Wire:
     program, driver = "sim.wire", "serial_node"
 
     def __init__(self, *options: str, rig: str = "samii") -> None:
+        self._name = rig
         self.image = "--image" in options  # the node is the firmware's image in an emulator
         self.process = subprocess.Popen(
             [sys.executable, "-m", self.program, "--rig", rig, *options],
@@ -72,14 +73,17 @@ class Wire:
 
     def rig_file(self, folder: Path) -> Path:
         """The shipped rig with its driver changed, as a file."""
-        text = load_rig("samii")[1]
+        text = load_rig(self._name)[1]
         head = text[: text.index("[device]")]
-        tables = [self._table(kind) for kind in ("encoder", "adc")]
+        tables = [
+            self._table(kind) for kind in ("output", "encoder", "adc") if kind in self.settings
+        ]
+        one = self.settings.get("output_counts_per_unit")
         path = folder / "wired.toml"
         path.write_text(
             head + '[device]\ndriver = "serial_node"\n\n[device.settings]\n'
             f'port = "{self.settings["port"]}"\n'
-            f"output_counts_per_unit = {self.settings['output_counts_per_unit']}\n\n"
+            + (f"output_counts_per_unit = {one}\n\n" if one else "\n")
             + "".join(tables)
         )
         return path
@@ -87,17 +91,18 @@ class Wire:
     def _table(self, kind: str) -> str:
         rows = [f"[device.settings.{kind}]\n"]
         for name, w in self.settings[kind].items():
+            zero = "offset" if "offset" in w else "null"
             rows.append(
                 f"{name} = {{ index = {w['index']}, counts_per_unit = {w['counts_per_unit']}, "
-                f"offset = {w['offset']} }}\n"
+                f"{zero} = {w[zero]} }}\n"
             )
         return "".join(rows)
 
 
-def slow_deadman(folder: Path) -> Path:
-    """The shipped rig with a deadman of 0.2 s."""
+def slow_deadman(folder: Path, rig: str = "samii") -> Path:
+    """A shipped rig with a deadman of 0.2 s."""
     path = folder / "slow.toml"
-    path.write_text(load_rig("samii")[1].replace("deadman = 0.05", "deadman = 0.2"))
+    path.write_text(load_rig(rig)[1].replace("deadman = 0.05", "deadman = 0.2"))
     return path
 
 

@@ -8,11 +8,8 @@ the page shows; nothing but a simulated rig is ever driven.
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -20,6 +17,7 @@ import pytest
 import yaml
 from conftest import ROOT
 from experiment_kit import SHORT, simulate
+from plugin_kit import Done, passed, pytest_in
 
 import samii_rig.diagnose.diagnose as room
 from samii_rig.pytest_plugin import _Asked, _simulated, assert_no_mismatch, assert_still_explained
@@ -33,26 +31,12 @@ PAGE = (ROOT / "docs" / "guide" / "ci.md").read_text(encoding="utf-8")
 (SHOWN,) = re.findall(r"```text\n(.*?)```", PAGE, re.S)  # what a failing test shows
 FILES = {name: text for _, name, text in re.findall(r"```(\w+) (\S+)\n(.*?)```", PAGE, re.S)}
 
-Done = subprocess.CompletedProcess[str]
-
-
-def pytest_in(folder: Path, *options: str, plugin: str = "samii_rig") -> Done:
-    """pytest in a process of its own, with no other plugin."""
-    env = {**os.environ, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
-    command = [sys.executable, "-m", "pytest", "-p", plugin, "-p", "no:cacheprovider", *options]
-    return subprocess.run(command, cwd=folder, env=env, text=True, capture_output=True, check=False)
-
 
 def project(folder: Path, **more: str) -> Path:
     """The page's files, and others."""
     for name, text in {**FILES, **more}.items():
         (folder / name).write_text(text, encoding="utf-8")
     return folder
-
-
-def passed(done: Done, n: int) -> None:
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert f"{n} passed" in done.stdout
 
 
 # Loading

@@ -66,7 +66,7 @@ def test_on_the_wire_they_are_commands_in_counts():
         f"1.0 jump {round(0.1 * b.encoder['theta_2'].counts_per_unit)}",
         f"2.0 drift a_0 {0.1 * 50.0 * b.adc['a_0'].counts_per_unit}",
         f"5.0 rail {b.adc['a_1'].index} 1",
-        f"5.0 stray {round(0.05 * 10.0 * b.output_counts_per_unit)}",
+        f"5.0 stray {round(0.05 * 10.0 * b.output['v_2'].counts_per_unit)}",
         "3.0 unplug",
         "5.0 freeze theta_2 1",
     ]

@@ -22,7 +22,7 @@ typedef struct {
 typedef struct {
     uint32_t went; /* bytes that the board has sent */
     uint32_t samples;
-    int16_t counts;
+    int16_t counts[NODE_MAX_OUTPUTS];
     uint16_t boot;
     uint8_t supply, handler, unused[2]; /* handler : of what is wrong, has put this out */
 } outputs;
@@ -76,6 +76,13 @@ static int32_t opened(const char *path, uint32_t mode)
     return host(SYS_OPEN, arguments);
 }
 
+static void put_nulls(void)
+{
+    for (unsigned o = 0; o < told.config.n_output; o++) {
+        out.counts[o] = told.config.output[o].null_counts;
+    }
+}
+
 const node_config *board_start(void)
 {
     if (kept.magic != MAGIC) {
@@ -92,7 +99,7 @@ const node_config *board_start(void)
         kept.magic = MAGIC;
     }
     ask(&told, sizeof told);
-    out.counts = told.config.null_counts;
+    put_nulls();
     reg_set(NVIC_ISER(IRQ_PVD), NVIC_BIT(IRQ_PVD));
     return &told.config;
 }
@@ -165,9 +172,11 @@ int board_emergency(void)
     return in.emergency;
 }
 
-void board_put(int16_t counts)
+void board_put(const int16_t *counts)
 {
-    out.counts = counts;
+    for (unsigned o = 0; o < told.config.n_output; o++) {
+        out.counts[o] = counts[o];
+    }
 }
 
 void board_supply(int on)
@@ -178,7 +187,7 @@ void board_supply(int on)
 
 void board_null(void)
 {
-    out.counts = told.config.null_counts;
+    put_nulls();
     out.supply = 0;
     out.handler = 1;
     tell();

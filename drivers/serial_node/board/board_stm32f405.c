@@ -1,7 +1,8 @@
 /* The chip itself: clocks, pins, converters, encoders, the number of the boot.
  *
- * Output: AD5761R, 16 bit, +-10 V. Its RESET is pulled to ground by a resistor, and so is the supply
- * line: while the chip is in reset, the converter holds its output at ground and the supply is off.
+ * Outputs: an AD5761R for each, 16 bit, +-10 V. Their RESET is pulled to ground by one resistor, and the
+ * supply line by another: while the chip is in reset, they hold their outputs at ground and the supply
+ * is off.
  * Inputs: ADS8688, 8 of 16 bit, +-10.24 V. Both on SPI2. docs/guide/board.md has the wiring.
  */
 #include "config.h"
@@ -9,7 +10,7 @@
 #include "stm32f405.h"
 
 /* Pins: number on its port. */
-enum { ADC_SELECT = 12, SCK = 13, MISO = 14, MOSI = 15, DAC_SELECT = 0, DAC_RESET = 1 }; /* B */
+enum { ADC_SELECT = 12, SCK = 13, MISO = 14, MOSI = 15, DAC_SELECT = 0, DAC_RESET = 1, DAC_1_SELECT = 5 }; /* B */
 enum { TX = 2, RX = 3, ENCODER_0_A = 15, ENCODER_0_B = 3 };                  /* A, A, A, B */
 enum { SUPPLY = 4, EMERGENCY = 5, ENCODER_1_A = 6, ENCODER_1_B = 7 };          /* C */
 enum { AF_TIM2 = 1, AF_TIM3 = 2, AF_SPI2 = 5, AF_USART2 = 7 }; /* datasheet, alternate function mapping */
@@ -43,21 +44,19 @@ enum { FLOATING, PULL_UP };
 static const node_config config = {
     .period_ns = 1000000000u / RATE_HZ,
     .deadman_ms = DEADMAN_MS,
+    .n_output = OUTPUTS,
     .n_encoder = ENCODERS,
     .n_adc = ADCS,
     .batch = BATCH,
-    .dac_low = INT16_MIN,
-    .dac_high = INT16_MAX,
-    .null_counts = NULL_COUNTS,
-    .max_output = MAX_OUTPUT,
-    .max_step = MAX_STEP,
-    .max_jump = MAX_JUMP,
+    .output = {{INT16_MIN, INT16_MAX, NULL_COUNTS, MAX_OUTPUT, MAX_STEP, MAX_JUMP},
+               {INT16_MIN, INT16_MAX, NULL_COUNTS_1, MAX_OUTPUT_1, MAX_STEP_1, MAX_JUMP_1}},
     .firmware = "stm32f405 1",
     .serial = SERIAL,
 };
 
 static int32_t second_encoder;
-static unsigned wrong;
+static const unsigned dac_select[] = {DAC_SELECT, DAC_1_SELECT};
+static unsigned wrong[OUTPUTS]; /* samples in a row, of each converter */
 
 static int became(uint32_t address, uint32_t field, uint32_t value, uint32_t looks)
 {
@@ -82,6 +81,15 @@ static void pin(uint32_t port, unsigned n, uint32_t mode, uint32_t pull, uint32_
     reg_field(GPIO_MODER(port), 3u << 2 * n, mode << 2 * n);
 }
 
+/* No converter takes what is on the bus. */
+static void deselect(void)
+{
+    level(GPIOB, ADC_SELECT, 1);
+    for (unsigned o = 0; o < OUTPUTS; o++) {
+        level(GPIOB, dac_select[o], 1);
+    }
+}
+
 /* First of all, at the 16 MHz of the reset: what must be low is driven low. */
 static void start_pins(void)
 {
@@ -89,11 +97,12 @@ static void start_pins(void)
     (void)reg_get(RCC_AHB1ENR); /* errata sheet: two cycles until it is there */
     level(GPIOC, SUPPLY, 0);
     level(GPIOB, DAC_RESET, 0);
-    level(GPIOB, DAC_SELECT, 1);
-    level(GPIOB, ADC_SELECT, 1);
+    deselect();
     pin(GPIOC, SUPPLY, OUTPUT, FLOATING, 0);
     pin(GPIOB, DAC_RESET, OUTPUT, FLOATING, 0);
-    pin(GPIOB, DAC_SELECT, OUTPUT, FLOATING, 0);
+    for (unsigned o = 0; o < OUTPUTS; o++) {
+        pin(GPIOB, dac_select[o], OUTPUT, FLOATING, 0);
+    }
     pin(GPIOB, ADC_SELECT, OUTPUT, FLOATING, 0);
     pin(GPIOC, EMERGENCY, INPUT, PULL_UP, 0); /* a broken wire is an emergency */
     pin(GPIOB, SCK, ALTERNATE, FLOATING, AF_SPI2);
@@ -173,13 +182,13 @@ static int exchange(unsigned select, uint32_t word, unsigned bits, uint32_t *bac
     return done;
 }
 
-/* Whether the converter holds these counts now, by what it gives back itself. */
-static int put(int16_t counts)
+/* Whether an output's converter holds these counts now, by what it gives back itself. */
+static int put(unsigned o, int16_t counts)
 {
     uint32_t code = (uint32_t)(counts + (int32_t)MID_SCALE), back = 0;
-    return exchange(DAC_SELECT, DAC_WRITE | code, 24u, &back) &&
-           exchange(DAC_SELECT, DAC_READ, 24u, &back) &&
-           exchange(DAC_SELECT, DAC_NOTHING, 24u, &back) && (back & 0xFFFFu) == code;
+    return exchange(dac_select[o], DAC_WRITE | code, 24u, &back) &&
+           exchange(dac_select[o], DAC_READ, 24u, &back) &&
+           exchange(dac_select[o], DAC_NOTHING, 24u, &back) && (back & 0xFFFFu) == code;
 }
 
 static int start_converters(void)
@@ -188,8 +197,13 @@ static int start_converters(void)
     reg_set(SPI2_CR1, SPI_CR1_MASTER | SPI_CR1_CPHA | SPI_CR1_DIV4 | SPI_CR1_SOFT_SELECT | SPI_CR1_SPE);
     level(GPIOB, DAC_RESET, 1);
     (void)became(SPI2_SR, SPI_SR_RXNE, SPI_SR_RXNE, SPI_WAITS); /* and so wait 50 us */
-    return exchange(DAC_SELECT, DAC_CONTROL | DAC_SET, 24u, &back) && put(NULL_COUNTS) &&
-           exchange(ADC_SELECT, ADC_INPUT(0) << 16, 32u, &back);
+    for (unsigned o = 0; o < OUTPUTS; o++) {
+        if (!exchange(dac_select[o], DAC_CONTROL | DAC_SET, 24u, &back) ||
+            !put(o, config.output[o].null_counts)) {
+            return 0;
+        }
+    }
+    return exchange(ADC_SELECT, ADC_INPUT(0) << 16, 32u, &back);
 }
 
 const node_config *board_start(void)
@@ -263,11 +277,13 @@ int board_emergency(void)
     return (reg_get(GPIO_IDR(GPIOC)) & 1u << EMERGENCY) != 0;
 }
 
-void board_put(int16_t counts)
+void board_put(const int16_t *counts)
 {
-    wrong = put(counts) ? 0u : wrong + 1u;
-    if (wrong >= WRONG_MOST) {
-        fault_handler();
+    for (unsigned o = 0; o < OUTPUTS; o++) {
+        wrong[o] = put(o, counts[o]) ? 0u : wrong[o] + 1u;
+        if (wrong[o] >= WRONG_MOST) {
+            fault_handler();
+        }
     }
 }
 
@@ -278,13 +294,14 @@ void board_supply(int on)
 
 void board_null(void)
 {
-    level(GPIOB, ADC_SELECT, 1);
-    level(GPIOB, DAC_SELECT, 1);
+    deselect();
     /* A byte may be on its way, of whatever was interrupted. */
     (void)became(SPI2_SR, SPI_SR_BSY, 0u, SPI_WAITS);
     (void)reg_get(SPI2_DR);
-    if (!put(NULL_COUNTS)) {
-        level(GPIOB, DAC_RESET, 0);
+    for (unsigned o = 0; o < OUTPUTS; o++) {
+        if (!put(o, config.output[o].null_counts)) {
+            level(GPIOB, DAC_RESET, 0); /* of all of them */
+        }
     }
     level(GPIOC, SUPPLY, 0);
 }

@@ -28,6 +28,22 @@
 #ifndef MAX_JUMP
 #define MAX_JUMP 1304 /* encoder counts in one sample: 0.05 rad of 163840 a turn */
 #endif
+#ifndef OUTPUTS
+#define OUTPUTS 1u /* 1 or 2 */
+#endif
+/* Of the second output. */
+#ifndef NULL_COUNTS_1
+#define NULL_COUNTS_1 0
+#endif
+#ifndef MAX_OUTPUT_1
+#define MAX_OUTPUT_1 MAX_OUTPUT
+#endif
+#ifndef MAX_STEP_1
+#define MAX_STEP_1 MAX_STEP
+#endif
+#ifndef MAX_JUMP_1
+#define MAX_JUMP_1 MAX_JUMP
+#endif
 #ifndef ENCODERS
 #define ENCODERS 2u /* 1 or 2 */
 #endif
@@ -47,6 +63,10 @@ _Static_assert(DEADMAN_MS * 17u * RATE_HZ > 2u * 47000u, "DEADMAN_MS: at least s
 _Static_assert(NULL_COUNTS >= -32768 && NULL_COUNTS <= 32767, "NULL_COUNTS: of 16 bit");
 _Static_assert(MAX_OUTPUT <= 65535u && MAX_STEP <= 65535u, "MAX_OUTPUT, MAX_STEP: of 16 bit");
 _Static_assert(MAX_JUMP >= 0, "MAX_JUMP: at least 0");
+_Static_assert(OUTPUTS >= 1 && OUTPUTS <= 2, "OUTPUTS: 1 or 2");
+_Static_assert(NULL_COUNTS_1 >= -32768 && NULL_COUNTS_1 <= 32767, "NULL_COUNTS_1: of 16 bit");
+_Static_assert(MAX_OUTPUT_1 <= 65535u && MAX_STEP_1 <= 65535u, "MAX_OUTPUT_1, MAX_STEP_1: of 16 bit");
+_Static_assert(MAX_JUMP_1 >= 0, "MAX_JUMP_1: at least 0");
 _Static_assert(ENCODERS >= 1 && ENCODERS <= 2, "ENCODERS: 1 or 2");
 _Static_assert(ADCS >= 1 && ADCS <= 8, "ADCS: 1 to 8");
 _Static_assert(BATCH >= 1 && BATCH <= 8 && BATCH * 100u <= RATE_HZ, "BATCH: 1 to 8 samples, at most 10 ms");

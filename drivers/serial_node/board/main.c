@@ -36,12 +36,12 @@ void tim4_handler(void);
 void tim4_handler(void)
 {
     int32_t encoders[NODE_MAX_ENCODERS];
-    int16_t adcs[NODE_MAX_ADCS];
+    int16_t adcs[NODE_MAX_ADCS], counts[NODE_MAX_OUTPUTS];
     ticks_take();
     uint32_t clock_us = board_sense(encoders, adcs);
-    int16_t counts = node_sample(&node, clock_us, encoders, adcs, board_emergency());
+    node_sample(&node, clock_us, encoders, adcs, board_emergency(), counts);
     board_put(counts);
-    board_supply(node_supply(&node)); /* after the converter: node.h */
+    board_supply(node_supply(&node)); /* after the converters: node.h */
     node_receive();
     send();
     watchdog_feed(); /* here alone: without samples, and without an end of one, the chip resets */

@@ -14,7 +14,7 @@
 #define APB1_HZ 42000000u /* of serial port and converters' bus */
 #define TIMER_HZ 84000000u /* of the timers on it: RM0090, 7.2 */
 
-/* board_*.c. What the board is; the clock at its full rate, the converters ready, the output at
+/* board_*.c. What the board is; the clock at its full rate, the converters ready, all outputs at
  * null, the supply line off. Does not return if something of that cannot be had. */
 const node_config *board_start(void);
 /* Number of this boot: not 0, another one than before the last reset. */
@@ -23,9 +23,10 @@ uint16_t board_boot(void);
 uint32_t board_sense(int32_t *encoders, int16_t *adcs);
 /* Whether the emergency input is open. */
 int board_emergency(void);
-void board_put(int16_t counts);
+/* Of each output. */
+void board_put(const int16_t *counts);
 void board_supply(int on);
-/* Null, then the supply line off, whatever went on before: for the handlers of what is wrong. */
+/* All outputs at null, then the supply line off, whatever went on before: for the handlers of what is wrong. */
 void board_null(void);
 
 /* wire.c: bytes of the serial port. */
