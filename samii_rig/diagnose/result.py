@@ -238,6 +238,7 @@ class Diagnosis:
     before : of two states, what both have; the causes are then what changed between them.
     moved : the largest first. sigma : root of the chi-square that the causes explain. gain : noise
         units by which the next experiment would tell the rivals apart; None where none was found.
+    states : the recordings of each state of the rig, where they are of more than one.
     """
 
     verdict: Verdict
@@ -265,6 +266,7 @@ class Diagnosis:
     sigma: float = 0.0
     gain: float | None = None
     before: Before | None = None
+    states: tuple[tuple[str, ...], ...] = ()
 
     def plain(self) -> dict[str, Any]:
         """The contract of `samii-rig diagnose --json`."""
@@ -302,7 +304,9 @@ class Diagnosis:
                 "gain": self.gain,
             },
             "model": self.model,
-        } | ({"before": self.before.plain()} if self.before else {})
+            **({"before": self.before.plain()} if self.before else {}),
+            **({"states": [list(names) for names in self.states]} if self.states else {}),
+        }
 
     def lines(self) -> tuple[str, ...]:
         """Three lines for a person: what, how sure and how much better, what next."""
@@ -328,7 +332,7 @@ class Diagnosis:
                 c.site,
                 f"{c.probability:.0%}",
                 ", ".join(
-                    f"{k} = {v.value:.4g} {v.unit} ({v.within()})" for k, v in c.parameters.items()
+                    f"{k} = {v.value:.4g}{_unit(v)} ({v.within()})" for k, v in c.parameters.items()
                 ),
                 ", ".join(f"{p.replace('_', ' ')} at {s}" for p, s in c.equivalents),
             )
@@ -353,6 +357,11 @@ class Diagnosis:
                     f"{what} to the noise (chi-square per degree of "
                     f"freedom {self.chi2_per_dof:.3f}, threshold {self.threshold:.3f})."
                 )
+            case "unknown" if self.states:
+                return (
+                    "The recordings are not of one state of the rig: no one model explains them "
+                    "all, and no cause is named."
+                )
             case "unknown":
                 site, p = self.sites[0] if self.sites else ("", 0.0)
                 place = f" It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
@@ -373,7 +382,9 @@ class Diagnosis:
             )
             on = f"on lines {what}"
         if not self.causes:
-            return f"{sentence(on)[:-1]} the refitted model has {before:.3g} of the noise's power."
+            counted = "; what the recordings differ by counts as noise" if self.states else ""
+            has = f"the refitted model has {before:.3g} of the noise's power{counted}."
+            return f"{sentence(on)[:-1]} {has}"
         sure = min(c.probability for c in self.causes)
         return (
             f"Probability {percent(sure)}; {on} chi-square per degree of freedom "
@@ -427,6 +438,12 @@ def percent(p: float) -> str:
 
 
 def _said(cause: Cause) -> str:
-    numbers = ", ".join(f"{k} = {v.value:.3g} {v.unit}" for k, v in cause.parameters.items())
+    every = cause.parameters.items()
+    numbers = ", ".join(f"{k} = {v.value:.3g}{_unit(v)}" for k, v in every)
     said = f"{cause.physics.replace('_', ' ')} at {cause.site}"
     return f"{said} ({numbers})" if numbers else said
+
+
+def _unit(value: Value) -> str:
+    """Behind a number; a ratio has none."""
+    return "" if value.unit == "1" else f" {value.unit}"

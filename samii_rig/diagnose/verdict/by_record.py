@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.measured import DIFFER
+from samii_rig.diagnose.fit.agreeing import Apart, states_apart
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
@@ -59,7 +60,13 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         if forced.spent:
             looked = replace(looked, said=(*looked.said, SPENT))
     looked = replace(looked, said=(*looked.said, *_unasked(search)))
-    return _answer(case, forced or search, first, bands, looked)
+    if len(case.runs) > 1:
+        search.begin("whether the recordings agree")
+    apart = states_apart(search, case.runs, case.clean.samples)
+    if apart is None:
+        return _answer(case, forced or search, first, bands, looked)
+    looked = replace(looked, judged=verdict.of_several_states(looked.judged, apart.part))
+    return _of_states(_answer(case, forced or search, first, bands, looked), apart)
 
 
 def by_samples(
@@ -123,6 +130,15 @@ def _answer(
     of_lines = case.clean.of_lines
     clean = replace(case.clean, told=tuple(w for w in case.clean.told if w not in of_lines))
     return told(replace(case, clean=clean), search, looked.judged, shown, looked.said)
+
+
+def _of_states(found: Diagnosis, apart: Apart) -> Diagnosis:
+    """The same, with what the recordings differ by; where that leaves no answer, what to do."""
+    found = replace(found, states=apart.states, not_physics=(apart.told(), *found.not_physics))
+    if found.verdict != "unknown":
+        return found
+    why = "what one model makes of several states is of none of them"
+    return replace(found, sites=(), why=why, experiment=apart.experiment(), gain=None)
 
 
 def forces_on(search: RecordSearch) -> ForceSearch | None:
