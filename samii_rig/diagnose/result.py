@@ -124,6 +124,28 @@ class Moved:
 
 
 @dataclass(frozen=True, slots=True)
+class Exact:
+    """A number that the rig file takes for exact, and is not: with another it explains the
+    recordings to their noise. stated : its value there, in the unit of `value`."""
+
+    parameter: str
+    stated: float
+    value: Value
+
+    def told(self) -> str:
+        """In words."""
+        v, unit = self.value, self.value.unit
+        return (
+            f"{self.parameter} = {v.value:.4g} {unit} ({v.within()}) in place of the rig file's "
+            f"{self.stated:.4g} {unit}"
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return {"parameter": self.parameter, "stated": self.stated, **self.value.plain()}
+
+
+@dataclass(frozen=True, slots=True)
 class Hiding:
     """What these data would not have shown: the smallest effect that would have been found with
     90 %. size : None where none within its range would have been."""
@@ -238,7 +260,8 @@ class Diagnosis:
     before : of two states, what both have; the causes are then what changed between them.
     moved : the largest first. sigma : root of the chi-square that the causes explain. gain : noise
         units by which the next experiment would tell the rivals apart; None where none was found.
-    states : the recordings of each state of the rig, where they are of more than one.
+    states : the recordings of each state of the rig, where they are of more than one. exact : what
+        is no missing physics, but a wrong number of the rig file.
     """
 
     verdict: Verdict
@@ -267,6 +290,7 @@ class Diagnosis:
     gain: float | None = None
     before: Before | None = None
     states: tuple[tuple[str, ...], ...] = ()
+    exact: Exact | None = None
 
     def plain(self) -> dict[str, Any]:
         """The contract of `samii-rig diagnose --json`."""
@@ -305,6 +329,7 @@ class Diagnosis:
             },
             "model": self.model,
             **({"before": self.before.plain()} if self.before else {}),
+            **({"exact": self.exact.plain()} if self.exact else {}),
             **({"states": [list(names) for names in self.states]} if self.states else {}),
         }
 
@@ -362,6 +387,8 @@ class Diagnosis:
                     "The recordings are not of one state of the rig: no one model explains them "
                     "all, and no cause is named."
                 )
+            case "unknown" if self.exact:
+                return f"A number of the rig file is wrong: {self.exact.told()}."
             case "unknown":
                 site, p = self.sites[0] if self.sites else ("", 0.0)
                 place = f" It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
@@ -381,6 +408,11 @@ class Diagnosis:
                 "that were fitted" if self.before.discrepancy else "of the state after kept apart"
             )
             on = f"on lines {what}"
+        if self.exact:
+            return (
+                f"{sentence(on)[:-1]} chi-square per degree of freedom falls from {before:.3g} to "
+                f"{after:.3g} (noise alone: 1); {self.gap.words()}."
+            )
         if not self.causes:
             counted = "; what the recordings differ by counts as noise" if self.states else ""
             has = f"the refitted model has {before:.3g} of the noise's power{counted}."

@@ -6,10 +6,12 @@ from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.measured import DIFFER
 from samii_rig.diagnose.fit.agreeing import Apart, states_apart
+from samii_rig.diagnose.fit.exact import wrong_length
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
+from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
-from samii_rig.diagnose.result import Band, Diagnosis, Gap
+from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.diagnose.verdict.stages import Case, Shown, told
@@ -44,6 +46,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     search.begin("what is missing")
     # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
     search.run(briefly=True)
+    if (wrong := wrong_length(search)) is not None:
+        return _of_length(case, search, first, bands, *wrong)
     search.begin("amplitude levels")
     forced = forces_on(search)
     if forced is None or not (case.search.lines.torn() or forced.is_enough()):
@@ -130,6 +134,40 @@ def _answer(
     of_lines = case.clean.of_lines
     clean = replace(case.clean, told=tuple(w for w in case.clean.told if w not in of_lines))
     return told(replace(case, clean=clean), search, looked.judged, shown, looked.said)
+
+
+def _of_length(
+    case: Case,
+    search: RecordSearch,
+    first: float,
+    bands: tuple[Band, ...],
+    wrong: Exact,
+    freed: RecordSearch,
+) -> Diagnosis:
+    """The answer where a length of the rig file is wrong. freed : the search with that one free."""
+    nominal, fitted = search.nominal.fitted, freed.nominal.fitted
+    plain, after, gap = freed.shown(nominal, fitted)
+    shown = Shown(
+        first=first,
+        threshold=threshold(search.spread),
+        bands=bands,
+        nominal=(search.ratio(nominal), plain),
+        with_causes=(freed.ratio(fitted), after),
+        gap=gap,
+        used=search.used(),
+    )
+    looked = _Looked(verdict.judge(freed), plain, after, gap)
+    found = told(case, freed, looked.judged, shown)
+    return replace(
+        found,
+        verdict="unknown",
+        exact=wrong,
+        rig=explained(fitted),
+        could_hide=(),
+        experiment=f"measure {wrong.parameter}, correct the rig file and diagnose again",
+        why="no single effect explains the recordings, and this number does",
+        gain=None,
+    )
 
 
 def _of_states(found: Diagnosis, apart: Apart) -> Diagnosis:
