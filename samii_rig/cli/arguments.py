@@ -5,7 +5,7 @@ Numpy, the model's compiler and the plots take seconds to import; a typing mista
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from samii_rig.errors import InputError, one_of
@@ -49,6 +49,26 @@ def check_recordings(folder: Path) -> None:
     """InputError unless it is a folder."""
     if not folder.is_dir():
         raise InputError("FOLDER", "", str(folder), "a folder of recordings")
+
+
+def check_free(names: Sequence[str], rig: str | None, logs: Sequence[Path] = ()) -> None:
+    """InputError unless every name is a parameter of the rig: the one named, else the one that the
+    first recording carries."""
+    from samii_rig.identify.parameters import check_names
+    from samii_rig.rig.load import load_rig, parse
+    from samii_rig.rig.schema import Rig
+
+    if not names:
+        return
+    if rig is not None:
+        check_names(load_rig(rig)[0], names, "--free")
+        return
+
+    from samii_rig.record.reader import read_rig_toml
+
+    text = next(filter(None, map(read_rig_toml, logs)), "")
+    if text:
+        check_names(parse(Rig, text, "the recording's rig file"), names, "--free")
 
 
 def check_choice(option: str, value: str, choices: Iterable[str]) -> None:

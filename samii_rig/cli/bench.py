@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from samii_rig.cli.common import JsonOption, RigOption, say_json
+from samii_rig.units import pretty
 
 if TYPE_CHECKING:
     from samii_rig.rig.schema import Rig
@@ -61,7 +62,7 @@ def devices(rig: RigOption = "samii", json: JsonOption = False) -> None:
         if key in found:
             typer.echo(f"{key:10} {found[key]}")
     if fault:
-        typer.echo(f"FAULT      since {fault.time}: {fault.reason}")
+        typer.echo(f"FAULT      since {fault.time}: {pretty(fault.reason)}")
 
 
 def _ports() -> list[str]:
@@ -116,10 +117,10 @@ def doctor(
         if not json:
             typer.echo(
                 f"{check.verdict.upper() if check.verdict == 'bad' else check.verdict:5} "
-                f"{check.what:14} {check.found}"
+                f"{check.what:14} {pretty(check.found)}"
             )
             if check.remedy:
-                typer.echo(f"{'':20} -> {check.remedy}")
+                typer.echo(f"{'':20} -> {pretty(check.remedy)}")
     bad = [c.what for c in checks if c.verdict == "bad"]
     if json:
         say_json({"good": not bad, "checks": [asdict(c) for c in checks]})
@@ -158,12 +159,14 @@ def jog(
     if json:
         say_json({**asdict(move), "reached": move.reached, "recording": str(move.recording)})
     else:
-        unit, status = move.unit, move.stop.status
+        unit, status = pretty(move.unit), move.stop.status
         ended = "NOT REACHED" if status == "completed" and not move.reached else status
         way = f"{move.before:.4f} {unit} -> {move.after:.4f} {unit}"
-        typer.echo(f"{ended}: {way}; asked for {move.to:.4f} within {move.within:.2g} {unit}")
+        typer.echo(
+            f"{ended}: {way}; asked for {move.to:.4f} {unit} within {move.within:.2g} {unit}"
+        )
         if status != "completed":
-            typer.echo(move.stop.reason)
+            typer.echo(pretty(move.stop.reason))
         typer.echo(f"recording  {move.recording}")
     raise typer.Exit(code)
 

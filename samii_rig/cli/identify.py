@@ -78,7 +78,7 @@ def identify(
 
     Example: samii-rig identify runs/*.mcap --free joint_1.k --free joint_2.k
     """
-    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+    from samii_rig.cli.arguments import check_choice, check_free, check_logs, check_rig
 
     check_choice("--method", method, ("likelihood", "1", "2"))
     check_choice("--gaps", gaps, GAPS)
@@ -88,6 +88,7 @@ def identify(
         given = {"LOGS": logs, "--output": output, "--pose": pose, "--band": band}
         given["--method"] = None if method == "likelihood" else [method]
         given["--gaps"] = None if gaps == "refuse" else [gaps]
+        check_free(free or (), rig)
         _of_modes(modes, given, rig, free or (), use or "residues", json=json)
         return
     if use:
@@ -95,6 +96,9 @@ def identify(
     if not logs:
         raise InputError.saying("LOGS", "", "missing; expected recordings (.mcap) or --modes FILE")
     check_logs(logs)
+    if method != "likelihood" and not free:
+        raise InputError("--free", "", None, "what to identify, as --free ELEMENT.SYMBOL")
+    check_free(free or (), rig, logs)
 
     from typing import cast
 
@@ -107,8 +111,6 @@ def identify(
     from samii_rig.identify.table import method_table, summary_table
     from samii_rig.report.summary import working
 
-    if method != "likelihood" and not free:
-        raise InputError("--free", "", None, "what to identify, for example --free joint_1.k")
     recordings = read_all(logs)
     held = rig_of(recordings, rig)
     if held is None:

@@ -13,6 +13,8 @@ from samii_rig.cli.common import RigOption
 if TYPE_CHECKING:
     from samii_rig.serve.access import Role
 
+LAST_PORT = 65535
+
 
 def serve(
     rig: RigOption = "samii",
@@ -20,11 +22,15 @@ def serve(
     host: Annotated[
         str, typer.Option(help="Address to listen at; beyond this machine it wants TLS and tokens.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port to listen at; 0 for any that is free.")] = 8340,
+    port: Annotated[
+        int, typer.Option(help="Port to listen at; 0 for any that is free.", min=0, max=LAST_PORT)
+    ] = 8340,
     stop_port: Annotated[
         int | None,
         typer.Option(
-            help="Port of the stop's own listener; 0 for any [default: the one after --port]"
+            help="Port of the stop's own listener; 0 for any [default: the one after --port]",
+            min=0,
+            max=LAST_PORT,
         ),
     ] = None,
     tls_cert: Annotated[
@@ -86,8 +92,15 @@ def serve(
     if os.name != "posix":
         expected = "Linux or macOS, whose signals and locks it uses"
         raise InputError("samii-rig serve", "", os.name, expected)
+    if new_token is not None and tokens is None:
+        raise InputError("--new-token", "--tokens", None, "the file that keeps its hash")
+    if new_token is not None and role not in ("viewer", "operator"):
+        raise InputError("--new-token", "--role", role, "viewer or operator")
+    if (tls_cert is None) != (tls_key is None):
+        raise InputError("samii-rig serve", "--tls-cert", str(tls_cert), "--tls-key beside it")
     from samii_rig.rig.load import load_rig
 
+    the_rig, text = load_rig(rig)
     try:
         from samii_rig.serve.access import Tokens
         from samii_rig.serve.app import serve as run
@@ -96,16 +109,9 @@ def serve(
         said = f"needs {error.name}, which is not installed; pip install 'samii-rig[serve]'"
         raise InputError.saying("samii-rig serve", "", said) from error
     known = Tokens(tokens) if tokens else None
-    if new_token is not None:
-        if known is None:
-            raise InputError("--new-token", "--tokens", None, "the file that keeps its hash")
-        if role not in ("viewer", "operator"):
-            raise InputError("--new-token", "--role", role, "viewer or operator")
+    if new_token is not None and known is not None:
         typer.echo(known.add(new_token, cast("Role", role)))
         return
-    if (tls_cert is None) != (tls_key is None):
-        raise InputError("samii-rig serve", "--tls-cert", str(tls_cert), "--tls-key beside it")
-    the_rig, text = load_rig(rig)
     run(
         Settings(
             rig=the_rig,

@@ -9,6 +9,7 @@ from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.display import card
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse
+from samii_rig.units import pretty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -446,13 +447,13 @@ def _hides(every: Sequence[Hiding]) -> list[str]:
         if worst.size is None:
             out.append(f"{words[0]} at {worst.site}, however large")
         else:
-            out.append(f"{words[1]} {worst.size:.2g} {worst.unit} at {worst.site}")
+            out.append(f"{words[1]} {worst.size:.2g} {pretty(worst.unit)} at {worst.site}")
     return out
 
 
 def sentence(text: str) -> str:
     """With a capital and a full stop; the name of a channel stays as it is."""
-    text = text.strip()
+    text = pretty(text.strip())
     if text[:1].islower() and " " in text and text.split()[0].isalpha():
         text = text[0].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) else f"{text}."
@@ -478,4 +479,4 @@ def _said(cause: Cause) -> str:
 
 def _unit(value: Value) -> str:
     """Behind a number; a ratio has none."""
-    return "" if value.unit == "1" else f" {value.unit}"
+    return "" if value.unit == "1" else f" {pretty(value.unit)}"

@@ -86,6 +86,12 @@ def read_recording(path: Path, *, partial: bool = False) -> Recording:
         )
 
 
+def read_rig_toml(path: Path) -> str:
+    """The rig file that a recording carries, "" without one; its samples are not read."""
+    with _contents(path, partial=False) as (data, contents):
+        return _text(data, contents, layout.RIG_FILE)
+
+
 def read_frequency_responses(path: Path, *, partial: bool = False) -> list[FrequencyResponse]:
     """The frequency responses logged in a recording, or in a file derived from some."""
     with _contents(path, partial=partial) as (data, contents):

@@ -22,12 +22,15 @@ from samii_rig.cli.estimate import GAPS, METHODS
 from samii_rig.cli.papers import FORMATS
 from samii_rig.errors import InputError, SamiiRigError, one_of
 from samii_rig.record.export_samples import WRITERS
+from samii_rig.record.reader import read_rig_toml
+from samii_rig.record.writer import RunWriter
 from samii_rig.report.figures import SUFFIXES
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
 from samii_rig.run.experiments import load_experiment
 from samii_rig.signal.choose import Method
 from samii_rig.signal.gather import Gaps
+from samii_rig.types import StopRecord
 
 HEAVY = ("numpy", "scipy", "numba", "mcap", "matplotlib", "plotly", "control", "rich.progress")
 WRONG = [
@@ -46,6 +49,9 @@ WRONG = [
     "control --rig sami",
     "prove --rig sami",
     "serve --rig sami",
+    "serve --port 65536",
+    "serve --new-token anna",
+    "serve --tls-key key.pem",
     "papers no",
     "papers --format gif",
     "recordings nowhere",
@@ -80,7 +86,12 @@ WRONG = [
     "diagnose there.mcap --rig samii --out there.mcap",
 ]
 # These ask the rig file for its elements, which takes numpy; the model is not asked.
-WRONG_FOR_THE_RIG = ["study --vary nope", "study --vary joint_1.q=1:2:3"]
+WRONG_FOR_THE_RIG = [
+    "study --vary nope",
+    "study --vary joint_1.q=1:2:3",
+    "identify there.mcap --rig samii --free joint_1.q",
+    "identify there.mcap --rig two_masses --free spring_1",
+]
 COUNT = """
 import json, sys
 from samii_rig.cli import main
@@ -134,6 +145,20 @@ def refused(*words: str) -> str:
     result = CliRunner().invoke(app, list(words))
     assert isinstance(result.exception, SamiiRigError), result.output
     return str(result.exception)
+
+
+def test_a_name_to_free_is_held_against_the_rig_at_hand_before_samples_are_read(tmp_path) -> None:
+    # A recording is read for its rig file alone; the example is one of that rig's own parameters.
+    (tmp_path / "there.mcap").touch()
+    words = ("identify", str(tmp_path / "there.mcap"), "--rig", "two_masses", "--free")
+    assert refused(*words, "spring_1").endswith("element.symbol, for example spring_1.k")
+    assert refused(*words, "spring_1.q").startswith("--free is 'spring_1.q'")
+    run = tmp_path / "run.mcap"
+    toml = load_rig("two_masses")[1]
+    with RunWriter(run, (), 500.0, rig_toml=toml) as writer:
+        writer.close(StopRecord("completed", "all segments done"))
+    assert read_rig_toml(run) == toml
+    assert "an element of Two masses" in refused("identify", str(run), "--free", "joint_1.k")
 
 
 @pytest.mark.parametrize(
