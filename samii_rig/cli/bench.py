@@ -14,6 +14,7 @@ from samii_rig.units import pretty
 if TYPE_CHECKING:
     from samii_rig.rig.schema import Rig
 
+FASTEST = 0.2  # as of `run.session`, which takes a second to import; a test holds them together
 EXIT = {"completed": 0, "stopped": 130, "tripped": 5, "failed": 6}
 OutOption = Annotated[Path, typer.Option("--out", help="Folder of the recordings.")]
 
@@ -131,7 +132,9 @@ def jog(
     to: Annotated[
         float, typer.Option("--to", help="Angle to bring the joint to, in its sensor's unit.")
     ] = 0.0,
-    speed: Annotated[float, typer.Option(help="Mean speed, unit/s; at most 0.2.")] = 0.05,
+    speed: Annotated[
+        float, typer.Option(help="Mean speed, unit/s; above 0.", min=0.0, max=FASTEST)
+    ] = 0.05,
     rig: RigOption = "samii",
     out: OutOption = Path("runs"),
     json: JsonOption = False,
@@ -205,12 +208,16 @@ def calibrate(
 
     import numpy as np
 
-    from samii_rig.record.export import replacing
     from samii_rig.rig.load import load_rig
     from samii_rig.run import calibrate as c
-    from samii_rig.run.session import column, listen, opened
 
     the_rig, text = load_rig(rig)
+    if sensor != "null":
+        c.wiring(the_rig, sensor)
+
+    from samii_rig.record.export import replacing
+    from samii_rig.run.session import column, listen, opened
+
     if sensor == "null":
         new_text, said = _null(the_rig, text, rig, seconds, out)
     else:

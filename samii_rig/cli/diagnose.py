@@ -115,10 +115,19 @@ def diagnose(
 
     Example: samii-rig diagnose runs/*.mcap --rig samii --out diagnosis
     """
-    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+    from samii_rig.cli.arguments import (
+        check_band,
+        check_channels,
+        check_choice,
+        check_known,
+        check_logs,
+        check_poses,
+        check_rig,
+    )
 
     check_rig(rig)
     check_choice("--gaps", gaps, GAPS)
+    check_band(band)
     any_known = bool(known or known_before)
     logs, earlier = _states(logs or [], before or [], after or [], each=each, known=any_known)
     if pose and (earlier or each):
@@ -128,6 +137,10 @@ def diagnose(
         raise InputError("--known-before", "", known_before[0], "--before and --after beside it")
     if not each:
         check_logs([*earlier, *logs])
+        check_known(known or (), "--known", rig, [*earlier, *logs])
+        check_known(known_before or (), "--known-before", rig, [*earlier, *logs])
+        check_poses(pose, rig, logs)
+        check_channels("--output", output, [*earlier, *logs])
 
     from rich.console import Console
 

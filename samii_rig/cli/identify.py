@@ -78,12 +78,21 @@ def identify(
 
     Example: samii-rig identify runs/*.mcap --free joint_1.k --free joint_2.k
     """
-    from samii_rig.cli.arguments import check_choice, check_free, check_logs, check_rig
+    from samii_rig.cli.arguments import (
+        check_band,
+        check_channels,
+        check_choice,
+        check_free,
+        check_logs,
+        check_poses,
+        check_rig,
+    )
 
     check_choice("--method", method, ("likelihood", "1", "2"))
     check_choice("--gaps", gaps, GAPS)
     check_choice("--use", use or "residues", ("residues", "shapes", "poles"))
     check_rig(rig)
+    check_band(band)
     if modes:
         given = {"LOGS": logs, "--output": output, "--pose": pose, "--band": band}
         given["--method"] = None if method == "likelihood" else [method]
@@ -99,6 +108,8 @@ def identify(
     if method != "likelihood" and not free:
         raise InputError("--free", "", None, "what to identify, as --free ELEMENT.SYMBOL")
     check_free(free or (), rig, logs)
+    check_poses(pose, rig, logs)
+    check_channels("--output", output, logs)
 
     from typing import cast
 

@@ -43,6 +43,17 @@ def by_pose(
     return list(out.items())
 
 
+def given_poses(n: int, rig: Rig, given: Sequence[str]) -> list[Angle]:
+    """The pose of each of n recordings in words; InputError as of `poses_of`."""
+    if rig.gravity == 0:
+        expected = f"none, as {rig.name} has no gravity: expected gravity = 9.81 in the rig file"
+        raise InputError("--pose", "", given[0], expected)
+    if len(given) != n:
+        expected = f"one --pose for each of {n} recordings, in their order"
+        raise InputError("--pose", "", f"{len(given)} poses", expected)
+    return [read_pose(text) for text in given]
+
+
 def poses_of(recordings: Sequence[Recording], rig: Rig, given: Sequence[str]) -> list[Angle]:
     """The pose of each recording: as `given`, else that of the rig file that it carries, if
     that has gravity, else that of `rig`.
@@ -50,14 +61,8 @@ def poses_of(recordings: Sequence[Recording], rig: Rig, given: Sequence[str]) ->
     Raises InputError for another number of poses than of recordings, for one that is no angle, and
     for poses of a rig without gravity.
     """
-    if given and rig.gravity == 0:
-        expected = f"none, as {rig.name} has no gravity: expected gravity = 9.81 in the rig file"
-        raise InputError("--pose", "", given[0], expected)
-    if given and len(given) != len(recordings):
-        expected = f"one --pose for each of {len(recordings)} recordings, in their order"
-        raise InputError("--pose", "", f"{len(given)} poses", expected)
     if given:
-        return [read_pose(text) for text in given]
+        return given_poses(len(recordings), rig, given)
     if rig.gravity == 0:
         return [HANGING] * len(recordings)
     out = []
