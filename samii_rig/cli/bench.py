@@ -14,7 +14,8 @@ from samii_rig.units import pretty
 if TYPE_CHECKING:
     from samii_rig.rig.schema import Rig
 
-FASTEST = 0.2  # as of `run.session`, which takes a second to import; a test holds them together
+# As of `run.session`, which takes a second to import; a test holds them together.
+FASTEST, FURTHEST = 0.2, 0.8
 EXIT = {"completed": 0, "stopped": 130, "tripped": 5, "failed": 6}
 OutOption = Annotated[Path, typer.Option("--out", help="Folder of the recordings.")]
 
@@ -132,9 +133,7 @@ def jog(
     to: Annotated[
         float, typer.Option("--to", help="Angle to bring the joint to, in its sensor's unit.")
     ] = 0.0,
-    speed: Annotated[
-        float, typer.Option(help="Mean speed, unit/s; above 0.", min=0.0, max=FASTEST)
-    ] = 0.05,
+    speed: Annotated[float, typer.Option(help="Mean speed, unit/s; at most 0.2.")] = 0.05,
     rig: RigOption = "samii",
     out: OutOption = Path("runs"),
     json: JsonOption = False,
@@ -151,10 +150,22 @@ def jog(
     check_rig(rig)
     check_folder("--out", out)
 
+    from samii_rig.errors import InputError
     from samii_rig.rig.load import load_rig
-    from samii_rig.run.session import jog as go
 
     the_rig, text = load_rig(rig)
+    if (loop := the_rig.centring) is not None:
+        unit = the_rig.units()[loop.sensor]
+        most = min((x.max for x in the_rig.limits_on(loop.sensor)), default=float("inf"))
+        if not abs(to) <= FURTHEST * most:
+            what = f"at most {FURTHEST * most:.3g} {unit}: 80 % of {loop.sensor}'s limit"
+            raise InputError("jog", "--to", to, what)
+        if not 0.0 < speed <= FASTEST:
+            what = f"above 0 and at most {FASTEST:g} {unit}/s"
+            raise InputError("jog", "--speed", speed, what)
+
+    from samii_rig.run.session import jog as go
+
     move = go(the_rig, text, to, speed, out)
     code = EXIT.get(move.stop.status, 1)
     if code == 0 and not move.reached:

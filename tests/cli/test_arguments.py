@@ -55,6 +55,7 @@ WRONG = [
     "study --vary joint_1.k=1:2:3 --rig sami",
     "control --rig sami",
     "prove --rig sami",
+    "prove --out there.mcap",
     "serve --rig sami",
     "serve --port 65536",
     "serve --new-token anna",
@@ -106,6 +107,8 @@ WRONG_FOR_THE_RIG = [
     "control --rig samii --sensor theta_2",
     "calibrate nope --rig samii --to new.toml",
     "jog --speed 9",
+    "jog --to 9",
+    "jog --to nan",
 ]
 COUNT = """
 import json, sys
@@ -140,7 +143,7 @@ def test_the_words_of_the_options_are_those_of_the_estimate() -> None:
     assert get_args(Gaps) == GAPS
     assert {f".{name}" for name in FORMATS} == set(SUFFIXES)
     assert FIGURES == SUFFIXES
-    assert bench.FASTEST == session.FASTEST
+    assert (bench.FASTEST, bench.FURTHEST) == (session.FASTEST, session.FURTHEST)
     assert tuple(WRITERS) == SAMPLES
 
 
