@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from samii_rig.errors import InputError
     from samii_rig.serve.access import Role
 
-LAST_PORT = 65535
-
 
 def serve(
     rig: RigOption = "samii",
@@ -23,15 +21,11 @@ def serve(
     host: Annotated[
         str, typer.Option(help="Address to listen at; beyond this machine it wants TLS and tokens.")
     ] = "127.0.0.1",
-    port: Annotated[
-        int, typer.Option(help="Port to listen at; 0 for any that is free.", min=0, max=LAST_PORT)
-    ] = 8340,
+    port: Annotated[int, typer.Option(help="Port to listen at; 0 for any that is free.")] = 8340,
     stop_port: Annotated[
         int | None,
         typer.Option(
-            help="Port of the stop's own listener; 0 for any [default: the one after --port]",
-            min=0,
-            max=LAST_PORT,
+            help="Port of the stop's own listener; 0 for any [default: the one after --port]"
         ),
     ] = None,
     tls_cert: Annotated[

@@ -57,7 +57,6 @@ WRONG = [
     "prove --rig sami",
     "prove --out there.mcap",
     "serve --rig sami",
-    "serve --port 65536",
     "serve --new-token anna",
     "serve --tls-key key.pem",
     "papers no",
