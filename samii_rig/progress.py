@@ -77,7 +77,7 @@ class Pace:
         if done < 1 or spent < SOON:
             return str(stage)
         left = duration((stage.of - stage.done) * spent / done)
-        return f"{stage}, {left} left" + (" of it" if stage.within else "")
+        return f"{stage}, {left} left" + (" of this round" if stage.within else "")
 
 
 def duration(seconds: float) -> str:

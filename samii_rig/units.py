@@ -179,6 +179,11 @@ def _joined(units: tuple[Unit, ...]) -> Unit:
     return whole
 
 
+def pretty(words: str) -> str:
+    """Units in words as they are printed: `m/s\u00b2`; files and channels have `m/s^2`."""
+    return words.replace("^2", "\u00b2").replace("^3", "\u00b3").replace("^4", "\u2074")
+
+
 def quantity(unit: str) -> str:
     """What a unit measures, as "acceleration"; "" for a unit that is not known or a product."""
     found = _meanings(unit)

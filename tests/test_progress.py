@@ -38,12 +38,12 @@ def test_another_round_has_a_pace_of_its_own_and_is_said_to_be_one() -> None:
     pace.words(Counted("what is missing", 0, 30, within="round 1"))
     now[0] = 60.0
     assert pace.words(Counted("what is missing", 15, 30, within="round 1")).endswith(
-        "round 1: 15 of 30, 60 s left of it"
+        "round 1: 15 of 30, 60 s left of this round"
     )
     assert "left" not in pace.words(Counted("what is missing", 1, 6, within="round 2"))
     now[0] = 64.0
     assert pace.words(Counted("what is missing", 3, 6, within="round 2")).endswith(
-        "round 2: 3 of 6, 6 s left of it"
+        "round 2: 3 of 6, 6 s left of this round"
     )
 
 

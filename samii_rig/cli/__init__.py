@@ -31,11 +31,12 @@ def _command() -> int:
     from samii_rig.cli.app import app
     from samii_rig.errors import NO_MEMORY, DiskError, SamiiRigError
     from samii_rig.files import DISK_ERRORS
+    from samii_rig.units import pretty
 
     try:
         return int(app(prog_name="samii-rig", standalone_mode=False) or 0)
     except SamiiRigError as error:
-        print(f"samii-rig: {error}", file=sys.stderr)
+        print(f"samii-rig: {pretty(str(error))}", file=sys.stderr)
         return error.exit_code
     except TyperException as error:
         print(_usage(error), file=sys.stderr)

@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from samii_rig.cli.common import JsonOption, RigOption, say_json
+from samii_rig.units import pretty
 
 if TYPE_CHECKING:
     from samii_rig.rig.schema import Rig
 
+# As of `run.session`, which takes a second to import; a test holds them together.
+FASTEST, FURTHEST = 0.2, 0.8
 EXIT = {"completed": 0, "stopped": 130, "tripped": 5, "failed": 6}
 OutOption = Annotated[Path, typer.Option("--out", help="Folder of the recordings.")]
 
@@ -61,7 +64,7 @@ def devices(rig: RigOption = "samii", json: JsonOption = False) -> None:
         if key in found:
             typer.echo(f"{key:10} {found[key]}")
     if fault:
-        typer.echo(f"FAULT      since {fault.time}: {fault.reason}")
+        typer.echo(f"FAULT      since {fault.time}: {pretty(fault.reason)}")
 
 
 def _ports() -> list[str]:
@@ -116,10 +119,10 @@ def doctor(
         if not json:
             typer.echo(
                 f"{check.verdict.upper() if check.verdict == 'bad' else check.verdict:5} "
-                f"{check.what:14} {check.found}"
+                f"{check.what:14} {pretty(check.found)}"
             )
             if check.remedy:
-                typer.echo(f"{'':20} -> {check.remedy}")
+                typer.echo(f"{'':20} -> {pretty(check.remedy)}")
     bad = [c.what for c in checks if c.verdict == "bad"]
     if json:
         say_json({"good": not bad, "checks": [asdict(c) for c in checks]})
@@ -147,10 +150,22 @@ def jog(
     check_rig(rig)
     check_folder("--out", out)
 
+    from samii_rig.errors import InputError
     from samii_rig.rig.load import load_rig
-    from samii_rig.run.session import jog as go
 
     the_rig, text = load_rig(rig)
+    if (loop := the_rig.centring) is not None:
+        unit = the_rig.units()[loop.sensor]
+        most = min((x.max for x in the_rig.limits_on(loop.sensor)), default=float("inf"))
+        if not abs(to) <= FURTHEST * most:
+            what = f"at most {FURTHEST * most:.3g} {unit}: 80 % of {loop.sensor}'s limit"
+            raise InputError("jog", "--to", to, what)
+        if not 0.0 < speed <= FASTEST:
+            what = f"above 0 and at most {FASTEST:g} {unit}/s"
+            raise InputError("jog", "--speed", speed, what)
+
+    from samii_rig.run.session import jog as go
+
     move = go(the_rig, text, to, speed, out)
     code = EXIT.get(move.stop.status, 1)
     if code == 0 and not move.reached:
@@ -158,12 +173,14 @@ def jog(
     if json:
         say_json({**asdict(move), "reached": move.reached, "recording": str(move.recording)})
     else:
-        unit, status = move.unit, move.stop.status
+        unit, status = pretty(move.unit), move.stop.status
         ended = "NOT REACHED" if status == "completed" and not move.reached else status
         way = f"{move.before:.4f} {unit} -> {move.after:.4f} {unit}"
-        typer.echo(f"{ended}: {way}; asked for {move.to:.4f} within {move.within:.2g} {unit}")
+        typer.echo(
+            f"{ended}: {way}; asked for {move.to:.4f} {unit} within {move.within:.2g} {unit}"
+        )
         if status != "completed":
-            typer.echo(move.stop.reason)
+            typer.echo(pretty(move.stop.reason))
         typer.echo(f"recording  {move.recording}")
     raise typer.Exit(code)
 
@@ -205,12 +222,16 @@ def calibrate(
 
     import numpy as np
 
-    from samii_rig.record.export import replacing
     from samii_rig.rig.load import load_rig
     from samii_rig.run import calibrate as c
-    from samii_rig.run.session import column, listen, opened
 
     the_rig, text = load_rig(rig)
+    if sensor != "null":
+        c.wiring(the_rig, sensor)
+
+    from samii_rig.record.export import replacing
+    from samii_rig.run.session import column, listen, opened
+
     if sensor == "null":
         new_text, said = _null(the_rig, text, rig, seconds, out, actuator)
     else:

@@ -48,11 +48,17 @@ def control(
 
     Example: samii-rig control --rig samii --out control
     """
-    from samii_rig.cli.arguments import check_rig
+    from samii_rig.cli.arguments import check_accelerometer, check_rig
     from samii_rig.files import check_folder, make_folder
 
     check_rig(rig)
     check_folder("--out", out)
+
+    from samii_rig.rig.load import load_rig
+
+    the_rig, text = load_rig(rig)
+    if sensor is not None and identified is None:
+        check_accelerometer(the_rig, sensor)
 
     from rich.console import Console
 
@@ -66,9 +72,7 @@ def control(
     from samii_rig.control.settle import settling
     from samii_rig.record.reader import read_recording
     from samii_rig.report.summary import working
-    from samii_rig.rig.load import load_rig
 
-    the_rig, text = load_rig(rig)
     known = None
     if identified is not None and identified.suffix == ".toml":
         the_rig, text = load_rig(str(identified))

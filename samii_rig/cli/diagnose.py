@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from samii_rig.diagnose.batch import How
     from samii_rig.diagnose.result import Diagnosis
     from samii_rig.record.reader import SavedResponses
-    from samii_rig.rig.schema import Rig
     from samii_rig.signal.gather import Gaps
     from samii_rig.types import FrequencyResponse, Recording
 
@@ -116,10 +115,19 @@ def diagnose(
 
     Example: samii-rig diagnose runs/*.mcap --rig samii --out diagnosis
     """
-    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+    from samii_rig.cli.arguments import (
+        check_band,
+        check_channels,
+        check_choice,
+        check_known,
+        check_logs,
+        check_poses,
+        check_rig,
+    )
 
     check_rig(rig)
     check_choice("--gaps", gaps, GAPS)
+    check_band(band)
     any_known = bool(known or known_before)
     logs, earlier = _states(logs or [], before or [], after or [], each=each, known=any_known)
     if pose and (earlier or each):
@@ -129,6 +137,10 @@ def diagnose(
         raise InputError("--known-before", "", known_before[0], "--before and --after beside it")
     if not each:
         check_logs([*earlier, *logs])
+        check_known(known or (), "--known", rig, [*earlier, *logs])
+        check_known(known_before or (), "--known-before", rig, [*earlier, *logs])
+        check_poses(pose, rig, logs)
+        check_channels("--output", output, [*earlier, *logs])
 
     from rich.console import Console
 
@@ -198,6 +210,7 @@ def _together(
 
     from samii_rig.diagnose.changed import State, changed
     from samii_rig.diagnose.diagnose import diagnose as found_by
+    from samii_rig.diagnose.fit.exact import lengths
     from samii_rig.diagnose.fit.known import stated, with_known
     from samii_rig.diagnose.posed import in_poses, one_pose, same_rig, sorted_by_pose
     from samii_rig.identify.poses import at_pose, poses_of
@@ -269,7 +282,8 @@ def _together(
         return
     for line in found.lines():
         console.print(line, soft_wrap=True)
-    if found.verdict == "unknown" and not first and (exact := _lengths(own_rig)):
+    apart = first or found.states or found.exact
+    if found.verdict == "unknown" and not apart and (exact := lengths(own_rig)):
         console.print(
             f"exact    The rig file gives {', '.join(exact)} no tolerance. If one may be wrong, "
             f"free it: samii-rig identify with the same recordings, --rig and --free {exact[0]}",
@@ -281,14 +295,6 @@ def _together(
         console.print(f"page     {page}", soft_wrap=True)
     if not (own or first or values or saved):
         console.print("not kept with the recordings: they carry another rig file", soft_wrap=True)
-
-
-def _lengths(rig: Rig) -> list[str]:
-    """Lengths without a tolerance: what is taken for exact, and measured wrong most easily."""
-    from samii_rig.rig.schema.base import parameters
-
-    return [f"{e.name}.L" for e in rig.element
-            if (p := parameters(e).get("L")) and not p.tolerance and p.value]  # fmt: skip
 
 
 def _saved(logs: list[Path], *, two: bool) -> list[SavedResponses]:
@@ -378,7 +384,7 @@ def _write(folder: Path, found: Diagnosis) -> str:
     make_folder("--out", folder)
     try:
         path = ""
-        if found.rig is not None and found.causes:
+        if found.rig is not None and (found.causes or found.exact):
             path = str(folder / "diagnosed.toml")
             Path(path).write_text(toml(found.rig), encoding="utf-8")
         plain = replace(found, model=path).plain()

@@ -96,12 +96,11 @@ def frf(
 
     Example: samii-rig frf runs/*.mcap --export frf.csv --save frf.mcap
     """
-    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+    from samii_rig.cli.arguments import check_logs, check_rig
 
     check_rig(rig)
     check_logs(logs)
-    check_choice("--method", method, METHODS)
-    check_choice("--gaps", gaps, GAPS)
+    check_estimate(method, gaps, band, input_, output, logs)
     for path in export or ():
         check_target("--export", path, (".csv", ".npz", ".mat", ".uff"), logs)
     if save:
@@ -180,12 +179,11 @@ def report(
 
     Example: samii-rig report runs/*.mcap --out report.html --figure bode.svg
     """
-    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+    from samii_rig.cli.arguments import check_logs, check_rig
 
     check_rig(rig)
     check_logs(logs)
-    check_choice("--method", method, METHODS)
-    check_choice("--gaps", gaps, GAPS)
+    check_estimate(method, gaps, band, input_, output, logs)
     page = out or (None if figure else logs[0].with_suffix(".html"))
     if page is not None:
         check_target("--out", page, (".html",), logs)
@@ -244,6 +242,24 @@ def report(
     console.print(summary(recordings, responses, curve, band or ALL, modes))
     for path in written:
         console.print(f"written  {path}", soft_wrap=True)
+
+
+def check_estimate(
+    method: str,
+    gaps: str,
+    band: tuple[float, float] | None,
+    input_: list[str] | None,
+    output: list[str] | None,
+    logs: list[Path],
+) -> None:
+    """InputError for options that no estimate can have, before it is imported."""
+    from samii_rig.cli.arguments import check_band, check_channels, check_choice
+
+    check_choice("--method", method, METHODS)
+    check_choice("--gaps", gaps, GAPS)
+    check_band(band)
+    check_channels("--input", input_, logs)
+    check_channels("--output", output, logs)
 
 
 def _of_one_pose(recordings: list[Recording], rig: Rig | None) -> Rig:

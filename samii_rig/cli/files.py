@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from samii_rig.cli.common import SAMPLES, JsonOption, Logs, check_target, say_json
+from samii_rig.units import pretty
 
 if TYPE_CHECKING:
     from samii_rig.record.describe import Description
@@ -199,7 +200,7 @@ def _verdict(v: Verdict) -> str:
         f"{v.path}: {v.status}; {v.samples:,} samples, {v.segments} segments, "
         f"{v.responses} frequency responses"
         + (f", {v.missing} samples missing in {v.gaps} gaps" if v.gaps else "")
-        + (f"; {v.stop.status}: {v.stop.reason}" if v.stop else "; no stop record")
+        + (f"; {v.stop.status}: {pretty(v.stop.reason)}" if v.stop else "; no stop record")
     )
 
 

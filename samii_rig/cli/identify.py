@@ -78,16 +78,26 @@ def identify(
 
     Example: samii-rig identify runs/*.mcap --free joint_1.k --free joint_2.k
     """
-    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+    from samii_rig.cli.arguments import (
+        check_band,
+        check_channels,
+        check_choice,
+        check_free,
+        check_logs,
+        check_poses,
+        check_rig,
+    )
 
     check_choice("--method", method, ("likelihood", "1", "2"))
     check_choice("--gaps", gaps, GAPS)
     check_choice("--use", use or "residues", ("residues", "shapes", "poles"))
     check_rig(rig)
+    check_band(band)
     if modes:
         given = {"LOGS": logs, "--output": output, "--pose": pose, "--band": band}
         given["--method"] = None if method == "likelihood" else [method]
         given["--gaps"] = None if gaps == "refuse" else [gaps]
+        check_free(free or (), rig)
         _of_modes(modes, given, rig, free or (), use or "residues", json=json)
         return
     if use:
@@ -95,6 +105,11 @@ def identify(
     if not logs:
         raise InputError.saying("LOGS", "", "missing; expected recordings (.mcap) or --modes FILE")
     check_logs(logs)
+    if method != "likelihood" and not free:
+        raise InputError("--free", "", None, "what to identify, as --free ELEMENT.SYMBOL")
+    check_free(free or (), rig, logs)
+    check_poses(pose, rig, logs)
+    check_channels("--output", output, logs)
 
     from typing import cast
 
@@ -107,8 +122,6 @@ def identify(
     from samii_rig.identify.table import method_table, summary_table
     from samii_rig.report.summary import working
 
-    if method != "likelihood" and not free:
-        raise InputError("--free", "", None, "what to identify, for example --free joint_1.k")
     recordings = read_all(logs)
     held = rig_of(recordings, rig)
     if held is None:

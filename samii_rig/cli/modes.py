@@ -11,14 +11,13 @@ import typer
 
 from samii_rig.cli.common import FIGURES, JsonOption, Logs, check_target, rig_of, say_json
 from samii_rig.cli.estimate import (
-    GAPS,
-    METHODS,
     BandOption,
     GapsOption,
     InputOption,
     MethodOption,
     OutputOption,
     RigOverride,
+    check_estimate,
     estimated,
     read_all,
 )
@@ -72,13 +71,12 @@ def modes(
 
     Example: samii-rig modes runs/*.mcap --out modes.html
     """
-    from samii_rig.cli.arguments import check_choice, check_logs, check_rig
+    from samii_rig.cli.arguments import check_logs, check_rig
 
     others = against or []
     check_rig(rig)
     check_logs([*logs, *others])
-    check_choice("--method", method, METHODS)
-    check_choice("--gaps", gaps, GAPS)
+    check_estimate(method, gaps, band, input_, output, [*logs, *others])
     wanted = _picked(pick)
     files = (
         ("--out", out, (".html",)),

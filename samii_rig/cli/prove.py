@@ -93,11 +93,12 @@ def prove(
         check_target("--page", page, (".md",))
     if calibrate is not None:
         check_file("--calibrate", calibrate)
+    if of is None:
+        check_folder("--out", out)
     from samii_rig.prove import outcomes as kept
 
     failures: list[str] = []
     if of is None:
-        check_folder("--out", out)
         counts = {"nothing": nothing, "one": one, "two": two, "outside": outside,
                   "joints": joints, "force": force}  # fmt: skip
         failures = _made(

@@ -11,6 +11,7 @@ import typer
 from samii_rig.cli.common import RigOption
 
 if TYPE_CHECKING:
+    from samii_rig.errors import InputError
     from samii_rig.serve.access import Role
 
 
@@ -86,40 +87,50 @@ def serve(
     if os.name != "posix":
         expected = "Linux or macOS, whose signals and locks it uses"
         raise InputError("samii-rig serve", "", os.name, expected)
-    from samii_rig.rig.load import load_rig
-
-    try:
-        from samii_rig.serve.access import Tokens
-        from samii_rig.serve.app import serve as run
-        from samii_rig.serve.settings import Settings
-    except ModuleNotFoundError as error:
-        said = f"needs {error.name}, which is not installed; pip install 'samii-rig[serve]'"
-        raise InputError.saying("samii-rig serve", "", said) from error
-    known = Tokens(tokens) if tokens else None
-    if new_token is not None:
-        if known is None:
-            raise InputError("--new-token", "--tokens", None, "the file that keeps its hash")
-        if role not in ("viewer", "operator"):
-            raise InputError("--new-token", "--role", role, "viewer or operator")
-        typer.echo(known.add(new_token, cast("Role", role)))
-        return
+    if new_token is not None and tokens is None:
+        raise InputError("--new-token", "--tokens", None, "the file that keeps its hash")
+    if new_token is not None and role not in ("viewer", "operator"):
+        raise InputError("--new-token", "--role", role, "viewer or operator")
     if (tls_cert is None) != (tls_key is None):
         raise InputError("samii-rig serve", "--tls-cert", str(tls_cert), "--tls-key beside it")
+    from samii_rig.rig.load import load_rig
+
     the_rig, text = load_rig(rig)
-    run(
-        Settings(
-            rig=the_rig,
-            rig_toml=text,
-            folder=folder,
-            host=host,
-            port=port,
-            tls=(tls_cert, tls_key) if tls_cert and tls_key else None,
-            tokens=known,
-            names=tuple(name or ()),
-            pace=pace,
-            foxglove=foxglove,
-            foxglove_open=foxglove_open,
-            stop_port=stop_port,
-            proxies=frozenset(proxy or ()),
-        )
+    try:
+        from samii_rig.serve.access import Tokens
+        from samii_rig.serve.settings import Settings
+    except ModuleNotFoundError as error:
+        raise _without(error) from error
+    known = Tokens(tokens) if tokens else None
+    if new_token is not None and known is not None:
+        typer.echo(known.add(new_token, cast("Role", role)))
+        return
+    settings = Settings(
+        rig=the_rig,
+        rig_toml=text,
+        folder=folder,
+        host=host,
+        port=port,
+        tls=(tls_cert, tls_key) if tls_cert and tls_key else None,
+        tokens=known,
+        names=tuple(name or ()),
+        pace=pace,
+        foxglove=foxglove,
+        foxglove_open=foxglove_open,
+        stop_port=stop_port,
+        proxies=frozenset(proxy or ()),
     )
+    settings.check()
+    try:
+        from samii_rig.serve.app import serve as run
+    except ModuleNotFoundError as error:
+        raise _without(error) from error
+    run(settings)
+
+
+def _without(error: ModuleNotFoundError) -> InputError:
+    """What is said where the service's own packages are not installed."""
+    from samii_rig.errors import InputError
+
+    said = f"needs {error.name}, which is not installed; pip install 'samii-rig[serve]'"
+    return InputError.saying("samii-rig serve", "", said)

@@ -9,6 +9,7 @@ from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.display import card
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse
+from samii_rig.units import pretty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -121,6 +122,28 @@ class Moved:
     def plain(self) -> dict[str, Any]:
         """As plain data."""
         return {"parameter": self.parameter, "sigmas": self.sigmas}
+
+
+@dataclass(frozen=True, slots=True)
+class Exact:
+    """A number that the rig file takes for exact, and is not: with another it explains the
+    recordings to their noise. stated : its value there, in the unit of `value`."""
+
+    parameter: str
+    stated: float
+    value: Value
+
+    def told(self) -> str:
+        """In words."""
+        v, unit = self.value, self.value.unit
+        return (
+            f"{self.parameter} = {v.value:.4g} {unit} ({v.within()}) in place of the rig file's "
+            f"{self.stated:.4g} {unit}"
+        )
+
+    def plain(self) -> dict[str, Any]:
+        """As plain data."""
+        return {"parameter": self.parameter, "stated": self.stated, **self.value.plain()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +261,8 @@ class Diagnosis:
     before : of two states, what both have; the causes are then what changed between them.
     moved : the largest first. sigma : root of the chi-square that the causes explain. gain : noise
         units by which the next experiment would tell the rivals apart; None where none was found.
+    states : the recordings of each state of the rig, where they are of more than one. exact : what
+        is no missing physics, but a wrong number of the rig file.
     """
 
     verdict: Verdict
@@ -265,6 +290,8 @@ class Diagnosis:
     sigma: float = 0.0
     gain: float | None = None
     before: Before | None = None
+    states: tuple[tuple[str, ...], ...] = ()
+    exact: Exact | None = None
 
     def plain(self) -> dict[str, Any]:
         """The contract of `samii-rig diagnose --json`."""
@@ -302,7 +329,10 @@ class Diagnosis:
                 "gain": self.gain,
             },
             "model": self.model,
-        } | ({"before": self.before.plain()} if self.before else {})
+            **({"before": self.before.plain()} if self.before else {}),
+            **({"exact": self.exact.plain()} if self.exact else {}),
+            **({"states": [list(names) for names in self.states]} if self.states else {}),
+        }
 
     def lines(self) -> tuple[str, ...]:
         """Three lines for a person: what, how sure and how much better, what next."""
@@ -328,7 +358,7 @@ class Diagnosis:
                 c.site,
                 f"{c.probability:.0%}",
                 ", ".join(
-                    f"{k} = {v.value:.4g} {v.unit} ({v.within()})" for k, v in c.parameters.items()
+                    f"{k} = {v.value:.4g}{_unit(v)} ({v.within()})" for k, v in c.parameters.items()
                 ),
                 ", ".join(f"{p.replace('_', ' ')} at {s}" for p, s in c.equivalents),
             )
@@ -353,6 +383,13 @@ class Diagnosis:
                     f"{what} to the noise (chi-square per degree of "
                     f"freedom {self.chi2_per_dof:.3f}, threshold {self.threshold:.3f})."
                 )
+            case "unknown" if self.states:
+                return (
+                    "The recordings are not of one state of the rig: no one model explains them "
+                    "all, and no cause is named."
+                )
+            case "unknown" if self.exact:
+                return f"A number of the rig file is wrong: {self.exact.told()}."
             case "unknown":
                 site, p = self.sites[0] if self.sites else ("", 0.0)
                 place = f" It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
@@ -372,8 +409,15 @@ class Diagnosis:
                 "that were fitted" if self.before.discrepancy else "of the state after kept apart"
             )
             on = f"on lines {what}"
+        if self.exact:
+            return (
+                f"{sentence(on)[:-1]} chi-square per degree of freedom falls from {before:.3g} to "
+                f"{after:.3g} (noise alone: 1); {self.gap.words()}."
+            )
         if not self.causes:
-            return f"{sentence(on)[:-1]} the refitted model has {before:.3g} of the noise's power."
+            counted = "; what the recordings differ by counts as noise" if self.states else ""
+            has = f"the refitted model has {before:.3g} of the noise's power{counted}."
+            return f"{sentence(on)[:-1]} {has}"
         sure = min(c.probability for c in self.causes)
         return (
             f"Probability {percent(sure)}; {on} chi-square per degree of freedom "
@@ -403,13 +447,13 @@ def _hides(every: Sequence[Hiding]) -> list[str]:
         if worst.size is None:
             out.append(f"{words[0]} at {worst.site}, however large")
         else:
-            out.append(f"{words[1]} {worst.size:.2g} {worst.unit} at {worst.site}")
+            out.append(f"{words[1]} {worst.size:.2g} {pretty(worst.unit)} at {worst.site}")
     return out
 
 
 def sentence(text: str) -> str:
     """With a capital and a full stop; the name of a channel stays as it is."""
-    text = text.strip()
+    text = pretty(text.strip())
     if text[:1].islower() and " " in text and text.split()[0].isalpha():
         text = text[0].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) else f"{text}."
@@ -427,6 +471,12 @@ def percent(p: float) -> str:
 
 
 def _said(cause: Cause) -> str:
-    numbers = ", ".join(f"{k} = {v.value:.3g} {v.unit}" for k, v in cause.parameters.items())
+    every = cause.parameters.items()
+    numbers = ", ".join(f"{k} = {v.value:.3g}{_unit(v)}" for k, v in every)
     said = f"{cause.physics.replace('_', ' ')} at {cause.site}"
     return f"{said} ({numbers})" if numbers else said
+
+
+def _unit(value: Value) -> str:
+    """Behind a number; a ratio has none."""
+    return "" if value.unit == "1" else f" {pretty(value.unit)}"

@@ -53,10 +53,15 @@ def identifiability(
         for v, u in zip(combinations[:weak], uncertainty[:weak], strict=True)
     ]
     if not weak:
-        sentences.append(
-            f"All {len(names)} parameters are identified from {channels}; the combination known "
-            f"least is known to {_percent(float(uncertainty[0]))}."
-        )
+        least = f"known to {_percent(float(uncertainty[0]))}."
+        if len(names) == 1:
+            sentences.append(f"{names[0]} is identified from {channels}; it is {least}")
+        else:
+            every = "Both" if len(names) == 2 else f"All {len(names)}"
+            sentences.append(
+                f"{every} parameters are identified from {channels}; the combination known least "
+                f"is {least}"
+            )
         sentences += _tied(jacobian, names)
     return Identifiability(
         tuple(names), np.asarray(uncertainty), np.asarray(combinations), weak, tuple(sentences)

@@ -15,6 +15,7 @@ from samii_rig.types import Float
 # Default bounds, as a factor of the rig file's value: wide enough that they are met only by
 # a parameter that the data do not hold.
 REACH = 30.0
+WHERE = "free parameters"
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,23 @@ class Space:
         return {k: float(v) for k, v in zip(self.keys, self.values(x), strict=True)}
 
 
+def check_names(rig: Rig, names: Sequence[str | Free], where: str = WHERE) -> list[Free]:
+    """Each as a parameter of the rig. where : who asked, for the error's line.
+
+    Raises InputError for an unknown parameter or one named twice.
+    """
+    known = {(e.name, s) for e in rig.element for s in parameters(e)}
+    found: list[Free] = []
+    for given in names:
+        item = given if isinstance(given, Free) else _named(rig, given, where)
+        if item.key not in known:
+            raise InputError(where, "", item.name, _choices(rig, item))
+        if item.key in [f.key for f in found]:
+            raise InputError(where, "", item.name, "each parameter once")
+        found.append(item)
+    return found
+
+
 def space(rig: Rig, free: Sequence[str | Free], prior: bool = False) -> Space:
     """The free parameters of `rig` by name (`joint_1.k`) or as `Free`.
 
@@ -92,36 +110,30 @@ def space(rig: Rig, free: Sequence[str | Free], prior: bool = False) -> Space:
     zero (a logarithm cannot leave it), bounds that do not hold the start.
     """
     known = {(e.name, s): p for e in rig.element for s, p in parameters(e).items()}
-    items: list[Free] = []
+    items = check_names(rig, free)
     rows: list[tuple[float, float, float, float, float]] = []
     units: list[str] = []
-    for given in free:
-        item = given if isinstance(given, Free) else _named(given)
-        if item.key not in known:
-            raise InputError("free parameters", "", item.name, _choices(rig, item))
-        if item.key in [f.key for f in items]:
-            raise InputError("free parameters", "", item.name, "each parameter once")
+    for item in items:
         parameter = known[item.key]
         start = parameter.value if item.start is None else item.start
         if start == 0 or not math.isfinite(start):
             expected = "a start that is not zero: a parameter is searched for in its logarithm"
-            raise InputError("free parameters", item.name, start, expected)
+            raise InputError(WHERE, item.name, start, expected)
         if not 0 < item.low <= 1 <= item.high:
             expected = "bounds as factors of the start, low <= 1 <= high"
-            raise InputError("free parameters", item.name, (item.low, item.high), expected)
+            raise InputError(WHERE, item.name, (item.low, item.high), expected)
         tolerance = item.tolerance
         if tolerance is None and prior and parameter.tolerance > 0:
             tolerance = parameter.tolerance
         if tolerance is not None and (tolerance <= 0 or parameter.value / start <= 0):
-            raise InputError("free parameters", item.name, tolerance, "a tolerance above 0")
+            raise InputError(WHERE, item.name, tolerance, "a tolerance above 0")
         mean, sd = (0.0, math.inf)
         if tolerance is not None:
             mean, sd = math.log(parameter.value / start), tolerance
         rows.append((start, math.log(item.low), math.log(item.high), mean, sd))
-        items.append(item)
         units.append(parameter.unit)
     if not items:
-        raise InputError("free parameters", "", [], "at least one, for example joint_1.k")
+        raise InputError(WHERE, "", [], f"at least one, for example {_example(rig)}")
     start_, lower, upper, mean_, sd_ = np.array(rows).T
     return Space(tuple(items), start_, lower, upper, mean_, sd_, tuple(units))
 
@@ -152,10 +164,17 @@ def changed(rig: Rig, values: Mapping[tuple[str, str], float]) -> Rig:
     return rig.model_copy(update={"element": tuple(elements)})
 
 
-def _named(name: str) -> Free:
+def _example(rig: Rig, element: str = "") -> str:
+    """A parameter of the rig that one may want to free, of this element if it has one."""
+    every = [f"{e.name}.{s}" for e in rig.element for s, p in parameters(e).items() if p.value]
+    own = [name for name in every if name.startswith(f"{element}.")]
+    return next(iter((*own, *uncertain(rig), *every)), "ELEMENT.SYMBOL")
+
+
+def _named(rig: Rig, name: str, where: str) -> Free:
     element, dot, symbol = name.partition(".")
     if not (element and dot and symbol):
-        raise InputError("free parameters", "", name, "element.symbol, for example joint_1.k")
+        raise InputError(where, "", name, f"element.symbol, for example {_example(rig, element)}")
     return Free(element, symbol)
 
 

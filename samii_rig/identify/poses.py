@@ -26,6 +26,15 @@ def by_pose(
     return list(out.items())
 
 
+def given_poses(n: int, rig: Rig, given: Sequence[str]) -> list[Angle]:
+    """The pose of each of n recordings in words; InputError as of `poses_of`."""
+    posed(rig, given[0])
+    if len(given) != n:
+        expected = f"one --pose for each of {n} recordings, in their order"
+        raise InputError("--pose", "", f"{len(given)} poses", expected)
+    return [read_pose(text) for text in given]
+
+
 def poses_of(recordings: Sequence[Recording], rig: Rig, given: Sequence[str]) -> list[Angle]:
     """The pose of each recording: as `given`, else that of the rig file that it carries, if
     that has gravity, else that of `rig`.
@@ -34,12 +43,7 @@ def poses_of(recordings: Sequence[Recording], rig: Rig, given: Sequence[str]) ->
     for poses of a rig without gravity.
     """
     if given:
-        posed(rig, given[0])
-    if given and len(given) != len(recordings):
-        expected = f"one --pose for each of {len(recordings)} recordings, in their order"
-        raise InputError("--pose", "", f"{len(given)} poses", expected)
-    if given:
-        return [read_pose(text) for text in given]
+        return given_poses(len(recordings), rig, given)
     if rig.gravity == 0:
         return [HANGING] * len(recordings)
     out = []

@@ -14,6 +14,7 @@ from samii_rig.identify.methods import Found
 from samii_rig.identify.modal import Modes
 from samii_rig.identify.result import Identification, Residual
 from samii_rig.modal.modes import Value
+from samii_rig.units import pretty
 
 
 def summary_table(found: Identification) -> RenderableType:
@@ -48,9 +49,9 @@ def _said(found: Identification, sentences: Sequence[str]) -> list[RenderableTyp
         table.add_row(
             name,
             f"{found.values[i]:.5g}",
-            found.limit(i) or f"\u00b1 {100 * half:.2g} %",
+            pretty(found.limit(i)) or f"\u00b1 {100 * half:.2g} %",
             f"{100 * (found.values[i] / found.start[i] - 1):+.1f} %",
-            found.units[i],
+            pretty(found.units[i]),
         )
     said = (Text(line) for line in sentences)
     return [*said, Text(""), table, Text("")]

@@ -28,7 +28,7 @@ from samii_rig.record.contents import (
 from samii_rig.record.events import Event
 from samii_rig.record.layout import SampleLayout
 from samii_rig.record.scan import DamagedError
-from samii_rig.types import FrequencyResponse, Recording, StopRecord
+from samii_rig.types import Channel, FrequencyResponse, Recording, StopRecord
 
 THREADS = min(4, os.cpu_count() or 1)
 _Records = np.ndarray[Any, np.dtype[np.void]]
@@ -84,6 +84,20 @@ def read_recording(path: Path, *, partial: bool = False) -> Recording:
             source=str(path),
             clock_offset=offset,
         )
+
+
+def read_channels(path: Path) -> tuple[Channel, ...]:
+    """The channels of a recording's samples, none of a file without; no sample is read."""
+    with _contents(path, partial=False) as (_, contents):
+        if contents.channel_id(layout.SAMPLES) is None:
+            return ()
+        return sample_channel(contents)[1].channels
+
+
+def read_rig_toml(path: Path) -> str:
+    """The rig file that a recording carries, "" without one; its samples are not read."""
+    with _contents(path, partial=False) as (data, contents):
+        return _text(data, contents, layout.RIG_FILE)
 
 
 def read_frequency_responses(path: Path, *, partial: bool = False) -> list[FrequencyResponse]:

@@ -177,11 +177,6 @@ def compare(
     return tuple(found)
 
 
-def pretty(unit: str) -> str:
-    """A unit as it is printed: `m/s\u00b2`."""
-    return unit.replace("^2", "\u00b2")
-
-
 def percent(part: float) -> str:
     """`12 %`."""
     return f"{100 * part:.0f} %"

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
 
-from samii_rig.report.compare import pretty
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     Acceleration,
@@ -42,6 +41,7 @@ from samii_rig.rig.schema.elements import (
     TranslationalSpring,
     parameters,
 )
+from samii_rig.units import pretty
 
 # All in user units of the drawing, about a pixel.
 _BEAM, _LINK, _SPRING, _SOURCE, _OTHER = 190.0, 96.0, 44.0, 56.0, 70.0  # widths

@@ -13,10 +13,11 @@ import numpy as np
 
 from samii_rig.progress import duration
 from samii_rig.record.events import Event
-from samii_rig.report.compare import Comparison, percent, pretty
+from samii_rig.report.compare import Comparison, percent
 from samii_rig.report.verdicts import counted, without_folders
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
+from samii_rig.units import pretty
 
 # Metadata that have their own place on the page.
 _FILES = {"import_map": "Import map"}

@@ -12,7 +12,7 @@ from markupsafe import Markup
 from samii_rig.errors import InputError
 from samii_rig.record.events import Event
 from samii_rig.report import facts, plots, series
-from samii_rig.report.compare import Comparison, ModelCurve, compare, pretty
+from samii_rig.report.compare import Comparison, ModelCurve, compare
 from samii_rig.report.drawing import draw
 from samii_rig.report.modes import Modes, modes_of_all, rows, sentences
 from samii_rig.report.modes_drawing import motions
@@ -20,6 +20,7 @@ from samii_rig.report.shell import Plot, check_suffix, page_text, put
 from samii_rig.report.verdicts import verdicts
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
+from samii_rig.units import pretty
 
 if TYPE_CHECKING:
     from samii_rig.diagnose.result import Diagnosis

@@ -20,11 +20,12 @@ from samii_rig.report.canvas import (
     ticked,
     unpacked,
 )
-from samii_rig.report.compare import BAND, Comparison, ModelCurve, pretty, telling
+from samii_rig.report.compare import BAND, Comparison, ModelCurve, telling
 from samii_rig.report.modes import Modes
 from samii_rig.signal.coherence import partial_coherence
 from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_width
 from samii_rig.types import Channel, Float, FrequencyResponse, Int
+from samii_rig.units import pretty
 
 _BINS = 280  # of log-frequency, two points each: the pixels of the panel
 _NOISE_PART = 0.004  # of the lines may lie outside a gain axis

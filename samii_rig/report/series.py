@@ -10,9 +10,9 @@ import numpy as np
 from scipy.signal import ShortTimeFFT, get_window
 
 from samii_rig.report.canvas import Figure, axis, base_layout, packed
-from samii_rig.report.compare import pretty
 from samii_rig.report.decimate import thin
 from samii_rig.types import Float, Recording
+from samii_rig.units import pretty
 
 _POINTS = 50_000  # of all time series of a page, 5 bytes each
 _PIXELS = 1200  # of one curve at most, and

@@ -18,12 +18,13 @@ from rich.table import Table
 from rich.text import Text
 
 from samii_rig.progress import Counted, Pace, duration
-from samii_rig.report.compare import Comparison, ModelCurve, compare, percent, pretty
+from samii_rig.report.compare import Comparison, ModelCurve, compare, percent
 from samii_rig.report.facts import names
 from samii_rig.report.modes import Modes, modes_table
 from samii_rig.report.plots import unit
 from samii_rig.report.verdicts import Verdict, verdicts
 from samii_rig.types import FrequencyResponse, Recording
+from samii_rig.units import pretty
 
 if TYPE_CHECKING:  # it compiles the model, which showing needs not
     from samii_rig.run.dryrun import DryRun
@@ -93,7 +94,7 @@ def progress_line(progress: ProgressLike, total_s: float, of: str = "") -> Rende
     )
     now = "at rest" if math.isnan(p.frequency) else f"{p.frequency:.2f} Hz"
     now = "the whole band" if math.isinf(p.frequency) else now
-    words = Text(f"{now} at {p.level:g} {p.unit}")
+    words = Text(f"{now} at {p.level:g} {pretty(p.unit)}")
     if p.worst_channel:
         style = "green" if p.worst_margin > _MARGIN_CLOSE else "yellow"
         style = "bold red" if p.worst_margin <= 0 else style
@@ -140,7 +141,7 @@ class LiveProgress:
             self._segment = progress.segment
             self._console.print(
                 f"{progress.segment}/{progress.n_segments} {progress.name}, "
-                f"{progress.level:g} {progress.unit}, "
+                f"{progress.level:g} {pretty(progress.unit)}, "
                 f"{duration(progress.time_left)}{self._of} left",
                 highlight=False,
             )

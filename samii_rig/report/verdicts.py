@@ -10,9 +10,10 @@ from typing import Literal
 import numpy as np
 
 from samii_rig.progress import duration
-from samii_rig.report.compare import Comparison, percent, pretty, telling
+from samii_rig.report.compare import Comparison, percent, telling
 from samii_rig.signal.statistics import difference, octaves
 from samii_rig.types import Finding, Float, FrequencyResponse, Recording
+from samii_rig.units import pretty
 
 Mark = Literal["good", "note", "warning", "bad"]
 
@@ -84,7 +85,7 @@ def _run(recordings: Sequence[Recording]) -> list[Verdict]:
     text += f"; {lost} of {total:,} samples missing" if lost else "; no sample missing"
     text += f", {counted(late, 'late tick')}" if late else ""
     if worst.stop.status not in ("completed", "unknown"):
-        text += f". Reason: {worst.stop.reason}"
+        text += f". Reason: {pretty(worst.stop.reason)}"
     return [Verdict("warning" if mark == "good" and lost else mark, title, text + ".")]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import logging
 import re
 import tomllib
 from contextlib import suppress
@@ -15,12 +16,15 @@ from pydantic.fields import FieldInfo
 
 from samii_rig.errors import InputError, one_of
 from samii_rig.files import open_file, reason
+from samii_rig.rig.plausible import remarks
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.base import Parameter
 from samii_rig.rig.shipped import FOLDER
 from samii_rig.rig.shipped import names_in as names_in
 from samii_rig.rig.shipped import shipped as shipped
 
+LOG = logging.getLogger(__name__)
+_told: set[tuple[str, str]] = set()  # a file is loaded several times, its remarks are told once
 Model = TypeVar("Model", bound=BaseModel)
 MAX_BYTES = 4_000_000  # a rig file is a few kB; more is not one
 MAX_PARTS = 16  # of a dotted key; ours have three, and the time to parse one grows with the square
@@ -106,8 +110,14 @@ def checked(model: type[Model], data: dict[str, Any], where: str) -> Model:
 
 
 def load_rig(name: str) -> tuple[Rig, str]:
-    """The rig called `name` (shipped, or the path of a file) and the text of its file."""
-    return load_named(Rig, name, FOLDER, "--rig", "rig file")
+    """The rig called `name` (shipped, or the path of a file) and the text of its file. What is
+    hardly meant is logged, as a warning."""
+    rig, text = load_named(Rig, name, FOLDER, "--rig", "rig file")
+    for remark in remarks(rig):
+        if (name, remark) not in _told:
+            _told.add((name, remark))
+            LOG.warning("samii-rig: look: %s, %s", name, remark)
+    return rig, text
 
 
 def load_named(

@@ -28,6 +28,7 @@ from samii_rig.run.session import (
 )
 from samii_rig.safety.latch import Latch
 from samii_rig.safety.limits import gate_limits
+from samii_rig.units import pretty
 
 LISTEN = 2.0  # s
 LATE = 0.01  # s that a sleep may end too late at worst
@@ -160,11 +161,13 @@ def _samples(rig: Rig, device: OpenRig) -> Iterator[Check]:
     span = int(block.sequence[-1] - block.sequence[0])
     lost = span + 1 - len(block)
     rate = span / ((block.time[-1] - block.time[0]) * 1e-9)
-    found = f"{rate:.2f} a second, {lost} of {span + 1} lost"
+    found = f"{rate:.2f} samples/s, {lost} of {span + 1} samples lost"
     if lost:
         yield Check("samples", "bad", found, "check the cable and its shield")
     elif abs(rate / rig.rate_hz - 1.0) > 1e-3:
-        yield Check("samples", "bad", found, f"the rig file says {rig.rate_hz:g}: correct rate_hz")
+        yield Check(
+            "samples", "bad", found, f"the rig file says {rig.rate_hz:g} Hz: correct rate_hz"
+        )
     else:
         yield Check("samples", "good", found)
     n = np.arange(len(block))
@@ -175,7 +178,9 @@ def _samples(rig: Rig, device: OpenRig) -> Iterator[Check]:
             continue
         noise = float(np.std(x - np.polyval(np.polyfit(n, x, 1), n)))
         expected = float(np.hypot(s.noise_rms, s.resolution / np.sqrt(12.0)))
-        found = f"at {np.mean(x):.4g}, noise {noise:.2g} {s.unit}, rig file {expected:.2g}"
+        unit = pretty(s.unit)
+        found = f"at {np.mean(x):.3g} {unit}, noise {noise:.2g} {unit}"
+        found += f", by the rig file {expected:.2g} {unit}"
         if noise > NOISE * expected:
             yield Check(s.name, "look", found, "keep the rig still; check shield and ground")
         elif s.noise_rms > s.resolution and noise < expected / NOISE:
@@ -203,7 +208,7 @@ def _sign(rig: Rig, rig_toml: str, folder: Path, actuator: str = "") -> Check:
     except SamiiRigError as error:
         return Check.failed(what, error)
     turned = move.after - move.before
-    found = f"{sensor} turned by {turned:.2g} {move.unit}, predicted {expected:.2g}"
+    found = f"{sensor} turned by {turned:.2g} {move.unit}, predicted {expected:.2g} {move.unit}"
     if move.stop.status != "completed":
         return Check(what, "bad", f"{move.stop.status}: {move.stop.reason}", "look at the rig")
     part = turned / expected

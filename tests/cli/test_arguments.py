@@ -16,18 +16,23 @@ import pytest
 from fake_device import RIG as TEXT
 from typer.testing import CliRunner
 
+from samii_rig.cli import bench
 from samii_rig.cli.app import app
 from samii_rig.cli.common import FIGURES, SAMPLES
 from samii_rig.cli.estimate import GAPS, METHODS
 from samii_rig.cli.papers import FORMATS
 from samii_rig.errors import InputError, SamiiRigError, one_of
 from samii_rig.record.export_samples import WRITERS
+from samii_rig.record.reader import read_rig_toml
+from samii_rig.record.writer import RunWriter
 from samii_rig.report.figures import SUFFIXES
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
+from samii_rig.run import session
 from samii_rig.run.experiments import load_experiment
 from samii_rig.signal.choose import Method
 from samii_rig.signal.gather import Gaps
+from samii_rig.types import Channel, StopRecord
 
 HEAVY = ("numpy", "scipy", "numba", "mcap", "matplotlib", "plotly", "control", "rich.progress")
 WRONG = [
@@ -36,6 +41,11 @@ WRONG = [
     "run swept_sin",
     "run swept_sine --rig sami",
     "frf no.mcap",
+    "frf there.mcap --band 5 1",
+    "modes there.mcap --band 5 1",
+    "report there.mcap --band -1 5",
+    "identify there.mcap --band 5 1",
+    "diagnose there.mcap --band 5 1",
     "frf no.mcap --rig sami",
     "report no.mcap",
     "modes no.mcap",
@@ -45,7 +55,10 @@ WRONG = [
     "study --vary joint_1.k=1:2:3 --rig sami",
     "control --rig sami",
     "prove --rig sami",
+    "prove --out there.mcap",
     "serve --rig sami",
+    "serve --new-token anna",
+    "serve --tls-key key.pem",
     "papers no",
     "papers --format gif",
     "recordings nowhere",
@@ -80,7 +93,22 @@ WRONG = [
     "diagnose there.mcap --rig samii --out there.mcap",
 ]
 # These ask the rig file for its elements, which takes numpy; the model is not asked.
-WRONG_FOR_THE_RIG = ["study --vary nope", "study --vary joint_1.q=1:2:3"]
+WRONG_FOR_THE_RIG = [
+    "run broken.toml",
+    "study --vary nope",
+    "study --vary joint_1.q=1:2:3",
+    "identify there.mcap --rig samii --free joint_1.q",
+    "identify there.mcap --rig two_masses --free spring_1",
+    "identify there.mcap --rig samii --pose 30",
+    "diagnose there.mcap --rig two_masses --known joint_1.k=3",
+    "diagnose there.mcap --rig two_masses --known spring_1.k",
+    "diagnose there.mcap --rig two_masses --pose 30deg",
+    "control --rig samii --sensor theta_2",
+    "calibrate nope --rig samii --to new.toml",
+    "jog --speed 9",
+    "jog --to 9",
+    "jog --to nan",
+]
 COUNT = """
 import json, sys
 from samii_rig.cli import main
@@ -100,6 +128,7 @@ print(json.dumps(found))
 )
 def test_a_wrong_argument_imports_nothing_heavy(tmp_path: Path, lines, heavy) -> None:
     (tmp_path / "there.mcap").touch()
+    (tmp_path / "broken.toml").write_text("a = {")
     code = COUNT.format(lines=lines, heavy=tuple(heavy))
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path
@@ -113,6 +142,7 @@ def test_the_words_of_the_options_are_those_of_the_estimate() -> None:
     assert get_args(Gaps) == GAPS
     assert {f".{name}" for name in FORMATS} == set(SUFFIXES)
     assert FIGURES == SUFFIXES
+    assert (bench.FASTEST, bench.FURTHEST) == (session.FASTEST, session.FURTHEST)
     assert tuple(WRITERS) == SAMPLES
 
 
@@ -134,6 +164,30 @@ def refused(*words: str) -> str:
     result = CliRunner().invoke(app, list(words))
     assert isinstance(result.exception, SamiiRigError), result.output
     return str(result.exception)
+
+
+def test_a_name_to_free_is_held_against_the_rig_at_hand_before_samples_are_read(tmp_path) -> None:
+    # A recording is read for its rig file alone; the example is one of that rig's own parameters.
+    (tmp_path / "there.mcap").touch()
+    words = ("identify", str(tmp_path / "there.mcap"), "--rig", "two_masses", "--free")
+    assert refused(*words, "spring_1").endswith("element.symbol, for example spring_1.k")
+    assert refused(*words, "spring_1.q").startswith("--free is 'spring_1.q'")
+    run = tmp_path / "run.mcap"
+    toml = load_rig("two_masses")[1]
+    with RunWriter(run, (), 500.0, rig_toml=toml) as writer:
+        writer.close(StopRecord("completed", "all segments done"))
+    assert read_rig_toml(run) == toml
+    assert "an element of Two masses" in refused("identify", str(run), "--free", "joint_1.k")
+
+
+@pytest.mark.parametrize("command", ["frf", "report", "modes", "identify", "diagnose"])
+def test_a_channel_that_no_sample_has_is_said_before_samples_are_read(tmp_path, command) -> None:
+    run = tmp_path / "run.mcap"
+    channels = (Channel("v", "V", "command", -1.0, 1.0, 0.0), Channel("a", "1", "sensor", -1, 1, 0))
+    with RunWriter(run, channels, 500.0) as writer:
+        writer.close(StopRecord("completed", "all segments done"))
+    said = refused(command, str(run), "--output", "v_9")
+    assert "--output is 'v_9'; expected one of v, a" in said
 
 
 @pytest.mark.parametrize(

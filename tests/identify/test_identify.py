@@ -209,6 +209,19 @@ def test_tied_parameters_are_named():
     assert "tied: correlation -0.99" in identifiability(J, ("a.k", "b.k"), ("y",)).sentences[1]
 
 
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("a.k",), "a.k is identified from y; it is known to "),
+        (("a.k", "b.k"), "Both parameters are identified from y; the combination known least "),
+        (("a.k", "b.k", "c.k"), "All 3 parameters are identified from y; the combination "),
+    ],
+)
+def test_what_is_identified_is_counted_in_words(names, words):
+    J = np.random.default_rng(0).standard_normal((50, len(names))) * 1000
+    assert identifiability(J, names, ("y",)).sentences[0].startswith(words)
+
+
 def test_the_summary_shows_every_parameter_and_verdict():
     found = identify([drawn(samii(), n=60)], samii(), STIFFNESSES, starts=1)
     console = Console(width=150, record=True)

@@ -22,10 +22,12 @@ def swept(
     ring_down: float,
     seed: int = 1,
     rig_toml: str = "",
+    actuator: str = "v_2",
+    source: str = "",
 ) -> Recording:
     """Sweeps of 0.8 to 35 Hz at one level, V, each from rest to rest; s."""
     plan = SweptSine(
-        experiment="swept_sine", name="short", actuator="v_2", unit="V", sweep="logarithmic",
+        experiment="swept_sine", name="short", actuator=actuator, unit="V", sweep="logarithmic",
         start_hz=0.8, stop_hz=35.0, duration=duration, ramp=0.5, lead_in=1.0, ring_down=ring_down,
         amplitudes=(level,), repeats=repeats,
     ).plan(rig)  # fmt: skip
@@ -42,5 +44,5 @@ def swept(
     )
     return Recording(
         b.channels, rig.rate_hz, b.time, b.sequence, b.values, b.quality, segments,
-        rig_toml=rig_toml, source=f"run at {level:g} V",
+        rig_toml=rig_toml, source=source or f"run at {level:g} V",
     )  # fmt: skip

@@ -14,7 +14,7 @@ from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.conversion import in_si
 from samii_rig.safety.limits import gate_limits
-from samii_rig.units import convert, factor, quantity
+from samii_rig.units import convert, factor, pretty, quantity
 
 TWO = load_rig("two_masses")[1]
 CARRIAGE = load_rig("carriage")[1]
@@ -165,3 +165,9 @@ def test_a_unit_of_another_kind_is_one_line(old: str, new: str, says: str) -> No
         parse(Rig, TWO.replace(old, new, 1), "two.toml")
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_printed_unit_is_one_that_a_file_may_have():
+    for unit in ("m/s^2", "kg m^2", "N s^2/m", "m^4", "rad/s"):
+        assert "^" not in pretty(unit)
+        assert factor(pretty(unit), unit) == 1.0

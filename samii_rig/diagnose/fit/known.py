@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from samii_rig.diagnose.fit.rigfile import toml
 from samii_rig.errors import InputError, one_of
 from samii_rig.rig.load import checked, tables
 from samii_rig.rig.schema import Rig, parameters
@@ -37,6 +36,18 @@ def stated(words: Sequence[str], where: str = WHERE) -> dict[str, float]:
     return out
 
 
+def check_names(rig: Rig, known: Mapping[str, float], where: str = WHERE) -> None:
+    """InputError for an element or a parameter that the rig file does not have."""
+    every = {e.name: e for e in flattened(rig.element)}
+    for name in known:
+        element, _, symbol = name.rpartition(".")
+        if element not in every:
+            raise InputError(where, name, element, one_of(element, every))
+        have = parameters(every[element])
+        if symbol not in have:
+            raise InputError(where, name, symbol, one_of(symbol, have))
+
+
 def with_known(rig: Rig, known: Mapping[str, float], where: str = WHERE) -> Rig:
     """The rig with these parameters, by "element.parameter", at these values, exactly. where : the
     option that states them.
@@ -44,16 +55,15 @@ def with_known(rig: Rig, known: Mapping[str, float], where: str = WHERE) -> Rig:
     Raises InputError for an element or a parameter that the rig file does not have, or a value
     that no rig can have.
     """
+    from samii_rig.diagnose.fit.rigfile import toml  # it imports the fits
+
+    check_names(rig, known, where)
     data = tables(toml(rig), where)
     every = {e.name: e for e in flattened(rig.element)}
     rows = {row["name"]: row for row in _flat(data["element"])}
     for name, value in known.items():
         element, _, symbol = name.rpartition(".")
-        if element not in every:
-            raise InputError(where, name, element, one_of(element, every))
         have = parameters(every[element])
-        if symbol not in have:
-            raise InputError(where, name, symbol, one_of(symbol, have))
         rows[element][symbol] = {
             "value": value,
             "unit": have[symbol].unit,

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.measured import DIFFER
+from samii_rig.diagnose.fit.agreeing import Apart, states_apart
+from samii_rig.diagnose.fit.exact import wrong_length
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
+from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
-from samii_rig.diagnose.result import Band, Diagnosis, Gap
+from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.diagnose.verdict.stages import Case, Shown, told
@@ -43,6 +46,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     search.begin("what is missing")
     # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
     search.run(briefly=True)
+    if (wrong := wrong_length(search)) is not None:
+        return _of_length(case, search, first, bands, *wrong)
     search.begin("amplitude levels")
     forced = forces_on(search)
     if forced is None or not (case.search.lines.torn() or forced.is_enough()):
@@ -59,7 +64,13 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         if forced.spent:
             looked = replace(looked, said=(*looked.said, SPENT))
     looked = replace(looked, said=(*looked.said, *_unasked(search)))
-    return _answer(case, forced or search, first, bands, looked)
+    if len(case.runs) > 1:
+        search.begin("whether the recordings agree")
+    apart = states_apart(search, case.runs, case.clean.samples)
+    if apart is None:
+        return _answer(case, forced or search, first, bands, looked)
+    looked = replace(looked, judged=verdict.of_several_states(looked.judged, apart.part))
+    return _of_states(_answer(case, forced or search, first, bands, looked), apart)
 
 
 def by_samples(
@@ -123,6 +134,49 @@ def _answer(
     of_lines = case.clean.of_lines
     clean = replace(case.clean, told=tuple(w for w in case.clean.told if w not in of_lines))
     return told(replace(case, clean=clean), search, looked.judged, shown, looked.said)
+
+
+def _of_length(
+    case: Case,
+    search: RecordSearch,
+    first: float,
+    bands: tuple[Band, ...],
+    wrong: Exact,
+    freed: RecordSearch,
+) -> Diagnosis:
+    """The answer where a length of the rig file is wrong. freed : the search with that one free."""
+    nominal, fitted = search.nominal.fitted, freed.nominal.fitted
+    plain, after, gap = freed.shown(nominal, fitted)
+    shown = Shown(
+        first=first,
+        threshold=threshold(search.spread),
+        bands=bands,
+        nominal=(search.ratio(nominal), plain),
+        with_causes=(freed.ratio(fitted), after),
+        gap=gap,
+        used=search.used(),
+    )
+    looked = _Looked(verdict.judge(freed), plain, after, gap)
+    found = told(case, freed, looked.judged, shown)
+    return replace(
+        found,
+        verdict="unknown",
+        exact=wrong,
+        rig=explained(fitted),
+        could_hide=(),
+        experiment=f"measure {wrong.parameter}, correct the rig file and diagnose again",
+        why="no single effect explains the recordings, and this number does",
+        gain=None,
+    )
+
+
+def _of_states(found: Diagnosis, apart: Apart) -> Diagnosis:
+    """The same, with what the recordings differ by; where that leaves no answer, what to do."""
+    found = replace(found, states=apart.states, not_physics=(apart.told(), *found.not_physics))
+    if found.verdict != "unknown":
+        return found
+    why = "what one model makes of several states is of none of them"
+    return replace(found, sites=(), why=why, experiment=apart.experiment(), gain=None)
 
 
 def forces_on(search: RecordSearch) -> ForceSearch | None:

@@ -225,6 +225,17 @@ def without_causes(judged: Judgement) -> Judgement:
     return replace(judged, verdict=said.get(judged.verdict, judged.verdict))
 
 
+def of_several_states(judged: Judgement, part: float) -> Judgement:
+    """The same where the recordings are of several states of the rig. part : of the mismatch, what
+    no model of one state explains; an effect may be told for the rest."""
+    if judged.verdict == "no_mismatch":
+        return replace(judged, verdict="unknown")
+    evidence = replace(judged.evidence, closed=min(judged.evidence.closed, 1 - part))
+    if evidence.closed >= PARTLY:
+        return judged
+    return replace(judged, verdict=_most(judged.verdict, evidence))
+
+
 def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
     """The same, but nothing is named that makes data worse which it was not fitted to: beyond what
     chance does, or at all if it is so large that it must show, there too.

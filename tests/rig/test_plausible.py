@@ -1,0 +1,43 @@
+"""Numbers that a rig file may hold and hardly means: told in a line, and used as they stand."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from samii_rig.rig.load import load_rig, parse
+from samii_rig.rig.plausible import remarks
+from samii_rig.rig.schema import Rig
+from samii_rig.rig.shipped import shipped
+
+BEAM = load_rig("beam_on_shaker")[1]
+
+
+def said(old: str, new: str) -> list[str]:
+    assert old in BEAM
+    return remarks(parse(Rig, BEAM.replace(old, new), "bench.toml"))
+
+
+@pytest.mark.parametrize("name", shipped())
+def test_nothing_is_remarked_on_a_shipped_rig(name):
+    assert remarks(load_rig(name)[0]) == []
+
+
+def test_metres_where_millimetres_were_meant_are_told_with_field_value_and_what_is_usual():
+    (line,) = said('value = 300.0, unit = "mm"', 'value = 450.0, unit = "m"')
+    assert line == "element strip: L is 450 m; usual are 0.0001 to 30 m; were mm meant?"
+    (line,) = said('value = 300.0, unit = "mm"', 'value = 0.003, unit = "mm"')
+    assert line == "element strip: L is 0.003 mm; usual are 0.0001 to 30 m"
+    (line,) = said('value = 20.0, unit = "g"', 'value = 20000.0, unit = "kg"')
+    assert line == "element tip_mass: m is 20000 kg; usual are 1e-06 to 10000 kg; were g meant?"
+
+
+def test_a_file_is_told_once_with_its_name_and_is_no_error(tmp_path, caplog):
+    path = tmp_path / "bench.toml"
+    path.write_text(BEAM.replace('value = 300.0, unit = "mm"', 'value = 450.0, unit = "m"'))
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            load_rig(str(path))
+    (record,) = caplog.records
+    assert record.getMessage().startswith(f"samii-rig: look: {path}, element strip: L is 450 m")
