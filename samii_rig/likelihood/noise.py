@@ -39,6 +39,9 @@ TURN = 0.15  # nepers or rad, by which what a disturbance makes may change withi
 STEPS = 200  # of the powers, at most: without progress they end before
 PROGRESS = 0.02  # of the logarithm of the likelihood, gained by a step, that goes on
 LOUD = 1e-6  # of all, power of a component that counts
+# Of the largest, what a disturbance makes that is rounding: a force at a place that is held. What
+# moves anything, in any unit, makes more than 1e-6.
+NOTHING = 1e-12
 # Degrees of freedom with which a block may believe the sum: from not at all to wholly.
 BELIEF = np.geomspace(4.0, 4e4, 25)
 LITTLE = 0.02  # of a line's freedom: one with less says nothing
@@ -99,6 +102,8 @@ class Noise:
         at, group, which = _once(f, known.group[piece])
         once, back = np.unique(at, return_inverse=True)
         u = disturbances(once)
+        size = np.max(np.abs(u), axis=(0, 1))
+        u = np.where(size > NOTHING * size.max(), u, 0.0)
         alike = _bins(once, u)[back] * (group.max(initial=0) + 1) + group
         _, middle, bins = np.unique(alike, return_index=True, return_inverse=True)
         S, w = _gathered(left, free, bins[which])

@@ -253,6 +253,21 @@ def test_a_disturbed_mode_makes_noise_at_that_mode_and_nowhere_else():
     assert np.mean(np.abs(whitened) ** 2) == pytest.approx(1.0, abs=0.05)
 
 
+def test_a_force_at_a_place_that_is_held_makes_no_noise():
+    """What it makes is rounding, that no power turns into noise of a few lines."""
+    rng = np.random.default_rng(6)
+    f = np.linspace(2, 8, 600)
+
+    def disturbances(g: Float) -> Complex:
+        H = response(2j * np.pi * g, poles(4.0, 0.01))
+        return np.concatenate([own_alone(g), 1e-18 * H[:, :, None]], axis=2)
+
+    left = rng.standard_normal((f.size, 2)) + 1j * rng.standard_normal((f.size, 2))
+    left[np.abs(f - 4) < 0.05] *= 30  # as if that force had acted
+    found = Noise.of(f, left, np.ones(f.size), one_piece(f), disturbances, white_rounding(0.0))
+    assert np.all(found.power[2] == 0)
+
+
 @pytest.mark.parametrize("corner", [0.0, 0.3, 2.0])
 def test_a_sensor_that_wanders_is_as_loud_as_that_at_the_lowest_lines(corner: float):
     """In a short record, one sensor of two."""
