@@ -87,13 +87,14 @@ def run(
     from samii_rig.files import check_folder
 
     check_rig(rig)
-    check_experiment(experiment)
     if out is not None and out.suffix != ".mcap":
         raise InputError("samii-rig run", "--out", str(out), "a name that ends in .mcap")
+    if not describe:
+        check_folder("--out", out.parent if out else Path("runs"))
+    check_experiment(experiment)
     if describe:
         _describe(experiment, rig)
         return
-    check_folder("--out", out.parent if out else Path("runs"))
     said = Said(
         Console(highlight=False),
         out,

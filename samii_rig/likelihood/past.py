@@ -13,6 +13,7 @@ projection with Kaufman's slope: Golub and Pereyra 2003, Inverse Problems 19.)
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +43,8 @@ class Past:
 
     lags : (p,) samples before it, of impulses of the inputs `of` (p,), a rig of `inputs` has.
     likely : (n_lines, q, m) the same, independent and of sd 1 beforehand, if what acted before was
-    as strong as what is known. impulses : (p, m) that make them.
+    as strong as what is known. impulses : (p, m) that make them. start : (w, q, m) what they move
+    at the piece's first samples.
     """
 
     shapes: Complex
@@ -51,6 +53,7 @@ class Past:
     inputs: int
     likely: Complex
     impulses: Float
+    start: Float
 
     @classmethod
     def of_piece(
@@ -81,6 +84,8 @@ class Past:
         shapes = np.asarray(answers @ (turn.T / size[:, None]))
         # As if one had acted from each to the next, all of one sign.
         sd = strength[of] * np.maximum(lag * (2 ** (1 / dense) - 1), 1.0)
+        first = lag + piece.history + np.arange(_period(piece, k))[:, None]
+        start = np.stack([each[j][first[:, i]] for i, j in enumerate(of)], axis=2)
         root, values, own = np.linalg.svd(turn * (size * sd), full_matrices=False)
         return cls(
             shapes / np.linalg.norm(shapes, axis=(0, 1)),
@@ -89,6 +94,7 @@ class Past:
             piece.inputs,
             np.asarray(shapes @ (root * values)),
             sd[:, None] * own.T,
+            np.asarray(start @ (sd[:, None] * own.T)),
         )
 
     def motion(self, piece: Piece, amplitudes: Float, impulse: Float) -> Float:
@@ -99,6 +105,20 @@ class Past:
             out += a * impulse[first : first + len(out), j :: self.inputs]
         return out
 
+    def begins(self, left: Float, amplitudes: Float) -> bool:
+        """Whether a piece begins with motion of such amplitudes (m,). left : (n, q) what a
+        reference leaves of the piece, in time.
+
+        Nothing rings more than at its start. A mismatch that is taken for it does not show there.
+        """
+        size = np.sqrt(np.mean(left**2, axis=0))
+        own = left[: len(self.start)] / np.where(size > 0, size, 1.0)
+        told = self.start @ amplitudes / np.where(size > 0, size, 1.0)
+        both = np.stack([own, own - told])
+        both -= np.mean(both, axis=1, keepdims=True)  # of a sensor's offset nobody knows
+        without, beside = np.sum(both**2, axis=(1, 2))
+        return bool(beside < without)
+
     def before(self, piece: Piece, amplitudes: Float) -> Piece:
         """The piece with impulses of such amplitudes (m,) before it."""
         most = int(self.lags.max())
@@ -106,6 +126,11 @@ class Past:
         np.add.at(r, (most - self.lags, self.of), self.impulses @ amplitudes)
         r = r[:, 0] if piece.r.ndim == 1 else r
         return replace(piece, r=np.concatenate([r, piece.r]), history=most + piece.history)
+
+
+def _period(piece: Piece, k: Int) -> int:
+    """Samples of a period in the middle of lines k (n,)."""
+    return int(np.clip(len(piece.z) / math.sqrt(k[0] * k[-1]), 2, len(piece.z)))
 
 
 def likely(shapes: Complex, e: Complex, N: Complex, W: Complex) -> Float | None:

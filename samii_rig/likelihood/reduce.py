@@ -399,8 +399,10 @@ def _with_past(
             continue
         for i, s in own:
             amplitudes, found = np.split(found, [s.past.impulses.shape[1]])
-            piece = pieces[i]  # lines are a sample's
-            pieces[i] = s.past.before(piece, math.sqrt(len(piece.z)) * amplitudes)
+            piece = pieces[i]
+            amplitudes = math.sqrt(len(piece.z)) * amplitudes  # lines are a sample's
+            if s.past.begins(s.left, amplitudes):
+                pieces[i] = s.past.before(piece, amplitudes)
     if all(a is b for a, b in zip(pieces, records.pieces, strict=True)):
         return None
     return replace(records, pieces=tuple(pieces))

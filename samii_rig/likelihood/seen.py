@@ -56,7 +56,8 @@ class Seen:
     e : (n, q) what the reference leaves, a sample's power. N : (n, q, m) nuisances, of size 1 each;
     the first are the past's. beside : those that are no past: an offset that acts from the first
     sample on rings as that does.
-    rounding : as `rounding.of_piece` has it.
+    rounding : as `rounding.of_piece` has it. left : (n_samples, q) in time what the reference
+    leaves.
     """
 
     e: Complex
@@ -64,6 +65,7 @@ class Seen:
     past: Past
     beside: slice
     rounding: tuple[Float, Float]
+    left: Float
 
     @classmethod
     def of(cls, piece: Piece, k: Int, answers: Answers, step: Float, strength: Float) -> Seen:
@@ -72,7 +74,8 @@ class Seen:
         n, q = piece.z.shape
         H, exact = answers.H, answers.exact
         y = exact.predicted(H, piece.r)[piece.history :]
-        left = np.fft.rfft(piece.z - y, axis=0)
+        left_in_time = piece.z - y
+        left = np.fft.rfft(left_in_time, axis=0)
         past = Past.of_piece(piece, k, answers.impulse, exact, strength)
         own = [nuisance.wander(n, k, q), nuisance.hum(left, k, exact.rate_hz, n)]
         if np.any(step > 0):  # what a converter reads is the whole motion
@@ -88,6 +91,7 @@ class Seen:
             past,
             slice(first, first + beside.shape[2]),
             rounding.of_piece(piece, step, y, exact.rate_hz),
+            left_in_time,
         )
 
 

@@ -139,6 +139,22 @@ def test_what_rang_before_a_record_rings_as_the_changed_response_does():
     assert after < 0.01 * before  # 0.18 where it was taken to ring as the reference does
 
 
+def test_what_does_not_move_at_a_records_start_is_not_taken_for_what_rang_before():
+    exact = Contour.over(3000, RATE, EXACT)
+    H = response(exact.s, poles(4.0))
+    impulse = exact.record(H, exact.samples)
+    one = piece(np.zeros(3000), np.zeros((3000, 2)))
+    past = Past.of_piece(one, np.arange(12, 225), impulse, exact, np.ones(1))
+    a = np.array([1.0, 0.5])
+    rang = past.motion(one, a, impulse)
+    sd = 0.2 * np.std(rang, axis=0)
+    noise = sd * np.random.default_rng(0).standard_normal(rang.shape)
+    offset = 3 * np.std(rang, axis=0)
+    assert past.begins(rang + noise + offset, a)
+    assert not past.begins(rang[::-1] + noise + offset, a)  # a mismatch that grows
+    assert not past.begins(rang + noise + offset, -a)
+
+
 @pytest.mark.parametrize("damping", [0.02, 0.05, 0.2])
 def test_a_past_of_one_mode_has_its_two_states_however_long_it_rings(damping: float):
     """Where the mode has died out, rounding of the contour is left: it is no past."""
