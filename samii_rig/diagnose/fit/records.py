@@ -554,9 +554,12 @@ class RecordSearch(Search):
     def inconsistent(self) -> tuple[float, float]:
         """Chi-square per degree of freedom of what no change of one linear response explains, and
         its standard deviation from noise."""
-        both = (self.reduced.inside, self.reduced.differing)
-        each = ((found / mean, math.sqrt(2 / mean)) for found, mean in both if mean > 0)
-        return max(each, key=lambda one: (one[0] - 1) / one[1])
+        inside, differing = self.reduced.inside, self.reduced.differing
+        each = [(inside, 0.0)] if inside[1] > 0 else []
+        if differing[1] > 0:  # whose noise is that of the lines inside, known to so much
+            each.append((differing, 1 / max(inside[1], 1.0)))
+        found = ((x / mean, math.sqrt(2 / mean + 2 * of)) for (x, mean), of in each)
+        return max(found, key=lambda one: (one[0] - 1) / one[1])
 
     def leftover(self, fitted: Fitted) -> float:
         """As of `Explanations`."""
