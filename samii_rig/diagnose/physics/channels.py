@@ -11,8 +11,9 @@ import numpy as np
 
 from samii_rig.diagnose.physics import insert
 from samii_rig.diagnose.physics.effect import Effect, Factor, Key, Unknown, Values
-from samii_rig.diagnose.physics.less import FASTER, SMALLEST
+from samii_rig.diagnose.physics.less import FASTER
 from samii_rig.diagnose.physics.rows import PHYSICS
+from samii_rig.diagnose.physics.scales import SMALLEST
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     SOURCES,

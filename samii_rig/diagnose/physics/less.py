@@ -17,7 +17,7 @@ from samii_rig.diagnose.physics.along import Along, stretches
 from samii_rig.diagnose.physics.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.physics.model import FARTHEST
 from samii_rig.diagnose.physics.points import ON_LINK
-from samii_rig.diagnose.physics.scales import spread
+from samii_rig.diagnose.physics.scales import SMALLEST, spread
 from samii_rig.rig.schema import (
     SOURCES,
     LumpedMass,
@@ -32,7 +32,6 @@ from samii_rig.rig.schema import (
 )
 from samii_rig.types import Complex, Float
 
-SMALLEST = 1e-5  # part of what is there; the data of no bench show less
 LARGEST = 0.6  # of a link's mass: what is left still is a body, whatever its tolerance says
 SURELY = 2.0  # tolerances above the rig file's value, up to which all of a part may be gone
 ALMOST = 0.99  # of a part, a start of a search: the refit goes on to all of it

@@ -19,7 +19,7 @@ from samii_rig.diagnose.physics import insert
 from samii_rig.diagnose.physics.along import Along, stretches
 from samii_rig.diagnose.physics.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.physics.insert import DISPLACEMENT, VOLUME
-from samii_rig.diagnose.physics.scales import PAIRS, REACH, Places, middle, spread
+from samii_rig.diagnose.physics.scales import PAIRS, REACH, SMALLEST, Places, middle, spread
 from samii_rig.model.tmm import State
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
@@ -42,7 +42,9 @@ from samii_rig.types import Complex, Float
 Law = Literal["spring", "softness", "column", "damper", "slip", "mass"]
 LOSS = (1e-4, 10.0)  # damping force over spring force in mid band
 LOSS_STARTS = (0.05,)
-MOST_DAMPED = 0.3  # damping ratio of an oscillator; with more it is a damper and does not resonate
+# Damping ratio of an oscillator: that of a steel part clamped well; with more it is a damper and
+# does not resonate.
+LEAST_DAMPED, MOST_DAMPED = 1e-3, 0.3
 JOINTS = (TorsionalSpring, TranslationalSpring, *ANGLE_SOURCES)
 # Parts of the way along a stretch at which a search begins; its ends are ports. What moves a rigid
 # link goes with the square of the place at most; a beam has its modes between.
@@ -367,11 +369,12 @@ def _swinging(where: Places, x: float) -> tuple[Unknown, ...]:
     """Mass, natural frequency and damping ratio of what hangs on; told as m, k, c."""
     low_w, high_w = (2 * math.pi * float(where.frequency[i]) for i in (0, -1))
     scale = x / middle(where) ** 2
-    masses = (1e-5 * scale, 3 * scale)
+    # At its own frequency a mass does 1/(2 zeta) times what it does elsewhere.
+    least = 2 * LEAST_DAMPED * SMALLEST
     return (
-        Unknown("m", "kg", *masses, spread(*masses, 7)),
+        Unknown("m", "kg", least * scale, 3 * scale, spread(SMALLEST * scale, 3 * scale, 7)),
         Unknown("k", "N/m", low_w, 2 * high_w, spread(low_w, high_w, 48)),
-        Unknown("c", "N s/m", 1e-3, MOST_DAMPED, (0.05,)),
+        Unknown("c", "N s/m", LEAST_DAMPED, MOST_DAMPED, (0.05,)),
     )
 
 
