@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from samii_rig.devices.channels import reference_channels
+from samii_rig.devices.channels import command_channel, reference_channels
 from samii_rig.model.realise import Realisation, realise
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Flags, Float, Int, SampleBlock
@@ -123,15 +123,7 @@ def device_channels(rig: Rig) -> tuple[Channel, ...]:
     return (
         *reference_channels(rig),
         *(
-            Channel(
-                a.name,
-                a.unit,
-                "command",
-                a.low,
-                a.high,
-                a.resolution,
-                "output as held by the converter",
-            )
+            command_channel(a, a.resolution, "output as held by the converter")
             for a in rig.actuator
         ),
         *(

@@ -13,7 +13,7 @@ import numpy as np
 from drivers.ni_daq.output import Playout
 from drivers.ni_daq.settings import NiSettings
 from drivers.sensing import taken
-from samii_rig.devices.channels import reference_channels
+from samii_rig.devices.channels import command_channel, reference_channels
 from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Flags, Float, Int, Quality, SampleBlock
@@ -55,15 +55,7 @@ class Board:
             self.channels = (
                 *reference_channels(rig),
                 *(
-                    Channel(
-                        spec.name,
-                        spec.unit,
-                        "command",
-                        spec.low,
-                        spec.high,
-                        spec.resolution,
-                        "read back, in steps of its resolution",
-                    )
+                    command_channel(spec, spec.resolution, "read back, in steps of its resolution")
                     for spec in self._specs
                 ),
                 *self._inputs,

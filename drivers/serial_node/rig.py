@@ -15,7 +15,7 @@ from drivers.serial_node.link import KEPT, Link
 from drivers.serial_node.outputs import OneOutput, Outputs
 from drivers.serial_node.settings import SerialSettings, check_node, read_settings
 from drivers.serial_node.wire import Event, Flag, Hello, State, Type, reason_text
-from samii_rig.devices.channels import centring_name, reference_channels
+from samii_rig.devices.channels import centring_name, command_channel, reference_channels
 from samii_rig.devices.clock import MonotonicClock
 from samii_rig.devices.protocols import DeviceEvent, OpenRig
 from samii_rig.errors import DeviceError, InputError
@@ -206,15 +206,7 @@ def _channels(rig: Rig, settings: SerialSettings) -> tuple[Channel, ...]:
     """Columns: references, the output of each actuator, the sensors in the rig's order."""
     inputs = settings.encoder | settings.adc
     commands = (
-        Channel(
-            spec.name,
-            spec.unit,
-            "command",
-            spec.low,
-            spec.high,
-            1.0 / abs(o.counts_per_unit),
-            "as put out by the node",
-        )
+        command_channel(spec, 1.0 / abs(o.counts_per_unit), "as put out by the node")
         for spec, o in zip(rig.actuator, settings.outputs(rig), strict=True)
     )
     sensors = (

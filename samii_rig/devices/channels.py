@@ -1,9 +1,9 @@
-"""The columns that a device has beside those of the rig file: the references of its outputs."""
+"""The columns of a device's outputs: references and commands."""
 
 from __future__ import annotations
 
 from samii_rig.errors import InputError
-from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema import ActuatorSpec, Rig
 from samii_rig.types import Channel
 
 
@@ -38,3 +38,8 @@ def reference_channels(rig: Rig) -> tuple[Channel, ...]:
             Channel(ref, units[centring], "reference", description=f"reference of {centring}"),
         ]
     return tuple(made)
+
+
+def command_channel(spec: ActuatorSpec, step: float, description: str) -> Channel:
+    """The command of an actuator. step : in which it is known. description : how."""
+    return Channel(spec.name, spec.unit, "command", spec.low, spec.high, step, description)
