@@ -142,8 +142,9 @@ def likely(shapes: Complex, e: Complex, N: Complex, W: Complex) -> Float | None:
     flat = every.reshape(-1, every.shape[2])
     square = (flat.conj().T @ (W @ every).reshape(flat.shape)).real
     head = (flat.conj().T @ (W @ e[:, :, None]).ravel()).real
-    turn, values = _directions(square[m:, m:])
-    others = turn / np.sqrt(values)
+    values, turn = directions(square[m:, m:])
+    kept = values > SAME * np.max(values, initial=0.0)
+    others = turn[:, kept] / np.sqrt(values[kept])
     across = square[:m, m:] @ others
     own = square[:m, :m] - across @ across.T
     pull = head[:m] - across @ (others.T @ head[m:])
@@ -163,12 +164,12 @@ def _independent(shapes: Complex) -> tuple[Float, Float]:
     return size, np.asarray(turn[values > NEW * values[0]])
 
 
-def _directions(square: Float) -> tuple[Float, Float]:
-    """(m, k) in which a matrix (m, m) of products is regular, and its values (k,) there."""
+def directions(square: Float) -> tuple[Float, Float]:
+    """Values (m,) of a matrix (m, m) of products, increasing, and the directions (m, m) that have
+    them."""
     if not len(square):
-        return square, np.zeros(0)
+        return np.zeros(0), square
     # Each in units of its own size: a metre and a metre a second squared are of one kind here.
     size = np.sqrt(np.maximum(np.diagonal(square), np.finfo(np.float64).tiny))
     values, turn = np.linalg.eigh(square / np.outer(size, size))
-    kept = values > SAME * values[-1]
-    return turn[:, kept] / size[:, None], values[kept]
+    return values, turn / size[:, None]

@@ -25,7 +25,7 @@ from samii_rig.likelihood import rounding
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Disturbances, Noise
-from samii_rig.likelihood.past import likely
+from samii_rig.likelihood.past import SAME, directions, likely
 from samii_rig.likelihood.pieces import Loops, Piece, Samples
 from samii_rig.likelihood.seen import Answers, Seen
 from samii_rig.types import Complex, Float, Int
@@ -45,7 +45,6 @@ CYCLES = (
     5  # in a record, of its lowest line: below, wandering is as large as what polynomials leave
 )
 AT_ONCE = 4096  # lines whose products are formed together: 30 MB at 120 nodes
-SAME = 1e-9  # of the largest, power in a direction that columns do not have
 
 Response = Callable[[Complex], Complex]
 """(n,) s -> (n, q) of the reference model, from input to sensors; (n, q m) of m inputs, all inputs
@@ -374,8 +373,7 @@ def _with_past(
 
     spare : as of `_residual`.
     """
-    root = np.linalg.inv(noise.root(rows.f, rows.piece))
-    W = 2 * (root.conj().swapaxes(1, 2) @ root)
+    W = _weights(rows, noise)
     pieces = list(records.pieces)
     rows, groups = _grouped(rows, spare)
     for on in groups:
@@ -606,8 +604,7 @@ class _Form:
 def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     """factor, target of `Reduced`, and chi-square of the reference with the best nuisances."""
     b, q = reference.shape  # q : of each input by itself, where there are several
-    L = np.linalg.inv(noise.root(rows.f, rows.piece))
-    W = 2 * (L.conj().swapaxes(1, 2) @ L)
+    W = _weights(rows, noise)
     We = (W @ rows.e[:, :, None])[:, :, 0]
     M = _products(rows.X, W)
     g = (rows.X.conj().T @ We).real.T.ravel()
@@ -629,6 +626,12 @@ def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     )
 
 
+def _weights(rows: Rows, noise: Noise) -> Complex:
+    """(n, q, q) twice the inverse of the noise: real and imaginary parts count by themselves."""
+    L = np.linalg.inv(noise.root(rows.f, rows.piece))
+    return np.asarray(2 * (L.conj().swapaxes(1, 2) @ L))
+
+
 def _nuisances(rows: Rows, W: Complex, We: Complex) -> tuple[Float, Float]:
     """The directions of all nuisances, of length 1: their products with the changes of all nodes
     (q 2 b, m), and with what the reference leaves (m,)."""
@@ -638,13 +641,11 @@ def _nuisances(rows: Rows, W: Complex, We: Complex) -> tuple[Float, Float]:
         q, flat = N.shape[1], N.reshape(-1, m)
         WN = W[on] @ N
         square = (flat.conj().T @ WN.reshape(-1, m)).real
-        # Each in units of its own size: a metre and a metre a second squared are of one kind here.
-        size = np.sqrt(np.maximum(np.diagonal(square), 1e-300))
-        values, turn = np.linalg.eigh(square / np.outer(size, size))
+        values, turn = directions(square)
         cross = _real(X).T @ _real(WN.reshape(-1, q * m))
         cross = cross.reshape(-1, q, m).swapaxes(0, 1).reshape(-1, m)
         head = (flat.conj().T @ We[on].ravel()).real
-        found.append((values, turn / size[:, None], cross, head))
+        found.append((values, turn, cross, head))
     largest = max(float(np.max(values, initial=0.0)) for values, *_ in found)
     crosses, heads = [], []
     for values, turn, cross, head in found:
