@@ -18,9 +18,9 @@ from samii_rig.rig.load import tables
 from samii_rig.types import Finding, Float, Int, Recording
 
 FARTHEST = 5  # samples; a logger that is later has another fault
-# Of what no shift leaves of the law, what the right one leaves at most: a command that is measured
-# keeps a few per cent. One that is rounded keeps a quarter of its step in the median, and a shift
-# that is seen above that leaves a fifth more.
+# Of what is fed back, what the law leaves at most where it holds: a command that is measured keeps
+# a few per cent. One that is rounded keeps a quarter of its step in the median. A shift is seen
+# where none leaves a fifth more.
 LEFT, ROUNDED, SEEN = 0.2, 0.3, 1.2
 ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same
 LOOKED_AT = 1 << 14  # samples about the largest reference: thousands tell a shift, millions cost
@@ -74,15 +74,26 @@ def shift_of(recording: Recording) -> int:
     def column(name: str) -> Float:
         return np.asarray(recording.values[around, recording.column(name)], np.float64)
 
-    theta, rest = column(sensor), column(command[0]) - asked(recording, command[0], kp, around)
+    theta, v = column(sensor), column(command[0])
+    sent = asked(recording, command[0], kp, around)
     inside = slice(FARTHEST, theta.size - FARTHEST)
     shifts = range(-FARTHEST, FARTHEST + 1)
-    off = [float(np.nanmedian(np.abs(rest + kp * np.roll(theta, -m))[inside])) for m in shifts]
+
+    def left(sent: Float, theta: Float) -> list[float]:
+        off = (np.abs(v - sent + kp * np.roll(theta, -m)) for m in shifts)
+        return [float(np.nanmedian(x[inside])) for x in off]
+
+    # What a voltmeter shows is halfway between two commands.
+    off = min(left(sent, theta), left(_halfway(sent), _halfway(theta)), key=min)
     if not np.isfinite(off).all():
         return 0
-    best, none = int(np.argmin(off)), off[FARTHEST]
-    exact = off[best] <= ROUNDED * names[command[0]].resolution and none > SEEN * off[best]
-    return shifts[best] if exact or off[best] < LEFT * none else 0
+    best, fed_back = int(np.argmin(off)), float(np.nanmedian(np.abs(v - sent)))
+    holds = off[best] < max(LEFT * fed_back, ROUNDED * names[command[0]].resolution)
+    return shifts[best] if holds and off[FARTHEST] > SEEN * off[best] else 0
+
+
+def _halfway(x: Float) -> Float:
+    return np.asarray((x + np.append(x[0], x[:-1])) / 2)
 
 
 def asked(recording: Recording, command: str, kp: float, rows: slice = slice(None)) -> Float:

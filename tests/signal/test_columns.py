@@ -121,6 +121,27 @@ def test_a_measured_command_shows_a_shift_too():
     assert shift_of(late(replace(run, values=values), 2)) == 2
 
 
+def test_a_shift_shows_beside_an_encoder_that_is_as_coarse_as_a_sample_of_motion():
+    """Between what was sent and what a voltmeter saw, half a sample and a step of the encoder are
+    left by the right shift too."""
+    run = loop(0.0)
+    values = run.values.copy()
+    t = np.arange(N) / RATE
+    theta = 0.02 * np.sin(2 * np.pi * (1.0 + 0.5 * t) * t)
+    values[:, 2] = np.rint(theta / STEP) * STEP
+    v = values[:, 0] - KP * values[:, 2]
+    values[:, 1] = (v + np.append(v[0], v[:-1])) / 2
+    for m in (-1, 0, 2):
+        assert shift_of(late(replace(run, values=values), m)) == m
+
+
+def test_a_law_that_does_not_hold_moves_nothing():
+    run = loop(0.0)
+    values = run.values.copy()
+    values[:, 1] = 0.6 * values[:, 1]
+    assert shift_of(late(replace(run, values=values), 2)) == 0
+
+
 def test_the_estimate_is_that_of_the_columns_in_order_and_says_so():
     (right,) = estimate([loop()])
     (found,) = estimate([late(loop(), 2)])
