@@ -6,18 +6,16 @@ that of the best amplitudes, which for diffuse Gaussian ones is the marginal lik
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.polynomial import legendre
 
-from samii_rig.likelihood import rounding
 from samii_rig.likelihood.contour import Contour
 from samii_rig.likelihood.pieces import Loops, Piece
 from samii_rig.types import Complex, Float, Int
 
 WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
-UNREAD = 6  # parts in which what is hardly read has a factor of its own
 # Hz of the mains in any country, how far they stray (EN 50160: 1 % for 99.5 % of a year), and their
 # multiples that a rectifier or a motor drive makes of them.
 MAINS, STRAY, MULTIPLES = (50.0, 60.0), 0.01, (1, 2, 3)
@@ -104,31 +102,18 @@ def _tones(left: Complex, k: Int, step: float) -> list[float]:
 
 
 def unread(
-    piece: Piece,
-    k: Int,
-    y: Float,
-    H: Complex,
-    contour: Contour,
-    loops: Loops,
-    step: Float,
+    piece: Piece, k: Int, factors: Mapping[int, Float], H: Complex, contour: Contour, loops: Loops
 ) -> Complex:
-    """(n_lines, q, m) of motion that a converter hardly reads, as it stays within a step: rounding
-    scales it by a factor that nobody knows, and the loop is told so. In parts of equal power: the
-    factor depends on the amplitude.
+    """(n_lines, q, m) of motion that a converter hardly reads, as it stays within few steps:
+    rounding scales it by a factor that nobody knows, and the loop is told so.
 
-    y : (n, q) as the sensors would move without noise. H : (M//2 + 1, q) from the input on the
+    factors : of each sensor (p, n) parts of its motion. H : (M//2 + 1, q) from the input on the
     contour; (M//2 + 1, q m) of m inputs.
     """
     n, q = piece.z.shape
     out = []
-    for i in np.flatnonzero(step > 0).tolist():
-        part = rounding.within(piece, i, y[:, i], float(step[i]), contour.rate_hz)
-        grown = np.cumsum(part**2)
-        if grown[-1] <= 0:
-            continue
-        turn = np.minimum((UNREAD * grown / grown[-1]).astype(np.int64), UNREAD - 1)
-        for j in range(UNREAD):
-            spectrum = np.fft.rfft(np.where(turn == j, part, 0.0))[k]
+    for i, parts in factors.items():
+        for spectrum in np.fft.rfft(parts, axis=1)[:, k]:
             seen = np.zeros((k.size, q), complex)
             seen[:, i] = spectrum
             for kp, sensor, of in loops:

@@ -335,7 +335,7 @@ def formed(
 
     known = rounding.Added.of([s.rounding for s in seen])
 
-    def told(with_past: Records) -> tuple[Rows, Noise]:
+    def told(with_past: Records, known: rounding.Added) -> tuple[Rows, Noise]:
         rows = _rows(records, _columns(with_past, smooth, nodes), seen)
         return rows, Noise.of(
             *_with_repeats(records, H, seen, rows, *_residual(rows, free)),
@@ -343,10 +343,13 @@ def formed(
             known=known,
         )
 
-    rows, power = told(records)
+    rows, power = told(records, known)
     with_past = _with_past(records, rows, seen, power, free)
     if with_past is not None:
-        rows, power = told(with_past)
+        rows, power = told(with_past, known)
+    times = _as_changes(rows, seen, power)
+    if np.any(times > 1):
+        rows, power = told(with_past or records, replace(known, times=times))
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
     rows = rows.take(np.flatnonzero(counted))
     form = _quadratic(rows, power, S[nodes])
@@ -404,6 +407,37 @@ def _with_past(
     if all(a is b for a, b in zip(pieces, records.pieces, strict=True)):
         return None
     return replace(records, pieces=tuple(pieces))
+
+
+def _as_changes(rows: Rows, seen: Sequence[Seen], noise: Noise) -> Float:
+    """(q,) times by which rounding shows more in a change of each sensor's response than noise of
+    its power that is independent from line to line, 1 at least.
+
+    The error of a motion of few steps repeats as the motion does: after each step, at each passage
+    of a mode. Tried at all places in the step, those of the pieces independent.
+    """
+    q = rows.e.shape[1]
+    out = np.ones(q)
+    C = np.diagonal(noise.covariance(rows.f, rows.piece), axis1=1, axis2=2).real
+    for c in range(q):
+        if not any(c in s.rounding.draws for s in seen):
+            continue
+        rng = np.random.default_rng(0)
+        draws = [
+            s.rounding.draws[c][rng.permutation(rounding.OFFSETS)].T
+            if c in s.rounding.draws
+            else np.zeros((len(s.e), rounding.OFFSETS), complex)
+            for s in seen
+        ]
+        scale = 1 / np.sqrt(C[:, c])[:, None]
+        errors = np.asarray(np.concatenate(draws)[rows.order] * scale, np.complex128)
+        Q = orthonormal(_real(rows.X * scale))
+        power = np.mean(np.abs(errors) ** 2, axis=1) / 2  # of the real part, and of the other
+        independent = float(np.sum(np.tile(power, 2) * np.sum(Q**2, axis=1)))
+        if independent > 0:
+            shows = float(np.sum((Q.T @ _real(errors)) ** 2)) / rounding.OFFSETS
+            out[c] = max(shows / independent, 1.0)
+    return out
 
 
 def _beyond(Q: Float, x: Complex) -> Complex:

@@ -20,19 +20,17 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.types import Float, Int
+from samii_rig.types import Complex, Float, Int
 
 WHITE = 1 / 12  # of a step, squared
 HARMONIC = np.arange(1.0, 200.0)  # of a sawtooth: all but 0.3 % of its power
 # Steps within which a motion is not read in proportion: the describing function of a staircase
 # is within 10 % of 1 from here on.
 FEW = 3.0
+STILL = 1e-3  # steps, rms of a motion that has no factor worth to be told
 SHORT = 0.5  # s in which a motion that crosses no step is not read: some periods of the band
 ALIKE = 0.05  # of a rounding error, that repeats itself: repeats do not show it
-# Of the power of what is not read, that is left where a factor of its own was taken out: it varies
-# from none to all over the amplitudes within a step.
-LEFT = 0.25
-AROUND = 5  # lines over which the power of what is not read is the mean
+UNREAD = 6  # parts in which what is hardly read has a factor of its own
 # Of a step, noise sd from which a rounding error is white: the first harmonic of a sawtooth is the
 # same to 0.7 % from here on.
 DITHERED = 0.5
@@ -74,15 +72,17 @@ class Added:
     """What rounding adds to pieces, in groups that it adds alike to.
 
     group : (p,) of each piece. each : of every group, for each of its pieces, Hz (m,) and power a
-    sample (m, q) of each sensor's rounding; the largest counts.
+    sample (m, q) of each sensor's rounding; the largest counts. times : (q,) as much of each.
     """
 
     group: Int
     each: tuple[tuple[tuple[Float, Float], ...], ...]
+    times: Float
 
     @classmethod
-    def of(cls, each: Sequence[tuple[Float, Float]]) -> Added:
-        """each : of every piece, as `of_piece` has it."""
+    def of(cls, pieces: Sequence[Rounding]) -> Added:
+        """Of every piece."""
+        each = [(x.frequency, x.power) for x in pieces]
         f = max((x[0] for x in each), key=len)
         level = np.stack([_at(f, x) for x in each])
         largest = np.max(level, axis=(0, 1))
@@ -102,7 +102,7 @@ class Added:
         members = tuple(
             tuple(x for x, g in zip(each, group, strict=True) if g == j) for j in range(len(first))
         )
-        return cls(np.array(group, np.int64), members)
+        return cls(np.array(group, np.int64), members, np.ones(level.shape[2]))
 
     def __call__(self, f: Float, group: Int) -> Float:
         """(n, q) power a sample at f (n,) Hz in pieces of groups (n,)."""
@@ -112,36 +112,49 @@ class Added:
             on = group == j
             for one in members:
                 out[on] = np.maximum(out[on], _at(f[on], one))
-        return out
+        return out * self.times
 
 
 def _at(f: Float, of: tuple[Float, Float]) -> Float:
     return np.stack([np.interp(f, of[0], p) for p in of[1].T], axis=1)
 
 
-def of_piece(piece: Piece, step: Float, y: Float, rate_hz: float) -> tuple[Float, Float]:
-    """Hz (m,) and power a sample (m, q) of each sensor's rounding.
+@dataclass(frozen=True, slots=True)
+class Rounding:
+    """What the converters' steps do to a piece.
 
-    step : (q,) of the converters. y : (n, q) as the sensors would move without noise.
+    frequency : (m,) Hz. power : (m, q) a sample, of each sensor's rounding. factors : of each
+    sensor (p, n) parts of its motion that are read by a factor of their own. draws : of each sensor
+    that nothing dithers (OFFSETS, n_lines) rounding beyond these, a sample's power, as it is
+    wherever the sensor stands in its step.
     """
-    n, q = piece.z.shape
-    frequency = np.asarray(np.fft.rfftfreq(n, 1 / rate_hz), np.float64)
-    power = np.zeros((frequency.size, q))
-    if not np.any(step > 0):
-        return frequency, power
-    same = alike(piece, step)
-    for i in np.flatnonzero(step > 0):
-        times = 1 + len(piece.repeats) * same[i]
-        sd = _noise(piece.z[:, i] - y[:, i], float(step[i]))
-        still, part = _within(piece, y[:, i], float(step[i]), sd, rate_hz)
-        if sd < DITHERED * step[i]:
-            power[:, i] = times * _made(y[:, i], still, float(step[i]), sd)
-        else:
+
+    frequency: Float
+    power: Float
+    factors: dict[int, Float]
+    draws: dict[int, Complex]
+
+    @classmethod
+    def of_piece(cls, piece: Piece, k: Int, step: Float, y: Float, rate_hz: float) -> Rounding:
+        """k : (n_lines,) that count. step : (q,) of the converters. y : (n, q) as the sensors
+        would move without noise."""
+        n, q = piece.z.shape
+        frequency = np.asarray(np.fft.rfftfreq(n, 1 / rate_hz), np.float64)
+        power = np.zeros((frequency.size, q))
+        factors, draws = {}, {}
+        same = alike(piece, step)
+        for i in np.flatnonzero(step > 0).tolist():
+            times = 1 + len(piece.repeats) * same[i]
             power[:, i] = times * WHITE * step[i] ** 2
-        if part.any():
-            unread = np.abs(np.fft.rfft(part)) ** 2 / n
-            power[:, i] += LEFT * ndimage.uniform_filter1d(unread, AROUND)
-    return frequency, power
+            sd = _noise(piece.z[:, i] - y[:, i], float(step[i]))
+            if sd >= DITHERED * step[i]:
+                continue
+            parts = _parts(piece, y[:, i], float(step[i]), sd, rate_hz)
+            errors = _errors(y[:, i] / step[i], parts, sd / step[i])
+            spectra = np.fft.rfft(math.sqrt(times / n) * step[i] * errors, axis=1)
+            power[:, i] = np.mean(np.abs(spectra) ** 2, axis=0)
+            factors[i], draws[i] = parts, np.asarray(spectra[:, k])
+        return cls(frequency, power, factors, draws)
 
 
 def _noise(left: Float, step: float) -> float:
@@ -151,42 +164,38 @@ def _noise(left: Float, step: float) -> float:
     return math.sqrt(max(white - WHITE * step**2, 0.0))
 
 
-def _made(y: Float, still: Int, step: float, sd: float) -> Float:
-    """(n//2 + 1,) power a sample of the rounding of a motion y (n,) wherever it stands in its step.
+def _errors(y: Float, parts: Float, sd: float) -> Float:
+    """(OFFSETS, n) rounding of a motion y (n,) in steps wherever it stands in its step, less what
+    factors of its parts (p, n) explain.
 
-    still : (n,) numbers of the stretches that stay within few steps, of which the mean error alone
-    counts, and 0. sd : of the noise that dithers it.
+    sd : of the noise that dithers it, in steps.
     """
     rng = np.random.default_rng(0)
-    power = np.zeros(y.size // 2 + 1)
-    count = int(still.max())
-    for offset in (np.arange(OFFSETS) + 0.5) / OFFSETS:
-        x = y / step + offset + rng.standard_normal(y.size) * (sd / step)
+    out = np.zeros((OFFSETS, y.size))
+    size = np.sum(parts**2, axis=1)
+    for one, offset in zip(out, (np.arange(OFFSETS) + 0.5) / OFFSETS, strict=True):
+        x = y + offset + rng.standard_normal(y.size) * sd
         error = np.rint(x) - x
-        if count:
-            mean = np.append(0.0, ndimage.mean(error, still, np.arange(1, count + 1)))
-            error = np.where(still > 0, mean[still], error)
-        power += np.abs(np.fft.rfft(error - np.mean(error))) ** 2
-    return power * (step**2 / (OFFSETS * y.size))
+        error -= np.mean(error)
+        one[:] = error - (parts @ error / size) @ parts
+    return out
 
 
-def within(piece: Piece, i: int, y: Float, step: float, rate_hz: float) -> Float:
-    """(n,) what of the motion y (n,) of sensor i stays within few steps and is not read in
+def _parts(piece: Piece, y: Float, step: float, sd: float, rate_hz: float) -> Float:
+    """(p, n) what of the motion y (n,) of a sensor stays within few steps and is not read in
     proportion, less its mean: each stretch its own, as a part may rest at another place after it
-    was moved."""
-    return _within(piece, y, step, _noise(piece.z[:, i] - y, step), rate_hz)[1]
-
-
-def _within(piece: Piece, y: Float, step: float, sd: float, rate_hz: float) -> tuple[Int, Float]:
-    """(n,) numbers of the stretches, 0 elsewhere, and what `within` gives. sd : of the noise."""
+    was moved. In parts of equal power: the factor depends on the amplitude. sd : of the noise."""
     times = math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
     width = max(int(SHORT * rate_hz), 3)
     high, low = ndimage.maximum_filter1d(y, width), ndimage.minimum_filter1d(y, width)
     still = high - low < FEW * step * times
     labels, count = ndimage.label(still)
-    stretch = np.asarray(labels, np.int64)
-    seen = math.exp(-2 * (math.pi * sd / step) ** 2)
-    if count == 0 or seen < UNSEEN:
-        return stretch, np.zeros(y.size)
-    mean = np.append(0.0, ndimage.mean(y, stretch, np.arange(1, count + 1)))
-    return stretch, np.asarray(np.where(still, seen * (y - mean[stretch]), 0.0))
+    if count == 0 or math.exp(-2 * (math.pi * sd / step) ** 2) < UNSEEN:
+        return np.zeros((0, y.size))
+    mean = np.append(0.0, ndimage.mean(y, labels, np.arange(1, count + 1)))
+    part = np.where(still, y - mean[labels], 0.0)
+    grown = np.cumsum(part**2)
+    if grown[-1] <= y.size * (STILL * step) ** 2:
+        return np.zeros((0, y.size))
+    turn = np.minimum((UNREAD * grown / grown[-1]).astype(np.int64), UNREAD - 1)
+    return np.stack([np.where(turn == j, part, 0.0) for j in np.unique(turn)])

@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from samii_rig.likelihood import nuisance, rounding
+from samii_rig.likelihood import nuisance
 from samii_rig.likelihood.contour import Contour
 from samii_rig.likelihood.past import Past, likely
 from samii_rig.likelihood.pieces import Loops, Piece
+from samii_rig.likelihood.rounding import Rounding
 from samii_rig.types import Complex, Float, Int
 
 
@@ -56,7 +57,7 @@ class Seen:
     e : (n, q) what the reference leaves, a sample's power. N : (n, q, m) nuisances, of size 1 each;
     the first are the past's. beside : those that are no past: an offset that acts from the first
     sample on rings as that does.
-    rounding : as `rounding.of_piece` has it. left : (n_samples, q) in time what the reference
+    rounding : of the converters. left : (n_samples, q) in time what the reference
     leaves.
     """
 
@@ -64,7 +65,7 @@ class Seen:
     N: Complex
     past: Past
     beside: slice
-    rounding: tuple[Float, Float]
+    rounding: Rounding
     left: Float
 
     @classmethod
@@ -80,7 +81,8 @@ class Seen:
         own = [nuisance.wander(n, k, q), nuisance.hum(left, k, exact.rate_hz, n)]
         if np.any(step > 0):  # what a converter reads is the whole motion
             y = y + _before(past, left[k], own[0], answers.impulse, piece)
-        own += [nuisance.unread(piece, k, y, H, exact, answers.loops, step)]
+        rounding = Rounding.of_piece(piece, k, step, y, exact.rate_hz)
+        own += [nuisance.unread(piece, k, rounding.factors, H, exact, answers.loops)]
         own += [nuisance.edges(piece, k, answers.impulse)]
         steps = nuisance.offsets(piece, k, answers.steps(len(piece.r)))
         beside, steps = _of_size_one(np.concatenate(own, axis=2)), _of_size_one(steps)
@@ -90,7 +92,7 @@ class Seen:
             np.concatenate([past.shapes, beside, steps], axis=2),
             past,
             slice(first, first + beside.shape[2]),
-            rounding.of_piece(piece, step, y, exact.rate_hz),
+            rounding,
             left_in_time,
         )
 
