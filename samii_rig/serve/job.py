@@ -59,7 +59,8 @@ OVER: tuple[Phase, ...] = ("done", "refused", "cancelled", "died")
 class Request:
     """What was asked for. setup : which run of an experiment of several. recording : its name
     below the folder. settings : of the device, over those of the rig file. stop_when_certain : end
-    once the diagnosis is (see `analysis`)."""
+    once the diagnosis is (see `analysis`). pose : as it was asked for, "" for the rig file's; the
+    job's rig file stands in it."""
 
     experiment: str
     recording: str
@@ -70,6 +71,7 @@ class Request:
     duration_s: float = 0.0
     stop_when_certain: bool = False
     settings: dict[str, Any] = field(default_factory=dict)
+    pose: str = ""
 
 
 @dataclass(frozen=True, slots=True)

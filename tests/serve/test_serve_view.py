@@ -102,6 +102,8 @@ def test_a_field_writes_the_file_and_each_limit_says_what_would_be_left(page: Br
     left = "[...document.querySelectorAll('#margins tbody tr')].map((r) => r.textContent)"
     before = page.value(left)
     assert any(row.startswith("theta_2 limit0.350 rad") for row in before)
+    # Without gravity there is no pose to stand in.
+    assert page.value("document.getElementById('stands').hidden")
     typed(page, "amplitudes", "Levels [rad]", "0.1, 0.05")
     page.until("document.getElementById('text').value.includes('amplitudes = [0.1, 0.05]')")
     page.until(f"({left}).length > 0 && ({left})[0] !== {before[0]!r}")
