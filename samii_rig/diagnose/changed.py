@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
+from samii_rig.diagnose.fit.agreeing import Given
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.known import with_known
 from samii_rig.diagnose.fit.records import RecordSearch, Whole
@@ -28,6 +29,7 @@ from samii_rig.rig.schema import RelativeAngle, Rig
 from samii_rig.rig.schema.elements import Branch, flattened, parameters
 from samii_rig.types import FrequencyResponse, Recording
 
+WHERE = (" after", " before")  # which recordings are not of one state
 COMMON = "common_"  # of the names of what both states have beside the rig file
 FREE = 1.0  # tolerance of what the state before was found to have: a factor of e, as good as none
 
@@ -98,7 +100,11 @@ def changed(
     at_first, bands = search.ratio(nominal), search.bands(nominal)
     search.begin("what changed")
     search.run()
-    answer = by_samples(second, search, at_first, bands)
+    given = [
+        Given(case.runs, *of, case.clean.samples, where)
+        for case, of, where in zip((second, first), search.by_state(), WHERE, strict=True)
+    ]
+    answer = by_samples(second, search, at_first, bands, given)
     beside = Before(
         found.verdict,
         found.causes if put_in else (),
@@ -106,7 +112,10 @@ def changed(
         (_named(before), _named(after)),
         explained(search.nominal.fitted),
     )
-    return replace(answer, before=beside, not_physics=(*beside.told(), *answer.not_physics))
+    words = (beside.told(), answer.not_physics)
+    # That one side is of several states is said first.
+    first_words, others = words[::-1] if answer.states else words
+    return replace(answer, before=beside, not_physics=(*first_words, *others))
 
 
 def _as_in(common: Rig, rig: Rig, names: Mapping[str, float]) -> Rig:

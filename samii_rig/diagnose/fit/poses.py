@@ -132,6 +132,12 @@ class PosesSearch(RecordSearch):
         """As of `RecordSearch`: where the first pose's own lines lead."""
         return replace(self.by_line.nominal.fitted, model=self.made(()))
 
+    def by_pose(self) -> list[tuple[Whole, Fitted, Float]]:
+        """The records of each pose, the nominal model there, and the nodes of their likelihood."""
+        assert isinstance(self.whole, InPoses)
+        parts = [part.frequency for part in parts_of(self.reduced)]
+        return list(zip(self.whole.each, _each(self.nominal.fitted), parts, strict=True))
+
     def made(self, effects: tuple[Effect, ...]) -> Model:
         """As of `Explanations`."""
         return Posed(self._rigs, effects)

@@ -195,6 +195,14 @@ class StatesSearch(RecordSearch):
         closed = (a - b) / (a - 1) if a > 1 else 0.0
         return a, b, Gap(closed, closed, closed)
 
+    def by_state(self) -> list[tuple[Whole, Fitted, Float]]:
+        """The records after and before, the nominal model of each, and the nodes of their
+        likelihoods."""
+        both, fitted = self.whole, self.nominal.fitted
+        assert isinstance(both, Both)
+        after, before = (part.frequency for part in parts_of(self.reduced))
+        return [(both.after, _after(fitted), after), (both.before, _before(fitted), before)]
+
     def first(self) -> Fitted:
         """As of `RecordSearch`."""
         model, x = self.made(()), self._common.x

@@ -187,6 +187,14 @@ def _verdict(found: Diagnosis) -> tuple[Mark, str, str]:
         case "ambiguous":
             text = "The data do not settle it: see what else it may be, and what would tell."
             return "warning", f"Most likely left out of the model: {parts}", text
+    if found.states:
+        text = f"No one model explains them all. {findings(found)[0]}"
+        return "bad", "The recordings are not of one state of the rig", text
+    if found.exact:
+        title = "A number of the rig file is wrong"
+        if len(found.exact) > 1:
+            title = "Two numbers of the rig file are wrong"
+        return "bad", title, f"{' and '.join(one.told() for one in found.exact)}."
     places = suspects(found)
     where = "The data do not tell where it is."
     site, p = next(iter(places.items()), ("", 0.0))
@@ -216,6 +224,9 @@ def _verdict_of_two(found: Diagnosis, before: Before, parts: str) -> tuple[Mark,
         case "ambiguous":
             text = "The data do not settle it: see what else it may be, and what would tell."
             return "warning", f"Most likely changed: {parts}", f"{text} {states}"
+    if found.states:
+        text = f"What changed is not told. {findings(found)[0]} {states}"
+        return "bad", "The recordings of one of the two states are of several", text
     places = suspects(found)
     site, p = next(iter(places.items()), ("", 0.0))
     where = f"It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
