@@ -14,7 +14,7 @@ from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit.agreeing import Given
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.known import with_known
-from samii_rig.diagnose.fit.records import RecordSearch, Whole
+from samii_rig.diagnose.fit.records import RecordSearch, Whole, within
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.states import Both, StatesSearch
 from samii_rig.diagnose.physics.effect import Effect
@@ -23,7 +23,6 @@ from samii_rig.diagnose.result import Before, Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError
-from samii_rig.likelihood.reduce import Records
 from samii_rig.progress import Progress, ahead
 from samii_rig.rig.schema import RelativeAngle, Rig
 from samii_rig.rig.schema.elements import Branch, flattened, parameters
@@ -151,17 +150,8 @@ def _both(first: Case, second: Case, band: Band | None) -> tuple[Both, RecordSea
     start = RecordSearch(before, first.search)
     alike = start.ratio(start.nominal.fitted) > threshold(start.spread)
     if alike:
-        after = replace(after, records=_within(after.records, before.records.band))
+        after = replace(after, records=within(after.records, before.records.band))
     return Both(after, before, alike), start
-
-
-def _within(records: Records, band: Band) -> Records:
-    """Records on the lines within a band alone."""
-    low, high = band
-    own = tuple((max(a, low), min(b, high)) for a, b in records.bands)
-    if any(a >= b for a, b in own):
-        raise EstimateError("the two states were not excited at the same frequencies")
-    return replace(records, bands=own)
 
 
 def common_rig(rig: Rig, found: Rig) -> Rig:

@@ -79,7 +79,7 @@ class JobState:
     """How it stands. status, reason : of the stop record. error : why there is none.
     live : path of the live data. early : why it ended before its plan did, in good order.
     at_zero : whether the last sample showed the output at zero; None where none was seen.
-    ended : when, UTC, ISO 8601."""
+    ended : when, UTC, ISO 8601. doing : what the diagnosis tries, with the time left."""
 
     phase: Phase = "queued"
     pid: int = 0
@@ -93,6 +93,7 @@ class JobState:
     at_zero: bool | None = None
     ended: str = ""
     time: str = ""
+    doing: str = ""
 
 
 class Job:

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from samii_rig.diagnose.data.measured import DIFFER, PERIODIC, Measured, measured, repeated
-from samii_rig.diagnose.fit.records import RecordSearch, Whole
+from samii_rig.diagnose.fit.records import RecordSearch, Whole, within
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.likelihood.pieces import Piece
@@ -177,10 +177,12 @@ def _alone(given: Given) -> list[_Alone]:
     for i, (run, _) in enumerate(aligned(given.runs)):
         try:
             own = Whole.of([run], whole.rig, band, sensors, _own(run, given.findings))
+            # On two states, those lines alone that both have.
+            among = within(own.records, records.band)
         except EstimateError:
             continue
         if own.wired == whole.wired:
-            long = replace(own, records=replace(own.records, least=records.longest))
+            long = replace(own, records=replace(among, least=records.longest))
             form = long.about(given.fitted, given.frequency)
             pieces = own.by_level().records.pieces
             out.append(_Alone(run.source or f"recording {i + 1}", pieces, form))

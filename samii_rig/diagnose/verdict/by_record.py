@@ -54,7 +54,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     if forced is None or not (case.search.lines.torn() or forced.is_enough()):
         search.begin("what is missing, in pairs")
         search.run()
-        search.begin("amplitude levels")
+        search.begin("amplitude levels, beside pairs")
         forced = None if forced is None else forces_on(search)
     search.begin("what cannot be told apart")
     if forced is None:

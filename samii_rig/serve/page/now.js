@@ -41,8 +41,9 @@ export function line(s) {
   return `${s.fault ? `FAULT: ${s.fault.reason}. ` : ""}${s.last ? ended(s.last) : s.fault ? "" : "No run."}`;
 }
 
-// What stands below it while samples come.
+// What stands below it while samples come, and while they are diagnosed.
 export function facts(p, s) {
+  if (s.running?.doing) return { "The diagnosis tries": s.running.doing };
   return p.segment ? {
     "Run left": clock(p.time_left / s.pace), "Queue left": clock(s.time_left_s / s.pace),
     Level: `${p.level} ${p.unit}`, Frequency: p.broadband ? "whole band" : p.frequency ? `${p.frequency.toFixed(2)} Hz` : "at rest",

@@ -1,0 +1,35 @@
+"""How long the rest of a diagnosis usually takes, where nobody knows how many rounds there will be.
+
+Of each stage the tenth and the ninetieth percentile of the time left, over the time spent since
+"what is missing" began. `benchmarks/pace_study.py` counts them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from samii_rig.progress import START
+
+Usual = Mapping[str, tuple[float, float]]
+
+# Of 33 concealed trials of two plants and thirteen rigs, 11 s in the median.
+RECORDS: Usual = {
+    "what is missing": START,
+    "what is missing, round 2": (5.7, 54.0),
+    "amplitude levels": (2.3, 37.0),
+    "amplitude levels, round 1": (0.64, 5.8),
+    "amplitude levels, round 2": (0.53, 5.1),
+    "what is missing, in pairs": (0.21, 2.0),
+    "what is missing, in pairs, round 4": (0.23, 1.1),
+    "amplitude levels, beside pairs": (0.1, 0.93),
+    "what cannot be told apart": (0.07, 0.69),
+    "whether the recordings agree": (0.13, 0.85),
+}
+# Of the responses of 20 of these alone, 7 s in the median.
+LINES: Usual = {
+    "what is missing": START,
+    "what is missing, round 2": (0.52, 11.0),
+    "what is missing, round 4": (1.4, 4.8),
+    "what is missing, round 8": (0.63, 1.9),
+    "what cannot be told apart": (0.03, 0.51),
+}
