@@ -10,8 +10,10 @@ how many rounds there will be, a stage that begins says how long the rest usuall
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from typing import Self, TypeVar
 
 Progress = Callable[[str], None]
@@ -19,6 +21,7 @@ T = TypeVar("T")
 
 SOON = 1.0  # s of work before a time left is more than a guess
 LEAST = 0.1  # s: the shortest time that is told
+TOLD = 1.0  # s between words that are told elsewhere
 START = (0.0, 0.0)  # `Begun.rest` of a first stage, when nothing is spent yet
 # From how many s on times to the end are told in steps of so many.
 STEPS = ((600.0, 60.0), (120.0, 30.0), (20.0, 5.0), (0.0, 1.0))
@@ -132,6 +135,22 @@ class Pace:
         if low_ == high_ or max(low, left) < SOON:
             return f", up to {high_} to the end"
         return f", {low_} to {high_} to the end"
+
+
+def telling(tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Progress:
+    """Tells what is tried, and the time left, every `TOLD` s at most; a disk that is full for that
+    is no reason to find nothing."""
+    pace, due = Pace(clock), -math.inf
+
+    def say(stage: str) -> None:
+        nonlocal due
+        words = pace.words(stage)
+        if clock() >= due:
+            due = clock() + TOLD
+            with suppress(OSError):
+                tell(words)
+
+    return say
 
 
 def _rough(seconds: float) -> float:

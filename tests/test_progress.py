@@ -10,8 +10,7 @@ from __future__ import annotations
 import pytest
 
 from samii_rig.diagnose.fit.usual import LINES, RECORDS
-from samii_rig.progress import Begun, Counted, Pace, ahead, counted, duration
-from samii_rig.serve.runner import telling
+from samii_rig.progress import Begun, Counted, Pace, ahead, counted, duration, telling
 
 
 def test_the_time_left_is_that_of_the_pace_so_far() -> None:

@@ -103,7 +103,9 @@ def changed(
         Given(case.runs, *of, case.clean.samples, where)
         for case, of, where in zip((second, first), search.by_state(), WHERE, strict=True)
     ]
-    answer = by_samples(second, search, at_first, bands, given)
+    # What both have and no model explains is no part of what changed.
+    left = max(nominal.chi2 - search.problem.expected, 0.0) if both.alike else None
+    answer = by_samples(second, search, at_first, bands, given, left)
     beside = Before(
         found.verdict,
         found.causes if put_in else (),

@@ -26,7 +26,7 @@ from samii_rig.serve.shared import get, made, put
 
 NAME = re.compile(r"[^/\0]+\.mcap")  # of a recording, in the folder of all
 ID = re.compile(r"\d{8}T\d{12}-[0-9a-f]{6}")
-REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS = (
+REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS, DOING = (
     "request.json",
     "state.json",
     "rig.toml",
@@ -37,6 +37,7 @@ REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS 
     "responses.json",
     "diagnosis_so_far.json",  # the analyst's
     "diagnosis.json",  # the runner's last word, of the whole run
+    "doing.json",  # what the analyst's diagnosis tries
 )
 
 # s without a sign of the service after which it counts as gone: it gives one every half second.

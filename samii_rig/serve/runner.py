@@ -13,8 +13,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-import time
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
@@ -26,7 +24,7 @@ import numpy as np
 
 from samii_rig.errors import GateError, SamiiRigError
 from samii_rig.index.remarks import add_note, set_diagnosis
-from samii_rig.progress import Pace
+from samii_rig.progress import telling
 from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.order import PlannedRun, RunOrder
@@ -39,8 +37,6 @@ from samii_rig.serve.job import DIAGNOSIS, LOST_AFTER, Job, JobState
 from samii_rig.serve.live import LiveWriter, live_folder
 from samii_rig.serve.planned import averages, planned
 from samii_rig.types import SampleBlock, StopRecord
-
-TOLD = 1.0  # s between words of what a diagnosis tries
 
 
 class Runner:
@@ -198,24 +194,6 @@ class Runner:
             self.job.tell(DIAGNOSIS, {**said(found), **told})
             return found.verdict
         return ""
-
-
-def telling(
-    tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic
-) -> Callable[[str], None]:
-    """Tells what is tried, and the time left, every `TOLD` s at most; a disk that is full for that
-    is no reason to find nothing."""
-    pace, due = Pace(clock), -math.inf
-
-    def say(stage: str) -> None:
-        nonlocal due
-        words = pace.words(stage)
-        if clock() >= due:
-            due = clock() + TOLD
-            with suppress(OSError):
-                tell(words)
-
-    return say
 
 
 def _numbers(data: dict[str, Any]) -> dict[str, Any]:

@@ -171,6 +171,14 @@ def test_while_a_run_is_diagnosed_the_page_says_what_is_tried_and_for_how_long(
     told["running"]["doing"] = ""
     page.value(f"show({json.dumps(told)})")
     assert page.text("facts") == ""
+    # And while the run goes on, of what is known so far.
+    told["running"] |= {"phase": "running", "status": "", "diagnosis": True}
+    told["so_far"] = {"responses": "0", "responses_age_s": 0, "diagnosis": None, "failed": False}
+    told["so_far"]["doing"] = doing
+    page.value(f"show({json.dumps(told)})")
+    assert page.text("diagnosis-doing") == f"Now: {doing}."
+    page.value(f"show({state()})")
+    assert page.text("diagnosis-doing") == ""
 
 
 def test_every_axis_of_frequency_has_its_unit_beside_its_numbers(page: Browser) -> None:

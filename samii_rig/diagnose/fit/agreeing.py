@@ -121,17 +121,20 @@ class _Alone:
         return _all_in(ours, theirs) and _all_in(theirs, ours)
 
 
-def states_apart(every: Sequence[Given]) -> list[Apart]:
+def states_apart(every: Sequence[Given], left: float | None = None) -> list[Apart]:
     """The states that recordings are of, for each of several that are given as of one and are of
-    more; those that differ most come first."""
+    more; those that differ most come first. left : chi-square over its mean that is to be explained
+    of all; None for what the models leave of each recording."""
     each = [_alone(given) if len(given.runs) > 1 else [] for given in every]
     found = [_grouped(one) for one in each]
     if not any(len(one.groups) > 1 for one in found):
         return []
-    alone = [one or _alone(given) for given, one in zip(every, each, strict=True)]
-    left = sum(_left(given, one) for given, one in zip(every, alone, strict=True))
+    if left is None:
+        alone = [one or _alone(given) for given, one in zip(every, each, strict=True)]
+        left = sum(_left(given, one) for given, one in zip(every, alone, strict=True))
+    whole = max(left, 1e-300)
     apart = [
-        Apart(one.states, one.worst, min(one.excess / left, 1.0) if left > 0 else 1.0, given.where)
+        Apart(one.states, one.worst, min(one.excess / whole, 1.0), given.where)
         for given, one in zip(every, found, strict=True)
         if len(one.groups) > 1
     ]

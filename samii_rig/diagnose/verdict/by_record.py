@@ -75,14 +75,15 @@ def by_samples(
     first: float,
     bands: tuple[Band, ...],
     given: Sequence[Given],
+    left: float | None = None,
 ) -> Diagnosis:
     """The answer, once all linear explanations of the records were tried. first, bands : what the
     refitted nominal model left before, in all and by band. given : the recordings that are taken
-    for those of one state, for each."""
+    for those of one state, for each; left : as of `states_apart`."""
     search.begin("what cannot be told apart")
     looked = _consistent(search, _looked(search))
     looked = replace(looked, said=(*looked.said, *_unasked(search)))
-    return _agreeing(case, search, first, bands, looked, given)
+    return _agreeing(case, search, first, bands, looked, given, left)
 
 
 def _agreeing(
@@ -92,11 +93,12 @@ def _agreeing(
     bands: tuple[Band, ...],
     looked: _Looked,
     given: Sequence[Given],
+    left: float | None = None,
 ) -> Diagnosis:
     """The answer, with what the recordings of one state differ by, where they are of several."""
     if any(len(one.runs) > 1 for one in given):
         search.begin("whether the recordings agree")
-    apart = states_apart(given)
+    apart = states_apart(given, left)
     for one in apart:
         looked = replace(looked, judged=verdict.of_several_states(looked.judged, one.part))
     return of_states(_answer(case, search, first, bands, looked), apart)
