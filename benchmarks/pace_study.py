@@ -3,8 +3,13 @@
     samii-rig prove --out trials --keep --nothing 10 --one 14 --two 5 --outside 4 \
         --joints 2 --force 5
     python benchmarks/pace_study.py trials [--lines] [--out paces.jsonl]
+    python benchmarks/states_study.py make states --rig samii --seeds 100 106
+    python benchmarks/pace_study.py states --states [--out paces.jsonl]
+    python benchmarks/pace_study.py --poses 10 [--out paces.jsonl]
 
-Each trial is diagnosed as `samii-rig prove` does, or of its responses alone (--lines). At each
+Each trial is diagnosed as `samii-rig prove` does, of its responses alone (--lines), or asked what
+changed between its two states, the time counted from "what changed" on (--states). With --poses so
+many arms of two links, with something hidden in two of three, are recorded in two poses. At each
 stage, and at rounds of it, the time that was left is divided by that since "what is missing" began.
 The tenth and the ninetieth percentile of these are the numbers of `samii_rig.diagnose.fit.usual`.
 """
@@ -14,31 +19,42 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import sys
 import time
 from collections import defaultdict
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import numpy as np
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "kits"))
 
+import numpy as np
+from poses_kit import held, in_pose, loaded, two_links
+
+from samii_rig.diagnose.changed import State, changed
 from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.posed import in_poses
 from samii_rig.errors import SamiiRigError
 from samii_rig.progress import Counted
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.estimate import estimate
+from samii_rig.types import Recording
 
-FIRST = "what is missing"
+FIRST = ("what is missing", "what changed")
+POSES = ("0 deg", "110 deg")
 ROUNDS = (1, 2, 4, 8, 16)
 LEAST = 5  # diagnoses that came to a stage, below which it is not told
 
 
-def stamped(folder: Path, *, lines: bool) -> list[tuple[float, str]]:
+Note = Callable[[str], None]
+
+
+def stamped(work: Callable[[Note], object]) -> list[tuple[float, str]]:
     """When each stage and each round of it began, and the end, in s from `FIRST` on."""
-    runs = [read_recording(path) for path in sorted(folder.glob("*.mcap"))]
-    rig = parse(Rig, runs[0].rig_toml, "the rig file")
     begun: list[tuple[float, str]] = []
 
     def note(stage: str) -> None:
@@ -47,11 +63,37 @@ def stamped(folder: Path, *, lines: bool) -> list[tuple[float, str]]:
         if not begun or begun[-1][1] != words:
             begun.append((time.monotonic(), words))
 
-    responses = estimate(runs, gaps="model")
-    diagnose(responses, rig, runs=() if lines else runs, progress=note)
+    work(note)
     begun.append((time.monotonic(), "end"))
-    start = next(t for t, words in begun if words.partition(",")[0] == FIRST)
+    start = next(t for t, words in begun if words.partition(",")[0] in FIRST)
     return [(t - start, words) for t, words in begun if t >= start]
+
+
+def one_state(folder: Path, lines: bool) -> Callable[[Note], object]:
+    """The diagnosis of all recordings in a folder."""
+    runs = read(folder)
+    rig = parse(Rig, runs[0].rig_toml, "the rig file")
+    held = () if lines else runs
+    return lambda note: diagnose(estimate(runs, gaps="model"), rig, runs=held, progress=note)
+
+
+def two_states(folder: Path) -> Callable[[Note], object]:
+    """What changed between the recordings of a folder's two."""
+    rig = parse(Rig, (folder / "rig.toml").read_text("utf-8"), "the rig file")
+    before, after = (State(estimate(r), r) for r in (read(folder / n) for n in ("before", "after")))
+    return lambda note: changed(before, after, rig, progress=note)
+
+
+def two_poses(seed: int) -> Callable[[Note], object]:
+    """What is missing over two poses."""
+    hidden = [(), (loaded(0.02 * (seed + 1)),), (held(0.5 * (seed + 1)),)][seed % 3]
+    each = [in_pose(two_links(), pose, 2 * seed + k, *hidden) for k, pose in enumerate(POSES, 1)]
+    return lambda note: in_poses(each, two_links(), progress=note)
+
+
+def read(folder: Path) -> list[Recording]:
+    """All recordings of a folder."""
+    return [read_recording(path) for path in sorted(folder.glob("*.mcap"))]
 
 
 def rests(every: list[list[tuple[float, str]]]) -> dict[str, list[float]]:
@@ -70,20 +112,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("trials", type=Path)
+    parser.add_argument("trials", type=Path, nargs="?")
     parser.add_argument("--lines", action="store_true")
-    parser.add_argument("--step", type=int, default=1, help="2 for every second trial alone")
+    parser.add_argument("--states", action="store_true")
+    parser.add_argument("--poses", type=int, default=0)
     parser.add_argument("--out", type=Path)
     asked = parser.parse_args()
     every = []
-    for folder in sorted((asked.trials / "recordings").iterdir())[:: asked.step]:
+    works: Iterator[Callable[[], Callable[[Note], object]]]
+    if asked.poses:
+        works = (partial(two_poses, seed) for seed in range(asked.poses))
+    elif asked.states:
+        works = (partial(two_states, folder) for folder in sorted(asked.trials.glob("*/*")))
+    else:
+        folders = sorted(asked.trials.glob("recordings/*"))
+        works = (partial(one_state, folder, asked.lines) for folder in folders)
+    for work in works:
         try:
-            every.append(stamped(folder, lines=asked.lines))
+            every.append(stamped(work()))
         except (SamiiRigError, StopIteration, IndexError):
             continue
         if asked.out:
             with asked.out.open("a") as out:
-                out.write(json.dumps({"trial": folder.name, "stages": every[-1]}) + "\n")
+                out.write(json.dumps({"stages": every[-1]}) + "\n")
     print(f"{len(every)} diagnoses, {np.median([e[-1][0] for e in every]):.1f} s in the median")
     for words, found in sorted(rests(every).items(), key=lambda x: -len(x[1])):
         head, _, number = words.rpartition(" ")

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import pytest
 
-from samii_rig.diagnose.fit.usual import LINES, RECORDS
-from samii_rig.progress import Begun, Counted, Pace, ahead, counted, duration, telling
+from samii_rig.diagnose.fit.usual import LINES, POSES, RECORDS, STATES
+from samii_rig.progress import START, Begun, Counted, Pace, ahead, counted, duration, telling
 
 
 def test_the_time_left_is_that_of_the_pace_so_far() -> None:
@@ -98,8 +98,9 @@ def test_what_is_a_part_of_more_tells_no_end_of_all() -> None:
 
 
 def test_the_rest_of_a_diagnosis_is_known_at_its_stages() -> None:
-    for usual in (RECORDS, LINES):
-        assert {"what is missing", "what cannot be told apart"} <= usual.keys()
+    for usual in (RECORDS, LINES, STATES, POSES):
+        assert usual[next(iter(usual))] == START
+        assert "what cannot be told apart" in usual
         assert all(0 <= low <= high for low, high in usual.values())
 
 

@@ -165,6 +165,7 @@ def test_while_a_run_is_diagnosed_the_page_says_what_is_tried_and_for_how_long(
     doing = "what is missing, round 2: 3 of 30, 4 s left of this round, 20 s to 60 s to the end"
     ended = {"phase": "analysing", "status": "completed", "reason": "", "at_zero": True}
     told["running"] |= {**ended, "ended": "2026-11-01T10:00:00+00:00", "doing": doing}
+    told["running"]["diagnosis"] = True
     page.value(f"show({json.dumps(told)})")
     assert page.text("now").endswith("Being estimated and diagnosed.")
     assert page.text("facts") == f"The diagnosis tries{doing}"

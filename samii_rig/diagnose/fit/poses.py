@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from samii_rig.diagnose.fit.records import RecordSearch, Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.summed import Stacked, Summed, parts_of
-from samii_rig.diagnose.fit.usual import Usual
+from samii_rig.diagnose.fit.usual import POSES
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.physics.poses import in_pose
@@ -126,7 +125,7 @@ class InPoses:
 class PosesSearch(RecordSearch):
     """As `RecordSearch`, over several poses. by_line : of the first; rigs : of each."""
 
-    usual: ClassVar[Usual] = {}  # nobody counted
+    usual = POSES
 
     def __init__(self, records: InPoses, by_line: Search, rigs: Sequence[Rig]) -> None:
         self._rigs = tuple(rigs)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from samii_rig.diagnose.fit.records import RecordSearch, Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.summed import Stacked, Summed, parts_of
-from samii_rig.diagnose.fit.usual import Usual
+from samii_rig.diagnose.fit.usual import STATES
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.result import Gap
@@ -184,7 +183,7 @@ class StatesSearch(RecordSearch):
     before : a fit of the state before, from which all start. by_line : of the state after.
     """
 
-    usual: ClassVar[Usual] = {}  # nobody counted
+    usual = STATES
 
     def __init__(self, both: Both, by_line: Search, before: Fitted) -> None:
         self._common, self._alike = before, both.alike

@@ -37,7 +37,9 @@ export function line(s) {
   const r = s.running, moves = MOVES.includes(r?.phase), p = moves ? r.progress : {};
   if (moves && p.segment && r.phase === "running") return `${called(r)}: ${p.name}, segment ${p.segment} of ${p.n_segments}`;
   if (moves) return `${called(r)}: ${PHASES[r.phase] ?? r.phase}`;
-  if (r) return `${ended(r)} Being estimated and diagnosed.`;
+  // Of a run that did not go through no diagnosis is kept, so none is made.
+  const whole = r && r.diagnosis && (r.status === "completed" || r.early);
+  if (r) return `${ended(r)} Being estimated${whole ? " and diagnosed" : ""}.`;
   return `${s.fault ? `FAULT: ${s.fault.reason}. ` : ""}${s.last ? ended(s.last) : s.fault ? "" : "No run."}`;
 }
 
