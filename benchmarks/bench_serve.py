@@ -1,7 +1,7 @@
 """The service under viewers and kills.
 
     python benchmarks/bench_serve.py [--viewers 20] [--slow 5] [--stops 15] [--attacked 15]
-        [--each 0] [--kinds heads tokens] [--pairs 3] [--kills 20] [--seed 1]
+        [--each 0] [--kinds heads tokens] [--most 1] [--pairs 3] [--kills 20] [--seed 1]
 
 Stops: a simulated rig in real time, so many viewers of whom some never read. Prints the machine's
 load, how long a stop takes from the request to its answer and to zero volts, how long an order and
@@ -18,7 +18,8 @@ all others where they want a processor: an attacker has one of their own. Where 
 the service's port with an error, the listener's figures are what a page gets.
 
 Each: so many stops under each of these by itself, and where a proxy answers the service's port with
-503. There the stop is asked at both at once, as the page does.
+503. There the stop is asked at both at once, as the page does. With --most N under every two and up
+to N of them at once too; how long zero volts took is then printed by their number.
 
 Pairs: the simulated serial node in real time, a run without viewers and one with them by turns;
 prints how late the loop's sleeps ended in either, and that no sample is missing.
@@ -53,6 +54,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from http.client import HTTPConnection
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import combinations
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -267,7 +269,8 @@ def ask(port: int | str) -> HTTPConnection:
 
 def stops(
     arguments: argparse.Namespace, count: int, kinds: Sequence[str] = (), proxy: bool = False
-) -> None:
+) -> list[float]:
+    """Prints what they took; ms from the request to zero volts of each."""
     at: dict[str, tuple[list[float], list[float]]] = {"service": ([], []), "listener": ([], [])}
     plain, orders, missing, viewer = [], [], 0, ""
     with tempfile.TemporaryDirectory() as folder, ExitStack() as kept:
@@ -337,6 +340,18 @@ def stops(
         f"frames got {min(v.frames for v in reading)} to {max(v.frames for v in reading)}, "
         f"lost {sum(v.lost for v in reading)}; samples missing in the recordings: {missing}"
     )
+    return [*at["service"][1], *at["listener"][1]]
+
+
+def combined(arguments: argparse.Namespace, kinds: Sequence[str]) -> None:
+    """Under every one of these attacks, every two, and up to `--most`."""
+    for n in range(1, arguments.most + 1):
+        zeros = [
+            ms
+            for some in combinations(kinds, n)
+            for ms in stops(arguments, arguments.each, some)
+        ]  # fmt: skip
+        told(f"STOP, REQUEST TO ZERO VOLTS, {n} ATTACK(S) AT ONCE", zeros)
 
 
 def pairs(arguments: argparse.Namespace) -> None:
@@ -523,6 +538,7 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=0)
     every = ("proxy", *ATTACKS)
     parser.add_argument("--kinds", nargs="+", choices=every, default=every, help="of --each")
+    parser.add_argument("--most", type=int, default=1, help="of --kinds at once")
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1, help="of the moments of the kills")
@@ -538,8 +554,7 @@ def main() -> None:
     if arguments.each:
         if "proxy" in arguments.kinds:
             stops(arguments, arguments.each, proxy=True)
-        for kind in (k for k in arguments.kinds if k != "proxy"):
-            stops(arguments, arguments.each, [kind])
+        combined(arguments, [k for k in arguments.kinds if k != "proxy"])
     if arguments.pairs:
         pairs(arguments)
     if arguments.kills:

@@ -14,7 +14,6 @@ from typing import ClassVar
 
 import numpy as np
 from pydantic import field_validator
-from scipy.linalg import hadamard
 
 from experiments.driven import Driven
 from samii_rig.errors import InputError
@@ -87,6 +86,9 @@ class Inputs(Driven):
         """
         if not self.beside:
             return plan
+
+        from scipy.linalg import hadamard
+
         k = len(self.inputs)
         m = self.block
         signs = hadamard(m)[:, :k]

@@ -8,10 +8,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from experiments.shapes import draw, scan_shapes, write_table
 from experiments.swept_sine import SweptSine
 from samii_rig.errors import EstimateError, InputError
-from samii_rig.identify.modal import estimate_modes
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Acceleration, AntiAlias, Finite, Name, NonNegative, Rig, Strict
 from samii_rig.run.outcome import Outcome
@@ -103,6 +101,10 @@ class ModeScan(SweptSine):
 
     def conclude(self, rigs: Sequence[Rig], outcomes: Sequence[Outcome], stem: Path) -> Conclusion:
         """The mode shapes as a table and a figure."""
+        # They take seconds; a scan's file is looked at without them.
+        from experiments.shapes import draw, scan_shapes, write_table
+        from samii_rig.identify.modal import estimate_modes
+
         for outcome in outcomes:
             if not outcome.responses:
                 raise EstimateError(f"{outcome.path.name}: {outcome.trouble}")

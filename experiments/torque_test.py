@@ -9,18 +9,13 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from experiments.swept_sine import SweptSine
 from samii_rig.errors import EstimateError, InputError
-from samii_rig.model.sampled import sampled_response
-from samii_rig.model.tmm import Chain
-from samii_rig.record.export import export_response
 from samii_rig.rig.schema import Moment, Name, Rig
 from samii_rig.run.outcome import Outcome
 from samii_rig.run.plan import Plan
 from samii_rig.run.setups import Conclusion
-from samii_rig.signal.ratio import ratio
 from samii_rig.types import FrequencyResponse
 
 # Part of the rate up to which M/theta is fitted: above it the aliases of a torque that grows
@@ -71,6 +66,9 @@ class TorqueTest(SweptSine):
 
     def conclude(self, rigs: Sequence[Rig], outcomes: Sequence[Outcome], stem: Path) -> Conclusion:
         """theta/M of every level into a file, and what the pendulum is."""
+        from samii_rig.record.export import export_response
+        from samii_rig.signal.ratio import ratio
+
         rig, outcome = rigs[0], outcomes[0]
         if not outcome.responses:
             raise EstimateError(f"no theta/M: {outcome.trouble}")
@@ -103,6 +101,12 @@ def pendulum(response: FrequencyResponse, rig: Rig, lowest: float) -> Pendulum:
     as the rig file's model has it. The half widths use the scatter about the fit where that is
     larger than the variances say. EstimateError for fewer than three lines.
     """
+    # They take seconds; a test's file is looked at without them.
+    from scipy import stats
+
+    from samii_rig.model.sampled import sampled_response
+    from samii_rig.model.tmm import Chain
+
     names = (response.outputs[0].name, response.inputs[0].name)
     columns = [[s.name for s in rig.sensor].index(name) for name in names]
     f = response.frequency

@@ -4,13 +4,16 @@
     for draw in counted(draws, progress, "draws"):             # it says 0 of 50, 1 of 50, ...
         ...
 
-Who shows it (`samii_rig.report.summary.working`) asks a `Pace` for the words.
+Who shows it (`samii_rig.report.summary.working`) asks a `Pace` for the words. Where nobody knows
+how many rounds there will be, a stage that begins says how long the rest usually takes (`Begun`).
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from typing import Self, TypeVar
 
 Progress = Callable[[str], None]
@@ -18,6 +21,24 @@ T = TypeVar("T")
 
 SOON = 1.0  # s of work before a time left is more than a guess
 LEAST = 0.1  # s: the shortest time that is told
+TOLD = 1.0  # s between words that are told elsewhere
+START = (0.0, 0.0)  # `Begun.rest` of a first stage, when nothing is spent yet
+# From how many s on times to the end are told in steps of so many.
+STEPS = ((600.0, 60.0), (120.0, 30.0), (20.0, 5.0), (0.0, 1.0))
+
+
+class Begun(str):
+    """The words of a stage that begins. rest : from here to the end of all work, over what was
+    spent since the first stage that has one: the tenth and the ninetieth percentile of such work;
+    None where nobody knows."""
+
+    rest: tuple[float, float] | None
+
+    def __new__(cls, stage: str, rest: tuple[float, float] | None = None) -> Self:
+        """stage : its words."""
+        made = super().__new__(cls, stage)
+        made.rest = rest
+        return made
 
 
 class Counted(str):
@@ -51,33 +72,91 @@ def counted(
         yield part
 
 
-def ahead(words: str, stage: str) -> str:
-    """The same stage, as a part of something larger that is named before it."""
+def ahead(words: str, stage: str, *, whole: bool = False) -> str:
+    """The same stage, as a part of something larger that is named before it. whole : whether its
+    end is that of all work, too."""
     if isinstance(stage, Counted):
         return Counted(words + stage.stage, stage.done, stage.of, stage.at, stage.within)
+    if isinstance(stage, Begun):
+        return Begun(words + stage, stage.rest if whole else None)
     return words + stage
 
 
 class Pace:
-    """The time that is left of what is counted, by what was done since it began."""
+    """The time that is left of what is counted, by what was done since it began, and of all, by how
+    long such work usually takes."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.clock = clock
         self._what: tuple[str, str, int] = ("", "", 0)
         self._first, self._begun = 0, clock()
+        self._all_begun: float | None = None
+        self._ends: tuple[float, float] | None = None
 
     def words(self, stage: str) -> str:
         """The stage, with the time left where it can be said."""
-        if not isinstance(stage, Counted):
-            return stage
+        if isinstance(stage, Begun):
+            self._begins(stage)
+        left = self._left(stage) if isinstance(stage, Counted) else 0.0
+        said = str(stage)
+        if left:
+            of = " of this round" if isinstance(stage, Counted) and stage.within else ""
+            said += f", {duration(left)} left{of}"
+        return said + self._to_the_end(left)
+
+    def _left(self, stage: Counted) -> float:
+        """s of what is counted; 0 where that is not known yet."""
         now, what = self.clock(), (stage.stage, stage.within, stage.of)
         if what != self._what or stage.done < self._first:
             self._what, self._first, self._begun = what, stage.done, now
         done, spent = stage.done - self._first, now - self._begun
         if done < 1 or spent < SOON:
-            return str(stage)
-        left = duration((stage.of - stage.done) * spent / done)
-        return f"{stage}, {left} left" + (" of this round" if stage.within else "")
+            return 0.0
+        return max((stage.of - stage.done) * spent / done, LEAST)
+
+    def _begins(self, stage: Begun) -> None:
+        now = self.clock()
+        if stage.rest is None or (stage.rest == START and self._all_begun is not None):
+            self._ends = None
+        elif self._all_begun is None:
+            self._all_begun = now
+        elif (spent := now - self._all_begun) >= SOON:
+            low, high = stage.rest
+            self._ends = now + low * spent, now + high * spent
+
+    def _to_the_end(self, left: float) -> str:
+        """Of all work, no less than is left of a part of it."""
+        if self._ends is None:
+            return ""
+        low, high = (end - self.clock() for end in self._ends)
+        if high < left:
+            return ", longer than most"
+        low_, high_ = (duration(_rough(max(end, left))) for end in (low, high))
+        if low_ == high_ or max(low, left) < SOON:
+            return f", up to {high_} to the end"
+        return f", {low_} to {high_} to the end"
+
+
+def telling(tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Progress:
+    """Tells what is tried, and the time left, every `TOLD` s at most; a disk that is full for that
+    is no reason to find nothing."""
+    pace, due = Pace(clock), -math.inf
+
+    def say(stage: str) -> None:
+        nonlocal due
+        words = pace.words(stage)
+        if clock() >= due:
+            due = clock() + TOLD
+            with suppress(OSError):
+                tell(words)
+
+    return say
+
+
+def _rough(seconds: float) -> float:
+    """In steps of about a tenth: it is an estimate."""
+    step = next(s for least, s in STEPS if seconds >= least)
+    return max(round(seconds / step), 1) * step
 
 
 def duration(seconds: float) -> str:

@@ -1,14 +1,16 @@
 """What long work says of itself.
 
 Plan: the time left is that of the pace so far, and is not said before there is a pace; another
-round has its own; a diagnosis says what it tries and how many of how many, in each of its stages.
+round has its own; what is left of all work is that of most such work, no less than of a part of it;
+the service tells it once a second.
 """
 
 from __future__ import annotations
 
 import pytest
 
-from samii_rig.progress import Counted, Pace, ahead, counted, duration
+from samii_rig.diagnose.fit.usual import LINES, POSES, RECORDS, STATES
+from samii_rig.progress import START, Begun, Counted, Pace, ahead, counted, duration, telling
 
 
 def test_the_time_left_is_that_of_the_pace_so_far() -> None:
@@ -64,3 +66,55 @@ def test_who_only_shows_words_has_them_and_a_part_of_more_keeps_its_count() -> N
 )  # fmt: skip
 def test_durations_are_said_as_people_say_them(s: float, said: str) -> None:
     assert duration(s) == said
+
+
+def test_the_time_to_the_end_is_that_of_most_such_work() -> None:
+    now = [0.0]
+    pace = Pace(lambda: now[0])
+    assert pace.words(Begun("nominal model")) == "nominal model"
+    now[0] = 90.0  # whatever came before does not count
+    assert pace.words(Begun("what is missing", (0.0, 0.0))) == "what is missing"
+    now[0] = 100.0
+    assert pace.words(Begun("in pairs", (0.5, 4.0))) == "in pairs, 5 s to 40 s to the end"
+    pairs = [Counted("in pairs", done, 20, within="round 1") for done in (0, 2, 4)]
+    assert pace.words(pairs[0]).endswith("0 of 20, 5 s to 40 s to the end")
+    now[0] = 104.0
+    # A round that takes longer than the rest usually does is the least that there is to wait.
+    assert pace.words(pairs[1]).endswith("36 s left of this round, up to 35 s to the end")
+    now[0] = 150.0
+    assert pace.words(pairs[2]).endswith("left of this round, longer than most")
+    now[0] = 151.0
+    assert pace.words(Begun("apart", (0.01, 0.02))) == "apart, up to 1 s to the end"
+    assert pace.words(Begun("another search")) == "another search"
+
+
+def test_what_is_a_part_of_more_tells_no_end_of_all() -> None:
+    stage = Begun("what is missing", (1.0, 2.0))
+    part, whole = (ahead("before: ", stage, whole=whole) for whole in (False, True))
+    assert part == whole == "before: what is missing"
+    assert isinstance(part, Begun)
+    assert isinstance(whole, Begun)
+    assert (part.rest, whole.rest) == (None, (1.0, 2.0))
+
+
+def test_the_rest_of_a_diagnosis_is_known_at_its_stages() -> None:
+    for usual in (RECORDS, LINES, STATES, POSES):
+        assert usual[next(iter(usual))] == START
+        assert "what cannot be told apart" in usual
+        assert all(0 <= low <= high for low, high in usual.values())
+
+
+def test_the_service_tells_it_once_a_second_whatever_the_disk_says() -> None:
+    now, told = [0.0], []
+
+    def tell(words: str) -> None:
+        told.append(words)
+        raise OSError("no space")
+
+    say = telling(tell, lambda: now[0])
+    for tenths in range(25):
+        now[0] = tenths / 10
+        say(Counted("what is missing", tenths, 25))
+    assert told[0] == "what is missing: 0 of 25"
+    assert len(told) == 3
+    assert told[2] == "what is missing: 20 of 25, 0.5 s left"

@@ -35,7 +35,8 @@ def check_map(name: str) -> None:
 
 
 def check_experiment(name: str) -> None:
-    """InputError unless there is an experiment of this name, for some rig at least, or a file."""
+    """InputError unless there is an experiment of this name, for some rig at least, or a file whose
+    fields are right."""
     from samii_rig.run.catalogue import shipped
 
     names = shipped()
@@ -45,7 +46,12 @@ def check_experiment(name: str) -> None:
     if name not in names:
         from samii_rig.rig.load import read_text, tables
 
-        tables(read_text(Path(name), "experiment file"), name)
+        text = read_text(Path(name), "experiment file")
+        tables(text, name)
+
+        from samii_rig.run.experiments import parse_experiment
+
+        parse_experiment(text, name)
 
 
 def check_logs(logs: Iterable[Path]) -> None:

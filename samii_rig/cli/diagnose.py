@@ -240,10 +240,9 @@ def _together(
     with working(console, "diagnosis", quiet=json) as say:
         say("frequency responses")
         if saved:
-            responses: Sequence[FrequencyResponse] = tuple(
-                r for file in saved for r in chosen(file, output)
-            )
-            found = found_by(responses, own_rig, band=band, progress=say)
+            files = [(file.source, chosen(file, output)) for file in saved]
+            responses: Sequence[FrequencyResponse] = [r for _, own in files for r in own]
+            found = found_by(responses, own_rig, band=band, progress=say, files=files)
         elif first:
             responses = of(second)
             found = changed(

@@ -214,7 +214,7 @@ def report(
 
             found = diagnose(
                 responses, in_pose, band=band, runs=recordings,
-                progress=lambda stage: say(ahead("diagnosis: ", stage)),
+                progress=lambda stage: say(ahead("diagnosis: ", stage, whole=True)),
             )  # fmt: skip
         say("modes")
         modes = modes_of_all(responses, held[0] if held else None)

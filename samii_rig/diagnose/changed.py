@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
+from samii_rig.diagnose.fit.agreeing import Given
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.known import with_known
-from samii_rig.diagnose.fit.records import RecordSearch, Whole
+from samii_rig.diagnose.fit.records import RecordSearch, Whole, within
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.states import Both, StatesSearch
 from samii_rig.diagnose.physics.effect import Effect
@@ -22,12 +23,12 @@ from samii_rig.diagnose.result import Before, Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError
-from samii_rig.likelihood.reduce import Records
 from samii_rig.progress import Progress, ahead
 from samii_rig.rig.schema import RelativeAngle, Rig
 from samii_rig.rig.schema.elements import Branch, flattened, parameters
 from samii_rig.types import FrequencyResponse, Recording
 
+WHERE = (" after", " before")  # which recordings are not of one state
 COMMON = "common_"  # of the names of what both states have beside the rig file
 FREE = 1.0  # tolerance of what the state before was found to have: a factor of e, as good as none
 
@@ -98,7 +99,13 @@ def changed(
     at_first, bands = search.ratio(nominal), search.bands(nominal)
     search.begin("what changed")
     search.run()
-    answer = by_samples(second, search, at_first, bands)
+    given = [
+        Given(case.runs, *of, case.clean.samples, where)
+        for case, of, where in zip((second, first), search.by_state(), WHERE, strict=True)
+    ]
+    # What both have and no model explains is no part of what changed.
+    left = max(nominal.chi2 - search.problem.expected, 0.0) if both.alike else None
+    answer = by_samples(second, search, at_first, bands, given, left)
     beside = Before(
         found.verdict,
         found.causes if put_in else (),
@@ -106,7 +113,10 @@ def changed(
         (_named(before), _named(after)),
         explained(search.nominal.fitted),
     )
-    return replace(answer, before=beside, not_physics=(*beside.told(), *answer.not_physics))
+    words = (beside.told(), answer.not_physics)
+    # That one side is of several states is said first.
+    first_words, others = words[::-1] if answer.states else words
+    return replace(answer, before=beside, not_physics=(*first_words, *others))
 
 
 def _as_in(common: Rig, rig: Rig, names: Mapping[str, float]) -> Rig:
@@ -142,17 +152,8 @@ def _both(first: Case, second: Case, band: Band | None) -> tuple[Both, RecordSea
     start = RecordSearch(before, first.search)
     alike = start.ratio(start.nominal.fitted) > threshold(start.spread)
     if alike:
-        after = replace(after, records=_within(after.records, before.records.band))
+        after = replace(after, records=within(after.records, before.records.band))
     return Both(after, before, alike), start
-
-
-def _within(records: Records, band: Band) -> Records:
-    """Records on the lines within a band alone."""
-    low, high = band
-    own = tuple((max(a, low), min(b, high)) for a, b in records.bands)
-    if any(a >= b for a, b in own):
-        raise EstimateError("the two states were not excited at the same frequencies")
-    return replace(records, bands=own)
 
 
 def common_rig(rig: Rig, found: Rig) -> Rig:

@@ -7,11 +7,13 @@ found.verdict, found.causes, found.lines(), found.plain()
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from samii_rig.diagnose.data import findings
 from samii_rig.diagnose.data.measured import measured, usable
+from samii_rig.diagnose.fit.agreeing import Saved
 from samii_rig.diagnose.fit.classes import without_twins
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.effect import Effect
@@ -53,6 +55,7 @@ def diagnose(
     effects: Sequence[Effect] | None = None,
     progress: Progress = lambda _stage: None,
     runs: Sequence[Recording] = (),
+    files: Sequence[Saved] = (),
 ) -> Diagnosis:
     """What `rig` leaves out, as far as `responses` tell.
 
@@ -65,11 +68,14 @@ def diagnose(
         `samii_rig.progress.Counted`.
     runs : the recordings that the responses come from. With them every sample counts, the start
         and the end of each record too; without them, the responses line by line.
+    files : name and responses of each file, where that is all that was kept: files of several
+        states of the rig are told.
 
     Raises InputError and EstimateError as `samii_rig.identify.data.collect` does.
     """
     progress("nominal model")
     case = case_of(responses, rig, band, effects, runs, progress=progress)
+    case = replace(case, files=files)
     search = on_records(case, band)
     return by_lines(case) if search is None else by_records(case, search)
 

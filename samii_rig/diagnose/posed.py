@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.findings import Sound
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
+from samii_rig.diagnose.fit.agreeing import Given
 from samii_rig.diagnose.fit.poses import InPoses, PosesSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.physics.effect import Effect
@@ -121,12 +122,17 @@ def in_poses(
     search.begin("what is missing")
     search.run()
     whole = replace(first, clean=_of_all([case.clean for case in cases]))
-    found = by_samples(whole, search, at_first, bands)
+    given = [
+        Given(case.runs, *of, case.clean.samples, f" in pose {one.told}")
+        for one, case, of in zip(each, cases, search.by_pose(), strict=True)
+    ]
+    found = by_samples(whole, search, at_first, bands, given)
     poses = ", ".join(one.told for one in each)
     said = f"one set of parameters in {len(each)} poses ({poses})"
     if found.rig is not None or found.traces:
         said += "; the curves and the new rig file are of the first"
-    return replace(found, not_physics=(said, *found.not_physics, FORCES))
+    words = (*found.not_physics, said) if found.states else (said, *found.not_physics)
+    return replace(found, not_physics=(*words, FORCES))
 
 
 def _measured(each: Sequence[InPose], band: Band | None) -> Band:

@@ -262,7 +262,7 @@ class Diagnosis:
     moved : the largest first. sigma : root of the chi-square that the causes explain. gain : noise
         units by which the next experiment would tell the rivals apart; None where none was found.
     states : the recordings of each state of the rig, where they are of more than one. exact : what
-        is no missing physics, but a wrong number of the rig file.
+        is no missing physics, but one or two wrong numbers of the rig file.
     """
 
     verdict: Verdict
@@ -291,7 +291,7 @@ class Diagnosis:
     gain: float | None = None
     before: Before | None = None
     states: tuple[tuple[str, ...], ...] = ()
-    exact: Exact | None = None
+    exact: tuple[Exact, ...] = ()
 
     def plain(self) -> dict[str, Any]:
         """The contract of `samii-rig diagnose --json`."""
@@ -330,7 +330,7 @@ class Diagnosis:
             },
             "model": self.model,
             **({"before": self.before.plain()} if self.before else {}),
-            **({"exact": self.exact.plain()} if self.exact else {}),
+            **({"exact": [one.plain() for one in self.exact]} if self.exact else {}),
             **({"states": [list(names) for names in self.states]} if self.states else {}),
         }
 
@@ -383,13 +383,21 @@ class Diagnosis:
                     f"{what} to the noise (chi-square per degree of "
                     f"freedom {self.chi2_per_dof:.3f}, threshold {self.threshold:.3f})."
                 )
+            case "unknown" if self.states and two:
+                return (
+                    "The recordings of one of the two states are themselves of several: what "
+                    "changed is not told."
+                )
             case "unknown" if self.states:
                 return (
                     "The recordings are not of one state of the rig: no one model explains them "
                     "all, and no cause is named."
                 )
             case "unknown" if self.exact:
-                return f"A number of the rig file is wrong: {self.exact.told()}."
+                what = "A number" if len(self.exact) == 1 else "Two numbers"
+                are = "is" if len(self.exact) == 1 else "are"
+                said = " and ".join(one.told() for one in self.exact)
+                return f"{what} of the rig file {are} wrong: {said}."
             case "unknown":
                 site, p = self.sites[0] if self.sites else ("", 0.0)
                 place = f" It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""

@@ -17,7 +17,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy import signal
 
 from samii_rig.rig.schema import Feedback
 from samii_rig.types import Complex, Float
@@ -50,6 +49,8 @@ def sections(loop: Feedback, rate_hz: float) -> Float:
 
     Do not change what is returned: it is kept, because a design asks for it again and again.
     """
+    from scipy import signal  # takes a second, which a mistyped experiment does not wait for
+
     roots: Any = signal.bilinear_zpk(*loop.zpk(), rate_hz)  # complex, which the stubs deny
     sos = signal.zpk2sos(*roots)
     return np.ascontiguousarray(sos[:, [0, 1, 2, 4, 5]])
@@ -84,6 +85,8 @@ class Reach:
 
 def reach(loop: Feedback, rate_hz: float) -> Reach:
     """Bounds of the digital filter's output, before it is clipped."""
+    from scipy import signal
+
     poles = loop.zpk()[1]
     slowest = min((-p.real for p in poles), default=rate_hz)
     n = min(MOST_MEMORY, 2 + int(np.ceil(MEMORY / slowest * rate_hz)))

@@ -22,7 +22,7 @@ from samii_rig.errors import InputError
 from samii_rig.record.export import replacing
 from samii_rig.report.canvas import Figure, halved
 
-_WORDS = {"good": "good", "note": "note", "warning": "look", "bad": "attention"}
+_WORDS = {"good": "good", "found": "found", "note": "note", "warning": "look", "bad": "attention"}
 
 
 @dataclass(frozen=True, slots=True)

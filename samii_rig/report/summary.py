@@ -29,8 +29,8 @@ from samii_rig.units import pretty
 if TYPE_CHECKING:  # it compiles the model, which showing needs not
     from samii_rig.run.dryrun import DryRun
 
-_STYLES = {"good": "green", "note": "blue", "warning": "yellow", "bad": "bold red"}
-_WORDS = {"good": "good", "note": "note", "warning": "look", "bad": "ATTENTION"}
+_STYLES = {"good": "green", "found": "blue", "note": "blue", "warning": "yellow", "bad": "bold red"}
+_WORDS = {"good": "good", "found": "found", "note": "note", "warning": "look", "bad": "ATTENTION"}
 _WHERE = 20  # characters of a segment's name that fit beside the rest; what tells is its end
 _MARGIN_CLOSE = 0.2  # of a limit left: shown as close
 _BAR = 30  # characters

@@ -15,7 +15,7 @@ from samii_rig.signal.statistics import difference, octaves
 from samii_rig.types import Finding, Float, FrequencyResponse, Recording
 from samii_rig.units import pretty
 
-Mark = Literal["good", "note", "warning", "bad"]
+Mark = Literal["good", "found", "note", "warning", "bad"]
 
 # A line that is known to less than this part of its gain shows little but noise.
 _USELESS = 0.3

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from samii_rig.errors import RecordingError
-from samii_rig.serve.job import LOG, RESPONSES, SO_FAR, Job
+from samii_rig.serve.job import DOING, LOG, RESPONSES, SO_FAR, Job
 from samii_rig.serve.shared import get
 
 CERTAIN = 0.95
@@ -84,8 +84,16 @@ class Analysis:
             "responses": str(seen),
             "responses_age_s": age,
             "diagnosis": diagnosis or None,
+            "doing": self._tried(),
             "failed": self._process is not None and self._process.poll() is not None,
         }
+
+    def _tried(self) -> str:
+        """What the diagnosis tries that is being made, "" where none is or nothing can be read."""
+        if self._job is not None and self._job.written.phase == "running":
+            with suppress(OSError, RecordingError, LookupError):
+                return str(get(self._job.folder / DOING)["doing"])
+        return ""
 
     def _look(self) -> None:
         """Take in what the analyst says, if it says something new that can be read."""

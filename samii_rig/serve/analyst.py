@@ -28,13 +28,14 @@ import numpy as np
 
 from samii_rig.errors import RecordingError, SamiiRigError
 from samii_rig.model.sampled import sampled_response
+from samii_rig.progress import telling
 from samii_rig.record.reader import read_events, read_recording
 from samii_rig.record.writer import PARTIAL
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.run.plan import Plan
 from samii_rig.serve.following import following
-from samii_rig.serve.job import RESPONSES, RIG, SO_FAR, Job
+from samii_rig.serve.job import DOING, RESPONSES, RIG, SO_FAR, Job
 from samii_rig.serve.live import LiveReader
 from samii_rig.serve.planned import planned
 from samii_rig.serve.sofar import SoFar
@@ -69,6 +70,7 @@ class Analyst:
         self._diagnoser = Diagnoser(self._setup.rig_toml)
         self._given: list[FrequencyResponse] = []
         self._segment = -1
+        self._doing = ""
 
     def go(self) -> None:
         """Look every second until the run is over."""
@@ -137,6 +139,9 @@ class Analyst:
     def _diagnose(self) -> None:
         """Take what was found, and ask again if there is something new to ask."""
         found = self._diagnoser.taken()
+        if self._diagnoser.doing != self._doing:
+            self._doing = self._diagnoser.doing
+            self.job.tell(DOING, {"doing": self._doing})
         if found is not None:
             next_toml = following(found.get("experiment", ""), self._text)
             self.job.tell(SO_FAR, {**found, "next_toml": next_toml})
@@ -171,7 +176,7 @@ class Diagnoser:
         process = context.Process(target=_diagnosing, args=(theirs, rig_toml), daemon=True)
         process.start()
         theirs.close()
-        self.idle = True
+        self.idle, self.doing = True, ""
 
     def ask(self, about: dict[str, Any], responses: Sequence[FrequencyResponse]) -> None:
         """Begin; `about` comes back with what is found."""
@@ -179,12 +184,15 @@ class Diagnoser:
         self.idle = False
 
     def taken(self) -> dict[str, Any] | None:
-        """What was found since, None if nothing was."""
-        if self.idle or not self._line.poll():
-            return None
-        self.idle = True
-        found: dict[str, Any] = self._line.recv()
-        return found
+        """What was found since, None if nothing was; meanwhile `doing` says what is tried."""
+        while not self.idle and self._line.poll():
+            found: dict[str, Any] | str = self._line.recv()
+            if isinstance(found, str):
+                self.doing = found
+                continue
+            self.idle, self.doing = True, ""
+            return found
+        return None
 
 
 def _diagnosing(line: Connection, rig_toml: str) -> None:
@@ -199,7 +207,7 @@ def _diagnosing(line: Connection, rig_toml: str) -> None:
             about, responses = line.recv()
             begun = time.monotonic()
             try:
-                found = said(diagnose(responses, rig))
+                found = said(diagnose(responses, rig, progress=telling(line.send)))
             except SamiiRigError as error:
                 found = {"verdict": "", "trouble": str(error)}
             line.send({**about, **found, "took_s": time.monotonic() - begun})

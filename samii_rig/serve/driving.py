@@ -126,6 +126,7 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
             seed=asked.seed,
             stop_when_certain=asked.stop_when_certain,
             rig_toml=rig_toml,
+            pose=asked.pose,
         )
         return {"jobs": [rooms.supervisor.plain(j) for j in jobs]}
 

@@ -26,7 +26,7 @@ from samii_rig.serve.shared import get, made, put
 
 NAME = re.compile(r"[^/\0]+\.mcap")  # of a recording, in the folder of all
 ID = re.compile(r"\d{8}T\d{12}-[0-9a-f]{6}")
-REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS = (
+REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS, DOING = (
     "request.json",
     "state.json",
     "rig.toml",
@@ -37,6 +37,7 @@ REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS 
     "responses.json",
     "diagnosis_so_far.json",  # the analyst's
     "diagnosis.json",  # the runner's last word, of the whole run
+    "doing.json",  # what the analyst's diagnosis tries
 )
 
 # s without a sign of the service after which it counts as gone: it gives one every half second.
@@ -59,7 +60,8 @@ OVER: tuple[Phase, ...] = ("done", "refused", "cancelled", "died")
 class Request:
     """What was asked for. setup : which run of an experiment of several. recording : its name
     below the folder. settings : of the device, over those of the rig file. stop_when_certain : end
-    once the diagnosis is (see `analysis`)."""
+    once the diagnosis is (see `analysis`). pose : as it was asked for, "" for the rig file's; the
+    job's rig file stands in it."""
 
     experiment: str
     recording: str
@@ -70,6 +72,7 @@ class Request:
     duration_s: float = 0.0
     stop_when_certain: bool = False
     settings: dict[str, Any] = field(default_factory=dict)
+    pose: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +80,7 @@ class JobState:
     """How it stands. status, reason : of the stop record. error : why there is none.
     live : path of the live data. early : why it ended before its plan did, in good order.
     at_zero : whether the last sample showed the output at zero; None where none was seen.
-    ended : when, UTC, ISO 8601."""
+    ended : when, UTC, ISO 8601. doing : what the diagnosis tries, with the time left."""
 
     phase: Phase = "queued"
     pid: int = 0
@@ -91,6 +94,7 @@ class JobState:
     at_zero: bool | None = None
     ended: str = ""
     time: str = ""
+    doing: str = ""
 
 
 class Job:

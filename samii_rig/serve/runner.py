@@ -24,6 +24,7 @@ import numpy as np
 
 from samii_rig.errors import GateError, SamiiRigError
 from samii_rig.index.remarks import add_note, set_diagnosis
+from samii_rig.progress import telling
 from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.order import PlannedRun, RunOrder
@@ -61,7 +62,7 @@ class Runner:
             self._set(trouble=outcome.trouble)
             self._note()
             verdict = self._diagnosed(run, outcome)
-            self._set(phase="done", verdict=verdict)
+            self._set(phase="done", verdict=verdict, doing="")
         except SamiiRigError as error:
             self._failed(str(error))
             raise
@@ -181,7 +182,12 @@ class Runner:
         from samii_rig.serve.analyst import said
 
         with suppress(SamiiRigError):
-            found = diagnose(outcome.responses, run.setup.rig, runs=[outcome.recording])
+            found = diagnose(
+                outcome.responses,
+                run.setup.rig,
+                runs=[outcome.recording],
+                progress=telling(lambda words: self._set(doing=words)),
+            )
             set_diagnosis(self.path, {**found.plain(), "lines": list(found.lines())})
             following_toml = following(found.experiment, run.experiment_toml)
             told = {"next_toml": following_toml, "final": True}

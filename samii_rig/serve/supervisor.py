@@ -74,12 +74,13 @@ class Supervisor:
         seed: int | None,
         stop_when_certain: bool = False,
         rig_toml: str = "",
+        pose: str = "",
     ) -> list[Job]:
         """Queue the runs of an experiment, one job each; InputError if that cannot be,
         GateError while the queue is held.
 
         predicted : of each run its `setup`, `instruction` and `duration_s`. rig_toml : the rig file
-        in the pose of these runs, "" as it is.
+        in the pose of these runs, "" as it is. pose : as it was asked for, for those who look.
         """
         simulated = self.simulated
         waiting = self.queue()
@@ -112,6 +113,7 @@ class Supervisor:
                 duration_s=run["duration_s"],
                 stop_when_certain=stop_when_certain,
                 settings={**settings, **with_seed},
+                pose=pose,
             )
             own_toml = rig_toml or self._rig_toml
             made.append(Job.make(self._jobs, request, own_toml, experiment_toml))

@@ -29,6 +29,7 @@ from samii_rig.report.figures import SUFFIXES
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
 from samii_rig.run import session
+from samii_rig.run.catalogue import kinds
 from samii_rig.run.experiments import load_experiment
 from samii_rig.signal.choose import Method
 from samii_rig.signal.gather import Gaps
@@ -95,6 +96,7 @@ WRONG = [
 # These ask the rig file for its elements, which takes numpy; the model is not asked.
 WRONG_FOR_THE_RIG = [
     "run broken.toml",
+    *(f"run {kind}.toml --dry-run" for kind in kinds()),
     "study --vary nope",
     "study --vary joint_1.q=1:2:3",
     "identify there.mcap --rig samii --free joint_1.q",
@@ -129,6 +131,8 @@ print(json.dumps(found))
 def test_a_wrong_argument_imports_nothing_heavy(tmp_path: Path, lines, heavy) -> None:
     (tmp_path / "there.mcap").touch()
     (tmp_path / "broken.toml").write_text("a = {")
+    for kind in kinds():
+        (tmp_path / f"{kind}.toml").write_text(f'experiment = "{kind}"\nrepeatz = 3\n')
     code = COUNT.format(lines=lines, heavy=tuple(heavy))
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=tmp_path

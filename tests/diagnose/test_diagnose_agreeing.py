@@ -1,17 +1,32 @@
 """Recordings of two states of a rig, given as if they were of one.
 
 Plan: the same sweep on two rigs whose spring differs, which passes for noise among repeats; on one
-rig, with other noise; who is odd among three, though repeats that differ are left out.
+rig, with other noise; who is odd among three, though repeats that differ are left out; one side of
+two states; one pose of two; responses that were kept without their samples.
 """
 
 from __future__ import annotations
 
-import pytest
-from sweep_kit import swept
+import json
+from dataclasses import replace
 
+import pytest
+from poses_kit import in_pose, loaded, two_links
+from poses_kit import recorded as swept_in_pose
+from sweep_kit import swept
+from typer.testing import CliRunner
+
+from samii_rig.cli.app import app
+from samii_rig.diagnose.changed import State, changed
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
-from samii_rig.diagnose.fit.agreeing import Apart, states_apart
+from samii_rig.diagnose.fit.agreeing import Apart, Given, states_apart
+from samii_rig.diagnose.posed import in_poses
+from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import on_records
+from samii_rig.identify.poses import at_pose
+from samii_rig.record.derived import save_frequency_responses
+from samii_rig.record.reader import read_saved_responses
+from samii_rig.report.diagnosis.words import banner
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.estimate import estimate
@@ -38,7 +53,8 @@ def apart(*runs: Recording) -> Apart | None:
     case = case_of(estimate(runs), RIG, None, None, runs)
     search = on_records(case, None)
     assert search is not None
-    return states_apart(search, case.runs, case.clean.samples)
+    found = states_apart([Given.of(search, case.runs, case.clean.samples)])
+    return found[0] if found else None
 
 
 def test_a_spring_that_differs_between_recordings_is_no_cause_that_both_have(runs):
@@ -67,3 +83,70 @@ def test_the_odd_one_of_three_is_told_though_its_repeats_are_foreign_to_the_othe
     assert found.states == (("one.mcap", "again.mcap"), ("stiffer.mcap",))
     assert found.differing > 100
     assert 0.5 < found.part <= 1
+
+
+def between(before: list[Recording], after: list[Recording]) -> Diagnosis:
+    few = [e for e in table(RIG, 0.8, 35.0, signed=True) if e.physics == "added_mass"]
+    states = (State(estimate(runs), runs) for runs in (before, after))
+    return changed(*states, RIG, effects=few)
+
+
+def test_a_state_that_is_two_is_told_before_what_changed(runs):
+    one, again, stiffer = (runs[name] for name in ("one", "again", "stiffer"))
+    found = between([one], [again, stiffer])
+    assert found.verdict == "unknown"
+    assert found.states == (("again.mcap",), ("stiffer.mcap",))
+    what, _, next_ = found.lines()
+    assert what.startswith("The recordings of one of the two states are themselves of several")
+    assert "The recordings after differ from each other" in next_
+    assert "--before again.mcap --after stiffer.mcap" in next_
+    found = between([one, stiffer], [again])
+    assert found.states == (("one.mcap",), ("stiffer.mcap",))
+    assert "The recordings before differ from each other" in found.lines()[2]
+
+
+def test_states_of_recordings_that_agree_among_themselves_are_no_others(runs):
+    assert between([runs["one"], runs["again"]], [recorded(TOML, 5, "third")]).states == ()
+
+
+def test_recordings_of_one_pose_that_are_of_two_states_are_told():
+    arm = two_links()
+    few = [e for e in table(arm, 0.6, 25.0) if e.name == ("added_mass", "upper")]
+    hanging, level = in_pose(arm, "0 deg", 1), in_pose(arm, "110 deg", 2)
+    assert in_poses([hanging, level], arm, effects=few).states == ()
+    heavier = loaded(0.1)(at_pose(arm, level.pose))
+    # Two of each: of three one would be left out as foreign, and told.
+    runs = [*level.runs, *(swept_in_pose(heavier, seed) for seed in (98, 99))]
+    mixed = replace(level, runs=runs, responses=estimate(runs))
+    found = in_poses([hanging, mixed], arm, effects=few)
+    assert found.verdict == "unknown"
+    (one,), (other,) = found.states
+    assert one.startswith("run_2")
+    assert other.startswith("run_9")
+    assert found.lines()[0].startswith("The recordings are not of one state of the rig")
+    assert "The recordings in pose 110 deg differ from each other" in found.lines()[2]
+    assert banner(found).title == "The recordings are not of one state of the rig"
+
+
+def test_responses_of_two_states_are_told_without_their_samples(runs, tmp_path):
+    paths = []
+    for name in ("one", "again", "stiffer"):
+        paths.append(tmp_path / f"{name}.mcap")
+        save_frequency_responses(paths[-1], estimate([runs[name]]), [], rig_toml=TOML)
+    kept = [read_saved_responses(path) for path in paths]
+    few = [e for e in table(RIG, 0.8, 35.0) if e.physics == "added_mass"]
+
+    def found_by(some):
+        files = [(file.source, file.responses) for file in some]
+        return diagnose([r for _, own in files for r in own], RIG, effects=few, files=files)
+
+    assert found_by(kept[:2]).states == ()
+    found = found_by(kept)
+    one, again, stiffer = (str(p) for p in paths)
+    assert found.states == ((one, again), (stiffer,))
+    assert found.verdict == "unknown"
+    assert f"those behind {stiffer}: samii-rig diagnose with --before and --after" in (
+        found.experiment
+    )
+    said = CliRunner().invoke(app, ["diagnose", *map(str, (paths[0], paths[2])), "--json"])
+    assert json.loads(said.stdout)["states"] == [[one], [stiffer]]

@@ -219,6 +219,8 @@ def test_the_verdict_stands_first_and_the_cause_with_its_interval(named, tmp_pat
     _, parsed = page_of(tmp_path, found, response, recordings=[recorded()], title="what is it")
     said = parsed.text
     assert "Left out of the model: torsional compliance at joint_1" in said
+    # Green is for nothing missing alone: what is left out is found, and the model is not well.
+    assert words.banner(found).mark == "found"
     (k,) = [v for s, v, _ in words.named(found.causes[0]).parameters if s == "k"]
     assert k in said
     assert "kN m/rad" in k

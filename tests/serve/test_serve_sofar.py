@@ -13,6 +13,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -34,9 +35,9 @@ from samii_rig.run.experiments import load_experiment
 from samii_rig.run.order import RunOrder
 from samii_rig.run.plan import Plan
 from samii_rig.serve.analysis import Analysis
-from samii_rig.serve.analyst import Analyst, curves, said
+from samii_rig.serve.analyst import Analyst, Diagnoser, curves, said
 from samii_rig.serve.following import following
-from samii_rig.serve.job import DIAGNOSIS, RESPONSES, SO_FAR, Job, JobState, Request
+from samii_rig.serve.job import DIAGNOSIS, DOING, RESPONSES, SO_FAR, Job, JobState, Request
 from samii_rig.serve.sofar import SoFar
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
@@ -389,6 +390,32 @@ time.sleep(600)
         analyst.kill()
         # Its end is read once nobody has it open any more.
         analyst.communicate(timeout=WITHIN)
+
+
+def test_what_a_diagnosis_tries_is_told_until_it_is_found(tmp_path: Path) -> None:
+    ours, theirs = Pipe()
+    diagnoser = Diagnoser.__new__(Diagnoser)
+    diagnoser._line, diagnoser.idle, diagnoser.doing = ours, False, ""
+    for words in ("what is missing: 1 of 3", "what is missing: 2 of 3, 4 s left"):
+        theirs.send(words)
+    assert diagnoser.taken() is None
+    assert diagnoser.doing == "what is missing: 2 of 3, 4 s left"
+    job = Job.make(tmp_path, Request("x", "x.mcap"), RIG_TOML, SWEEPS)
+    analysis = Analysis(tmp_path)
+    analysis._job = job
+    job.set(JobState(phase="running"))
+    assert analysis.state()["doing"] == ""
+    job.tell(DOING, {"doing": diagnoser.doing})
+    assert analysis.state()["doing"] == diagnoser.doing
+    # The last word is the runner's, who says what it tries itself.
+    job.set(JobState(phase="analysing"))
+    assert analysis.state()["doing"] == ""
+    job.set(JobState(phase="running"))
+    (job.folder / DOING).write_text("[")
+    assert analysis.state()["doing"] == ""
+    theirs.send({"verdict": "named"})
+    assert diagnoser.taken() == {"verdict": "named"}
+    assert (diagnoser.idle, diagnoser.doing) == (True, "")
 
 
 def test_a_run_that_may_end_early_ends_at_rest(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,8 @@ def test_a_field_writes_the_file_and_each_limit_says_what_would_be_left(page: Br
     left = "[...document.querySelectorAll('#margins tbody tr')].map((r) => r.textContent)"
     before = page.value(left)
     assert any(row.startswith("theta_2 limit0.350 rad") for row in before)
+    # Without gravity there is no pose to stand in.
+    assert page.value("document.getElementById('stands').hidden")
     typed(page, "amplitudes", "Levels [rad]", "0.1, 0.05")
     page.until("document.getElementById('text').value.includes('amplitudes = [0.1, 0.05]')")
     page.until(f"({left}).length > 0 && ({left})[0] !== {before[0]!r}")
@@ -153,6 +156,52 @@ def test_the_responses_are_shown_in_every_view_with_cursors(page: Browser) -> No
     assert said["coherence"] == ["\u2013", "0.99", "0.98"]
     page.value("document.querySelector('#frf-laid button').click(); panel.set(null, false)")
     assert page.value("document.getElementById('frf-section').hidden")
+
+
+def test_while_a_run_is_diagnosed_the_page_says_what_is_tried_and_for_how_long(
+    page: Browser,
+) -> None:
+    told = json.loads(state())
+    doing = "what is missing, round 2: 3 of 30, 4 s left of this round, 20 s to 60 s to the end"
+    ended = {"phase": "analysing", "status": "completed", "reason": "", "at_zero": True}
+    told["running"] |= {**ended, "ended": "2026-11-01T10:00:00+00:00", "doing": doing}
+    told["running"]["diagnosis"] = True
+    page.value(f"show({json.dumps(told)})")
+    assert page.text("now").endswith("Being estimated and diagnosed.")
+    assert page.text("facts") == f"The diagnosis tries{doing}"
+    told["running"]["doing"] = ""
+    page.value(f"show({json.dumps(told)})")
+    assert page.text("facts") == ""
+    # And while the run goes on, of what is known so far.
+    told["running"] |= {"phase": "running", "status": "", "diagnosis": True}
+    told["so_far"] = {"responses": "0", "responses_age_s": 0, "diagnosis": None, "failed": False}
+    told["so_far"]["doing"] = doing
+    page.value(f"show({json.dumps(told)})")
+    assert page.text("diagnosis-doing") == f"Now: {doing}."
+    page.value(f"show({state()})")
+    assert page.text("diagnosis-doing") == ""
+
+
+def test_every_axis_of_frequency_has_its_unit_beside_its_numbers(page: Browser) -> None:
+    """At each width of a diagram: the unit is drawn, inside the picture and on no number."""
+    drawn = """
+    (() => { const out = [], g = document.createElement("canvas").getContext("2d");
+      const draw = g.fillText.bind(g);
+      g.fillText = (text, x, y) => { const w = g.measureText(text).width;
+        const left = x - (g.textAlign === "right" ? w : g.textAlign === "center" ? w / 2 : 0);
+        out.push([text, left, left + w, y]); draw(text, x, y); };
+      diagram(g, { x: 52, y: 22, w: %d, h: 130 }, { title: "t", unit: "u", x: [%g, %g],
+        y: [0, 1, 0.5], logarithmic: true, curves: [] }, () => "black");
+      return out.filter(([, , , y]) => y > 160); })()
+    """
+    page.value("import('/page/chart.js').then((m) => { window.diagram = m.diagram; })")
+    for width in (160, 196, 208, 300):
+        for low, high in ((0.5, 40.0), (0.5, 20.0), (1.0, 25.0), (0.8, 35.0)):
+            found = page.value(drawn % (width, low, high))
+            assert [text for text, *_ in found].count("Hz") == 1
+            assert max(right for _, _, right, _ in found) <= 52 + width + 10
+            spans = sorted((left, right) for _, left, right, _ in found)
+            assert all(a[1] <= b[0] for a, b in pairwise(spans)), found
 
 
 def test_layout_and_colours_stay_with_the_browser(page: Browser) -> None:

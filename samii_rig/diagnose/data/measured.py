@@ -82,9 +82,8 @@ class Measured:
             np.sqrt(np.maximum(values, 0.0))[:, :, None] * vectors.conj().swapaxes(1, 2)
         )
 
-    def differing(self) -> float:
-        """Chi-square per degree of freedom of the levels against each other, line by line; nan
-        where no line was measured at two of them."""
+    def disagreeing(self) -> tuple[float, float]:
+        """Chi-square of the levels against each other, line by line, and its mean."""
         f, which = np.unique(self.frequency, return_inverse=True)
         A = summed(self.W, which, f.size)
         b = summed(np.einsum("nij,nj->ni", self.W, self.H), which, f.size)
@@ -92,7 +91,12 @@ class Measured:
         times = np.bincount(which)[which]
         several = times > 1
         mean = float(np.sum((self.expected * (1 - 1 / times))[several]))
-        left = float(np.sum(self.chi_square(common[which])[several]))
+        return float(np.sum(self.chi_square(common[which])[several])), mean
+
+    def differing(self) -> float:
+        """Chi-square per degree of freedom of the levels against each other, line by line; nan
+        where no line was measured at two of them."""
+        left, mean = self.disagreeing()
         return left / mean if mean > 0 else math.nan
 
     def torn(self) -> bool:

@@ -8,6 +8,9 @@ quadratic form of recording i in a change d of the response, all on the same nod
 
 is chi-square of what no one response, and so no one linear model, explains of i and j. Where both
 hold the same excitations a force cannot explain it either: it answers the same the same.
+
+Responses that were kept without their samples are held against each other line by line, those of
+one level, as a force answers the same the same.
 """
 
 from __future__ import annotations
@@ -17,17 +20,48 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from samii_rig.diagnose.data.measured import DIFFER
-from samii_rig.diagnose.fit.records import RecordSearch, Whole
-from samii_rig.errors import EstimateError
+from samii_rig.diagnose.data.measured import DIFFER, PERIODIC, Measured, measured, repeated
+from samii_rig.diagnose.fit.records import RecordSearch, Whole, within
+from samii_rig.diagnose.fit.refit import Fitted
+from samii_rig.errors import EstimateError, InputError
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.likelihood.reduce import Reduced, orthonormal
+from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned, proportional
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Finding, Recording
+from samii_rig.types import Finding, Float, FrequencyResponse, Recording
 
 REPEAT = "repeat"  # kind of finding that tells a repeat which is unlike the others
 SURE = 5.0  # standard deviations of chi-square beyond which two recordings differ
+
+Band = tuple[float, float]
+Saved = tuple[str, Sequence[FrequencyResponse]]  # a file and the responses that it kept
+
+
+@dataclass(frozen=True, slots=True)
+class Given:
+    """Recordings that were given as of one state.
+
+    whole : all of them; fitted : a model of that state, about which they are held against each
+    other, on the nodes frequency, Hz. findings : of their samples, as of `Whole.of`. where : which
+    of the recordings these are, " before" or " in pose 30 deg".
+    """
+
+    runs: Sequence[Recording]
+    whole: Whole
+    fitted: Fitted
+    frequency: Float
+    findings: Sequence[Finding] = ()
+    where: str = ""
+
+    @classmethod
+    def of(
+        cls, search: RecordSearch, runs: Sequence[Recording], findings: Sequence[Finding]
+    ) -> Given:
+        """All recordings of a search that is ended."""
+        assert isinstance(search.whole, Whole)
+        fitted = search.nominal.fitted
+        return cls(runs, search.whole, fitted, search.reduced.frequency, findings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,17 +71,20 @@ class Apart:
     states : the recordings of each, the first one's first. differing : chi-square per degree of
     freedom of the two that differ most. part : of what the nominal model leaves of all recordings,
     in units of each one's own noise, what the two differ by: no model of one state explains it.
+    where : as of `Given`. samples : whether they were compared by their samples.
     """
 
     states: tuple[tuple[str, ...], ...]
     differing: float
     part: float
+    where: str = ""
+    samples: bool = True
 
     def told(self) -> str:
         """In words."""
         first, *others = (", ".join(names) for names in self.states)
         return (
-            f"the recordings differ from each other (chi-square per degree of freedom "
+            f"the recordings{self.where} differ from each other (chi-square per degree of freedom "
             f"{self.differing:.3g}): {'; '.join(others)} as if of another state of the rig than "
             f"{first}"
         )
@@ -55,6 +92,9 @@ class Apart:
     def experiment(self) -> str:
         """How they are compared."""
         before, after = (" ".join(names) for names in self.states[:2])
+        if not self.samples:
+            behind = f"the recordings behind {before} and those behind {after}"
+            return f"compare {behind}: samii-rig diagnose with --before and --after"
         return f"compare the states: samii-rig diagnose --before {before} --after {after}"
 
 
@@ -81,14 +121,41 @@ class _Alone:
         return _all_in(ours, theirs) and _all_in(theirs, ours)
 
 
-def states_apart(
-    search: RecordSearch, runs: Sequence[Recording], findings: Sequence[Finding] = ()
-) -> Apart | None:
-    """The states that recordings are of, where they are of more than one.
+def states_apart(every: Sequence[Given], left: float | None = None) -> list[Apart]:
+    """The states that recordings are of, for each of several that are given as of one and are of
+    more; those that differ most come first. left : chi-square over its mean that is to be explained
+    of all; None for what the models leave of each recording."""
+    each = [_alone(given) if len(given.runs) > 1 else [] for given in every]
+    found = [_grouped(one) for one in each]
+    if not any(len(one.groups) > 1 for one in found):
+        return []
+    if left is None:
+        alone = [one or _alone(given) for given, one in zip(every, each, strict=True)]
+        left = sum(_left(given, one) for given, one in zip(every, alone, strict=True))
+    whole = max(left, 1e-300)
+    apart = [
+        Apart(one.states, one.worst, min(one.excess / whole, 1.0), given.where)
+        for given, one in zip(every, found, strict=True)
+        if len(one.groups) > 1
+    ]
+    return sorted(apart, key=lambda one: -one.differing)
 
-    search : ended, on all of them together. findings : of their samples, as of `Whole.of`.
-    """
-    each = _alone(search, runs, findings)
+
+@dataclass(frozen=True, slots=True)
+class _Grouped:
+    """Recordings by their states. worst : chi-square per degree of freedom of the two that differ
+    most; excess : the most of it over its mean."""
+
+    groups: list[list[_Alone]]
+    worst: float
+    excess: float
+
+    @property
+    def states(self) -> tuple[tuple[str, ...], ...]:
+        return tuple(tuple(one.name for one in group) for group in self.groups)
+
+
+def _grouped(each: Sequence[_Alone]) -> _Grouped:
     groups: list[list[_Alone]] = []
     worst = excess = 0.0
     for one in each:
@@ -101,31 +168,25 @@ def states_apart(
             worst, excess = max(worst, chi2 / mean), max(excess, chi2 - mean)
         else:
             groups.append([one])
-    if len(groups) < 2:
-        return None
-    left = _left(search, each)
-    states = tuple(tuple(one.name for one in group) for group in groups)
-    return Apart(states, worst, min(excess / left, 1.0) if left > 0 else 1.0)
+    return _Grouped(groups, worst, excess)
 
 
-def _alone(
-    search: RecordSearch, runs: Sequence[Recording], findings: Sequence[Finding]
-) -> list[_Alone]:
+def _alone(given: Given) -> list[_Alone]:
     """Each recording of which enough takes part, its likelihood on the nodes of all."""
-    whole = search.whole
-    if len(runs) < 2 or not isinstance(whole, Whole):
-        return []
+    whole = given.whole
     records, sensors = whole.records, whole.wired.sensors
     band = records.bands[0] if whole.asked else None
     out = []
-    for i, (run, _) in enumerate(aligned(runs)):
+    for i, (run, _) in enumerate(aligned(given.runs)):
         try:
-            own = Whole.of([run], whole.rig, band, sensors, _own(run, findings))
+            own = Whole.of([run], whole.rig, band, sensors, _own(run, given.findings))
+            # On two states, those lines alone that both have.
+            among = within(own.records, records.band)
         except EstimateError:
             continue
         if own.wired == whole.wired:
-            long = replace(own, records=replace(own.records, least=records.longest))
-            form = long.about(search.nominal.fitted, search.reduced.frequency)
+            long = replace(own, records=replace(among, least=records.longest))
+            form = long.about(given.fitted, given.frequency)
             pieces = own.by_level().records.pieces
             out.append(_Alone(run.source or f"recording {i + 1}", pieces, form))
     return out
@@ -156,14 +217,65 @@ def _difference(a: Reduced, b: Reduced) -> tuple[float, float, float]:
     return chi2, mean, float(np.sqrt(2 * mean + 2 * mean**2 * free))
 
 
-def _left(search: RecordSearch, each: Sequence[_Alone]) -> float:
+def _left(given: Given, each: Sequence[_Alone]) -> float:
     """Chi-square, over its mean, that the nominal model leaves in units of each one's noise."""
-    fitted, total = search.nominal.fitted, 0.0
+    total = 0.0
     for one in each:
-        at = search.whole.nodes(one.form, fitted)
-        r = one.form.residual(fitted.model.response(fitted.x, at))
+        at = given.whole.nodes(one.form, given.fitted)
+        r = one.form.residual(given.fitted.model.response(given.fitted.x, at))
         total += float(r @ r) - one.form.known
     return total
+
+
+def lines_apart(files: Sequence[Saved], lines: Measured, left: float, rig: Rig) -> Apart | None:
+    """As `states_apart`, of responses that were kept without their samples.
+
+    lines : of all that take part; left : chi-square over its mean that the nominal model leaves of
+    them.
+    """
+    groups: list[list[Saved]] = []
+    worst = excess = 0.0
+    band = float(lines.frequency[0]), float(lines.frequency[-1])
+    for one in files:
+        for group in groups:
+            chi2, mean, sd = _lines_differ(group[0][1], one[1], rig, band)
+            if not chi2 > max(DIFFER * mean, mean + SURE * sd):
+                group.append(one)
+                break
+            worst, excess = max(worst, chi2 / mean), max(excess, chi2 - mean)
+        else:
+            groups.append([one])
+    if len(groups) < 2:
+        return None
+    states = tuple(tuple(name for name, _ in group) for group in groups)
+    part = min(excess / left, 1.0) if left > 0 else 1.0
+    return Apart(states, worst, part, samples=False)
+
+
+def _lines_differ(
+    some: Sequence[FrequencyResponse], others: Sequence[FrequencyResponse], rig: Rig, band: Band
+) -> tuple[float, float, float]:
+    """Chi-square of what two files' responses of one level differ by, its mean and its standard
+    deviation; 0 where they have none in common whose noise is known from repeats."""
+    chi2 = mean = variance = 0.0
+    for a in some:
+        for b in others:
+            if _excited(a) != _excited(b) or not (repeated(a) and repeated(b)):
+                continue
+            try:
+                both = measured([a, b], rig, band)
+            except (EstimateError, InputError):
+                continue
+            found, expected = both.disagreeing()
+            chi2, mean = chi2 + found, mean + expected
+            # That of two sets of lines is shared by their difference.
+            variance += both.spread * expected**2
+    return chi2, mean, float(np.sqrt(variance))
+
+
+def _excited(r: FrequencyResponse) -> tuple[float, str, bool, tuple[str, ...]]:
+    """What must be the same of two responses that no force lets differ."""
+    return r.level, r.level_unit, r.estimator in PERIODIC, tuple(c.name for c in r.inputs)
 
 
 def _all_in(some: Sequence[Piece], others: Sequence[Piece]) -> bool:

@@ -159,7 +159,12 @@ def without_twins(
     kept: list[tuple[Effect, np.ndarray]] = []
     for effect in table:
         each = [(at, in_pose(effect, at)) for at in poses] or [(rig, effect)]
-        h = np.stack([_at_start(at, own, frequency) for at, own in each])
+        try:
+            h = np.stack([_at_start(at, own, frequency) for at, own in each])
+        except SamiiRigError:
+            # What it begins with is no rig, as a link with more mass taken off than it has about
+            # its middle: the refit goes elsewhere, and it is nobody's twin.
+            h = np.array(np.nan)
         for i, (other, response) in enumerate(kept):
             if len(other.unknowns) == len(effect.unknowns) and _same(h, response):
                 names_ = tuple(dict.fromkeys((*other.aliases, *effect.names)))

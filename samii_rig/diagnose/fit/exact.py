@@ -1,14 +1,16 @@
-"""Lengths that the rig file takes for exact, and one of them that is wrong.
+"""Lengths that the rig file takes for exact, and one or two of them that are wrong.
 
 A length without a tolerance takes no part in a refit, and is no missing physics. One that was
 measured or typed wrong bends every mode, and pairs of effects mimic it at great length. So each is
-freed in turn where no single effect explains the records.
+freed in turn where no single effect explains the records, and where no length does, each with the
+few that help most.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,8 @@ LENGTH = "L"  # symbol of what is measured with a rule, and taken for exact
 FREE = 0.5  # tolerance of a length whose value nobody trusts: a factor of e lies two of them away
 # Of what the nominal model leaves of the lines: one that leaves more is held against no record.
 LEAVES = 0.1
+HELPING = 3  # lengths that explain most by themselves, each of which is freed with every other
+CLEARLY = 2.0  # times what the best pair leaves of the lines: another that leaves less is as good
 NINETY = 1.645  # standard deviations of a 90 % interval
 
 
@@ -34,9 +38,10 @@ def lengths(rig: Rig) -> tuple[str, ...]:
     return tuple(f"{name}.{LENGTH}" for name in _exact(rig))
 
 
-def wrong_length(search: RecordSearch) -> tuple[Exact, RecordSearch] | None:
-    """The length with which the rig file explains the records to their noise, and the search on the
-    rig that has it free; None where the best single effect does, or no length.
+def wrong_lengths(search: RecordSearch) -> tuple[tuple[Exact, ...], RecordSearch] | None:
+    """The length or the two lengths with which the rig file explains the records to their noise,
+    and the search on the rig that has them free; None where the best single effect does, or
+    neither.
 
     search : over single effects, ended.
     """
@@ -46,24 +51,55 @@ def wrong_length(search: RecordSearch) -> tuple[Exact, RecordSearch] | None:
     close = search.ratio(best) <= threshold(search.spread)
     if close or gross < GROSS or by_line.lines.torn() or not isinstance(whole, Whole):
         return None
-    freed = [
-        (name, alone)
-        for name in search.each(list(_exact(by_line.rig)), lambda n: f"another {n}.{LENGTH}")
-        for alone in _on_lines(by_line, name)
+    names = list(_exact(by_line.rig))
+    alone = _freed_each(search, [(name,) for name in names])
+    if found := _explaining(search, whole, alone[:1], LEAVES * gross):
+        return found
+    helping = [one for (one,), _ in alone[:HELPING]]
+    pairs = [pair for pair in combinations(names, 2) if set(pair) & set(helping)]
+    together = _freed_each(search, pairs)
+    if len(together) > 1 and _left(together[1]) < CLEARLY * _left(together[0]):
+        return None  # another pair does as well: which are wrong is not known
+    return _explaining(search, whole, together[:1], LEAVES * gross)
+
+
+Freed = tuple[tuple[str, ...], Search]
+
+
+def _left(freed: Freed) -> float:
+    """Chi-square per degree of freedom that the nominal model leaves of the lines."""
+    return freed[1].ratio(freed[1].nominal.fitted)
+
+
+def _freed_each(search: RecordSearch, several: Sequence[tuple[str, ...]]) -> list[Freed]:
+    """The lines with each of some sets of lengths free, those first that explain most."""
+
+    def words(names: tuple[str, ...]) -> str:
+        return "another " + " and ".join(f"{name}.{LENGTH}" for name in names)
+
+    found = [
+        (names, one)
+        for names in search.each(several, words)
+        for one in _on_lines(search.by_line, names)
     ]
-    name, alone = min(
-        freed, key=lambda one: one[1].ratio(one[1].nominal.fitted), default=("", by_line)
-    )
-    if not name or alone.ratio(alone.nominal.fitted) > LEAVES * gross:
-        return None
-    try:
-        found = RecordSearch(replace(whole, rig=alone.rig), alone)
-    except (SamiiRigError, np.linalg.LinAlgError):
-        return None
-    fitted = found.nominal.fitted
-    if found.ratio(fitted) > threshold(found.spread):
-        return None
-    return _told(by_line.rig, name, fitted), found
+    return sorted(found, key=_left)
+
+
+def _explaining(
+    search: RecordSearch, whole: Whole, some: Sequence[Freed], leaves: float
+) -> tuple[tuple[Exact, ...], RecordSearch] | None:
+    """The first of these that explains the records too. leaves : of the lines, at most."""
+    for names, by_line in some:
+        if _left((names, by_line)) > leaves:
+            continue
+        try:
+            found = RecordSearch(replace(whole, rig=by_line.rig), by_line)
+        except (SamiiRigError, np.linalg.LinAlgError):
+            continue
+        fitted = found.nominal.fitted
+        if found.ratio(fitted) <= threshold(found.spread):
+            return tuple(_told(search.by_line.rig, name, fitted) for name in names), found
+    return None
 
 
 def _exact(rig: Rig) -> Iterator[str]:
@@ -73,20 +109,20 @@ def _exact(rig: Rig) -> Iterator[str]:
             yield e.name
 
 
-def _on_lines(by_line: Search, name: str) -> Iterator[Search]:
-    """The same lines with one length free, where that is a rig."""
+def _on_lines(by_line: Search, names: Collection[str]) -> Iterator[Search]:
+    """The same lines with these lengths free, where that is a rig."""
     try:
-        yield Search(_freed(by_line.rig, name), by_line.lines, by_line.grid, by_line.table)
+        yield Search(_freed(by_line.rig, names), by_line.lines, by_line.grid, by_line.table)
     except (SamiiRigError, np.linalg.LinAlgError):
         return
 
 
-def _freed(rig: Rig, name: str) -> Rig:
-    """The rig, nothing known of the length of one element."""
+def _freed(rig: Rig, names: Collection[str]) -> Rig:
+    """The rig, nothing known of the lengths of these elements."""
 
     def element(e: Any) -> Any:
         update: dict[str, Any] = {}
-        if e.name == name:
+        if e.name in names:
             free = {"tolerance": FREE}
             update[LENGTH] = parameters(e)[LENGTH].model_copy(update=free)
         if isinstance(e, Branch):

@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from scipy import stats
@@ -19,10 +19,11 @@ from samii_rig.diagnose.data.measured import Measured, binned
 from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.refit import STEPS, Fitted, Problem, refit
 from samii_rig.diagnose.fit.stated import IN_DATA
+from samii_rig.diagnose.fit.usual import Usual
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model, grid
 from samii_rig.errors import SamiiRigError
-from samii_rig.progress import Progress, counted
+from samii_rig.progress import Begun, Progress, counted
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Float
 
@@ -82,6 +83,7 @@ class Explanations:
     temperature: float = 1.0
     progress: Progress = lambda _stage: None
     stage: str = "nominal model"
+    usual: ClassVar[Usual] = {}  # how long the rest takes, by where it is
     _round: int = 0
     _gross: float = 0.0  # chi-square that the nominal model leaves
     _rows: Counter[str] = field(init=False)
@@ -102,13 +104,16 @@ class Explanations:
     def begin(self, stage: str) -> None:
         """Say that a stage begins."""
         self.stage, self._round = stage, 0
-        self.progress(stage)
+        self.progress(Begun(stage, self.usual.get(stage)))
 
     def each(self, parts: Sequence[T], name: Callable[[T], str] = lambda _: "") -> Iterator[T]:
         """The parts of one round of the stage, each said before it is tried. How many rounds there
         will be nobody knows."""
         if len(parts) > 1:
             self._round += 1
+            here = f"{self.stage}, round {self._round}"
+            if here in self.usual:
+                self.progress(Begun(here, self.usual[here]))
         within = f"round {max(self._round, 1)}"
         return counted(parts, self.progress, self.stage, name, within)
 

@@ -15,6 +15,7 @@ from samii_rig.diagnose.fit.records import RecordSearch, Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.summed import Stacked, Summed, parts_of
+from samii_rig.diagnose.fit.usual import POSES
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.physics.poses import in_pose
@@ -124,6 +125,8 @@ class InPoses:
 class PosesSearch(RecordSearch):
     """As `RecordSearch`, over several poses. by_line : of the first; rigs : of each."""
 
+    usual = POSES
+
     def __init__(self, records: InPoses, by_line: Search, rigs: Sequence[Rig]) -> None:
         self._rigs = tuple(rigs)
         super().__init__(records, by_line)
@@ -131,6 +134,12 @@ class PosesSearch(RecordSearch):
     def first(self) -> Fitted:
         """As of `RecordSearch`: where the first pose's own lines lead."""
         return replace(self.by_line.nominal.fitted, model=self.made(()))
+
+    def by_pose(self) -> list[tuple[Whole, Fitted, Float]]:
+        """The records of each pose, the nominal model there, and the nodes of their likelihood."""
+        assert isinstance(self.whole, InPoses)
+        parts = [part.frequency for part in parts_of(self.reduced)]
+        return list(zip(self.whole.each, _each(self.nominal.fitted), parts, strict=True))
 
     def made(self, effects: tuple[Effect, ...]) -> Model:
         """As of `Explanations`."""

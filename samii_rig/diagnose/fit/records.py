@@ -24,6 +24,7 @@ from samii_rig.diagnose.fit.forms import Form
 from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.refit import Fitted, Problem, counted, refit
 from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.fit.usual import RECORDS
 from samii_rig.diagnose.physics.disturbed import Disturbed
 from samii_rig.diagnose.physics.model import Aliases, Closed, Grid, JointLoops, Loop, Model, grid
 from samii_rig.diagnose.physics.rows import RESONANT
@@ -450,8 +451,22 @@ class RecordProblem(Problem):
         return F, (F.T @ F).reshape(n, 2 * q, n, 2 * q)
 
 
+def within(records: Records, band: tuple[float, float]) -> Records:
+    """Records on the lines within a band alone.
+
+    Raises EstimateError where one has none there.
+    """
+    low, high = band
+    own = tuple((max(a, low), min(b, high)) for a, b in records.bands)
+    if any(a >= b for a, b in own):
+        raise EstimateError("the two states were not excited at the same frequencies")
+    return replace(records, bands=own)
+
+
 class RecordSearch(Search):
     """As `Search`, on whole records."""
+
+    usual = RECORDS
 
     def __init__(self, whole: Recorded, by_line: Search) -> None:
         self.whole, self.by_line = whole, by_line

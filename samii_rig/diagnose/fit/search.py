@@ -18,6 +18,7 @@ from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations,
 from samii_rig.diagnose.fit.ranking import moved, ranking
 from samii_rig.diagnose.fit.refit import Fitted, refit
 from samii_rig.diagnose.fit.screen import Screen, Start
+from samii_rig.diagnose.fit.usual import LINES
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.types import Float
 
@@ -48,6 +49,8 @@ Candidate = tuple[float, tuple[Effect, ...], list[Float]]  # chi-square hoped fo
 
 class Search(Explanations):
     """What is tried: effects added, taken away again and swapped."""
+
+    usual = LINES
 
     def run(self, *, briefly: bool = False) -> list[Explanation]:
         """Grow, swap, prune; all explanations, the most probable first. briefly : single effects

@@ -15,6 +15,7 @@ from samii_rig.diagnose.fit.records import RecordSearch, Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.summed import Stacked, Summed, parts_of
+from samii_rig.diagnose.fit.usual import STATES
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.result import Gap
@@ -182,6 +183,8 @@ class StatesSearch(RecordSearch):
     before : a fit of the state before, from which all start. by_line : of the state after.
     """
 
+    usual = STATES
+
     def __init__(self, both: Both, by_line: Search, before: Fitted) -> None:
         self._common, self._alike = before, both.alike
         super().__init__(both, by_line)
@@ -194,6 +197,14 @@ class StatesSearch(RecordSearch):
         a, b = self.ratio(before), self.ratio(after)
         closed = (a - b) / (a - 1) if a > 1 else 0.0
         return a, b, Gap(closed, closed, closed)
+
+    def by_state(self) -> list[tuple[Whole, Fitted, Float]]:
+        """The records after and before, the nominal model of each, and the nodes of their
+        likelihoods."""
+        both, fitted = self.whole, self.nominal.fitted
+        assert isinstance(both, Both)
+        after, before = (part.frequency for part in parts_of(self.reduced))
+        return [(both.after, _after(fitted), after), (both.before, _before(fitted), before)]
 
     def first(self) -> Fitted:
         """As of `RecordSearch`."""

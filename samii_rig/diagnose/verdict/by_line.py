@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
+from samii_rig.diagnose.fit.agreeing import Apart, lines_apart
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.result import Diagnosis, Used
 from samii_rig.diagnose.verdict import answer
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.force_words import distorted
-from samii_rig.diagnose.verdict.stages import Case, Shown, told
+from samii_rig.diagnose.verdict.stages import Case, Shown, of_states, told
 
 DIFFER = (
     "levels differ; give the recordings: friction, play, hardening and the like are told from "
@@ -35,6 +38,9 @@ def by_lines(case: Case) -> Diagnosis:
     judged = verdict.shown(judged, gap, due)
     if torn:
         judged = replace(judged, verdict="unknown")
+    apart = _states(case)
+    for one in apart:
+        judged = verdict.of_several_states(judged, one.part)
     shown = Shown(
         first=first,
         threshold=threshold(search.spread),
@@ -47,5 +53,21 @@ def by_lines(case: Case) -> Diagnosis:
     clean = case.clean
     said = (DIFFER, *distorted(case.responses)) if torn else ()
     if clean.doubt is None and clean.guessed is not None:
-        return told(case, search, judged, shown, (*said, clean.guessed.why), clean.guessed)
-    return told(case, search, judged, shown, said, clean.doubt)
+        found = told(case, search, judged, shown, (*said, clean.guessed.why), clean.guessed)
+    else:
+        found = told(case, search, judged, shown, said, clean.doubt)
+    return of_states(found, apart)
+
+
+def _states(case: Case) -> list[Apart]:
+    """The states that files of responses are of, where they are of more than one."""
+    if len(case.files) < 2:
+        return []
+    search, lines = case.search, case.lines
+    search.begin("whether the recordings agree")
+    fitted = search.nominal.fitted
+    at = search.grid.at(lines.frequency, lines.level)
+    chi2 = float(np.sum(lines.chi_square(fitted.model.response(fitted.x, at))))
+    left = chi2 - float(np.sum(lines.expected))
+    apart = lines_apart(case.files, lines, left, search.rig)
+    return [] if apart is None else [apart]

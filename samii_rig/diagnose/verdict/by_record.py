@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.measured import DIFFER
-from samii_rig.diagnose.fit.agreeing import Apart, states_apart
-from samii_rig.diagnose.fit.exact import wrong_length
+from samii_rig.diagnose.fit.agreeing import Given, states_apart
+from samii_rig.diagnose.fit.exact import wrong_lengths
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.fit.rigfile import explained
@@ -14,7 +15,7 @@ from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
-from samii_rig.diagnose.verdict.stages import Case, Shown, told
+from samii_rig.diagnose.verdict.stages import Case, Shown, of_states, told
 from samii_rig.errors import EstimateError, SamiiRigError
 
 SPENT = (
@@ -46,14 +47,14 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     search.begin("what is missing")
     # Linear effects bend towards what no linear rig does: a force comes before pairs of them.
     search.run(briefly=True)
-    if (wrong := wrong_length(search)) is not None:
-        return _of_length(case, search, first, bands, *wrong)
+    if (wrong := wrong_lengths(search)) is not None:
+        return _of_lengths(case, search, first, bands, *wrong)
     search.begin("amplitude levels")
     forced = forces_on(search)
     if forced is None or not (case.search.lines.torn() or forced.is_enough()):
         search.begin("what is missing, in pairs")
         search.run()
-        search.begin("amplitude levels")
+        search.begin("amplitude levels, beside pairs")
         forced = None if forced is None else forces_on(search)
     search.begin("what cannot be told apart")
     if forced is None:
@@ -64,13 +65,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         if forced.spent:
             looked = replace(looked, said=(*looked.said, SPENT))
     looked = replace(looked, said=(*looked.said, *_unasked(search)))
-    if len(case.runs) > 1:
-        search.begin("whether the recordings agree")
-    apart = states_apart(search, case.runs, case.clean.samples)
-    if apart is None:
-        return _answer(case, forced or search, first, bands, looked)
-    looked = replace(looked, judged=verdict.of_several_states(looked.judged, apart.part))
-    return _of_states(_answer(case, forced or search, first, bands, looked), apart)
+    given = Given.of(search, case.runs, case.clean.samples)
+    return _agreeing(case, forced or search, first, bands, looked, [given])
 
 
 def by_samples(
@@ -78,13 +74,34 @@ def by_samples(
     search: RecordSearch,
     first: float,
     bands: tuple[Band, ...],
+    given: Sequence[Given],
+    left: float | None = None,
 ) -> Diagnosis:
     """The answer, once all linear explanations of the records were tried. first, bands : what the
-    refitted nominal model left before, in all and by band."""
+    refitted nominal model left before, in all and by band. given : the recordings that are taken
+    for those of one state, for each; left : as of `states_apart`."""
     search.begin("what cannot be told apart")
     looked = _consistent(search, _looked(search))
     looked = replace(looked, said=(*looked.said, *_unasked(search)))
-    return _answer(case, search, first, bands, looked)
+    return _agreeing(case, search, first, bands, looked, given, left)
+
+
+def _agreeing(
+    case: Case,
+    search: RecordSearch,
+    first: float,
+    bands: tuple[Band, ...],
+    looked: _Looked,
+    given: Sequence[Given],
+    left: float | None = None,
+) -> Diagnosis:
+    """The answer, with what the recordings of one state differ by, where they are of several."""
+    if any(len(one.runs) > 1 for one in given):
+        search.begin("whether the recordings agree")
+    apart = states_apart(given, left)
+    for one in apart:
+        looked = replace(looked, judged=verdict.of_several_states(looked.judged, one.part))
+    return of_states(_answer(case, search, first, bands, looked), apart)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,15 +153,15 @@ def _answer(
     return told(replace(case, clean=clean), search, looked.judged, shown, looked.said)
 
 
-def _of_length(
+def _of_lengths(
     case: Case,
     search: RecordSearch,
     first: float,
     bands: tuple[Band, ...],
-    wrong: Exact,
+    wrong: tuple[Exact, ...],
     freed: RecordSearch,
 ) -> Diagnosis:
-    """The answer where a length of the rig file is wrong. freed : the search with that one free."""
+    """The answer where lengths of the rig file are wrong. freed : the search with these free."""
     nominal, fitted = search.nominal.fitted, freed.nominal.fitted
     plain, after, gap = freed.shown(nominal, fitted)
     shown = Shown(
@@ -158,25 +175,18 @@ def _of_length(
     )
     looked = _Looked(verdict.judge(freed), plain, after, gap)
     found = told(case, freed, looked.judged, shown)
+    measured = " and ".join(one.parameter for one in wrong)
+    which = "this number does" if len(wrong) == 1 else "these numbers do"
     return replace(
         found,
         verdict="unknown",
         exact=wrong,
         rig=explained(fitted),
         could_hide=(),
-        experiment=f"measure {wrong.parameter}, correct the rig file and diagnose again",
-        why="no single effect explains the recordings, and this number does",
+        experiment=f"measure {measured}, correct the rig file and diagnose again",
+        why=f"no single effect explains the recordings, and {which}",
         gain=None,
     )
-
-
-def _of_states(found: Diagnosis, apart: Apart) -> Diagnosis:
-    """The same, with what the recordings differ by; where that leaves no answer, what to do."""
-    found = replace(found, states=apart.states, not_physics=(apart.told(), *found.not_physics))
-    if found.verdict != "unknown":
-        return found
-    why = "what one model makes of several states is of none of them"
-    return replace(found, sites=(), why=why, experiment=apart.experiment(), gain=None)
 
 
 def forces_on(search: RecordSearch) -> ForceSearch | None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.findings import Doubt, Sound
 from samii_rig.diagnose.data.measured import Measured
+from samii_rig.diagnose.fit.agreeing import Apart, Saved
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.result import Band, Diagnosis, Gap, Used
@@ -29,7 +30,8 @@ class Case:
 
     clean : the responses without what is no physics. responses : those that intervals can rest on.
     runs : the recordings. lines : of all responses; search : on those that are fitted; decide,
-    show : those that decide, and those that show on what was found.
+    show : those that decide, and those that show on what was found. files : the responses of each
+    file, where they were kept without their recordings.
     """
 
     clean: Sound
@@ -39,6 +41,7 @@ class Case:
     search: Search
     decide: Measured | None
     show: Measured
+    files: Sequence[Saved] = ()
 
     def not_whole(self) -> str:
         """Why these records cannot be held sample by sample against others of one linear rig; ""
@@ -61,6 +64,19 @@ class Shown:
     with_causes: tuple[float, float]
     gap: Gap
     used: Used
+
+
+def of_states(found: Diagnosis, apart: Sequence[Apart]) -> Diagnosis:
+    """The same, with what recordings of one state differ by, if they do; where that leaves no
+    answer, what to do."""
+    if not apart:
+        return found
+    words = (*(one.told() for one in apart), *found.not_physics)
+    found = replace(found, states=apart[0].states, not_physics=words)
+    if found.verdict != "unknown":
+        return found
+    why = "what one model makes of several states is of none of them"
+    return replace(found, sites=(), why=why, experiment=apart[0].experiment(), gain=None)
 
 
 def told(

@@ -183,10 +183,18 @@ def _verdict(found: Diagnosis) -> tuple[Mark, str, str]:
             text = "What model and measurement differ by is no more than the noise."
             return "good", "Nothing is missing from the model", text
         case "named":
-            return "good", f"Left out of the model: {parts}", ""
+            return "found", f"Left out of the model: {parts}", ""
         case "ambiguous":
             text = "The data do not settle it: see what else it may be, and what would tell."
             return "warning", f"Most likely left out of the model: {parts}", text
+    if found.states:
+        text = f"No one model explains them all. {findings(found)[0]}"
+        return "bad", "The recordings are not of one state of the rig", text
+    if found.exact:
+        title = "A number of the rig file is wrong"
+        if len(found.exact) > 1:
+            title = "Two numbers of the rig file are wrong"
+        return "bad", title, f"{' and '.join(one.told() for one in found.exact)}."
     places = suspects(found)
     where = "The data do not tell where it is."
     site, p = next(iter(places.items()), ("", 0.0))
@@ -212,10 +220,13 @@ def _verdict_of_two(found: Diagnosis, before: Before, parts: str) -> tuple[Mark,
             text = "What the two states differ by is no more than the noise."
             return "good", "Nothing changed between the two states", f"{text} {states}"
         case "named":
-            return "good", f"Changed: {parts}", states
+            return "found", f"Changed: {parts}", states
         case "ambiguous":
             text = "The data do not settle it: see what else it may be, and what would tell."
             return "warning", f"Most likely changed: {parts}", f"{text} {states}"
+    if found.states:
+        text = f"What changed is not told. {findings(found)[0]} {states}"
+        return "bad", "The recordings of one of the two states are of several", text
     places = suspects(found)
     site, p = next(iter(places.items()), ("", 0.0))
     where = f"It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
@@ -240,7 +251,8 @@ def _facts(found: Diagnosis) -> list[tuple[str, str, str]]:
         limit = f"of the refitted model; noise passes {found.threshold:.3g} in 3 of 10,000 cases"
         return [("Chi-square per degree of freedom", ratio(found.chi2_per_dof), limit)]
     sure = min(c.probability for c in found.causes)
-    g = found.gap
+    value, low, high = map(percent, (found.gap.value, found.gap.low, found.gap.high))
+    between = "" if low == high else f"{low} to {high}, "
     return [
         (
             "Probability",
@@ -249,8 +261,8 @@ def _facts(found: Diagnosis) -> list[tuple[str, str, str]]:
         ),
         (
             "Gap closed",
-            f"{100 * g.value:.3g} %",
-            f"{100 * g.low:.3g} to {100 * g.high:.3g} %, on lines kept apart",
+            value,
+            f"{between}on lines kept apart",
         ),
         (
             "Chi-square per degree of freedom",

@@ -31,11 +31,12 @@ export function diagram(g, b, { title, unit, x, y, logarithmic, curves, hatched 
     if (v < x[0] * (logarithmic ? 0.999 : 1) - 1e-12 || v > x[1] * (logarithmic ? 1.001 : 1) + 1e-12) continue;
     const at = Math.abs(v) < 1e-12 ? 0 : v;
     rule(px(v), b.y, px(v), b.y + b.h, !logarithmic && at === 0);
-    if (px(v) - right < 26) continue; // no number on another
+    if (px(v) - right < 26) continue; // no number on another, nor where the unit has to stand
+    if (logarithmic && b.x + b.w - px(v) < 18) continue;
     g.fillText(short(at), px(v), b.y + b.h + 14); right = px(v);
   }
-  // The unit of the axis, where no number stands.
-  if (logarithmic && b.x + b.w - right > 34) { g.textAlign = "right"; g.fillText("Hz", b.x + b.w, b.y + b.h + 14); }
+  // The unit of the axis behind its last number.
+  if (logarithmic) { g.textAlign = "left"; g.fillText("Hz", Math.max(right + 11, b.x + b.w - 14), b.y + b.h + 14); }
   g.save(); g.beginPath(); g.rect(b.x, b.y, b.w, b.h); g.clip();
   for (const [from, to] of hatched) hatch(g, Math.max(b.x, px(from)), Math.min(b.x + b.w, px(to)), b, ink);
   for (const c of curves) {

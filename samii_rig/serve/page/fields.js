@@ -1,6 +1,6 @@
 // An experiment's levels, band, repeats and channels as fields with units. They write into the
 // experiment's file, which is what is ordered; each change is predicted at once, and each limit
-// says how much of it would be left.
+// says how much of it would be left. The pose of a rig that has weight is a field of the order.
 
 const WAIT = 350; // ms after the last key
 // What a file may hold, in the order of the page: key, name, unit ("" for a number, null for the file's).
@@ -26,9 +26,33 @@ export function written(text, key, value) {
 }
 
 export class Fields {
-  // text : the file's textarea. predict : a file to its dry run. changed : the file was changed here.
+  // text : the file's textarea. predict : a file and what goes with it to its dry run. changed : the
+  // file was changed here.
   constructor({ $, put, predict, changed }) {
     Object.assign(this, { $, put, predict, changed, timer: 0, turn: 0, inputs: {}, rig: null });
+    $("pose").oninput = () => this.posed();
+  }
+
+  // Of which rig they are. Without gravity it has no pose; degrees, as the drive's of a bench.
+  of(rig) {
+    const { $ } = this;
+    this.rig = rig;
+    $("stands").hidden = !rig.gravity;
+    this.own = rig.pose ? String(Number(((180 / Math.PI) * rig.pose.value).toPrecision(12))) : "0";
+    $("pose").value = this.own;
+  }
+
+  // The pose of the order, where it is another than the rig file's.
+  get pose() {
+    const { $ } = this, at = $("pose").value.trim();
+    return $("stands").hidden || !at || Number(at) === Number(this.own) ? {} : { pose: `${at} deg` };
+  }
+
+  posed() {
+    const { $ } = this, at = $("pose").value.trim(), wrong = at !== "" && !NUMBER.test(at);
+    $("pose").setAttribute("aria-invalid", wrong);
+    if (!wrong) { this.check(); return; }
+    this.stale(`Pose: ${at} is not a number of degrees.`);
   }
 
   // The fields of another file; check : whether its margins are wanted at once.
@@ -58,7 +82,6 @@ export class Fields {
     const { $ } = this, parts = input.value.split(",").map((v) => v.trim());
     const list = key === "amplitudes", word = key === "actuator";
     if (!word && !(parts.every((v) => NUMBER.test(v)) && (list || parts.length === 1))) {
-      clearTimeout(this.timer); this.turn++;
       this.wrong(key, list ? "numbers with commas between them" : "a number");
       return;
     }
@@ -68,12 +91,18 @@ export class Fields {
   }
 
   // A field whose value is not in the file is not what would be run.
-  get bad() { return Object.values(this.inputs).some((i) => i.getAttribute("aria-invalid") === "true"); }
+  get bad() { return [...Object.values(this.inputs), this.$("pose")].some((i) => i.getAttribute("aria-invalid") === "true"); }
 
   wrong(key, expected) {
     this.inputs[key].setAttribute("aria-invalid", "true");
     const name = FIELDS.find(([k]) => k === key)[1];
-    this.said(`${name}: ${this.inputs[key].value || "nothing"} is not ${expected}.`, true);
+    this.stale(`${name}: ${this.inputs[key].value || "nothing"} is not ${expected}.`);
+  }
+
+  // What was predicted, or is being predicted, is not of what stands in the fields.
+  stale(text) {
+    clearTimeout(this.timer); this.turn++;
+    this.said(text, true);
     this.$("margins").replaceChildren();
   }
 
@@ -85,7 +114,7 @@ export class Fields {
     this.timer = setTimeout(async () => {
       const mine = ++this.turn;
       let found, failed = "";
-      try { found = await this.predict(this.$("text").value); } catch (error) { failed = error.message; }
+      try { found = await this.predict(this.$("text").value, this.pose); } catch (error) { failed = error.message; }
       if (mine !== this.turn) return; // typed again meanwhile
       for (const [key, input] of Object.entries(this.inputs)) input.setAttribute("aria-invalid", new RegExp(`: ${key}\\b`).test(failed));
       this.$("margins").replaceChildren();

@@ -15,31 +15,37 @@ export function clock(s) {
   return m ? `${m} min ${String(Math.floor(s % 60)).padStart(2, "0")} s` : `${Math.ceil(s)} s`;
 }
 
+// A run by its experiment, and the pose that it was asked for in.
+export const called = (j) => (j.pose ? `${j.experiment} at ${j.pose}` : j.experiment);
+
 // How a run ended, who ended it, and that the output is at zero.
 export function ended(l) {
   const at = new Date(l.ended || l.time), today = at.toDateString() === new Date().toDateString();
   const when = today ? at.toLocaleTimeString() : at.toLocaleString();
-  if (l.phase === "refused" && !l.status) return `${l.experiment}: did not start, ${when}: ${l.error}. Nothing moved.`;
+  if (l.phase === "refused" && !l.status) return `${called(l)}: did not start, ${when}: ${l.error}. Nothing moved.`;
   if (l.phase === "died") {
     const output = l.reason.startsWith("stopped") ? "Nothing moved." : "The device's own deadman drops the output: look at the rig.";
-    return `${l.experiment}: ${l.reason}, ${when}. ${l.at_zero ? OUTPUT.true : output}`;
+    return `${called(l)}: ${l.reason}, ${when}. ${l.at_zero ? OUTPUT.true : output}`;
   }
   const by = l.reason.startsWith("stop asked by ") ? ` by ${l.reason.slice(14)}` : "";
   const why = by || l.status === "completed" ? "" : `: ${l.early || (l.status === "failed" && l.error) || l.reason}`;
-  return `${l.experiment}: ${ENDS[l.status] ?? l.status}${by}, ${when}${why}. ${OUTPUT[l.at_zero] ?? ""}`;
+  return `${called(l)}: ${ENDS[l.status] ?? l.status}${by}, ${when}${why}. ${OUTPUT[l.at_zero] ?? ""}`;
 }
 
 // The line of a state.
 export function line(s) {
   const r = s.running, moves = MOVES.includes(r?.phase), p = moves ? r.progress : {};
-  if (moves && p.segment && r.phase === "running") return `${r.experiment}: ${p.name}, segment ${p.segment} of ${p.n_segments}`;
-  if (moves) return `${r.experiment}: ${PHASES[r.phase] ?? r.phase}`;
-  if (r) return `${ended(r)} Being estimated and diagnosed.`;
+  if (moves && p.segment && r.phase === "running") return `${called(r)}: ${p.name}, segment ${p.segment} of ${p.n_segments}`;
+  if (moves) return `${called(r)}: ${PHASES[r.phase] ?? r.phase}`;
+  // Of a run that did not go through no diagnosis is kept, so none is made.
+  const whole = r && r.diagnosis && (r.status === "completed" || r.early);
+  if (r) return `${ended(r)} Being estimated${whole ? " and diagnosed" : ""}.`;
   return `${s.fault ? `FAULT: ${s.fault.reason}. ` : ""}${s.last ? ended(s.last) : s.fault ? "" : "No run."}`;
 }
 
-// What stands below it while samples come.
+// What stands below it while samples come, and while they are diagnosed.
 export function facts(p, s) {
+  if (s.running?.doing) return { "The diagnosis tries": s.running.doing };
   return p.segment ? {
     "Run left": clock(p.time_left / s.pace), "Queue left": clock(s.time_left_s / s.pace),
     Level: `${p.level} ${p.unit}`, Frequency: p.broadband ? "whole band" : p.frequency ? `${p.frequency.toFixed(2)} Hz` : "at rest",

@@ -10,7 +10,7 @@ import { Why } from "/page/why.js";
 import { Notes } from "/page/notes.js";
 import { Panel } from "/page/panel.js";
 import { Recordings } from "/page/recordings.js";
-import { MOVES, VERDICTS, clock, facts, line } from "/page/now.js";
+import { MOVES, VERDICTS, called, clock, facts, line } from "/page/now.js";
 import { keep, kept, sized, themed } from "/page/kept.js";
 
 const $ = (id) => document.getElementById(id);
@@ -163,7 +163,7 @@ function show(s) {
   $("resume").hidden = !(s.held && s.queue.length && lease);
   $("queue").replaceChildren();
   for (const j of s.queue) {
-    const item = put($("queue"), "li", `${j.experiment}, ${planned(j.duration_s)} `);
+    const item = put($("queue"), "li", `${called(j)}, ${planned(j.duration_s)} `);
     if (lease) {
       const b = put(item, "button", "Take out");
       b.type = "button";
@@ -172,7 +172,7 @@ function show(s) {
   }
   const l = s.last;
   const told = l ? [l.status || l.phase, l.error || l.reason, VERDICTS[l.verdict]].filter(Boolean) : [];
-  $("last").textContent = l ? `Last: ${l.experiment}: ${told.join("; ")}.` : "";
+  $("last").textContent = l ? `Last: ${called(l)}: ${told.join("; ")}.` : "";
   scope.over = motion.over = !moves && !replay.on;
   document.body.classList.toggle("quiet", !r && !replay.on && scope.empty);
   lamps.state(s, moves);
@@ -228,9 +228,9 @@ addEventListener("pagehide", () => {
 });
 // The experiment, or its file as it was changed
 let files = {};
-const chosen = () => ($("changed").hidden ? { experiment: $("experiment").value } : { experiment_toml: $("text").value });
+const chosen = () => ({ ...fields.pose, ...($("changed").hidden ? { experiment: $("experiment").value } : { experiment_toml: $("text").value }) });
 const changed = () => { $("changed").hidden = $("text").value === files[$("experiment").value]; };
-const fields = new Fields({ $, put, changed, predict: (text) => ask("POST", "/dry-run", { experiment_toml: text }) });
+const fields = new Fields({ $, put, changed, predict: (text, more) => ask("POST", "/dry-run", { experiment_toml: text, ...more }) });
 $("text").oninput = () => { changed(); fields.show(true); };
 const shipped = (check) => {
   $("text").value = files[$("experiment").value];
@@ -248,8 +248,10 @@ $("plan").onclick = tried(async () => {
   $("planned").textContent = found.refused ? `Refused: ${found.refused}`
     : `${found.runs.length > 1 ? `${found.runs.length} runs, ` : ""}${planned(total)}; nearest to a limit: ${worst.channel} in ${worst.segment}, ${(100 * worst.margin).toFixed(0)} % left of ${worst.limit} ${worst.unit}`;
 });
+// What is asked for next is of the rig as it stood in the run that asks for it.
+const standing = (run) => (run?.pose ? { pose: run.pose } : {});
 const order = (what) => ask("POST", "/runs", { ...what, operator: name(), stop_when_certain: $("early").checked });
-$("next").onclick = tried(async () => order({ experiment_toml: await soFar.next() }));
+$("next").onclick = tried(async () => order({ experiment_toml: await soFar.next(), ...standing(state.running ?? state.last) }));
 $("start").onclick = tried(async () => {
   sound();
   $("planned").textContent = "predicting …";
@@ -291,7 +293,7 @@ async function begin() {
   if (wanted) { wanted = false; listen(); }
   const drawn = ask("GET", "/rig").then(({ rig, drawing, motion: moves }) => {
     lamps.rig(rig);
-    fields.rig = rig;
+    fields.of(rig);
     for (const c of [...rig.sensor, ...rig.actuator]) scope.about[c.name] = { resolution: c.resolution, limit: bounds(rig)[c.name]?.max };
     $("drawing").innerHTML = drawing;
     motion.rig(moves);

@@ -15,6 +15,7 @@ export class SoFar {
     const run = state.running, job = run ? run.id : state.last ? state.last.id : "";
     if (job !== this.job) { this.job = job; this.seen = ""; this.data = null; this.final(run ? null : state.last); }
     const told = run ? state.so_far : null;
+    $("diagnosis-doing").textContent = told?.doing ? `Now: ${told.doing}.` : "";
     if (told) this.diagnosis(told, run);
     else if (!run && this.was) this.final(state.last);
     this.was = run;
