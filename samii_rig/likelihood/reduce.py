@@ -542,8 +542,7 @@ def _columns(records: Records, contour: Contour, nodes: Int) -> list[Complex]:
         own = [i for i, s in enumerate(shapes) if s == shape]
         X = [contour.damped(r) for i in own for r in by_input(records.pieces[i].r)]
         lines = records.lines(records.pieces[own[0]])
-        one, turned = columns(contour, np.stack(X), nodes, *shape[:2], lines.k)
-        both = [np.concatenate(ab, axis=1) for ab in zip(one, turned, strict=True)]
+        both = columns(contour, np.stack(X), nodes, *shape[:2], lines.k)
         m = len(both) // len(own)
         for j, i in enumerate(own):
             out[i] = both[j] if m == 1 else np.concatenate(both[j * m : (j + 1) * m], axis=1)
