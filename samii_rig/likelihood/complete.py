@@ -12,7 +12,7 @@ the first part that of `Reduced`. A force changes g, and so both.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,16 @@ from scipy import linalg
 
 from samii_rig.likelihood.noise import Disturbances
 from samii_rig.likelihood.pieces import Loops
-from samii_rig.likelihood.reduce import Records, Reduced, Response, Rows, formed, orthonormal
+from samii_rig.likelihood.reduce import (
+    Records,
+    Reduced,
+    Response,
+    Rows,
+    as_complex,
+    as_real,
+    formed,
+    orthonormal,
+)
 from samii_rig.types import Complex, Float, Int
 
 
@@ -28,13 +37,15 @@ from samii_rig.types import Complex, Float, Int
 class Complete:
     """Chi-square of all lines, split.
 
-    rows : the lines. root : (n, q, q) so that root e has real and imaginary parts of variance 1.
-    nuisances : of each piece its lines and orthonormal columns over their real, then imaginary
-    parts. factor : (m, m) C.
+    rows : the lines, without `X`. columns : (2 n, 2 b) real parts of that, then imaginary ones.
+    root : (n, q, q) so that root e has real and imaginary parts of variance 1. nuisances : of each
+    piece its lines and orthonormal columns over their real, then imaginary parts. factor : (m, m)
+    C.
     """
 
     reduced: Reduced
     rows: Rows
+    columns: Float
     root: Complex
     nuisances: tuple[tuple[Int, Float], ...]
     factor: Float
@@ -54,7 +65,8 @@ class Complete:
         each = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
         nuisances = tuple((on, _columns(root[on] @ rows.N[on])) for on in each)
         m = found.factor.shape[0]
-        return cls(found, rows, root, nuisances, found.factor.reshape(m, m))
+        columns, rows = as_real(rows.X), replace(rows, X=rows.X[:, :0].copy())
+        return cls(found, rows, columns, root, nuisances, found.factor.reshape(m, m))
 
     @property
     def expected(self) -> float:
@@ -62,27 +74,33 @@ class Complete:
         return self.reduced.known + self.reduced.inside[1]
 
     def split(self, e: Complex) -> Float:
-        """(m + 2 n q,) both parts of lines e (n, q), in noise units."""
-        g = self.white(e)
-        X, q = self.rows.X, e.shape[1]
-        back = np.einsum("nji,nj->ni", self.root.conj(), g)
-        head = (back.conj().T @ X).real.ravel()
-        t = linalg.solve_triangular(self.factor, head, trans="T", check_finite=False)
-        d = linalg.solve_triangular(self.factor, t, check_finite=False)
-        rest = g - self.white(X @ d.reshape(q, -1).T)
-        return np.concatenate([t, rest.real.ravel(), rest.imag.ravel()])
+        """Both parts of lines e (n, q), in noise units, (m + 2 n q,); of several at once, e
+        (n, q, p), (m + 2 n q, p)."""
+        g = self.white(e.reshape(*e.shape[:2], -1))
+        n, q, p = g.shape
+        back = self.root.conj().swapaxes(1, 2) @ g
+        head = self.columns.T @ as_real(back.reshape(n, -1))
+        head = head.reshape(-1, q, p).swapaxes(0, 1).reshape(-1, p)
+        # The factor's rows stand in memory as the columns of a lower triangle: nothing is copied.
+        lower = self.factor.T
+        t = linalg.blas.dtrsm(1.0, lower, head, lower=1)
+        rest = g - self.white(self._lines(linalg.blas.dtrsm(1.0, lower, t, lower=1, trans_a=1)))
+        parts = np.concatenate([t, rest.real.reshape(-1, p), rest.imag.reshape(-1, p)])
+        return parts if e.ndim == 3 else parts[:, 0]
 
     def joined(self, parts: Float) -> Complex:
         """(n, q, k) of what `split` would make of lines: of slopes or residuals, both `parts`
         (m + 2 n q, k), the whitened lines. Their real products are those of the parts."""
         m, (n, q) = len(self.factor), self.rows.e.shape
-        d = linalg.solve_triangular(self.factor, parts[:m], check_finite=False)
-        own = self.rows.X @ d.reshape(q, -1, parts.shape[1]).transpose(1, 0, 2).reshape(
-            -1, q * parts.shape[1]
-        )
-        out = self.white(own.reshape(n, q, -1))
+        d = linalg.blas.dtrsm(1.0, self.factor.T, parts[:m], lower=1, trans_a=1)
         rest = parts[m:].reshape(2, n, q, -1)
-        return np.asarray(out + rest[0] + 1j * rest[1])
+        return np.asarray(self.white(self._lines(d)) + rest[0] + 1j * rest[1])
+
+    def _lines(self, d: Float) -> Complex:
+        """(n, q, p) of changes d (m, p) of the response on the nodes."""
+        q, p = self.rows.e.shape[1], d.shape[1]
+        flat = d.reshape(q, -1, p).swapaxes(0, 1).reshape(-1, q * p)
+        return as_complex(self.columns @ flat).reshape(-1, q, p)
 
     def white(self, e: Complex) -> Complex:
         """(n, q) or (n, q, p) whitened, without nuisances."""

@@ -218,10 +218,10 @@ def left_by(
     white = both[:, :, 0]
     for on, m in rows.each():
         N = both[on][:, :, 1 : 1 + m].reshape(-1, m)
-        Q = orthonormal(_real(N))
-        goal = _real(white[on].ravel())
+        Q = orthonormal(as_real(N))
+        goal = as_real(white[on].ravel())
         goal -= Q @ (Q.T @ goal)
-        white[on] = _complex(goal).reshape(on.size, -1)
+        white[on] = as_complex(goal).reshape(on.size, -1)
     each = noise.noise.scaled(rows.f, rows.piece, white) / 2
     return Left(rows.f, np.sum(np.abs(white) ** 2, axis=1), each)
 
@@ -381,7 +381,7 @@ def _with_past(
     rows, groups = _grouped(rows, spare)
     for on in groups:
         one = rows.take(on)
-        Q = orthonormal(_real(one.X))
+        Q = orthonormal(as_real(one.X))
         own = [(i, seen[i]) for i in np.unique(one.piece)]
         past, beside, first = [], [], 0
         for i, s in own:
@@ -442,8 +442,8 @@ def _as_changes(rows: Rows, seen: Sequence[Seen], noise: Noise) -> Float:
 
 def _beyond(Q: Float, x: Complex) -> Complex:
     """Lines (n, q, m) less what is along directions Q (2 n, p) of each sensor."""
-    flat = _real(x.reshape(len(x), -1))
-    return _complex(flat - Q @ (Q.T @ flat)).reshape(x.shape)
+    flat = as_real(x.reshape(len(x), -1))
+    return as_complex(flat - Q @ (Q.T @ flat)).reshape(x.shape)
 
 
 def _with_repeats(
@@ -512,20 +512,20 @@ def _without(e: Complex, N: Complex) -> tuple[Complex, Float]:
     n, q = e.shape[:2]
     out, used = np.zeros_like(e), np.zeros(2 * n)
     for c in range(q):
-        Q = orthonormal(_real(N[:, c][:, np.any(N[:, c] != 0, axis=0)]))
-        goal = _real(e[:, c])
+        Q = orthonormal(as_real(N[:, c][:, np.any(N[:, c] != 0, axis=0)]))
+        goal = as_real(e[:, c])
         goal = goal - Q @ (Q.T @ goal)
         used += np.sum(Q**2, axis=1)
-        out[:, c] = _complex(goal)
+        out[:, c] = as_complex(goal)
     return out, np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
 
 
-def _real(x: Complex) -> Float:
+def as_real(x: Complex) -> Float:
     """Real parts over imaginary parts."""
     return np.concatenate([x.real, x.imag])
 
 
-def _complex(x: Float) -> Complex:
+def as_complex(x: Float) -> Complex:
     """From real parts over imaginary parts."""
     half = len(x) // 2
     return np.asarray(x[:half] + 1j * x[half:])
@@ -602,11 +602,11 @@ def _free(X: Complex) -> int:
 
 
 def _of_piece(rows: Rows) -> tuple[Complex, Float]:
-    Q = orthonormal(_real(rows.X))
+    Q = orthonormal(as_real(rows.X))
     n, q = rows.e.shape
     left, used = np.zeros((n, q), complex), np.sum(Q**2, axis=1) * q
     for c in range(q):
-        goal, more = _real(rows.e[:, c]), _real(rows.N[:, c])
+        goal, more = as_real(rows.e[:, c]), as_real(rows.N[:, c])
         more = more[:, np.any(more != 0, axis=0)]
         more = orthonormal(more - Q @ (Q.T @ more))
         goal = goal - Q @ (Q.T @ goal)
@@ -675,7 +675,7 @@ def _nuisances(rows: Rows, W: Complex, We: Complex) -> tuple[Float, Float]:
         WN = W[on] @ N
         square = (flat.conj().T @ WN.reshape(-1, m)).real
         values, turn = directions(square)
-        cross = _real(X).T @ _real(WN.reshape(-1, q * m))
+        cross = as_real(X).T @ as_real(WN.reshape(-1, q * m))
         cross = cross.reshape(-1, q, m).swapaxes(0, 1).reshape(-1, m)
         head = (flat.conj().T @ We[on].ravel()).real
         found.append((values, turn, cross, head))
@@ -695,13 +695,13 @@ def _products(X: Complex, W: Complex) -> Float:
     M = np.zeros((q * size, q * size))
     for first in range(0, len(X), AT_ONCE):
         x, w = X[first : first + AT_ONCE], W[first : first + AT_ONCE]
-        real = _real(x)
+        real = as_real(x)
         for i in range(q):
             own = slice(i * size, (i + 1) * size)
             root = real * np.tile(np.sqrt(w[:, i, i].real), 2)[:, None]
             M[own, own] += root.T @ root
             for j in range(i + 1, q):
-                M[own, j * size : (j + 1) * size] += real.T @ _real(w[:, i, j, None] * x)
+                M[own, j * size : (j + 1) * size] += real.T @ as_real(w[:, i, j, None] * x)
     return np.triu(M) + np.triu(M, 1).T
 
 

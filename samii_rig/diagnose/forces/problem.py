@@ -182,6 +182,6 @@ class ForceProblem(RecordProblem):
         out = np.zeros((self.goal.size, d.shape[2]))
         out[: self.reduced.factor.shape[0]] = self.reduced.slopes(d)
         if lines.size:
-            for j in np.flatnonzero(np.any(lines != 0, axis=(0, 1))):
-                out[:, j] += self.complete.split(lines[:, :, j])
+            moving = np.flatnonzero(np.any(lines != 0, axis=(0, 1)))
+            out[:, moving] += self.complete.split(lines[:, :, moving])
         return out
