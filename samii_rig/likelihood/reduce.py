@@ -651,7 +651,7 @@ def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     C, ridge = _factor(M, SAME * np.maximum(diagonal, SAME * largest))
     turned, _ = linalg.lapack.dtrtri(C)
     return _Form(
-        known=C.shape[0] - float(ridge @ np.sum(turned**2, axis=1)),
+        known=C.shape[0] - float(ridge @ np.einsum("ij,ij->i", turned, turned)),
         factor=np.ascontiguousarray(C).reshape(-1, q, 2, b),
         target=linalg.solve_triangular(C, g, trans="T", check_finite=False),
         total=float(np.sum(rows.e.conj() * We).real) - float(own_head @ own_head),
@@ -702,16 +702,22 @@ def _products(X: Complex, W: Complex) -> Float:
             M[own, own] += root.T @ root
             for j in range(i + 1, q):
                 M[own, j * size : (j + 1) * size] += real.T @ as_real(w[:, i, j, None] * x)
-    return np.triu(M) + np.triu(M, 1).T
+    # In place: with eight sensors and some hundred nodes M is the most that is kept of any record.
+    for i in range(q):
+        for j in range(i + 1, q):
+            one, other = slice(i * size, (i + 1) * size), slice(j * size, (j + 1) * size)
+            M[other, one] = M[one, other].T
+    return M
 
 
 def _factor(M: Float, ridge: Float) -> tuple[Float, Float]:
     """The upper factor of M (m, m) plus a ridge (m,) on its diagonal, and the ridge: as small as it
-    can be, where records of few periods leave most directions unknown."""
+    can be, where records of few periods leave most directions unknown. M is changed."""
+    diagonal = np.diagonal(M).copy()
     for _ in range(RIDGES):
+        np.fill_diagonal(M, diagonal + ridge)
         try:
-            whole = M + np.diag(ridge)
-            return linalg.cholesky(whole, overwrite_a=True, check_finite=False), ridge
+            return linalg.cholesky(M, check_finite=False), ridge
         except np.linalg.LinAlgError:
             ridge = MORE * ridge
     raise EstimateError("the records hold no numbers that a response could be told from")
