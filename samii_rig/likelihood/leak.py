@@ -20,9 +20,7 @@ from samii_rig.types import Complex, Float, Int
 BLOCK = 256  # lines at once: what is summed of one input is 16 kB
 
 
-def columns(
-    contour: Contour, X: Complex, nodes: Int, history: int, n: int, lines: Int
-) -> Complex:
+def columns(contour: Contour, X: Complex, nodes: Int, history: int, n: int, lines: Int) -> Complex:
     """Spectra (m, n_lines, 2 n_nodes) of a change of 1 in each node, then of 1j in each.
 
     X : (m, M//2 + 1) damped inputs. nodes : (n_nodes,) lines of the contour, increasing.
@@ -103,7 +101,13 @@ def _poles(W: Float, pr: float, pi: float) -> None:
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def _add(
-    sums: Float, W: Float, re: float, im: float, mirrored_re: float, mirrored_im: float, right: float
+    sums: Float,
+    W: Float,
+    re: float,
+    im: float,
+    mirrored_re: float,
+    mirrored_im: float,
+    right: float,
 ) -> None:
     """What a line of the contour does, and its part in the node to the right, to rows of sums."""
     for i in range(BLOCK):

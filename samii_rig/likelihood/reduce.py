@@ -431,11 +431,11 @@ def _as_changes(rows: Rows, seen: Sequence[Seen], noise: Noise) -> Float:
         ]
         scale = 1 / np.sqrt(C[:, c])[:, None]
         errors = np.asarray(np.concatenate(draws)[rows.order] * scale, np.complex128)
-        Q = orthonormal(_real(rows.X * scale))
+        Q = orthonormal(as_real(rows.X * scale))
         power = np.mean(np.abs(errors) ** 2, axis=1) / 2  # of the real part, and of the other
         independent = float(np.sum(np.tile(power, 2) * np.sum(Q**2, axis=1)))
         if independent > 0:
-            shows = float(np.sum((Q.T @ _real(errors)) ** 2)) / rounding.OFFSETS
+            shows = float(np.sum((Q.T @ as_real(errors)) ** 2)) / rounding.OFFSETS
             out[c] = max(shows / independent, 1.0)
     return out
 
