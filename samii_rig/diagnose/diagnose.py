@@ -38,12 +38,14 @@ def table(
     *,
     signed: bool = False,
     poses: Sequence[Rig] = (),
+    recorded_hz: float | None = None,
 ) -> list[Effect]:
-    """All effects that the table knows on this rig, structural twins as one. signed : with what a
-    rig has less of, see `vocabulary.hypotheses`. poses : the rig in each of several; twins in all
-    of them are one."""
+    """All effects that the table knows on this rig, structural twins as one. signed, recorded_hz :
+    as of `vocabulary.hypotheses`. poses : the rig in each of several; twins in all of them are
+    one."""
     f = np.geomspace(low_hz, high_hz, TWIN_POINTS)
-    every = weighty(hypotheses(rig, low_hz, high_hz, signed=signed), rig, poses=bool(poses))
+    every = hypotheses(rig, low_hz, high_hz, signed=signed, recorded_hz=recorded_hz)
+    every = weighty(every, rig, poses=bool(poses))
     return without_twins(rig, every, f, poses)
 
 
@@ -99,7 +101,7 @@ def case_of(
     at = grid(rig, lines.frequency, lines.sensor, lines.actuator)
     if effects is None:
         low, high = float(lines.frequency[0]), float(lines.frequency[-1])
-        effects = table(rig, low, high, signed=signed)
+        effects = table(rig, low, high, signed=signed, recorded_hz=sound[0].rate_hz)
     by_line = Search(rig, seen, at, clean.competing(effects), progress=progress)
     runs = runs if clean.mend is None else [clean.mend(run) for run in runs]
     return Case(clean, sound, runs, lines, by_line, decide, show)

@@ -106,7 +106,8 @@ def in_poses(
         )
     progress("nominal model")
     if effects is None:
-        effects = table(rigs[0], *_measured(each, band), poses=rigs)
+        rate = each[0].responses[0].rate_hz
+        effects = table(rigs[0], *_measured(each, band), poses=rigs, recorded_hz=rate)
     cases = [
         case_of(one.responses, own, band, effects, one.runs, progress=progress)
         for one, own in zip(each, rigs, strict=True)

@@ -26,7 +26,7 @@ from samii_rig.types import Channel, Recording
 RIG = samii()
 LINES = np.geomspace(0.5, 40.0, 120)
 SENSORS = np.arange(len(RIG.sensor))
-ALL = list(mistakes.effects(RIG))
+ALL = list(mistakes.effects(RIG, RIG.rate_hz))
 TWO, _ = load_rig("two_masses")
 
 
@@ -76,6 +76,15 @@ def test_a_mistake_is_a_factor_that_is_exactly_known(physics, site, said, factor
     assert found[:, k] == pytest.approx(factor(LINES) * response(RIG)[:, k], rel=1e-3)
     others = [i for i in SENSORS if i != k]
     assert np.array_equal(found[:, others], response(RIG)[:, others])
+
+
+def test_a_logger_shifts_by_rows_of_the_recording_not_of_the_loop():
+    rows = [e for e in mistakes.effects(RIG, RIG.rate_hz / 4) if e.physics == "columns_shifted"]
+    s = 2j * np.pi * LINES
+    late = one("columns_shifted", rows[0].site, "stands samples from the sensors'", [
+        e for e in rows if "2 samples later" in e.variant and "measured" not in e.variant
+    ])  # fmt: skip
+    assert late.factor.value(s, np.zeros(0))[0] == pytest.approx(np.exp(-s * 8 / RIG.rate_hz))
 
 
 def measured(rig, H, lines=LINES, seed=3):
@@ -130,10 +139,14 @@ def test_a_rig_a_quarter_stiffer_than_its_file_is_no_wrong_rate(rig):
         ("kind_error", "a_2", "a velocity"),
         ("unit_error", "v", "is 1000 times"),
         ("sign_error", "a_2", "wrong sign"),
+        # Both at once look like a dead time of the drive.
+        ("columns_shifted", "v", "measured, not held, and stands samples from the sensors'"),
     ],
 )
 def test_it_is_told_and_no_physics_is_named(physics, site, said):
-    effect = one(physics, site, said, list(mistakes.effects(TWO)))
+    some = [e for e in mistakes.effects(TWO, TWO.rate_hz) if "2 samples later" in e.variant]
+    every = some if "shifted" in physics else list(mistakes.effects(TWO, TWO.rate_hz))
+    effect = one(physics, site, said, every)
     found = diagnose([measured(TWO, response(TWO, effect))], TWO)
     assert found.verdict == "no_mismatch"
     assert not found.causes

@@ -6,7 +6,7 @@ compete with physics in the same search, at the price of what has no unknown.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from samii_rig.diagnose.physics import insert
+from samii_rig.diagnose.physics.channels import not_held
 from samii_rig.diagnose.physics.confusions import UNITS
 from samii_rig.diagnose.physics.effect import Effect, Factor
 from samii_rig.rig.schema import (
@@ -29,6 +30,7 @@ from samii_rig.rig.schema import (
 from samii_rig.types import Complex, Float
 
 MOST_SHIFTED = 5  # samples, by which a logger's columns are apart; as `signal.columns` looks for
+MEASURED = 0.3  # of loggers that shift columns, those that measure the command
 ORDERS = ("a displacement", "a velocity", "an acceleration")  # by how often it was derived
 ORDER = {AbsoluteAngle: 0, RelativeAngle: 0, Displacement: 0, Velocity: 1, Acceleration: 2}
 
@@ -58,15 +60,16 @@ def derived(s: Complex, times: int) -> Complex:
     return np.where(s == 0, 0.0, np.where(s == 0, 1.0, s) ** float(times))
 
 
-def effects(rig: Rig) -> Iterator[Effect]:
-    """Every mistake that this rig's columns allow."""
+def effects(rig: Rig, recorded_hz: float) -> Iterator[Effect]:
+    """Every mistake that this rig's columns allow, of so many rows a second."""
     for actuator in rig.actuator:
-        for m in (*_of_any(), *_shifts("columns_shifted", rig.rate_hz)):
+        shifts = list(_shifts("columns_shifted", recorded_hz))
+        for m in (*_of_any(), *shifts, *_measured_too(shifts, rig.rate_hz)):
             yield _on("input", actuator.name, m)
     for sensor in rig.sensor:
         rows = [*_of_any(), *_of_kind(sensor)]
         if len(rig.sensor) > 1:
-            rows += _shifts("column_shifted", rig.rate_hz)
+            rows += _shifts("column_shifted", recorded_hz)
         for m in rows:
             yield _on("sensor", sensor.name, m)
         yield from _angles(rig, sensor)
@@ -99,6 +102,18 @@ def _shifts(physics: str, rate_hz: float) -> Iterator[Mistake]:
             said = f"stands samples from the sensors' columns, which are {many}: a logger's"
         law = partial(behind, seconds=n / rate_hz)
         yield Mistake(physics, said, law, 1 / (2 * MOST_SHIFTED))
+
+
+def _measured_too(shifts: Iterable[Mistake], rate_hz: float) -> Iterator[Mistake]:
+    """Each of them where what stands apart was measured, not sent: both at once look like one dead
+    time or lag, and explain none of it alone."""
+
+    def both(s: Complex, factor: Callable[[Complex], Complex]) -> Complex:
+        return factor(s) * not_held(s, np.zeros(0), rate_hz)[0]
+
+    for m in shifts:
+        said = f"was measured, not held, and {m.said}"
+        yield Mistake(m.physics, said, partial(both, factor=m.factor), MEASURED * m.weight)
 
 
 def _of_kind(sensor: Sensor) -> Iterator[Mistake]:

@@ -19,11 +19,18 @@ from samii_rig.rig.schema import Rig
 GROUP = "samii_rig.effects"  # of entry points
 
 
-def hypotheses(rig: Rig, low_hz: float, high_hz: float, *, signed: bool = False) -> list[Effect]:
+def hypotheses(
+    rig: Rig,
+    low_hz: float,
+    high_hz: float,
+    *,
+    signed: bool = False,
+    recorded_hz: float | None = None,
+) -> list[Effect]:
     """Every single effect that the table knows on this rig; ranges are those of the band.
 
     signed : with what is less than it was, in parameters that the refit moves too: what may change
-    between two states.
+    between two states. recorded_hz : rate of the recordings, where it is not the rig's.
     """
     where = places(rig, low_hz, high_hz)
     return [
@@ -31,7 +38,7 @@ def hypotheses(rig: Rig, low_hz: float, high_hz: float, *, signed: bool = False)
         *bodies.effects(rig, where),
         *less.effects(rig, between=signed),
         *channels.effects(rig, low_hz, high_hz),
-        *mistakes.effects(rig),
+        *mistakes.effects(rig, recorded_hz or rig.rate_hz),
         *plugged(rig, low_hz, high_hz),
     ]
 
