@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import signal
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +65,8 @@ class Bench:
         self.rig = tmp_path / "rig.toml"
         self.rig.write_text(TEXT + '\n[device]\ndriver = "bench"\n')
         self.experiment = tmp_path / "thrice.toml"
-        self.experiment.write_text("")  # what it would say is `Thrice`
+        shipped = resources.files("experiments") / "data" / "step.toml"
+        self.experiment.write_text(shipped.read_text())  # what is run in its place is `Thrice`
         # The fake has no entry point, so nobody can be asked what it could run.
         monkeypatch.setattr(opening, "check_device", lambda rig: None)
         monkeypatch.setattr(campaign, "open_device", self.open)
