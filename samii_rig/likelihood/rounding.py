@@ -198,4 +198,5 @@ def _parts(piece: Piece, y: Float, step: float, sd: float, rate_hz: float) -> Fl
     if grown[-1] <= y.size * (STILL * step) ** 2:
         return np.zeros((0, y.size))
     turn = np.minimum((UNREAD * grown / grown[-1]).astype(np.int64), UNREAD - 1)
-    return np.stack([np.where(turn == j, part, 0.0) for j in np.unique(turn)])
+    # A part before all motion, which jumps from none to the next, has nothing to be scaled.
+    return np.stack([np.where(turn == j, part, 0.0) for j in np.unique(turn[part != 0])])

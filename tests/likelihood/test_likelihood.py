@@ -491,6 +491,14 @@ def test_a_part_that_rests_elsewhere_after_a_motion_has_not_moved_within_a_step(
     assert np.max(np.abs(still)) < 3  # steps, as far as a motion that counts as still
 
 
+def test_a_motion_that_is_within_few_steps_for_some_samples_has_no_part_without_motion():
+    i = np.arange(2000)
+    y = (1.49 + 2.13e-5 * (i - 1000.0) ** 2) * np.sin(2 * np.pi * i / 7)
+    found = read(y, y)
+    assert np.all(np.sum(found.factors[0] ** 2, axis=1) > 0)
+    assert np.all(np.isfinite(found.power))
+
+
 @pytest.mark.parametrize("size", [1.5, 2.5, 4.0])
 def test_the_rounding_of_a_motion_that_follows_the_input_is_no_change_of_the_response(size: float):
     """Steps of the input: each is followed by the same motion, of three to eight steps of a
