@@ -114,9 +114,8 @@ def _check_units(recordings: Sequence[Recording | SavedResponses], rig: Rig) -> 
         for c in channels:
             wanted = units.get(c.name, c.unit)
             if c.unit != wanted and factor(c.unit, wanted) is None:
-                expected = (
-                    f"{wanted!r}, as in the rig {rig.name!r}; import's map says both, and the scale"
-                )
+                remedy = "give unit and scale in the map of samii-rig import"
+                expected = f"{wanted!r}, as in the rig {rig.name!r}; {remedy}"
                 raise InputError(r.source, f"channel {c.name}: unit", c.unit, expected)
 
 
