@@ -163,7 +163,8 @@ def _one_line() -> Iterator[None]:
         return
     except SamiiRigError as error:
         line = str(error)
-    pytest.fail(line, pytrace=False)
+    # The error that it stands for would be printed above it once more.
+    raise pytest.fail.Exception(line, pytrace=False) from None
 
 
 def _asked(request: pytest.FixtureRequest) -> _Asked:

@@ -80,14 +80,43 @@ def say_json(data: dict[str, Any]) -> None:
 def rig_of(
     recordings: Sequence[Recording | SavedResponses], option: str | None
 ) -> tuple[Rig, str] | None:
-    """The rig to hold against recordings: the one asked for, else the one they carry."""
+    """The rig to hold against recordings: the one asked for, else the one they carry.
+
+    InputError if a channel of theirs measures another quantity than the rig's of that name.
+    """
     from samii_rig.rig.load import load_rig, parse
     from samii_rig.rig.schema import Rig
 
     if option:
-        return load_rig(option)
-    text = next((r.rig_toml for r in recordings if r.rig_toml), "")
-    return (parse(Rig, text, "the recording's rig file"), text) if text else None
+        held = load_rig(option)
+    else:
+        text = next((r.rig_toml for r in recordings if r.rig_toml), "")
+        if not text:
+            return None
+        held = parse(Rig, text, "the recording's rig file"), text
+    _check_units(recordings, held[0])
+    return held
+
+
+def _check_units(recordings: Sequence[Recording | SavedResponses], rig: Rig) -> None:
+    """Counts that nobody scaled, held against radians, would be minutes of work for nothing. What
+    is a factor off, as g from m/s^2, the diagnosis sees by itself."""
+    from samii_rig.errors import InputError
+    from samii_rig.types import Recording
+    from samii_rig.units import factor
+
+    units = rig.units()
+    for r in recordings:
+        if isinstance(r, Recording):
+            channels = r.channels
+        else:
+            channels = tuple(c for x in r.responses for c in (*x.inputs, *x.outputs))
+        for c in channels:
+            wanted = units.get(c.name, c.unit)
+            if c.unit != wanted and factor(c.unit, wanted) is None:
+                remedy = "give unit and scale in the map of samii-rig import"
+                expected = f"{wanted!r}, as in the rig {rig.name!r}; {remedy}"
+                raise InputError(r.source, f"channel {c.name}: unit", c.unit, expected)
 
 
 def without_rig() -> InputError:

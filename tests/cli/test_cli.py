@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from samii_rig.cli import main
 from samii_rig.cli.app import app
+from samii_rig.cli.common import rig_of
 from samii_rig.errors import SamiiRigError
 from samii_rig.index.remarks import read_remarks
 from samii_rig.record import scan
@@ -353,6 +354,26 @@ def test_real_recordings_are_imported_and_estimated(recordings: Path, tmp_path: 
     hold = -180 * 12.5 / 500  # half a sample's lag at the middle of the band
     assert theta["phase_deg"] - hold == pytest.approx(0.0, abs=1.0)
     assert a["phase_deg"] - hold == pytest.approx(3.0, abs=1.0)
+
+
+@pytest.mark.parametrize("command", ["diagnose", "identify", "frf"])
+def test_channels_of_another_quantity_than_the_rigs_are_refused(
+    command: str, tmp_path: Path, log: Path
+) -> None:
+    """Counts in place of radians: one line at once, and no model is fitted to them. A factor, as
+    mrad from rad, is the diagnosis's to find."""
+    run = read_recording(log)
+
+    def named(unit: str) -> Path:
+        channels = tuple(replace(c, unit=unit) if c.name == "theta_2" else c for c in run.channels)
+        path = tmp_path / f"{unit}.mcap"
+        write_recording(path, replace(run, channels=channels))
+        return path
+
+    code, said = call(command, named("count"), "--rig", "samii")
+    assert code == 2
+    assert "count.mcap: channel theta_2: unit is 'count'; expected 'rad', as in the rig" in said
+    assert rig_of([read_recording(named("mrad"))], "samii")
 
 
 def test_parameters_are_identified_from_a_log(log: Path) -> None:

@@ -239,4 +239,5 @@ def test_what_cannot_be_run_fails_with_one_line_each(tmp_path):
     ):
         assert line in done.stdout, done.stdout
     assert "Traceback" not in done.stdout
+    assert "During handling" not in done.stdout
     assert "def recording" not in done.stdout

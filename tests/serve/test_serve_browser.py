@@ -6,6 +6,7 @@ Skips where no Chromium is installed.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -52,6 +53,9 @@ def test_an_afternoon_at_the_page(
         browser.go(service.url)
         browser.until("document.getElementById('link').textContent === 'live'")
         assert browser.text("rig-name") == "SAMII"
+        browser.until("document.getElementById('kind').textContent !== ''")
+        assert browser.text("kind") == "simulated rig, 2 × real time"
+        assert browser.text("now") == "No run. One is started under Drive."
         browser.until("document.querySelectorAll('#drawing svg text').length > 10")
         browser.until("document.querySelectorAll('#list tr').length === 1")
         assert browser.value("document.querySelectorAll('#list img').length") == 0
@@ -165,6 +169,8 @@ def test_a_run_tells_what_it_knows_while_it_goes_on(
         # What was measured until then stays, as of a run that is over.
         browser.until("document.getElementById('frf-about').textContent.startsWith('Last run')")
         assert "goes on" not in browser.text("frf-about")
+        assert re.search(r"as estimated when \d+ of 60 .* were whole", browser.text("frf-about"))
+        assert browser.value("document.getElementById('frf-hatched').hidden")
         service.kill()
         browser.until("document.getElementById('motion').ariaLabel.includes('not live')")
     assert browser.errors == []

@@ -59,15 +59,7 @@ def test_a_run_and_a_recording_without_a_mouse(
         browser.press("Enter")  # without a name it asks for one, and goes there
         browser.until(f"{FOCUS}.id === 'operator'")
         browser.call("Input.insertText", text="Ada")
-        browser.call(
-            "Input.dispatchKeyEvent",
-            type="keyDown",
-            key="Tab",
-            modifiers=8,
-            code="Tab",
-            windowsVirtualKeyCode=9,
-        )
-        browser.until(f"{FOCUS}.id === 'take'")
+        tab_to(browser, "#take", 1)
         browser.press("Enter")
         browser.until("document.getElementById('driver').textContent.startsWith('Ada drives')")
         tab_to(browser, "#experiment")

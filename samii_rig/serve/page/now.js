@@ -15,6 +15,12 @@ export function clock(s) {
   return m ? `${m} min ${String(Math.floor(s % 60)).padStart(2, "0")} s` : `${Math.ceil(s)} s`;
 }
 
+// Whether what moves is real; a simulated rig may have a clock of its own.
+export function kind(s) {
+  if (s.real) return "real rig";
+  return `simulated rig${s.pace === 1 ? "" : s.pace ? `, ${s.pace} × real time` : ", as fast as it can"}`;
+}
+
 // A run by its experiment, and the pose that it was asked for in.
 export const called = (j) => (j.pose ? `${j.experiment} at ${j.pose}` : j.experiment);
 
@@ -40,7 +46,7 @@ export function line(s) {
   // Of a run that did not go through no diagnosis is kept, so none is made.
   const whole = r && r.diagnosis && (r.status === "completed" || r.early);
   if (r) return `${ended(r)} Being estimated${whole ? " and diagnosed" : ""}.`;
-  return `${s.fault ? `FAULT: ${s.fault.reason}. ` : ""}${s.last ? ended(s.last) : s.fault ? "" : "No run."}`;
+  return `${s.fault ? `FAULT: ${s.fault.reason}. ` : ""}${s.last ? ended(s.last) : s.fault ? "" : "No run. One is started under Drive."}`;
 }
 
 // What stands below it while samples come, and while they are diagnosed.

@@ -10,7 +10,7 @@ import { Why } from "/page/why.js";
 import { Notes } from "/page/notes.js";
 import { Panel } from "/page/panel.js";
 import { Recordings } from "/page/recordings.js";
-import { MOVES, VERDICTS, called, clock, facts, line } from "/page/now.js";
+import { MOVES, VERDICTS, called, clock, facts, kind, line } from "/page/now.js";
 import { keep, kept, sized, themed } from "/page/kept.js";
 
 const $ = (id) => document.getElementById(id);
@@ -138,6 +138,7 @@ function show(s) {
   const before = state;
   state = known.state = s;
   $("rig-name").textContent = s.rig;
+  $("kind").textContent = kind(s);
   document.title = `${s.running ? "▶ " : ""}${s.rig}`;
   $("driver").textContent = `${s.operator ? `${s.operator} drives` : "nobody drives"}, ${s.viewers} watching`;
   // A run that begins is more than a replay.
@@ -246,7 +247,7 @@ $("plan").onclick = tried(async () => {
   const found = await ask("POST", "/dry-run", chosen()).catch((e) => { $("planned").textContent = ""; throw e; });
   const total = found.runs.reduce((sum, r) => sum + r.duration_s, 0), worst = found.runs[0].margins[0];
   $("planned").textContent = found.refused ? `Refused: ${found.refused}`
-    : `${found.runs.length > 1 ? `${found.runs.length} runs, ` : ""}${planned(total)}; nearest to a limit: ${worst.channel} in ${worst.segment}, ${(100 * worst.margin).toFixed(0)} % left of ${worst.limit} ${worst.unit}`;
+    : `${found.runs.length > 1 ? `${found.runs.length} runs, ` : ""}${planned(total)}; nearest to a limit: ${worst.channel} in ${worst.segment}, ${(100 * worst.margin).toFixed(0)} % left of ${worst.limit} ${worst.unit.replace("^2", "²")}`;
 });
 // What is asked for next is of the rig as it stood in the run that asks for it.
 const standing = (run) => (run?.pose ? { pose: run.pose } : {});

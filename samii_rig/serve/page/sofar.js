@@ -36,9 +36,11 @@ export class SoFar {
     if (!data) return;
     const said = data.responses.map((r) => `${r.level} ${r.unit}: ${hz(r.low_hz)} to ${hz(r.high_hz)} Hz, ${
       r.going_on ? (run ? "goes on" : "cut off") : `${r.n} ${r.n > 1 ? "repeats" : "sweep"}`}`).join("; ");
-    const of = `${data.done} of ${data.of} segments whole`;
-    $("frf-about").textContent = `${run ? "" : "Last run. "}${of}. ${said || "Nothing measured yet"}.${
+    const of = `${data.done} of ${data.of} segments`;
+    // A run that was stopped has ended before its last segments were estimated.
+    $("frf-about").textContent = `${run ? `${of} whole` : `Last run, as estimated when ${of} were whole`}. ${said || "Nothing measured yet"}.${
       data.trouble ? ` The newest part: ${data.trouble}.` : ""}`;
+    $("frf-hatched").hidden = !run;
     $("frf").setAttribute("aria-label", `Frequency responses over the model. ${$("frf-about").textContent}`);
   }
 
