@@ -113,7 +113,7 @@ def _check_units(recordings: Sequence[Recording | SavedResponses], rig: Rig) -> 
             channels = tuple(c for x in r.responses for c in (*x.inputs, *x.outputs))
         for c in channels:
             wanted = units.get(c.name, c.unit)
-            if c.unit != wanted and factor(c.unit, wanted) is None:
+            if c.unit and c.unit != wanted and factor(c.unit, wanted) is None:
                 remedy = "give unit and scale in the map of samii-rig import"
                 expected = f"{wanted!r}, as in the rig {rig.name!r}; {remedy}"
                 raise InputError(r.source, f"channel {c.name}: unit", c.unit, expected)
