@@ -112,9 +112,9 @@ def _gains() -> Unknown:
 
 
 def _corners(symbol: str, low_hz: float, high_hz: float) -> Unknown:
-    """A corner in rad/s, from far below the band to where it is invisible."""
+    """A corner in rad/s, from far below the band to where it is invisible: as late as `_times`."""
     w = 2 * math.pi * math.sqrt(low_hz * high_hz)
-    return _unknown(symbol, "rad/s", w / 30, 1e4 * w)
+    return _unknown(symbol, "rad/s", w / 30, 1e6 * high_hz)
 
 
 def _times(high_hz: float) -> Unknown:
