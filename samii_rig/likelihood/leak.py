@@ -60,10 +60,9 @@ def _leak(
             sums[:] = 0.0
             for j in range(first, end):
                 right = (j - first) / (last - first)
-                p = np.exp(complex(step, 2 * np.pi * j / M))
-                whole = np.exp(history * complex(step, 2 * np.pi * j / M))
-                whole -= np.exp((history + n) * complex(step, 2 * np.pi * j / M))
-                whole /= M
+                turn = complex(step, 2 * np.pi * j / M)  # of a sample
+                p = np.exp(turn)
+                whole = (np.exp(history * turn) - np.exp((history + n) * turn)) / M
                 _poles(W, p.real, p.imag)
                 for k in range(m):
                     w = X[k, j] * whole

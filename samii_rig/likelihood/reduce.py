@@ -335,21 +335,20 @@ def formed(
 
     known = rounding.Added.of([s.rounding for s in seen])
 
-    def told(with_past: Records, known: rounding.Added) -> tuple[Rows, Noise]:
+    def told(with_past: Records) -> tuple[Rows, Callable[[rounding.Added], Noise]]:
         rows = _rows(records, _columns(with_past, smooth, nodes), seen)
-        return rows, Noise.of(
-            *_with_repeats(records, H, seen, rows, *_residual(rows, free)),
-            disturbances=disturbances,
-            known=known,
-        )
+        left = _with_repeats(records, H, seen, rows, *_residual(rows, free))
+        return rows, lambda known: Noise.of(*left, disturbances=disturbances, known=known)
 
-    rows, power = told(records, known)
+    rows, noise = told(records)
+    power = noise(known)
     with_past = _with_past(records, rows, seen, power, free)
     if with_past is not None:
-        rows, power = told(with_past, known)
+        rows, noise = told(with_past)
+        power = noise(known)
     times = _as_changes(rows, seen, power)
     if np.any(times > 1):
-        rows, power = told(with_past or records, replace(known, times=times))
+        power = noise(replace(known, times=times))
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
     rows = rows.take(np.flatnonzero(counted))
     form = _quadratic(rows, power, S[nodes])
@@ -416,12 +415,12 @@ def _as_changes(rows: Rows, seen: Sequence[Seen], noise: Noise) -> Float:
     The error of a motion of few steps repeats as the motion does: after each step, at each passage
     of a mode. Tried at all places in the step, those of the pieces independent.
     """
-    q = rows.e.shape[1]
-    out = np.ones(q)
+    out = np.ones(rows.e.shape[1])
+    coarse = sorted({c for s in seen for c in s.rounding.draws})
+    if not coarse:
+        return out
     C = np.diagonal(noise.covariance(rows.f, rows.piece), axis1=1, axis2=2).real
-    for c in range(q):
-        if not any(c in s.rounding.draws for s in seen):
-            continue
+    for c in coarse:
         rng = np.random.default_rng(0)
         draws = [
             s.rounding.draws[c][rng.permutation(rounding.OFFSETS)].T

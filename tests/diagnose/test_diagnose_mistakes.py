@@ -28,6 +28,7 @@ LINES = np.geomspace(0.5, 40.0, 120)
 SENSORS = np.arange(len(RIG.sensor))
 ALL = list(mistakes.effects(RIG, RIG.rate_hz))
 TWO, _ = load_rig("two_masses")
+LATE = "stands samples from the sensors' columns, which are 2 samples later"
 
 
 def response(rig, *effects, lines=LINES):
@@ -79,11 +80,8 @@ def test_a_mistake_is_a_factor_that_is_exactly_known(physics, site, said, factor
 
 
 def test_a_logger_shifts_by_rows_of_the_recording_not_of_the_loop():
-    rows = [e for e in mistakes.effects(RIG, RIG.rate_hz / 4) if e.physics == "columns_shifted"]
+    (late,) = (e for e in mistakes.effects(RIG, RIG.rate_hz / 4) if e.variant.startswith(LATE))
     s = 2j * np.pi * LINES
-    late = one("columns_shifted", rows[0].site, "stands samples from the sensors'", [
-        e for e in rows if "2 samples later" in e.variant and "measured" not in e.variant
-    ])  # fmt: skip
     assert late.factor.value(s, np.zeros(0))[0] == pytest.approx(np.exp(-s * 8 / RIG.rate_hz))
 
 
@@ -140,13 +138,11 @@ def test_a_rig_a_quarter_stiffer_than_its_file_is_no_wrong_rate(rig):
         ("unit_error", "v", "is 1000 times"),
         ("sign_error", "a_2", "wrong sign"),
         # Both at once look like a dead time of the drive.
-        ("columns_shifted", "v", "measured, not held, and stands samples from the sensors'"),
+        ("columns_shifted", "v", f"measured, not held, and {LATE}"),
     ],
 )
 def test_it_is_told_and_no_physics_is_named(physics, site, said):
-    some = [e for e in mistakes.effects(TWO, TWO.rate_hz) if "2 samples later" in e.variant]
-    every = some if "shifted" in physics else list(mistakes.effects(TWO, TWO.rate_hz))
-    effect = one(physics, site, said, every)
+    effect = one(physics, site, said, list(mistakes.effects(TWO, TWO.rate_hz)))
     found = diagnose([measured(TWO, response(TWO, effect))], TWO)
     assert found.verdict == "no_mismatch"
     assert not found.causes

@@ -15,8 +15,9 @@ one level, as a force answers the same the same.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -126,16 +127,15 @@ def states_apart(every: Sequence[Given], left: float | None = None) -> list[Apar
     more; those that differ most come first. left : chi-square over its mean that is to be explained
     of all; None for what the models leave of each recording."""
     each = [_alone(given) if len(given.runs) > 1 else [] for given in every]
-    found = [_grouped(one) for one in each]
+    found = [_grouped(len(own), partial(_records_differ, own)) for own in each]
     if not any(len(one.groups) > 1 for one in found):
         return []
     if left is None:
         alone = [one or _alone(given) for given, one in zip(every, each, strict=True)]
         left = sum(_left(given, one) for given, one in zip(every, alone, strict=True))
-    whole = max(left, 1e-300)
     apart = [
-        Apart(one.states, one.worst, min(one.excess / whole, 1.0), given.where)
-        for given, one in zip(every, found, strict=True)
+        replace(one.apart([alone.name for alone in own], left), where=given.where)
+        for given, own, one in zip(every, each, found, strict=True)
         if len(one.groups) > 1
     ]
     return sorted(apart, key=lambda one: -one.differing)
@@ -143,31 +143,32 @@ def states_apart(every: Sequence[Given], left: float | None = None) -> list[Apar
 
 @dataclass(frozen=True, slots=True)
 class _Grouped:
-    """Recordings by their states. worst : chi-square per degree of freedom of the two that differ
-    most; excess : the most of it over its mean."""
+    """Recordings by their states. groups : of each the numbers. worst : chi-square per degree of
+    freedom of the two that differ most; excess : the most of it over its mean."""
 
-    groups: list[list[_Alone]]
+    groups: list[list[int]]
     worst: float
     excess: float
 
-    @property
-    def states(self) -> tuple[tuple[str, ...], ...]:
-        return tuple(tuple(one.name for one in group) for group in self.groups)
+    def apart(self, names: Sequence[str], left: float) -> Apart:
+        """What they differ by, of so much that is to be explained."""
+        states = tuple(tuple(names[i] for i in group) for group in self.groups)
+        return Apart(states, self.worst, min(self.excess / left, 1.0) if left > 0 else 1.0)
 
 
-def _grouped(each: Sequence[_Alone]) -> _Grouped:
-    groups: list[list[_Alone]] = []
+def _grouped(n: int, difference: Callable[[int, int], tuple[float, float, float]]) -> _Grouped:
+    """n recordings. difference : of two, chi-square, its mean and its standard deviation."""
+    groups: list[list[int]] = []
     worst = excess = 0.0
-    for one in each:
+    for i in range(n):
         for group in groups:
-            chi2, mean, sd = _difference(group[0].form, one.form)
-            differ = group[0].comparable(one) and chi2 > max(DIFFER * mean, mean + SURE * sd)
-            if not differ:
-                group.append(one)
+            chi2, mean, sd = difference(group[0], i)
+            if not chi2 > max(DIFFER * mean, mean + SURE * sd):
+                group.append(i)
                 break
             worst, excess = max(worst, chi2 / mean), max(excess, chi2 - mean)
         else:
-            groups.append([one])
+            groups.append([i])
     return _Grouped(groups, worst, excess)
 
 
@@ -204,6 +205,12 @@ def _own(run: Recording, findings: Sequence[Finding]) -> Sequence[Finding]:
     return [*foreign, *(f for f in findings if f.kind != REPEAT)]
 
 
+def _records_differ(each: Sequence[_Alone], i: int, j: int) -> tuple[float, float, float]:
+    """As `_difference`, of two of them; 0 where a force may let them differ."""
+    a, b = each[i], each[j]
+    return _difference(a.form, b.form) if a.comparable(b) else (0.0, 0.0, 0.0)
+
+
 def _difference(a: Reduced, b: Reduced) -> tuple[float, float, float]:
     """Chi-square of what no one response explains of two, its mean and its standard deviation."""
     m = a.factor.shape[0]
@@ -233,23 +240,12 @@ def lines_apart(files: Sequence[Saved], lines: Measured, left: float, rig: Rig) 
     lines : of all that take part; left : chi-square over its mean that the nominal model leaves of
     them.
     """
-    groups: list[list[Saved]] = []
-    worst = excess = 0.0
     band = float(lines.frequency[0]), float(lines.frequency[-1])
-    for one in files:
-        for group in groups:
-            chi2, mean, sd = _lines_differ(group[0][1], one[1], rig, band)
-            if not chi2 > max(DIFFER * mean, mean + SURE * sd):
-                group.append(one)
-                break
-            worst, excess = max(worst, chi2 / mean), max(excess, chi2 - mean)
-        else:
-            groups.append([one])
-    if len(groups) < 2:
+    names, each = zip(*files, strict=True)
+    found = _grouped(len(each), lambda i, j: _lines_differ(each[i], each[j], rig, band))
+    if len(found.groups) < 2:
         return None
-    states = tuple(tuple(name for name, _ in group) for group in groups)
-    part = min(excess / left, 1.0) if left > 0 else 1.0
-    return Apart(states, worst, part, samples=False)
+    return replace(found.apart(names, left), samples=False)
 
 
 def _lines_differ(
