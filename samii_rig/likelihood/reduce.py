@@ -413,7 +413,8 @@ def _as_changes(rows: Rows, seen: Sequence[Seen], noise: Noise) -> Float:
     its power that is independent from line to line, 1 at least.
 
     The error of a motion of few steps repeats as the motion does: after each step, at each passage
-    of a mode. Tried at all places in the step, those of the pieces independent.
+    of a mode, in pieces that move alike. Of all places in the step at which the sensor may rest,
+    alike in all pieces, those count that leave least of what is read.
     """
     out = np.ones(rows.e.shape[1])
     coarse = sorted({c for s in seen for c in s.rounding.draws})
@@ -421,20 +422,21 @@ def _as_changes(rows: Rows, seen: Sequence[Seen], noise: Noise) -> Float:
         return out
     C = np.diagonal(noise.covariance(rows.f, rows.piece), axis1=1, axis2=2).real
     for c in coarse:
-        rng = np.random.default_rng(0)
         draws = [
-            s.rounding.draws[c][rng.permutation(rounding.OFFSETS)].T
+            s.rounding.draws[c].T
             if c in s.rounding.draws
             else np.zeros((len(s.e), rounding.OFFSETS), complex)
             for s in seen
         ]
         scale = 1 / np.sqrt(C[:, c])[:, None]
         errors = np.asarray(np.concatenate(draws)[rows.order] * scale, np.complex128)
+        beyond = np.sum(np.abs(rows.e[:, c, None] * scale - errors) ** 2, axis=0)
+        errors = errors[:, np.argsort(beyond)[: rounding.LIKELY]]
         Q = orthonormal(as_real(rows.X * scale))
         power = np.mean(np.abs(errors) ** 2, axis=1) / 2  # of the real part, and of the other
         independent = float(np.sum(np.tile(power, 2) * np.sum(Q**2, axis=1)))
         if independent > 0:
-            shows = float(np.sum((Q.T @ as_real(errors)) ** 2)) / rounding.OFFSETS
+            shows = float(np.sum((Q.T @ as_real(errors)) ** 2)) / rounding.LIKELY
             out[c] = max(shows / independent, 1.0)
     return out
 

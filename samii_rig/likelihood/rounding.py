@@ -39,6 +39,7 @@ UNSEEN = 0.05  # of a staircase's error, what dithering leaves of it that nobody
 # told apart at most: each has bins of its own.
 APART, GROUPS = 1.5, 8
 OFFSETS = 16  # places of a motion in its step, at which its rounding is tried: within 25 % a line
+LIKELY = 4  # of these, that are nearest to what is read
 
 
 def repeating(spread: float) -> float:
@@ -144,14 +145,14 @@ class Rounding:
         factors, draws = {}, {}
         same = alike(piece, step)
         for i in np.flatnonzero(step > 0).tolist():
-            times = 1 + len(piece.repeats) * same[i]
-            power[:, i] = times * WHITE * step[i] ** 2
+            power[:, i] = (1 + len(piece.repeats) * same[i]) * WHITE * step[i] ** 2
             sd = _noise(piece.z[:, i] - y[:, i], float(step[i]))
             if sd >= DITHERED * step[i]:
                 continue
             parts = _parts(piece, y[:, i], float(step[i]), sd, rate_hz)
-            errors = _errors(y[:, i] / step[i], parts, sd / step[i])
-            spectra = np.fft.rfft(math.sqrt(times / n) * step[i] * errors, axis=1)
+            shares = np.array([c.part for c in piece.commands] or [1.0])
+            errors = _errors(y[:, i] / step[i], shares, parts, sd / step[i])
+            spectra = np.fft.rfft(step[i] / math.sqrt(n) * errors, axis=1)
             power[:, i] = np.mean(np.abs(spectra) ** 2, axis=0)
             factors[i], draws[i] = parts, np.asarray(spectra[:, k])
         return cls(frequency, power, factors, draws)
@@ -164,18 +165,21 @@ def _noise(left: Float, step: float) -> float:
     return math.sqrt(max(white - WHITE * step**2, 0.0))
 
 
-def _errors(y: Float, parts: Float, sd: float) -> Float:
+def _errors(y: Float, shares: Float, parts: Float, sd: float) -> Float:
     """(OFFSETS, n) rounding of a motion y (n,) in steps wherever it stands in its step, less what
     factors of its parts (p, n) explain.
 
-    sd : of the noise that dithers it, in steps.
+    shares : of the records behind it, whose sum it is, each with its share of y and of its own
+    rounding: repeats round alike, other levels otherwise. sd : of the noise that dithers each, in
+    steps.
     """
-    rng = np.random.default_rng(0)
+    dither = np.random.default_rng(0).standard_normal((shares.size, y.size)) * sd
+    moved = y * shares[:, None] + dither
     out = np.zeros((OFFSETS, y.size))
     size = np.sum(parts**2, axis=1)
     for one, offset in zip(out, (np.arange(OFFSETS) + 0.5) / OFFSETS, strict=True):
-        x = y + offset + rng.standard_normal(y.size) * sd
-        error = np.rint(x) - x
+        x = moved + offset
+        error = shares @ (np.rint(x) - x)
         error -= np.mean(error)
         one[:] = error - (parts @ error / size) @ parts
     return out

@@ -1,6 +1,7 @@
 """A search that is led into a valley gets out of it: each of these once ended at a wrong answer."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from identify_kit import noiseless, samii
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.fit.records import RecordSearch
 from samii_rig.diagnose.fit.refit import refit
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.model import Model, grid
@@ -110,3 +112,46 @@ def test_of_two_effects_the_one_behind_what_mimics_both_is_grown():
     search = search_of(redraw(exact, H[:, :, None], np.random.default_rng(1), 10), few, rig)
     search.run()
     assert {e.key for e in search.ranked()[0].effects} == {e.key for e in both}
+
+
+def test_who_starts_far_away_runs_on_while_that_falls_fast():
+    """Of two candidates the better one is still far after the first leg of the race."""
+    near, far = (effect("attached_oscillator", n) for n in ("link_0", "beam"))
+    costs = {near: iter([1150.0, 1140.0]), far: iter([1.6e4, 770.0, 769.0])}
+
+    class Raced(Search):
+        def refitted_from(self, effects, start, give_up=np.inf, steps=0, *, far=True):
+            return SimpleNamespace(cost=next(costs[effects[0]]), x=start)
+
+    raced = object.__new__(Raced)
+    raced.progress = lambda _: None
+    ends = raced._ahead([(1.0, (near,), [1]), (1.0, (far,), [2])])
+    assert [(cost, effects) for cost, effects, _ in ends] == [(769.0, (far,)), (1140.0, (near,))]
+
+
+def test_a_sensor_that_lags_is_seen_beside_a_command_that_was_measured():
+    """What is wrong with the data hides what is missing of the rig, and is no answer by itself."""
+    unheld, late = effect("input_not_held", "v_2"), effect("sensor_lag", "a_1")
+    found = concealing((unheld, []), (late, [3000.0]))
+    search = search_of(found, [unheld, late, effect("added_mass", "link_2", "added")])
+    best = search.run(briefly=True)[0]
+    assert {e.physics for e in best.effects} == {"input_not_held", "sensor_lag"}
+
+
+def test_the_noise_of_records_is_told_anew_by_the_rig_that_was_found():
+    late = effect("sensor_lag", "a_1")
+    told = []
+
+    class Told(RecordSearch):
+        def _stands(self, fitted, times=1.0):
+            return True
+
+        def _about(self, fitted):
+            told.append(fitted.model.effects)
+            self._rig = fitted.model.effects
+
+    search = object.__new__(Told)
+    search._rig = ()
+    for effects in ((), (late,), (late,)):
+        search.rebin(SimpleNamespace(model=SimpleNamespace(effects=effects)))
+    assert told == [(late,)]

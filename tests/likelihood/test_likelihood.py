@@ -516,6 +516,30 @@ def test_the_rounding_of_a_motion_that_follows_the_input_is_no_change_of_the_res
     assert 0.7 < np.mean(left) < 1.1
 
 
+def coarse(u: Float, denominator: Float, place: float, rng: np.random.Generator) -> Piece:
+    """What a converter of steps of 2 shows of a motion that rests at a place in its step."""
+    z = from_rest(u, denominator)
+    z[:, 0] = np.rint(z[:, 0] / 2 + place) * 2 - 2 * place
+    z[:, 1] += 1e-2 * rng.standard_normal(u.size)
+    return replace(piece(u, z), commands=(pieces.Command(u, 1.0),))
+
+
+def test_what_rests_at_one_place_in_its_step_is_rounded_alike_in_all_records():
+    """One motion in several records and at two levels, some of them joined. Each by itself, the
+    levels taken for one larger motion, 1.5."""
+    left, denominator = [], poles(damping=0.08)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        u, place = np.repeat(rng.choice([-1.0, 1.0], 20), 400), rng.random()
+        parts = (u, 0.63 * u, u[:-9], 0.63 * u[:-50])
+        found = tuple(pieces.joined([coarse(x, denominator, place, rng) for x in parts]))
+        assert [len(p.commands) for p in found] == [2, 1, 1]
+        records = Records(found, RATE, ((0.8, 15.0),) * 3, (2.0, 0.0))
+        form = reduced(records, lambda s: response(s, denominator), own_alone)
+        left.append(float(form.target @ form.target) / form.known)
+    assert 0.6 < np.mean(left) < 1.15, left
+
+
 @pytest.mark.parametrize("every", [1, 2, 3, 7, 10, 16, 64])
 def test_one_line_in_ten_is_kept_apart_of_any_comb(every: int):
     k = np.arange(every, 400 * every, every)

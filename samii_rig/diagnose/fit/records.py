@@ -524,6 +524,7 @@ class RecordSearch(Search):
         self.problem = RecordProblem.about(self.whole, fitted, self.by_line.problem)
         between = self.whole.between(self.reduced, fitted)
         self._between = between, fitted.model.response(fitted.x, between)
+        self._rig = fitted.model.effects
 
     def _stands(self, fitted: Fitted, times: float = 1.0) -> bool:
         """Whether a fit changes the response as linearly between nodes as the likelihood has it, to
@@ -596,10 +597,10 @@ class RecordSearch(Search):
         return left * alike
 
     def rebin(self, fitted: Fitted) -> None:
-        """The likelihood anew, about this fit, unless the one in use serves."""
-        if self._stands(fitted):
-            return
-        self._about(fitted)
+        """The likelihood anew, about this fit, unless the one in use serves: what disturbs the rig
+        comes out through it, so that the noise is that of one rig."""
+        if self._rig != fitted.model.effects or not self._stands(fitted):
+            self._about(fitted)
 
     def _nearest(self) -> Explanation:
         return self.ranked()[0]

@@ -39,7 +39,8 @@ ANYHOW = 2  # of the most promising in another's place are refitted whatever the
 SHARE = 0.3  # of the best candidate's gain: one that promises less is not refitted
 BENT = 3.0  # of the penalty of a nominal parameter above which the refit hides what is missing
 GROSS = 8.0  # chi-square over its mean above which candidates race before they are refitted
-AHEAD, FINALISTS = 5, 5  # steps of that race, and how many go on
+AHEAD, FINALISTS = 5, 5  # steps of a leg of that race, and how many go on after it
+FALLING = 0.5  # of its cost, after a leg, below which one is still on its way and runs another
 OTHERS = 3  # of other physics than theirs, that go on too
 SWITCHED = 12  # effects without unknowns that race: the nearest as the rig file has the rest
 BROAD = 4  # single effects of different physics that are grown where none is enough
@@ -54,18 +55,25 @@ class Search(Explanations):
 
     def run(self, *, briefly: bool = False) -> list[Explanation]:
         """Grow, swap, prune; all explanations, the most probable first. briefly : single effects
-        alone."""
+        alone, and beside what is wrong with the data."""
         self.grow(self.nominal, FIRST, open_to_all=not briefly)
         if self._bent(self.ranked()[0]):
             self.grow(self._straight(), STRAIGHT, again=True)
         self.temper()
+        best = self.ranked()[0]
+        if briefly and mistaken(best.effects) and not self._enough(best):
+            self.renew(best)
+            self.grow(self.ranked()[0], FIRST)
+            self.temper()
         if briefly:
             return self.ranked()
+        about = self.nominal.key
         for turn in range(MOST - 1):
             before = self._nearest() if turn == 0 else self.ranked()[0]
             if not before.effects:
                 break
             self.renew(before)
+            about = before.key
             if turn == 0 and not self._enough(self.ranked()[0]):
                 # What is one of two often stands behind what mimics both.
                 for base in list(_each_physics(self.ranked()))[:BROAD]:
@@ -86,6 +94,9 @@ class Search(Explanations):
             self.prune()
             if self.ranked()[0].key == best.key:
                 break
+        if (best := self.ranked()[0]).key != about and best.effects:
+            self.renew(best)
+            self.temper()
         return self.ranked()
 
     def _bent(self, best: Explanation) -> bool:
@@ -161,7 +172,7 @@ class Search(Explanations):
         return len(real) > MIXED and len(set(real)) > 1
 
     def _ahead(self, tried: Sequence[Candidate]) -> list[Candidate]:
-        """Those that a few steps of a refit bring farthest, from where these ended.
+        """Those that the first steps of a refit bring farthest, from where these ended.
 
         Far from the noise the nominal parameters stand where they mend what is missing, and
         what a screen about them says of a cure does not rank it.
@@ -169,7 +180,7 @@ class Search(Explanations):
         ends = []
         for _, effects, starts in self.each(tried, lambda one: named(one[1])):
             for x in starts:
-                end = self.refitted_from(effects, x, steps=AHEAD)
+                end = self._run(effects, x)
                 if end is not None:
                     ends.append((end.cost, effects, [end.x]))
         ends.sort(key=lambda end: end[0])
@@ -180,6 +191,15 @@ class Search(Explanations):
             if (physics := other[1][-1].physics) not in seen:
                 others.setdefault(physics, other)
         return first + list(others.values())[:OTHERS]
+
+    def _run(self, effects: tuple[Effect, ...], x: Float) -> Fitted | None:
+        """A refit for as long as it falls fast: who starts far away is not behind for that."""
+        end = self.refitted_from(effects, x, steps=AHEAD)
+        cost = math.inf
+        while end is not None and end.cost < FALLING * cost:
+            cost = end.cost
+            end = self.refitted_from(effects, end.x, steps=AHEAD) or end
+        return end
 
     def screen(self, base: Explanation) -> list[tuple[float, Effect, list[Start]]]:
         """How far chi-square should fall with each further effect, and one or two starts for its
@@ -323,6 +343,11 @@ class Search(Explanations):
             end = self.refitted(e.effects, e)
             if end is not None:
                 self.keep(e.effects, end)
+
+
+def mistaken(effects: Sequence[Effect]) -> bool:
+    """Whether these are of the data alone, not of the rig."""
+    return bool(effects) and not any(e.physical for e in effects)
 
 
 def _without(whole: Explanation) -> Callable[[int], str]:

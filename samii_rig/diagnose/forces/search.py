@@ -60,10 +60,7 @@ class ForceSearch(RecordSearch):
         self.levels = whole = linear.whole.by_level().with_harmonics()
         self._ways = Ways()
         self.linear = linear
-        base = linear.ranked()[0]
-        if any(e.physical for e in base.effects):
-            base = linear.nominal
-        moved = base.fitted
+        moved = _of_data(linear).fitted
         self.reach = Reach(whole, moved.model, moved.x, int(linear.grid.actuator[0]))
         self.forces = tuple(forces(whole.rig, self.reach))
         super().__init__(whole, linear.by_line)
@@ -114,10 +111,12 @@ class ForceSearch(RecordSearch):
     def settled(self) -> bool:
         """Refit what promises most, and all that may compete again about the best of it, until
         that stands still. Whether it has a force."""
-        first = next((e for e in self.ranked() if len(e.effects) == 1), None)
-        ahead = 0.0 if first is None else self.nominal.fitted.cost - first.fitted.cost
+        base = _of_data(self)
         # Without what is wrong with the data itself nothing can be seen of a force beside it.
-        mistaken = first is not None and not any(e.physical for e in first.effects)
+        mistaken = bool(base.effects)
+        single = (e for e in self.ranked() if len(e.effects) == 1)
+        first = base if mistaken else next(single, None)
+        ahead = 0.0 if first is None else self.nominal.fitted.cost - first.fitted.cost
         both = [self.nominal] if first is None or mistaken else [self.nominal, first]
         hopes = self.hopes(both)
         self._try([h for h in hopes if h.own[0] >= STRONG * ahead], self.nominal, 0)
@@ -306,6 +305,14 @@ def compete_on_records(linear: RecordSearch) -> ForceSearch | None:
     """
     search = ForceSearch(linear)
     return search if search.settled() else None
+
+
+def _of_data(search: Explanations) -> Explanation:
+    """What is wrong with the data by the most probable explanation, without what is missing of the
+    rig: the nominal model where that is nothing."""
+    best = search.ranked()[0].effects
+    mistakes = frozenset(e.key for e in best if not e.physical)
+    return search.found.get(mistakes, search.nominal)
 
 
 def _worth_while(hopes: Sequence[Hope], worth: float, look: int) -> list[Hope]:
