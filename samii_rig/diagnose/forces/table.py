@@ -36,7 +36,6 @@ from samii_rig.rig.schema import (
 Spring = TorsionalSpring | TranslationalSpring | TorsionalGroundSpring | TranslationalGroundSpring
 
 STARTS = 14  # of a strength over its range
-COMPUTED = 0.01  # of a strength: what it was off by where it is hidden in strong forces
 RANGE = (1e-6, 30.0)  # of a strength over the one that doubles or halves the motion at its place
 SOFTEST = 1.0  # the same of a stiffness that falls: beyond, a spring would push
 WIDTHS = (1e-6, 2.0)  # of a gap or limit over the largest amplitude that meets it
@@ -152,7 +151,7 @@ def effect(
         unknowns=unknowns,
         quasi=Force(place, law, scale),
         aliases=((law.physics, alias),) if alias else (),
-        rough=0.0 if place.kind == "command" else COMPUTED,
+        rough=0.0 if place.kind == "command" else law.rough,
         variant=f"{law.tag} {place.name}",
         report=(lambda x: -x) if softens else (lambda x: x),
     )
