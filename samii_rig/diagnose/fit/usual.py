@@ -14,10 +14,10 @@ from samii_rig.progress import START
 Usual = Mapping[str, tuple[float, float]]
 
 # s for each thousand samples, or lines: of 31 concealed trials of 9,000 to 339,000 samples, of the
-# 150 to 5,200 lines of 33, of two states of 20,000 samples in 9 trials, of 8 arms in two poses.
+# 150 to 5,200 lines of 33, of two states of 20,000 samples in 18 trials, of 8 arms in two poses.
 RECORDS_TAKE = (0.08, 0.7)
 LINES_TAKE = (0.25, 9.5)
-STATES_TAKE = (0.25, 0.6)
+STATES_TAKE = (0.2, 0.75)
 POSES_TAKE = (0.16, 1.1)
 LEAST = 0.5  # s: the work that every diagnosis has
 
@@ -50,19 +50,20 @@ LINES: Usual = {
     "what is missing, round 16": (0.06, 0.54),
     "what cannot be told apart": (0.02, 0.46),
 }
-# Of 9 trials of two states on two rigs, from the state before on: 7 s in the median.
+# Of 18 trials of two states on four rigs, from the state before on: 9 s in the median.
 STATES: Usual = {
     "before: what is missing": START,
-    "before: what is missing, round 2": (13.0, 25.0),
-    "before: amplitude levels": (8.8, 16.0),
-    "before: amplitude levels, round 1": (3.3, 7.1),
-    "before: what is missing, in pairs": (2.8, 5.6),
-    "before: what cannot be told apart": (1.7, 3.3),
-    "both states": (1.3, 2.7),
-    "what changed": (0.38, 1.0),
-    "what changed, round 2": (0.47, 0.66),
-    "what changed, round 4": (0.36, 0.54),
-    "what cannot be told apart": (0.11, 0.15),
+    "before: what is missing, round 2": (17.0, 27.0),
+    "before: amplitude levels": (11.0, 19.0),
+    "before: amplitude levels, round 1": (3.6, 8.7),
+    "before: what is missing, in pairs": (3.0, 6.2),
+    "before: what is missing, in pairs, round 4": (2.4, 3.4),
+    "before: what cannot be told apart": (1.7, 4.4),
+    "both states": (1.3, 3.5),
+    "what changed": (0.39, 1.0),
+    "what changed, round 2": (0.34, 0.69),
+    "what changed, round 4": (0.28, 0.53),
+    "what cannot be told apart": (0.07, 0.15),
 }
 # Of 12 arms of two links in two poses, 7 s in the median.
 POSES: Usual = {
