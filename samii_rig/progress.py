@@ -115,6 +115,7 @@ class Pace:
         self._first, self._begun = 0, clock()
         self._all_begun: float | None = None
         self._ends: tuple[float, float] | None = None
+        self._by_size = False  # that end is told by the work's size alone
         self._aside: float | None = None
 
     def words(self, stage: str) -> str:
@@ -158,14 +159,14 @@ class Pace:
         now = self.clock()
         if stage.takes is not None:
             low, high = stage.takes
-            self._ends = now + low, now + high
+            self._ends, self._by_size = (now + low, now + high), True
         if stage.rest is None or (stage.rest == START and self._all_begun is not None):
             self._ends = None if stage.takes is None else self._ends
         elif self._all_begun is None:
             self._all_begun = now
         elif (spent := now - self._all_begun) >= SOON:
             low, high = stage.rest
-            self._ends = now + low * spent, now + high * spent
+            self._ends, self._by_size = (now + low * spent, now + high * spent), False
 
     def _to_the_end(self, left: float) -> str:
         """Of all work, no less than is left of a part of it."""
@@ -173,7 +174,8 @@ class Pace:
             return ""
         low, high = (end - self.clock() for end in self._ends)
         if high < left:
-            return ", longer than most"
+            # By the size alone it says as much of a busy machine as of the work.
+            return "" if self._by_size else ", longer than most"
         low_, high_ = (duration(_rough(max(end, left))) for end in (low, high))
         if low_ == high_ or max(low, left) < SOON:
             return f", up to {high_} to the end"

@@ -112,6 +112,8 @@ def test_the_first_stage_tells_it_by_how_much_there_is_to_do() -> None:
     said = "nominal model of whole records, fit 2 of at most 6"
     assert pace.words(said) == f"{said}, 3 s to 65 s to the end"
     assert pace.words(Begun("what is missing", START)).endswith("3 s to 65 s to the end")
+    now[0] = 80.0  # a busy machine, of which the size says nothing
+    assert pace.words("fit 3") == "fit 3"
     now[0] = 9.0
     assert pace.words(Begun("round 2", (1.0, 5.0))) == "round 2, 4 s to 20 s to the end"
 
