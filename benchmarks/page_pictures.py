@@ -74,6 +74,7 @@ def running(browser: Browser, into: Path) -> list[str]:
     browser.picture(into / "service-so-far.png")
     browser.press("Escape")
     browser.until(text("now", ".includes('output is at zero')"), LONG)
+    browser.until("!document.getElementById('kept').hidden", LONG)
     browser.value(SETTLES)
     browser.picture(into / "service-stopped.png")
     return ["service.png", *made, "service-so-far.png", "service-stopped.png"]

@@ -5,14 +5,15 @@
         ...
 
 Who shows it (`samii_rig.report.summary.working`) asks a `Pace` for the words. Where nobody knows
-how many rounds there will be, a stage that begins says how long the rest usually takes (`Begun`).
+how many rounds there will be, a stage that begins says how long the rest usually takes (`Begun`):
+by how much there is to do at first, then by what was spent.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Self, TypeVar
 
@@ -30,15 +31,27 @@ STEPS = ((600.0, 60.0), (120.0, 30.0), (20.0, 5.0), (0.0, 1.0))
 class Begun(str):
     """The words of a stage that begins. rest : from here to the end of all work, over what was
     spent since the first stage that has one: the tenth and the ninetieth percentile of such work;
-    None where nobody knows."""
+    None where nobody knows. takes : the same in s of a processor, for work of its size, before
+    anything is spent that the rest could be told from."""
 
     rest: tuple[float, float] | None
+    takes: tuple[float, float] | None
 
-    def __new__(cls, stage: str, rest: tuple[float, float] | None = None) -> Self:
+    def __new__(
+        cls,
+        stage: str,
+        rest: tuple[float, float] | None = None,
+        takes: tuple[float, float] | None = None,
+    ) -> Self:
         """stage : its words."""
         made = super().__new__(cls, stage)
-        made.rest = rest
+        made.rest, made.takes = rest, takes
         return made
+
+
+class Aside(str):
+    """What is done once, whatever else is done, as the compilation of kernels: the time until the
+    next words are told is none of the work's."""
 
 
 class Counted(str):
@@ -72,14 +85,24 @@ def counted(
         yield part
 
 
-def ahead(words: str, stage: str, *, whole: bool = False) -> str:
+def ahead(
+    words: str,
+    stage: str,
+    *,
+    whole: bool = False,
+    usual: Mapping[str, tuple[float, float]] | None = None,
+) -> str:
     """The same stage, as a part of something larger that is named before it. whole : whether its
-    end is that of all work, too."""
+    end is that of all work, too. usual : how long the rest of the larger takes from it on; what is
+    not in it is told as any words are."""
     if isinstance(stage, Counted):
         return Counted(words + stage.stage, stage.done, stage.of, stage.at, stage.within)
-    if isinstance(stage, Begun):
-        return Begun(words + stage, stage.rest if whole else None)
-    return words + stage
+    said = words + stage
+    if isinstance(stage, Begun) and whole:
+        return Begun(said, stage.rest, stage.takes)
+    if isinstance(stage, Begun) and usual and said in usual:
+        return Begun(said, usual[said])
+    return said
 
 
 class Pace:
@@ -92,9 +115,15 @@ class Pace:
         self._first, self._begun = 0, clock()
         self._all_begun: float | None = None
         self._ends: tuple[float, float] | None = None
+        self._by_size = False  # that end is told by the work's size alone
+        self._aside: float | None = None
 
     def words(self, stage: str) -> str:
         """The stage, with the time left where it can be said."""
+        self._goes_on()
+        if isinstance(stage, Aside):
+            self._aside = self.clock()
+            return str(stage)
         if isinstance(stage, Begun):
             self._begins(stage)
         left = self._left(stage) if isinstance(stage, Counted) else 0.0
@@ -103,6 +132,18 @@ class Pace:
             of = " of this round" if isinstance(stage, Counted) and stage.within else ""
             said += f", {duration(left)} left{of}"
         return said + self._to_the_end(left)
+
+    def _goes_on(self) -> None:
+        """What was done aside is over: it counts for nothing."""
+        if self._aside is None:
+            return
+        took, self._aside = self.clock() - self._aside, None
+        self._begun += took
+        if self._all_begun is not None:
+            self._all_begun += took
+        if self._ends is not None:
+            low, high = self._ends
+            self._ends = low + took, high + took
 
     def _left(self, stage: Counted) -> float:
         """s of what is counted; 0 where that is not known yet."""
@@ -116,13 +157,16 @@ class Pace:
 
     def _begins(self, stage: Begun) -> None:
         now = self.clock()
+        if stage.takes is not None:
+            low, high = stage.takes
+            self._ends, self._by_size = (now + low, now + high), True
         if stage.rest is None or (stage.rest == START and self._all_begun is not None):
-            self._ends = None
+            self._ends = None if stage.takes is None else self._ends
         elif self._all_begun is None:
             self._all_begun = now
         elif (spent := now - self._all_begun) >= SOON:
             low, high = stage.rest
-            self._ends = now + low * spent, now + high * spent
+            self._ends, self._by_size = (now + low * spent, now + high * spent), False
 
     def _to_the_end(self, left: float) -> str:
         """Of all work, no less than is left of a part of it."""
@@ -130,7 +174,8 @@ class Pace:
             return ""
         low, high = (end - self.clock() for end in self._ends)
         if high < left:
-            return ", longer than most"
+            # By the size alone it says as much of a busy machine as of the work.
+            return "" if self._by_size else ", longer than most"
         low_, high_ = (duration(_rough(max(end, left))) for end in (low, high))
         if low_ == high_ or max(low, left) < SOON:
             return f", up to {high_} to the end"

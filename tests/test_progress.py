@@ -1,16 +1,29 @@
 """What long work says of itself.
 
 Plan: the time left is that of the pace so far, and is not said before there is a pace; another
-round has its own; what is left of all work is that of most such work, no less than of a part of it;
-the service tells it once a second.
+round has its own; what is left of all work is that of most such work, first by its size, and no
+less than of a part of it; the service tells it once a second.
 """
 
 from __future__ import annotations
 
 import pytest
+from states_kit import RIG, effects, recorded
 
-from samii_rig.diagnose.fit.usual import LINES, POSES, RECORDS, STATES
-from samii_rig.progress import START, Begun, Counted, Pace, ahead, counted, duration, telling
+from samii_rig.diagnose.changed import changed
+from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.fit.usual import LINES, POSES, RECORDS, STATES, takes
+from samii_rig.progress import (
+    START,
+    Aside,
+    Begun,
+    Counted,
+    Pace,
+    ahead,
+    counted,
+    duration,
+    telling,
+)
 
 
 def test_the_time_left_is_that_of_the_pace_so_far() -> None:
@@ -88,13 +101,70 @@ def test_the_time_to_the_end_is_that_of_most_such_work() -> None:
     assert pace.words(Begun("another search")) == "another search"
 
 
-def test_what_is_a_part_of_more_tells_no_end_of_all() -> None:
-    stage = Begun("what is missing", (1.0, 2.0))
-    part, whole = (ahead("before: ", stage, whole=whole) for whole in (False, True))
+def test_the_first_stage_tells_it_by_how_much_there_is_to_do() -> None:
+    now = [0.0]
+    pace = Pace(lambda: now[0])
+    assert takes((0.08, 0.7), 40_000) == pytest.approx((3.2, 28.0))
+    assert takes((0.08, 0.7), 10) == (0.5, 1.0)
+    first = Begun("nominal model", takes=takes((0.08, 0.7), 100_000))
+    assert pace.words(first) == "nominal model, 8 s to 70 s to the end"
+    now[0] = 5.0  # and all the way to where there is a pace
+    said = "nominal model of whole records, fit 2 of at most 6"
+    assert pace.words(said) == f"{said}, 3 s to 65 s to the end"
+    assert pace.words(Begun("what is missing", START)).endswith("3 s to 65 s to the end")
+    now[0] = 80.0  # a busy machine, of which the size says nothing
+    assert pace.words("fit 3") == "fit 3"
+    now[0] = 9.0
+    assert pace.words(Begun("round 2", (1.0, 5.0))) == "round 2, 4 s to 20 s to the end"
+
+
+def test_what_is_done_aside_counts_for_nothing() -> None:
+    now = [0.0]
+    pace = Pace(lambda: now[0])
+    pace.words(Begun("nominal model", START, (10.0, 20.0)))
+    now[0] = 2.0
+    assert pace.words(Aside("compiling the kernels")) == "compiling the kernels"
+    now[0] = 32.0
+    assert pace.words("fit 1").endswith("fit 1, 8 s to 18 s to the end")
+    assert pace.words(Begun("round 2", (2.0, 3.0))) == "round 2, 4 s to 6 s to the end"
+
+
+def test_a_part_of_more_tells_the_end_of_all_where_that_is_known() -> None:
+    usual = {"before: what is missing": (3.0, 9.0)}
+    stage = Begun("what is missing", (1.0, 2.0), (5.0, 6.0))
+    whole, part = ahead("before: ", stage, whole=True), ahead("before: ", stage, usual=usual)
     assert part == whole == "before: what is missing"
     assert isinstance(part, Begun)
     assert isinstance(whole, Begun)
-    assert (part.rest, whole.rest) == (None, (1.0, 2.0))
+    assert (part.rest, part.takes) == ((3.0, 9.0), None)
+    assert (whole.rest, whole.takes) == ((1.0, 2.0), (5.0, 6.0))
+    # What nobody counted leaves what was told.
+    assert not isinstance(ahead("before: ", Begun("in pairs", (1.0, 2.0)), usual=usual), Begun)
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_a_diagnosis_tells_its_end_from_its_first_stage_on(several: bool) -> None:
+    """Of one state, and of two while the state before is diagnosed."""
+    state, said = recorded(0), []
+
+    def say(stage: str) -> None:
+        said.append(stage)
+
+    few = effects("added_mass", site="link_1")
+    if several:
+        changed(state, recorded(1), RIG, effects=few, progress=say)
+    else:
+        diagnose(state.responses, RIG, runs=state.runs, effects=few, progress=say)
+    assert isinstance(said[0], Begun)
+    assert said[0].takes is not None
+    pace = Pace(iter(0.01 * k for k in range(10**6)).__next__)
+    words = [pace.words(stage) for stage in said]
+    whole = [w for w in words if "nominal model of whole records" in w]
+    assert whole
+    before = [w for w in words if w.startswith("before: ")]
+    assert bool(before) == several
+    for told in (*whole[:1], *before):
+        assert told.endswith("to the end")
 
 
 def test_the_rest_of_a_diagnosis_is_known_at_its_stages() -> None:

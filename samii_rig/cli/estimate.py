@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -23,7 +24,7 @@ from samii_rig.cli.common import (
 from samii_rig.errors import EstimateError, InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from samii_rig.rig.schema import Rig
     from samii_rig.signal.choose import Method
@@ -120,6 +121,10 @@ def frf(
     recordings = read_all(logs)
     responses = estimated(recordings, input_, output, method, gaps, band)
     held = rig_of(recordings, rig)
+    if save and held and len(recordings) > 1:
+        _of_one_state(
+            recordings, held[0], lambda one: estimated([one], input_, output, method, gaps, band)
+        )
     curve = model_curve(held[0], responses) if held else None
     written = []
     for path in export or ():
@@ -271,6 +276,31 @@ def _of_one_pose(recordings: list[Recording], rig: Rig | None) -> Rig:
         raise without_rig()
     expected = "recordings in one pose; samii-rig diagnose takes those of several"
     return at_pose(rig, one_pose(poses_of(recordings, rig, ()), "--diagnosis", expected))
+
+
+def _of_one_state(
+    recordings: Sequence[Recording],
+    rig: Rig,
+    alone: Callable[[Recording], Sequence[FrequencyResponse]],
+) -> None:
+    """InputError for recordings of several states of the rig: in one file of responses nobody could
+    tell them apart any more. alone : the responses of one by itself."""
+    from samii_rig.diagnose.fit.agreeing import states_of
+
+    each = []
+    for one in recordings:
+        # What gives no response by itself shows no state either.
+        with suppress(EstimateError):
+            each.append((one.source, alone(one)))
+    states = states_of(each, rig) if len(each) > 1 else ()
+    if len(states) > 1:
+        told = "; ".join(", ".join(names) for names in states)
+        raise InputError.saying(
+            "--save",
+            "",
+            f"the recordings are of {len(states)} states of the rig ({told}); expected those of "
+            "one in a file",
+        )
 
 
 def read_all(logs: list[Path]) -> list[Recording]:

@@ -81,8 +81,6 @@ def run(
 
     Example: samii-rig run swept_sine --rig samii
     """
-    from rich.console import Console
-
     from samii_rig.cli.arguments import check_experiment, check_rig
     from samii_rig.files import check_folder
 
@@ -95,6 +93,9 @@ def run(
     if describe:
         _describe(experiment, rig)
         return
+    # Last: what is wrong in the words before is said without it.
+    from rich.console import Console
+
     said = Said(
         Console(highlight=False),
         out,

@@ -17,13 +17,14 @@ from samii_rig.diagnose.fit.known import with_known
 from samii_rig.diagnose.fit.records import RecordSearch, Whole, within
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.states import Both, StatesSearch
+from samii_rig.diagnose.fit.usual import STATES, STATES_TAKE, takes
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.insert import PREFIX
 from samii_rig.diagnose.result import Before, Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError
-from samii_rig.progress import Progress, ahead
+from samii_rig.progress import Begun, Progress, ahead
 from samii_rig.rig.schema import RelativeAngle, Rig
 from samii_rig.rig.schema.elements import Branch, flattened, parameters
 from samii_rig.types import FrequencyResponse, Recording
@@ -70,17 +71,19 @@ def changed(
     """
     with_known(rig, known or {})  # what is wrong is said before the work
     first_rig = with_known(rig, known_before or {}, "--known-before")
+    n = sum(map(len, [*before.runs, *after.runs]))
+    progress(Begun("two states", takes=takes(STATES_TAKE, n)))
     found = diagnose(
         before.responses,
         first_rig,
         band=band,
         effects=effects,
         runs=before.runs,
-        progress=lambda stage: progress(ahead("before: ", stage)),
+        progress=lambda stage: progress(ahead("before: ", stage, usual=STATES)),
     )
     put_in = found.verdict != "no_mismatch" and found.rig is not None
     common = common_rig(first_rig, found.rig) if put_in and found.rig else first_rig
-    progress("both states")
+    progress(Begun("both states", STATES["both states"]))
     first = case_of(before.responses, common, band, effects, before.runs, progress=progress)
     # What is known of the state before alone is as the rig file has it after.
     own = _as_in(common, rig, known_before or {})

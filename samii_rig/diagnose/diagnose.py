@@ -16,6 +16,7 @@ from samii_rig.diagnose.data.measured import measured, usable
 from samii_rig.diagnose.fit.agreeing import Saved
 from samii_rig.diagnose.fit.classes import without_twins
 from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.fit.usual import LINES_TAKE, RECORDS_TAKE, takes
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import grid
 from samii_rig.diagnose.physics.poses import weighty
@@ -24,7 +25,7 @@ from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_line import by_lines
 from samii_rig.diagnose.verdict.by_record import by_records, on_records
 from samii_rig.diagnose.verdict.stages import Case
-from samii_rig.progress import Progress
+from samii_rig.progress import Begun, Progress
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
 
@@ -75,7 +76,8 @@ def diagnose(
 
     Raises InputError and EstimateError as `samii_rig.identify.data.collect` does.
     """
-    progress("nominal model")
+    n = sum(map(len, runs)) if runs else sum(r.frequency.size for r in responses)
+    progress(Begun("nominal model", takes=takes(RECORDS_TAKE if runs else LINES_TAKE, n)))
     case = case_of(responses, rig, band, effects, runs, progress=progress)
     case = replace(case, files=files)
     search = on_records(case, band)

@@ -16,13 +16,14 @@ from samii_rig.diagnose.diagnose import case_of, diagnose, table
 from samii_rig.diagnose.fit.agreeing import Given
 from samii_rig.diagnose.fit.poses import InPoses, PosesSearch
 from samii_rig.diagnose.fit.records import Whole
+from samii_rig.diagnose.fit.usual import POSES_TAKE, takes
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.identify.poses import at_pose, by_pose
-from samii_rig.progress import Progress
+from samii_rig.progress import Begun, Progress
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
@@ -104,7 +105,8 @@ def in_poses(
         return diagnose(
             one.responses, rigs[0], band=band, effects=effects, progress=progress, runs=one.runs
         )
-    progress("nominal model")
+    n = sum(len(run) for one in each for run in one.runs)
+    progress(Begun("nominal model", takes=takes(POSES_TAKE, n)))
     if effects is None:
         rate = each[0].responses[0].rate_hz
         effects = table(rigs[0], *_measured(each, band), poses=rigs, recorded_hz=rate)

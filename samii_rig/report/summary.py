@@ -17,7 +17,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from samii_rig.progress import Counted, Pace, duration
+from samii_rig.progress import Aside, Counted, Pace, duration
 from samii_rig.report.compare import Comparison, ModelCurve, compare, percent
 from samii_rig.report.facts import names
 from samii_rig.report.modes import Modes, modes_table
@@ -192,7 +192,7 @@ def _compiling(say: Callable[[str], None]) -> Iterator[Callable[[str], None]]:
 
     class Heard(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            say(record.getMessage())
+            say(Aside(record.getMessage()))
 
     heard = Heard()
     KERNELS.addHandler(heard)

@@ -47,6 +47,7 @@ def carry_out(
     loop: LoopSettings | None = None,
     watch: Callable[[SampleBlock], None] | None = None,
     at_rest: Callable[[StopRecord], None] | None = None,
+    why: Callable[[StopRecord], str] | None = None,
 ) -> Outcome:
     """Run the order's plan on the rig's device into the recording `path`, estimate, close.
 
@@ -54,8 +55,9 @@ def carry_out(
     is estimated where it suffices. A FAULT on a real rig is latched (`samii_rig.safety.latch`), and
     while one is, nothing is opened. progress, stop, alive, loop : see `samii_rig.run.loop.run`.
     watch : gets every block after it was recorded, for a display; it must neither wait nor raise.
-    at_rest : is told how the run ended once nothing moves, before the estimate is made and the
-    recording closed.
+    why : is asked for the reason of an end, where it may be known better than here: a signal does
+    not say who sent it. at_rest : is told how the run ended once nothing moves, before the estimate
+    is made and the recording closed.
 
     Raises LimitError if the order would break a limit, GateError for a latched fault, DeviceError
     if the rig does not open or another program drives it, RecordingError if the file cannot be
@@ -94,6 +96,8 @@ def carry_out(
                     interrupts=interrupts,
                     latch=latch.set if real else None,
                 )
+            if why is not None:
+                ended = replace(ended, reason=why(ended))
             if at_rest is not None:
                 at_rest(ended)
             # What the device has learnt meanwhile, as how well its clocks are known.

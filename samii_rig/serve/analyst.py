@@ -24,23 +24,19 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from samii_rig.errors import RecordingError, SamiiRigError
-from samii_rig.model.sampled import sampled_response
 from samii_rig.progress import telling
 from samii_rig.record.reader import read_events, read_recording
 from samii_rig.record.writer import PARTIAL
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
-from samii_rig.run.plan import Plan
+from samii_rig.serve.drawn import Drawn
 from samii_rig.serve.following import following
 from samii_rig.serve.job import DOING, RESPONSES, RIG, SO_FAR, Job
 from samii_rig.serve.live import LiveReader
 from samii_rig.serve.planned import planned
 from samii_rig.serve.sofar import SoFar
-from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_width
-from samii_rig.types import Complex, Float, FrequencyResponse, Int
+from samii_rig.types import FrequencyResponse
 from samii_rig.workers import ends_with_its_parent
 
 if TYPE_CHECKING:
@@ -49,9 +45,6 @@ if TYPE_CHECKING:
 EVERY = 1.0  # s between looks
 MEMORY = 8 << 30  # bytes of address space
 NICE = 5  # steps behind the loop and the service
-POINTS = 200  # of a curve on a page
-BAND = 0.9
-DIGITS = 4
 SITES = 4  # that are told
 
 
@@ -65,8 +58,7 @@ class Analyst:
         self._setup, self._text, self._plan = run.setup, run.experiment_toml, run.plan
         self._so_far = SoFar(self._plan)
         self._start: int | None = None
-        self._frequency = _grid(self._plan)
-        self._model = sampled_response(self._setup.rig, self._frequency)
+        self._drawn = Drawn(self._setup.rig, self._plan)
         self._diagnoser = Diagnoser(self._setup.rig_toml)
         self._given: list[FrequencyResponse] = []
         self._segment = -1
@@ -111,30 +103,9 @@ class Analyst:
         self._segment = segment if self._so_far.done >= segment - 1 else -1
 
     def _responses(self, took: float) -> dict[str, Any]:
-        low = min((s.band_hz[0] for s in self._plan.segments), default=0.0)
-        high = max((s.band_hz[1] for s in self._plan.segments), default=0.0)
-        return {
-            "low_hz": low,
-            "high_hz": high,
-            "done": self._so_far.done,
-            "of": len(self._plan.segments),
-            "took_s": took,
-            "trouble": self._so_far.trouble,
-            "model": _curves_of_model(self._setup.rig, self._plan, self._frequency, self._model),
-            "responses": [
-                {
-                    "level": r.level,
-                    "unit": r.level_unit,
-                    "method": r.method,
-                    "n": r.n_averages,
-                    "going_on": going_on,
-                    "low_hz": float(r.frequency[0]),
-                    "high_hz": float(r.frequency[-1]),
-                    **curves(r),
-                }
-                for r, going_on in self._so_far.responses()
-            ],
-        }
+        so_far = self._so_far
+        done, trouble = so_far.done, so_far.trouble
+        return self._drawn.told(so_far.responses(), done, trouble=trouble, took_s=took)
 
     def _diagnose(self) -> None:
         """Take what was found, and ask again if there is something new to ask."""
@@ -241,65 +212,6 @@ def said(found: Diagnosis) -> dict[str, Any]:
         "why": found.why,
         "experiment": found.experiment,
     }
-
-
-def curves(r: FrequencyResponse) -> dict[str, Any]:
-    """Gain and phase of each entry with their 90 % bands, few enough points for a page."""
-    inside = magnitude_interval(r, BAND)
-    angle, half = phase(r), phase_half_width(r, BAND)
-    at = _thinned(r.frequency)
-    entries = [
-        {
-            "output": y.name,
-            "input": u.name,
-            "unit": f"{y.unit}/{u.unit}",
-            "gain": _short(np.abs(r.H[at, i, j])),
-            "low": _short(inside.low[at, i, j]),
-            "high": _short(inside.high[at, i, j]),
-            "phase": _short(angle[at, i, j]),
-            "half": _short(half[at, i, j]),
-            "coherence": _short(r.coherence[at, i]),
-        }
-        for i, y in enumerate(r.outputs)
-        for j, u in enumerate(r.inputs)
-    ]
-    return {"frequency": _short(r.frequency[at]), "curves": entries}
-
-
-def _curves_of_model(rig: Rig, plan: Plan, f: Float, H: Complex) -> dict[str, Any]:
-    j = [a.name for a in rig.actuator].index(plan.actuator)
-    entries = [
-        {
-            "output": sensor.name,
-            "unit": f"{sensor.unit}/{rig.actuator[j].unit}",
-            "gain": _short(np.abs(H[:, i, j])),
-            "phase": _short(np.degrees(np.unwrap(np.angle(H[:, i, j])))),
-        }
-        for i, sensor in enumerate(rig.sensor)
-    ]
-    return {"frequency": _short(f), "input": plan.actuator, "curves": entries}
-
-
-def _grid(plan: Plan) -> Float:
-    """(n,) Hz, even on a logarithmic axis over all that the plan drives."""
-    bands = [s.band_hz for s in plan.segments] or [(0.1, 1.0)]
-    high = min(max(b[1] for b in bands), 0.49 * plan.rate_hz)
-    low = max(min(b[0] for b in bands), 1e-3 * high)
-    return np.geomspace(low, high, POINTS)
-
-
-def _thinned(f: Float) -> Int:
-    """Which lines are drawn: about even on a logarithmic axis."""
-    f = np.where(f > 0, f, np.nextafter(0.0, 1.0))
-    if f.size <= POINTS:
-        return np.arange(f.size)
-    bins = np.floor(POINTS * np.log(f / f[0]) / np.log(f[-1] / f[0]))
-    return np.unique(bins, return_index=True)[1]
-
-
-def _short(x: Float) -> list[float | None]:
-    """Few digits, and null for what is no number."""
-    return [float(f"{v:.{DIGITS}g}") if math.isfinite(v) else None for v in x.tolist()]
 
 
 def _ends_with_its_input() -> None:

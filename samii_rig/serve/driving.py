@@ -13,7 +13,7 @@ from samii_rig.rig.load import MAX_BYTES
 from samii_rig.run.experiments import fitting
 from samii_rig.serve import questions
 from samii_rig.serve.access import COOKIE, DRIVES, STOP
-from samii_rig.serve.job import DIAGNOSIS, RESPONSES, SO_FAR
+from samii_rig.serve.job import DIAGNOSIS, ESTIMATE, RESPONSES, SO_FAR
 from samii_rig.serve.lease import EVERY, LASTS
 from samii_rig.serve.rooms import NotThereError, Rooms, counted, operator, person
 from samii_rig.serve.viewers import MOST_VIEWERS
@@ -141,7 +141,7 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
     @router.get("/jobs/{id_}/responses")
     def responses(id_: str) -> Response:
         """The frequency responses of a run so far, with 90 % bands, and the model's."""
-        return _told(rooms, id_, RESPONSES)
+        return _told(rooms, id_, ESTIMATE, RESPONSES)
 
     @router.get("/jobs/{id_}/diagnosis")
     def diagnosis(id_: str) -> Response:

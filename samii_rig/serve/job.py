@@ -26,7 +26,7 @@ from samii_rig.serve.shared import get, made, put
 
 NAME = re.compile(r"[^/\0]+\.mcap")  # of a recording, in the folder of all
 ID = re.compile(r"\d{8}T\d{12}-[0-9a-f]{6}")
-REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS, DOING = (
+REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, ESTIMATE, DIAGNOSIS, DOING = (
     "request.json",
     "state.json",
     "rig.toml",
@@ -36,7 +36,8 @@ REQUEST, STATE, RIG, EXPERIMENT, LOCK, LOG, STOPS, RESPONSES, SO_FAR, DIAGNOSIS,
     "stops.jsonl",
     "responses.json",
     "diagnosis_so_far.json",  # the analyst's
-    "diagnosis.json",  # the runner's last word, of the whole run
+    "estimate.json",  # the runner's last word, of all that was recorded
+    "diagnosis.json",  # its last word, of a whole run
     "doing.json",  # what the analyst's diagnosis tries
 )
 

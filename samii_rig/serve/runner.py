@@ -25,6 +25,7 @@ import numpy as np
 from samii_rig.errors import GateError, SamiiRigError
 from samii_rig.index.remarks import add_note, set_diagnosis
 from samii_rig.progress import telling
+from samii_rig.record.reader import read_events
 from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.order import PlannedRun, RunOrder
@@ -33,10 +34,13 @@ from samii_rig.run.plan import Plan
 from samii_rig.run.progress import Progress
 from samii_rig.safety.limits import gate_limits
 from samii_rig.serve.following import following
-from samii_rig.serve.job import DIAGNOSIS, LOST_AFTER, Job, JobState
+from samii_rig.serve.job import DIAGNOSIS, ESTIMATE, LOST_AFTER, Job, JobState
 from samii_rig.serve.live import LiveWriter, live_folder
 from samii_rig.serve.planned import averages, planned
+from samii_rig.serve.sofar import SoFar
 from samii_rig.types import SampleBlock, StopRecord
+
+NO_SIGN = f"the service gave no sign for {LOST_AFTER:g} s"
 
 
 class Runner:
@@ -61,6 +65,7 @@ class Runner:
             outcome = self._carry_out(run, live)
             self._set(trouble=outcome.trouble)
             self._note()
+            self._estimated(run, outcome)
             verdict = self._diagnosed(run, outcome)
             self._set(phase="done", verdict=verdict, doing="")
         except SamiiRigError as error:
@@ -94,6 +99,7 @@ class Runner:
             alive=lambda: self._alive(order.rig),
             watch=lambda block: self._watch(order.plan, live, block),
             at_rest=lambda ended: self._at_rest(order, ended),
+            why=self._reason,
         )
 
     def _watch(self, plan: Plan, live: Path, block: SampleBlock) -> None:
@@ -131,7 +137,7 @@ class Runner:
             self._set(
                 phase="analysing",
                 status=ended.status,
-                reason=self._reason(ended),
+                reason=ended.reason,
                 at_zero=None if math.isnan(self._shown) else at_zero,
                 ended=datetime.now(UTC).isoformat(timespec="seconds"),
             )
@@ -158,18 +164,38 @@ class Runner:
     def _reason(self, ended: StopRecord) -> str:
         """Why it ended; who asked for it says more than the signal by which that came."""
         stops = self.job.stops()
-        if ended.status == "stopped" and stops:
+        if ended.status != "stopped":
+            return ended.reason
+        if stops:
             return f"stop asked by {stops[0]['by']}"
-        return ended.reason
+        return self.state.early or (NO_SIGN if self.lost else ended.reason)
 
     def _note(self) -> None:
         """Who stopped it, beside the recording."""
         said = [f"ended early: {self.state.early}"] if self.state.early else []
         said += [f"stop asked by {s['by']} at {s['time']}" for s in self.job.stops()]
         if self.lost:
-            said.append(f"stopped, as the service gave no sign for {LOST_AFTER:g} s")
+            said.append(f"stopped, as {NO_SIGN}")
         if said:
             add_note(self.path, "service", "; ".join(said)[:2000])
+
+    def _estimated(self, run: PlannedRun, outcome: Outcome) -> None:
+        """The last word on the responses: of a run that was cut off, of its last segment too."""
+        from samii_rig.serve.drawn import Drawn
+
+        found, done = [(r, False) for r in outcome.responses], len(outcome.recording.segments)
+        trouble = outcome.trouble
+        # A display that fails is none of the run's business.
+        with suppress(Exception):
+            if outcome.stop.status != "completed":
+                so_far = SoFar(run.plan)
+                (start,) = (
+                    int(e.payload["start"]) for e in read_events(self.path) if e.name == "plan"
+                )
+                so_far.take(outcome.recording, start)
+                found, trouble = so_far.responses(), so_far.trouble
+            told = Drawn(run.setup.rig, run.plan).told(found, done, trouble=trouble, final=True)
+            self.job.tell(ESTIMATE, told)
 
     def _diagnosed(self, run: PlannedRun, outcome: Outcome) -> str:
         """The verdict; "" where there is nothing to tell it from."""

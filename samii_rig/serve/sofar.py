@@ -136,5 +136,28 @@ class SoFar:
         return part(n, "single", (low, high)) if high > LEAST_PASSED * low else None
 
 
+def first(plan: Plan) -> int | None:
+    """Samples of the plan after which the first response can be estimated; None where none ever
+    can."""
+    before = 0
+    for s in plan.segments:
+        if s.kind != "transient":
+            return before + _first_of(s, plan.kp)
+        before += len(s.u)
+    return None
+
+
+def _first_of(s: PlannedSegment, kp: float) -> int:
+    begin, last = s.recorded or (0, len(s.u))
+    if s.dwell is not None:
+        return len(s.u)
+    if s.kind == "periodic":
+        return min(begin + 2 * period((s.u + kp * s.theta_ref)[begin:last]), last)
+    f = s.frequency[:last]
+    high = np.fmax.accumulate(f)
+    passed = np.flatnonzero(high > LEAST_PASSED * np.fmin.accumulate(f))
+    return int(passed[0]) + 1 if passed.size else len(s.u)
+
+
 def _key(s: Segment | PlannedSegment) -> Hashable:
     return s.kind, s.level, s.unit

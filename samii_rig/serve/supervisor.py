@@ -16,12 +16,26 @@ from pathlib import Path
 from typing import Any
 
 from samii_rig.errors import GateError, InputError, RecordingError, SamiiRigError
+from samii_rig.index.entry import identity
 from samii_rig.index.store import PRIVATE, Index
 from samii_rig.record.recover import recover
 from samii_rig.record.writer import PARTIAL
 from samii_rig.rig.schema import Rig
 from samii_rig.run.experiments import recording_stem
-from samii_rig.serve.job import ID, JOBS, LOG, OVER, Job, JobState, Request, asked_to_stop
+from samii_rig.serve.job import (
+    DIAGNOSIS,
+    ESTIMATE,
+    ID,
+    JOBS,
+    LOG,
+    OVER,
+    RESPONSES,
+    SO_FAR,
+    Job,
+    JobState,
+    Request,
+    asked_to_stop,
+)
 from samii_rig.serve.live import LiveReader
 
 MOST_QUEUED = 50
@@ -261,12 +275,24 @@ class Supervisor:
         return path if ID.fullmatch(id_) and path.is_file() else None
 
     def plain(self, job: Job) -> dict[str, Any]:
-        """A job as data."""
+        """A job as data. estimated, diagnosed : whether there is one to be asked for.
+        recording_id : of a run that is over, in the list of recordings; "" where it has none."""
         request, state = asdict(job.request), asdict(job.state)
         for private in ("pid", "live"):
             state.pop(private)
         request.pop("settings")
-        return {"id": job.id, **request, **state}
+        known = {
+            "estimated": any((job.folder / name).exists() for name in (ESTIMATE, RESPONSES)),
+            "diagnosed": any((job.folder / name).exists() for name in (DIAGNOSIS, SO_FAR)),
+            "recording_id": self._listed(job) if state["phase"] in OVER else "",
+        }
+        return {"id": job.id, **request, **state, **known}
+
+    def _listed(self, job: Job) -> str:
+        with suppress(SamiiRigError):
+            entry = self._index.get(identity(job.request.recording))
+            return entry.id if entry is not None else ""
+        return ""
 
     def state(self) -> dict[str, Any]:
         """All that a display of the queue and the run shows.

@@ -21,6 +21,7 @@ from samii_rig.signal.several import turn
 from samii_rig.signal.several.estimate import How, inputs_of, together
 from samii_rig.signal.skew import skews_of, with_skew
 from samii_rig.signal.spectra import (
+    Spectrum,
     burst_spectra,
     comb,
     excited,
@@ -31,6 +32,8 @@ from samii_rig.signal.spectra import (
 from samii_rig.types import Complex, Finding, Float, FrequencyResponse, Int, Recording
 
 LEAD_IN = 0.01  # of a burst; less rest before it cannot be tapered
+# Of the strongest line, what input and reference have in common: less is rounding.
+NO_POWER = 1e-14
 # Frequencies of a local estimate at most; neighbours share their data anyhow.
 LOCAL_LINES = 2000
 # A local rational model is taken where it lowers the logarithm of the leave-one-out error
@@ -205,6 +208,7 @@ def _repeats(
         pieces, spectra = periods.pieces, periods.independent
         why = f"{why}; {periods.why}" if periods.why else why
     lines = comb(spectra, band) if method == "periodic" else excited(spectra, band)
+    lines = _driven(group, pieces, spectra, lines)
     n, p = len(spectra), len(group.selection.outputs)
     wanted = pooling or repeats.pooling_lines(n, p)
     if min(wanted, lines.size) * (n - 1) <= p:
@@ -253,6 +257,28 @@ def _repeats(
         why=f"{why}; {result.remark}",
     )
     return replace(response, even=seen.even, odd=seen.odd)
+
+
+def _driven(group: Group, pieces: Sequence[Piece], spectra: Sequence[Spectrum], lines: Int) -> Int:
+    """The lines at which the input follows the reference; of any other nothing is known.
+
+    EstimateError where the input stands still: a command below its converter's step is rounded to
+    rest once the start is over.
+    """
+    name = group.selection.input.name
+    if all(np.ptp(p.z[:, 0]) == 0 for p in pieces):
+        raise EstimateError(
+            f"{pieces[0].name}: the input {name} stands still in all that is estimated from; "
+            "expected a level above its converter's step"
+        )
+    R, V = (np.stack(x) for x in ([s.R for s in spectra], [s.Z[:, 0] for s in spectra]))
+    power = repeats.followed(R, V)[lines]
+    kept = lines[power > NO_POWER * power.max()]
+    if left_out := lines.size - kept.size:
+        what = "line is" if left_out == 1 else "lines are"
+        text = f"{left_out} {what} left out, as the reference has no power there"
+        group.findings.append(Finding("leakage", "note", text))
+    return np.asarray(kept, np.int64)
 
 
 def _with_transient(

@@ -83,6 +83,11 @@ def over_repeats(
     )
 
 
+def followed(R: Complex, V: Complex) -> Float:
+    """|sum_m V_m R_m^*| at each line, by which a response is divided. R, V : (n, n_freq)."""
+    return np.asarray(np.abs(np.einsum("nf,nf->f", V, R.conj())), float)
+
+
 def wanted_dof(p: int) -> int:
     """Degrees of freedom that a pooled covariance of p outputs should have."""
     return max(30, 12 * p)

@@ -23,9 +23,11 @@ from samii_rig.diagnose.fit.agreeing import Apart, Given, states_apart
 from samii_rig.diagnose.posed import in_poses
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import on_records
+from samii_rig.errors import InputError
 from samii_rig.identify.poses import at_pose
 from samii_rig.record.derived import save_frequency_responses
 from samii_rig.record.reader import read_saved_responses
+from samii_rig.record.store import write_recording
 from samii_rig.report.diagnosis.words import banner
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
@@ -150,3 +152,21 @@ def test_responses_of_two_states_are_told_without_their_samples(runs, tmp_path):
     )
     said = CliRunner().invoke(app, ["diagnose", *map(str, (paths[0], paths[2])), "--json"])
     assert json.loads(said.stdout)["states"] == [[one], [stiffer]]
+
+
+def test_recordings_of_two_states_are_not_saved_as_one_file(runs, tmp_path):
+    for name, run in runs.items():
+        write_recording(tmp_path / f"{name}.mcap", run)
+    saved = tmp_path / "all.mcap"
+    args = ["frf", "--rig", "two_masses", "--save", str(saved)]
+    both = [str(tmp_path / f"{name}.mcap") for name in ("one", "stiffer")]
+    found = CliRunner().invoke(app, [*args, *both])
+    assert isinstance(found.exception, InputError)
+    said = str(found.exception)
+    assert said.startswith("--save: the recordings are of 2 states of the rig (")
+    assert said.endswith("stiffer.mcap); expected those of one in a file")
+    assert "\n" not in said
+    assert not saved.exists()
+    both = [str(tmp_path / f"{name}.mcap") for name in ("one", "again")]
+    assert CliRunner().invoke(app, [*args, *both]).exit_code == 0
+    assert saved.exists()

@@ -76,8 +76,12 @@ def test_an_afternoon_at_the_page(
         browser.until("document.getElementById('planned').textContent.includes('nearest to a')")
         browser.choose("operator", "")
         browser.click("take")
-        browser.until("document.getElementById('alarm').textContent.startsWith('Your name first')")
+        # What is missing is said by its field, and is no alarm.
+        browser.until("!document.getElementById('name-hint').hidden")
+        assert browser.value("document.getElementById('alarm').hidden")
+        assert browser.value("document.activeElement.id") == "operator"
         browser.choose("operator", "Ada")
+        assert browser.value("document.getElementById('name-hint').hidden")
         browser.click("take")
         browser.until("document.getElementById('driver').textContent.startsWith('Ada drives')")
         assert browser.text("start") == "Start"
@@ -109,11 +113,17 @@ def test_an_afternoon_at_the_page(
         browser.until("document.querySelectorAll('#list tr').length === 2")
         (path,) = (tmp_path / "runs").glob("*_step.mcap")
         recording = read_recording(path)
-        assert recording.stop.reason == "stopped by SIGTERM"
+        assert recording.stop.reason == "stop asked by Ada at 127.0.0.1"
         assert recording.values[-1, recording.column("v_2")] == 0.0
         assert "[0.1]" in recording.experiment_toml
         browser.until("document.getElementById('scope-state').textContent.includes('is over')")
         browser.until("document.getElementById('motion').ariaLabel.includes('no run')")
+        # Where it says what is now: the recording and its report.
+        browser.until("!document.getElementById('kept').hidden")
+        assert browser.text("kept-name") == path.name
+        report = service.http.get(browser.value("document.getElementById('kept-report').href"))
+        assert report.status_code == 200
+        assert path.name in report.text
 
         browser.value("document.querySelector('#list button').click()")
         browser.until("document.getElementById('one-about').textContent.includes('stopped')")
@@ -169,7 +179,8 @@ def test_a_run_tells_what_it_knows_while_it_goes_on(
         # What was measured until then stays, as of a run that is over.
         browser.until("document.getElementById('frf-about').textContent.startsWith('Last run')")
         assert "goes on" not in browser.text("frf-about")
-        assert re.search(r"as estimated when \d+ of 60 .* were whole", browser.text("frf-about"))
+        browser.until("document.getElementById('frf-about').textContent.includes('all that was')")
+        assert re.search(r"recorded: \d+ of 60 segments whole", browser.text("frf-about"))
         assert browser.value("document.getElementById('frf-hatched').hidden")
         service.kill()
         browser.until("document.getElementById('motion').ariaLabel.includes('not live')")

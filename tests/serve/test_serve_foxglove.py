@@ -31,7 +31,7 @@ from websockets.sync.client import ClientConnection, connect
 from samii_rig.errors import InputError
 from samii_rig.rig.load import load_rig
 from samii_rig.serve.access import Tokens
-from samii_rig.serve.analyst import curves
+from samii_rig.serve.drawn import curves
 from samii_rig.serve.foxglove import BODE, Foxglove, usual_channels
 from samii_rig.serve.live import LiveReader, LiveWriter
 from samii_rig.serve.rooms import Rooms

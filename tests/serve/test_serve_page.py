@@ -53,6 +53,6 @@ def test_every_file_that_is_named_is_served_and_runs_under_the_policy(tmp_path: 
 
 @pytest.mark.parametrize("control", ["input", "select", "button"])
 def test_every_control_has_a_name_for_who_does_not_see_it(control: str) -> None:
-    labelled = re.sub(r"<label>.*?</label>", "", HTML, flags=re.DOTALL)
+    labelled = re.sub(r"<label[^>]*>.*?</label>", "", HTML, flags=re.DOTALL)
     for tag, text in re.findall(rf"<({control}\b[^>]*)>([^<]*)", labelled):
         assert text.strip() or "aria-label" in tag or "hidden" in tag, tag

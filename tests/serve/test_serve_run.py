@@ -15,11 +15,13 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from serve_kit import Service, sweep
 from wait_kit import WITHIN
 
+from samii_rig.cli import main
 from samii_rig.errors import RecordingError
 from samii_rig.index.store import Index
 from samii_rig.record.reader import read_recording
@@ -61,7 +63,7 @@ def recording_of(service: Service, job: dict) -> Path:
     return service.folder / job["recording"]
 
 
-def test_a_lab_s_afternoon(service: Service) -> None:
+def test_a_lab_s_afternoon(service: Service, capsys: pytest.CaptureFixture[str]) -> None:
     """Three runs are asked for; one is stopped by somebody, one taken back, one goes through."""
     with service.lease() as lease:
         first = service.start(lease, LONG)
@@ -91,6 +93,13 @@ def test_a_lab_s_afternoon(service: Service) -> None:
             "/api/recordings", params={"text": "stop asked by Ada at 127.0.0.1"}
         )
         assert found.json()["recordings"][0]["path"] == job["recording"]
+        assert found.json()["recordings"][0]["id"] == job["recording_id"]
+        # The recording says the same as the page, and so does `verify`.
+        assert recording.stop.reason == job["reason"]
+        asked = ["samii-rig", "verify", str(recording_of(service, job))]
+        with patch("sys.argv", asked), pytest.raises(SystemExit):
+            main()
+        assert f"stopped: {job['reason']}" in capsys.readouterr().out
 
         # What was stopped is looked at by a person before anything moves again.
         state = service.state()
@@ -163,6 +172,28 @@ def test_a_service_ends_without_a_word_whatever_is_asked_of_it(
         assert ending.http.get("/api/state").status_code == 200  # what came before is being done
     assert ending.process.returncode == 0
     assert capfd.readouterr().err == ""
+
+
+def test_after_a_stop_all_that_was_recorded_is_estimated(service: Service) -> None:
+    with service.lease() as lease:
+        id_ = service.start(lease, LONG)
+        # The first sweep, from 1 Hz on, has passed 5 Hz and is not over.
+        service.until(lambda: frequency(service) > 5.0)
+        service.http.post("/api/stop")
+        job = ended(service, id_)
+        # No diagnosis was asked for, and none is there to be asked for.
+        assert (job["estimated"], job["diagnosed"]) == (True, False)
+        told = service.http.get(f"/api/jobs/{id_}/responses").json()
+        assert (told["final"], told["done"], told["of"]) == (True, 0, 20)
+        (response,) = told["responses"]
+        assert response["going_on"]
+        assert response["high_hz"] > 4.0
+
+
+def frequency(service: Service) -> float:
+    """That the run has reached, Hz; 0 at rest."""
+    running = service.state()["running"]
+    return (running or {"progress": {}})["progress"].get("frequency") or 0.0
 
 
 def test_a_stop_while_it_starts_keeps_anything_from_moving(service: Service) -> None:

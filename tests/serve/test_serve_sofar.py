@@ -35,10 +35,11 @@ from samii_rig.run.experiments import load_experiment
 from samii_rig.run.order import RunOrder
 from samii_rig.run.plan import Plan
 from samii_rig.serve.analysis import Analysis
-from samii_rig.serve.analyst import Analyst, Diagnoser, curves, said
+from samii_rig.serve.analyst import Analyst, Diagnoser, said
+from samii_rig.serve.drawn import Drawn, curves
 from samii_rig.serve.following import following
 from samii_rig.serve.job import DIAGNOSIS, DOING, RESPONSES, SO_FAR, Job, JobState, Request
-from samii_rig.serve.sofar import SoFar
+from samii_rig.serve.sofar import SoFar, first
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
 
@@ -117,6 +118,24 @@ def test_a_sweep_grows_with_what_it_has_passed(swept: tuple[Plan, Recording, int
     assert not so_far.take(until(recording, start + n), start)
 
 
+@pytest.mark.parametrize("text", [SWEEPS, PERIODS])
+def test_when_the_first_estimate_comes_is_known_before(tmp_path: Path, text: str) -> None:
+    plan, recording, start = made(tmp_path, text)
+    n = first(plan)
+    assert n is not None
+    assert 0 < n < len(plan.segments[0].u)
+    so_far = SoFar(plan)
+    so_far.take(until(recording, start + n - 1), start)
+    assert (so_far.responses(), so_far.trouble) == ([], "")
+    so_far.take(until(recording, start + n), start)
+    # There is enough to ask the estimator.
+    assert so_far.responses() or so_far.trouble
+    told = Drawn(RIG, plan).told([], 0)
+    assert told["first_s"] == n / plan.rate_hz
+    rests = [replace(s, kind="transient") for s in plan.segments]
+    assert Drawn(RIG, replace(plan, segments=tuple(rests))).told([], 0)["first_s"] is None
+
+
 def test_at_the_end_it_says_what_the_estimate_of_the_whole_says(
     swept: tuple[Plan, Recording, int],
 ) -> None:
@@ -165,10 +184,10 @@ def test_a_level_counts_once_whatever_is_driven_at_it(
 def test_of_a_multisine_whole_periods_count(tmp_path: Path) -> None:
     plan, recording, start = made(tmp_path, PERIODS)
     so_far = SoFar(plan)
-    first, last = plan.segments[0].recorded or (0, len(plan.segments[0].u))
+    begin, last = plan.segments[0].recorded or (0, len(plan.segments[0].u))
     length = round(4.0 * RIG.rate_hz)
     methods = []
-    for n in range(first + length // 2, last, length):
+    for n in range(begin + length // 2, last, length):
         so_far.take(until(recording, start + n), start)
         methods += [r.estimator for r, going_on in so_far.responses() if going_on]
     assert methods

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -180,6 +181,84 @@ def test_while_a_run_is_diagnosed_the_page_says_what_is_tried_and_for_how_long(
     assert page.text("diagnosis-doing") == f"Now: {doing}."
     page.value(f"show({state()})")
     assert page.text("diagnosis-doing") == ""
+
+
+# Of what the page asks for of a job: which, and answers that are made up.
+ASKS = """
+window.asked = []; window.real = window.real ?? window.fetch;
+window.fetch = (url, more = {}) => {
+  const of = /\\/api\\/jobs\\/(.+)/.exec(String(url));
+  if (!of) return real(url, more);
+  asked.push(of[1]);
+  return Promise.resolve(new Response(JSON.stringify(%s), { status: 200 }));
+};
+undefined
+"""
+NO_RESPONSE = {"low_hz": 1, "high_hz": 20, "first_s": 30, "done": 0, "of": 6, "took_s": 0}
+NO_RESPONSE |= {"trouble": "", "final": False, "responses": []}
+NO_RESPONSE["model"] = {"input": "v_2", "frequency": [1, 20], "curves": []}
+
+
+def test_before_there_is_an_estimate_the_page_says_when_one_is_expected(page: Browser) -> None:
+    page.value(ASKS % json.dumps(NO_RESPONSE))
+    told = json.loads(state(segment=1, n_segments=6, time_left=90.0, duration=100.0))
+    told["running"] |= {"diagnosis": True, "id": "awaited"}
+    told["so_far"] = {"responses": "1", "responses_age_s": 0, "diagnosis": None, "failed": False}
+    told["pace"] = 2
+    said = "The first estimate is expected in about 13 s."  # (30 - 10)/2, and what it takes
+    page.until(f"show({json.dumps(told)}); soFar.data?.first_s === 30")
+    page.value(f"show({json.dumps(told)})")
+    assert page.text("diagnosis-what").endswith(said)
+    assert said in page.text("frf-about")
+    told["running"]["progress"]["time_left"] = 60.0
+    page.value(f"show({json.dumps(told)})")
+    assert page.text("diagnosis-what").endswith("The first estimate is being made.")
+    # Of a run that was stopped before there was one nothing is expected, nor asked for.
+    ended = {"phase": "analysing", "status": "stopped", "reason": "", "at_zero": True}
+    told["running"] |= {**ended, "ended": "2026-11-01T10:00:00+00:00"}
+    page.value(f"show({json.dumps(told)})")
+    assert page.text("diagnosis-what") == "None: the run ended before there was one."
+    last = {**told["running"], "phase": "done", "estimated": False, "diagnosed": False}
+    page.value("asked.length = 0")
+    told |= {"running": None, "so_far": None, "last": {**last, "recording_id": ""}}
+    page.value(f"show({json.dumps(told)})")
+    page.until("document.getElementById('diagnosis-section').hidden && soFar.seen === 'over'")
+    assert page.value("asked") == []
+    page.value("window.fetch = real; undefined")
+
+
+def test_a_queue_that_is_held_and_what_was_recorded_are_seen_at_once(page: Browser) -> None:
+    told = json.loads(state())
+    last = {**told["running"], "phase": "done", "status": "stopped", "reason": "stop asked by Ada"}
+    last |= {"recording": "a.mcap", "recording_id": "ab12", "estimated": False, "at_zero": True}
+    waiting = [{"id": "2", "experiment": "short", "duration_s": 5.0}]
+    told |= {"running": None, "last": last, "held": "stop asked by Ada", "queue": waiting}
+    page.size(1440, 900)
+    page.call("Page.reload")
+    page.until("document.getElementById('link')?.textContent === 'live'")
+    page.until("document.querySelectorAll('#fields input').length > 3 && Boolean(window.show)")
+    page.until("document.querySelectorAll('#drawing svg').length === 1")
+    page.value(f"scrollTo(0, 0); show({json.dumps(told)})")
+    assert page.text("held-now") == "Queue held, 1 run waits."
+    assert page.text("held") == "Held: stop asked by Ada"
+    assert page.text("kept-name") == "a.mcap"
+    report = "document.getElementById('kept-report').getAttribute('href')"
+    assert page.value(report) == "/api/recordings/ab12/report"
+    for id_ in ("held-now", "h-queue", "held", "kept-report"):
+        box = page.value(f"document.getElementById('{id_}').getBoundingClientRect().toJSON()")
+        assert box["height"] > 10, id_
+        assert 0 < box["top"] < box["bottom"] <= 900, (id_, box)
+    page.value(f"show({state()})")
+    assert page.value("document.getElementById('held-here').hidden")
+    assert page.value("document.getElementById('kept').hidden")
+
+
+def test_units_are_written_one_way(page: Browser) -> None:
+    said = "import('/page/units.js').then((m) => m.pretty('%s'))"
+    assert page.value(said % "m/s^2") == "m/s²"
+    assert page.value(said % "N^2 s/m^4") == "N² s/m⁴"
+    files = (resources.files("samii_rig.serve") / "page").iterdir()
+    assert [f.name for f in files if "²" in f.read_text()] == ["units.js"]
 
 
 def test_every_axis_of_frequency_has_its_unit_beside_its_numbers(page: Browser) -> None:

@@ -171,6 +171,39 @@ def test_whole_periods_of_a_multisine_are_free_of_leakage():
     np.testing.assert_allclose(r.input_rms, np.sqrt(0.5), rtol=1e-6)
 
 
+def test_a_command_that_is_rounded_to_rest_gives_no_response():
+    """A level below the converter's step: only the start of the run moves it."""
+    t = np.arange(400 * 5)
+    u = 0.4 * np.cos(2 * np.pi * 5 * t / 400) + 0.05 * np.cos(2 * np.pi * 9 * t / 400)
+    rounded = _periodic(u, np.zeros(u.size))
+    values = rounded.values.copy()
+    values[:, 1] = np.round(u)
+    values[:50, 1] = 1.0
+    values[:, 2] = 1e-3 * np.random.default_rng(3).normal(size=u.size)
+    with pytest.raises(EstimateError, match="the input v stands still in all that is estimated"):
+        estimate([replace(rounded, values=values)])
+
+
+def test_a_line_without_power_is_left_out_and_that_is_said():
+    """Two pulses two samples apart have none at a quarter of the rate."""
+    rng = np.random.default_rng(4)
+    n, repeats = 200, 4
+    u = np.zeros(n * repeats)
+    u[50::n] = u[52::n] = 1.0
+    v = u + 1e-3 * rng.normal(size=u.size)
+    run = _periodic(u, 2 * v + 1e-3 * rng.normal(size=u.size))
+    values = run.values.copy()
+    values[:, 1] = v
+    each = [Segment(f"b{k}", "burst", k * n, (k + 1) * n, 1.0, "V") for k in range(repeats)]
+    r = estimate([replace(run, values=values, segments=tuple(each))], method="burst")[0]
+    assert np.all(np.isfinite(r.H))
+    assert np.all(np.isfinite(r.covariance))
+    assert 25.0 not in r.frequency
+    assert {24.5, 25.5} <= set(r.frequency)
+    (said,) = (f.message for f in r.findings if "no power" in f.message)
+    assert said == "1 line is left out, as the reference has no power there"
+
+
 def test_a_joint_that_ends_at_another_angle_does_not_leak():
     n = 2000
     t = (np.arange(n) - 200) / 100

@@ -248,6 +248,16 @@ def lines_apart(files: Sequence[Saved], lines: Measured, left: float, rig: Rig) 
     return replace(found.apart(names, left), samples=False)
 
 
+def states_of(files: Sequence[Saved], rig: Rig) -> tuple[tuple[str, ...], ...]:
+    """The states that recordings are of by their own responses, the names of each; one where they
+    agree."""
+    names, each = zip(*files, strict=True)
+    every = [f for own in each for r in own for f in r.frequency]
+    band = float(min(every)), float(max(every))
+    found = _grouped(len(each), lambda i, j: _lines_differ(each[i], each[j], rig, band))
+    return found.apart(names, 0.0).states
+
+
 def _lines_differ(
     some: Sequence[FrequencyResponse], others: Sequence[FrequencyResponse], rig: Rig, band: Band
 ) -> tuple[float, float, float]:

@@ -101,10 +101,10 @@ class Explanations:
         self.rebin(nominal)
         self.keep((), refit(model, self.problem, nominal.x))
 
-    def begin(self, stage: str) -> None:
-        """Say that a stage begins."""
+    def begin(self, stage: str, takes: tuple[float, float] | None = None) -> None:
+        """Say that a stage begins. takes : as of `Begun`."""
         self.stage, self._round = stage, 0
-        self.progress(Begun(stage, self.usual.get(stage)))
+        self.progress(Begun(stage, self.usual.get(stage), takes))
 
     def each(self, parts: Sequence[T], name: Callable[[T], str] = lambda _: "") -> Iterator[T]:
         """The parts of one round of the stage, each said before it is tried. How many rounds there

@@ -477,7 +477,7 @@ class RecordSearch(Search):
         self.use(self.table)
         fitted = self.first()
         self._about(fitted)
-        self.begin(NOMINAL)
+        self.stage = NOMINAL
         for made in range(MOST_MADE):
             self.progress(f"{NOMINAL}, fit {made + 1} of at most {MOST_MADE}")
             fitted = refit(fitted.model, self.problem, fitted.x)

@@ -1,7 +1,8 @@
-"""How long the rest of a diagnosis usually takes, where nobody knows how many rounds there will be.
+"""How long a diagnosis and the rest of it usually take: nobody knows how many rounds there will be.
 
 Of each stage the tenth and the ninetieth percentile of the time left, over the time spent since the
-first of them began. `benchmarks/pace_study.py` counts them.
+first of them began; and of all of it, for each thousand samples or lines, in s of a processor.
+`benchmarks/pace_study.py` counts them.
 """
 
 from __future__ import annotations
@@ -11,6 +12,21 @@ from collections.abc import Mapping
 from samii_rig.progress import START
 
 Usual = Mapping[str, tuple[float, float]]
+
+# s for each thousand samples, or lines: of 31 concealed trials of 9,000 to 339,000 samples, of the
+# 150 to 5,200 lines of 33, of two states of 20,000 samples in 18 trials, of 8 arms in two poses.
+RECORDS_TAKE = (0.08, 0.7)
+LINES_TAKE = (0.25, 9.5)
+STATES_TAKE = (0.2, 0.75)
+POSES_TAKE = (0.16, 1.1)
+LEAST = 0.5  # s: the work that every diagnosis has
+
+
+def takes(each: tuple[float, float], n: int) -> tuple[float, float]:
+    """s from its start to the end of a diagnosis of n samples or lines."""
+    low, high = (max(LEAST, 1e-3 * n * s) for s in each)
+    return low, max(high, 2 * LEAST)
+
 
 # Of 33 concealed trials of two plants and thirteen rigs, 11 s in the median.
 RECORDS: Usual = {
@@ -34,12 +50,20 @@ LINES: Usual = {
     "what is missing, round 16": (0.06, 0.54),
     "what cannot be told apart": (0.02, 0.46),
 }
-# Of 18 trials of two states on three rigs, from what changed on: 2 s in the median.
+# Of 18 trials of two states on four rigs, from the state before on: 9 s in the median.
 STATES: Usual = {
-    "what changed": START,
-    "what changed, round 2": (3.4, 5.6),
-    "what changed, round 4": (1.5, 3.3),
-    "what cannot be told apart": (0.28, 0.62),
+    "before: what is missing": START,
+    "before: what is missing, round 2": (17.0, 27.0),
+    "before: amplitude levels": (11.0, 19.0),
+    "before: amplitude levels, round 1": (3.6, 8.7),
+    "before: what is missing, in pairs": (3.0, 6.2),
+    "before: what is missing, in pairs, round 4": (2.4, 3.4),
+    "before: what cannot be told apart": (1.7, 4.4),
+    "both states": (1.3, 3.5),
+    "what changed": (0.39, 1.0),
+    "what changed, round 2": (0.34, 0.69),
+    "what changed, round 4": (0.28, 0.53),
+    "what cannot be told apart": (0.07, 0.15),
 }
 # Of 12 arms of two links in two poses, 7 s in the median.
 POSES: Usual = {

@@ -8,6 +8,7 @@ import numpy as np
 
 from samii_rig.diagnose.fit.agreeing import Apart, lines_apart
 from samii_rig.diagnose.fit.explanations import threshold
+from samii_rig.diagnose.fit.usual import LINES_TAKE, takes
 from samii_rig.diagnose.result import Diagnosis, Used
 from samii_rig.diagnose.verdict import answer
 from samii_rig.diagnose.verdict import judge as verdict
@@ -27,7 +28,7 @@ def by_lines(case: Case) -> Diagnosis:
     nominal = search.nominal.fitted
     first, bands = search.ratio(nominal), answer.bands(search, nominal)
     torn = search.lines.torn()
-    search.begin("what is missing")
+    search.begin("what is missing", takes(LINES_TAKE, case.lines.n) if case.runs else None)
     search.run(briefly=torn)
     search.begin("what cannot be told apart")
     judged = verdict.judge(search, case.decide)

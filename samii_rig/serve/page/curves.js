@@ -1,5 +1,7 @@
 // Recorded curves on a canvas: channels over time, frequency responses in dB.
 
+import { pretty } from "/page/units.js";
+
 export function plot(canvas, lanes, { logarithmic = false, unit = "s" } = {}) {
   const ratio = window.devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
   canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio);
@@ -20,7 +22,7 @@ export function plot(canvas, lanes, { logarithmic = false, unit = "s" } = {}) {
     g.fillText(lane.name, left - 8, y0 + 14);
     if (ys.length && tall > 44) {
       g.fillStyle = ink("--muted");
-      g.fillText(`${high.toPrecision(2)} ${lane.unit.replace("^2", "²")}`, left - 8, y0 + 30);
+      g.fillText(`${high.toPrecision(2)} ${pretty(lane.unit)}`, left - 8, y0 + 30);
       g.fillText(low.toPrecision(2), left - 8, y0 + tallest - 2);
     }
     g.beginPath(); g.strokeStyle = ink(`--c${i % 4}`); g.lineWidth = 1.3;

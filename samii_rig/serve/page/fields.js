@@ -2,6 +2,8 @@
 // experiment's file, which is what is ordered; each change is predicted at once, and each limit
 // says how much of it would be left. The pose of a rig that has weight is a field of the order.
 
+import { pretty } from "/page/units.js";
+
 const WAIT = 350; // ms after the last key
 // What a file may hold, in the order of the page: key, name, unit ("" for a number, null for the file's).
 const FIELDS = [
@@ -63,7 +65,7 @@ export class Fields {
     for (const [key, name, own] of FIELDS) {
       const value = read(text, key);
       if (value === null) continue;
-      const label = put($("fields"), "label", ""), says = own === null ? unit : own;
+      const label = put($("fields"), "label", "", key === "amplitudes" ? "list" : ""), says = own === null ? unit : own;
       put(label, "span", `${name}${says ? ` [${says}]` : ""}`);
       const choice = key === "actuator" && this.rig;
       const input = this.inputs[key] = put(label, choice ? "select" : "input", "");
@@ -137,9 +139,9 @@ export class Fields {
     for (const m of [...rows.values()].sort((a, b) => a.margin - b.margin)) {
       const row = put(body, "tr", "", m.margin <= 0 ? "bad" : "");
       put(row, "th", `${m.channel} ${m.what}`).scope = "row";
-      put(row, "td", `${m.limit.toPrecision(3)} ${m.unit.replace("^2", "²")}`);
+      put(row, "td", `${m.limit.toPrecision(3)} ${pretty(m.unit)}`);
       put(row, "td", `${(100 * m.margin).toFixed(0)} %`);
-      row.title = `${m.predicted.toPrecision(3)} ${m.unit} in ${m.segment}; ${m.reason}`;
+      row.title = `${m.predicted.toPrecision(3)} ${pretty(m.unit)} in ${m.segment}; ${m.reason}`;
     }
   }
 }

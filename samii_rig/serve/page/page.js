@@ -12,6 +12,7 @@ import { Panel } from "/page/panel.js";
 import { Recordings } from "/page/recordings.js";
 import { MOVES, VERDICTS, called, clock, facts, kind, line } from "/page/now.js";
 import { keep, kept, sized, themed } from "/page/kept.js";
+import { pretty } from "/page/units.js";
 
 const $ = (id) => document.getElementById(id);
 const scope = new Scope($("scope"), (text) => { $("scope-state").textContent = text; });
@@ -61,8 +62,8 @@ async function pin(text) {
   await notes.add(text, id);
   if (id) { panel.laid.at(-1).notes.push({ text }); panel.draw(); }
 }
-Object.assign(window, { scope, motion, lamps, panel, show }); // to measure what they cost and show
 const soFar = new SoFar($, ask, put, panel);
+Object.assign(window, { scope, motion, lamps, panel, soFar, show }); // to measure what they cost and show
 
 // Live data, or a recording in their place
 function take(data) {
@@ -161,7 +162,11 @@ function show(s) {
   $("fault").hidden = !s.fault;
   if (s.fault) $("fault-text").textContent = `FAULT since ${s.fault.time}: ${s.fault.reason}`;
   $("held").textContent = s.held ? `Held: ${s.held}` : s.queue.length ? "" : "Empty.";
-  $("resume").hidden = !(s.held && s.queue.length && lease);
+  // What waits for somebody's word is said where it says what is now.
+  const waits = s.held && s.queue.length;
+  $("held-here").hidden = !waits;
+  if (waits) $("held-now").textContent = `Queue held, ${s.queue.length} ${s.queue.length > 1 ? "runs wait" : "run waits"}.`;
+  $("resume").hidden = !(waits && lease);
   $("queue").replaceChildren();
   for (const j of s.queue) {
     const item = put($("queue"), "li", `${called(j)}, ${planned(j.duration_s)} `);
@@ -172,6 +177,11 @@ function show(s) {
     }
   }
   const l = s.last;
+  $("kept").hidden = Boolean(r) || !l?.recording_id;
+  if (!$("kept").hidden) {
+    $("kept-name").textContent = l.recording;
+    $("kept-report").href = `/api/recordings/${l.recording_id}/report`;
+  }
   const told = l ? [l.status || l.phase, l.error || l.reason, VERDICTS[l.verdict]].filter(Boolean) : [];
   $("last").textContent = l ? `Last: ${called(l)}: ${told.join("; ")}.` : "";
   scope.over = motion.over = !moves && !replay.on;
@@ -214,8 +224,14 @@ function driving(secret) {
     }
   }, 2000);
 }
+// A field that is empty yet is no alarm.
+function nameless(is) {
+  $("name-hint").hidden = !is;
+  $("operator").setAttribute("aria-invalid", is);
+}
 async function take_() {
-  if (!name()) { $("operator").focus(); throw new Error("Your name first: it stands with every run."); }
+  nameless(!name());
+  if (!name()) { $("operator").focus(); return; }
   driving((await ask("POST", "/lease")).lease);
 }
 $("take-here").onclick = tried(take_);
@@ -223,7 +239,8 @@ $("take").onclick = tried(async () => {
   if (lease) { await ask("DELETE", "/lease"); driving(""); } else await take_();
 });
 $("operator").value = kept("name");
-$("operator").onchange = () => keep("name", name());
+$("operator").oninput = () => { if (name()) nameless(false); };
+$("operator").onchange = () => { keep("name", name()); if (name()) nameless(false); };
 addEventListener("pagehide", () => {
   if (lease && !(state && state.running)) fetch("/api/lease", { method: "DELETE", keepalive: true, headers: { "X-Lease": lease } });
 });
@@ -247,7 +264,7 @@ $("plan").onclick = tried(async () => {
   const found = await ask("POST", "/dry-run", chosen()).catch((e) => { $("planned").textContent = ""; throw e; });
   const total = found.runs.reduce((sum, r) => sum + r.duration_s, 0), worst = found.runs[0].margins[0];
   $("planned").textContent = found.refused ? `Refused: ${found.refused}`
-    : `${found.runs.length > 1 ? `${found.runs.length} runs, ` : ""}${planned(total)}; nearest to a limit: ${worst.channel} in ${worst.segment}, ${(100 * worst.margin).toFixed(0)} % left of ${worst.limit} ${worst.unit.replace("^2", "²")}`;
+    : `${found.runs.length > 1 ? `${found.runs.length} runs, ` : ""}${planned(total)}; nearest to a limit: ${worst.channel} in ${worst.segment}, ${(100 * worst.margin).toFixed(0)} % left of ${worst.limit} ${pretty(worst.unit)}`;
 });
 // What is asked for next is of the rig as it stood in the run that asks for it.
 const standing = (run) => (run?.pose ? { pose: run.pose } : {});
@@ -278,6 +295,7 @@ const recordings = new Recordings({
   },
   lay: (recording) => panel.lay(recording),
 });
+$("kept-look").onclick = tried(() => recordings.look(state.last.recording_id));
 themed($("theme"));
 sized($("rig-size"), $("rig-section"), $("side"), $("rig-here"));
 

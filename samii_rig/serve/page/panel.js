@@ -3,6 +3,7 @@
 
 import { diagram } from "/page/chart.js";
 import { remembered } from "/page/kept.js";
+import { pretty } from "/page/units.js";
 import { VIEWS, fromParts, nearest, shown, spanned, turned } from "/page/values.js";
 
 const INKS = ["--c1", "--c2", "--c3"];
@@ -99,7 +100,7 @@ export class Panel {
   // Which outputs over which inputs there are, with their units.
   entries() {
     const found = new Map(), { live } = this;
-    const add = (c, input) => found.set(`${c.output} / ${input}`, { output: c.output, input, unit: c.unit.replace("^2", "²") });
+    const add = (c, input) => found.set(`${c.output} / ${input}`, { output: c.output, input, unit: pretty(c.unit) });
     for (const c of live?.model.curves ?? []) add(c, live.model.input);
     for (const l of this.laid) for (const c of l.responses.at(-1)?.curves ?? []) add(c, c.input);
     return [...found].map(([title, e]) => ({ title, ...e }));

@@ -3,6 +3,7 @@
 
 import { grid, range } from "/page/grid.js";
 import { Samples } from "/page/samples.js";
+import { pretty } from "/page/units.js";
 
 const EASE = 0.12; // of what is missing, a frame: blocks come four times a second
 const BEFORE = 0.25; // of the span, before the trigger
@@ -141,7 +142,7 @@ export class Scope {
     g.strokeStyle = ink("--line"); g.lineWidth = 1; g.strokeRect(x, y, w, h);
     this.curve(g, view, column, lane, y, w, h);
     // Over the curve, with room round it: the edge beside it is the values'.
-    const name = channel ? channel.name : "", unit = channel ? channel.unit.replace("^2", "²") : "";
+    const name = channel ? channel.name : "", unit = channel ? pretty(channel.unit) : "";
     g.font = "600 13px system-ui, sans-serif"; g.textAlign = "left"; g.lineWidth = 5; g.strokeStyle = ink("--panel");
     const after = x + 12 + g.measureText(name).width;
     g.strokeText(name, x + 6, y + 14); g.fillStyle = colour; g.fillText(name, x + 6, y + 14);
@@ -229,7 +230,7 @@ export class Scope {
       const pair = this.read[lane], c = this.channels[column];
       if (!pair || !c) return;
       const dv = pair[1] - pair[0];
-      parts.push(`Δ${c.name} ${Number.isFinite(dv) ? dv.toPrecision(4) : "–"} ${c.unit.replace("^2", "²")}`);
+      parts.push(`Δ${c.name} ${Number.isFinite(dv) ? dv.toPrecision(4) : "–"} ${pretty(c.unit)}`);
     });
     return parts.join(", ");
   }

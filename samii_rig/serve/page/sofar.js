@@ -1,8 +1,13 @@
 // What is known of the run while it goes on: its frequency responses and its diagnosis.
 
+import { MOVES, clock } from "/page/now.js";
+
 const part = (p) => (p > 0.9995 ? "over 99.9 %" : p < 0.0005 ? "under 0.1 %" : `${(100 * p).toFixed(1)} %`);
 const ago = (s) => (s < 90 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
 const hz = (f) => f.toPrecision(2);
+const TAKES = 3; // s of a look and an estimate
+// In steps of a tenth or so: it is an expectation, and each change is read aloud.
+const rounded = (s) => (s > 60 ? 10 * Math.ceil(s / 10) : s > 15 ? 5 * Math.ceil(s / 5) : Math.ceil(s));
 
 export class SoFar {
   // $ : element by id. ask : the service. put : append an element. panel : draws the responses.
@@ -16,40 +21,62 @@ export class SoFar {
     if (job !== this.job) { this.job = job; this.seen = ""; this.data = null; this.final(run ? null : state.last); }
     const told = run ? state.so_far : null;
     $("diagnosis-doing").textContent = told?.doing ? `Now: ${told.doing}.` : "";
-    if (told) this.diagnosis(told, run);
+    if (told) this.diagnosis(told, state);
     else if (!run && this.was) this.final(state.last);
     this.was = run;
-    $("frf-age").textContent = told && told.responses !== "0" ? `Estimated ${ago(told.responses_age_s)} ago.` : "";
+    $("frf-age").textContent = told && this.data?.responses.length ? `Estimated ${ago(told.responses_age_s)} ago.` : "";
+    const due = this.expected(state);
+    if (due !== this.due && this.data) this.about(run, due);
+    this.due = due;
     if (this.busy || !job || (told ? told.responses === this.seen : this.seen === "over")) return;
     this.busy = true;
     const seen = told ? told.responses : "over";
     try {
-      if (seen !== "0") this.data = await this.ask("GET", `/jobs/${job}/responses`);
-      this.seen = seen;
+      // Nothing is asked for that is not there.
+      const there = told ? seen !== "0" : state.last.estimated;
+      const data = there ? await this.ask("GET", `/jobs/${job}/responses`) : null;
+      if (job === this.job) Object.assign(this, { data, seen });
     } catch { this.seen = seen; } finally { this.busy = false; }
-    this.about(run);
+    this.about(run, this.expected(state));
   }
 
-  about(run) {
+  // When there will be a first estimate, in words; "" once there is one, or no run.
+  expected({ running: run, pace }) {
+    const { data } = this;
+    if (!run || data?.responses.length) return "";
+    if (!MOVES.includes(run.phase)) return "The last one is being made.";
+    if (!data) return "Its process is being started.";
+    if (data.first_s === null) return "This experiment gives none.";
+    const { duration, time_left: left } = run.progress, s = (data.first_s - (duration - left)) / pace + TAKES;
+    if (!(s < Infinity)) return "The first estimate comes soon.";
+    return s > TAKES ? `The first estimate is expected in about ${clock(rounded(s))}.` : "The first estimate is being made.";
+  }
+
+  about(run, due) {
     const { $, data } = this;
     this.panel.set(data, Boolean(run));
     if (!data) return;
     const said = data.responses.map((r) => `${r.level} ${r.unit}: ${hz(r.low_hz)} to ${hz(r.high_hz)} Hz, ${
       r.going_on ? (run ? "goes on" : "cut off") : `${r.n} ${r.n > 1 ? "repeats" : "sweep"}`}`).join("; ");
     const of = `${data.done} of ${data.of} segments`;
-    // A run that was stopped has ended before its last segments were estimated.
-    $("frf-about").textContent = `${run ? `${of} whole` : `Last run, as estimated when ${of} were whole`}. ${said || "Nothing measured yet"}.${
-      data.trouble ? ` The newest part: ${data.trouble}.` : ""}`;
+    const when = run ? `${of} whole` : data.final ? `Last run, all that was recorded: ${of} whole` : `Last run, as estimated when ${of} were whole`;
+    const none = run ? `Nothing measured yet. ${due}`.trim().replace(/\.$/, "") : "No response can be estimated from it";
+    $("frf-about").textContent = `${when}. ${said || none}.${data.trouble ? ` The newest part: ${data.trouble}.` : ""}`;
     $("frf-hatched").hidden = !run;
     $("frf").setAttribute("aria-label", `Frequency responses over the model. ${$("frf-about").textContent}`);
   }
 
-  diagnosis({ diagnosis: d, failed }, run) {
-    const { $ } = this;
+  diagnosis({ diagnosis: d, failed }, state) {
+    const { $ } = this, run = state.running;
     $("diagnosis-section").hidden = !run.diagnosis;
     $("h-diagnosis").textContent = "Diagnosis so far";
     const why = run.phase === "analysing" ? " The last one is being made." : failed ? " What makes it has ended; the log of the job says why." : "";
-    if (!d) { this.empty(`None yet: it is made from what is measured so far.${why}`); return; }
+    if (!d) {
+      const cut = run.phase === "analysing" && run.status !== "completed" && !run.early;
+      const then = failed || run.phase === "analysing" ? why : ` ${this.expected(state) || "The first one is being made."}`;
+      this.empty(cut ? "None: the run ended before there was one." : `None yet: it is made from what is measured.${then}`);
+      return;
+    }
     this.say(d, d.repeats ? "" : "Preliminary, from one sweep: its noise is not known from repeats.");
     const end = d.certain ? `Certain: ${d.certain}. ` : "";
     const stop = run.stop_when_certain ? (d.certain ? "The run ends after this segment." : "The run ends once it is certain.") : "";
@@ -61,7 +88,7 @@ export class SoFar {
   async final(last) {
     const { $ } = this;
     $("diagnosis-section").hidden = true;
-    if (!last || !last.diagnosis) return;
+    if (!last || !last.diagnosed) return;
     const d = await this.ask("GET", `/jobs/${last.id}/diagnosis`).catch(() => null);
     if (!d || this.job !== last.id) return;
     $("diagnosis-section").hidden = false;

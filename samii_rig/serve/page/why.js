@@ -28,11 +28,10 @@ export class Why {
   }
 
   async look(last) {
-    const { recordings } = await this.ask("GET", "/recordings?limit=20");
-    const found = recordings.find((r) => r.path === last.recording);
-    if (!found || this.job !== last.id) return;
-    const { remarks } = await this.ask("GET", `/recordings/${found.id}`);
-    this.recording = found.id;
+    if (!last.recording_id) return;
+    const { remarks } = await this.ask("GET", `/recordings/${last.recording_id}`);
+    if (this.job !== last.id) return;
+    this.recording = last.recording_id;
     this.tell(remarks?.notes ?? []);
   }
 
