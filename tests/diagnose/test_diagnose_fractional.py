@@ -5,6 +5,10 @@ import pytest
 from identify_kit import samii
 
 from samii_rig.diagnose.diagnose import table
+from samii_rig.diagnose.forces.laws import FRICTION, Force
+from samii_rig.diagnose.forces.model import model_of
+from samii_rig.diagnose.forces.place import Place
+from samii_rig.diagnose.physics.effect import Effect, Unknown
 from samii_rig.diagnose.physics.fractional import FractionalChain, Joint
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.model.tmm import Chain
@@ -68,3 +72,17 @@ def test_it_stands_beside_a_lossy_beam() -> None:
         step = 1e-4 * np.eye(model.n)[j]
         differences = (model.response(x + step, at) - model.response(x - step, at)) / 2e-4
         assert np.abs(slopes[..., j] - differences).max() < 1e-5 * np.abs(differences).max()
+
+
+def test_beside_a_force_the_chain_is_that_without_both() -> None:
+    """A force and a fractional damper of one joint ended with "expected a known parameter"."""
+    every = table(samii(), 0.5, 40.0)
+    damper = next(e for e in every if e.fractional is not None and e.site == "joint_2")
+    strength = Unknown("T_c", "N m", 1e-3, 1e3, (1.0,))
+    force = Force(Place("joint", ("joint_1",)), FRICTION)
+    rubbed = Effect("coulomb_friction", "joint_1", (strength,), quasi=force)
+    both, alone = model_of(samii(), (rubbed, damper)), Model(samii(), (damper,))
+    x = np.zeros(both.n)
+    chain = both.plain(x)
+    assert chain.parameters == alone.plain(x[: alone.n]).parameters
+    assert np.allclose(chain.response([3.0]), Chain(samii()).response([3.0]))

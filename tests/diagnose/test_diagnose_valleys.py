@@ -138,6 +138,25 @@ def test_a_sensor_that_lags_is_seen_beside_a_command_that_was_measured():
     assert {e.physics for e in best.effects} == {"input_not_held", "sensor_lag"}
 
 
+def test_of_two_unknowns_a_rival_is_refitted_from_weak_to_strong():
+    """A soft spring ended in a valley beside its own: it lost to a sensor's delay by that alone."""
+    spring, late = effect("ground_spring", "joint_1"), effect("sensor_delay", "a_1")
+    search = search_of(concealing((spring, [3e3, 20.0])), [spring, late])
+    for one in (spring, late):
+        start = [np.log(u.starts[len(u.starts) // 2]) for u in one.unknowns]
+        search.keep((one,), search.refitted((one,), search.nominal, start))
+    found = search.found[frozenset({spring.key})]
+    x, valley = found.fitted.x.copy(), found.fitted.chi2
+    x[-2:] = np.log(spring.unknowns[0].starts[-1]), np.log(0.05)
+    stopped = refit(found.fitted.model, search.problem, x, far=False, steps=0)
+    search.found[found.key] = replace(found, fitted=stopped, weight=-1e9)
+    search.found[found.key] = replace(
+        search.found[found.key], weight=search.ranked()[0].weight - 20.0
+    )
+    search._from_everywhere()
+    assert search.found[found.key].fitted.chi2 < valley + 0.5
+
+
 def test_the_noise_of_records_is_told_anew_by_the_rig_that_was_found():
     late = effect("sensor_lag", "a_1")
     told = []

@@ -30,6 +30,7 @@ WORTH = 8.0  # of chi-square, gain in the screen below which a candidate is not 
 ENOUGH = 1.15  # chi-square over its mean below which growth looks at one explanation only
 SATURATED = "torsional_compliance"  # joints that give: what is missing in many places at once
 MOST_SATURATED = 12  # of these places
+APART = (2, 5, 8)  # tenths of their range at which several unknowns start together
 WEAK = (4, 5, 6)  # tenths of the range at which they start
 BEAM = 2  # explanations that are grown further
 HOPELESS = 20.0  # times the best chi-square, above which an explanation is let go
@@ -97,7 +98,23 @@ class Search(Explanations):
         if (best := self.ranked()[0]).key != about and best.effects:
             self.renew(best)
             self.temper()
+        self._from_everywhere()
         return self.ranked()
+
+    def _from_everywhere(self) -> None:
+        """Single effects of several unknowns that may still compete, refitted from weak to strong:
+        one that stopped in a valley beside its own loses to others by that alone."""
+        best = self.ranked()[0]
+        near = [e for e in self.ranked() if best.effects and e.weight > best.weight - NEAR]
+        several = [e for e in near if len(e.effects) == 1 and len(e.effects[0].unknowns) > 1]
+        for e in self.each(several, lambda e: named(e.effects)):
+            unknowns = e.effects[0].unknowns
+            for tenth in APART:
+                start = [math.log(u.starts[tenth * len(u.starts) // 10]) for u in unknowns]
+                end = self.refitted(e.effects, self.nominal, start, e.fitted.cost)
+                if end is not None:
+                    self.keep(e.effects, end)
+        self.temper()
 
     def _bent(self, best: Explanation) -> bool:
         """Whether nominal parameters at unlikely values may hide what is missing."""

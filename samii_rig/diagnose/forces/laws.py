@@ -19,6 +19,7 @@ COMPUTED = 0.01  # of a strength: what it was off by where it is hidden in stron
 # nearer (Armstrong-Helouvry et al. 1994, Automatica 30). Two programs' friction differed by that.
 RUBBED = 0.05
 
+
 @dataclass(frozen=True, eq=False)
 class Law:
     """A force law.

@@ -50,7 +50,7 @@ class ForceModel(Model):
 
     def plain(self, x: Float) -> Chain:
         """As of `Model`, without the force's input and sensor."""
-        return Chain(self.built).with_values(self.values(x))
+        return self.chain_of(self.built).with_values(self.values(x)).plain
 
     def strengths(self, x: Float) -> Float:
         """The force's unknowns."""
