@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from concealed_kit import SAMII
 from cut_kit import DESIGN, cut_sweeps
+from diagnose_kit import effect
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
+from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.records import RecordProblem, Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
@@ -281,3 +283,31 @@ def test_the_real_motor_has_dry_friction(recordings: Path) -> None:
     assert force.physics == "coulomb_friction"
     # Two fifths and more of what the nominal model leaves over the noise.
     assert search.ratio(best.fitted) - 1 < 0.6 * (search.ratio(search.nominal.fitted) - 1)
+
+
+def test_a_force_is_held_against_what_is_wrong_with_the_data_alone():
+    """A measured command hides friction of 160 noise units; a slip of the valve mimics both."""
+    unheld, slip = effect("input_not_held", "v_2"), effect("velocity_feedback", "joint_2_source")
+    fitted = SimpleNamespace(model=None)
+    nominal, mistake, both = (
+        Explanation(some, fitted, weight)
+        for some, weight in (((), -1e6), ((unheld,), -500.0), ((unheld, slip), -200.0))
+    )
+    found = {e.key: e for e in (nominal, mistake, both)}
+    ranked = [both, mistake, nominal]
+    linear = SimpleNamespace(stage="", nominal=nominal, found=found, ranked=lambda: ranked)
+
+    class Kept(ForceSearch):
+        def use(self, table):
+            pass
+
+        def _about(self, fitted):
+            pass
+
+        def _only(self, some):
+            self.kept = list(some)
+
+    search = object.__new__(Kept)
+    search.linear, search.table = linear, ()
+    search.__post_init__()
+    assert search.kept == [nominal, mistake, both]

@@ -72,7 +72,8 @@ class ForceSearch(RecordSearch):
         ranked = self.linear.ranked()
         self._about(ranked[0].fitted)
         kept = [e for e in ranked[:RIVALS] if e.weight > ranked[0].weight - NEAR]
-        self._only((self.linear.nominal, *kept))
+        # Beside what is wrong with the data a force is held against what the rig lacks otherwise.
+        self._only((self.linear.nominal, _of_data(self.linear), *kept))
 
     def _only(self, some: Sequence[Explanation]) -> None:
         """Refit some explanations, and forget all others."""
