@@ -241,21 +241,24 @@ def lines_apart(files: Sequence[Saved], lines: Measured, left: float, rig: Rig) 
     them.
     """
     band = float(lines.frequency[0]), float(lines.frequency[-1])
-    names, each = zip(*files, strict=True)
-    found = _grouped(len(each), lambda i, j: _lines_differ(each[i], each[j], rig, band))
+    found = _lines_grouped(files, rig, band)
     if len(found.groups) < 2:
         return None
-    return replace(found.apart(names, left), samples=False)
+    return replace(found.apart([name for name, _ in files], left), samples=False)
 
 
 def states_of(files: Sequence[Saved], rig: Rig) -> tuple[tuple[str, ...], ...]:
     """The states that recordings are of by their own responses, the names of each; one where they
     agree."""
-    names, each = zip(*files, strict=True)
-    every = [f for own in each for r in own for f in r.frequency]
-    band = float(min(every)), float(max(every))
-    found = _grouped(len(each), lambda i, j: _lines_differ(each[i], each[j], rig, band))
-    return found.apart(names, 0.0).states
+    every = [f for _, own in files for r in own for f in r.frequency]
+    found = _lines_grouped(files, rig, (float(min(every)), float(max(every))))
+    return found.apart([name for name, _ in files], 0.0).states
+
+
+def _lines_grouped(files: Sequence[Saved], rig: Rig, band: Band) -> _Grouped:
+    """Files of responses by the states that they are of."""
+    each = [own for _, own in files]
+    return _grouped(len(each), lambda i, j: _lines_differ(each[i], each[j], rig, band))
 
 
 def _lines_differ(

@@ -30,7 +30,7 @@ WORTH = 8.0  # of chi-square, gain in the screen below which a candidate is not 
 ENOUGH = 1.15  # chi-square over its mean below which growth looks at one explanation only
 SATURATED = "torsional_compliance"  # joints that give: what is missing in many places at once
 MOST_SATURATED = 12  # of these places
-APART = (2, 5, 8)  # tenths of their range at which several unknowns start together
+TENTHS = (2, 5, 8)  # tenths of their range at which several unknowns start together
 WEAK = (4, 5, 6)  # tenths of the range at which they start
 BEAM = 2  # explanations that are grown further
 HOPELESS = 20.0  # times the best chi-square, above which an explanation is let go
@@ -109,7 +109,7 @@ class Search(Explanations):
         several = [e for e in near if len(e.effects) == 1 and len(e.effects[0].unknowns) > 1]
         for e in self.each(several, lambda e: named(e.effects)):
             unknowns = e.effects[0].unknowns
-            for tenth in APART:
+            for tenth in TENTHS:
                 start = [math.log(u.starts[tenth * len(u.starts) // 10]) for u in unknowns]
                 end = self.refitted(e.effects, self.nominal, start, e.fitted.cost)
                 if end is not None:
