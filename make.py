@@ -42,6 +42,9 @@ SITE: list[str | Path] = [
 ]
 # Trust the machine's certificates: a network may have its own. Which name counts: uv's version.
 TRUST = {"UV_SYSTEM_CERTS": "1", "UV_NATIVE_TLS": "1"}
+# Whether this user's processes may come before others; a system without priorities has none to ask.
+FIRST = "import os; os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))"
+OTHERS = ".pytest_cache/others"
 UV_PATIENCE = "20"  # s; pip is there when uv's way is closed, so nobody waits for uv for minutes
 
 
@@ -138,21 +141,29 @@ def check(arguments: list[str]) -> None:
 
 
 def tests(arguments: list[str]) -> None:
-    """All tests: those in real time first, one after another and nothing beside them.
+    """All tests: those in real time one after another, the others side by side.
 
-    What failed of them is tried once more, and told: another program on this machine may have had
-    the cores for longer than a device waits.
+    What runs in real time comes before the rest of the machine's work (tests/conftest.py). Who may
+    not ask for that has nothing beside it, and what failed is tried once more, and told: another
+    program on this machine may have had the cores for longer than a device waits.
     """
     cores = min(os.cpu_count() or 1, 4)
     pytest: list[str | Path] = [BIN / "pytest", "-q", "--durations=10"]
-    workers = ["-n", str(cores), "--dist", "worksteal"]  # neighbours stay together: one fixture
+    # One more than cores: services and browsers wait. Neighbours stay together: one fixture.
+    workers = ["-n", str(cores + 1), "--dist", "worksteal"]
     if arguments:
         call(*pytest, *workers, *arguments)
         return
-    if run(*pytest, "-m", "real_time and not slow"):
+    real_time = [*pytest, "-m", "real_time and not slow"]
+    # Each run keeps what failed in it by itself.
+    others = [*pytest, *workers, "-m", "not real_time and not slow", "-o", f"cache_dir={OTHERS}"]
+    if run(PYTHON, "-c", FIRST, quiet=True) == 0:
+        side_by_side(others, real_time)
+        return
+    if run(*real_time):
         say("what failed in real time is tried once more, alone")
-        call(*pytest, "--last-failed", "-m", "real_time and not slow")
-    call(*pytest, *workers, "-m", "not real_time and not slow")
+        call(*real_time, "--last-failed")
+    call(*others)
 
 
 def side_by_side(*commands: Sequence[str | Path]) -> None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from samii_rig.errors import EstimateError
-from samii_rig.likelihood import rounding
+from samii_rig.likelihood import rounding, spikes
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Disturbances, Noise
@@ -181,6 +181,26 @@ class Records:
         y = samples.z - contour.predicted(H, samples.r)[len(samples.r) - len(samples.z) :]
         return np.asarray(np.fft.rfft(y, axis=0)[k] / np.sqrt(len(y)))
 
+    def without_spikes(self, H: Complex) -> Records:
+        """The same, without spikes that show beside what H on `exact` predicts: as `spikes`, whose
+        cubic is blind to them where the motion is fast."""
+        exact = self.exact()
+
+        def left(samples: Samples | Piece) -> Float:
+            y = exact.predicted(H, samples.r)[len(samples.r) - len(samples.z) :]
+            e = samples.z - y
+            mended, count = spikes.mended(e, self.step)
+            return samples.z + (mended - e) if count.any() else samples.z
+
+        def each(found: tuple[Samples, ...]) -> tuple[Samples, ...]:
+            return tuple(replace(x, z=left(x)) for x in found)
+
+        pieces = tuple(
+            replace(p, z=left(p), repeats=each(p.repeats), contrasts=each(p.contrasts))
+            for p in self.pieces
+        )
+        return replace(self, pieces=pieces)
+
     def seen(self, H: Complex, loop: Loops) -> list[Seen]:
         """Of each piece what H on `exact` leaves, and what else is in it."""
         answers = Answers.of(H, self.exact(), loop, self.longest, self.pieces[0].inputs)
@@ -210,7 +230,9 @@ def left_by(
     part: Callable[[Int], NDArray[np.bool_]] | None = None,
 ) -> Left:
     """The lines of all pieces under one model, in units of the noise that `noise` has."""
-    rows = _rows(records, None, records.seen(response(records.exact().s), loop))
+    H = response(records.exact().s)
+    records = records.without_spikes(H)
+    rows = _rows(records, None, records.seen(H, loop))
     if part is not None:
         rows = rows.take(np.flatnonzero(part(rows.k)))
     both = np.concatenate([rows.e[:, :, None], rows.N], axis=2)
@@ -324,6 +346,7 @@ def formed(
     """As `reduced`, and the lines that it was made of."""
     smooth, exact = records.smooth(), records.exact()
     H, S = response(exact.s), response(smooth.s)
+    records = records.without_spikes(H)
     inside = (smooth.frequency > records.band[0]) & (smooth.frequency < records.band[1])
     shape = S / np.median(np.abs(S[inside]), axis=0)
     if at is None:

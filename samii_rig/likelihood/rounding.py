@@ -38,6 +38,9 @@ UNSEEN = 0.05  # of a staircase's error, what dithering leaves of it that nobody
 # Times by which what rounding adds may differ between pieces of one group, and how many groups are
 # told apart at most: each has bins of its own.
 APART, GROUPS = 1.5, 8
+# s for which what wanders, below the band, rests in its step: some periods of the band, from which
+# its place is told.
+REST = 1.0
 OFFSETS = 16  # places of a motion in its step, at which its rounding is tried: within 25 % a line
 LIKELY = 4  # of these, that are nearest to what is read
 
@@ -151,7 +154,10 @@ class Rounding:
                 continue
             parts = _parts(piece, y[:, i], float(step[i]), sd, rate_hz)
             shares = np.array([c.part for c in piece.commands] or [1.0])
-            errors = _errors(y[:, i] / step[i], shares, parts, sd / step[i])
+            moved = y[:, i] / step[i]
+            if shares.size == 1 and not piece.repeats and not piece.contrasts:
+                moved = moved + _place(moved, piece.z[:, i] / step[i], max(int(REST * rate_hz), 3))
+            errors = _errors(moved, shares, parts, sd / step[i])
             spectra = np.fft.rfft(step[i] / math.sqrt(n) * errors, axis=1)
             power[:, i] = np.mean(np.abs(spectra) ** 2, axis=0)
             factors[i], draws[i] = parts, np.asarray(spectra[:, k])
@@ -163,6 +169,16 @@ def _noise(left: Float, step: float) -> float:
     power = np.abs(np.fft.rfft(left - np.mean(left))) ** 2 / left.size
     white = float(np.median(power[power.size // 2 :])) / math.log(2)
     return math.sqrt(max(white - WHITE * step**2, 0.0))
+
+
+def _place(y: Float, z: Float, width: int) -> Float:
+    """(n,) where a motion y (n,) that wanders stands in its step: of each `width` samples the place
+    at which its rounding is nearest to what is read z (n,). All in steps."""
+    out = np.zeros(y.size)
+    for on in np.array_split(np.arange(y.size), max(y.size // width, 1)):
+        off = np.stack([np.rint(y[on] + o) - z[on] for o in np.arange(OFFSETS) / OFFSETS])
+        out[on] = int(np.argmin(np.var(off, axis=1))) / OFFSETS
+    return out
 
 
 def _errors(y: Float, shares: Float, parts: Float, sd: float) -> Float:
