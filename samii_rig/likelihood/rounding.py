@@ -156,7 +156,8 @@ class Rounding:
             shares = np.array([c.part for c in piece.commands] or [1.0])
             moved = y[:, i] / step[i]
             if shares.size == 1 and not piece.repeats and not piece.contrasts:
-                moved = moved + _place(moved, piece.z[:, i] / step[i], max(int(REST * rate_hz), 3))
+                width = max(int(REST * rate_hz), 3)
+                moved = moved + _wandering(moved, piece.z[:, i] / step[i], width)
             errors = _errors(moved, shares, parts, sd / step[i])
             spectra = np.fft.rfft(step[i] / math.sqrt(n) * errors, axis=1)
             power[:, i] = np.mean(np.abs(spectra) ** 2, axis=0)
@@ -171,14 +172,18 @@ def _noise(left: Float, step: float) -> float:
     return math.sqrt(max(white - WHITE * step**2, 0.0))
 
 
-def _place(y: Float, z: Float, width: int) -> Float:
-    """(n,) where a motion y (n,) that wanders stands in its step: of each `width` samples the place
-    at which its rounding is nearest to what is read z (n,). All in steps."""
-    out = np.zeros(y.size)
-    for on in np.array_split(np.arange(y.size), max(y.size // width, 1)):
-        off = np.stack([np.rint(y[on] + o) - z[on] for o in np.arange(OFFSETS) / OFFSETS])
-        out[on] = int(np.argmin(np.var(off, axis=1))) / OFFSETS
-    return out
+def _wandering(y: Float, z: Float, width: int) -> Float:
+    """(n,) by how much a motion y (n,) stands elsewhere in its step than over all: of each `width`
+    samples the place at which its rounding is nearest to what is read z (n,). All in steps."""
+    every = np.arange(y.size)
+    parts = np.array_split(every, max(y.size // width, 1))
+    offsets = np.arange(OFFSETS) / OFFSETS
+
+    def place(on: Int) -> float:
+        off = np.rint(y[on] + offsets[:, None]) - z[on]
+        return float(offsets[np.argmin(np.var(off, axis=1))])
+
+    return np.repeat([place(on) for on in parts], [on.size for on in parts]) - place(every)
 
 
 def _errors(y: Float, shares: Float, parts: Float, sd: float) -> Float:

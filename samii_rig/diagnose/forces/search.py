@@ -30,6 +30,7 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
 from samii_rig.likelihood.reduce import Left
+from samii_rig.likelihood.unexplained import Unexplained, unexplained
 from samii_rig.types import Float
 
 CLOSER = 2  # times that the best strength is looked at closer
@@ -109,9 +110,14 @@ class ForceSearch(RecordSearch):
         # Every refit of a force is done anew with the likelihood: it goes on from where it ended.
         return super().refitted_from(effects, start, give_up, min(steps, FEW), far=False)
 
-    def settled(self) -> bool:
+    @property
+    def won(self) -> bool:
+        """Whether the best explanation has a force."""
+        return isinstance(self.ranked()[0].fitted.model, ForceModel)
+
+    def settle(self) -> None:
         """Refit what promises most, and all that may compete again about the best of it, until
-        that stands still. Whether it has a force."""
+        that stands still."""
         base = _of_data(self)
         # Without what is wrong with the data itself nothing can be seen of a force beside it.
         mistaken = bool(base.effects)
@@ -127,7 +133,7 @@ class ForceSearch(RecordSearch):
         for _ in range(AGAIN):
             best = self.ranked()[0]
             if not isinstance(best.fitted.model, ForceModel):
-                return False
+                return
             self._about(best.fitted)
             near = [e for e in self.ranked() if e.weight > best.weight - NEAR]
             self._only((*near, self.nominal))
@@ -139,7 +145,6 @@ class ForceSearch(RecordSearch):
         self._either_way(self.ranked()[0])
         self.pair()
         self.temper()
-        return isinstance(self.ranked()[0].fitted.model, ForceModel)
 
     def _try(self, hopes: Sequence[Hope], base: Explanation, look: int) -> None:
         """Refit the forces that may be the best beside `base`, by the gains of that look."""
@@ -273,10 +278,18 @@ class ForceSearch(RecordSearch):
 
     def left(self, fitted: Fitted, *, shown: bool = False) -> Left:
         """As of `RecordSearch`."""
+        return self._rest(fitted).left(fitted, self.reduced, shown=shown)
+
+    def unexplained(self, fitted: Fitted) -> list[Unexplained]:
+        """What a fit leaves of each piece."""
+        rest = self._rest(fitted)
+        return unexplained(rest.records, rest.response(fitted), self.reduced, rest.wired.loops)
+
+    def _rest(self, fitted: Fitted) -> Whole:
+        """The records as those of the linear part of a fit."""
         if not isinstance(fitted.model, ForceModel):
-            return super().left(fitted, shown=shown)
-        rest = Moved(self.levels, self._ways).without(fitted)
-        return rest.left(fitted, self.reduced, shown=shown)
+            return self.levels
+        return Moved(self.levels, self._ways).without(fitted)
 
     def beside(self, best: Explanation) -> tuple[Explanations, Explanation]:
         """As of `Explanations`: the records without the force of `best`, about which the likelihood
@@ -299,13 +312,14 @@ class ForceSearch(RecordSearch):
         return self.problem
 
 
-def compete_on_records(linear: RecordSearch) -> ForceSearch | None:
-    """Let forces compete with what the linear search of whole records found; None where none wins.
+def compete_on_records(linear: RecordSearch) -> ForceSearch:
+    """Let forces compete with what the linear search of whole records found.
 
     Raises SamiiRigError where no force can be computed on this rig.
     """
     search = ForceSearch(linear)
-    return search if search.settled() else None
+    search.settle()
+    return search
 
 
 def _of_data(search: Explanations) -> Explanation:

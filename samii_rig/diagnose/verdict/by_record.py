@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.measured import DIFFER
 from samii_rig.diagnose.fit.agreeing import Given, states_apart
+from samii_rig.diagnose.fit.between_runs import MOSTLY
 from samii_rig.diagnose.fit.exact import wrong_lengths
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
+from samii_rig.diagnose.forces.varying import varying
 from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
@@ -50,12 +52,15 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     if (wrong := wrong_lengths(search)) is not None:
         return _of_lengths(case, search, first, bands, *wrong)
     search.begin("amplitude levels")
-    forced = forces_on(search)
+    forces = forces_on(search)
+    forced = forces if forces is not None and forces.won else None
     if forced is None or not (case.search.lines.torn() or forced.is_enough()):
         search.begin("what is missing, in pairs")
         search.run()
         search.begin("amplitude levels, beside pairs")
-        forced = None if forced is None else forces_on(search)
+        if forced is not None:
+            forces = forces_on(search)
+            forced = forces if forces is not None and forces.won else None
     search.begin("what cannot be told apart")
     if forced is None:
         looked = _consistent(search, _looked(search))
@@ -64,6 +69,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         looked = _looked(forced)
         if forced.spent:
             looked = replace(looked, said=(*looked.said, SPENT))
+    if forces is not None:
+        looked = _constant(forces, looked, (forced or search).problem.expected)
     looked = replace(looked, said=(*looked.said, *_unasked(search)))
     given = Given.of(search, case.runs, case.clean.samples)
     return _agreeing(case, forced or search, first, bands, looked, [given])
@@ -190,9 +197,8 @@ def _of_lengths(
 
 
 def forces_on(search: RecordSearch) -> ForceSearch | None:
-    """The search among forces, where one explains the records best; None where none does, where
-    the rig has no partial fractions in which it could be computed, or where it has several
-    inputs."""
+    """The search among forces; None where the rig has no partial fractions in which they could be
+    computed, or where it has several inputs."""
     if len(search.whole.wired.inputs) > 1:
         return None
     try:
@@ -205,6 +211,18 @@ def _unasked(search: RecordSearch) -> tuple[str, ...]:
     """In words what was not looked for."""
     names = [x.command for x in search.whole.wired.inputs]
     return (SEVERAL.format(len(names), ", ".join(names)),) if len(names) > 1 else ()
+
+
+def _constant(forces: ForceSearch, looked: _Looked, expected: float) -> _Looked:
+    """The same, but where a stiffness varies something is missing; and that in words. expected : of
+    chi-square."""
+    judged = looked.judged
+    found = varying(forces, judged.best)
+    if found is None or found.gain < MOSTLY * (judged.best.fitted.chi2 - expected):
+        return looked
+    if judged.verdict in verdict.SAID and judged.evidence.drop > found.gain:
+        return replace(looked, said=(*looked.said, found.told()))
+    return replace(looked, judged=replace(judged, verdict="unknown", beyond=found))
 
 
 def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:

@@ -15,6 +15,7 @@ from samii_rig.diagnose.fit.explanations import NEAR, Explanation, threshold
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.stated import IN_DATA, PLACE, TINY, Evidence, probability
+from samii_rig.diagnose.forces.varying import Varying
 from samii_rig.diagnose.result import Gap, Verdict
 
 NOTHING = 0.2  # probability of nothing missing below which it is called missing
@@ -44,7 +45,7 @@ class Judgement:
     right: float
     evidence: Evidence
     inflation: float
-    beyond: Changing | None = None
+    beyond: Changing | Varying | None = None
     partly: bool = False
 
     @property
