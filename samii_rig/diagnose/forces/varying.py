@@ -54,11 +54,10 @@ class Varying:
 
     def told(self) -> str:
         """In words."""
-        swings = f"swings at {self.hz:.3g} Hz"
-        way = swings if self.hz > self.slow else "drifts, or differs from record to record,"
+        swing = f", as by a swing at {self.hz:.3g} Hz," if self.hz > self.slow else ""
         return (
-            f"the stiffness of {self.sites[0][0]} {way} by {100 * self.depth:.2g} % "
-            f"(+/- {100 * NINETY * self.sd:.1g})"
+            f"the stiffness of {self.sites[0][0]} is not constant: it varies{swing} by "
+            f"{100 * self.depth:.2g} % (+/- {100 * NINETY * self.sd:.1g})"
         )
 
 
@@ -127,7 +126,8 @@ class Pulled:
             np.arange(size // 2 + 1) * (span.rate_hz * span.n / span.samples / size), np.float64
         )
         power = np.asarray(np.abs(P) ** 2, np.float64)
-        return cls(f, power, np.maximum(V, ROUNDED * V.max()))
+        seen = V > ROUNDED * V.max()  # not where no sensor shows the force
+        return cls(f, np.where(seen, power, 0.0), np.where(seen, V, 1.0))
 
 
 def pulled(span: Span, sensors: Complex, k: Int, lines: Complex, times: float) -> Float:

@@ -217,10 +217,16 @@ def _constant(forces: ForceSearch, looked: _Looked, expected: float) -> _Looked:
     """The same, but where a stiffness varies something is missing; and that in words. expected : of
     chi-square."""
     judged = looked.judged
+    drop = judged.evidence.drop
+    if judged.verdict in verdict.SAID:
+        # In the place of what is said, or beside it.
+        other = varying(forces, verdict.as_meant(forces, judged.best))
+        if other is not None and other.gain > drop:
+            return replace(looked, judged=replace(judged, verdict="unknown", beyond=other))
     found = varying(forces, judged.best)
     if found is None or found.gain < MOSTLY * (judged.best.fitted.chi2 - expected):
         return looked
-    if judged.verdict in verdict.SAID and judged.evidence.drop > found.gain:
+    if judged.verdict in verdict.SAID and drop > found.gain:
         return replace(looked, said=(*looked.said, found.told()))
     return replace(looked, judged=replace(judged, verdict="unknown", beyond=found))
 

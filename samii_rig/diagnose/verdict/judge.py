@@ -11,7 +11,7 @@ import numpy as np
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.between_runs import Changing, between_runs
 from samii_rig.diagnose.fit.classes import Class, classes
-from samii_rig.diagnose.fit.explanations import NEAR, Explanation, threshold
+from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, threshold
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.stated import IN_DATA, PLACE, TINY, Evidence, probability
@@ -139,7 +139,7 @@ def _evidence(
     # Sums, not 1 - p: odds of a million are told from odds of a billion.
     others = sum(c.probability for c in ordered[1:])
     empty = next((e.weight for e in ranked if not e.effects), -math.inf)
-    base = _as_meant(search, first).fitted
+    base = as_meant(search, first).fitted
     before, left = search.ratio(base), search.ratio(first.fitted)
     return Evidence(
         odds=math.log(max(chosen.probability, TINY) / max(others, TINY)),
@@ -157,7 +157,7 @@ def _evidence(
     )
 
 
-def _as_meant(search: Search, best: Explanation) -> Explanation:
+def as_meant(search: Explanations, best: Explanation) -> Explanation:
     """The nominal model of what was meant to be recorded: with what is no physics of `best`, which
     no physics gets the credit for."""
     meant = frozenset(e.key for e in best.effects if not e.physical)
