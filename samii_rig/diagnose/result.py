@@ -262,7 +262,8 @@ class Diagnosis:
     moved : the largest first. sigma : root of the chi-square that the causes explain. gain : noise
         units by which the next experiment would tell the rivals apart; None where none was found.
     states : the recordings of each state of the rig, where they are of more than one. exact : what
-        is no missing physics, but one or two wrong numbers of the rig file.
+        is no missing physics, but one or two wrong numbers of the rig file. beyond : what is in no
+        table and was found instead, in words.
     """
 
     verdict: Verdict
@@ -292,6 +293,7 @@ class Diagnosis:
     before: Before | None = None
     states: tuple[tuple[str, ...], ...] = ()
     exact: tuple[Exact, ...] = ()
+    beyond: str = ""
 
     def plain(self) -> dict[str, Any]:
         """The contract of `samii-rig diagnose --json`."""
@@ -331,6 +333,7 @@ class Diagnosis:
             "model": self.model,
             **({"before": self.before.plain()} if self.before else {}),
             **({"exact": [one.plain() for one in self.exact]} if self.exact else {}),
+            **({"beyond": self.beyond} if self.beyond else {}),
             **({"states": [list(names) for names in self.states]} if self.states else {}),
         }
 
@@ -402,6 +405,8 @@ class Diagnosis:
                 site, p = self.sites[0] if self.sites else ("", 0.0)
                 place = f" It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
                 what = "Something changed" if two else "Something is missing"
+                if self.beyond:
+                    return f"{what} that is in no table: {self.beyond}."
                 return f"{what} that the table does not name for sure.{place}"
         named = " and ".join(_said(c) for c in self.causes)
         what = "Changed" if two else "Left out"

@@ -59,7 +59,9 @@ def test_a_joint_that_changes_between_runs_is_unknown_but_its_place_is_told(join
     found = diagnose(runs, samii(), effects=FEW)
     assert found.verdict == "unknown"
     assert found.sites[0][0] == joint
-    assert any(f"{joint} changes from run to run" in line for line in found.not_physics)
+    assert f"{joint} changes from run to run" in found.beyond
+    assert found.beyond in found.lines()[0]
+    assert found.plain()["beyond"] == found.beyond
 
 
 def test_runs_that_agree_have_no_joint_that_changes():

@@ -126,7 +126,7 @@ class Pulled:
             np.arange(size // 2 + 1) * (span.rate_hz * span.n / span.samples / size), np.float64
         )
         power = np.asarray(np.abs(P) ** 2, np.float64)
-        seen = V > ROUNDED * V.max()  # not where no sensor shows the force
+        seen = ROUNDED * V.max() < V  # not where no sensor shows the force
         return cls(f, np.where(seen, power, 0.0), np.where(seen, V, 1.0))
 
 

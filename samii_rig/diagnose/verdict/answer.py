@@ -101,8 +101,6 @@ def told(judged: Judgement) -> list[str]:
             case _ if unit:
                 g = found["gain"]
                 out.append(f"{effect.site} is {g.value:.4g} times what it should be: {unit}")
-    if judged.beyond is not None:
-        out.append(judged.beyond.told())
     many = judged.classes[0].names()
     if many > MOST_NAMES:
         alike = [" and ".join(" at ".join(e.name) for e in m.effects)

@@ -22,6 +22,10 @@ from samii_rig.diagnose.verdict.plan import next_experiment
 from samii_rig.types import FrequencyResponse, Recording
 
 ALTERNATIVES = 6
+REPEAT = (
+    "a stiffness that changes is told apart from a force by when it does",
+    "repeat one recording at once, and again after a pause",
+)
 
 
 @dataclass(frozen=True)
@@ -107,6 +111,8 @@ def told(
         words += answer.told(judged)
     words += (*said, *clean.lacks)
     why, experiment, gain = next_levels(judged) or next_experiment(search, judged)
+    if judged.beyond is not None:
+        why, experiment, gain = (*REPEAT, None)
     if doubt and missing:
         why, experiment, gain = doubt.why, doubt.experiment, None
     ranked = list(zip(judged.classes, judged.shares, strict=True))[len(causes) > 0 :]
@@ -132,7 +138,7 @@ def told(
         experiment=experiment,
         outside=judged.outside,
         rig=explained(best.fitted) if best.effects else None,
-        traces=traces(search, judged) if missing else (),
+        traces=traces(search, judged) if missing and judged.beyond is None else (),
         moved=answer.moved(best.fitted),
         could_hide=could_hide(*search.beside(best)),
         used=shown.used,
@@ -143,4 +149,5 @@ def told(
             "beyond": judged.beyond is not None,
             "causes": [c.plain() for c in own],
         },
+        beyond=judged.beyond.told() if judged.beyond is not None else "",
     )

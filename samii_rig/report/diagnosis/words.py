@@ -195,6 +195,8 @@ def _verdict(found: Diagnosis) -> tuple[Mark, str, str]:
         if len(found.exact) > 1:
             title = "Two numbers of the rig file are wrong"
         return "bad", title, f"{' and '.join(one.told() for one in found.exact)}."
+    if found.beyond:
+        return "bad", "Something is missing that is in no table", sentence(found.beyond)
     places = suspects(found)
     where = "The data do not tell where it is."
     site, p = next(iter(places.items()), ("", 0.0))
