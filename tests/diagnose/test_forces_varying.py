@@ -14,7 +14,7 @@ from cut_kit import DESIGN, cut_sweeps
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.search import ForceSearch
-from samii_rig.diagnose.forces.varying import Pulled, Seen, pulled, varying
+from samii_rig.diagnose.forces.varying import Pulled, pulled, varying
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.record.reader import read_recording
@@ -90,13 +90,12 @@ def test_under_noise_alone_every_frequency_has_chi_square_of_two_freedoms(
     """Noise that is white in the likelihood's own units, at the lines of real records."""
     rng, reach = np.random.default_rng(2), nothing.reach
     left = nothing.unexplained(nothing.nominal.fitted)
-    f = np.arange(0.5, 20.0, 0.25)
-    each = []
+    f, each = (0.0, 0.02, 0.1, 0.4, 1.6, 6.4), []
     for spring in (e.quasi for e in nothing.forces if e.quasi and e.quasi.law is HARDENING):
         ports = reach.ports(spring.place, of_speed=False)
         assert ports is not None
         motion = reach.motion(spring.place, of_speed=False)
-        for _ in range(20):
+        for _ in range(40):
             noise = [
                 replace(
                     x,
@@ -106,10 +105,13 @@ def test_under_noise_alone_every_frequency_has_chi_square_of_two_freedoms(
                 for x in left
             ]
             parts = zip(reach.spans, motion, ports.sensors, noise, strict=True)
-            each.append(Seen.of([Pulled.of(*one) for one in parts], f).chi2)
-    chi2, freedoms = np.array(each), 2 * sum(len(x.white) for x in left)
-    assert np.mean(chi2) == pytest.approx(freedoms, rel=0.05)
-    assert np.var(chi2) == pytest.approx(2 * freedoms, rel=0.2)
+            pieces = [Pulled.of(*one) for one in parts]
+            each += [[np.sum([one.exact(hz) for one in pieces], axis=0) for hz in f]]
+    chi2, free, _ = np.moveaxis(np.array(each), 2, 0)
+    assert np.mean(free, axis=0)[0] == np.mean(free, axis=0)[-1] / 2
+    unit = (chi2 - free) / np.sqrt(2 * free)
+    assert np.max(np.abs(np.mean(unit, axis=0))) < 0.3, np.mean(unit, axis=0)
+    assert np.max(np.abs(np.var(unit, axis=0) - 1)) < 0.5, np.var(unit, axis=0)
 
 
 def test_where_nothing_is_missing_every_stiffness_is_constant(nothing: ForceSearch) -> None:

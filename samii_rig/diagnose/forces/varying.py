@@ -9,7 +9,8 @@ explain it, how far a change cos(Omega t) lies along that is the Fourier coeffic
 
 under noise alone, which knows nothing of phi: R_phi the products of the motion with itself, R_pull
 the covariance of the pull, of the noise's own spectrum. So 2 |P|^2/V is chi-square with two degrees
-of freedom at every Omega, summed over the records with two for each.
+of freedom at every Omega, summed over the records with two for each. Where it is largest both
+phases are computed exactly: ends and all, and as one where the motion is short for a slow swing.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from samii_rig.diagnose.fit.between_runs import STIFFNESS
 from samii_rig.diagnose.fit.exact import NINETY
 from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.forces.laws import HARDENING
@@ -32,6 +34,7 @@ from samii_rig.types import Complex, Float, Int
 FASTEST = 0.5  # of the highest frequency in the records: what varies faster is no stiffness
 FINE = 4  # frequencies for each that the longest record tells apart
 ALARM = 2e-3  # chance that noise alone makes any stiffness vary
+ONE_PHASE = 1e-3  # of V: less variance is that of a phase which the motion does not show
 ROUNDED = 1e-6  # of the largest variance: less is rounding
 
 
@@ -72,47 +75,55 @@ def varying(search: ForceSearch, best: Explanation) -> Varying | None:
     for spring in (e for e in search.forces if e.quasi is not None and e.quasi.law is HARDENING):
         assert spring.quasi is not None
         ports = reach.ports(spring.quasi.place, of_speed=False)
-        if ports is None:
+        if ports is None or not reach.scale((spring.site, STIFFNESS)) > 0:
             continue
         motion = reach.motion(spring.quasi.place, of_speed=False)
         each = zip(reach.spans, motion, ports.sensors, left, strict=True)
-        found.append((spring.site, Seen.of([Pulled.of(*one) for one in each], f)))
+        found.append((spring.site, Swing.of([Pulled.of(*one) for one in each], f)))
     if not found:
         return None
-    found.sort(key=lambda one: -one[1].most)
-    site, seen = found[0]
-    rows = sum(len(one.white) for one in left)
-    # Of a motion that is short, both phases of a slow swing are one: at worst of all.
-    chance = float(stats.chi2.sf(seen.most / 2, rows))
-    if len(found) * 2 * longest * f[-1] * chance > ALARM:
+    found.sort(key=lambda one: one[1].free - one[1].chi2)
+    site, best_one = found[0]
+    tries = len(found) * 2 * longest * f[-1]
+    if tries * float(stats.chi2.sf(best_one.chi2, best_one.free)) > ALARM:
         return None
-    p = np.exp([(one.most - seen.most) / 2 for _, one in found])
-    hz, gain, slow = float(f[seen.at]), seen.most - 2 * rows, 1 / longest
-    of_swing = 2.0 if hz > slow else 0.5
-    k, known = reach.scale((site, "k")), seen.known[seen.at]
+    p = np.exp([(one.gain - best_one.gain) / 2 for _, one in found])
+    slow = 1 / longest
+    of_swing = 2.0 if best_one.hz > slow else 0.5
+    k = reach.scale((site, STIFFNESS))
     return Varying(
         sites=tuple(
             (name, float(share)) for (name, _), share in zip(found, p / p.sum(), strict=True)
         ),
-        hz=hz,
+        hz=best_one.hz,
         slow=slow,
-        depth=math.sqrt(of_swing * gain / known) / k,
-        sd=math.sqrt(of_swing / known) / k,
-        gain=gain,
+        depth=math.sqrt(of_swing * best_one.gain / best_one.known) / k,
+        sd=math.sqrt(of_swing / best_one.known) / k,
+        gain=best_one.gain,
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Pulled:
-    """Of one piece and its repeats. f : (m,) Hz. power : (rows, m) |P|^2. mean : (rows, m) V."""
+    """Of one piece and its repeats.
 
+    span, left : of the piece. phi : (M,) the way over the spring. sensors : (M//2 + 1, q) lines of
+    a unit force. times : (rows,) of each the motion. f : (m,) Hz. P : (rows, m). V : (m,) of a row
+    that is once the motion.
+    """
+
+    span: Span
+    left: Unexplained
+    phi: Float
+    sensors: Complex
+    times: Float
     f: Float
-    power: Float
-    mean: Float
+    P: Complex
+    V: Float
 
     @classmethod
     def of(cls, span: Span, phi: Float, sensors: Complex, left: Unexplained) -> Pulled:
-        """phi : (M,) the way over the spring. sensors : (M//2 + 1, q) lines of a unit force."""
+        """As above."""
         times = np.ones(len(left.white))
         times[0] = span.times  # a piece is so many times the motion, its repeats differ
         pull = np.stack(
@@ -120,14 +131,31 @@ class Pulled:
         )
         size = 2 * phi.size  # nothing wraps around
         phi = phi * span.alive
-        P = np.fft.rfft(phi * pull, size, axis=1)
-        V = times[:, None] ** 2 * _variance(span, phi, sensors, left)
-        f = np.asarray(
-            np.arange(size // 2 + 1) * (span.rate_hz * span.n / span.samples / size), np.float64
-        )
-        power = np.asarray(np.abs(P) ** 2, np.float64)
-        seen = ROUNDED * V.max() < V  # not where no sensor shows the force
-        return cls(f, np.where(seen, power, 0.0), np.where(seen, V, 1.0))
+        f = np.arange(size // 2 + 1) * (span.rate_hz * span.n / span.samples / size)
+        P, V = np.fft.rfft(phi * pull, size, axis=1), _variance(span, phi, sensors, left)
+        return cls(span, left, phi, sensors, times, np.asarray(f, np.float64), P, V)
+
+    def chi_square(self) -> Float:
+        """(m,) 2 |P|^2/V of all rows; none where no sensor shows the force."""
+        power = np.sum(np.abs(self.P / self.times[:, None]) ** 2, axis=0)
+        seen = ROUNDED * self.V.max() < self.V
+        return np.asarray(np.divide(2 * power, self.V, out=np.zeros_like(power), where=seen))
+
+    def exact(self, hz: float) -> tuple[float, int, float]:
+        """Chi-square of all rows at a frequency, its degrees of freedom, and V of all. Both phases
+        of a swing that is slow for the motion are nearly one."""
+        at = int(np.argmin(np.abs(self.f - hz)))
+        t = np.pi * self.f[at] / self.f[-1] * np.arange(self.phi.size)
+        span, left = self.span, self.left
+        each = [span.damped(self.phi * x) for x in (np.cos(t), np.sin(t))]
+        lines = np.stack([span.lines(e, self.sensors, left.k) for e in each], axis=2) / span.times
+        white = (left.root @ lines).reshape(-1, 2)
+        power, phases = np.linalg.eigh((white.conj().T @ white).real)
+        shown = power > max(ONE_PHASE * power[1], ROUNDED * self.V.max())
+        along = phases.T @ np.stack([self.P[:, at].real, -self.P[:, at].imag]) / self.times
+        chi2 = np.sum(along[shown] ** 2 / power[shown, None])
+        known = float(np.sum(power)) * float(self.times @ self.times)
+        return float(chi2), int(np.count_nonzero(shown)) * self.times.size, known
 
 
 def pulled(span: Span, sensors: Complex, k: Int, lines: Complex, times: float) -> Float:
@@ -142,7 +170,7 @@ def pulled(span: Span, sensors: Complex, k: Int, lines: Complex, times: float) -
 
 
 def _variance(span: Span, phi: Float, sensors: Complex, left: Unexplained) -> Float:
-    """(M + 1,) V at multiples of half the contour's spacing, of a piece that is once the motion."""
+    """(M + 1,) V at multiples of half the contour's spacing, of a row that is once the motion."""
     M, n = phi.size, span.n
     at = np.rint(left.k * (M / n)).astype(np.int64)
     power = np.zeros(M // 2 + 1)
@@ -157,28 +185,23 @@ def _variance(span: Span, phi: Float, sensors: Complex, left: Unexplained) -> Fl
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """Of one spring. chi2 : (m,) at each frequency. known : (m,) sum of V."""
+class Swing:
+    """At one spring, where most is explained. hz. chi2, with `free` degrees of freedom. known : sum
+    of V."""
 
-    chi2: Float
-    known: Float
+    hz: float
+    chi2: float
+    free: int
+    known: float
 
     @classmethod
-    def of(cls, pieces: Sequence[Pulled], f: Float) -> Seen:
-        """Of all pieces, at f (m,) Hz."""
-        chi2 = known = np.zeros(f.size)
-        for one in pieces:
-            for power, mean in zip(one.power, one.mean, strict=True):
-                chi2 = chi2 + np.interp(f, one.f, 2 * power / mean)
-                known = known + np.interp(f, one.f, mean)
-        return cls(chi2, known)
+    def of(cls, pieces: Sequence[Pulled], f: Float) -> Swing:
+        """Of all pieces, at one of f (m,) Hz."""
+        hz = float(f[np.argmax(sum(np.interp(f, one.f, one.chi_square()) for one in pieces))])
+        chi2, free, known = zip(*(one.exact(hz) for one in pieces), strict=True)
+        return cls(hz, sum(chi2), sum(free), sum(known))
 
     @property
-    def at(self) -> int:
-        """Where it is largest."""
-        return int(np.argmax(self.chi2))
-
-    @property
-    def most(self) -> float:
-        """The largest."""
-        return float(self.chi2[self.at])
+    def gain(self) -> float:
+        """Of chi-square, beyond what noise makes in the mean."""
+        return self.chi2 - self.free
