@@ -85,7 +85,8 @@ def varying(search: ForceSearch, best: Explanation) -> Varying | None:
     found.sort(key=lambda one: one[1].free - one[1].chi2)
     site, best_one = found[0]
     tries = len(found) * 2 * longest * f[-1]
-    if tries * float(stats.chi2.sf(best_one.chi2, best_one.free)) > ALARM:
+    seen = best_one.free > 0  # by any sensor
+    if not seen or tries * float(stats.chi2.sf(best_one.chi2, best_one.free)) > ALARM:
         return None
     p = np.exp([(one.gain - best_one.gain) / 2 for _, one in found])
     slow = 1 / longest
