@@ -1,12 +1,18 @@
-"""A value as a notebook shows it: a few facts and a small table, as plain HTML."""
+"""A value as a notebook shows it: a few facts and a small table, as plain HTML; and other forms."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from html import escape
+from typing import Any
 
 Rows = Sequence[Sequence[object]]
 _MOST_ROWS = 24  # of a table; the rest is counted
+
+
+# By name, what makes another form of data: a picture, a table of another library. The package's own
+# face says who: they stand above the data.
+FORMS: dict[str, Callable[..., Any]] = {}
 
 
 def card(title: str, facts: Mapping[str, object], head: Sequence[str] = (), rows: Rows = ()) -> str:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from samii_rig.display import card
+from samii_rig.display import FORMS, card
 
 if TYPE_CHECKING:
     import control
@@ -197,21 +197,18 @@ class Recording:
 
     def to_numpy(self) -> dict[str, NDArray[Any]]:
         """(n,) arrays by name: `time_s` from the first sample on, `sequence`, every channel."""
-        from samii_rig.record.convert import columns
-
-        return columns(self)
+        made: dict[str, NDArray[Any]] = FORMS["columns"](self)
+        return made
 
     def to_xarray(self) -> xarray.Dataset:
         """A variable a channel over `time`, with units (`record.convert.samples`)."""
-        from samii_rig.record.convert import samples
-
-        return samples(self)
+        made: xarray.Dataset = FORMS["samples"](self)
+        return made
 
     def plot(self) -> Figure:
         """Every channel over time; one segment at a time, chosen above."""
-        from samii_rig.report.notebook import series
-
-        return series(self)
+        made: Figure = FORMS["series"](self)
+        return made
 
     def _repr_html_(self) -> str:
         missing = np.sum((self.quality & Quality.MISSING) != 0, axis=0)
@@ -293,30 +290,26 @@ class FrequencyResponse:
 
     def to_numpy(self) -> dict[str, NDArray[Any]]:
         """All of it, words too, as arrays by name: those of the file that `.npz` exports."""
-        from samii_rig.record.convert import arrays
-
-        return arrays(self)
+        made: dict[str, NDArray[Any]] = FORMS["arrays"](self)
+        return made
 
     def to_xarray(self) -> xarray.Dataset:
         """H, its deviation and covariance by names of channels (`record.convert.lines`)."""
-        from samii_rig.record.convert import lines
-
-        return lines(self)
+        made: xarray.Dataset = FORMS["lines"](self)
+        return made
 
     def to_control(self) -> control.FrequencyResponseData:
         """H as python-control's FRD: outputs and inputs by name, rad/s."""
-        from samii_rig.record.convert import frd
-
-        return frd(self)
+        made: control.FrequencyResponseData = FORMS["frd"](self)
+        return made
 
     def plot(self, output: str = "", input: str = "", rig: Rig | None = None) -> Figure:
         """Bode diagram of one entry with its 90 % bands, and the model of `rig` over it.
 
         output, input : names of channels; by default the first.
         """
-        from samii_rig.report.notebook import bode
-
-        return bode([self], output, input, rig)
+        made: Figure = FORMS["bode"]([self], output, input, rig)
+        return made
 
     def _repr_html_(self) -> str:
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from samii_rig.diagnose.physics.rows import PHYSICS
-from samii_rig.display import card
+from samii_rig.display import FORMS, card
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse
 from samii_rig.units import pretty
@@ -350,9 +350,12 @@ class Diagnosis:
     ) -> Figure:
         """With the responses and the rig that were diagnosed, one entry before and after; with
         none, what is missing at the most probable place, free of any law."""
-        from samii_rig.report.notebook import before_after, place
-
-        return before_after(self, responses, rig, output, input) if rig else place(self)
+        made: Figure = (
+            FORMS["before_after"](self, responses, rig, output, input)
+            if rig
+            else FORMS["place"](self)
+        )
+        return made
 
     def _repr_html_(self) -> str:
         rows = [

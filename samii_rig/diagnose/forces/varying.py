@@ -83,24 +83,24 @@ def varying(search: ForceSearch, best: Explanation) -> Varying | None:
     if not found:
         return None
     found.sort(key=lambda one: one[1].free - one[1].chi2)
-    site, best_one = found[0]
+    site, most = found[0]
     tries = len(found) * 2 * longest * f[-1]
-    seen = best_one.free > 0  # by any sensor
-    if not seen or tries * float(stats.chi2.sf(best_one.chi2, best_one.free)) > ALARM:
+    seen = most.free > 0  # by any sensor
+    if not seen or tries * float(stats.chi2.sf(most.chi2, most.free)) > ALARM:
         return None
-    p = np.exp([(one.gain - best_one.gain) / 2 for _, one in found])
+    p = np.exp([(one.gain - most.gain) / 2 for _, one in found])
     slow = 1 / longest
-    of_swing = 2.0 if best_one.hz > slow else 0.5
+    of_swing = 2.0 if most.hz > slow else 0.5
     k = reach.scale((site, STIFFNESS))
     return Varying(
         sites=tuple(
             (name, float(share)) for (name, _), share in zip(found, p / p.sum(), strict=True)
         ),
-        hz=best_one.hz,
+        hz=most.hz,
         slow=slow,
-        depth=math.sqrt(of_swing * best_one.gain / best_one.known) / k,
-        sd=math.sqrt(of_swing / best_one.known) / k,
-        gain=best_one.gain,
+        depth=math.sqrt(of_swing * most.gain / most.known) / k,
+        sd=math.sqrt(of_swing / most.known) / k,
+        gain=most.gain,
     )
 
 
