@@ -31,6 +31,8 @@ STRUCTURE = 0.7  # lag-one coherence; noise alone has about 1/sqrt(lines)
 # reach 2.4 on the simulated rig, 5.7 where dry friction holds a real one (SFLR, lowest level).
 KNOCK, KNOCK_SECONDS = 6.0, 0.5
 STUCK_PART = 0.2  # of the samples in which the input moves
+LIVELY = 0.1  # of the samples, at which one that moves may read the same as before
+AROUND = 3  # times as long as a sensor stands still, on either side
 STUCK_SAMPLES = 20
 FLAT_RUN, FLAT_RUNS = 3, 3  # as many equal samples at the extreme, as many times
 OUTSIDE = 0.01  # of a converter's range, by which a value lies beyond it
@@ -145,8 +147,8 @@ def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Findin
     """Outputs that stand still while the input moves.
 
     One that never changes is an error, and so is one that freezes although its noise moves
-    it at nearly every other sample. A coarse sensor that rests for long is a warning: dry
-    friction looks the same.
+    it at nearly every other sample, before and after it too. A coarse sensor that rests for long
+    is a warning: dry friction looks the same.
     """
     out = []
     v = cut.values[:, cut.column(selection.input.name)]
@@ -166,7 +168,11 @@ def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Findin
         inside = int(np.count_nonzero(moving[longest[0] : longest[1]]))
         if inside < STUCK_SAMPLES:
             continue
-        lively = np.count_nonzero(still) - length < 0.1 * (still.size - length)
+        beside = AROUND * length  # where it has stood still so often before and after, it rests
+        near = still[max(longest[0] - beside, 0) : longest[1] + beside]
+        lively = all(
+            np.count_nonzero(x) - length < LIVELY * (x.size - length) for x in (still, near)
+        )
         if lively or inside > STUCK_PART * np.count_nonzero(moving):
             message = (
                 f"{place} stands still for {length + 1} samples from "

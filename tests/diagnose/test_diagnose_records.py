@@ -12,10 +12,11 @@ from cut_kit import cut_sweeps
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.fit.records import RecordProblem, Whole
+from samii_rig.diagnose.fit.records import RecordProblem, Whole, _unfolded
 from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.diagnose.result import Diagnosis
+from samii_rig.likelihood.pieces import Piece
 from samii_rig.progress import Counted
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
@@ -120,3 +121,20 @@ def test_what_could_hide_is_what_a_refit_leaves(nothing: list[Recording]):
     h = hidden.response(np.append(none.x, np.log(told.size)), problem.at)
     left = refit(model, problem.toward(h), none.x, far=False)
     assert 3.0 < np.sqrt(left.chi2) < 9.0
+
+
+def test_where_not_every_sample_was_recorded_what_folds_back_bounds_the_band():
+    """Of tones that follow each other at once, each change has power above half the rate, and at
+    the record's samples it reads as of below. A sweep that comes and goes has none."""
+    rate, n = 100.0, 4000
+    t = np.arange(n) / rate
+    smooth = np.sin(2 * np.pi * (1 + 0.4 * t) * t) * np.hanning(n)  # to 33 Hz
+    hz = np.repeat([40.0, 37.0, 34.0, 31.0, 20.0, 9.0, 4.0, 2.0], n // 8)
+    tones = np.sin(2 * np.pi * np.cumsum(hz) / rate)
+
+    def top(u: np.ndarray, edges: tuple[tuple[int, int], ...] = ()) -> float:
+        return _unfolded(Piece("a", u, np.zeros((n, 1)), 0, ((1.0, "V"),), edges=edges), rate)
+
+    assert top(smooth) > 33
+    assert top(tones) == 30
+    assert top(tones, ((500, 0),)) == 50

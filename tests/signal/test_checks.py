@@ -191,6 +191,18 @@ def test_a_sensor_that_freezes_in_one_repeat_costs_that_repeat():
     assert any(f.kind == "stuck" and f.segment == "sweep_1" for f in r.findings)
 
 
+def test_a_coarse_sensor_that_rests_before_it_moves_is_not_frozen():
+    """Its noise reaches the next step now and then, and dry friction holds it at a small drive."""
+    run = sweeps()
+    theta, rng = run.values[:, 2].copy(), np.random.default_rng(1)
+    step = 1e-3 * float(np.std(theta))
+    rest = np.where(rng.random(120) < 0.3, step, 0.0)
+    rest[50:75] = 0.0
+    theta[N + 300 : N + 420] = theta[N + 300] + rest
+    coarse = changed(run, slice(None), 2, np.rint(theta / step) * step)
+    assert not [f for f in estimate([coarse])[0].findings if f.kind == "stuck"]
+
+
 def test_a_repeat_that_does_not_repeat_is_named_and_left_out():
     recording = sweeps(4)
     r = estimate([changed(recording, slice(N, 2 * N), 2, 1.1 * recording.values[N : 2 * N, 2])])[0]

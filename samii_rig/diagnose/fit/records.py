@@ -16,7 +16,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, special, stats
+from scipy import ndimage, optimize, special, stats
 
 from samii_rig.diagnose.fit import forms
 from samii_rig.diagnose.fit.explanations import FIVE, Explanation, threshold
@@ -65,6 +65,9 @@ MOST_LINES = 12000
 MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
 ALIASES = 16  # sums over aliases that are kept
 HIGHEST = 0.45  # of the rate: aliases of both sides meet above
+# Where not every sample was recorded: of an input's power what may fold back, 1 % of its amplitude;
+# of the rate, from where that is judged, and up to where it is taken for none; lines as one.
+FOLDS, EDGE, UNFOLDED, TOGETHER = 1e-4, 0.47, 0.3, 16
 # Of half the rate, width over which samples between those that were recorded are told from these:
 # at `HIGHEST` they are to 1e-6, after 130 samples of either side nothing is left. And how many
 # widths count: 1e-12 behind them.
@@ -119,7 +122,10 @@ class Whole:
         (rate,) = {run.rate_hz for run in runs}
         finest = {a.name: a.resolution for a in rig.actuator}
         rounding = np.array([finest[x.command] ** 2 / 12 for x in wired.inputs])
-        all_, apart = (_records(p, rate, band, step, rounding) for p in (joined(levels), levels))
+        slower = round(rig.rate_hz / rate) > 1
+        all_, apart = (
+            _records(p, rate, band, step, rounding, slower=slower) for p in (joined(levels), levels)
+        )
         return cls(rig, all_, wired, tuple(without.items()), apart, band is not None)
 
     @property
@@ -273,9 +279,18 @@ def _records(
     band: tuple[float, float] | None,
     step: tuple[float, ...],
     rounding: Float,
+    *,
+    slower: bool = False,
 ) -> Records:
-    """Those that anything drives. rounding : (m,) of each input's converter, its power."""
+    """Those that anything drives. rounding : (m,) of each input's converter, its power. slower :
+    whether not every sample of the rig was recorded."""
     bands_of = excited(pieces, rate_hz, rounding)
+    if slower:
+        bands_of = [
+            b and (b[0], max(min(b[1], _unfolded(p, rate_hz)), b[0]))
+            for p, b in zip(pieces, bands_of, strict=True)
+        ]
+        bands_of = [b if b and b[1] - b[0] > 0 else None for b in bands_of]
     driven = [(p, b) for p, b in zip(pieces, bands_of, strict=True) if b]
     if not driven:
         raise EstimateError("nothing drives the rig for five cycles of any line")
@@ -310,6 +325,21 @@ def excited(
         low, high = max(edges[on[0]], CYCLES * line), min(edges[on[-1] + 1], HIGHEST * rate_hz)
         out.append((float(low), float(high)) if high - low > CYCLES * line else None)
     return out
+
+
+def _unfolded(piece: Piece, rate_hz: float) -> float:
+    """Hz up to which an input has more than what folds back from above half the rate may be: as
+    much as it has just below. An edge that was found counts by itself."""
+    if piece.edges:
+        return rate_hz / 2
+    tops = []
+    for r in by_input(piece.r):
+        power = ndimage.uniform_filter1d(np.abs(np.fft.rfft(r)) ** 2, TOGETHER, mode="nearest")
+        f = np.arange(power.size) * (rate_hz / r.size)
+        edge = np.mean(power[f > EDGE * rate_hz])
+        more = np.flatnonzero(power * FOLDS > edge)
+        tops.append(f[more[-1]] if more.size else 0.0)
+    return max(float(max(tops)), UNFOLDED * rate_hz)
 
 
 def _energy(r: Float, rate_hz: float) -> tuple[Float, Float, Float]:

@@ -31,7 +31,7 @@ from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.types import Complex, Float, Int
 
-FASTEST = 0.5  # of the highest frequency in the records: what varies faster is no stiffness
+FASTEST = 0.2  # of the highest frequency in the records: what varies faster is no stiffness
 FINE = 4  # frequencies for each that the longest record tells apart
 ALARM = 2e-3  # chance that noise alone makes any stiffness vary
 ONE_PHASE = 1e-3  # of V: less variance is that of a phase which the motion does not show
@@ -88,18 +88,20 @@ def varying(search: ForceSearch, best: Explanation) -> Varying | None:
     seen = most.free > 0  # by any sensor
     if not seen or tries * float(stats.chi2.sf(most.chi2, most.free)) > ALARM:
         return None
-    p = np.exp([(one.gain - most.gain) / 2 for _, one in found])
-    slow = 1 / longest
+    slow, k = 1 / longest, reach.scale((site, STIFFNESS))
     of_swing = 2.0 if most.hz > slow else 0.5
-    k = reach.scale((site, STIFFNESS))
+    depth, sd = (math.sqrt(of_swing * x / most.known) / k for x in (most.gain, 1.0))
+    if depth > 1:  # no stiffness varies by more than all of it: something else is missing
+        return None
+    p = np.exp([(one.gain - most.gain) / 2 for _, one in found])
     return Varying(
         sites=tuple(
             (name, float(share)) for (name, _), share in zip(found, p / p.sum(), strict=True)
         ),
         hz=most.hz,
         slow=slow,
-        depth=math.sqrt(of_swing * most.gain / most.known) / k,
-        sd=math.sqrt(of_swing / most.known) / k,
+        depth=depth,
+        sd=sd,
         gain=most.gain,
     )
 
