@@ -143,9 +143,10 @@ def check(arguments: list[str]) -> None:
 def tests(arguments: list[str]) -> None:
     """All tests: those in real time one after another, the others side by side.
 
-    What runs in real time comes before the rest of the machine's work (tests/conftest.py). Who may
-    not ask for that has nothing beside it, and what failed is tried once more, and told: another
-    program on this machine may have had the cores for longer than a device waits.
+    What runs in real time comes before the rest of the machine's work (tests/conftest.py), so the
+    others run beside it; who may not ask for that has nothing beside it. What failed of it is tried
+    once more, alone, and told: another program may have had the cores for longer than a device
+    waits.
     """
     cores = min(os.cpu_count() or 1, 4)
     pytest: list[str | Path] = [BIN / "pytest", "-q", "--durations=10"]
@@ -157,13 +158,27 @@ def tests(arguments: list[str]) -> None:
     real_time = [*pytest, "-m", "real_time and not slow"]
     # Each run keeps what failed in it by itself.
     others = [*pytest, *workers, "-m", "not real_time and not slow", "-o", f"cache_dir={OTHERS}"]
-    if run(PYTHON, "-c", FIRST, quiet=True) == 0:
-        side_by_side(others, real_time)
-        return
-    if run(*real_time):
+    beside = run(PYTHON, "-c", FIRST, quiet=True) == 0
+    late, failed = together(real_time, others) if beside else (run(*real_time), 0)
+    if late:
         say("what failed in real time is tried once more, alone")
         call(*real_time, "--last-failed")
-    call(*others)
+    if not beside:
+        failed = run(*others)
+    if failed:
+        sys.exit(failed)
+
+
+def together(first: Sequence[str | Path], beside: Sequence[str | Path]) -> tuple[int, int]:
+    """Run two commands at once; the first prints as it goes, the other when both have ended."""
+    with TemporaryFile("w+", encoding="utf-8") as said:
+        words = [str(word) for word in beside]
+        process = subprocess.Popen(words, cwd=ROOT, stdout=said, stderr=STDOUT)
+        one = run(*first)
+        other = process.wait()
+        said.seek(0)
+        print(said.read(), end="", flush=True)
+    return one, other
 
 
 def side_by_side(*commands: Sequence[str | Path]) -> None:

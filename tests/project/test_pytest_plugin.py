@@ -52,7 +52,7 @@ def test_it_is_an_entry_point_that_imports_nothing_but_pytest(tmp_path):
     assert "@pytest.mark.samii_rig(rig='samii'" in with_it.stdout
     loaded = _modules(pytest_in(tmp_path, "-s"))
     without = _modules(pytest_in(tmp_path, "-s", plugin="no:samii_rig"))
-    assert loaded - without == {"samii_rig", "samii_rig.pytest_plugin"}
+    assert loaded - without == {"samii_rig", "samii_rig.display", "samii_rig.pytest_plugin"}
 
 
 def _modules(done: Done) -> set[str]:

@@ -28,6 +28,7 @@ from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.reach import Span
 from samii_rig.diagnose.forces.search import ForceSearch
+from samii_rig.likelihood.reduce import CYCLES
 from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.types import Complex, Float, Int
 
@@ -42,22 +43,20 @@ ROUNDED = 1e-6  # of the largest variance: less is rounding
 class Varying:
     """A stiffness that varies.
 
-    sites : (site, probability), the likeliest first. hz : at which it varies most there. slow : Hz,
-    below which a record sees a drift, or nothing: it differs from one to the next. depth, sd :
-    relative to the stiffness; amplitude of a swing, rms of what is slower. gain : of chi-square,
-    beyond what noise makes in the mean.
+    sites : (site, probability), the likeliest first. hz : at which it varies most there; 0 where it
+    differs from record to record. depth, sd : relative to the stiffness; amplitude of a swing, rms
+    of what records differ by. gain : of chi-square, beyond what noise makes in the mean.
     """
 
     sites: tuple[tuple[str, float], ...]
     hz: float
-    slow: float
     depth: float
     sd: float
     gain: float
 
     def told(self) -> str:
         """In words."""
-        swing = f", as by a swing at {self.hz:.3g} Hz," if self.hz > self.slow else ""
+        swing = f", as by a swing at {self.hz:.3g} Hz," if self.hz > 0 else " between records"
         return (
             f"the stiffness of {self.sites[0][0]} is not constant: it varies{swing} by "
             f"{100 * self.depth:.2g} % (+/- {100 * NINETY * self.sd:.1g})"
@@ -70,12 +69,13 @@ def varying(search: ForceSearch, best: Explanation) -> Varying | None:
     left = search.unexplained(best.fitted)
     records, reach = search.levels.records, search.reach
     longest = max(len(p.z) for p in records.pieces) / records.rate_hz
-    f = np.arange(0.0, FASTEST * records.band[1], 1 / (FINE * longest))
-    found = []
+    # What is slower than the lines that count is as a sensor that wanders.
+    f = np.arange(CYCLES / longest, FASTEST * records.band[1], 1 / (FINE * longest))
+    found: list[tuple[str, Swing]] = []
     for spring in (e for e in search.forces if e.quasi is not None and e.quasi.law is HARDENING):
         assert spring.quasi is not None
         ports = reach.ports(spring.quasi.place, of_speed=False)
-        if ports is None or not reach.scale((spring.site, STIFFNESS)) > 0:
+        if ports is None or not f.size or not reach.scale((spring.site, STIFFNESS)) > 0:
             continue
         motion = reach.motion(spring.quasi.place, of_speed=False)
         each = zip(reach.spans, motion, ports.sensors, left, strict=True)
@@ -84,13 +84,10 @@ def varying(search: ForceSearch, best: Explanation) -> Varying | None:
         return None
     found.sort(key=lambda one: one[1].free - one[1].chi2)
     site, most = found[0]
-    tries = len(found) * 2 * longest * f[-1]
-    seen = most.free > 0  # by any sensor
-    if not seen or tries * float(stats.chi2.sf(most.chi2, most.free)) > ALARM:
+    if len(found) * 2 * longest * f[-1] * most.chance > ALARM:
         return None
-    slow, k = 1 / longest, reach.scale((site, STIFFNESS))
-    of_swing = 2.0 if most.hz > slow else 0.5
-    depth, sd = (math.sqrt(of_swing * x / most.known) / k for x in (most.gain, 1.0))
+    k = reach.scale((site, STIFFNESS))
+    depth, sd = (math.sqrt(x / most.known) / k for x in (most.gain, 1.0))
     if depth > 1:  # no stiffness varies by more than all of it: something else is missing
         return None
     p = np.exp([(one.gain - most.gain) / 2 for _, one in found])
@@ -99,7 +96,6 @@ def varying(search: ForceSearch, best: Explanation) -> Varying | None:
             (name, float(share)) for (name, _), share in zip(found, p / p.sum(), strict=True)
         ),
         hz=most.hz,
-        slow=slow,
         depth=depth,
         sd=sd,
         gain=most.gain,
@@ -145,20 +141,33 @@ class Pulled:
         return np.asarray(np.divide(2 * power, self.V, out=np.zeros_like(power), where=seen))
 
     def exact(self, hz: float) -> tuple[float, int, float]:
-        """Chi-square of all rows at a frequency, its degrees of freedom, and V of all. Both phases
-        of a swing that is slow for the motion are nearly one."""
+        """Chi-square of all rows at a frequency, beyond what another constant stiffness of each
+        does, its degrees of freedom, and what is known of both phases of a swing."""
         at = int(np.argmin(np.abs(self.f - hz)))
         t = np.pi * self.f[at] / self.f[-1] * np.arange(self.phi.size)
-        span, left = self.span, self.left
-        each = [span.damped(self.phi * x) for x in (np.cos(t), np.sin(t))]
-        lines = np.stack([span.lines(e, self.sensors, left.k) for e in each], axis=2) / span.times
-        white = (left.root @ lines).reshape(-1, 2)
-        power, phases = np.linalg.eigh((white.conj().T @ white).real)
-        shown = power > max(ONE_PHASE * power[1], ROUNDED * self.V.max())
-        along = phases.T @ np.stack([self.P[:, at].real, -self.P[:, at].imag]) / self.times
+        G = self._products([np.ones(t.size), np.cos(t), np.sin(t)])
+        pull = np.stack([self.P[:, 0].real, self.P[:, at].real, -self.P[:, at].imag]) / self.times
+        if not G[0, 0] > ROUNDED * self.V.max():
+            return 0.0, 0, 0.0
+        share = G[1:, :1] / G[0, 0]
+        power, phases = np.linalg.eigh(G[1:, 1:] - share * G[:1, 1:])
+        shown = power > ONE_PHASE * np.trace(G[1:, 1:])
+        along = phases.T @ (pull[1:] - share * pull[:1])
         chi2 = np.sum(along[shown] ** 2 / power[shown, None])
-        known = float(np.sum(power)) * float(self.times @ self.times)
+        known = float(np.sum(power[shown])) * float(self.times @ self.times)
         return float(chi2), int(np.count_nonzero(shown)) * self.times.size, known
+
+    def constants(self) -> tuple[Float, Float]:
+        """(rows,) how far a constant change lies along what is left, and what is known of it."""
+        known = self._products([np.ones(self.phi.size)])[0, 0]
+        return self.P[:, 0].real, np.asarray(known * self.times**2)
+
+    def _products(self, shapes: Sequence[Float]) -> Float:
+        """Of what forces phi x (M,) add to the whitened lines of a row that is once the motion."""
+        span, left = self.span, self.left
+        each = [span.lines(span.damped(self.phi * x), self.sensors, left.k) for x in shapes]
+        white = (left.root @ np.stack(each, axis=2)).reshape(-1, len(shapes)) / span.times
+        return np.asarray((white.conj().T @ white).real)
 
 
 def pulled(span: Span, sensors: Complex, k: Int, lines: Complex, times: float) -> Float:
@@ -189,8 +198,8 @@ def _variance(span: Span, phi: Float, sensors: Complex, left: Unexplained) -> Fl
 
 @dataclass(frozen=True, slots=True)
 class Swing:
-    """At one spring, where most is explained. hz. chi2, with `free` degrees of freedom. known : sum
-    of V."""
+    """At one spring, where most is explained. hz : 0 for what differs from record to record. chi2,
+    with `free` degrees of freedom. known : of its amplitude's square, or of its mean square."""
 
     hz: float
     chi2: float
@@ -199,12 +208,40 @@ class Swing:
 
     @classmethod
     def of(cls, pieces: Sequence[Pulled], f: Float) -> Swing:
-        """Of all pieces, at one of f (m,) Hz."""
-        hz = float(f[np.argmax(sum(np.interp(f, one.f, one.chi_square()) for one in pieces))])
+        """Of all pieces, at one of f (m,) Hz or from record to record."""
+        scan = np.sum([np.interp(f, one.f, one.chi_square()) for one in pieces], axis=0)
+        hz = float(f[np.argmax(scan)])
         chi2, free, known = zip(*(one.exact(hz) for one in pieces), strict=True)
-        return cls(hz, sum(chi2), sum(free), sum(known))
+        # Where noise is louder than it is told, at the lowest lines say, it is so beside too.
+        near = scan[(f > hz / 2) & (f < 2 * hz)]
+        usual = stats.chi2.median(2 * sum(one.times.size for one in pieces))
+        louder = max(float(np.median(near)) / float(usual), 1.0)
+        swing = cls(hz, sum(chi2) / louder, sum(free), sum(known) / 2 / louder)
+        return min(swing, _between(pieces), key=lambda one: one.chance)
 
     @property
     def gain(self) -> float:
         """Of chi-square, beyond what noise makes in the mean."""
         return self.chi2 - self.free
+
+    @property
+    def chance(self) -> float:
+        """That noise makes as much at one frequency."""
+        return float(stats.chi2.sf(self.chi2, self.free)) if self.free else 1.0
+
+
+def _between(pieces: Sequence[Pulled]) -> Swing:
+    """What differs from record to record: a constant of each, but for what all have in common.
+    Repeats differ by what they do not have in common."""
+    each = [one.constants() for one in pieces]
+    P, known = (np.concatenate(x) for x in zip(*each, strict=True))
+    first = np.cumsum([0, *(len(x) for x, _ in each[:-1])])
+    seen = known > ROUNDED * known.max(initial=0.0)
+    common = first[seen[first]]
+    free = int(np.count_nonzero(seen)) - min(len(common), 1)
+    if free <= 0:
+        return Swing(0.0, 0.0, 0, 1.0)
+    chi2 = float(np.sum(P[seen] ** 2 / known[seen]))
+    if len(common):
+        chi2 -= float(np.sum(P[common])) ** 2 / float(np.sum(known[common]))
+    return Swing(0.0, chi2, free, float(np.sum(known[seen])))

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.measured import DIFFER
 from samii_rig.diagnose.fit.agreeing import Given, states_apart
-from samii_rig.diagnose.fit.between_runs import MOSTLY
 from samii_rig.diagnose.fit.exact import wrong_lengths
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
@@ -28,6 +27,9 @@ SEVERAL = (
     "friction, play, hardening and the like were not looked for, as the recordings have {} inputs "
     "({}); recordings of one of them alone would show these"
 )
+# Of what is left, that a stiffness which is not constant must explain: what a linear model lacks
+# is another stiffness to every excitation.
+NEARLY_ALL = 0.8
 MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 
 
@@ -220,11 +222,13 @@ def _constant(forces: ForceSearch, looked: _Looked, expected: float) -> _Looked:
     drop = judged.evidence.drop
     if judged.verdict in verdict.SAID:
         # In the place of what is said, or beside it.
-        other = varying(forces, verdict.as_meant(forces, judged.best))
-        if other is not None and other.gain > drop:
+        base = verdict.as_meant(forces, judged.best)
+        other = varying(forces, base)
+        left = base.fitted.chi2 - forces.problem.expected
+        if other is not None and other.gain > max(drop, NEARLY_ALL * left):
             return replace(looked, judged=replace(judged, verdict="unknown", beyond=other))
     found = varying(forces, judged.best)
-    if found is None or found.gain < MOSTLY * (judged.best.fitted.chi2 - expected):
+    if found is None or found.gain < NEARLY_ALL * (judged.best.fitted.chi2 - expected):
         return looked
     if judged.verdict in verdict.SAID and drop > found.gain:
         return replace(looked, said=(*looked.said, found.told()))
