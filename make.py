@@ -150,8 +150,7 @@ def tests(arguments: list[str]) -> None:
     """
     cores = min(os.cpu_count() or 1, 4)
     pytest: list[str | Path] = [BIN / "pytest", "-q", "--durations=10"]
-    # One more than cores: services and browsers wait. Neighbours stay together: one fixture.
-    workers = ["-n", str(cores + 1), "--dist", "worksteal"]
+    workers = ["-n", str(cores), "--dist", "worksteal"]  # neighbours stay together: one fixture
     if arguments:
         call(*pytest, *workers, *arguments)
         return

@@ -167,20 +167,22 @@ def test_while_a_run_is_diagnosed_the_page_says_what_is_tried_and_for_how_long(
     ended = {"phase": "analysing", "status": "completed", "reason": "", "at_zero": True}
     told["running"] |= {**ended, "ended": "2026-11-01T10:00:00+00:00", "doing": doing}
     told["running"]["diagnosis"] = True
-    page.value(f"show({json.dumps(told)})")
-    assert page.text("now").endswith("Being estimated and diagnosed.")
-    assert page.text("facts") == f"The diagnosis tries{doing}"
+    assert shown(page, told, "now").endswith("Being estimated and diagnosed.")
+    assert shown(page, told, "facts") == f"The diagnosis tries{doing}"
     told["running"]["doing"] = ""
-    page.value(f"show({json.dumps(told)})")
-    assert page.text("facts") == ""
+    assert shown(page, told, "facts") == ""
     # And while the run goes on, of what is known so far.
     told["running"] |= {"phase": "running", "status": "", "diagnosis": True}
     told["so_far"] = {"responses": "0", "responses_age_s": 0, "diagnosis": None, "failed": False}
     told["so_far"]["doing"] = doing
-    page.value(f"show({json.dumps(told)})")
-    assert page.text("diagnosis-doing") == f"Now: {doing}."
-    page.value(f"show({state()})")
-    assert page.text("diagnosis-doing") == ""
+    assert shown(page, told, "diagnosis-doing") == f"Now: {doing}."
+    assert shown(page, json.loads(state()), "diagnosis-doing") == ""
+
+
+def shown(page: Browser, told: object, id_: str) -> str:
+    """What an element says of a state, before the service's own next one arrives."""
+    element = f"document.getElementById('{id_}')"
+    return str(page.value(f"(show({json.dumps(told)}), {element}.textContent)"))
 
 
 # Of what the page asks for of a job: which, and answers that are made up.
