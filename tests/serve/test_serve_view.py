@@ -209,17 +209,14 @@ def test_before_there_is_an_estimate_the_page_says_when_one_is_expected(page: Br
     told["pace"] = 2
     said = "The first estimate is expected in about 13 s."  # (30 - 10)/2, and what it takes
     page.until(f"show({json.dumps(told)}); soFar.data?.first_s === 30")
-    page.value(f"show({json.dumps(told)})")
-    assert page.text("diagnosis-what").endswith(said)
+    assert shown(page, told, "diagnosis-what").endswith(said)
     assert said in page.text("frf-about")
     told["running"]["progress"]["time_left"] = 60.0
-    page.value(f"show({json.dumps(told)})")
-    assert page.text("diagnosis-what").endswith("The first estimate is being made.")
+    assert shown(page, told, "diagnosis-what").endswith("The first estimate is being made.")
     # Of a run that was stopped before there was one nothing is expected, nor asked for.
     ended = {"phase": "analysing", "status": "stopped", "reason": "", "at_zero": True}
     told["running"] |= {**ended, "ended": "2026-11-01T10:00:00+00:00"}
-    page.value(f"show({json.dumps(told)})")
-    assert page.text("diagnosis-what") == "None: the run ended before there was one."
+    assert shown(page, told, "diagnosis-what") == "None: the run ended before there was one."
     last = {**told["running"], "phase": "done", "estimated": False, "diagnosed": False}
     page.value("asked.length = 0")
     told |= {"running": None, "so_far": None, "last": {**last, "recording_id": ""}}
