@@ -130,13 +130,15 @@ def check(arguments: list[str]) -> None:
     setup(EVERYTHING)
     call(BIN / "ruff", "check", ".")
     call(BIN / "ruff", "format", "--check", ".")
-    side_by_side(
+    codes = side_by_side(
         [PYTHON, "-m", "tools.kernels"],
         [PYTHON, "-m", "tools.release"],
         SITE,
         [BIN / "lint-imports"],
         [BIN / "mypy"],
     )
+    if failed := next(filter(None, codes), 0):
+        sys.exit(failed)
     tests(arguments)
 
 
@@ -158,7 +160,7 @@ def tests(arguments: list[str]) -> None:
     # Each run keeps what failed in it by itself.
     others = [*pytest, *workers, "-m", "not real_time and not slow", "-o", f"cache_dir={OTHERS}"]
     beside = run(PYTHON, "-c", FIRST, quiet=True) == 0
-    late, failed = together(real_time, others) if beside else (run(*real_time), 0)
+    failed, late = side_by_side(others, real_time) if beside else (0, run(*real_time))
     if late:
         say("what failed in real time is tried once more, alone")
         call(*real_time, "--last-failed")
@@ -168,38 +170,25 @@ def tests(arguments: list[str]) -> None:
         sys.exit(failed)
 
 
-def together(first: Sequence[str | Path], beside: Sequence[str | Path]) -> tuple[int, int]:
-    """Run two commands at once; the first prints as it goes, the other when both have ended."""
-    with TemporaryFile("w+", encoding="utf-8") as said:
-        words = [str(word) for word in beside]
-        process = subprocess.Popen(words, cwd=ROOT, stdout=said, stderr=STDOUT)
-        one = run(*first)
-        other = process.wait()
-        said.seek(0)
-        print(said.read(), end="", flush=True)
-    return one, other
-
-
-def side_by_side(*commands: Sequence[str | Path]) -> None:
-    """Run commands at once; the last prints as it goes, each other when it ends. Ends if one of
-    them failed, after the others."""
+def side_by_side(*commands: Sequence[str | Path]) -> list[int]:
+    """Run commands at once; the last prints as it goes, each other when it ends. Their exit
+    codes."""
+    codes, running = [], []
     with ExitStack() as stack:
-        running = []
         for command in commands[:-1]:
             said = stack.enter_context(TemporaryFile("w+", encoding="utf-8"))
             words = [str(word) for word in command]
             process = subprocess.Popen(words, cwd=ROOT, stdout=said, stderr=STDOUT)
             running.append((command, process, said))
-        failed = run(*commands[-1])
+        last = run(*commands[-1])
         for command, process, said in running:
             code = process.wait()
             said.seek(0)
             print(said.read(), end="", flush=True)
             if code:
                 say(f"{' '.join(Path(str(w)).name for w in command)}: exit code {code}")
-            failed = failed or code
-    if failed:
-        sys.exit(failed)
+            codes.append(code)
+    return [*codes, last]
 
 
 def docs(arguments: list[str]) -> None:

@@ -259,7 +259,7 @@ def motor(data: Path, rig: Rig) -> None:
         return
     linear.run(briefly=True)
     search = ForceSearch(linear)
-    search.settled()
+    search.settle()
     left = search.ratio(search.nominal.fitted)
     print(f"\nmotor alone, chi-square per dof of the refitted model {left:.3g}")
     tried: set[str] = set()

@@ -178,8 +178,8 @@ class Records:
 
     def left(self, samples: Samples | Piece, k: Int, H: Complex, contour: Contour) -> Complex:
         """(n, q) lines k of what H (M//2 + 1, q) on `exact` leaves of samples, a sample's power."""
-        y = samples.z - contour.predicted(H, samples.r)[len(samples.r) - len(samples.z) :]
-        return np.asarray(np.fft.rfft(y, axis=0)[k] / np.sqrt(len(y)))
+        e = _left_in_time(samples, H, contour)
+        return np.asarray(np.fft.rfft(e, axis=0)[k] / np.sqrt(len(e)))
 
     def without_spikes(self, H: Complex) -> Records:
         """The same, without spikes that show beside what H on `exact` predicts: as `spikes`, whose
@@ -187,8 +187,7 @@ class Records:
         exact = self.exact()
 
         def left(samples: Samples | Piece) -> Float:
-            y = exact.predicted(H, samples.r)[len(samples.r) - len(samples.z) :]
-            e = samples.z - y
+            e = _left_in_time(samples, H, exact)
             mended, count = spikes.mended(e, self.step)
             return samples.z + (mended - e) if count.any() else samples.z
 
@@ -207,6 +206,11 @@ class Records:
         rms = [np.sqrt(np.mean(by_input(p.r) ** 2, axis=1)) for p in self.pieces]
         strength = np.max(rms, axis=0)
         return [Seen.of(p, self.lines(p).k, answers, self.step, strength) for p in self.pieces]
+
+
+def _left_in_time(samples: Samples | Piece, H: Complex, contour: Contour) -> Float:
+    """(n, q) what H on a contour leaves of samples."""
+    return samples.z - contour.predicted(H, samples.r)[len(samples.r) - len(samples.z) :]
 
 
 @dataclass(frozen=True, slots=True)

@@ -286,11 +286,11 @@ def _records(
     whether not every sample of the rig was recorded."""
     bands_of = excited(pieces, rate_hz, rounding)
     if slower:
+        tops = [_unfolded(p, rate_hz) for p in pieces]
         bands_of = [
-            b and (b[0], max(min(b[1], _unfolded(p, rate_hz)), b[0]))
-            for p, b in zip(pieces, bands_of, strict=True)
+            (b[0], min(b[1], top)) if b and b[0] < top else None
+            for b, top in zip(bands_of, tops, strict=True)
         ]
-        bands_of = [b if b and b[1] - b[0] > 0 else None for b in bands_of]
     driven = [(p, b) for p, b in zip(pieces, bands_of, strict=True) if b]
     if not driven:
         raise EstimateError("nothing drives the rig for five cycles of any line")

@@ -82,7 +82,7 @@ def varying(search: ForceSearch, best: Explanation) -> Varying | None:
         found.append((spring.site, Swing.of([Pulled.of(*one) for one in each], f)))
     if not found:
         return None
-    found.sort(key=lambda one: one[1].free - one[1].chi2)
+    found.sort(key=lambda one: -one[1].gain)
     site, most = found[0]
     if len(found) * 2 * longest * f[-1] * most.chance > ALARM:
         return None

@@ -55,14 +55,14 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         return _of_lengths(case, search, first, bands, *wrong)
     search.begin("amplitude levels")
     forces = forces_on(search)
-    forced = forces if forces is not None and forces.won else None
+    forced = _winning(forces)
     if forced is None or not (case.search.lines.torn() or forced.is_enough()):
         search.begin("what is missing, in pairs")
         search.run()
         search.begin("amplitude levels, beside pairs")
         if forced is not None:
             forces = forces_on(search)
-            forced = forces if forces is not None and forces.won else None
+            forced = _winning(forces)
     search.begin("what cannot be told apart")
     if forced is None:
         looked = _consistent(search, _looked(search))
@@ -207,6 +207,11 @@ def forces_on(search: RecordSearch) -> ForceSearch | None:
         return compete_on_records(search)
     except SamiiRigError:
         return None
+
+
+def _winning(forces: ForceSearch | None) -> ForceSearch | None:
+    """The same where a force explains the records best."""
+    return forces if forces is not None and forces.won else None
 
 
 def _unasked(search: RecordSearch) -> tuple[str, ...]:
