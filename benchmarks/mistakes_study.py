@@ -250,7 +250,7 @@ def page(rows: dict[tuple[str, str], list[tuple[str, dict[str, Any]]]]) -> str:
     out = [
         "# What becomes of mistakes\n",
         f"Made at commit {commit} by `python benchmarks/mistakes_study.py OUT`. Recordings of the",
-        f"[second plant](../second-plant.md), {SECONDS:g} s a trial, nothing concealed in them.",
+        f"[second plant](second-plant.md), {SECONDS:g} s a trial, nothing concealed in them.",
         "One mistake is put into each. Of each rig and mistake: how often it was\n",
         "- told: what is wrong stands in `not_physics`, and nothing else is missing;",
         "- told, unknown: something stands in `not_physics`, and more than noise is left;",

@@ -161,7 +161,7 @@ def page(rows: list[tuple[str, dict[str, Any], dict[str, Any]]]) -> str:
     out = [
         "# What changed between two states\n",
         f"Made at commit {commit} by `python benchmarks/states_study.py page OUT`.",
-        f"{len(rows)} pairs of the [second plant](../second-plant.md), 20 s or less of records a",
+        f"{len(rows)} pairs of the [second plant](second-plant.md), 20 s or less of records a",
         "state. Every third pair has an effect in both states that the rig file does not know.",
         "Sigma is what the records of both states hold of the change.\n",
         f"Of {len(changes)} changes {place} were told at the right place and {named} by the right",

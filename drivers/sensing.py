@@ -25,7 +25,7 @@ def only_measures(rig: Rig, settings: Mapping[str, object]) -> None:
         rig.name,
         "device.driver",
         rig.device.driver,
-        "a device that drives; this one only measures, beside another (docs/composite.md)",
+        "one that drives; this one only measures, beside another (docs/reference/composite.md)",
     )
 
 

@@ -1,4 +1,4 @@
-"""Several devices as one; see docs/composite.md."""
+"""Several devices as one; see docs/reference/composite.md."""
 
 from drivers.composite.rig import check_rig, open_rig
 

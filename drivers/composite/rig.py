@@ -193,7 +193,7 @@ def _sub(rig: Rig, part: Part, parts: dict[str, Part]) -> Rig:
 
 def _read(rig: Rig, settings: Mapping[str, object]) -> dict[str, Part]:
     """The devices, the main one first."""
-    expected = "a device: driver, sensors and its settings; see docs/composite.md"
+    expected = "a device: driver, sensors and its settings; see docs/reference/composite.md"
     parts = {
         name: checked(Part, rig, given, table=f"{TABLE}.{name}", expected=expected)
         for name, given in settings.items()

@@ -1,4 +1,4 @@
-"""A six-axis force/torque sensor on a CAN bus; see docs/force-torque.md."""
+"""A six-axis force/torque sensor on a CAN bus; see docs/reference/force-torque.md."""
 
 from drivers.force_torque.device import open_rig
 from drivers.sensing import only_measures as check_rig

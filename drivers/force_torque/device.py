@@ -1,7 +1,7 @@
 """A force/torque sensor as a device: newtons and newton metres, on the host's clock.
 
 It drives nothing: its actuator has no deadman, so that no gate arms it. Beside a node that
-drives, it is part of a composite rig (docs/composite.md).
+drives, it is part of a composite rig (docs/reference/composite.md).
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class CanSettings(Strict):
 
 def read_settings(rig: Rig, given: Mapping[str, object]) -> CanSettings:
     """The settings, checked against the rig; InputError names the first wrong one."""
-    s = checked(CanSettings, rig, given, page="docs/force-torque.md")
+    s = checked(CanSettings, rig, given, page="docs/reference/force-torque.md")
     sensors = {x.name: x for x in (*rig.sensor, *rig.monitor)}
     for name, axis in s.axes.items():
         if name not in sensors:

@@ -1,4 +1,4 @@
-"""A National Instruments board, through NI-DAQmx; see docs/ni-daq.md."""
+"""A National Instruments board, through NI-DAQmx; see docs/reference/ni-daq.md."""
 
 from drivers.ni_daq.rig import NiRig, open_rig
 from drivers.ni_daq.settings import check_rig

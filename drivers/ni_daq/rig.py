@@ -1,4 +1,4 @@
-"""Analogue inputs, encoders and the output of a board, on one sample clock; docs/ni-daq.md."""
+"""Analogue inputs, encoders, output of a board on one sample clock; docs/reference/ni-daq.md."""
 
 from __future__ import annotations
 

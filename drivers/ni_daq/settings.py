@@ -120,7 +120,7 @@ class NiSettings(Strict):
 
 def read_settings(rig: Rig, given: Mapping[str, object]) -> NiSettings:
     """The settings, checked against the rig; InputError names the first wrong one."""
-    s = checked(NiSettings, rig, given, page="docs/ni-daq.md")
+    s = checked(NiSettings, rig, given, page="docs/reference/ni-daq.md")
     units = {x.name: x.unit for x in (*rig.sensor, *rig.monitor)}
     if sorted([*s.analogue, *s.encoder]) != sorted(units):
         found = sorted([*s.analogue, *s.encoder])

@@ -1,4 +1,4 @@
-"""A quadrature counter on a serial port; see docs/quadrature.md."""
+"""A quadrature counter on a serial port; see docs/reference/quadrature.md."""
 
 from drivers.quadrature.device import open_rig
 from drivers.sensing import only_measures as check_rig

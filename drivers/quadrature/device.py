@@ -1,6 +1,7 @@
-"""A quadrature counter on a serial port, that sends its counts unasked; see docs/quadrature.md.
+"""A quadrature counter on a serial port, that sends its counts unasked.
 
-It measures only, on a clock of its own; beside a device that drives it is part of a composite rig.
+Its protocol is docs/reference/quadrature.md. It measures only, on a clock of its own; beside
+a device that drives it is part of a composite rig.
 """
 
 from __future__ import annotations
@@ -280,7 +281,7 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
 
 
 def _read(rig: Rig, given: Mapping[str, object]) -> CounterSettings:
-    s = checked(CounterSettings, rig, given, page="docs/quadrature.md")
+    s = checked(CounterSettings, rig, given, page="docs/reference/quadrature.md")
     names = [x.name for x in (*rig.sensor, *rig.monitor)]
     if sorted(s.counters) != sorted(names):
         raise wrong(rig, "counters", sorted(s.counters), f"{', '.join(names)}, and no other")

@@ -1,4 +1,4 @@
-"""Frames of the quadrature counter, protocol version 1 (docs/quadrature.md)."""
+"""Frames of the quadrature counter, protocol version 1 (docs/reference/quadrature.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The serial I/O node: a microcontroller that closes the loop; see docs/serial-node.md.
+"""The serial I/O node: a microcontroller that closes the loop; see docs/reference/serial-node.md.
 
 The C files beside this are the portable part of its firmware; a board needs `node.h`.
 """

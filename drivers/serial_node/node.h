@@ -1,7 +1,7 @@
 /* Serial I/O node: the portable part of the firmware. A node with one output speaks protocol version
  * 1, a node with several version 2.
  *
- * The protocol is docs/serial-node.md of samii-rig. This part holds everything that decides about
+ * The protocol is docs/reference/serial-node.md of samii-rig. This part holds everything that decides about
  * the outputs; what is left to the board is a timer, the converters, a serial port and one word of
  * memory that survives a reset:
  *

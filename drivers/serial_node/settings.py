@@ -74,7 +74,7 @@ class SerialSettings(Strict):
 
 def read_settings(rig: Rig, given: Mapping[str, object]) -> SerialSettings:
     """The settings, checked against the rig; InputError names the first wrong one."""
-    s = checked(SerialSettings, rig, given, page="docs/serial-node.md")
+    s = checked(SerialSettings, rig, given, page="docs/reference/serial-node.md")
     names = {x.name: x for x in (*rig.sensor, *rig.monitor)}
     for table, inputs in (("encoder", s.encoder), ("adc", s.adc)):
         for name, x in inputs.items():

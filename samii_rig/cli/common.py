@@ -123,7 +123,7 @@ def without_rig() -> InputError:
     """What is said where a model is needed and nobody named one."""
     from samii_rig.errors import InputError
 
-    none = "these recordings carry no rig file; expected one, by its name or path (docs/rig.md)"
+    none = "these recordings carry no rig file; expected its name or path (docs/reference/rig.md)"
     return InputError.saying("--rig", "", none)
 
 

@@ -93,7 +93,7 @@ def frf(
     """Estimate frequency responses with their uncertainty; recordings of one level are pooled.
 
     The method is chosen from what the recordings hold, and said. Several inputs are told apart by
-    experiments in turn or together (docs/several-inputs.md).
+    experiments in turn or together (docs/method/several-inputs.md).
 
     Example: samii-rig frf runs/*.mcap --export frf.csv --save frf.mcap
     """

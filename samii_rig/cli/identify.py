@@ -73,7 +73,7 @@ def identify(
     """Identify parameters by maximum likelihood, with intervals and what cannot be known.
 
     All channels and levels count, in units of their noise. A model that does not fit is said so.
-    Recordings in several poses share one set of parameters (docs/identify.md). With --modes:
+    Recordings in several poses share one set of parameters (docs/method/identify.md). With --modes:
     from measured modes, weighted by the covariance of their poles and residues.
 
     Example: samii-rig identify runs/*.mcap --free joint_1.k --free joint_2.k

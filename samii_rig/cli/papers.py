@@ -31,7 +31,7 @@ def papers(
         str, typer.Option("--format", help="Of the pictures: svg, png or pdf.")
     ] = "svg",
     page: Annotated[
-        Path | None, typer.Option(help="A page whose tables are written anew (docs/papers.md).")
+        Path | None, typer.Option(help="A page to write its tables anew (docs/evidence/papers.md).")
     ] = None,
     json: JsonOption = False,
 ) -> None:

@@ -142,7 +142,8 @@ def section_5() -> Result:
             "Both give the same numbers here. Finite elements pay for generality with a matrix and "
             "a mesh; transfer matrices have no mesh, but take branches and loops only as elements.",
             "The paper's 89 degrees of freedom are not broken down; ours count 45 coordinates and "
-            "11 multipliers, for axial motion is left out (docs/fem.md has a count that gives 89).",
+            "11 multipliers, for axial motion is left out "
+            "(docs/method/fem.md has a count that gives 89).",
         ),
         (
             Picture(

@@ -1,4 +1,4 @@
-"""docs/papers.md: the tables between its markers are written by `samii-rig papers --page`.
+"""docs/evidence/papers.md: the tables between its markers are written by `samii-rig papers --page`.
 
 <!-- result ID -->
 ...

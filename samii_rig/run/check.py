@@ -21,4 +21,6 @@ class Check:
     def failed(cls, what: str, error: Exception) -> Check:
         """An error's line: what was found and, after the last semicolon, what to do."""
         found, _, remedy = str(error).rpartition("; ")
-        return cls(what, "bad", found or remedy, remedy if found else "see docs/drivers.md")
+        return cls(
+            what, "bad", found or remedy, remedy if found else "see docs/reference/drivers.md"
+        )

@@ -1,6 +1,6 @@
 """A simulated force/torque sensor with CAN: the bytes of its frames, and its faults.
 
-Written from the protocol's page (docs/force-torque.md), apart from the driver.
+Written from the protocol's page (docs/reference/force-torque.md), apart from the driver.
 """
 
 from __future__ import annotations

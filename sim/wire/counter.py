@@ -1,4 +1,4 @@
-"""A simulated quadrature counter: the bytes that its board sends, from docs/quadrature.md."""
+"""A simulated quadrature counter: the bytes of its board, from docs/reference/quadrature.md."""
 
 from __future__ import annotations
 

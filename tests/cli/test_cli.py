@@ -342,7 +342,8 @@ def test_an_existing_recording_is_never_overwritten(log: Path, sweep: Path) -> N
 
 def test_real_recordings_are_imported_and_estimated(recordings: Path, tmp_path: Path) -> None:
     """The author's model over the measurement: gain 0.595 and 0.544 in the median. The phase
-    is his to 1 and 3 degrees without the hold, which his model has in its lag (docs/sflr.md)."""
+    is his to 1 and 3 degrees without the hold, which his model has in its lag: see
+    docs/evidence/sflr.md."""
     files = sorted(recordings.glob("*full-robot*swept*amp-75*"))
     assert call("import", *files, "--map", "sflr", "--out", tmp_path)[0] == 0
     logs = sorted(tmp_path.glob("*.mcap"))

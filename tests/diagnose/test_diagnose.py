@@ -267,7 +267,7 @@ def test_effects_that_another_package_gets_wrong_are_one_line_with_its_name(a_pa
 
 
 def test_the_page_on_adding_physics_adds_it(a_package):
-    page = (ROOT / "docs" / "add-physics.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "guide" / "add-physics.md").read_text(encoding="utf-8")
     assert f'entry-points."{vocabulary.GROUP}"]\nhose = "our_lab.hose:hose"' in page
     installed(a_package, page.split("```python")[1].split("```")[0])
     own = [e for e in table(samii(), *BAND) if "hose" in {p for p, _ in e.names}]

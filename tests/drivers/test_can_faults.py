@@ -243,7 +243,11 @@ def lossy(wire: CanWire, rig: Rig, device: OpenRig) -> None:
         ("ft", {"sensors": None}, "ft.sensors is None; expected the sensors that it measures"),
         ("ft", {"axes": {}}, r"device.settings.ft.axes is \[\]; expected M_2 among them"),
         ("ft", {"driver": "nonesuch"}, "driver is 'nonesuch'; expected one of composite"),
-        ("ft", {"driver": "serial_node"}, "device.settings.ft.port: is missing; see docs/serial"),
+        (
+            "ft",
+            {"driver": "serial_node"},
+            "device.settings.port: is missing; see docs/reference/serial",
+        ),
         ("ft", {"driver": ""}, "ft.driver is ''; expected a device"),
         ("main", {"sensors": ["a_0"]}, r"main.sensors is \('a_0',\); expected left out"),
         ("ft", {"gap": 0.03}, "ft.gap is 0.03; expected at most 0.025, half of the least"),

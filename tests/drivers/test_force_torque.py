@@ -368,7 +368,7 @@ def test_a_wrong_setting_is_one_line(bench, rig, monkeypatch, changes, said):
 
 
 def test_a_setting_that_is_missing_points_to_the_page(rig):
-    with pytest.raises(InputError, match=r"axes: is missing; see docs/force-torque\.md"):
+    with pytest.raises(InputError, match=r"axes: is missing; see docs/reference/force-torque\.md"):
         open_rig(rig, {"interface": "virtual", "channel": "x"})
 
 

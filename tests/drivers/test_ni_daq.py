@@ -142,5 +142,5 @@ def test_encoders_alone_have_no_clock(ni, rig):
     only = rig.model_copy(update={"sensor": rig.sensor[:1]})
     with pytest.raises(InputError, match="at least one: its sample clock"):
         open_rig(only, {**SETTINGS, "analogue": {}})
-    with pytest.raises(InputError, match=r"board: is missing; see docs/ni-daq\.md"):
+    with pytest.raises(InputError, match=r"board: is missing; see docs/reference/ni-daq\.md"):
         open_rig(rig, {})

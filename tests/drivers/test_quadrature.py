@@ -209,7 +209,7 @@ def test_a_wrong_setting_is_one_line(bench, rig, changes, said):
 
 
 def test_a_setting_that_is_missing_points_to_the_page(rig):
-    with pytest.raises(InputError, match=r"counters: is missing; see docs/quadrature\.md"):
+    with pytest.raises(InputError, match=r"counters: is missing; see docs/reference/quad"):
         open_rig(rig, {"port": "x"})
 
 

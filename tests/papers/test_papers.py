@@ -22,7 +22,7 @@ from samii_rig.papers.equations import EQUATIONS
 from samii_rig.papers.result import Number, Result, beside, between
 from samii_rig.papers.rigs import SOURCE, collocated, lossless, samii
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "papers.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "evidence" / "papers.md"
 QUICK = ("table-1", "table-3", "limits", "p2-fig-5", "p1-offset", "fig-3", "p2-fig-12")
 
 

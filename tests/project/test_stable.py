@@ -1,4 +1,4 @@
-"""What docs/stable.md promises: what 0.1.0 wrote is read to the last bit, names stay.
+"""What docs/reference/stable.md promises: what 0.1.0 wrote is read to the last bit, names stay.
 
 Plan: a recording that 0.1.0 made is whole and gives the same samples, times, marks, segments,
 words and responses; the rig and the experiment in it still say the same; the entry points that the
@@ -114,7 +114,7 @@ def test_its_rig_and_its_experiment_still_say_the_same(recording: Recording, tmp
 
 def test_the_entry_points_of_the_page_are_those_that_exist() -> None:
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    page = (ROOT / "docs" / "stable.md").read_text("utf-8")
+    page = (ROOT / "docs" / "reference" / "stable.md").read_text("utf-8")
     told = set(re.findall(r"^\| `(samii_rig\.\w+)` \|", page, re.M))
     # Effects ship as rows of the vocabulary; the group is for those of a lab.
     groups = {g for g in declared["entry-points"] if g != "pytest11"} | {"samii_rig.effects"}
