@@ -18,12 +18,13 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from scipy import linalg, optimize, stats
+from scipy import linalg, stats
 
 from samii_rig.errors import EstimateError, InputError, one_of
 from samii_rig.identify.identifiability import identifiability
 from samii_rig.identify.parameters import Free, Space, changed, space
 from samii_rig.identify.result import Identification, bounds_met
+from samii_rig.levenberg import minimise
 from samii_rig.modal.match import model_modes, paired
 from samii_rig.modal.saved import SavedModes
 from samii_rig.model.shapes import root
@@ -128,13 +129,7 @@ def identify_modes(
         have = f"{n} real numbers for {needed} parameters without a prior"
         raise InputError("identify", "modes", have, "more modes, fewer free parameters or priors")
     fitted = _Problem(Chain(rig), chosen, blocks)
-    found = optimize.least_squares(
-        fitted.residual,
-        np.zeros(chosen.start.size),
-        fitted.slopes,
-        (chosen.lower, chosen.upper),
-        x_scale="jac",
-    )
+    found = minimise(fitted.at, np.zeros(chosen.start.size), chosen.lower, chosen.upper)
     return _result(fitted, rig, found.x, use, tuple(without))
 
 
@@ -246,29 +241,14 @@ class _Problem:
         self.chain, self.space, self.blocks = chain, chosen, blocks
         self._x = np.zeros(chosen.start.size)
         self._poles = self._roots(self._x, np.concatenate([b.start for b in blocks]))
-        self._known: tuple[bytes, tuple[Float, Float]] | None = None
 
     @property
     def n(self) -> int:
         """Numbers that are fitted."""
         return sum(b.goal.size for b in self.blocks)
 
-    def residual(self, x: Float) -> Float:
-        """(n + priors,) at x."""
-        return self.at(x)[0]
-
-    def slopes(self, x: Float) -> Float:
-        """(n + priors, n_free) at x."""
-        return self.at(x)[1]
-
     def at(self, x: Float) -> tuple[Float, Float]:
-        """Both."""
-        key = x.tobytes()
-        if self._known is None or self._known[0] != key:
-            self._known = key, self._evaluated(x)
-        return self._known[1]
-
-    def _evaluated(self, x: Float) -> tuple[Float, Float]:
+        """(n + priors,) residuals at x, and their slopes (n + priors, n_free)."""
         r, J = [], []
         for block, (y, dy) in zip(self.blocks, self.model(x), strict=True):
             have, by = block.predicted(y, dy)

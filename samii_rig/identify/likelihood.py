@@ -9,24 +9,22 @@ in the wrong place costs what it is off, not a thousand times its noise.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
+from samii_rig import levenberg
 from samii_rig.identify.data import Data
 from samii_rig.identify.parameters import Space
 from samii_rig.identify.predict import Predictor
+from samii_rig.levenberg import Minimum
 from samii_rig.types import Complex, Float
 
 # A logarithm of a response is not taken to be known better than this: 10 % of gain or 6
 # degrees. Below it the first stage would look at what only the second can resolve.
 LOG_FLOOR = 0.1
-STEPS = 60  # evaluations of either stage at most; 4 to 15 are usual
-# First damping, of the squared norm of a column of the Jacobian, near the minimum and far from
-# it. With a tenth of FAR 5 of 100 starts within 30 % of the truth end in another minimum.
-NEAR, FAR = 1e-3, 0.1
-LEAST_SCALE = 1e-8  # of the largest norm: a parameter that nothing depends on stays in place
-AGREES = 0.25  # of the decrease that the linear model expects, at least, to end there
+# First damping far from the minimum. With a tenth of it 5 of 100 starts within 30 % of the truth
+# end in another minimum.
+FAR = 0.1
 
 Evaluated = tuple[Float, Float]
 
@@ -81,16 +79,6 @@ def chi_square(data: Data, predictor: Predictor, x: Float) -> list[Float]:
     ]
 
 
-@dataclass(frozen=True, slots=True)
-class Minimum:
-    """Where one start led: x, half the sum of squares there, the residuals' Jacobian."""
-
-    x: Float
-    cost: float
-    jacobian: Float
-    converged: bool
-
-
 Misfit = Callable[[Data, Space, Predictor, Float], Evaluated]
 
 
@@ -103,58 +91,22 @@ def minimise(
     *,
     fixed: int | None = None,
     tolerance: float = 1e-9,
-    damping: float = NEAR,
+    damping: float = levenberg.NEAR,
 ) -> Minimum:
-    """A local minimum within the bounds by the method of Levenberg and Marquardt.
-
-    The normal equations: with a few parameters they cost nothing beside the model, and the
-    columns are scaled by their norms (More, 1978), so that what is lost in digits is what the
-    noise has long taken. Each step moves the parameters that no bound holds and ends at the
-    bounds (projection).
+    """A local minimum of a misfit within the bounds of the space: see `levenberg.minimise`.
 
     fixed : index of a parameter that stays at its start (profile likelihood).
-    tolerance : of the cost and of x, relative, at which it ends.
     damping : the first one; `FAR` where the start may be far away.
     """
-    free = np.ones(start.size, bool)
+    lower, upper = space.lower.copy(), space.upper.copy()
     if fixed is not None:
-        free[fixed] = False
-    x = np.where(free, np.clip(start, space.lower, space.upper), start)
-    r, J = misfit(data, space, predictor, x)
-    cost, growth = float(r @ r) / 2, 2.0
-    scale = np.zeros(start.size)
-    for _ in range(STEPS - 1):
-        slope, curvature = J.T @ r, J.T @ J
-        scale = np.maximum(scale, np.sqrt(np.diagonal(curvature)))
-        floor = LEAST_SCALE * float(scale.max(initial=0.0)) + np.finfo(float).tiny
-        held = ((x <= space.lower) & (slope > 0)) | ((x >= space.upper) & (slope < 0))
-        moving = np.flatnonzero(free & ~held)
-        if not moving.size:
-            return Minimum(x, cost, J, True)
-        damped = curvature[np.ix_(moving, moving)]
-        damped = damped + np.diag(damping * np.maximum(scale, floor)[moving] ** 2)
-        trial = x.copy()
-        trial[moving] -= np.linalg.solve(damped, slope[moving])
-        trial = np.where(free, np.clip(trial, space.lower, space.upper), start)
-        step = trial - x
-        expected = -float(step @ slope + step @ curvature @ step / 2)
-        small = float(np.linalg.norm(step)) < tolerance * (tolerance + float(np.linalg.norm(x)))
-        if small or expected <= 0:
-            return Minimum(x, cost, J, True)
-        r_new, J_new = misfit(data, space, predictor, trial)
-        new = float(r_new @ r_new) / 2
-        gain = (cost - new) / expected
-        if gain > 0:
-            ends = cost - new < tolerance * cost and gain > AGREES
-            x, r, J, cost = trial, r_new, J_new, new
-            damping, growth = damping * max(1 / 9, 1 - (2 * gain - 1) ** 3), 2.0
-            if ends:
-                return Minimum(x, cost, J, True)
-        else:
-            if expected < tolerance * cost:
-                return Minimum(x, cost, J, True)
-            damping, growth = damping * growth, 2 * growth
-    return Minimum(x, cost, J, False)
+        lower[fixed] = upper[fixed] = start[fixed]
+    return levenberg.minimise(
+        lambda x: misfit(data, space, predictor, x),
+        *(start, lower, upper),
+        tolerance=tolerance,
+        damping=damping,
+    )
 
 
 def _real(rows: list[Complex], slopes: list[Complex], space: Space, x: Float) -> Evaluated:

@@ -19,7 +19,6 @@ from samii_rig.identify.data import Data, collect
 from samii_rig.identify.identifiability import identifiability
 from samii_rig.identify.likelihood import (
     FAR,
-    Minimum,
     chi_square,
     log_misfit,
     minimise,
@@ -28,6 +27,7 @@ from samii_rig.identify.likelihood import (
 from samii_rig.identify.parameters import Free, Space, changed, space
 from samii_rig.identify.predict import Predictor
 from samii_rig.identify.result import Identification, bounds_met, residuals_of
+from samii_rig.levenberg import Minimum
 from samii_rig.progress import Progress, counted
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle

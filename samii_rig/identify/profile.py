@@ -8,9 +8,10 @@ import numpy as np
 from scipy import stats
 
 from samii_rig.errors import InputError
-from samii_rig.identify.likelihood import Minimum, minimise, noise_misfit
+from samii_rig.identify.likelihood import minimise, noise_misfit
 from samii_rig.identify.maximum_likelihood import Problem
 from samii_rig.identify.result import Identification
+from samii_rig.levenberg import Minimum
 from samii_rig.types import Float
 
 STEPS = 12  # refits on each side at most

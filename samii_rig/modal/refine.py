@@ -15,13 +15,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from samii_rig.levenberg import ByGain, Normal, Progress, descend, step
 from samii_rig.modal.rational import Rational, functions
 from samii_rig.types import Complex, Float
 
 STEPS = 60  # of Levenberg-Marquardt; ten are usual
 ENOUGH = 0.01  # change of chi-square at which they end: a tenth of a sigma at most
 TRUST = 1e-3  # first damping of the steps, over the scaled diagonal of the reduced information
-SHRINK, GROW, STUCK = 0.2, 5.0, 1e8  # of it, after a step that helped or not; and the end
 RIDGE = 1e-13  # relative, added to the scaled normal equations: rounding of their digits
 TWICE = 1e-6  # relative distance of two real poles that are one: a double pole is none of the model
 
@@ -40,27 +40,24 @@ def refine(
     pairs : Im > 0. real : of the start. A pair may end as two real poles.
     """
     bc = np.stack([-2 * pairs.real, np.abs(pairs) ** 2], axis=1)
-    now = _fitted(s, G, W, bc, real)
-    trust, n = TRUST, bc.size + real.size
-    N, g = _normal(now.F, now.slopes(s), now.c, G, W)
-    for _ in range(STEPS if n else 0):
-        reduced, gradient = _reduced(N, g, n)
-        size = np.sqrt(np.diag(reduced))
-        scaled = reduced / np.outer(size, size) + (trust + RIDGE) * np.eye(n)
-        step = np.linalg.solve(scaled, gradient / size) / size
-        bc, real = now.bc + step[: now.bc.size].reshape(-1, 2), now.real + step[now.bc.size :]
-        trial = _fitted(s, G, W, bc, real)
-        if not trial.chi2 < now.chi2:
-            trust = max(trust * GROW, TRUST)
-            if trust > STUCK:
-                break
-            continue
-        gained, now = now.chi2 - trial.chi2, trial
-        trust *= SHRINK
+
+    def normal(now: _Sections) -> Normal:
         N, g = _normal(now.F, now.slopes(s), now.c, G, W)
-        if gained < ENOUGH:
-            break
-    return _as_poles(s, G, W, scale, now)
+        A, g = _reduced(N, g, now.x.size)
+        return Normal(A, -g)
+
+    def trial(now: _Sections, by: Normal, damping: float) -> _Sections:
+        x = now.x + step(by.A, by.g, (damping + RIDGE) * np.diagonal(by.A))
+        return _fitted(s, G, W, x[: now.bc.size].reshape(-1, 2), x[now.bc.size :])
+
+    def settled(p: Progress) -> bool:
+        return (p.gain if p.gain > 0 else p.expected) < ENOUGH
+
+    first = _fitted(s, G, W, bc, real)
+    if not first.x.size:
+        return _as_poles(s, G, W, scale, first)
+    end = descend(first, normal, trial, settled, ByGain(TRUST), trials=STEPS)
+    return _as_poles(s, G, W, scale, end.at)
 
 
 def score(model: Rational, s: Complex, G: Complex, W: Complex, pole: complex) -> float:
@@ -91,7 +88,12 @@ class _Sections:
     real: Float
     F: Complex
     c: Float
-    chi2: float
+    cost: float
+
+    @property
+    def x(self) -> Float:
+        """(n_poles,) b, c of each section, then the real poles."""
+        return np.concatenate([self.bc.ravel(), self.real])
 
     def slopes(self, s: Complex) -> Complex:
         """(n, p, n_poles) derivatives by b, c of each section and by each real pole."""

@@ -13,10 +13,12 @@ from typing import Protocol
 import numpy as np
 
 from samii_rig.diagnose.physics.effect import Unknown
+from samii_rig.levenberg import ByFactor, step
 from samii_rig.types import Complex, Float
 
 LONGEST = 3.0  # a step of a logarithm
 ROUNDS = 6  # of a descent, at most
+DAMPING = ByFactor(1e-2, shrink=0.1, grow=30.0)  # of the diagonal: few rounds, so it changes fast
 SETTLED = 0.05  # of chi-square, gained in one of them: less and they end
 STEP = 1e-4  # of a logarithm, for derivatives of a law
 
@@ -123,26 +125,32 @@ def descend(
     """Chi-square and logarithms (m, k) after a few damped Gauss-Newton steps from y."""
     low, high = np.log([(u.low, u.high) for u in unknowns]).T
     m, k = y.shape
-    damping = np.full(m, 1e-2)
+    damping = np.full(m, DAMPING.value)
     for turn in range(ROUNDS):
         ahead = (y[:, None, :] + STEP * np.eye(k)).reshape(-1, k)
         every = phi_of(np.exp(np.concatenate([y, ahead])))
         phi = every[:m]
         d = (every[m:].reshape(m, k, -1) - phi[:, None, :]) / STEP
         g, H = form.normal(phi, d)
-        diagonal = np.einsum("mkk->mk", H)
-        tiny = 1e-9 * np.max(np.abs(diagonal), axis=1, initial=1e-30)[:, None]
-        A = H + (damping[:, None] * np.abs(diagonal) + tiny)[:, :, None] * np.eye(k)
-        if not (np.all(np.isfinite(A)) and np.all(np.isfinite(g))):
+        if not (np.all(np.isfinite(H)) and np.all(np.isfinite(g))):
             break
-        step = np.clip(-np.linalg.solve(A, g[:, :, None])[:, :, 0], -LONGEST, LONGEST)
-        new = np.clip(y + step, low, high)
+        new = np.clip(y + bounded_step(H, g, damping[:, None]), low, high)
         there = form.cost(phi_of(np.exp(new)))
         better = there < cost
         settled = turn > 0 and not np.any(cost - there > SETTLED)
         y = np.where(better[:, None], new, y)
         cost = np.where(better, there, cost)
-        damping = np.where(better, damping * 0.1, damping * 30)
+        damping *= np.where(better, DAMPING.shrink, DAMPING.grow)
         if settled:
             break
     return cost, y
+
+
+def bounded_step(A: Float, g: Float, damping: float | Float) -> Float:
+    """(..., k) damped step of logarithms, none longer than `LONGEST`.
+
+    A : (..., k, k). g : (..., k). damping : of the diagonal, one or (..., 1).
+    """
+    size = np.abs(np.einsum("...kk->...k", A))
+    floor = 1e-9 * np.max(size, axis=-1, initial=1e-30, keepdims=True)
+    return np.asarray(np.clip(step(A, g, damping * size + floor), -LONGEST, LONGEST))

@@ -17,6 +17,7 @@ from samii_rig.diagnose.fit import forms
 from samii_rig.diagnose.fit.forms import Form
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.errors import SamiiRigError
+from samii_rig.levenberg import ByFactor, Normal, Progress, descend, step
 from samii_rig.types import Complex, Float
 
 STEPS = 40
@@ -24,8 +25,14 @@ LOG_STEPS = 20
 LOG_FLOOR = 0.1  # of the response's logarithm: see identify.likelihood
 FAR = 20.0  # chi-square per degree of freedom above which the logarithm is fitted first
 LONGEST = 1.2  # a step of an effect's logarithm at most
-FIRST, LEAST = 10.0, 1e-2  # damping: of chi-square, for a step of the largest allowed size
+# Of chi-square, for a step of the largest allowed size.
+DAMPING = ByFactor(10.0, shrink=0.3, grow=5.0, least=1e-2)
+LOG_DAMPING = ByFactor(1e-2, shrink=1.0, grow=1.0)
+LOG_SETTLED = 1e-3  # of the logarithm's cost, gained by a step: less and they end
+TRIES = 7  # dampings of one step
 CORRECTIONS = 4  # of a step that left the valley
+RETURNS = 0.9  # of the cost before, at which a correction leads nowhere
+NOTHING = 1e-7  # of a logarithm: no step
 SETTLED = 0.02  # of chi-square, improvement of a step at which a refit ends
 HOPELESS = 0.05  # of the way to a chi-square that matters, gained by a step
 PATIENT = 3  # steps before that is asked
@@ -185,26 +192,68 @@ def refit(
         chi2 = _cost(model, problem, fixed, model.response(fixed, problem.at))
         rows = problem.residual(problem.data.H).size
         return Fitted(model, fixed, chi2, 0.0, np.zeros((rows, 0)), np.zeros((0, 0)))
-    x = np.clip(start, model.lower, model.upper)
-    scaled = problem.expected
-    h, dh = model.gradient(x, problem.at)
-    cost = _cost(model, problem, x, h)
-    if far and cost > FAR * scaled:
-        x, h, dh, cost = _logarithm(model, problem, x, h, dh, cost)
-    damping = FIRST
-    for step in range(steps):
-        J, r = problem.whiten(dh), problem.residual(h)
-        x_new, h_new, new, damping = _step(model, problem, x, J, r, cost, damping)
-        gain = cost - new
-        if h_new is None:
-            break
-        x, cost = x_new, new
+    first = _Point.of(model, problem, np.clip(start, model.lower, model.upper))
+    if far and first.cost > FAR * problem.expected:
+        first = _logarithm(model, problem, first)
+
+    def settled(p: Progress) -> bool:
+        hopeless = p.steps > PATIENT and p.gain < HOPELESS * (p.cost - give_up)
+        return p.gain > 0 and (p.gain < SETTLED + 1e-9 * p.cost or hopeless or p.steps >= steps)
+
+    end = descend(
+        first,
+        lambda at: _normal(model, problem, at),
+        lambda at, by, damping: _trial(model, problem, at, by, damping),
+        settled,
+        DAMPING,
+        trials=TRIES * steps,
+        tries=TRIES,
+    )
+    x, J, penalty = end.at.x, end.normal.J, _penalty(model, end.at.x)
+    return Fitted(model, x, end.at.cost - penalty, penalty, J, J.T @ J)
+
+
+@dataclass(frozen=True, slots=True)
+class _Point:
+    """x, the cost there, the response h and its derivative dh, where both were computed."""
+
+    x: Float
+    cost: float
+    h: Complex
+    dh: Complex | None = None
+
+    @classmethod
+    def of(cls, model: Model, problem: Problem, x: Float) -> _Point:
+        """With the derivative."""
         h, dh = model.gradient(x, problem.at)
-        if gain < SETTLED + 1e-9 * cost or (step >= PATIENT and gain < HOPELESS * (cost - give_up)):
-            break
-    J = problem.whiten(dh)
-    penalty = _penalty(model, x)
-    return Fitted(model, x, cost - penalty, penalty, J, J.T @ J)
+        return cls(x, _cost(model, problem, x, h), h, dh)
+
+
+@dataclass(frozen=True, slots=True)
+class _Normal(Normal):
+    """Normal equations with the priors in them, and the Jacobian J of the data alone."""
+
+    J: Float
+
+    @classmethod
+    def of(cls, model: Model, x: Float, J: Float, r: Float) -> _Normal:
+        """From residuals and their Jacobian."""
+        n = np.arange(model.n_nominal)
+        A = J.T @ J
+        A[n, n] += 1 / model.prior[n] ** 2
+        return cls(A, _gradient(model, x, J, r), J)
+
+
+def _gradient(model: Model, x: Float, J: Float, r: Float) -> Float:
+    n = model.n_nominal
+    g = J.T @ r
+    g[:n] += x[:n] / model.prior[:n] ** 2
+    return np.asarray(g)
+
+
+def _normal(model: Model, problem: Problem, at: _Point) -> _Normal:
+    dh = model.gradient(at.x, problem.at)[1] if at.dh is None else at.dh
+    return _Normal.of(model, at.x, problem.whiten(dh), problem.residual(at.h))
 
 
 def _penalty(model: Model, x: Float) -> float:
@@ -217,67 +266,55 @@ def _cost(model: Model, problem: Problem, x: Float, h: Complex) -> float:
     return float(r @ r) + _penalty(model, x)
 
 
-def _step(
-    model: Model, problem: Problem, x: Float, J: Float, r: Float, cost: float, damping: float
-) -> tuple[Float, Complex | None, float, float]:
-    """A Levenberg-Marquardt step that lowers the cost; None where there is none."""
-    n = model.n_nominal
-    A = J.T @ J
-    downhill = J.T @ r
-    A[np.arange(n), np.arange(n)] += 1 / model.prior[:n] ** 2
-    downhill[:n] += x[:n] / model.prior[:n] ** 2
-    for _ in range(7):
-        new = move(model, x, A, downhill, damping)
-        if new is None:
-            damping = max(damping * 5, LEAST)
-            continue
-        try:
-            h = model.response(new, problem.at)
-        except SamiiRigError:
-            damping = max(damping * 5, LEAST)
-            continue
-        there = _cost(model, problem, new, h)
-        for _ in range(CORRECTIONS):
-            if there < cost:
-                break
-            # Back into the curved valley along which the step went, by the same derivatives.
-            g = J.T @ problem.residual(h)
-            g[:n] += new[:n] / model.prior[:n] ** 2
-            back = move(model, new, A, g, damping)
-            if back is None:
-                break
-            try:
-                h = model.response(back, problem.at)
-            except SamiiRigError:
-                break
-            new, before, there = back, there, _cost(model, problem, back, h)
-            if there > 0.9 * before and there >= cost:
-                break
-        if there < cost:
-            return new, h, there, max(damping * 0.3, LEAST)
-        if np.max(np.abs(new - x)) < 1e-7:
+def _trial(
+    model: Model, problem: Problem, at: _Point, by: _Normal, damping: float
+) -> _Point | None:
+    """The point after a step, brought back into the valley that it left."""
+    new = _moved(model, problem, at.x, by, damping)
+    if new is None:
+        return None
+    for _ in range(CORRECTIONS):
+        if new.cost < at.cost:
+            return new
+        # Back into the curved valley along which the step went, by the same derivatives.
+        g = _gradient(model, new.x, by.J, problem.residual(new.h))
+        back = _moved(model, problem, new.x, replace(by, g=g), damping)
+        if back is None:
             break
-        damping = max(damping * 5, LEAST)
-    return x, None, cost, damping
+        new, before = back, new.cost
+        if new.cost > RETURNS * before and new.cost >= at.cost:
+            break
+    nothing = new.cost >= at.cost and np.max(np.abs(new.x - at.x)) < NOTHING
+    return at if nothing else new
 
 
-def move(model: Model, x: Float, A: Float, g: Float, damping: float) -> Float | None:
+def _moved(model: Model, problem: Problem, x: Float, by: Normal, damping: float) -> _Point | None:
+    """The point after a damped step from x; None where there is none, or no model there."""
+    new = move(model, x, by, damping)
+    if new is None:
+        return None
+    try:
+        h = model.response(new, problem.at)
+    except SamiiRigError:
+        return None
+    return _Point(new, _cost(model, problem, new, h), h)
+
+
+def move(model: Model, x: Float, by: Normal, damping: float) -> Float | None:
     """x after a damped step within the bounds; unknowns held at a bound do not take part.
 
-    A, g : half of the cost's second and first derivatives. None where there is no step.
+    None where there is no step.
     """
-    scale = np.sqrt(np.maximum(np.diag(A), 1e-12 * np.max(np.diag(A)) + 1e-30))
-    held = ((x <= model.lower) & (g > 0)) | ((x >= model.upper) & (g < 0))
-    on = np.flatnonzero(~held)
+    diagonal = np.diag(by.A)
+    floor = 1e-12 * np.maximum(diagonal, 1e-12 * np.max(diagonal) + 1e-30)
+    on = np.flatnonzero(~by.held(x, model.lower, model.upper))
     if on.size == 0:
         return None
     limit = np.where(on < model.n_nominal, 4 * np.minimum(model.prior[on], 1e3), LONGEST)
-    S = A[np.ix_(on, on)] / np.outer(scale[on], scale[on])
     # Damped by what a parameter may move, not by what the data say of it: parameters that
     # the data hardly tell apart would otherwise creep along their common valley.
-    S[np.diag_indices(on.size)] += damping / (limit * scale[on]) ** 2 + 1e-12
     try:
-        d = -np.linalg.solve(S, g[on] / scale[on]) / scale[on]
+        d = step(by.A[np.ix_(on, on)], by.g[on], damping / limit**2 + floor[on])
     except np.linalg.LinAlgError:
         return None
     d *= min(1.0, float(1 / np.max(np.abs(d) / limit)) if np.any(d) else 1.0)
@@ -286,45 +323,50 @@ def move(model: Model, x: Float, A: Float, g: Float, damping: float) -> Float | 
     return np.asarray(np.clip(new, model.lower, model.upper))
 
 
-def _logarithm(
-    model: Model, problem: Problem, x: Float, h: Complex, dh: Complex, cost: float
-) -> tuple[Float, Complex, Complex, float]:
+def _logarithm(model: Model, problem: Problem, first: _Point) -> _Point:
     """A few steps on log(model/measurement), line by line; kept only if chi-square fell too."""
     lines = problem.lines
     d = lines.data.H
     precision = np.diagonal(lines.data.W, axis1=1, axis2=2).real * np.abs(d) ** 2
     # An entry that was not measured has none, and no weight.
     weight = np.sqrt(precision / (LOG_FLOOR**2 * precision + 2))
-    n = model.n_nominal
-    best = (x, h, dh, cost)
-    damping, current = 1e-2, math.inf
-    same = lines is problem
-    y, (hy, dhy), moved = x, (h, dh) if same else model.gradient(x, lines.at), False
-    for _ in range(LOG_STEPS):
-        left = weight * np.log(hy / np.where(d == 0, hy, d))
-        slope = (weight / hy)[:, :, None] * dhy
-        r = np.concatenate([left.real.ravel(), left.imag.ravel()])
+    same, best = lines is problem, first
+
+    def left(h: Complex) -> Float:
+        r = weight * np.log(h / np.where(d == 0, h, d))
+        return np.concatenate([r.real.ravel(), r.imag.ravel()])
+
+    def point(x: Float, h: Complex, dh: Complex | None) -> _Point:
+        r = left(h)
+        return _Point(x, float(r @ r) + _penalty(model, x), h, dh)
+
+    def normal(now: _Point) -> _Normal:
+        dh = model.gradient(now.x, lines.at)[1] if now.dh is None else now.dh
+        slope = (weight / now.h)[:, :, None] * dh
         J = np.concatenate([slope.real.reshape(-1, model.n), slope.imag.reshape(-1, model.n)])
-        here = float(r @ r) + _penalty(model, y)
-        if here >= current * 0.999:
-            break
-        current = here
-        A, g = J.T @ J, J.T @ r
-        A[np.arange(n), np.arange(n)] += 1 / model.prior[:n] ** 2
-        g[:n] += y[:n] / model.prior[:n] ** 2
-        new = move(model, y, A, g, damping)
-        if new is None:
-            break
+        return _Normal.of(model, now.x, J, left(now.h))
+
+    def trial(now: _Point, by: _Normal, damping: float) -> _Point | None:
+        nonlocal best
+        x = move(model, now.x, by, damping)
+        if x is None:
+            return now
         try:
-            hy, dhy = model.gradient(new, lines.at)
-            at = hy if same else model.response(new, problem.at)
+            h, dh = model.gradient(x, lines.at)
+            at = h if same else model.response(x, problem.at)
         except SamiiRigError:
-            break
-        y = new
-        there = _cost(model, problem, y, at)
-        if there < best[3]:
-            best, moved = (y, at, dhy, there), True
-    if moved and not same:
-        h, dh = model.gradient(best[0], problem.at)
-        best = (best[0], h, dh, best[3])
+            return None
+        cost = _cost(model, problem, x, at)
+        if cost < best.cost:
+            best = _Point(x, cost, at, dh if same else None)
+        return point(x, h, dh)
+
+    def settled(p: Progress) -> bool:
+        return not p.gain > LOG_SETTLED * (p.cost + max(p.gain, 0.0))
+
+    if same:
+        start = point(first.x, first.h, first.dh)
+    else:
+        start = point(first.x, *model.gradient(first.x, lines.at))
+    descend(start, normal, trial, settled, LOG_DAMPING, trials=LOG_STEPS)
     return best

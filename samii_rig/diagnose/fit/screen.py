@@ -12,18 +12,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 
 import numpy as np
 
-from samii_rig.diagnose.fit.forms import LONGEST, ROUNDS, SETTLED, Form, descend
+from samii_rig.diagnose.fit import forms
+from samii_rig.diagnose.fit.forms import DAMPING, LONGEST, ROUNDS, SETTLED, Form, bounded_step
 from samii_rig.diagnose.fit.moebius import Place
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.physics.effect import Effect, Unknown
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
+from samii_rig.levenberg import Normal, Progress, descend
 from samii_rig.types import Complex, Float
 
 APART = 2.5  # of logarithms: two starts from which different optima may be reached
@@ -39,6 +42,15 @@ SECOND = 0.6  # of the best try's gain: less is no start of its own
 Start = tuple[float, ...]
 Found = tuple[float, list[Start]]
 Tried = tuple[float, Start, Float]  # chi-square, where, and what is left
+
+
+@dataclass(frozen=True, slots=True)
+class _Point:
+    """Logarithms x of an effect's unknowns, chi-square there, and what is left."""
+
+    x: Float
+    cost: float
+    left: Float
 
 
 @dataclass(frozen=True)
@@ -149,7 +161,7 @@ class Screen:
             if all(np.max(np.abs(y[i] - y[j])) > VALLEY for j in chosen):
                 chosen.append(int(i))
         with np.errstate(all="ignore"):
-            end, at = descend(form, phi, y[chosen], cost[chosen], unknowns)
+            end, at = forms.descend(form, phi, y[chosen], cost[chosen], unknowns)
         best = np.argsort(end)
         gain = self.base.cost - end
         starts = [at[best[0]]]
@@ -233,28 +245,30 @@ class Screen:
         """The best try after a few damped Gauss-Newton steps in all of the effect's unknowns."""
         first = model.n - len(effect.unknowns)
         low, high = np.log([(u.low, u.high) for u in effect.unknowns]).T
-        damping = 1e-2
-        for _ in range(ROUNDS):
-            cost, start, left = best
-            y = np.log(start)
-            try:
-                _, dh = model.gradient(np.append(known, y), self.problem.at)
-            except SamiiRigError:
-                break
+
+        def normal(now: _Point) -> Normal:
+            _, dh = model.gradient(np.append(known, now.x), self.problem.at)
             slopes = self.problem.whiten(dh[:, :, first:])
-            J = self._left(np.concatenate([slopes, np.zeros((self.tail.size, y.size))]))
-            A = J.T @ J
-            A[np.diag_indices(y.size)] += damping * np.diag(A) + 1e-9 * np.max(np.diag(A)) + 1e-30
-            if not np.all(np.isfinite(A)):
-                break
-            step = np.clip(-np.linalg.solve(A, J.T @ left), -LONGEST, LONGEST)
-            new = self._cost(model, known, tuple(np.exp(np.clip(y + step, low, high)).tolist()))
-            if new is None or new[0] >= cost:
-                damping *= 30
-                continue
-            best, damping = new, damping * 0.1
-            if cost - new[0] < SETTLED:
-                break
+            J = self._left(np.concatenate([slopes, np.zeros((self.tail.size, now.x.size))]))
+            return Normal(J.T @ J, J.T @ now.left)
+
+        def trial(now: _Point, by: Normal, damping: float) -> _Point | None:
+            nonlocal best
+            if not np.all(np.isfinite(by.A)):
+                return now
+            x = np.clip(now.x + bounded_step(by.A, by.g, damping), low, high)
+            new = self._cost(model, known, tuple(np.exp(x).tolist()))
+            if new is None:
+                return None
+            best = min(best, new, key=lambda t: t[0])
+            return _Point(x, new[0], new[2])
+
+        def settled(p: Progress) -> bool:
+            return 0 < p.gain < SETTLED
+
+        start = _Point(np.log(best[1]), best[0], best[2])
+        with suppress(SamiiRigError):  # no derivative there: the best so far is it
+            descend(start, normal, trial, settled, DAMPING, trials=ROUNDS)
         return best
 
     def _stepped(
