@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -19,24 +20,28 @@ from samii_rig.cli.common import (
 from samii_rig.cli.estimate import (
     GAPS,
     BandOption,
+    Estimating,
     GapsOption,
     OutputOption,
     PoseOption,
     RigOverride,
-    estimated,
     read_all,
 )
+from samii_rig.cli.options import takes
 from samii_rig.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from concurrent.futures import Executor
 
     from rich.console import Console
 
     from samii_rig.diagnose.batch import How
     from samii_rig.diagnose.result import Diagnosis
+    from samii_rig.progress import Progress
     from samii_rig.record.reader import SavedResponses
+    from samii_rig.rig.schema import Rig
+    from samii_rig.rig.schema.pose import Angle
     from samii_rig.signal.gather import Gaps
     from samii_rig.types import FrequencyResponse, Recording
 
@@ -59,54 +64,60 @@ class Spread(TyperCommand):
         return super().parse_args(ctx, out)
 
 
-def diagnose(
+@dataclass(frozen=True, kw_only=True)
+class DiagnoseOptions:
+    """Words of `samii-rig diagnose`."""
+
     logs: Annotated[
         list[Path] | None,
         typer.Argument(
             help="Recordings (.mcap), or responses that frf --save kept.", show_default=False
         ),
-    ] = None,
-    rig: RigOverride = None,
+    ] = None
+    rig: RigOverride = None
     before: Annotated[
         list[Path] | None,
         typer.Option(help="Recordings of the state before a change, one or more."),
-    ] = None,
+    ] = None
     after: Annotated[
         list[Path] | None, typer.Option(help="Recordings of the state after it, one or more.")
-    ] = None,
+    ] = None
     known: Annotated[
         list[str] | None,
         typer.Option(
             help="ELEMENT.PARAMETER=VALUE of the rig file, known and exact; with --before, of the "
             "state after. May be repeated."
         ),
-    ] = None,
+    ] = None
     known_before: Annotated[
         list[str] | None,
         typer.Option(help="The same of the state before alone. May be repeated."),
-    ] = None,
-    pose: PoseOption = None,
+    ] = None
+    pose: PoseOption = None
     out: Annotated[
         Path | None,
         typer.Option(
             help="Folder for the page (diagnosis.html), the new rig file (diagnosed.toml) and the "
             "diagnosis as data (diagnosis.json)."
         ),
-    ] = None,
-    output: OutputOption = None,
-    gaps: GapsOption = "exclude",
-    band: BandOption = None,
+    ] = None
+    output: OutputOption = None
+    gaps: GapsOption = "exclude"
+    band: BandOption = None
     each: Annotated[
         bool,
         typer.Option(
             "--each",
             help="Diagnose every recording by itself, a folder's too; --out gets a .json for each.",
         ),
-    ] = False,
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = "",
-    json: JsonOption = False,
-) -> None:
+    ] = False
+    workers: WorkersOption = None
+    scheduler: SchedulerOption = ""
+    json: JsonOption = False
+
+
+@takes(DiagnoseOptions)
+def diagnose(o: DiagnoseOptions) -> None:
     """Locate what differs between rig file and recordings, name it, model it, show the gain.
 
     Says which explanations the data do not tell apart, and which experiment would. With --before
@@ -115,6 +126,15 @@ def diagnose(
 
     Example: samii-rig diagnose runs/*.mcap --rig samii --out diagnosis
     """
+    logs, earlier = _checked(o)
+    if o.each:
+        _by_themselves(o, logs)
+    else:
+        _together(o, logs, earlier)
+
+
+def _checked(o: DiagnoseOptions) -> tuple[list[Path], list[Path]]:
+    """The recordings to be explained and those of the state before, once all is possible."""
     from samii_rig.cli.arguments import (
         check_band,
         check_channels,
@@ -125,62 +145,39 @@ def diagnose(
         check_rig,
     )
 
-    check_rig(rig)
-    check_choice("--gaps", gaps, GAPS)
-    check_band(band)
-    any_known = bool(known or known_before)
-    logs, earlier = _states(logs or [], before or [], after or [], each=each, known=any_known)
-    if pose and (earlier or each):
+    check_rig(o.rig)
+    check_choice("--gaps", o.gaps, GAPS)
+    check_band(o.band)
+    logs, earlier = _states(o)
+    if o.pose and (earlier or o.each):
         what = "recordings of one state, diagnosed together: no --before, --after or --each"
-        raise InputError("--pose", "", pose[0], what)
-    if known_before and not earlier:
-        raise InputError("--known-before", "", known_before[0], "--before and --after beside it")
-    if not each:
-        check_logs([*earlier, *logs])
-        check_known(known or (), "--known", rig, [*earlier, *logs])
-        check_known(known_before or (), "--known-before", rig, [*earlier, *logs])
-        check_poses(pose, rig, logs)
-        check_channels("--output", output, [*earlier, *logs])
+        raise InputError("--pose", "", o.pose[0], what)
+    if o.known_before and not earlier:
+        raise InputError("--known-before", "", o.known_before[0], "--before and --after beside it")
+    if not o.each:
+        every = [*earlier, *logs]
+        check_logs(every)
+        check_known(o.known or (), "--known", o.rig, every)
+        check_known(o.known_before or (), "--known-before", o.rig, every)
+        check_poses(o.pose, o.rig, logs)
+        check_channels("--output", o.output, every)
 
-    from rich.console import Console
+    from samii_rig.files import check_folder
 
-    from samii_rig.files import check_folder, make_folder
-
-    if out is not None:
-        check_folder("--out", out)
-    if each:
-        from samii_rig.diagnose.batch import How
-        from samii_rig.rig.load import load_rig
-        from samii_rig.workers import workers as at_work
-
-        how = How(
-            load_rig(rig)[1] if rig else "",
-            tuple(output) if output else None,
-            cast("Gaps", gaps),
-            band,
-        )
-        if out is not None:
-            make_folder("--out", out)
-        with at_work(workers, scheduler) as executor:
-            said = _each(logs, how, out, executor, Console(highlight=False, stderr=json))
-        if json:
-            say_json({"recordings": said})
-        return
-    stated = (tuple(known or ()), tuple(known_before or ()))
-    how_ = (output, gaps, band)
-    _together(logs, earlier, rig, stated, how_, out, poses=pose or (), json=json)
+    if o.out is not None:
+        check_folder("--out", o.out)
+    return logs, earlier
 
 
-def _states(
-    logs: list[Path], before: list[Path], after: list[Path], *, each: bool, known: bool
-) -> tuple[list[Path], list[Path]]:
+def _states(o: DiagnoseOptions) -> tuple[list[Path], list[Path]]:
     """The recordings to be explained, and those of the state before, none if there is one state."""
+    logs, before, after = o.logs or [], o.before or [], o.after or []
     if bool(before) != bool(after):
         given, other = ("--before", "--after") if before else ("--after", "--before")
         raise InputError(given, "", str((before or after)[0]), f"{other} with recordings beside it")
     if before and logs:
         raise InputError("LOGS", "", str(logs[0]), "recordings of --before and --after alone")
-    if each and (before or known):
+    if o.each and (before or o.known or o.known_before):
         raise InputError("--each", "", True, "neither --before, --after nor --known beside it")
     if not (logs or after):
         none = "missing; expected recordings (.mcap), or --before and --after with theirs"
@@ -191,109 +188,149 @@ def _states(
     return logs or after, before
 
 
-def _together(
-    logs: list[Path],
-    earlier: list[Path],
-    rig: str | None,
-    known: tuple[tuple[str, ...], tuple[str, ...]],
-    how: tuple[list[str] | None, str, tuple[float, float] | None],
-    out: Path | None,
-    *,
-    poses: Sequence[str],
-    json: bool,
-) -> None:
-    """One diagnosis of all recordings, said, kept and written. earlier : of the state before;
-    known : words of --known and --known-before; poses : words of --pose."""
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """What is held against a rig file.
+
+    first, second : recordings of the state before and of the one that is explained; or saved
+    responses. rig, text : the file. at : the pose of each of `second`. in_pose : the rig in the
+    first of them; own : with what is known put in. known, known_before : as the words say.
+    """
+
+    first: list[Recording]
+    second: list[Recording]
+    saved: list[SavedResponses]
+    rig: Rig
+    text: str
+    at: list[Angle]
+    in_pose: Rig
+    own: Rig
+    known: Mapping[str, float]
+    known_before: Mapping[str, float]
+
+    @property
+    def plain(self) -> bool:
+        """One state, as it was recorded, with the rig file as it is."""
+        return not (self.first or self.known or self.saved)
+
+    @property
+    def kept(self) -> bool:
+        """A change is no diagnosis of either state's recordings, nor is one of another rig."""
+        from samii_rig.diagnose.posed import same_rig
+
+        alike = (
+            r.rig_toml in ("", self.text) or same_rig(r.rig_toml, self.rig) for r in self.second
+        )
+        return self.plain and all(alike)
+
+
+def _asked(o: DiagnoseOptions, logs: list[Path], earlier: list[Path]) -> _Asked:
+    """All of it, read."""
+    from samii_rig.diagnose.fit.known import stated, with_known
+    from samii_rig.diagnose.posed import one_pose
+    from samii_rig.identify.poses import at_pose, poses_of
+
+    known, before = stated(o.known or ()), stated(o.known_before or (), "--known-before")
+    saved = _saved([*earlier, *logs], two=bool(earlier))
+    first, second = ([], []) if saved else (read_all(earlier), read_all(logs))
+    held = rig_of(saved or [*first, *second], o.rig)
+    if held is None:
+        raise without_rig()
+    rig, text = held
+    if saved and o.pose:
+        what = "recordings: several poses are held against the model by their samples"
+        raise InputError("LOGS", "", saved[0].source, what)
+    at = poses_of(second, rig, o.pose or ())
+    if first:
+        every = [*poses_of(first, rig, ()), *at]
+        at = [one_pose(every, "--before", "both states in one pose")]
+    in_pose = at_pose(rig, at[0]) if at else rig
+    own = with_known(in_pose, known)
+    return _Asked(first, second, saved, rig, text, at, in_pose, own, known, before)
+
+
+def _found(
+    o: DiagnoseOptions, asked: _Asked, say: Progress
+) -> tuple[Diagnosis, Sequence[FrequencyResponse]]:
+    """The diagnosis, and the responses that a page shows."""
+    from samii_rig.diagnose.changed import State, changed
+    from samii_rig.diagnose.diagnose import diagnose as found_by
+    from samii_rig.diagnose.posed import in_poses, sorted_by_pose
+
+    of = Estimating(output=o.output, gaps=o.gaps, band=o.band).of
+    say("frequency responses")
+    if asked.saved:
+        files = [(file.source, chosen(file, o.output)) for file in asked.saved]
+        responses = [r for _, own in files for r in own]
+        found = found_by(responses, asked.own, band=o.band, progress=say, files=files)
+        return found, responses
+    if asked.first:
+        after = State(of(asked.second), asked.second)
+        found = changed(
+            State(of(asked.first), asked.first),
+            after,
+            asked.in_pose,
+            known=asked.known,
+            known_before=asked.known_before,
+            band=o.band,
+            progress=say,
+        )
+        return found, after.responses
+    each = sorted_by_pose(asked.second, asked.at, of)
+    return in_poses(each, asked.own, band=o.band, progress=say), each[0].responses
+
+
+def _together(o: DiagnoseOptions, logs: list[Path], earlier: list[Path]) -> None:
+    """One diagnosis of all recordings, said, kept and written."""
     from dataclasses import replace
 
     from rich.console import Console
 
-    from samii_rig.diagnose.changed import State, changed
-    from samii_rig.diagnose.diagnose import diagnose as found_by
-    from samii_rig.diagnose.fit.exact import lengths
-    from samii_rig.diagnose.fit.known import stated, with_known
-    from samii_rig.diagnose.posed import in_poses, one_pose, same_rig, sorted_by_pose
-    from samii_rig.identify.poses import at_pose, poses_of
     from samii_rig.report.summary import working
 
-    output, gaps, band = how
-    values, values_before = stated(known[0]), stated(known[1], "--known-before")
-    saved = _saved([*earlier, *logs], two=bool(earlier))
-    first, second = ([], []) if saved else (read_all(earlier), read_all(logs))
-    held = rig_of(saved or [*first, *second], rig)
-    if held is None:
-        raise without_rig()
-    if saved and poses:
-        what = "recordings: several poses are held against the model by their samples"
-        raise InputError("LOGS", "", saved[0].source, what)
-    at = poses_of(second, held[0], poses)
-    if first:
-        every = [*poses_of(first, held[0], ()), *at]
-        at = [one_pose(every, "--before", "both states in one pose")]
-    the_rig = at_pose(held[0], at[0]) if at else held[0]
-    own_rig = with_known(the_rig, values)
+    asked = _asked(o, logs, earlier)
     console = Console(highlight=False)
-
-    def of(runs: Sequence[Recording]) -> Sequence[FrequencyResponse]:
-        return estimated(list(runs), None, output, "auto", gaps, band)
-
-    with working(console, "diagnosis", quiet=json) as say:
-        say("frequency responses")
-        if saved:
-            files = [(file.source, chosen(file, output)) for file in saved]
-            responses: Sequence[FrequencyResponse] = [r for _, own in files for r in own]
-            found = found_by(responses, own_rig, band=band, progress=say, files=files)
-        elif first:
-            responses = of(second)
-            found = changed(
-                State(of(first), first),
-                State(responses, second),
-                the_rig,
-                known=values,
-                known_before=values_before,
-                band=band,
-                progress=say,
-            )
-        else:
-            each = sorted_by_pose(second, at, of)
-            responses = each[0].responses
-            found = in_poses(each, own_rig, band=band, progress=say)
-    # A change is no diagnosis of either state's recordings, nor is one of another rig.
-    alike = all(r.rig_toml in ("", held[1]) or same_rig(r.rig_toml, held[0]) for r in second)
-    own = not (first or values or saved) and alike
-    if own:
+    with working(console, "diagnosis", quiet=o.json) as say:
+        found, responses = _found(o, asked, say)
+    if asked.kept:
         keep_diagnosis(logs, found)
     page = None
-    if out is not None:
+    if o.out is not None:
         from samii_rig.report.diagnosis.page import write_diagnosis
 
-        found = replace(found, model=_write(out, found))
+        found = replace(found, model=_write(o.out, found))
         page = write_diagnosis(
-            out / "diagnosis.html",
+            o.out / "diagnosis.html",
             found,
             responses,
-            own_rig,
-            recordings=[*first, *second],
-            band_hz=band or (0.0, float("inf")),
+            asked.own,
+            recordings=[*asked.first, *asked.second],
+            band_hz=o.band or (0.0, float("inf")),
         )
-    if json:
+    if o.json:
         say_json(found.plain())
         return
-    for line in found.lines():
+    for line in _lines(asked, found):
         console.print(line, soft_wrap=True)
-    apart = first or found.states or found.exact
-    if found.verdict == "unknown" and not apart and (exact := lengths(own_rig)):
-        console.print(
-            f"exact    The rig file gives {', '.join(exact)} no tolerance. If one may be wrong, "
-            f"free it: samii-rig identify with the same recordings, --rig and --free {exact[0]}",
-            soft_wrap=True,
-        )
-    if found.model:
-        console.print(f"written  {found.model}", soft_wrap=True)
     if page:
         console.print(f"page     {page}", soft_wrap=True)
-    if not (own or first or values or saved):
+    if asked.plain and not asked.kept:
         console.print("not kept with the recordings: they carry another rig file", soft_wrap=True)
+
+
+def _lines(asked: _Asked, found: Diagnosis) -> Iterator[str]:
+    """What was found, and what would tell more."""
+    from samii_rig.diagnose.fit.exact import lengths
+
+    yield from found.lines()
+    apart = asked.first or found.states or found.exact
+    if found.verdict == "unknown" and not apart and (exact := lengths(asked.own)):
+        yield (
+            f"exact    The rig file gives {', '.join(exact)} no tolerance. If one may be wrong, "
+            f"free it: samii-rig identify with the same recordings, --rig and --free {exact[0]}"
+        )
+    if found.model:
+        yield f"written  {found.model}"
 
 
 def _saved(logs: list[Path], *, two: bool) -> list[SavedResponses]:
@@ -343,6 +380,25 @@ def _keep(logs: list[Path], found: dict[str, Any]) -> None:
         except RecordingError as error:
             # A folder that only lets itself be read is no reason to diagnose nothing.
             typer.echo(f"samii-rig: the diagnosis is not kept: {error}", err=True)
+
+
+def _by_themselves(o: DiagnoseOptions, logs: list[Path]) -> None:
+    """A diagnosis of each recording."""
+    from rich.console import Console
+
+    from samii_rig.diagnose.batch import How
+    from samii_rig.files import make_folder
+    from samii_rig.rig.load import load_rig
+    from samii_rig.workers import workers as at_work
+
+    text = load_rig(o.rig)[1] if o.rig else ""
+    how = How(text, tuple(o.output) if o.output else None, cast("Gaps", o.gaps), o.band)
+    if o.out is not None:
+        make_folder("--out", o.out)
+    with at_work(o.workers, o.scheduler) as executor:
+        said = _each(logs, how, o.out, executor, Console(highlight=False, stderr=o.json))
+    if o.json:
+        say_json({"recordings": said})
 
 
 def _each(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
@@ -21,11 +22,18 @@ from samii_rig.cli.common import (
     say_json,
     without_rig,
 )
+from samii_rig.cli.options import takes
 from samii_rig.errors import EstimateError, InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from rich.console import Console
+
+    from samii_rig.diagnose.result import Diagnosis
+    from samii_rig.progress import Progress
+    from samii_rig.report.compare import ModelCurve
+    from samii_rig.report.modes import Modes
     from samii_rig.rig.schema import Rig
     from samii_rig.signal.choose import Method
     from samii_rig.signal.gather import Gaps
@@ -69,27 +77,67 @@ PoseOption = Annotated[
 ]
 
 
-def frf(
-    logs: Logs,
-    rig: RigOverride = None,
-    input_: InputOption = None,
-    output: OutputOption = None,
-    method: MethodOption = "auto",
-    gaps: GapsOption = "refuse",
-    band: BandOption = None,
+@dataclass(frozen=True, kw_only=True)
+class Estimating:
+    """Which frequency responses are estimated, and how."""
+
+    input_: InputOption = None
+    output: OutputOption = None
+    method: MethodOption = "auto"
+    gaps: GapsOption = "refuse"
+    band: BandOption = None
+
+    def check(self, logs: list[Path]) -> None:
+        """InputError for options that no estimate can have, before it is imported."""
+        from samii_rig.cli.arguments import check_band, check_channels, check_choice
+
+        check_choice("--method", self.method, METHODS)
+        check_choice("--gaps", self.gaps, GAPS)
+        check_band(self.band)
+        check_channels("--input", self.input_, logs)
+        check_channels("--output", self.output, logs)
+
+    def of(self, recordings: Sequence[Recording]) -> tuple[FrequencyResponse, ...]:
+        """Frequency responses by the options of the command line."""
+        from samii_rig.signal.estimate import estimate
+
+        # `estimate` itself refuses names that it does not know.
+        try:
+            return estimate(
+                recordings,
+                input=self.input_ or None,
+                outputs=self.output,
+                method=cast("Method", self.method),
+                gaps=cast("Gaps", self.gaps),
+                band=self.band,
+            )
+        except EstimateError as error:  # its advice in the words of the command line
+            said = re.sub(r"(gaps|input)='(\w+)'", r"--\1 \2", str(error))
+            raise EstimateError(said) from error
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrfOptions(Estimating):
+    """Words of `samii-rig frf`."""
+
+    logs: Logs
+    rig: RigOverride = None
     export: Annotated[
         list[Path] | None,
         typer.Option(
             help="Write a .csv, .npz, .mat or .uff file, replaced if it exists; of several levels "
             "one each, as NAME_0.5_V.csv. May be repeated."
         ),
-    ] = None,
+    ] = None
     save: Annotated[
         Path | None,
         typer.Option(help="Write a new .mcap of the results that names its sources."),
-    ] = None,
-    json: JsonOption = False,
-) -> None:
+    ] = None
+    json: JsonOption = False
+
+
+@takes(FrfOptions)
+def frf(o: FrfOptions) -> None:
     """Estimate frequency responses with their uncertainty; recordings of one level are pooled.
 
     The method is chosen from what the recordings hold, and said. Several inputs are told apart by
@@ -99,43 +147,30 @@ def frf(
     """
     from samii_rig.cli.arguments import check_logs, check_rig
 
-    check_rig(rig)
-    check_logs(logs)
-    check_estimate(method, gaps, band, input_, output, logs)
-    for path in export or ():
-        check_target("--export", path, (".csv", ".npz", ".mat", ".uff"), logs)
-    if save:
-        check_target("--save", save, (".mcap",), logs)
-        if save.exists():
-            raise InputError("--save", "", str(save), "no recording of that name yet")
+    check_rig(o.rig)
+    check_logs(o.logs)
+    o.check(o.logs)
+    for path in o.export or ():
+        check_target("--export", path, (".csv", ".npz", ".mat", ".uff"), o.logs)
+    if o.save:
+        check_target("--save", o.save, (".mcap",), o.logs)
+        if o.save.exists():
+            raise InputError("--save", "", str(o.save), "no recording of that name yet")
 
     from rich.console import Console
 
-    from samii_rig.record.derived import save_frequency_responses
-    from samii_rig.record.export import export_response
     from samii_rig.report.compare import model_curve
     from samii_rig.report.facts import names
     from samii_rig.report.summary import summary
 
-    console = Console(highlight=False)
-    recordings = read_all(logs)
-    responses = estimated(recordings, input_, output, method, gaps, band)
-    held = rig_of(recordings, rig)
-    if save and held and len(recordings) > 1:
-        _of_one_state(
-            recordings, held[0], lambda one: estimated([one], input_, output, method, gaps, band)
-        )
+    recordings = read_all(o.logs)
+    responses = o.of(recordings)
+    held = rig_of(recordings, o.rig)
+    if o.save and held and len(recordings) > 1:
+        _of_one_state(recordings, held[0], lambda one: o.of([one]))
     curve = model_curve(held[0], responses) if held else None
-    written = []
-    for path in export or ():
-        targets = _one_a_level(path, responses)
-        written += [export_response(t, r) for t, r in zip(targets, responses, strict=True)]
-    if save:
-        carried = {r.rig_toml for r in recordings}
-        rig_toml = carried.pop() if len(carried) == 1 else ""
-        save_frequency_responses(save, responses, logs, rig_toml=rig_toml)
-        written.append(save)
-    if json:
+    written = _exported(o, recordings, responses)
+    if o.json:
         say_json(
             {
                 "responses": [response_json(r) for r in responses],
@@ -144,127 +179,170 @@ def frf(
             }
         )
         return
-    console.print(summary(recordings, responses, curve, band or ALL))
+    console = Console(highlight=False)
+    console.print(summary(recordings, responses, curve, o.band or ALL))
     for r, name in zip(responses, names(responses), strict=True):
         console.print(f"\n{name}: {r.method}. {r.why}")
-    for path in written:
-        console.print(f"written  {path}", soft_wrap=True)
+    say_written(console, written)
 
 
-def report(
-    logs: Logs,
-    rig: RigOverride = None,
+def _exported(
+    o: FrfOptions, recordings: Sequence[Recording], responses: Sequence[FrequencyResponse]
+) -> list[Path]:
+    """The files that --export and --save ask for."""
+    from samii_rig.record.derived import save_frequency_responses
+    from samii_rig.record.export import export_response
+
+    written = []
+    for path in o.export or ():
+        targets = _one_a_level(path, responses)
+        written += [export_response(t, r) for t, r in zip(targets, responses, strict=True)]
+    if o.save:
+        carried = {r.rig_toml for r in recordings}
+        rig_toml = carried.pop() if len(carried) == 1 else ""
+        save_frequency_responses(o.save, responses, o.logs, rig_toml=rig_toml)
+        written.append(o.save)
+    return written
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportOptions(Estimating):
+    """Words of `samii-rig report`."""
+
+    logs: Logs
+    rig: RigOverride = None
     out: Annotated[
         Path | None,
         typer.Option(
             help="The page (.html), replaced if it exists [default: beside the first recording; "
             "none if there is a --figure]"
         ),
-    ] = None,
+    ] = None
     figure: Annotated[
         list[Path] | None,
         typer.Option(
             help="The Bode diagram as .png, .svg or .pdf, for a paper; replaced if it exists."
         ),
-    ] = None,
-    input_: InputOption = None,
-    output: OutputOption = None,
-    method: MethodOption = "auto",
-    gaps: GapsOption = "refuse",
-    band: BandOption = None,
+    ] = None
     diagnosis: Annotated[
         bool,
         typer.Option(
             "--diagnosis", help="Diagnose them first, and show what is found on the page."
         ),
-    ] = False,
-    json: JsonOption = False,
-) -> None:
+    ] = False
+    json: JsonOption = False
+
+    @property
+    def page(self) -> Path | None:
+        """Where the page goes, if one is asked for."""
+        return self.out or (None if self.figure else self.logs[0].with_suffix(".html"))
+
+
+@takes(ReportOptions)
+def report(o: ReportOptions) -> None:
     """Write one self-contained HTML page about recordings: works offline, interactive.
 
     Example: samii-rig report runs/*.mcap --out report.html --figure bode.svg
     """
     from samii_rig.cli.arguments import check_logs, check_rig
 
-    check_rig(rig)
-    check_logs(logs)
-    check_estimate(method, gaps, band, input_, output, logs)
-    page = out or (None if figure else logs[0].with_suffix(".html"))
-    if page is not None:
-        check_target("--out", page, (".html",), logs)
-    for path in figure or ():
-        check_target("--figure", path, FIGURES, logs)
+    check_rig(o.rig)
+    check_logs(o.logs)
+    o.check(o.logs)
+    if o.page is not None:
+        check_target("--out", o.page, (".html",), o.logs)
+    for path in o.figure or ():
+        check_target("--figure", path, FIGURES, o.logs)
 
     from rich.console import Console
 
-    from samii_rig.progress import ahead
-    from samii_rig.record.reader import read_events
     from samii_rig.report.compare import model_curve
-    from samii_rig.report.figures import bode_figure, save_figure
     from samii_rig.report.modes import modes_of_all
-    from samii_rig.report.page import write_report
     from samii_rig.report.summary import summary, working
 
-    console, found = Console(highlight=False), None
-    with working(console, "report", quiet=json) as say:
+    console = Console(highlight=False)
+    with working(console, "report", quiet=o.json) as say:
         say("recordings")
-        recordings = read_all(logs)
-        held = rig_of(recordings, rig)
-        in_pose = _of_one_pose(recordings, held[0] if held else None) if diagnosis else None
+        recordings = read_all(o.logs)
+        held = rig_of(recordings, o.rig)
+        rig = held[0] if held else None
+        in_pose = _of_one_pose(recordings, rig) if o.diagnosis else None
         say("frequency responses")
-        responses = estimated(recordings, input_, output, method, gaps, band)
-        curve = model_curve(held[0], responses) if held else None
-        if in_pose is not None:
-            from samii_rig.diagnose.diagnose import diagnose
-
-            found = diagnose(
-                responses, in_pose, band=band, runs=recordings,
-                progress=lambda stage: say(ahead("diagnosis: ", stage, whole=True)),
-            )  # fmt: skip
+        responses = o.of(recordings)
+        curve = model_curve(rig, responses) if rig else None
+        found = _diagnosed(o, in_pose, recordings, responses, say) if in_pose else None
         say("modes")
-        modes = modes_of_all(responses, held[0] if held else None)
-        written = []
-        if page is not None:
-            say("the page")
-            write_report(
-                page,
-                recordings,
-                responses,
-                rig=held[0] if held else None,
-                model=curve,
-                band_hz=band or ALL,
-                events=[event for path in logs for event in read_events(path)],
-                diagnosis=found,
-                modes=modes,
-            )
-            written.append(page)
-        for path in figure or ():
-            say(f"the figure {path.name}")
-            written.append(save_figure(path, bode_figure(responses, curve)))
-    if json:
+        modes = modes_of_all(responses, rig)
+        written = _written(o, _Shown(recordings, responses, rig, curve, found, modes), say)
+    if o.json:
         say_json({"written": written, "model_over_measurement": comparisons(responses, curve)})
         return
-    console.print(summary(recordings, responses, curve, band or ALL, modes))
+    console.print(summary(recordings, responses, curve, o.band or ALL, modes))
+    say_written(console, written)
+
+
+def _diagnosed(
+    o: ReportOptions,
+    in_pose: Rig,
+    recordings: list[Recording],
+    responses: Sequence[FrequencyResponse],
+    say: Progress,
+) -> Diagnosis:
+    from samii_rig.diagnose.diagnose import diagnose
+    from samii_rig.progress import ahead
+
+    return diagnose(
+        responses,
+        in_pose,
+        band=o.band,
+        runs=recordings,
+        progress=lambda stage: say(ahead("diagnosis: ", stage, whole=True)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """What a page is about."""
+
+    recordings: Sequence[Recording]
+    responses: Sequence[FrequencyResponse]
+    rig: Rig | None
+    curve: ModelCurve | None
+    diagnosis: Diagnosis | None
+    modes: Sequence[Modes]
+
+
+def _written(o: ReportOptions, shown: _Shown, say: Progress) -> list[Path]:
+    """Page and figures."""
+    from samii_rig.record.reader import read_events
+    from samii_rig.report.figures import bode_figure, save_figure
+    from samii_rig.report.page import write_report
+
+    written = []
+    if o.page is not None:
+        say("the page")
+        write_report(
+            o.page,
+            shown.recordings,
+            shown.responses,
+            rig=shown.rig,
+            model=shown.curve,
+            band_hz=o.band or ALL,
+            events=[event for path in o.logs for event in read_events(path)],
+            diagnosis=shown.diagnosis,
+            modes=shown.modes,
+        )
+        written.append(o.page)
+    for path in o.figure or ():
+        say(f"the figure {path.name}")
+        written.append(save_figure(path, bode_figure(shown.responses, shown.curve)))
+    return written
+
+
+def say_written(console: Console, written: Sequence[object]) -> None:
+    """A line for each file."""
     for path in written:
         console.print(f"written  {path}", soft_wrap=True)
-
-
-def check_estimate(
-    method: str,
-    gaps: str,
-    band: tuple[float, float] | None,
-    input_: list[str] | None,
-    output: list[str] | None,
-    logs: list[Path],
-) -> None:
-    """InputError for options that no estimate can have, before it is imported."""
-    from samii_rig.cli.arguments import check_band, check_channels, check_choice
-
-    check_choice("--method", method, METHODS)
-    check_choice("--gaps", gaps, GAPS)
-    check_band(band)
-    check_channels("--input", input_, logs)
-    check_channels("--output", output, logs)
 
 
 def _of_one_pose(recordings: list[Recording], rig: Rig | None) -> Rig:
@@ -303,37 +381,11 @@ def _of_one_state(
         )
 
 
-def read_all(logs: list[Path]) -> list[Recording]:
+def read_all(logs: Sequence[Path]) -> list[Recording]:
     """All recordings; RecordingError names the first that cannot be read."""
     from samii_rig.record.reader import read_recording
 
     return [read_recording(path) for path in logs]
-
-
-def estimated(
-    recordings: list[Recording],
-    input_: list[str] | None,
-    output: list[str] | None,
-    method: str,
-    gaps: str,
-    band: tuple[float, float] | None,
-) -> tuple[FrequencyResponse, ...]:
-    """Frequency responses by the options of the command line."""
-    from samii_rig.signal.estimate import estimate
-
-    # `estimate` itself refuses names that it does not know.
-    try:
-        return estimate(
-            recordings,
-            input=input_ or None,
-            outputs=output,
-            method=cast("Method", method),
-            gaps=cast("Gaps", gaps),
-            band=band,
-        )
-    except EstimateError as error:  # its advice in the words of the command line
-        said = re.sub(r"(gaps|input)='(\w+)'", r"--\1 \2", str(error))
-        raise EstimateError(said) from error
 
 
 def _one_a_level(path: Path, responses: Sequence[FrequencyResponse]) -> list[Path]:

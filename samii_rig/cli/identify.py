@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -11,65 +12,77 @@ from samii_rig.cli.common import JsonOption, rig_of, say_json, without_rig
 from samii_rig.cli.estimate import (
     GAPS,
     BandOption,
+    Estimating,
     GapsOption,
     PoseOption,
     RigOverride,
-    estimated,
     read_all,
 )
+from samii_rig.cli.options import takes
 from samii_rig.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable
 
+    from rich.console import RenderableType
+
+    from samii_rig.rig.schema import Rig
     from samii_rig.rig.schema.pose import Angle
-    from samii_rig.types import FrequencyResponse, Recording
+    from samii_rig.types import Recording
+
+    Identified = tuple[Any, Callable[[Any], RenderableType]]  # what was found, and its table
 
 
-def identify(
+@dataclass(frozen=True, kw_only=True)
+class IdentifyOptions:
+    """Words of `samii-rig identify`."""
+
     logs: Annotated[
         list[Path] | None, typer.Argument(help="Recordings (.mcap).", show_default=False)
-    ] = None,
-    rig: RigOverride = None,
+    ] = None
+    rig: RigOverride = None
     modes: Annotated[
         list[Path] | None,
         typer.Option(
             help="Modes that modes --save kept, in place of recordings; with --rig. May be repeated"
         ),
-    ] = None,
+    ] = None
     use: Annotated[
         str | None,
         typer.Option(
             help="Of --modes: residues (all), shapes (no calibrated input needed), or poles "
             "(frequencies and damping alone) [default: residues]"
         ),
-    ] = None,
+    ] = None
     free: Annotated[
         list[str] | None,
         typer.Option(
             help="Parameter to identify, as element.symbol; may be repeated. "
             "Without it all that the rig file gives a tolerance, which is then used as a prior."
         ),
-    ] = None,
+    ] = None
     method: Annotated[
         str,
         typer.Option(
             help="likelihood, or the methods of paper 1: 1 (two frequencies and a zero), "
             "2 (braced base: a frequency and a mode shape ratio)."
         ),
-    ] = "likelihood",
+    ] = "likelihood"
     output: Annotated[
         list[str] | None,
         typer.Option(
             help="Output channel; may be repeated. Methods 1 and 2: the accelerometers whose "
             "zero or mode shape ratio counts."
         ),
-    ] = None,
-    pose: PoseOption = None,
-    gaps: GapsOption = "refuse",
-    band: BandOption = None,
-    json: JsonOption = False,
-) -> None:
+    ] = None
+    pose: PoseOption = None
+    gaps: GapsOption = "refuse"
+    band: BandOption = None
+    json: JsonOption = False
+
+
+@takes(IdentifyOptions)
+def identify(o: IdentifyOptions) -> None:
     """Identify parameters by maximum likelihood, with intervals and what cannot be known.
 
     All channels and levels count, in units of their noise. A model that does not fit is said so.
@@ -78,114 +91,111 @@ def identify(
 
     Example: samii-rig identify runs/*.mcap --free joint_1.k --free joint_2.k
     """
-    from samii_rig.cli.arguments import (
-        check_band,
-        check_channels,
-        check_choice,
-        check_free,
-        check_logs,
-        check_poses,
-        check_rig,
-    )
+    from samii_rig.cli.arguments import check_band, check_choice, check_rig
 
-    check_choice("--method", method, ("likelihood", "1", "2"))
-    check_choice("--gaps", gaps, GAPS)
-    check_choice("--use", use or "residues", ("residues", "shapes", "poles"))
-    check_rig(rig)
-    check_band(band)
-    if modes:
-        given = {"LOGS": logs, "--output": output, "--pose": pose, "--band": band}
-        given["--method"] = None if method == "likelihood" else [method]
-        given["--gaps"] = None if gaps == "refuse" else [gaps]
-        check_free(free or (), rig)
-        _of_modes(modes, given, rig, free or (), use or "residues", json=json)
+    check_choice("--method", o.method, ("likelihood", "1", "2"))
+    check_choice("--gaps", o.gaps, GAPS)
+    check_choice("--use", o.use or "residues", ("residues", "shapes", "poles"))
+    check_rig(o.rig)
+    check_band(o.band)
+    result, table = _of_modes(o, o.modes) if o.modes else _of_recordings(o)
+    if o.json:
+        say_json(result.plain())
         return
-    if use:
-        raise InputError("--use", "", use, "--modes FILE beside it: it is of modes")
-    if not logs:
-        raise InputError.saying("LOGS", "", "missing; expected recordings (.mcap) or --modes FILE")
-    check_logs(logs)
-    if method != "likelihood" and not free:
-        raise InputError("--free", "", None, "what to identify, as --free ELEMENT.SYMBOL")
-    check_free(free or (), rig, logs)
-    check_poses(pose, rig, logs)
-    check_channels("--output", output, logs)
 
+    from rich.console import Console
+
+    Console(highlight=False).print(table(result))
+
+
+def _of_recordings(o: IdentifyOptions) -> Identified:
+    """By the likelihood, or by a method of paper 1."""
+    logs = _checked(o)
+
+    from samii_rig.identify.poses import poses_of
+
+    recordings = read_all(logs)
+    held = rig_of(recordings, o.rig)
+    if held is None:
+        raise without_rig()
+    at = poses_of(recordings, held[0], o.pose or ())
+    by = _by_likelihood if o.method == "likelihood" else _by_paper
+    return by(o, recordings, held[0], at)
+
+
+def _checked(o: IdentifyOptions) -> list[Path]:
+    """The recordings, when everything beside them is possible."""
+    from samii_rig.cli.arguments import check_channels, check_free, check_logs, check_poses
+
+    if o.use:
+        raise InputError("--use", "", o.use, "--modes FILE beside it: it is of modes")
+    if not o.logs:
+        raise InputError.saying("LOGS", "", "missing; expected recordings (.mcap) or --modes FILE")
+    check_logs(o.logs)
+    if o.method != "likelihood" and not o.free:
+        raise InputError("--free", "", None, "what to identify, as --free ELEMENT.SYMBOL")
+    check_free(o.free or (), o.rig, o.logs)
+    check_poses(o.pose, o.rig, o.logs)
+    check_channels("--output", o.output, o.logs)
+    return o.logs
+
+
+def _by_paper(
+    o: IdentifyOptions, recordings: list[Recording], rig: Rig, at: list[Angle]
+) -> Identified:
     from typing import cast
 
     from rich.console import Console
 
     from samii_rig.identify import methods
-    from samii_rig.identify.maximum_likelihood import identify as maximum_likelihood
-    from samii_rig.identify.parameters import uncertain
-    from samii_rig.identify.poses import at_pose, poses_of
-    from samii_rig.identify.table import method_table, summary_table
+    from samii_rig.identify.poses import at_pose
+    from samii_rig.identify.table import method_table
     from samii_rig.report.summary import working
 
-    recordings = read_all(logs)
-    held = rig_of(recordings, rig)
-    if held is None:
-        raise without_rig()
-    console = Console(highlight=False)
-    at = poses_of(recordings, held[0], pose or ())
-    if method != "likelihood":
-        if len(set(at)) > 1:
-            expected = "recordings in one pose, or --method likelihood"
-            raise InputError("--method", "", method, expected)
-        responses = estimated(recordings, None, None, "auto", gaps, band)
-        with working(console, "identifying", quiet=json):
-            by = methods.from_responses(
-                cast("methods.Method", method), responses, at_pose(held[0], at[0]), free or (),
-                outputs=output, band=band,
-            )  # fmt: skip
-        if json:
-            say_json(by.plain())
-        else:
-            console.print(method_table(by))
-        return
-    in_pose = _in_poses(recordings, at, output, gaps, band)
-    with working(console, "identifying", quiet=json) as say:
+    if len(set(at)) > 1:
+        expected = "recordings in one pose, or --method likelihood"
+        raise InputError("--method", "", o.method, expected)
+    responses = Estimating(gaps=o.gaps, band=o.band).of(recordings)
+    with working(Console(highlight=False), "identifying", quiet=o.json):
+        found = methods.from_responses(
+            cast("methods.Method", o.method), responses, at_pose(rig, at[0]), o.free or (),
+            outputs=o.output, band=o.band,
+        )  # fmt: skip
+    return found, method_table
+
+
+def _by_likelihood(
+    o: IdentifyOptions, recordings: list[Recording], rig: Rig, at: list[Angle]
+) -> Identified:
+    from rich.console import Console
+
+    from samii_rig.identify.maximum_likelihood import identify as maximum_likelihood
+    from samii_rig.identify.parameters import uncertain
+    from samii_rig.identify.poses import by_pose
+    from samii_rig.identify.table import summary_table
+    from samii_rig.report.summary import working
+
+    # Recordings of one pose are pooled.
+    estimating = Estimating(output=o.output, gaps=o.gaps, band=o.band)
+    in_pose = [(r, pose) for pose, alike in by_pose(recordings, at) for r in estimating.of(alike)]
+    with working(Console(highlight=False), "identifying", quiet=o.json) as say:
         found = maximum_likelihood(
-            [response for response, _ in in_pose], held[0], free or uncertain(held[0]),
-            prior=not free, band=band, poses=[one for _, one in in_pose],
+            [response for response, _ in in_pose], rig, o.free or uncertain(rig),
+            prior=not o.free, band=o.band, poses=[one for _, one in in_pose],
             progress=say,
         )  # fmt: skip
-    if json:
-        say_json(found.plain())
-    else:
-        console.print(summary_table(found))
+    return found, summary_table
 
 
-def _in_poses(
-    recordings: list[Recording],
-    at: list[Angle],
-    output: list[str] | None,
-    gaps: str,
-    band: tuple[float, float] | None,
-) -> list[tuple[FrequencyResponse, Angle]]:
-    """Responses with the pose of their recordings; those of one pose are pooled."""
-    from samii_rig.identify.poses import by_pose
-
-    return [
-        (r, pose)
-        for pose, alike in by_pose(recordings, at)
-        for r in estimated(alike, None, output, "auto", gaps, band)
-    ]
-
-
-def _of_modes(
-    files: list[Path],
-    given: Mapping[str, object],
-    rig: str | None,
-    free: Sequence[str],
-    use: str,
-    *,
-    json: bool,
-) -> None:
-    """From saved modes. given : options that are for recordings alone."""
+def _of_modes(o: IdentifyOptions, files: list[Path]) -> Identified:
+    """From saved modes."""
     from typing import cast
 
     from rich.console import Console
+
+    from samii_rig.cli.arguments import check_free
+
+    check_free(o.free or (), o.rig)
 
     from samii_rig.identify.from_modes import Use, identify_modes
     from samii_rig.identify.parameters import uncertain
@@ -194,23 +204,32 @@ def _of_modes(
     from samii_rig.report.summary import working
     from samii_rig.rig.load import load_rig
 
-    for option, value in given.items():
-        if value:
-            shown = value if isinstance(value, tuple) else str(value[0])  # type: ignore[index]
-            raise InputError(option, "", shown, "none beside --modes: it is for recordings")
-    if rig is None:
+    _no_recordings(o)
+    if o.rig is None:
         raise InputError("--rig", "", None, "a rig: saved modes carry none")
     for i, path in enumerate(files):
         if path.resolve() in [other.resolve() for other in files[:i]]:
             raise InputError("--modes", "", str(path), "each file once, or its noise counts twice")
     saved = [level for path in files for level in saved_modes(path)]
-    console = Console(highlight=False)
-    own = load_rig(rig)[0]
-    with working(console, "identifying", quiet=json):
+    own = load_rig(o.rig)[0]
+    with working(Console(highlight=False), "identifying", quiet=o.json):
         found = identify_modes(
-            saved, own, free or uncertain(own), prior=not free, use=cast("Use", use)
-        )
-    if json:
-        say_json(found.plain())
-    else:
-        console.print(from_modes_table(found))
+            saved, own, o.free or uncertain(own), prior=not o.free,
+            use=cast("Use", o.use or "residues"),
+        )  # fmt: skip
+    return found, from_modes_table
+
+
+def _no_recordings(o: IdentifyOptions) -> None:
+    """InputError for options that are for recordings alone."""
+    given = (
+        ("LOGS", o.logs and str(o.logs[0])),
+        ("--output", o.output and o.output[0]),
+        ("--pose", o.pose and o.pose[0]),
+        ("--band", o.band),
+        ("--method", None if o.method == "likelihood" else o.method),
+        ("--gaps", None if o.gaps == "refuse" else o.gaps),
+    )
+    for option, value in given:
+        if value:
+            raise InputError(option, "", value, "none beside --modes: it is for recordings")

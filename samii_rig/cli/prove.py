@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from samii_rig.cli.common import JsonOption, SchedulerOption, WorkersOption, rigs, say_json
+from samii_rig.cli.options import takes
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from samii_rig.prove.campaign import Campaign
-    from samii_rig.prove.jobs import Job
     from samii_rig.prove.outcomes import Outcome
     from samii_rig.prove.score import Score
 
-Count = typer.Option(min=0)
 
+@dataclass(frozen=True, kw_only=True)
+class ProveOptions:
+    """Words of `samii-rig prove`."""
 
-def prove(
     out: Annotated[Path, typer.Option("--out", help="Folder of trials, answers and the page.")] = (
         Path("proof")
-    ),
+    )
     rig: Annotated[
         list[str] | None,
         typer.Option(
@@ -31,51 +32,58 @@ def prove(
             help="Shipped rig or path of a rig file, may be repeated; by default all shipped.",
             autocompletion=rigs,
         ),
-    ] = None,
+    ] = None
     plant: Annotated[
         list[str] | None,
         typer.Option("--plant", help="What makes the recordings, may be repeated; by default all."),
-    ] = None,
-    nothing: Annotated[int, typer.Option(min=0, help="Trials that conceal nothing.")] = 300,
-    one: Annotated[int, typer.Option(min=0, help="Trials that conceal one effect.")] = 430,
-    two: Annotated[int, typer.Option(min=0, help="Trials that conceal two.")] = 150,
-    joints: Annotated[
-        int, typer.Option(min=0, help="Trials that conceal every joint's give.")
-    ] = 40,
+    ] = None
+    nothing: Annotated[int, typer.Option(min=0, help="Trials that conceal nothing.")] = 300
+    one: Annotated[int, typer.Option(min=0, help="Trials that conceal one effect.")] = 430
+    two: Annotated[int, typer.Option(min=0, help="Trials that conceal two.")] = 150
+    joints: Annotated[int, typer.Option(min=0, help="Trials that conceal every joint's give.")] = 40
     force: Annotated[
         int, typer.Option(min=0, help="Trials that conceal one effect that depends on the level.")
-    ] = 150,
+    ] = 150
     outside: Annotated[
         int, typer.Option(min=0, help="Trials that conceal what the vocabulary has no word for.")
-    ] = 150,
+    ] = 150
     seed: Annotated[
         int,
         typer.Option(help="Seed of the first trial of each kind. Thresholds were set below 1e6."),
-    ] = 1_000_000,
+    ] = 1_000_000
     hours: Annotated[
         float, typer.Option(min=0.0, help="Begin no trial after that long; 0 for no end.")
-    ] = 0.0,
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = "",
-    keep: Annotated[
-        bool, typer.Option("--keep", help="Keep the recordings (12 MB a trial).")
-    ] = False,
+    ] = 0.0
+    workers: WorkersOption = None
+    scheduler: SchedulerOption = ""
+    keep: Annotated[bool, typer.Option("--keep", help="Keep the recordings (12 MB a trial).")] = (
+        False
+    )
     page: Annotated[
         Path | None,
         typer.Option(help="Write the documentation's page (.md), and the outcomes beside it."),
-    ] = None,
+    ] = None
     of: Annotated[
         Path | None,
         typer.Option("--of", help="Score the outcomes kept in this file (.jsonl.xz), make none."),
-    ] = None,
+    ] = None
     calibrate: Annotated[
         Path | None,
         typer.Option(
             help="Write the weights of stated probabilities that these trials give to this file."
         ),
-    ] = None,
-    json: JsonOption = False,
-) -> None:
+    ] = None
+    json: JsonOption = False
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Trials of each kind."""
+        kinds = ("nothing", "one", "two", "outside", "joints", "force")
+        return {kind: getattr(self, kind) for kind in kinds}
+
+
+@takes(ProveOptions)
+def prove(o: ProveOptions) -> None:
     """Conceal physics from the diagnosis, trial by trial, and score what it says.
 
     Plant, rig and style of recording are drawn for every trial. Trials that have an answer are not
@@ -87,57 +95,30 @@ def prove(
     from samii_rig.cli.common import check_target
     from samii_rig.files import check_file, check_folder
 
-    for name in rig or ():
+    for name in o.rig or ():
         check_rig(name)
-    if page is not None:
-        check_target("--page", page, (".md",))
-    if calibrate is not None:
-        check_file("--calibrate", calibrate)
-    if of is None:
-        check_folder("--out", out)
+    if o.page is not None:
+        check_target("--page", o.page, (".md",))
+    if o.calibrate is not None:
+        check_file("--calibrate", o.calibrate)
+    if o.of is None:
+        check_folder("--out", o.out)
     from samii_rig.prove import outcomes as kept
 
     failures: list[str] = []
-    if of is None:
-        counts = {"nothing": nothing, "one": one, "two": two, "outside": outside,
-                  "joints": joints, "force": force}  # fmt: skip
-        failures = _made(
-            out.resolve(), _Order(rig, plant, counts, seed, hours, keep), workers, scheduler, json
-        )
-        made, found = kept.collected(out.resolve())
+    if o.of is None:
+        failures = _made(o)
+        made, found = kept.collected(o.out.resolve())
     else:
-        made, found = kept.read(of)
-    if calibrate is not None:
-        _calibrate(calibrate, found)
-    _report(None if of else out, page, made, found, failures, json)
+        made, found = kept.read(o.of)
+    if o.calibrate is not None:
+        _calibrate(o.calibrate, found)
+    _report(o, made, found, failures)
     if failures:
         raise typer.Exit(1)
 
 
-class _Order:
-    """What is asked for."""
-
-    def __init__(
-        self,
-        rig: list[str] | None,
-        plant: list[str] | None,
-        counts: Mapping[str, int],
-        seed: int,
-        hours: float,
-        keep: bool,
-    ) -> None:
-        from samii_rig.prove.jobs import jobs, pairs, plants
-        from samii_rig.rig.load import load_rig
-        from samii_rig.rig.shipped import shipped
-
-        self.plants = tuple(plant or plants())
-        self.rigs = {name: load_rig(name)[1] for name in rig or shipped()}
-        having, self.left_out = pairs(self.plants, self.rigs, asked=rig or ())
-        self.jobs: Sequence[Job] = jobs(counts, seed, having)
-        self.hours, self.keep = hours, keep
-
-
-def _made(out: Path, order: _Order, workers: int | None, scheduler: str, quiet: bool) -> list[str]:
+def _made(o: ProveOptions) -> list[str]:
     """Carry out what is asked for; what failed, in words."""
     import time
 
@@ -145,25 +126,33 @@ def _made(out: Path, order: _Order, workers: int | None, scheduler: str, quiet: 
 
     from samii_rig.progress import Counted
     from samii_rig.prove.campaign import Campaign, carry_out, claim
+    from samii_rig.prove.jobs import jobs, pairs, plants
     from samii_rig.report.summary import working
+    from samii_rig.rig.load import load_rig
+    from samii_rig.rig.shipped import shipped
     from samii_rig.workers import workers as at_work
 
-    if not order.jobs:
+    names = tuple(o.plant or plants())
+    rigs = {name: load_rig(name)[1] for name in o.rig or shipped()}
+    having, left_out = pairs(names, rigs, asked=o.rig or ())
+    asked = jobs(o.counts, o.seed, having)
+    if not asked:
         return []
-    made = {"plants": order.plants, "rigs": tuple(order.rigs), "left_out": order.left_out,
+    out = o.out.resolve()
+    made = {"plants": names, "rigs": tuple(rigs), "left_out": left_out,
             "command": _command(), "commit": _commit()}  # fmt: skip
     claim(out, made)
-    campaign: Campaign = Campaign(out, order.rigs, keep=order.keep)
-    until = time.monotonic() + 3600 * order.hours if order.hours else float("inf")
+    campaign = Campaign(out, rigs, keep=o.keep)
+    until = time.monotonic() + 3600 * o.hours if o.hours else float("inf")
     with (
-        working(Console(stderr=True, highlight=False), "proof", quiet=quiet) as say,
-        at_work(workers, scheduler) as executor,
+        working(Console(stderr=True, highlight=False), "proof", quiet=o.json) as say,
+        at_work(o.workers, o.scheduler) as executor,
     ):
 
         def told(done: int, failed: int) -> None:
-            say(Counted("trials", done, len(order.jobs), f"{failed} failed" if failed else ""))
+            say(Counted("trials", done, len(asked), f"{failed} failed" if failed else ""))
 
-        return carry_out(campaign, order.jobs, executor, told, until)
+        return carry_out(campaign, asked, executor, told, until)
 
 
 # Options that say where and how fast, not which trials.
@@ -212,14 +201,9 @@ def _calibrate(file: Path, found: Sequence[Outcome]) -> None:
 
 
 def _report(
-    out: Path | None,
-    page: Path | None,
-    made: dict[str, Any],
-    found: Sequence[Outcome],
-    failures: Sequence[str],
-    json: bool,
+    o: ProveOptions, made: dict[str, Any], found: Sequence[Outcome], failures: Sequence[str]
 ) -> None:
-    """Write the pages, that of a campaign into `out`; print the scores."""
+    """Write the pages, that of a campaign into its folder; print the scores."""
     from rich.console import Console
 
     from samii_rig.prove import evidence
@@ -230,15 +214,15 @@ def _report(
     trials = kept.trials(found)
     broken = sum(o.get("at") == "diagnosis" for o in found if "error" in o)
     result = scores(trials, broken)
-    pages = [write_page(out / "proof.html", trials, failed=broken)] if out is not None else []
-    if page is not None:
-        file = page.with_name("proof-trials.jsonl.xz")
+    pages = [] if o.of else [write_page(o.out / "proof.html", trials, failed=broken)]
+    if o.page is not None:
+        file = o.page.with_name("proof-trials.jsonl.xz")
         kept.write(file, made, found)
         known = {"command": "", "commit": "", "left_out": (), **made}
-        known["page"] = f"samii-rig prove --of {file} --page {page}"
-        evidence.write(page, known, found, file.name)
-        pages += [page, file]
-    if json:
+        known["page"] = f"samii-rig prove --of {file} --page {o.page}"
+        evidence.write(o.page, known, found, file.name)
+        pages += [o.page, file]
+    if o.json:
         data = {"trials": len(trials), "failures": failures, "page": pages[0] if pages else None}
         say_json({**data, "scores": [_plain(s) for s in result]})
         return

@@ -11,6 +11,7 @@ import typer
 
 from samii_rig.cli.common import JsonOption, RigOption, experiments, say_json
 from samii_rig.cli.one_run import Done, Said, one_run
+from samii_rig.cli.options import takes
 from samii_rig.cli.predicted import say_predictions
 from samii_rig.errors import InputError
 
@@ -25,7 +26,10 @@ if TYPE_CHECKING:
 EXIT = {"completed": 0, "stopped": 130, "tripped": 5, "failed": 6}
 
 
-def run(
+@dataclass(frozen=True, kw_only=True)
+class RunOptions:
+    """Words of `samii-rig run`."""
+
     experiment: Annotated[
         str,
         typer.Argument(
@@ -33,32 +37,32 @@ def run(
             "mode_scan, step), or the path of its file.",
             autocompletion=experiments,
         ),
-    ],
-    rig: RigOption = "samii",
+    ]
+    rig: RigOption = "samii"
     out: Annotated[
         Path | None,
         typer.Option(help="The recording's name [default: runs/TIME_RIG_EXPERIMENT.mcap]"),
-    ] = None,
+    ] = None
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Predict, say the margins, move nothing.")
-    ] = False,
+    ] = False
     describe: Annotated[
         bool, typer.Option("--describe", help="Say what the experiment's file can hold, and end.")
-    ] = False,
+    ] = False
     seed: Annotated[
         int | None,
         typer.Option(
             help="Seed of the simulated rig's noise [default: drawn, and recorded]", min=0
         ),
-    ] = None,
+    ] = None
     pose: Annotated[
         str | None,
         typer.Option(
             help='The pose the rig stands in, from the way down, such as "30 deg"; recorded '
             "[default: the rig file's]"
         ),
-    ] = None,
-    operator: Annotated[str, typer.Option(help="Who stands at the rig; recorded.")] = "",
+    ] = None
+    operator: Annotated[str, typer.Option(help="Who stands at the rig; recorded.")] = ""
     heartbeat: Annotated[
         float | None,
         typer.Option(
@@ -66,13 +70,16 @@ def run(
             "which the run trips [default: none is needed]",
             min=0.1,
         ),
-    ] = None,
-    no_report: Annotated[bool, typer.Option("--no-report", help="Write no HTML page.")] = False,
+    ] = None
+    no_report: Annotated[bool, typer.Option("--no-report", help="Write no HTML page.")] = False
     no_diagnosis: Annotated[
         bool, typer.Option("--no-diagnosis", help="Do not look for what the model leaves out.")
-    ] = False,
-    json: JsonOption = False,
-) -> None:
+    ] = False
+    json: JsonOption = False
+
+
+@takes(RunOptions)
+def run(o: RunOptions) -> None:
     """Run an experiment: predict, drive, record, estimate, report.
 
     Before anything moves, the model predicts every peak; a plan that would break a limit is
@@ -84,29 +91,29 @@ def run(
     from samii_rig.cli.arguments import check_experiment, check_rig
     from samii_rig.files import check_folder
 
-    check_rig(rig)
-    if out is not None and out.suffix != ".mcap":
-        raise InputError("samii-rig run", "--out", str(out), "a name that ends in .mcap")
-    if not describe:
-        check_folder("--out", out.parent if out else Path("runs"))
-    check_experiment(experiment)
-    if describe:
-        _describe(experiment, rig)
+    check_rig(o.rig)
+    if o.out is not None and o.out.suffix != ".mcap":
+        raise InputError("samii-rig run", "--out", str(o.out), "a name that ends in .mcap")
+    if not o.describe:
+        check_folder("--out", o.out.parent if o.out else Path("runs"))
+    check_experiment(o.experiment)
+    if o.describe:
+        _describe(o.experiment, o.rig)
         return
     # Last: what is wrong in the words before is said without it.
     from rich.console import Console
 
     said = Said(
         Console(highlight=False),
-        out,
-        seed,
-        operator,
-        heartbeat=heartbeat,
-        report=not no_report,
-        diagnosis=not no_diagnosis,
-        json=json,
+        o.out,
+        o.seed,
+        o.operator,
+        heartbeat=o.heartbeat,
+        report=not o.no_report,
+        diagnosis=not o.no_diagnosis,
+        json=o.json,
     )
-    raise typer.Exit(_ordered(experiment, rig, said, pose, dry_run=dry_run))
+    raise typer.Exit(_ordered(o.experiment, o.rig, said, o.pose, dry_run=o.dry_run))
 
 
 def _ordered(experiment: str, rig: str, said: Said, pose: str | None, *, dry_run: bool) -> int:
