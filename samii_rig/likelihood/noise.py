@@ -112,7 +112,10 @@ class Noise:
         scale = np.where(scale > 0, scale, 1.0)
         S = S / (scale[:, None] * scale)
         u = u[back[middle]] / scale[:, None]
-        own = known(at[middle], group[middle])
+        # What is known may differ from line to line: between those of a motion that repeats itself
+        # its rounding has next to nothing.
+        weight = np.asarray(np.bincount(which, free, at.size), np.float64)
+        own = _mean(known(at, group), weight, bins)
         power = _powers(u, S, w, _colours(at[middle], corners), own)
         plain = cls(
             disturbances,
@@ -223,6 +226,13 @@ def _gathered(left: Complex, free: Float, bins: Int) -> tuple[Complex, Float]:
     S = np.zeros((n, q, q), np.complex128)
     np.add.at(S, bins, left[:, :, None] * left[:, None, :].conj())
     return S, np.asarray(np.bincount(bins, free, n), np.float64)
+
+
+def _mean(x: Float, weight: Float, bins: Int) -> Float:
+    """(b, q) of x (n, q) over each bin."""
+    n = int(bins.max()) + 1
+    sums = [np.bincount(bins, weight * one, n) for one in x.T]
+    return np.asarray(np.stack(sums, axis=1) / np.bincount(bins, weight, n)[:, None])
 
 
 def _powers(u: Complex, S: Complex, w: Float, g: Float, known: Float) -> Float:
