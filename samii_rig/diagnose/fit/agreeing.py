@@ -26,11 +26,11 @@ from samii_rig.diagnose.fit.records import RecordSearch, Whole, within
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.likelihood.reduce import Reduced, orthonormal
+from samii_rig.likelihood.reduce import Reduced, Response, orthonormal
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned, proportional
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Finding, Float, FrequencyResponse, Recording
+from samii_rig.types import Complex, Finding, Float, FrequencyResponse, Recording
 
 REPEAT = "repeat"  # kind of finding that tells a repeat which is unlike the others
 SURE = 5.0  # standard deviations of chi-square beyond which two recordings differ
@@ -177,6 +177,7 @@ def _alone(given: Given) -> list[_Alone]:
     whole = given.whole
     records, sensors = whole.records, whole.wired.sensors
     band = records.bands[0] if whole.asked else None
+    response = _kept(whole.response(given.fitted))
     out = []
     for i, (run, _) in enumerate(aligned(given.runs)):
         try:
@@ -187,10 +188,23 @@ def _alone(given: Given) -> list[_Alone]:
             continue
         if own.wired == whole.wired:
             long = replace(own, records=replace(among, least=records.longest))
-            form = long.about(given.fitted, given.frequency)
+            form = long.about(given.fitted, given.frequency, response)
             pieces = own.by_level().records.pieces
             out.append(_Alone(run.source or f"recording {i + 1}", pieces, form))
     return out
+
+
+def _kept(response: Response) -> Response:
+    """The same, computed once on each contour: those of all recordings are as long."""
+    made: dict[tuple[int, complex], Complex] = {}
+
+    def at(s: Complex) -> Complex:
+        key = s.size, complex(s[-1])
+        if key not in made:
+            made[key] = response(s)
+        return made[key]
+
+    return at
 
 
 def _own(run: Recording, findings: Sequence[Finding]) -> Sequence[Finding]:

@@ -257,10 +257,13 @@ class Whole:
         once, which = np.unique(f, return_inverse=True)
         return np.asarray(fitted.model.response(fitted.x, self.grid(once, 0.0, fitted))[which])
 
-    def about(self, fitted: Fitted, at: Float | None = None) -> Reduced:
-        """The likelihood near a fit, on the lines that are fitted. at : Hz of its nodes."""
-        disturbed = self.disturbed(fitted)
-        return reduced(self.records, self.response(fitted), disturbed, self._loop, _fitted, at)
+    def about(
+        self, fitted: Fitted, at: Float | None = None, response: Response | None = None
+    ) -> Reduced:
+        """The likelihood near a fit, on the lines that are fitted. at : Hz of its nodes. response :
+        that of the fit, where it is known."""
+        response = self.response(fitted) if response is None else response
+        return reduced(self.records, response, self.disturbed(fitted), self._loop, _fitted, at)
 
     def complete(self, fitted: Fitted) -> Complete:
         """The same, with what no linear model explains."""
@@ -526,6 +529,7 @@ class RecordSearch(Search):
         plain refit to the wrong one."""
         model = fitted.model
         x = np.zeros(model.n)
+        before = self.problem, self._between
         self._about(self._there(model, x))
         cold = self.problem.expected / max(self._there(model, x).cost, 1.0)
         steps = int(np.ceil(-np.log(min(cold, 1.0)) / np.log(COOLER)))
@@ -536,10 +540,12 @@ class RecordSearch(Search):
             now = self._there(model, x)
             if not self._stands(now, COOLER**k):
                 self._about(now)
+            if self.ratio(now) > COOLER**k:  # less noise than what is left tells nothing more
+                break
         now = refit(model, self.problem, x)
         if now.cost < self._there(model, fitted.x).cost:
             return now
-        self._about(fitted)
+        self.problem, self._between = before
         return refit(model, self.problem, fitted.x)
 
     def _there(self, model: Model, x: Float) -> Fitted:
@@ -558,11 +564,12 @@ class RecordSearch(Search):
 
     def _stands(self, fitted: Fitted, times: float = 1.0) -> bool:
         """Whether a fit changes the response as linearly between nodes as the likelihood has it, to
-        noise of so many times the power."""
+        noise of so many times the power, and to what the fit leaves: where that is more than noise,
+        no less can be told from it."""
         between, reference = self._between
         d = fitted.model.response(fitted.x, self.problem.at) - self.reduced.reference
         middle = fitted.model.response(fitted.x, between) - reference
-        return self.reduced.bent(d, middle) < BETWEEN * math.sqrt(times)
+        return self.reduced.bent(d, middle) < BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
 
     @property
     def reduced(self) -> Reduced:

@@ -326,14 +326,10 @@ def move(model: Model, x: Float, by: Normal, damping: float) -> Float | None:
 def _logarithm(model: Model, problem: Problem, first: _Point) -> _Point:
     """A few steps on log(model/measurement), line by line; kept only if chi-square fell too."""
     lines = problem.lines
-    d = lines.data.H
-    precision = np.diagonal(lines.data.W, axis1=1, axis2=2).real * np.abs(d) ** 2
-    # An entry that was not measured has none, and no weight.
-    weight = np.sqrt(precision / (LOG_FLOOR**2 * precision + 2))
-    same, best = lines is problem, first
+    weight, same, best = _of_logarithms(lines), lines is problem, first
 
     def left(h: Complex) -> Float:
-        r = weight * np.log(h / np.where(d == 0, h, d))
+        r = _left_of_logarithms(lines, weight, h)
         return np.concatenate([r.real.ravel(), r.imag.ravel()])
 
     def point(x: Float, h: Complex, dh: Complex | None) -> _Point:
@@ -370,3 +366,28 @@ def _logarithm(model: Model, problem: Problem, first: _Point) -> _Point:
         start = point(first.x, *model.gradient(first.x, lines.at))
     descend(start, normal, trial, settled, LOG_DAMPING, trials=LOG_STEPS)
     return best
+
+
+def far_off(model: Model, problem: Problem, x: Float) -> float:
+    """How far the logarithm of a model is off the measurement's, line by line, in the weights in
+    which it is fitted far from the optimum; infinite where there is no rig."""
+    lines = problem.lines
+    try:
+        h = model.response(x, lines.at)
+    except SamiiRigError:
+        return math.inf
+    off = float(np.sum(np.abs(_left_of_logarithms(lines, _of_logarithms(lines), h)) ** 2))
+    return off if math.isfinite(off) else math.inf
+
+
+def _of_logarithms(lines: Problem) -> Float:
+    """(n, q) weights of the logarithms of the responses."""
+    precision = np.diagonal(lines.data.W, axis1=1, axis2=2).real * np.abs(lines.data.H) ** 2
+    # An entry that was not measured has none, and no weight.
+    return np.asarray(np.sqrt(precision / (LOG_FLOOR**2 * precision + 2)))
+
+
+def _left_of_logarithms(lines: Problem, weight: Float, h: Complex) -> Complex:
+    """(n, q) what a response leaves of them."""
+    d = lines.data.H
+    return np.asarray(weight * np.log(h / np.where(d == 0, h, d)))

@@ -16,7 +16,7 @@ import numpy as np
 
 from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, named
 from samii_rig.diagnose.fit.ranking import moved, ranking
-from samii_rig.diagnose.fit.refit import Fitted, refit
+from samii_rig.diagnose.fit.refit import Fitted, far_off, refit
 from samii_rig.diagnose.fit.screen import Screen, Start
 from samii_rig.diagnose.fit.usual import LINES
 from samii_rig.diagnose.physics.effect import Effect
@@ -170,16 +170,24 @@ class Search(Explanations):
     def _switches(self, base: Explanation) -> list[Candidate]:
         """Effects that are there or not, from the nominal parameters as the rig file has them:
         where a gross mismatch has bent these, no step along them shows what such an effect does."""
-        out: list[Candidate] = []
+        nearest: dict[tuple[str, str], tuple[float, tuple[Effect, ...], Float]] = {}
         for effect in self.table:
             effects = (*base.effects, effect)
             model = None if effect.unknowns or self._mixed(effects) else self.model(effects)
-            if model is not None and frozenset(e.key for e in effects) not in self.found:
-                x = moved(base.fitted.model, base.fitted.x, model)
-                x[: model.n_nominal] = 0.0
-                there = self.refitted_from(effects, x, steps=0)
-                if there is not None:
-                    out.append((there.cost, effects, [x]))
+            if model is None or frozenset(e.key for e in effects) in self.found:
+                continue
+            x = moved(base.fitted.model, base.fitted.x, model)
+            x[: model.n_nominal] = 0.0
+            off = far_off(model, self.problem, x)
+            # Of the units of a channel, or of its shifts, one is nearest wherever the rest stands.
+            kin = effect.physics, effect.site
+            if kin not in nearest or off < nearest[kin][0]:
+                nearest[kin] = off, effects, x
+        out: list[Candidate] = []
+        for _, effects, x in nearest.values():
+            there = self.refitted_from(effects, x, steps=0)
+            if there is not None:
+                out.append((there.cost, effects, [x]))
         return sorted(out, key=lambda one: one[0])[:SWITCHED]
 
     @staticmethod
@@ -215,7 +223,7 @@ class Search(Explanations):
         cost = math.inf
         while end is not None and end.cost < FALLING * cost:
             cost = end.cost
-            end = self.refitted_from(effects, end.x, steps=AHEAD) or end
+            end = self.refitted_from(effects, end.x, steps=AHEAD, far=False) or end
         return end
 
     def screen(self, base: Explanation) -> list[tuple[float, Effect, list[Start]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -222,6 +222,27 @@ def grid(
     return Grid(f, factor, every, folded, rig.rate_hz, sensor, actuator, sigma=sigma, loop=loop)
 
 
+@dataclass(frozen=True, slots=True)
+class _Passed:
+    """What factors on channels do to the response at the grid's own s, and to each of its `orders`.
+
+    F : (1 + order, n, q) their product. parts : of each unknown, its place in x, the entries that
+    it acts on and the slope of the product's logarithm there (1 + order, n, 1).
+    """
+
+    F: Complex
+    parts: Sequence[tuple[int, Int, Complex]]
+
+    def slopes(self) -> Iterator[tuple[int, Int, Complex]]:
+        """Of each unknown the slope of F itself."""
+        return ((j, on, self.F[:, :, on] * slope) for j, on, slope in self.parts)
+
+
+def _folded(at: Grid, F: Complex) -> Complex:
+    """(n, q) aliases of a grid, each times its factors."""
+    return np.asarray(at.aliases + np.sum(at.folded * (F[1:] - 1), axis=0))
+
+
 class Model:
     """A rig, the effects added to it, and its uncertain nominal parameters.
 
@@ -311,8 +332,11 @@ class Model:
         """(n, q) at the grid's frequencies."""
         chain = self.chain.with_values(self.values(x))
         G = chain.evaluate(at.s)[:, at.sensor, at.actuator]
-        F, _ = self._factors(x, at, slopes=False)
-        H = np.asarray(G * at.factor * F + self._aliases(x, at, slopes=False)[0])
+        passed = self._passed(x, at)
+        factor, aliases = at.factor, at.aliases
+        if passed is not None:
+            factor, aliases = factor * passed.F[0], _folded(at, passed.F)
+        H = np.asarray(G * factor + aliases)
         return H if at.loop is None else at.loop.closed(H)
 
     def gradient(self, x: Float, at: Grid) -> tuple[Complex, Complex]:
@@ -322,8 +346,10 @@ class Model:
         chain = self.chain.with_values(values)
         G, dG = chain.gradient_at(at.s, keys)
         G, dG = G[:, at.sensor, at.actuator], dG[:, at.sensor, at.actuator]
-        F, slopes = self._factors(x, at, slopes=True)
-        factor = at.factor * F
+        passed = self._passed(x, at)
+        factor, aliases = at.factor, at.aliases
+        if passed is not None:
+            factor, aliases = factor * passed.F[0], _folded(at, passed.F)
         dG *= factor[:, :, None]
         dH = np.zeros((*G.shape, self.n), complex)
         n = self.n_nominal
@@ -337,25 +363,12 @@ class Model:
                 there = self.values(ahead)
                 map_[:, i] = [(there[k] - values[k]) / STEP for k in keys]
             dH[:, :, read] = dG @ map_
-        for j, dlog in slopes:
-            dH[:, :, j] += G * at.factor * dlog
-        aliases, more = self._aliases(x, at, slopes=True)
-        for j, slope in more:
-            dH[:, :, j] += slope
+        if passed is not None:
+            terms = np.concatenate([(G * at.factor)[None], at.folded])
+            for j, on, slope in passed.slopes():
+                dH[:, on, j] += np.sum(terms[:, :, on] * slope, axis=0)
         H = G * factor + aliases
         return (H, dH) if at.loop is None else (at.loop.closed(H), at.loop.slopes(H, dH))
-
-    def _aliases(
-        self, x: Float, at: Grid, *, slopes: bool
-    ) -> tuple[Complex, list[tuple[int, Complex]]]:
-        """What the aliases add where factors act on them too, and its slopes."""
-        total, more = at.aliases, []
-        if any(e.factor is not None for e in self.effects):
-            for s, part in zip(at.orders(), at.folded, strict=True):
-                F, each = self._factors(x, at, slopes=slopes, s=s)
-                total = total + part * (F - 1)
-                more += [(j, part * slope) for j, slope in each]
-        return total, more
 
     def _reading(self) -> list[int]:
         """Entries of x that reach the chain's parameters through an effect."""
@@ -364,29 +377,25 @@ class Model:
             range(self.n_nominal, self.n)
         )
 
-    def _factors(
-        self, x: Float, at: Grid, *, slopes: bool, s: Complex | None = None
-    ) -> tuple[Complex, list[tuple[int, Complex]]]:
-        """(n, q) product of the factors at s, by default at the grid's own, and its slopes."""
-        total = np.ones((at.frequency.size, at.sensor.size), complex)
+    def _passed(self, x: Float, at: Grid) -> _Passed | None:
+        """What the factors on channels do; None where there is none."""
+        if not any(e.factor is not None for e in self.effects):
+            return None
+        s = np.stack([at.s, *at.orders()])
+        total = np.ones((*s.shape, at.sensor.size), complex)
         parts = []
-        s = at.s if s is None else s
         first = self.n_nominal
         for effect, theta in zip(self.effects, self.parts(x), strict=True):
             if effect.factor is not None:
-                F, dF = effect.factor.value(s, theta)
+                F, dF = effect.factor.value(s.ravel(), theta)
                 on = self.entries(effect, at)
-                total[:, on] *= F[:, None]
-                parts.append((first, on, F, dF, theta))
+                total[:, :, on] *= F.reshape(*s.shape, 1)
+                parts += [
+                    (first + j, on, (d * theta[j] / F).reshape(*s.shape, 1))
+                    for j, d in enumerate(dF)
+                ]
             first += len(effect.unknowns)
-        out: list[tuple[int, Complex]] = []
-        if slopes:
-            for first, on, F, dF, theta in parts:
-                for j, d in enumerate(dF):
-                    slope = np.zeros_like(total)
-                    slope[:, on] = total[:, on] * (d * theta[j] / F)[:, None]
-                    out.append((first + j, slope))
-        return total, out
+        return _Passed(total, parts)
 
     def entries(self, effect: Effect, at: Grid) -> Int:
         """Entries of the grid that an effect's factor is on."""
