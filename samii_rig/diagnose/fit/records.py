@@ -559,7 +559,7 @@ class RecordSearch(Search):
         """The likelihood anew, about a fit."""
         self.problem = RecordProblem.about(self.whole, fitted, self.by_line.problem)
         between = self.whole.between(self.reduced, fitted)
-        self._between = between, fitted.model.response(fitted.x, between)
+        self._between: tuple[Grid, Complex] = between, fitted.model.response(fitted.x, between)
         self._rig = fitted.model.effects
 
     def _stands(self, fitted: Fitted, times: float = 1.0) -> bool:
