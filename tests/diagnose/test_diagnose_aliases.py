@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from samii_rig.diagnose.physics.channels import effects
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.likelihood.contour import EXACT, Contour
 from samii_rig.model.realise import realise
+from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Float
@@ -48,3 +52,36 @@ def test_the_samples_of_a_slow_record_are_the_rigs(rate: float):
     for i in range(q):
         off = shown[: N // 2, i] - exact[: N // 2, i]
         assert np.std(off) < 5e-4 * np.std(exact[: N // 2, i])
+
+
+@pytest.mark.parametrize(
+    ("physics", "unknown", "late"), [("transport_delay", 0.12e-3, {"delay": 0.12e-3}),
+                                     ("sensor_delay", 0.3e-3, {"delay": 0.3e-3}),
+                                     ("sensor_lag", 1 / 0.3e-3, {"lag": 0.3e-3})]
+)  # fmt: skip
+def test_what_is_late_is_late_in_every_alias(physics: str, unknown: float, late: dict[str, float]):
+    """An accelerometer on the mass that the coil drives has a hundredth of what it shows from
+    aliases beyond the second, and a delay of a sixteenth of a sample turns those by a radian."""
+    rig = load_rig("two_masses")[0]
+    near = next(s for s in rig.sensor if s.name == "a_2")
+    near = near.model_copy(update={"name": "a_1", "on": "mass_1"})
+    rig = rig.model_copy(update={"sensor": (*rig.sensor, near)})
+    found = next(
+        e for e in effects(rig, 0.7, 40.0)
+        if e.physics == physics and e.site in ("coil", "a_1") and len(e.unknowns) == 1
+    )  # fmt: skip
+    f, q = np.linspace(0.7, 40.0, 80), len(rig.sensor)
+    model = Model(rig, (found,))
+    at = grid(rig, f, np.arange(q), np.zeros(q, int))
+    x = np.append(np.zeros(model.n_nominal), np.log(unknown))
+    ours = model.response(x, at)
+    on = "sensor" if physics.startswith("sensor") else "actuator"
+    some = [
+        x.model_copy(update=late) if on == "actuator" or x.name == "a_1" else x
+        for x in getattr(rig, on)
+    ]
+    theirs = sampled_response(rig.model_copy(update={on: tuple(some)}), f)[:, :, 0]
+    off = np.max(np.abs(ours - theirs), axis=0) / np.max(np.abs(theirs), axis=0)
+    assert np.all(off < 1e-4)
+    near_alone = model.response(x, replace(at, far=None))
+    assert np.max(np.abs(near_alone - theirs)[:, -1]) > 1e-3 * np.max(np.abs(theirs)[:, -1])

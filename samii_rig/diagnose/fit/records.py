@@ -500,6 +500,7 @@ class RecordSearch(Search):
     """As `Search`, on whole records."""
 
     usual = RECORDS
+    _between: tuple[Grid, Complex]  # the middles between nodes, and the reference there
 
     def __init__(self, whole: Recorded, by_line: Search) -> None:
         self.whole, self.by_line = whole, by_line
@@ -559,7 +560,7 @@ class RecordSearch(Search):
         """The likelihood anew, about a fit."""
         self.problem = RecordProblem.about(self.whole, fitted, self.by_line.problem)
         between = self.whole.between(self.reduced, fitted)
-        self._between: tuple[Grid, Complex] = between, fitted.model.response(fitted.x, between)
+        self._between = between, fitted.model.response(fitted.x, between)
         self._rig = fitted.model.effects
 
     def _stands(self, fitted: Fitted, times: float = 1.0) -> bool:

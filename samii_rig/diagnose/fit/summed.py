@@ -37,6 +37,7 @@ class Stacked(Grid):
             actuator=first.actuator,
             sigma=np.concatenate([np.full(g.frequency.size, g.sigma) for g in each]),
             loop=first.loop,
+            far=first.far,  # hardly differs: far above what a pose or a part moves
             sizes=tuple(g.frequency.size for g in each),
         )
 
@@ -47,6 +48,7 @@ class Stacked(Grid):
             Grid(
                 self.frequency[own], self.factor[own], self.aliases[own], self.folded[:, own],
                 self.rate_hz, self.sensor, self.actuator, sigma=sigma[own], loop=self.loop,
+                far=self.far,
             )
             for own in runs(self.sizes)
         )  # fmt: skip

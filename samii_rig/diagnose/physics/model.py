@@ -22,6 +22,11 @@ ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smoo
 # Aliases that are computed at every frequency, as a mode in one may be sharp, and that a factor on
 # a channel changes.
 NEAR = (-1, 1, -2, 2)
+# Aliases beyond those, each by itself at a few frequencies, as a factor changes each otherwise:
+# what it leaves of them is smooth between. Behind the last of `FAR` every term falls as the one
+# before it did; up to the last of all a delay is 7e-5 of the largest off, and 2e-3 without any.
+FAR_POINTS, FAR, FARTHER = 9, range(3, 17), range(17, 65)
+STEEPEST = 8.0  # power of the frequency with which such a term falls, at most: nothing is left then
 STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
 FARTHEST = 6.0  # tolerances that a refit moves a nominal parameter at most
 
@@ -107,11 +112,58 @@ Closed = Loop | JointLoops
 
 
 @dataclass(frozen=True, slots=True)
+class Far:
+    """Aliases beyond the nearest, each by itself at a few frequencies (m,) Hz.
+
+    s : (order m,) rad/s of all of them. terms : (order, m, q), without the hold's 1 - e^{-s T}.
+    """
+
+    few: Float
+    s: Complex
+    terms: Complex
+
+    @classmethod
+    def of(cls, rig: Rig, chain: Chain, few: Float, sensor: Int, actuator: Int) -> Far:
+        """Of a chain of the rig."""
+        few = np.interp(np.linspace(0, few.size - 1, FAR_POINTS), np.arange(few.size), few)
+        s = np.asarray(2j * np.pi * few, np.complex128)
+
+        def there(orders: Sequence[int]) -> Complex:
+            turns = 2j * np.pi * rig.rate_hz * np.array(orders)
+            return np.asarray(s + turns[:, None])
+
+        each, terms = [], []
+        for way in (1, -1):
+            known = [way * k for k in FAR]
+            T = np.stack([_term(rig, chain, s, k, sensor, actuator) for k in known])
+            T = T / _held(s, rig.rate_hz)
+            behind = there([way * k for k in FARTHER])
+            size = np.sum(np.abs(T), axis=1)
+            octave = np.log2(FAR[-1] / FAR[len(FAR) // 2])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                falls = np.log2(size[len(FAR) // 2] / size[-1]) / octave
+            falls = np.maximum(np.where(np.isfinite(falls), falls, np.inf), 1.0)
+            ratio = there(known[-1:]) / behind  # below 1
+            last = T[-1] * np.exp(np.log(ratio)[:, :, None] * np.minimum(falls, STEEPEST))
+            each += [there(known), behind]
+            terms += [T, last]
+        return cls(few, np.concatenate(each).ravel(), np.concatenate(terms))
+
+    def changed(self, factor: Complex, s: Complex, rate_hz: float) -> Complex:
+        """(n, q) what a factor (order m, q) of each alias adds to all of them at s (n,) rad/s."""
+        left = np.sum(self.terms * factor.reshape(self.terms.shape), axis=0)
+        f = s.imag / (2 * np.pi)
+        between = np.stack([np.interp(f, self.few, one) for one in left.T], axis=1)
+        return np.asarray(_held(s, rate_hz) * between)
+
+
+@dataclass(frozen=True, slots=True)
 class Grid:
     """Frequencies (n,), at s = sigma + 2 pi j f, with what does not change between models there.
 
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
-    folded : (order, n, q) of these the ones of `NEAR`, or none. rate_hz : of the samples.
+    folded : (order, n, q) of these the ones of `NEAR`, or none. far : of these those beyond.
+    rate_hz : of the samples.
     sensor, actuator : (q,) entries. loop : closed around them, if responses are to the references.
     sigma : of all, or (n,) of each.
     """
@@ -125,6 +177,7 @@ class Grid:
     actuator: Int
     sigma: float | Float = field(default=0.0, kw_only=True)
     loop: Closed | None = field(default=None, kw_only=True)
+    far: Far | None = field(default=None, kw_only=True)
 
     @property
     def changed(self) -> slice:
@@ -142,7 +195,7 @@ class Grid:
         i = np.searchsorted(self.frequency, frequency)
         return Grid(
             frequency, self.factor[i], self.aliases[i], self.folded[:, i], self.rate_hz,
-            self.sensor, self.actuator, sigma=self.sigma, loop=self.loop,
+            self.sensor, self.actuator, sigma=self.sigma, loop=self.loop, far=self.far,
         )  # fmt: skip
 
     def orders(self) -> list[Complex]:
@@ -156,11 +209,13 @@ class Aliases:
     """What a chain's aliases beyond the nearest add at a few frequencies (m,) Hz.
 
     rest : (m, q) without the hold's 1 - e^{-s T}, which all aliases have: that is smooth between
-    the frequencies, and hardly changes from the imaginary axis to a line beside it.
+    the frequencies, and hardly changes from the imaginary axis to a line beside it. far : the same,
+    each by itself.
     """
 
     few: Float
     rest: Complex
+    far: Far
 
     @classmethod
     def of(cls, rig: Rig, chain: Chain, few: Float, sensor: Int, actuator: Int) -> Aliases:
@@ -168,7 +223,8 @@ class Aliases:
         s = np.asarray(2j * np.pi * few, np.complex128)
         near = sum(_term(rig, chain, s, k, sensor, actuator) for k in (0, *NEAR))
         rest = sampled_response(rig, few, chain)[:, sensor, actuator] - near
-        return cls(few, rest / _held(s, rig.rate_hz))
+        far = Far.of(rig, chain, few, sensor, actuator)
+        return cls(few, rest / _held(s, rig.rate_hz), far)
 
     def spread(self, s: Complex, rate_hz: float) -> Complex:
         """(n, q) at s (n,) rad/s."""
@@ -219,15 +275,18 @@ def grid(
     folded = np.stack([_term(rig, chain, s, k, sensor, actuator) for k in NEAR])
     every = made.spread(s, rig.rate_hz) + folded.sum(axis=0)
     factor = _around(rig, s, sensor, actuator)
-    return Grid(f, factor, every, folded, rig.rate_hz, sensor, actuator, sigma=sigma, loop=loop)
+    return Grid(
+        f, factor, every, folded, rig.rate_hz, sensor, actuator,
+        sigma=sigma, loop=loop, far=made.far,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class _Passed:
-    """What factors on channels do to the response at the grid's own s, and to each of its `orders`.
+    """What factors on channels do to the response at several orders of s.
 
-    F : (1 + order, n, q) their product. parts : of each unknown, its place in x, the entries that
-    it acts on and the slope of the product's logarithm there (1 + order, n, 1).
+    F : (order, n, q) their product. parts : of each unknown, its place in x, the entries that
+    it acts on and the slope of the product's logarithm there (order, n, 1).
     """
 
     F: Complex
@@ -238,9 +297,14 @@ class _Passed:
         return ((j, on, self.F[:, :, on] * slope) for j, on, slope in self.parts)
 
 
-def _folded(at: Grid, F: Complex) -> Complex:
-    """(n, q) aliases of a grid, each times its factors."""
-    return np.asarray(at.aliases + np.sum(at.folded * (F[1:] - 1), axis=0))
+def _through(at: Grid, near: _Passed | None, beyond: _Passed | None) -> tuple[Complex, Complex]:
+    """(n, q) hold, filters and delays of a grid and its aliases, each times its factors."""
+    if near is None:
+        return at.factor, at.aliases
+    aliases = at.aliases + np.sum(at.folded * (near.F[1:] - 1), axis=0)
+    if beyond is not None and at.far is not None:
+        aliases = aliases + at.far.changed(beyond.F[0] - 1, at.s, at.rate_hz)
+    return np.asarray(at.factor * near.F[0]), np.asarray(aliases)
 
 
 class Model:
@@ -332,10 +396,7 @@ class Model:
         """(n, q) at the grid's frequencies."""
         chain = self.chain.with_values(self.values(x))
         G = chain.evaluate(at.s)[:, at.sensor, at.actuator]
-        passed = self._passed(x, at)
-        factor, aliases = at.factor, at.aliases
-        if passed is not None:
-            factor, aliases = factor * passed.F[0], _folded(at, passed.F)
+        factor, aliases = _through(at, *self._passed(x, at))
         H = np.asarray(G * factor + aliases)
         return H if at.loop is None else at.loop.closed(H)
 
@@ -346,10 +407,8 @@ class Model:
         chain = self.chain.with_values(values)
         G, dG = chain.gradient_at(at.s, keys)
         G, dG = G[:, at.sensor, at.actuator], dG[:, at.sensor, at.actuator]
-        passed = self._passed(x, at)
-        factor, aliases = at.factor, at.aliases
-        if passed is not None:
-            factor, aliases = factor * passed.F[0], _folded(at, passed.F)
+        near, beyond = self._passed(x, at)
+        factor, aliases = _through(at, near, beyond)
         dG *= factor[:, :, None]
         dH = np.zeros((*G.shape, self.n), complex)
         n = self.n_nominal
@@ -363,10 +422,15 @@ class Model:
                 there = self.values(ahead)
                 map_[:, i] = [(there[k] - values[k]) / STEP for k in keys]
             dH[:, :, read] = dG @ map_
-        if passed is not None:
+        if near is not None:
             terms = np.concatenate([(G * at.factor)[None], at.folded])
-            for j, on, slope in passed.slopes():
+            for j, on, slope in near.slopes():
                 dH[:, on, j] += np.sum(terms[:, :, on] * slope, axis=0)
+        if beyond is not None and at.far is not None:
+            for j, on, slope in beyond.slopes():
+                whole = np.zeros_like(beyond.F[0])
+                whole[:, on] = slope[0]
+                dH[:, :, j] += at.far.changed(whole, at.s, at.rate_hz)
         H = G * factor + aliases
         return (H, dH) if at.loop is None else (at.loop.closed(H), at.loop.slopes(H, dH))
 
@@ -377,11 +441,16 @@ class Model:
             range(self.n_nominal, self.n)
         )
 
-    def _passed(self, x: Float, at: Grid) -> _Passed | None:
-        """What the factors on channels do; None where there is none."""
+    def _passed(self, x: Float, at: Grid) -> tuple[_Passed | None, _Passed | None]:
+        """What the factors on channels do at the grid's own s and to the aliases of `folded`, and
+        to those of `far`; None where there is no factor, or no such aliases."""
         if not any(e.factor is not None for e in self.effects):
-            return None
-        s = np.stack([at.s, *at.orders()])
+            return None, None
+        near = self._passed_at(x, at, np.stack([at.s, *at.orders()]))
+        return near, None if at.far is None else self._passed_at(x, at, at.far.s[None])
+
+    def _passed_at(self, x: Float, at: Grid, s: Complex) -> _Passed:
+        """s : (order, n)."""
         total = np.ones((*s.shape, at.sensor.size), complex)
         parts = []
         first = self.n_nominal
