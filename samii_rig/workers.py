@@ -15,7 +15,7 @@ from samii_rig.errors import InputError
 
 ANSWERS_WITHIN = "10s"  # of a scheduler
 # Each process has one core; a worker of dask sets the same, so that digits are the same too.
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @contextmanager
@@ -31,7 +31,7 @@ def workers(n: int | None = None, scheduler: str = "") -> Iterator[Executor]:
         return
     # Fresh processes: a forked one would share the threads of numerical libraries.
     with (
-        _environment(_ONE_THREAD),
+        _environment(ONE_THREAD),
         ProcessPoolExecutor(
             n or os.cpu_count(), get_context("spawn"), ends_with_its_parent
         ) as pool,

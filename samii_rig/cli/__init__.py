@@ -9,7 +9,12 @@ import threading
 def main() -> None:
     """Entry point of `samii-rig`: errors of ours end in one line and their exit code."""
     from samii_rig.run.interrupts import one_press_counts
+    from samii_rig.workers import ONE_THREAD
 
+    # Matrices here are small: threads that wait for each other take longer than one. Whoever set
+    # a number knows better; read by numpy when it is imported first, which is after this.
+    for name in ONE_THREAD:
+        os.environ.setdefault(name, "1")
     # Only Python's main thread may handle signals.
     handles = threading.current_thread() is threading.main_thread()
     if handles:

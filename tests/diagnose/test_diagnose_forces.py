@@ -153,6 +153,15 @@ def test_a_weak_force_does_to_first_order_what_it_does_in_time(nothing: list[Rec
         assert in_time == pytest.approx(power(hope.own, hope.may, hope.times), rel=0.2), law.tag
 
 
+def test_no_dead_band_is_narrower_than_a_step_of_the_commands_converter(
+    nothing: list[Recording],
+) -> None:
+    search = forces_of(nothing)
+    (dead,) = (e for e in search.forces if e.physics == "valve_deadband")
+    step = search.rig.actuator[0].resolution
+    assert dead.unknowns[0].low == step > 1e-6 * search.reach.largest
+
+
 def power(own: Float, _may: Float, times: Float | float) -> float:
     """Squared length of a change, from what it gains and how many times it should be."""
     return float(np.ravel(own / (2 * np.asarray(times) - 1))[0])

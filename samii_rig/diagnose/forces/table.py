@@ -26,6 +26,7 @@ from samii_rig.diagnose.physics.scales import spread
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     SOURCES,
+    ActuatorSpec,
     Rig,
     TorsionalGroundSpring,
     TorsionalSpring,
@@ -69,7 +70,7 @@ def forces(rig: Rig, reach: Reach) -> Iterator[Effect]:
     if source is None:
         return
     turns = isinstance(source, ANGLE_SOURCES)
-    yield from _drive(reach, source.name, actuator.name, actuator.unit, turns=turns)
+    yield from _drive(reach, source.name, actuator, turns=turns)
 
 
 def _between(reach: Reach, place: Place, spring: Spring) -> Iterator[Effect]:
@@ -100,10 +101,14 @@ def _between(reach: Reach, place: Place, spring: Spring) -> Iterator[Effect]:
     yield effect(HYSTERESIS, place, name, "", (T_y, k))
 
 
-def _drive(reach: Reach, source: str, alias: str, unit: str, *, turns: bool) -> Iterator[Effect]:
+def _drive(reach: Reach, source: str, actuator: ActuatorSpec, *, turns: bool) -> Iterator[Effect]:
     """Forces on the command. turns : whether the source gives an angle."""
+    alias, unit = actuator.name, actuator.unit
     largest, across = reach.largest, (source,)
-    low, high = WIDTHS[0] * largest, WIDTHS[1] * largest
+    # What is narrower than a step of the command's converter is that converter's rounding.
+    low, high = max(WIDTHS[0] * largest, actuator.resolution), WIDTHS[1] * largest
+    if low >= high:
+        return
     drive, flow = Place("drive", across), Place("flow", across)
     if turns and reach.ports(drive, of_speed=True) is not None:
         yield effect(FRICTION, drive, source, alias, (_log("T_c", unit, low, high),))
