@@ -71,3 +71,16 @@ def rotation(x: float, h: float, phi: float = 0.0) -> Float:
             3 * u**2 - (2 - phi) * u,
         ]
     ) / (1 + phi)
+
+
+def curvature(x: float, h: float, phi: float = 0.0) -> Float:
+    """(4,) theta' there, 1/m a unit of each coordinate; its error falls with h^2."""
+    u = x / h
+    return np.array(
+        [
+            6 * (2 * u - 1) / h**2,
+            (6 * u - 4 - phi) / h,
+            6 * (1 - 2 * u) / h**2,
+            (6 * u - 2 + phi) / h,
+        ]
+    ) / (1 + phi)

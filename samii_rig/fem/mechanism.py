@@ -35,8 +35,9 @@ class Mechanism:
     joints : coordinate of every joint by element name.
     angle, velocity, acceleration : (n_sensor, n_q) rows on q, q' and q''; zero for a sensor of
         another kind, but for gravity on a tilted accelerometer's angle.
-    moment : (sensor, row of Phi, factor) of every moment, force or pressure sensor at a joint that
+    moment : (sensor, row of Phi, factor) of every sensor of a moment or a force at a joint that
         can carry one.
+    feed : (sensor, index of a load, factor) of every sensor that reads a load itself.
     """
 
     M: csc_array
@@ -54,4 +55,5 @@ class Mechanism:
     velocity: csc_array
     acceleration: csc_array
     moment: tuple[tuple[int, int, float], ...]
+    feed: tuple[tuple[int, int, float], ...]
     places: Places

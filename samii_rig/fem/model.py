@@ -127,6 +127,9 @@ class Fem:
             H[i] = m.angle @ x[:n] + at * (m.velocity @ x[:n]) + at**2 * (m.acceleration @ x[:n])
             for sensor, row, factor in m.moment:
                 H[i, sensor] = factor * unit * x[n + row]
+            for sensor, index, factor in m.feed:
+                load = m.loads[index]
+                H[i, sensor, load.column] += factor * load.law.at(complex(at))
         return H
 
     def basis(self, also: Collection[int] = ()) -> modal.Basis:

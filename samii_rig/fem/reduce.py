@@ -179,6 +179,8 @@ def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced
         velocity[sensor] = -v @ (fem.C @ phi)
         acceleration[sensor] = -v @ (m.M @ phi)
         carried[sensor] = v[at_loads]
+    for sensor, index, factor in m.feed:
+        carried[sensor, index] += factor
     inputs = (*(a.name for a in rig.actuator), *(f"T_{name}" for name in torque))
     force = np.zeros((len(K), len(inputs)))
     for i, joint in enumerate(m.feedback, len(m.sources)):

@@ -19,6 +19,7 @@ from samii_rig.fem import hermite, lagrange
 from samii_rig.fem.drive import Feedback, Load, Prescribed, law
 from samii_rig.fem.mechanism import Mechanism, Places
 from samii_rig.rig.schema import (
+    ANGLE_SOURCES,
     MOTION_SOURCES,
     AbsoluteAngle,
     Acceleration,
@@ -27,6 +28,7 @@ from samii_rig.rig.schema import (
     AngularVelocitySource2,
     Beam,
     Branch,
+    Current,
     Cylinder,
     Displacement,
     DisplacementSource,
@@ -46,6 +48,7 @@ from samii_rig.rig.schema import (
     Rod,
     Sensor,
     Spindle,
+    Strain,
     TimoshenkoBeam,
     TorqueSource,
     TorsionalGroundSpring,
@@ -104,6 +107,7 @@ class Walk:
         self._feedback: list[Feedback] = []
         self._loads: list[Load] = []
         self._places: list[tuple[float, str, Row, Row]] = []
+        self._chambers: dict[str, tuple[Row, Row]] = {}  # pressures of each cylinder
         self._weight = rig.pull * sum(map(_mass, rig.element))  # N, of what lies beyond
         self.w: Row = {}
         self.theta: Row = {}
@@ -232,6 +236,13 @@ class Walk:
         self.w = {**self.w, **self._new()}
         S0, S1 = 1 / V + 1 / W, a / V + b / W
         k_0, k_1 = B * (a - b) ** 2 / (V * W) / S0, B * S1**2 / S0
+        # A stretch of the oil empties chamber 1 and fills chamber 2; what has slipped by the
+        # leak has made their pressures one.
+        even = (a - b) / (V * W) / S0
+        one, two = {oil: -B * a / V}, {oil: B * b / W}
+        if e.leak.value > 0:
+            one[slipping], two[slipping] = B * (a / V - even), -B * (b / W + even)
+        self._chambers[e.name] = one, two
         if e.leak.value == 0:
             self._spring(oil, k_0 + k_1)
             return
@@ -327,15 +338,35 @@ class Walk:
             _stack([self._speed(s) for s in sensors], n),
             _stack([self._acceleration(s) for s in sensors], n),
             tuple(self._multipliers(sensors)),
+            tuple(self._feeds(sensors)),
             Places(np.array(x), element, _stack(w, n), _stack(theta, n)),
         )
 
     def _multipliers(self, sensors: tuple[Sensor, ...]) -> Iterator[tuple[int, int, float]]:
         for i, s in enumerate(sensors):
-            if isinstance(s, Moment | Force | Pressure):
-                rows = self._moment if isinstance(s, Moment) else self._force
-                if s.after in rows:
-                    yield i, rows[s.after], -1 / s.area if isinstance(s, Pressure) else 1.0
+            match s:
+                case Moment():
+                    rows, at, factor = self._moment, s.after, 1.0
+                case Force():
+                    rows, at, factor = self._force, s.after, 1.0
+                case Pressure() if s.area is not None:
+                    rows, at, factor = self._force, s.after, -1 / s.area
+                case Current():
+                    # What a source of motion passes on. One that pushes reads its own load.
+                    (source,) = (e for e in self._rig.element if e.name == s.of)
+                    turns = isinstance(source, ANGLE_SOURCES)
+                    rows = self._moment if turns else self._force
+                    at, factor = s.of if s.of in self._locks else "", -1 / s.constant
+                case _:
+                    continue
+            if at in rows:
+                yield i, rows[at], factor
+
+    def _feeds(self, sensors: tuple[Sensor, ...]) -> Iterator[tuple[int, int, float]]:
+        names = [load.element for load in self._loads]
+        for i, s in enumerate(sensors):
+            if isinstance(s, Current) and s.of in names:
+                yield i, names.index(s.of), 1 / s.constant
 
     def _new(self) -> Row:
         self._n += 1
@@ -381,6 +412,11 @@ class Walk:
                 return _minus(self._span[sensor.across[-1]][1], self._span[sensor.across[0]][0])
             case Displacement():
                 return self._way(sensor)
+            case Strain():
+                bend = self._along(sensor, hermite.curvature, {})
+                return {i: -sensor.height * x for i, x in bend.items()}
+            case Pressure() if sensor.chamber is not None:
+                return self._chambers[sensor.after][sensor.chamber - 1]
         return {}
 
     def _speed(self, sensor: Sensor) -> Row:
@@ -400,7 +436,10 @@ class Walk:
         return self._along(sensor, hermite.shape, {0: 1.0, 1: arm})
 
     def _along(
-        self, sensor: Acceleration, on_beam: Callable[[float, float, float], Float], on_body: Row
+        self,
+        sensor: Acceleration | Strain,
+        on_beam: Callable[[float, float, float], Float],
+        on_body: Row,
     ) -> Row:
         """A row on the coordinates of the element that carries the sensor."""
         host, first = self._host(sensor), self._nodes[sensor.on]
@@ -415,7 +454,7 @@ class Walk:
         host = next(e for e in self._rig.element if e.name == sensor.on)
         return isinstance(host, (LumpedMass, *MOTION_SOURCES))
 
-    def _host(self, sensor: Acceleration) -> Beam | TimoshenkoBeam | RigidLink:
+    def _host(self, sensor: Acceleration | Strain) -> Beam | TimoshenkoBeam | RigidLink:
         host = next(e for e in self._rig.element if e.name == sensor.on)
         assert isinstance(host, Beam | TimoshenkoBeam | RigidLink)  # the schema allows no other
         return host

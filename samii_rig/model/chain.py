@@ -7,7 +7,7 @@ beam that carries an accelerometer is divided there, so it counts as two element
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -30,7 +30,7 @@ from samii_rig.model.kernels.registers import (
     System,
 )
 from samii_rig.model.laws import POINTS, SOURCE_LAWS
-from samii_rig.model.sensing import source_feed, terms
+from samii_rig.model.sensing import reading_of, source_feed, terms
 from samii_rig.model.weight import Weight, segments
 from samii_rig.rig.schema import (
     BEAMS,
@@ -46,6 +46,7 @@ from samii_rig.rig.schema import (
     RigidLink,
     Rod,
     Spindle,
+    Strain,
     TimoshenkoBeam,
     TorsionalSpring,
     parameters,
@@ -87,6 +88,8 @@ class CompiledChain:
     branches : (element of the kernels, chain, index into `parameters` of its first).
     rigid : indices into `parameters` that cannot change without a new chain, as a sensor or a
         position divides the beam whose length they are.
+    readings : (sensor, law of `laws.READINGS`, element of the kernels) of the sensors whose reading
+        depends on what they stand on.
     weight : what gravity loads, None without it.
     """
 
@@ -108,6 +111,7 @@ class CompiledChain:
     places: tuple[tuple[str, float], ...]
     branches: tuple[tuple[int, CompiledChain, int], ...]
     rigid: frozenset[int]
+    readings: tuple[tuple[int, str, int], ...] = ()
     weight: Weight | None = None
 
     def with_values(self, values: Float) -> CompiledChain:
@@ -190,7 +194,7 @@ def _cuts(rig: Rig, extra: Mapping[str, Sequence[float]]) -> dict[str, list[floa
             continue
         wanted = {float(x) for x in extra.get(element.name, ())}
         for sensor in rig.sensor:
-            if isinstance(sensor, Acceleration) and sensor.on == element.name:
+            if isinstance(sensor, Acceleration | Strain) and sensor.on == element.name:
                 wanted.add(sensor.position)
         L = element.L.value
         for x in wanted:
@@ -341,7 +345,7 @@ def compile_chain(rig: Rig, extra: Mapping[str, Sequence[float]] | None = None) 
     if rig.motion == "axial":
         base = TURNING_BASE if turning(rig) else AXIAL_BASE
         ends = base[rig.base], AXIAL_TIP[rig.tip]
-    return _assemble(
+    compiled = _assemble(
         parts,
         ends,
         np.array(parts.source),
@@ -351,6 +355,15 @@ def compile_chain(rig: Rig, extra: Mapping[str, Sequence[float]] | None = None) 
         term_c,
         at_end,
     )
+    return replace(compiled, readings=tuple(_readings(rig, parts.places)))
+
+
+def _readings(rig: Rig, places: Sequence[tuple[str, float]]) -> Iterator[tuple[int, str, int]]:
+    behind = {name: port for port, (name, _) in enumerate(places)}
+    for i, sensor in enumerate(rig.sensor):
+        found = reading_of(sensor)
+        if found:
+            yield i, found[0], behind[found[1]] - 1
 
 
 def compile_branch(branch: Branch, pull: float = 0.0) -> CompiledChain:

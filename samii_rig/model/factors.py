@@ -13,7 +13,7 @@ from samii_rig.model import rod, timoshenko, transformer
 from samii_rig.model.chain import LINE_AT, SOURCE_WIDTH, WIDTH, CompiledChain
 from samii_rig.model.kernels import respond
 from samii_rig.model.kernels.registers import Factors
-from samii_rig.model.laws import LINE_FILTERS, POINTS, SOURCE_LAWS
+from samii_rig.model.laws import LINE_FILTERS, POINTS, READINGS, SOURCE_LAWS
 from samii_rig.types import Complex, Float
 
 _TURN = np.array([1.0, -1.0, 1.0, -1.0])  # theta and V of a mirrored chain
@@ -83,6 +83,22 @@ def _pars(c: CompiledChain, e: int) -> Float:
 def _law(kind: str) -> ModuleType:
     """The module with matrix, scaling and gradient of an element of waves."""
     return rod if kind == "rod" else timoshenko
+
+
+def read(c: CompiledChain, s: Complex, H: Complex) -> None:
+    """Let the sensors whose reading depends on their element read it, H (n, n_out, n_in)."""
+    for sensor, law, e in c.readings:
+        H[:, sensor] *= READINGS[law].value(s, c.system.pars[e])[:, None]
+
+
+def read_slopes(c: CompiledChain, s: Complex, place: np.ndarray, H: Complex, dH: Complex) -> None:
+    """`read` of H and dH; `place` as in `add_waves`."""
+    for sensor, law, e in c.readings:
+        dH[:, sensor] *= READINGS[law].value(s, c.system.pars[e])[:, None, None]
+        for slope, slot in zip(READINGS[law].slopes(s, c.system.pars[e]), c.slots[e], strict=False):
+            if place[slot] >= 0:
+                dH[:, sensor, :, place[slot]] += H[:, sensor] * slope[:, None]
+    read(c, s, H)
 
 
 def impedance(inner: CompiledChain, s: Complex) -> Complex:

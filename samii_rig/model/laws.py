@@ -54,6 +54,17 @@ class SourceLaw:
     relative: Callable[[Complex, Float], Complex]
 
 
+@dataclass(frozen=True, slots=True)
+class ReadingLaw:
+    """x(s, p) by which a sensor reads a state, p the parameters of the element it stands on.
+
+    value : (s (n,), p) -> (n,). slopes : -> (n_param, n), derivatives by p.
+    """
+
+    value: Callable[[Complex, Float], Complex]
+    slopes: Callable[[Complex, Float], Complex]
+
+
 def _inverse(z: Complex) -> Complex:
     # 0 at a pole itself: a response there is of no use, but D is asked for and needs no source.
     return np.divide(1.0, z, out=np.zeros_like(z), where=z != 0)
@@ -149,6 +160,61 @@ def _constant(s: Complex, p: Float) -> Complex:
 
 def _constant_slopes(s: Complex, p: Float) -> Complex:
     return np.ones((1, s.size), complex)
+
+
+@dataclass(frozen=True, slots=True)
+class _Chamber:
+    """p_k/V of a `schema.Cylinder`, V its push, k = 1 or 2: N/E with N = (A_1 s/V_1 + x) of the
+    first, -(A_2 s/V_2 - x) of the second, E = S_2 s + x d, x = g d/(V_1 V_2), d = A_1 - A_2."""
+
+    number: int
+
+    def parts(self, s: Complex, p: Float) -> tuple[Complex, Complex]:
+        """N and E; without x both over s, which is in both."""
+        a, b, V, W, B, leak = p[:6]
+        S2, x = a**2 / V + b**2 / W, B * leak * (a - b) / (V * W)
+        at = s if x != 0 else np.ones_like(s)
+        own = a / V if self.number == 1 else -b / W
+        return np.asarray(own * at + x), np.asarray(S2 * at + x * (a - b))
+
+    def value(self, s: Complex, p: Float) -> Complex:
+        N, E = self.parts(s, p)
+        return np.asarray(N * _inverse(E))
+
+    def slopes(self, s: Complex, p: Float) -> Complex:
+        """(6, n)."""
+        a, b, V, W, B, leak = p[:6]
+        zero, one, d = np.zeros_like(s), np.ones_like(s), a - b
+        x = B * leak * d / (V * W)
+        dx = [B * leak / (V * W), -B * leak / (V * W), -x / V, -x / W, x / B, B * d / (V * W)]
+        first = self.number == 1
+        own = [s / V, zero, -a * s / V**2, zero] if first else [zero, -s / W, zero, b * s / W**2]
+        S2 = [2 * a / V * s, 2 * b / W * s, -((a / V) ** 2) * s, -((b / W) ** 2) * s]
+        dd = [x, -x, 0.0, 0.0, 0.0, 0.0]
+        N = (a / V if first else -b / W) * s + x
+        E = (a**2 / V + b**2 / W) * s + x * d
+        dN = np.stack([n + y * one for n, y in zip([*own, zero, zero], dx, strict=True)])
+        dE = np.stack(
+            [n + (y * d + more) * one for n, y, more in zip([*S2, zero, zero], dx, dd, strict=True)]
+        )
+        return np.asarray(_inverse(E) * (dN - N * _inverse(E) * dE))
+
+
+def _flexibility(s: Complex, p: Float) -> Complex:
+    """theta'/M of a beam, p = (EI, mu, L, eta, tau, ...)."""
+    return _inverse(_modulus(s, p))
+
+
+def _modulus(s: Complex, p: Float) -> Complex:
+    # The loss factor changes sign with Im s, so that the response of a real input is real.
+    return np.asarray(p[0] * (1 + 1j * np.where(s.imag < 0, -p[3], p[3]) + s * p[4]))
+
+
+def _flexibility_slopes(s: Complex, p: Float) -> Complex:
+    x = _flexibility(s, p)
+    sign = np.where(s.imag < 0, -1.0, 1.0)
+    zero = np.zeros_like(s)
+    return np.stack([-x / p[0], zero, zero, -1j * sign * p[0] * x**2, -s * p[0] * x**2])
 
 
 SMALL_LINE = 1e-3  # |G|^2 below which series replace quotients of G; their error is |G|^6/1e4
@@ -296,6 +362,14 @@ POINTS: dict[str, Law] = {
     "oil_column": Law(THETA_M, _oil, _oil_slopes),
     "hydraulic_line": Law(THETA_M, _line, _line_slopes, _clear_line),
     "lumped_line": Law(THETA_M, _lump, _lump_slopes, _clear_lump),
+}
+
+
+# By what a sensor reads of its element.
+READINGS: dict[str, ReadingLaw] = {
+    "strain": ReadingLaw(_flexibility, _flexibility_slopes),
+    "chamber_1": ReadingLaw(_Chamber(1).value, _Chamber(1).slopes),
+    "chamber_2": ReadingLaw(_Chamber(2).value, _Chamber(2).slopes),
 }
 
 

@@ -11,31 +11,50 @@ from samii_rig.model.laws import POINTS
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     BEAMS,
+    MOTION_SOURCES,
     SOURCES,
     AbsoluteAngle,
     Acceleration,
+    Current,
     Displacement,
     Force,
+    ForceSource,
     Gear,
     Moment,
     Pressure,
     RelativeAngle,
     Rig,
     RigidLink,
+    Sensor,
+    Strain,
+    TorqueSource,
     Velocity,
 )
 from samii_rig.types import Float, Int
 
 
 def source_feed(rig: Rig) -> Float:
-    """(n_sensor, n_source) what a relative angle reads of the sources' own jumps."""
+    """(n_sensor, n_source) what a sensor reads of the sources' own jumps: a relative angle across
+    one that turns, the current of one that pushes."""
     sources = [e for e in rig.element if isinstance(e, SOURCES)]
     feed = np.zeros((len(rig.sensor), len(sources)))
     for i, sensor in enumerate(rig.sensor):
         for j, source in enumerate(sources):
             if isinstance(sensor, RelativeAngle) and isinstance(source, ANGLE_SOURCES):
                 feed[i, j] = source.name in sensor.across
+            elif isinstance(sensor, Current) and isinstance(source, (ForceSource, TorqueSource)):
+                feed[i, j] = (source.name == sensor.of) / sensor.constant
     return feed
+
+
+def reading_of(sensor: Sensor) -> tuple[str, str] | None:
+    """Which law of `READINGS` a sensor has, and of which element; None for one without."""
+    match sensor:
+        case Strain():
+            return "strain", sensor.on
+        case Pressure() if sensor.chamber is not None:
+            return f"chamber_{sensor.chamber}", sensor.after
+    return None
 
 
 def terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Int, Float]:
@@ -88,7 +107,18 @@ def terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Int, Float]:
             case Force():
                 add(i, behind[sensor.after], V=-1.0)
             case Pressure():
-                add(i, behind[sensor.after], V=1.0 / sensor.area)
+                add(i, behind[sensor.after], V=1.0 / (sensor.area or 1.0))
+            case Strain():
+                port = before[sensor.on]
+                if sensor.position > 0:
+                    port = places.index((sensor.on, sensor.position))
+                add(i, port, M=-sensor.height)
+            case Current():
+                source = elements[sensor.of]
+                if isinstance(source, ANGLE_SOURCES):
+                    add(i, behind[sensor.of], M=-1.0 / sensor.constant)
+                elif isinstance(source, MOTION_SOURCES):
+                    add(i, behind[sensor.of], V=1.0 / sensor.constant)
             case Acceleration():
                 port, arm = before[sensor.on], sensor.position
                 if isinstance(elements[sensor.on], BEAMS):

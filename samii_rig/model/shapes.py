@@ -20,12 +20,15 @@ from typing import Literal
 import numpy as np
 
 from samii_rig.errors import InputError
+from samii_rig.model.laws import READINGS
 from samii_rig.model.modes import undamped
 from samii_rig.model.poles import contour_residues
+from samii_rig.model.sensing import reading_of
 from samii_rig.model.tmm import Chain, State
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     Acceleration,
+    Current,
     Displacement,
     Element,
     Force,
@@ -36,9 +39,11 @@ from samii_rig.rig.schema import (
     RigidLink,
     Rod,
     Sensor,
+    Strain,
     Velocity,
+    parameters,
 )
-from samii_rig.rig.schema.elements import BEAMS
+from samii_rig.rig.schema.elements import ANGLE_SOURCES, BEAMS, MOTION_SOURCES
 from samii_rig.types import Complex, Float
 
 POINTS = 40  # places along each beam
@@ -273,4 +278,28 @@ def _reading(
         case Force():
             return complex(-state[ports[order.index(sensor.after) + 1], 3])
         case Pressure():
-            return complex(state[ports[order.index(sensor.after) + 1], 3] / sensor.area)
+            area = sensor.area or 1.0
+            push = complex(state[ports[order.index(sensor.after) + 1], 3])
+            return push / area * _law(sensor, rig, s)
+        case Strain():
+            port = ports[order.index(sensor.on)]
+            if sensor.position > 0:
+                port = places.index((sensor.on, sensor.position))
+            return -sensor.height * complex(state[port, 2]) * _law(sensor, rig, s)
+        case Current():
+            source, port = rig.element[order.index(sensor.of)], ports[order.index(sensor.of) + 1]
+            if isinstance(source, ANGLE_SOURCES):
+                return -complex(state[port, 2]) / sensor.constant
+            if isinstance(source, MOTION_SOURCES):
+                return complex(state[port, 3]) / sensor.constant
+            return 0j  # at zero input it does not push
+
+
+def _law(sensor: Sensor, rig: Rig, s: complex) -> complex:
+    """By which a sensor reads its state, where that depends on its element."""
+    found = reading_of(sensor)
+    if not found:
+        return 1.0 + 0j
+    law, on = found
+    p = np.array([q.value for e in rig.element if e.name == on for q in parameters(e).values()])
+    return complex(READINGS[law].value(np.array([s], complex), p)[0])

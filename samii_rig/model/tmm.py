@@ -22,7 +22,7 @@ from pydantic import BaseModel
 from samii_rig.errors import InputError
 from samii_rig.model import timoshenko
 from samii_rig.model.chain import L_OF_BEAM, compile_chain
-from samii_rig.model.factors import bind, characteristic, differentiate
+from samii_rig.model.factors import bind, characteristic, differentiate, read, read_slopes
 from samii_rig.model.kernels import respond
 from samii_rig.rig.schema import (
     Acceleration,
@@ -30,6 +30,7 @@ from samii_rig.rig.schema import (
     Element,
     Rig,
     Sensor,
+    Strain,
     flattened,
     parameters,
 )
@@ -118,6 +119,7 @@ class Chain:
         H = np.zeros((s.size, len(self._rig.sensor), len(self._rig.actuator)), complex)
         if s.size:
             respond.response(c.system, bind(c, s), s, H)
+            read(c, s, H)
         return H
 
     def gradient(
@@ -153,6 +155,7 @@ class Chain:
                 slope, bend = self._end_slopes(s, parameter, z)
                 moved = (s**2)[:, None] * slope + _tilt(sensors[sensor], self._rig) * bend
                 dH[:, sensor, :, place[parameter]] -= moved
+        read_slopes(c, s, place, H, dH)
         return H, dH
 
     def _end_slopes(self, s: Complex, parameter: int, z: Complex) -> tuple[Complex, Complex]:
@@ -294,7 +297,9 @@ def _checks(rig: Rig) -> dict[str, _Check]:
     for element in flattened(rig.element):
         symbols = tuple(parameters(element))
         on = [
-            x.position for x in rig.sensor if isinstance(x, Acceleration) and x.on == element.name
+            x.position
+            for x in rig.sensor
+            if isinstance(x, Acceleration | Strain) and x.on == element.name
         ]
         out[element.name] = _Check(type(element), first, symbols, max(on, default=0.0))
         first += len(symbols)

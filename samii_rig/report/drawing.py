@@ -12,12 +12,14 @@ from html import escape
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     Acceleration,
+    Current,
     Displacement,
     Force,
     Moment,
     Pressure,
     RelativeAngle,
     Rig,
+    Strain,
     Velocity,
 )
 from samii_rig.rig.schema.elements import (
@@ -252,7 +254,9 @@ def _sensors(
                 span = min(one, other), max(one, other)
             case AbsoluteAngle() | Moment() | Displacement() | Velocity() | Force() | Pressure():
                 span = (spans[sensor.after][1],) * 2
-            case Acceleration():
+            case Current():
+                span = spans[sensor.of]
+            case Acceleration() | Strain():
                 a, b = spans[sensor.on]
                 host = next(e for e in rig.element if e.name == sensor.on)
                 length = (

@@ -16,12 +16,14 @@ from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     Acceleration,
+    Current,
     Displacement,
     Force,
     Moment,
     Pressure,
     RelativeAngle,
     SensorBase,
+    Strain,
     Velocity,
 )
 from samii_rig.types import Float
@@ -181,14 +183,19 @@ def plant(setup: Setup, pushes: tuple[Push, ...] = ()) -> Plant:
             v = v + sig.unit(n_x + 1 + n_law + j)
     drive = sig.filtered(v, path)
     load = np.zeros((n, n_x + n_u))  # generalised forces
+    pushed: dict[str, Float] = {}  # of the sources that push
     for part in sources:
-        _source(sig, mech, part, drive, (Q, dQ, ddQ), load)
+        row = _source(sig, mech, part, drive, (Q, dQ, ddQ), load)
+        if row is not None:
+            pushed[part.name] = row
     for i, force in enumerate(setup.forces):
         if force.on in mech.joints:
             load[mech.joints[force.on], n_x + 1 + i] += 1.0
     _pushes(mech, pushes, n_x + 1 + n_law, load, ddQ)
+    slipped: dict[int, Float] = {}  # what a branch's dashpot has given, by its coordinate
     for branch in mech.maxwell:
         own = sig.states(1)
+        slipped[branch.at] = sig.unit(own.start)
         sig.rate[own] += Q[branch.at] / branch.t
         sig.rate[own, own] -= 1.0 / branch.t
         load[branch.at] -= branch.k * Q[branch.at]
@@ -208,7 +215,7 @@ def plant(setup: Setup, pushes: tuple[Push, ...] = ()) -> Plant:
     # What holds a locked rotation is the moment inside the chain at that place.
     inside = load - mech.M @ ddQ
     rows = [
-        s.gain * sig.filtered(_seen(s, mech, (Q, dQ, ddQ), inside), sections)
+        s.gain * sig.filtered(_seen(s, mech, (Q, dQ, ddQ), inside, slipped, pushed), sections)
         for s, sections in zip(setup.sensors, filters, strict=True)
     ]
     Y = np.array(rows)
@@ -224,8 +231,9 @@ def _source(
     drive: Float,
     motion: tuple[Float, Float, Float],
     load: Float,
-) -> None:
-    """The states of a source and what it does: its angle or displacement prescribed, or a force."""
+) -> Float | None:
+    """The states of a source and what it does: its angle or displacement prescribed, or a force,
+    which is returned."""
     values, (Q, dQ, ddQ) = part.values, motion
     if part.kind in ("displacement_source", "acceleration_source"):
         at, w = mech.sources[part.name], values["omega"]
@@ -233,7 +241,7 @@ def _source(
         static = values["K"] / (w**2 if part.kind == "acceleration_source" else 1.0)
         Q[at] = sig.filtered(static * drive, [_second(w, values["zeta"])])
         dQ[at], ddQ[at] = w * sig.unit(first + 1), w * sig.rate[first + 1]
-        return
+        return None
     if part.name in mech.sources:
         at = mech.sources[part.name]
         second = part.kind == "angular_velocity_source_2"
@@ -245,10 +253,12 @@ def _source(
         dQ[at] = speed
         sig.rate[own] = speed
         ddQ[at] = sig.rate[before]  # the first state of either filter is the speed itself
-        return
+        return None
     row = mech.before(part.name)[0 if part.kind == "force_source" else 1]
     lag = [_lag(values["p"])] if values.get("p", 0.0) > 0 else []
-    load += np.outer(row, sig.filtered(values["K"] * drive, lag))
+    push = sig.filtered(values["K"] * drive, lag)
+    load += np.outer(row, push)
+    return push
 
 
 def _pushes(mech: Mechanism, pushes: tuple[Push, ...], first: int, load: Float, ddQ: Float) -> None:
@@ -262,7 +272,12 @@ def _pushes(mech: Mechanism, pushes: tuple[Push, ...], first: int, load: Float, 
 
 
 def _seen(
-    sensor: SensorBase, mech: Mechanism, motion: tuple[Float, Float, Float], inside: Float
+    sensor: SensorBase,
+    mech: Mechanism,
+    motion: tuple[Float, Float, Float],
+    inside: Float,
+    slipped: dict[int, Float],
+    pushed: dict[str, Float],
 ) -> Float:
     """The quantity at a sensor's place as a row over [x, u], before its filters."""
     Q, _, ddQ = motion
@@ -281,13 +296,32 @@ def _seen(
             row = _stretch(sensor, mech) @ motion[1]
         case Force():
             row = inside[mech.gaps[sensor.after]]
-        case Pressure():
+        case Pressure() if sensor.area is not None:
             row = -inside[mech.gaps[sensor.after]] / sensor.area
+        case Pressure():
+            row = _chamber(sensor, mech, Q, slipped)
+        case Strain():
+            row = -sensor.height * (mech.bend(sensor.on, sensor.position) @ Q)
+        case Current():
+            at = mech.sources.get(sensor.of)
+            push = pushed[sensor.of] if at is None else -inside[at]
+            row = push / sensor.constant
         case Moment():
             row = inside[mech.cuts[sensor.after]]
         case _:
             raise TypeError(type(sensor))
     return row
+
+
+def _chamber(sensor: Pressure, mech: Mechanism, Q: Float, slipped: dict[int, Float]) -> Float:
+    """The pressure in one chamber: what the oil's stretch less the leak makes there, and what the
+    leak leaves in both where the areas differ."""
+    v = mech.setup.part(sensor.after).values
+    at = mech.joints[sensor.after]
+    leaked = slipped.get(at, np.zeros_like(Q[at]))
+    common = (v["A_1"] - v["A_2"]) / (v["V_1"] + v["V_2"])
+    own = v["A_1"] / v["V_1"] if sensor.chamber == 1 else -v["A_2"] / v["V_2"]
+    return np.asarray(-v["B"] * (own * (Q[at] - leaked) + common * leaked))
 
 
 def _stretch(sensor: Displacement | Velocity, mech: Mechanism) -> Float:

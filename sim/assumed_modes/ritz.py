@@ -82,7 +82,11 @@ class Mechanism:
     def __init__(self, setup: Setup) -> None:
         self.setup = setup
         self._cut_after = [s.after for s in setup.sensors if isinstance(s, Moment)]
-        self._gap_after = [s.after for s in setup.sensors if isinstance(s, Force | Pressure)]
+        self._gap_after = [
+            s.after
+            for s in setup.sensors
+            if isinstance(s, Force) or (isinstance(s, Pressure) and s.area is not None)
+        ]
         n = (
             3
             + len(self._cut_after)
@@ -130,6 +134,14 @@ class Mechanism:
         if part.kind not in EXTENDED:
             return self._cut_to_size(self._after[on])
         return self._cut_to_size(self._along(part, x))
+
+    def bend(self, on: str, x: float) -> Float:
+        """The row of the curvature at `x` m along a beam."""
+        length, own = self._beams[on]
+        row = np.zeros(self._n)
+        at = 2 * x / length - 1
+        row[own] = [legendre.legval(at, unit) / length for unit in np.eye(ORDER)]
+        return row[: self._used]
 
     def _cut_to_size(self, rows: tuple[Float, Float]) -> tuple[Float, Float]:
         return rows[0][: self._used], rows[1][: self._used]

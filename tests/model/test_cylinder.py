@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from axial_kit import axial, part, place
 
+from samii_rig.errors import InputError
 from samii_rig.fem.model import Fem
 from samii_rig.model.realise import realise
 from samii_rig.model.tmm import Chain
+from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
 
 F = np.geomspace(0.3, 150.0, 40)
@@ -23,6 +25,10 @@ def bench(**changes: float) -> Rig:
             place("displacement", "mass", "x"),
             place("force", "cylinder", "F"),
             {"name": "p", "kind": "pressure", "after": "cylinder", "area": 5e-4, "unit": "Pa"},
+            *(
+                {"name": n, "kind": "pressure", "after": "cylinder", "chamber": i, "unit": "Pa"}
+                for i, n in ((1, "p_1"), (2, "p_2"))
+            ),
         ],
     )  # fmt: skip
 
@@ -36,7 +42,7 @@ def test_the_mass_moves_as_the_equations_of_the_chambers_say(changes: dict[str, 
     s = 2j * np.pi * F
     # States x, x', p_1, p_2, and the flow into chamber 1 over A_1, with u = 1.
     flow = K * P / (s + P)
-    expected = np.zeros((F.size, 3), complex)
+    expected = np.zeros((F.size, 5), complex)
     for i, at in enumerate(s):
         leak = p["leak"]
         A = np.array(
@@ -50,7 +56,8 @@ def test_the_mass_moves_as_the_equations_of_the_chambers_say(changes: dict[str, 
         b = np.array([0.0, 0.0, p["A_1"] * flow[i], -p["A_2"] * flow[i]])
         x = np.linalg.solve(A, b)
         push = p["A_1"] * x[2] - p["A_2"] * x[3]
-        expected[i] = x[0], -push, push / 5e-4  # tension is negative while it pushes
+        # Tension is negative while it pushes.
+        expected[i] = x[0], -push, push / 5e-4, x[2], x[3]
     H = Chain(bench(**changes)).response(F)[:, :, 0]
     assert np.max(np.abs(H - expected) / np.abs(expected)) < 1e-8
 
@@ -76,3 +83,25 @@ def test_gradients_are_those_of_differences() -> None:
             by_difference = (more - less) / (2 * step)
             size = np.abs(by_difference).max(axis=0) + 1e-3 * np.abs(H).max(axis=0) / value
             assert np.max(np.abs(by_difference - dH[..., i]) / size) < 1e-6, key
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("chamber = 1\n", "", "neither area nor chamber; expected area for the load pressure"),
+        ("chamber = 1\n", "chamber = 1\narea = 5e-4\n", "area and chamber; expected"),
+        ("chamber = 1\n", "chamber = 3\n", "sensor[p_1].chamber"),
+        (
+            'after = "cylinder"\nchamber = 1',
+            'after = "mass"\nchamber = 1',
+            "mass is of kind 'mass'; expected a cylinder, which has chambers",
+        ),
+    ],
+)
+def test_a_pressure_of_no_chamber_is_refused_in_a_line(old: str, new: str, said: str) -> None:
+    _, text = load_rig("cylinder")
+    assert text.count(old) == 1
+    with pytest.raises(InputError) as caught:
+        parse(Rig, text.replace(old, new), "cylinder.toml")
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -27,6 +27,7 @@ BENCHES = (
     "beam_on_shaker",
     "flexible_joint",
     "carriage",
+    "cylinder",
     "spindle_drive",
 )
 

@@ -25,6 +25,7 @@ from samii_rig.rig.schema import (
     Rig,
     RigidLink,
     Rod,
+    Strain,
 )
 
 POSITION = "position"  # symbol of the unknown
@@ -86,7 +87,7 @@ class Along:
 
 def stretches(rig: Rig, element: Element) -> Iterator[Along]:
     """The stretches of a body along which a part may stand: all of a link, a beam from one
-    accelerometer to the next."""
+    sensor to the next."""
     if not isinstance(element, BODIES) or element.L.value <= 0:
         return
     L = element.L.value
@@ -100,9 +101,9 @@ def stretches(rig: Rig, element: Element) -> Iterator[Along]:
         yield Along(element.name, start, end, L, number)
 
 
-def sensors_on(rig: Rig, body: str) -> tuple[Acceleration, ...]:
-    """The accelerometers on a body."""
-    return tuple(s for s in rig.sensor if isinstance(s, Acceleration) and s.on == body)
+def sensors_on(rig: Rig, body: str) -> tuple[Acceleration | Strain, ...]:
+    """The accelerometers and strain gauges on a body."""
+    return tuple(s for s in rig.sensor if isinstance(s, Acceleration | Strain) and s.on == body)
 
 
 def carried(rig: Rig, link: str, name: str, parts: tuple[Any, ...]) -> Rig:
@@ -146,14 +147,16 @@ def cut(rig: Rig, along: Along, part: Element) -> Rig:
         kind="lumped_mass", name=f"{along.body}{PIECE}end", m=insert.parameter(0.0, "kg")
     )
     most = (1 - SHORTEST) * along.whole
-    at_tip = any(s.position >= most for s in sensors_on(rig, along.body))
+    at_tip = any(
+        s.position >= most for s in sensors_on(rig, along.body) if isinstance(s, Acceleration)
+    )
     there = [*map(of, along.pieces[:before]), part, *map(of, along.pieces[before:]), last]
     there += [tip] if at_tip else []
 
     def kept(sensor: Any) -> Any:
-        if not isinstance(sensor, Acceleration) or sensor.on != along.body:
+        if not isinstance(sensor, Acceleration | Strain) or sensor.on != along.body:
             return sensor
-        if sensor.position >= most:
+        if sensor.position >= most and isinstance(sensor, Acceleration):
             return sensor.model_copy(update={"on": tip.name, "position": 0.0})
         if sensor.position <= along.start:
             return sensor.model_copy(update={"on": along.pieces[0]})

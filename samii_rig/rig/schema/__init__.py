@@ -57,6 +57,7 @@ from samii_rig.rig.schema.sensors import (
     AbsoluteAngle,
     Acceleration,
     AntiAlias,
+    Current,
     Displacement,
     Force,
     Moment,
@@ -64,6 +65,7 @@ from samii_rig.rig.schema.sensors import (
     RelativeAngle,
     Sensor,
     SensorBase,
+    Strain,
     Velocity,
 )
 
@@ -84,6 +86,7 @@ __all__ = [
     "Beam",
     "Branch",
     "Centring",
+    "Current",
     "Cylinder",
     "Device",
     "Displacement",
@@ -116,6 +119,7 @@ __all__ = [
     "Service",
     "Source",
     "Spindle",
+    "Strain",
     "Strict",
     "TimoshenkoBeam",
     "TorqueSource",

@@ -17,7 +17,7 @@ from samii_rig.rig.schema.elements import (
     Spindle,
     TranslationalSpring,
 )
-from samii_rig.rig.schema.sensors import AbsoluteAngle, Moment, RelativeAngle, places
+from samii_rig.rig.schema.sensors import AbsoluteAngle, Current, Moment, RelativeAngle, places
 
 if TYPE_CHECKING:
     from samii_rig.rig.schema.elements import Element
@@ -102,6 +102,8 @@ def _listed(kinds: tuple[type[Any], ...]) -> str:
 
 
 def _check_sensor(s: Sensor, turns: set[str], rig: Rig) -> None:
+    if isinstance(s, Current):  # a motor stands on either side of the spindle
+        return
     inside = [name in turns for name in places(s)]
     if isinstance(s, ANGULAR) and not all(inside):
         raise ValueError(

@@ -29,6 +29,8 @@ SENSOR_UNITS = {
         (sensors.Velocity, "m/s"),
         (sensors.Force, "N"),
         (sensors.Pressure, "Pa"),
+        (sensors.Strain, "m/m"),
+        (sensors.Current, "A"),
     )
 }
 IN_SENSOR_UNIT = ("noise_rms", "resolution", "offset", "low", "high")

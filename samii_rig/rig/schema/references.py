@@ -15,6 +15,7 @@ from samii_rig.rig.schema.elements import (
     LINES,
     MOTION_SOURCES,
     SOURCES,
+    Cylinder,
     LumpedMass,
     RigidLink,
     Source,
@@ -22,10 +23,19 @@ from samii_rig.rig.schema.elements import (
     input_unit,
 )
 from samii_rig.rig.schema.pose import check_gravity
-from samii_rig.rig.schema.sensors import Acceleration, RelativeAngle, places
+from samii_rig.rig.schema.sensors import (
+    Acceleration,
+    Current,
+    Pressure,
+    RelativeAngle,
+    Strain,
+    places,
+)
 
 if TYPE_CHECKING:
+    from samii_rig.rig.schema.elements import Element
     from samii_rig.rig.schema.rig import Rig
+    from samii_rig.rig.schema.sensors import Sensor
 
 
 def check_references(rig: Rig) -> None:
@@ -93,6 +103,12 @@ def _check_sensors(rig: Rig) -> None:
             _check_across(s, rig)
         if isinstance(s, Acceleration):
             _check_position(s, rig)
+        if isinstance(s, Strain):
+            _check_gauge(s, rig)
+        if isinstance(s, Pressure) and s.chamber is not None:
+            _check_kind(s, s.after, rig, (Cylinder,), "a cylinder, which has chambers")
+        if isinstance(s, Current):
+            _check_kind(s, s.of, rig, SOURCES, "a source")
 
 
 def _check_across(s: RelativeAngle, rig: Rig) -> None:
@@ -126,6 +142,25 @@ def _check_position(s: Acceleration, rig: Rig) -> None:
             f"sensor {s.name}: position {s.position:g} m lies beyond {s.on}; "
             f"expected at most {length:g} m"
         )
+
+
+def _check_gauge(s: Strain, rig: Rig) -> None:
+    """On a beam and before its end, where the next element begins."""
+    _check_kind(s, s.on, rig, BEAMS, "a beam")
+    length = next(e.L.value for e in rig.element if isinstance(e, BEAMS) and e.name == s.on)
+    if s.position >= length:
+        raise ValueError(
+            f"sensor {s.name}: position {s.position:g} m is not on {s.on}; "
+            f"expected less than {length:g} m"
+        )
+
+
+def _check_kind(
+    s: Sensor, name: str, rig: Rig, kinds: tuple[type[Element], ...], said: str
+) -> None:
+    host = next(e for e in rig.element if e.name == name)
+    if not isinstance(host, kinds):
+        raise ValueError(f"sensor {s.name}: {name} is of kind {host.kind!r}; expected {said}")
 
 
 def _check_channels(rig: Rig) -> None:

@@ -131,15 +131,57 @@ class Force(SensorBase):
 
 
 class Pressure(SensorBase):
-    """The load pressure behind the element `after`, a cylinder: its push V over `area`, m^2.
-
-    Of chambers with pressures p_1 and p_2 it is (A_1 p_1 - A_2 p_2)/area.
-    """
+    """A pressure of the element `after`, a cylinder: with `chamber` that in its chamber 1 or 2,
+    over the one at rest; with `area`, m^2, the load pressure (A_1 p_1 - A_2 p_2)/area, its push
+    over the area."""
 
     kind: Literal["pressure"]
     after: Name
-    area: Positive
+    area: Positive | None = None
+    chamber: Literal[1, 2] | None = None
     unit: Annotated[str, _unit("Pa")]
+
+    @model_validator(mode="after")
+    def _one_of(self) -> Self:
+        if (self.area is None) == (self.chamber is None):
+            given = "neither area nor chamber" if self.area is None else "area and chamber"
+            raise ValueError(f"{given}; expected area for the load pressure, or chamber 1 or 2")
+        return self
+
+
+class Strain(SensorBase):
+    """A strain gauge at `position` metres from the upstream end of a beam: -height theta'.
+
+    height : m from the neutral fibre to the gauge, positive on the side of positive w. A half or
+    full bridge of bending reads a multiple of it, its `gain`.
+    """
+
+    kind: Literal["strain"]
+    on: Name
+    position: NonNegative = 0.0
+    height: Finite
+    unit: Annotated[str, _unit("m/m")]
+
+    @model_validator(mode="after")
+    def _off_the_fibre(self) -> Self:
+        if self.height == 0:
+            raise ValueError(
+                "height 0; expected the distance from the neutral fibre, where there is no strain"
+            )
+        return self
+
+
+class Current(SensorBase):
+    """The current of the motor that the source `of` is: what it pushes with, over `constant`.
+
+    constant : N m/A of a source that turns, N/A of one that slides. A source of motion pushes with
+    what its load asks of it, one of a force or torque with K v.
+    """
+
+    kind: Literal["current"]
+    of: Name
+    constant: Positive
+    unit: Annotated[str, _unit("A")]
 
 
 Sensor = Annotated[
@@ -150,7 +192,9 @@ Sensor = Annotated[
     | Displacement
     | Velocity
     | Force
-    | Pressure,
+    | Pressure
+    | Strain
+    | Current,
     Field(discriminator="kind"),
 ]
 
@@ -164,6 +208,8 @@ def places(sensor: SensorBase) -> tuple[str, ...]:
             return (sensor.after,)
         case Displacement() | Velocity():
             return (sensor.after,) if sensor.against is None else (sensor.after, sensor.against)
-        case Acceleration():
+        case Acceleration() | Strain():
             return (sensor.on,)
+        case Current():
+            return (sensor.of,)
     raise TypeError(type(sensor))
