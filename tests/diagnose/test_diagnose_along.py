@@ -199,3 +199,18 @@ def test_an_interval_holds_the_draws_of_both_explanations_or_has_no_end() -> Non
 
 def test_every_effect_of_the_table_has_a_row_with_its_words() -> None:
     assert {e.physics for e in TABLE} <= PHYSICS.keys()
+
+
+@pytest.mark.parametrize("states", [("V", "w"), ("M", "theta")])
+def test_the_laws_within_a_spring_along_a_beam_are_those_of_its_ends(states) -> None:
+    """At the beam's tip it is the spring that the table has there; without its k a damper."""
+    spring, _ = effect("ground_spring", "beam", 0.9 * L, states)
+    inside = [e for e in TABLE if e.within(spring)]
+    assert {"ground_spring", "viscous_damping"} <= {e.physics for e in inside}
+    assert not any(e.within(e) or len(e.unknowns) >= len(spring.unknowns) for e in inside)
+    k, loss = 900.0, 0.05
+    ours = response(spring, [k, loss, math.e])  # the place's unknown where the stretch ends
+    ends = [response(e, [k, loss]) for e in inside if e.physics == "ground_spring"]
+    off = min(float(np.max(np.abs(ours / end - 1))) for end in ends)
+    none = float(np.max(np.abs(ours / Chain(RIG).response(F) - 1)))
+    assert off < 0.02 < 0.2 < none  # a place is kept 1e-4 of the body away from its end

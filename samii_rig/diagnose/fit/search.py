@@ -67,6 +67,7 @@ class Search(Explanations):
             self.grow(self.ranked()[0], FIRST)
             self.temper()
         if briefly:
+            self._plainer()
             return self.ranked()
         about = self.nominal.key
         for turn in range(MOST - 1):
@@ -99,7 +100,28 @@ class Search(Explanations):
             self.renew(best)
             self.temper()
         self._from_everywhere()
+        self._plainer()
         return self.ranked()
+
+    def _plainer(self) -> None:
+        """The best with a law of fewer unknowns in place of each of its effects: a part that ends
+        at the end of its body, or a spring that is all damper, is one that the table has by itself,
+        and need not have been refitted."""
+        for _ in range(SWAPS):
+            best = self.ranked()[0]
+            for i, gone in enumerate(best.effects):
+                base, some = self.bare(best, i), [e for e in self.table if e.within(gone)]
+                if base is None or not some:
+                    continue
+                look = Screen.of(self.problem, base.fitted)
+                for _drop, effect, starts in ranking(look, some, base.effects, self.model):
+                    effects = (*base.effects, effect)
+                    end = self.refitted(effects, base, np.log(starts[0]).tolist())
+                    if end is not None:
+                        self.keep(effects, end)
+            self.temper()
+            if self.ranked()[0].key == best.key:
+                return
 
     def _from_everywhere(self) -> None:
         """Single effects of several unknowns that may still compete, refitted from weak to strong:

@@ -138,6 +138,15 @@ class Effect:
         """(physics, site)."""
         return self.physics, self.site
 
+    def within(self, other: Effect) -> bool:
+        """Whether another may do the same by a choice of its unknowns: one that has more of them
+        and acts by the same states, at the same place or along a body that this one stands on."""
+        if self.jump is None or other.jump is None or self.jump.states != other.jump.states:
+            return False
+        there = self.jump.place == other.jump.place
+        there |= other.site in {site for _, site in self.names}
+        return there and len(self.unknowns) < len(other.unknowns)
+
     @property
     def names(self) -> tuple[tuple[str, str], ...]:
         """All names of the same change, its own first."""
