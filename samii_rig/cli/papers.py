@@ -109,11 +109,13 @@ def _table(entry: Entry, result: Result) -> Table:
         title_justify="left",
         box=box.SIMPLE_HEAD,
     )
-    for name in ("", "published", "ours", "deviation", "asked for", ""):
+    for name in ("", "published", "ours", "deviation", "asked for", "", "agreement"):
         table.add_column(name)
     for n in result.numbers:
         verdict = "" if not n.must else "holds" if n.holds else "DOES NOT HOLD"
-        table.add_row(n.what, n.published, n.shown(), n.shown_deviation(), n.must, verdict)
+        table.add_row(
+            n.what, n.published, n.shown(), n.shown_deviation(), n.must, verdict, n.agreement
+        )
     return table
 
 
@@ -132,6 +134,7 @@ def _plain(entry: Entry, result: Result, written: list[Path]) -> dict[str, Any]:
                 "deviation": n.deviation if n.reference == n.reference else None,
                 "must": n.must,
                 "holds": n.holds,
+                "agreement": n.agreement,
             }
             for n in result.numbers
         ],

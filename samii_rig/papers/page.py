@@ -18,7 +18,7 @@ from samii_rig.record.export import replacing
 from samii_rig.rig.load import read_text
 
 BLOCK = re.compile(r"<!-- result (?P<id>[\w-]+) -->\n(?P<body>.*?)<!-- end -->", re.DOTALL)
-HEAD = ("| | published | ours | deviation | asked for |", "|---|---|---|---|---|")
+HEAD = ("| | published | ours | deviation | asked for | agreement |", "|---|---|---|---|---|---|")
 EQUATION_TABLE = "equations"
 
 
@@ -33,7 +33,7 @@ def table(result: Result) -> str:
 def row(n: Number) -> str:
     """One line of the table."""
     ours = n.shown() if n.holds else f"**{n.shown()}**"
-    cells = (n.what, n.published, ours, n.shown_deviation(), n.must)
+    cells = (n.what, n.published, ours, n.shown_deviation(), n.must, n.agreement)
     return "| " + " | ".join(_cell(c) for c in cells) + " |"
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,6 +14,11 @@ from samii_rig.types import Complex, Float
 Kind = Literal["line", "dashed", "points", "broad"]
 Corner = Literal["upper left", "upper right", "lower left", "lower right", "lower center"]
 
+
+# What a number beside a published one shows. Computed: from what the papers print alone.
+# Calibrated: values that they do not print were chosen or solved for so that it comes out. Found
+# again: a method finds in the simulated rig what was put there.
+Agreement = Literal["", "computed", "calibrated", "found again"]
 
 PLAIN = (-4, 6)  # powers of ten between which a number is written without one
 
@@ -26,6 +31,7 @@ class Number:
     reference : the published value that `deviation` is taken from, NaN where there is none.
     low, high : between which `ours` must lie; infinite for a number that is only shown.
     must : the same in words. digits : significant ones that are shown.
+    agreement : kind of it, "" for that of the whole result.
     """
 
     what: str
@@ -37,6 +43,7 @@ class Number:
     high: float = math.inf
     must: str = ""
     digits: int = 4
+    agreement: Agreement = ""
 
     @property
     def holds(self) -> bool:
@@ -65,7 +72,14 @@ class Number:
         return "" if math.isnan(self.deviation) else f"{100 * self.deviation:+.2g} %"
 
 
-def beside(what: str, ours: float, published: float, unit: str, within: float) -> Number:
+def beside(
+    what: str,
+    ours: float,
+    published: float,
+    unit: str,
+    within: float,
+    agreement: Agreement = "",
+) -> Number:
     """A number that must agree with the published one, `within` relative."""
     return Number(
         what,
@@ -77,6 +91,7 @@ def beside(what: str, ours: float, published: float, unit: str, within: float) -
         published + within * abs(published),
         f"within {100 * within:.2g} %",
         5,
+        agreement,
     )
 
 
@@ -88,6 +103,7 @@ def between(
     high: float,
     published: str = "",
     digits: int = 4,
+    agreement: Agreement = "",
 ) -> Number:
     """A number that must lie in an interval; `published` in the paper's terms."""
     if math.isinf(low) or low == 0:
@@ -96,7 +112,7 @@ def between(
         must = f"at least {low:g}"
     else:
         must = f"{low:g}" if low == high else f"{low:g} to {high:g}"
-    return Number(what, float(ours), unit, published, math.nan, low, high, must, digits)
+    return Number(what, float(ours), unit, published, math.nan, low, high, must, digits, agreement)
 
 
 def shown(
@@ -105,9 +121,10 @@ def shown(
     unit: str = "",
     published: str = "",
     digits: int = 4,
+    agreement: Agreement = "",
 ) -> Number:
     """A number that is only told."""
-    return Number(what, float(ours), unit, published, digits=digits)
+    return Number(what, float(ours), unit, published, digits=digits, agreement=agreement)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,6 +207,15 @@ class Result:
     numbers: tuple[Number, ...]
     sentences: tuple[str, ...] = ()
     pictures: tuple[Picture, ...] = ()
+
+    def of_kind(self, agreement: Agreement) -> Result:
+        """The same, every number that must hold beside a published one with a kind of agreement:
+        its own or this. A number that is only told need not agree."""
+        numbers = (
+            replace(n, agreement=n.agreement or agreement) if n.published and n.must else n
+            for n in self.numbers
+        )
+        return replace(self, numbers=tuple(numbers))
 
     @property
     def holds(self) -> bool:

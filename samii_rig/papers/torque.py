@@ -184,6 +184,7 @@ def figures_8_9_10() -> Result:
                 5.0,
                 "agree closely",
                 2,
+                "found again",
             )
         )
     k = closed_form(both[0].rig)

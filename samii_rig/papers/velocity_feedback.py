@@ -41,7 +41,8 @@ INTERACTION = (7.2, 8.0)  # Hz, where the papers see actuator and structure meet
 AROUND = (4.5, 12.5)  # Hz, around mode 2, where the dip and the rise are read
 ALPHA = 2.5e-3  # s, Rayleigh damping for which the dip is in the middle of 20 to 30 degrees
 ALPHAS = (4e-3, 3e-3, 2.5e-3, 2e-3, 1e-3)  # s
-SAID = "20 to 30 deg"
+SIZES = (20.0, 30.0)  # deg, of dip and rise
+SAID = f"{SIZES[0]:g} to {SIZES[1]:g} deg"
 GAINS = np.geomspace(10.0, 1e5, 81)  # N m s/rad
 FEW = 4  # every so many of them by finite elements as well
 MOVED = (0.01, 0.05)  # relative change of a natural frequency: "almost unaffected" is over
@@ -58,7 +59,7 @@ def in_series(rig: Rig, g_v: float) -> Rig:
 
 def by_fem(rig: Rig, g_v: float) -> Fem:
     """The rig with velocity feedback in finite elements, encoder at the actuator."""
-    return Fem(collocated(rig), feedback={SOURCE: (g_v, _gain(rig))})
+    return Fem(collocated(rig), feedback={SOURCE: (g_v, gain_of(rig))})
 
 
 def dip_and_rise(f: Float, H: Complex, nominal: Complex) -> tuple[float, float, float, float]:
@@ -74,7 +75,7 @@ def figure_5() -> Result:
     """theta_2/v_2 with velocity feedback, encoder at the actuator, by both methods."""
     f = np.geomspace(0.5, 40.0, 1600)
     inside = (f > AROUND[0]) & (f < AROUND[1])
-    nominal: Complex = np.asarray(_gain(samii()) / (2j * np.pi * f), dtype=np.complex128)
+    nominal: Complex = np.asarray(gain_of(samii()) / (2j * np.pi * f), dtype=np.complex128)
     numbers: list[Number] = []
     bodes = []
     for colour, (name, rig) in enumerate(
@@ -89,11 +90,11 @@ def figure_5() -> Result:
         chosen = colour == 1
         said = SAID if chosen else ""
         numbers += [
-            between(f"phase dip, {name}", -dip, "deg", 20, 30, said)
+            between(f"phase dip, {name}", -dip, "deg", *SIZES, said)
             if chosen
             else shown(f"phase dip, {name}", -dip, "deg"),
             shown(f"at, {name}", dip_hz, "Hz", "mode 2" if chosen else "", 3),
-            between(f"phase rise after it, {name}", rise, "deg", 20, 30, said)
+            between(f"phase rise after it, {name}", rise, "deg", *SIZES, said)
             if chosen
             else shown(f"phase rise after it, {name}", rise, "deg"),
             shown(f"at, {name}", rise_hz, "Hz", "", 3),
@@ -287,7 +288,7 @@ def _over_first(values: Float) -> Float:
     return np.asarray(values / values[0])
 
 
-def _gain(rig: Rig) -> float:
+def gain_of(rig: Rig) -> float:
     """g_a, rad/s per V: the K of the rig's source."""
     source = next(e for e in rig.element if e.kind == "angular_velocity_source")
     return source.K.value
