@@ -75,14 +75,15 @@ def filters(rig: Rig, feedback: Sequence[Feedback]) -> kernel.Filters:
 def drive(rig: Rig, settings: SimSettings, actuator: int = 0) -> kernel.Drive:
     """What acts on one output's drive beside the command."""
     # The disturbance passes the source's lag; a source without a first-order one lets it through.
-    sources = [e for e in rig.element if isinstance(e, SOURCES)]
-    own = next(e for e in sources if e.input == rig.actuator[actuator].name)
+    sources, name = [e for e in rig.element if isinstance(e, SOURCES)], rig.actuator[actuator].name
+    own = next(e for e in sources if e.input == name)
+    rubs = settings.coulomb_friction
     lag = None if isinstance(own, SECOND_ORDER) else own.p
     p = lag.value if lag else np.inf
     return kernel.Drive(
         # White noise: its mean over `inner` steps has this rms.
         settings.disturbance_rms * np.sqrt(settings.inner),
-        settings.coulomb_friction,
+        rubs.get(name, 0.0) if isinstance(rubs, dict) else rubs,
         float(np.exp(-p / (rig.rate_hz * settings.inner))),
     )
 

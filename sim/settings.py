@@ -6,7 +6,7 @@ import secrets
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from pydantic import Field
+from pydantic import Discriminator, Field, Tag
 
 from samii_rig.rig.schema import Name, NonNegative, Positive, Rig, Strict
 from samii_rig.rig.settings import checked, wrong
@@ -18,6 +18,10 @@ class Hum(Strict):
 
     amplitude: NonNegative
     frequency_hz: Positive
+
+
+def _which(given: object) -> str:
+    return "by_actuator" if isinstance(given, dict) else "of_every_drive"
 
 
 class SimSettings(Strict):
@@ -38,6 +42,7 @@ class SimSettings(Strict):
         actuator's unit. An ideal velocity source does not feel a torque beside it, so the
         friction acts inside the drive: speed' = p (v - friction sign(speed) - speed), stuck
         at zero speed while |v| is smaller. The best linear response then depends on the level.
+        A number is that of every drive; by an actuator's name it is of that one alone.
     guide_friction : dry friction, N, of the guide of a mass that slides, by the mass's name. The
         force stops the mass where it can and opposes its speed else. One mass may have it.
     hum : by sensor name.
@@ -53,7 +58,11 @@ class SimSettings(Strict):
     inner: Annotated[int, Field(ge=1, le=64)] = 8
     band_hz: Positive | None = None
     disturbance_rms: NonNegative = 0.0
-    coulomb_friction: NonNegative = 0.0
+    coulomb_friction: Annotated[
+        Annotated[NonNegative, Tag("of_every_drive")]
+        | Annotated[dict[Name, NonNegative], Tag("by_actuator")],
+        Discriminator(_which),  # one reading of what was given, and so one line of what is wrong
+    ] = 0.0
     guide_friction: dict[Name, NonNegative] = Field(default_factory=dict)
     hum: dict[Name, Hum] = Field(default_factory=dict)
     stuck: dict[Name, NonNegative] = Field(default_factory=dict)
@@ -71,6 +80,11 @@ def read_settings(rig: Rig, overrides: Mapping[str, object]) -> SimSettings:
         for name in getattr(settings, setting):
             if name not in names:
                 raise wrong(rig, setting, name, f"one of {', '.join(sorted(names))}")
+    if isinstance(settings.coulomb_friction, dict):
+        known = [a.name for a in rig.actuator]
+        for name in settings.coulomb_friction:
+            if name not in known:
+                raise wrong(rig, "coulomb_friction", name, f"one of {', '.join(known)}")
     for made in faults.settings(rig, settings.faults):
         for setting, value in made.items():
             settings = settings.model_copy(

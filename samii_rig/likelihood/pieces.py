@@ -107,6 +107,10 @@ class Wiring:
         (one,) = self.inputs
         return one
 
+    def column(self, command: str) -> int:
+        """Which of the inputs a command is."""
+        return [x.command for x in self.inputs].index(command)
+
     @property
     def loops(self) -> Loops:
         """Those that run."""

@@ -11,19 +11,16 @@ import pytest
 from concealed_kit import SAMII
 from cut_kit import DESIGN, cut_sweeps
 from diagnose_kit import effect
+from weak_forces_kit import weak_ones
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
 from samii_rig.diagnose.fit.explanations import Explanation
-from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.records import RecordProblem, Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.fit.stated import IN_DATA
-from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS, PLAY
-from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.problem import ForceProblem
-from samii_rig.diagnose.forces.screen import Looks, scaled, weakly
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.way import Ways
 from samii_rig.diagnose.physics.effect import Effect
@@ -37,7 +34,7 @@ from samii_rig.record.importer import import_file
 from samii_rig.record.maps import load_map
 from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Float, Recording
+from samii_rig.types import Recording
 
 # One level alone, short: every response and every search is what takes the time here.
 ONE = replace(DESIGN, levels=(1.0,), burst=18.0, high_hz=20.0)
@@ -130,27 +127,9 @@ def test_both_parts_of_the_lines_are_joined_again(nothing: list[Recording]) -> N
 
 
 def test_a_weak_force_does_to_first_order_what_it_does_in_time(nothing: list[Recording]) -> None:
-    search = forces_of(nothing)
-    nominal = search.nominal.fitted
-    looks = Looks(search.problem, (Screen.of(search.problem, nominal),))
-    hopes = weakly(search.forces, search.reach, looks)
-    assert {h.effect.key for h in hopes} == {e.key for e in search.forces}
-    for hope in hopes:
-        law = hope.effect.quasi.law
-        if law in (
-            PLAY,
-            HYSTERESIS,
-            FRICTION,
-        ):  # whose shape depends on the strength, or that stick
-            continue
-        share = 0.02 if law.told is None else 1.0
-        strengths = scaled(law, hope.strengths, share, search.reach.largest)
-        model = search.model((hope.effect,))
-        assert isinstance(model, ForceModel)
-        x = np.append(moved(nominal.model, nominal.x, model), np.log(strengths))
-        in_time = power(*looks.gains(search.problem.change(model, x))) / share**2
+    for law, _, first_order, in_time in weak_ones(forces_of(nothing)):
         # Harmonics above the third fold back at the low rate.
-        assert in_time == pytest.approx(power(hope.own, hope.may, hope.times), rel=0.2), law.tag
+        assert in_time == pytest.approx(first_order, rel=0.2), law.tag
 
 
 def test_no_dead_band_is_narrower_than_a_step_of_the_commands_converter(
@@ -159,12 +138,7 @@ def test_no_dead_band_is_narrower_than_a_step_of_the_commands_converter(
     search = forces_of(nothing)
     (dead,) = (e for e in search.forces if e.physics == "valve_deadband")
     step = search.rig.actuator[0].resolution
-    assert dead.unknowns[0].low == step > 1e-6 * search.reach.largest
-
-
-def power(own: Float, _may: Float, times: Float | float) -> float:
-    """Squared length of a change, from what it gains and how many times it should be."""
-    return float(np.ravel(own / (2 * np.asarray(times) - 1))[0])
+    assert dead.unknowns[0].low == step < dead.unknowns[0].high
 
 
 def forces_of(runs: list[Recording]) -> ForceSearch:

@@ -53,13 +53,19 @@ def together() -> list[Float]:
     return [np.stack([up, down], axis=1), np.stack([up, -down], axis=1)]
 
 
-def recorded(hidden: Rig, references: Sequence[Float], seed: int = 1) -> list[Recording]:
-    """One recording of each reference (n, 2), from rest, with noise, steps and the loops."""
-    return [_one(hidden, u, f"run_{i}", seed + i) for i, u in enumerate(references)]
+def recorded(
+    hidden: Rig, references: Sequence[Float], seed: int = 1, **settings: object
+) -> list[Recording]:
+    """One recording of each reference (n, 2), from rest, with noise, steps and the loops.
+    settings : more of the simulated rig."""
+    return [
+        _one(hidden, u, f"run_{i}", {"seed": seed + i, **settings})
+        for i, u in enumerate(references)
+    ]
 
 
-def _one(hidden: Rig, u: Float, name: str, seed: int) -> Recording:
-    device = open_rig(hidden, {"seed": seed})
+def _one(hidden: Rig, u: Float, name: str, settings: dict[str, object]) -> Recording:
+    device = open_rig(hidden, settings)
     loops = [hidden.centring_of(n) for n in INPUTS]
     far = 1e9  # limits that nothing reaches
     device.actuator.configure(tuple(DeviceLoop(c.sensor, c.kp, far, far, far) for c in loops))

@@ -5,6 +5,7 @@ import pytest
 from sim_physics_kit import LINES, PERIOD, last_period, multisine
 
 from samii_rig.devices.protocols import CommandBlock, DeviceLoop
+from samii_rig.errors import InputError
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.load import load_rig
 from samii_rig.types import Quality
@@ -99,3 +100,30 @@ def test_a_lost_encoder_drops_both_outputs(lost):
     v = block.values[:, V]
     assert (v[:250] != 0.0).all()
     assert not v[250:].any()
+
+
+def test_friction_of_one_drive_holds_that_one_and_no_other():
+    u = np.full((2000, K), 0.2)  # V, less than what holds joint 3
+    free, held = (
+        respond(fine(), u, band_hz=200.0, coulomb_friction=c).values[:, Y]
+        for c in (0.0, {"v_3": 0.25})
+    )
+    theta_2, theta_3 = ([s.name for s in RIG.sensor].index(f"theta_{j}") for j in (2, 3))
+    assert abs(held[-1, theta_3]) < 0.01 * abs(free[-1, theta_3])  # its spring gives way
+    assert held[-1, theta_2] == pytest.approx(free[-1, theta_2], rel=0.01)
+    every = respond(fine(), u, band_hz=200.0, coulomb_friction=0.25).values[:, Y]
+    assert np.all(every == 0.0)
+
+
+@pytest.mark.parametrize(
+    ("friction", "named"),
+    [
+        (-1.0, r"coulomb_friction\.of_every_drive is -1\.0; expected greater"),
+        ({"v_9": 0.1}, "coulomb_friction is 'v_9'; expected one of v_2, v_3"),
+        ({"v_3": -1.0}, r"coulomb_friction\.by_actuator\.v_3 is -1\.0; expected greater"),
+    ],
+)
+def test_friction_that_cannot_be_is_told_in_one_line(friction, named):
+    with pytest.raises(InputError, match=named) as no:
+        open_rig(RIG, {"coulomb_friction": friction})
+    assert "\n" not in str(no.value)

@@ -154,6 +154,12 @@ class Whole:
         return np.array([names.index(n) for n in self.wired.sensors], np.int64)
 
     @property
+    def acting(self) -> Int:
+        """(m,) indices of the inputs into the rig's actuators."""
+        names = [a.name for a in self.rig.actuator]
+        return np.array([names.index(x.command) for x in self.wired.inputs], np.int64)
+
+    @property
     def loop(self) -> Closed | None:
         """The loops around the sensors."""
         if not self._loop:
@@ -171,8 +177,7 @@ class Whole:
 
     def grid(self, frequency: Float, sigma: float, fitted: Fitted) -> Grid:
         """The grid beside the imaginary axis, with the aliases of a fit."""
-        names = [a.name for a in self.rig.actuator]
-        acting = np.array([names.index(x.command) for x in self.wired.inputs], np.int64)
+        acting = self.acting
         sensor = np.repeat(self.sensor, acting.size)
         actuator = np.tile(acting, self.sensor.size)
         model = fitted.model

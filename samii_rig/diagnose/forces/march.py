@@ -18,7 +18,7 @@ _row, _rows = types.Array(_f8, 1, "C"), types.Array(_f8, 2, "C")
 _FAST = {"reassoc", "contract", "nsz"}
 
 
-@njit(_rows(_law, _rows, _rows, _rows, _f8, _f8, _row, _i8, _i8, _row, _rows), cache=True,
+@njit(_rows(_law, _rows, _rows, _rows, _f8, _f8, _row, _row, _i8, _i8, _row, _rows), cache=True,
       fastmath=_FAST)  # fmt: skip
 def march(
     law: Step,
@@ -28,6 +28,7 @@ def march(
     direct: float,
     g: float,
     v: Float,
+    others: Float,
     late: int,
     inner: int,
     p: Float,
@@ -37,7 +38,8 @@ def march(
     of its numbers.
 
     grow, by_v, by_e : (2, n_pole) real and imaginary parts. What drives the force is the sum of
-    all real parts, and direct and g per unit of command and of force. late : steps of dead time.
+    all real parts, and direct and g per unit of command and of force. others : (n inner,) what
+    other commands do to it, as `moved`, or none. late : steps of dead time.
     seeds : (m, 2) each change of the numbers p (2,).
     """
     m, n_pole = seeds.shape[0], grow.shape[1]
@@ -48,7 +50,7 @@ def march(
     for step in range(v.size * inner):
         u = v[(step - late) // inner] if step >= late else 0.0
         for i in range(1 + m):
-            e, total = held[i], 0.0
+            e, total = held[i], (others[step] if i == 0 and others.size else 0.0)
             given = u if i == 0 else 0.0
             for k in range(n_pole):
                 real, imag = wr[i, k] + by_e[0, k] * e, wi[i, k] + by_e[1, k] * e
@@ -71,6 +73,24 @@ def march(
         for i in range(1 + m):
             before[i] = y[i] + g * held[i]
     return f
+
+
+@njit(cache=True, fastmath=_FAST)
+def moved(v: Float, grow: Float, by_v: Float, direct: float, late: int, inner: int) -> Float:
+    """(n inner,) what a command v (n,) alone does from rest; as `march` has it."""
+    n_pole = grow.shape[1]
+    wr, wi = np.zeros(n_pole), np.zeros(n_pole)
+    out = np.zeros(v.size * inner)
+    for step in range(v.size * inner):
+        u = v[(step - late) // inner] if step >= late else 0.0
+        total = direct * u
+        for k in range(n_pole):
+            real = grow[0, k] * wr[k] - grow[1, k] * wi[k] + by_v[0, k] * u
+            wi[k] = grow[0, k] * wi[k] + grow[1, k] * wr[k] + by_v[1, k] * u
+            wr[k] = real
+            total += real
+        out[step] = total
+    return out
 
 
 @njit(cache=True, fastmath=_FAST)

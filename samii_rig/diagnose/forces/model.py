@@ -69,22 +69,22 @@ class ForceModel(Model):
         rows = [own[self.unknowns.index(j)] if j in self.unknowns else by_scale for j in moving]
         return np.ascontiguousarray(rows, np.float64).reshape(-1, 2)
 
-    def channels(self, x: Float, s: Complex) -> tuple[Complex, dict[str, Complex]] | None:
-        """(n,) at s what the effects on channels do to the command, and to each sensor by name;
+    def channels(
+        self, x: Float, s: Complex
+    ) -> tuple[dict[str, Complex], dict[str, Complex]] | None:
+        """(n,) at s what the effects on channels do to each command, and to each sensor, by name;
         None where no effect is on a channel."""
         some = [
             (e.factor, theta)
             for e, theta in zip(self.effects, self.parts(x), strict=True)
             if e.factor is not None
         ]
-        given = np.ones(s.size, complex)
+        given: dict[str, Complex] = {}
         seen: dict[str, Complex] = {}
         for factor, theta in some:
             F = factor.value(s, theta)[0]
-            if factor.kind == "input":
-                given = given * F
-            else:
-                seen[factor.channel] = seen.get(factor.channel, np.ones_like(F)) * F
+            known = given if factor.kind == "input" else seen
+            known[factor.channel] = known.get(factor.channel, np.ones_like(F)) * F
         return (given, seen) if some else None
 
     def response(self, x: Float, at: Grid) -> Complex:
@@ -92,7 +92,7 @@ class ForceModel(Model):
         h = super().response(x, at)
         if not isinstance(at, RecordGrid):
             return h
-        return np.concatenate([h, at.added(self, x, ())[:, :, 0]])
+        return np.concatenate([h, _wide(at.added(self, x, ())[:, :, 0], h.shape[1])])
 
     def gradient(self, x: Float, at: Grid) -> tuple[Complex, Complex]:
         """The same, and its derivatives (n, q, n_x). The force moves with its own numbers; what the
@@ -100,10 +100,17 @@ class ForceModel(Model):
         h, dh = super().gradient(x, at)
         if not isinstance(at, RecordGrid):
             return h, dh
-        added = at.added(self, x, self.moving)
+        added = _wide(at.added(self, x, self.moving), h.shape[1])
         more = np.zeros((*added.shape[:2], self.n), complex)
         more[:, :, list(self.moving)] = added[:, :, 1:]
         return np.concatenate([h, added[:, :, 0]]), np.concatenate([dh, more])
+
+
+def _wide(lines: Complex, width: int) -> Complex:
+    """Lines (n, q, ...) as rows of responses (n, width, ...), those of several inputs."""
+    out = np.zeros((len(lines), width, *lines.shape[2:]), complex)
+    out[:, : lines.shape[1]] = lines
+    return out
 
 
 def model_of(rig: Rig, effects: Sequence[Effect]) -> Model:

@@ -7,6 +7,7 @@ from typing import Literal
 
 from samii_rig.diagnose.physics import insert
 from samii_rig.rig.schema import (
+    SOURCES,
     AbsoluteAngle,
     ActuatorSpec,
     Displacement,
@@ -47,6 +48,18 @@ class Place:
     def own_input(self) -> bool:
         """Whether the force has an input of its own."""
         return self.kind in ("joint", "ground")
+
+    def acts_on(self, rig: Rig) -> int:
+        """Index of the input through which the force acts among those of the rig and its own."""
+        if self.own_input:
+            return len(rig.actuator)
+        return [a.name for a in rig.actuator].index(self.command(rig))
+
+    def command(self, rig: Rig) -> str:
+        """The actuator of the source that it stands in the drive of."""
+        source = next(e for e in rig.element if e.name == self.across[0])
+        assert isinstance(source, SOURCES)
+        return source.input
 
     @property
     def units(self) -> tuple[str, str]:

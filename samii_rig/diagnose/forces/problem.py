@@ -26,6 +26,7 @@ from samii_rig.diagnose.forces.way import Ways
 from samii_rig.diagnose.physics.model import Grid
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.pieces import Piece, Samples
+from samii_rig.likelihood.reduce import by_input
 from samii_rig.types import Complex, Float
 
 
@@ -40,28 +41,31 @@ class Moved:
         """Of each piece the change of its input r (history + n,) and of its sensors z (n, q), then
         the slopes of both by the entries `moving` of x."""
         p, seeds = model.numbers(x), model.seeds(x, moving)
+        wired = self.whole.wired
         if model.force.law.told is not None:
             pieces = self.whole.records.pieces
-            return [_told(piece, model, p, seeds, self.whole.every) for piece in pieces]
-        way, wired = self.ways.at(model, x), self.whole.wired
+            on = wired.column(model.force.place.command(model.built))
+            return [_told(piece, model, p, seeds, self.whole.every, on) for piece in pieces]
+        way = self.ways.at(model, x)
         contour = self.whole.records.exact()
         channels = model.channels(x, contour.s)
         every = self.whole.every
         out = []
         for piece in self.whole.records.pieces:
             v, times = mean_command(piece)
-            if channels is not None:
-                v = contour.record(contour.damped(v) * channels[0], v.size)
+            for name, F in channels[0].items() if channels is not None else ():
+                each, j = v.reshape(len(v), -1), wired.column(name)
+                each[:, j] = contour.record(contour.damped(each[:, j]) * F, len(v))
             own = []
-            self.ways.marched += (1 + len(seeds)) * v.size * every
+            self.ways.marched += (1 + len(seeds)) * len(v) * every
             for e in way.force(model, between(v, every), p, seeds):
                 y = times * way.sensed.of(e)[::every, self.whole.sensor]
                 for name, F in channels[1].items() if channels is not None else ():
                     j = wired.sensors.index(name)
                     y[:, j] = contour.record(contour.damped(y[:, j]) * F, len(y))
-                r = np.zeros(piece.r.size)
-                for kp, sensor, _ in wired.loops:
-                    r -= kp * y[:, sensor]
+                r = np.zeros_like(piece.r)
+                for kp, sensor, of in wired.loops:
+                    r.reshape(len(r), -1)[:, of] -= kp * y[:, sensor]
                 own.append(Samples(r, y[piece.history :]))
             out.append(own)
         return out
@@ -78,23 +82,27 @@ class Moved:
         return replace(self.whole, records=replace(records, pieces=pieces))
 
 
-def _told(piece: Piece, model: ForceModel, p: Float, seeds: Float, every: int) -> list[Samples]:
-    """A force on the command alone, of every record by itself: a converter's steps fall differently
-    each time."""
+def _told(
+    piece: Piece, model: ForceModel, p: Float, seeds: Float, every: int, on: int
+) -> list[Samples]:
+    """A force on the command of input `on` alone, of every record by itself: a converter's steps
+    fall differently each time."""
     told = model.force.law.told
     assert told is not None
-    r = np.zeros((1 + len(seeds), piece.r.size))
+    r = np.zeros((1 + len(seeds), *piece.r.shape))
     for command in piece.commands:
-        e, slopes = told(between(command.v, every), p)
+        e, slopes = told(between(by_input(command.v)[on], every), p)
         all_ = np.concatenate([e[None], (slopes @ seeds.T).T])
-        r += command.part * (all_ if every == 1 else signal.resample_poly(all_, 1, every, axis=1))
+        r.reshape(*r.shape[:2], -1)[:, :, on] += command.part * (
+            all_ if every == 1 else signal.resample_poly(all_, 1, every, axis=1)
+        )
     still = np.zeros_like(piece.z)
     return [Samples(own, still) for own in r]
 
 
 def between(v: Float, every: int) -> Float:
-    """(n every,) a command of which every so-manieth sample was recorded: what the band up to half
-    the record's rate makes of it."""
+    """(n every, ...) commands of which every so-manieth sample was recorded: what the band up to
+    half the record's rate makes of it."""
     return v if every == 1 else np.asarray(signal.resample_poly(v, every, 1))
 
 
@@ -182,6 +190,7 @@ class ForceProblem(RecordProblem):
         out = np.zeros((self.goal.size, d.shape[2]))
         out[: self.reduced.factor.shape[0]] = self.reduced.slopes(d)
         if lines.size:
+            lines = lines[:, : self.complete.rows.e.shape[1]]  # one row for all inputs
             moving = np.flatnonzero(np.any(lines != 0, axis=(0, 1)))
             out[:, moving] += self.complete.split(lines[:, :, moving])
         return out

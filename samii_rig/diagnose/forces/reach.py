@@ -8,7 +8,6 @@ third harmonics of it (`samii_rig.likelihood.contour`).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
 from scipy import fft
@@ -20,6 +19,7 @@ from samii_rig.diagnose.physics.effect import Key
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
 from samii_rig.likelihood.pieces import Piece
+from samii_rig.likelihood.reduce import by_input
 from samii_rig.model.sampled import dead_time, hold_at, sensors_at
 from samii_rig.types import Complex, Float, Int
 
@@ -31,9 +31,10 @@ DAMPING = 5.0  # of the contour: 0.7 % wraps around, what is cut above the rate 
 class Span:
     """One piece on its contour, at a low rate.
 
-    n : samples of the record at the low rate, of `samples`. v : damped spectrum of the command,
-    from the record's first sample on (what is before it wraps around). decay : (M,) of the contour.
-    alive : (M,) whether the instant is in the record or in the input before it.
+    n : samples of the record at the low rate, of `samples`. v : (M//2 + 1, m) damped spectra of the
+    commands, from the record's first sample on (what is before it wraps around).
+    decay : (M,) of the contour. alive : (M,) whether the instant is in the record or in the input
+    before it.
     """
 
     n: int
@@ -61,22 +62,25 @@ class Span:
         at = np.arange(m) * (n / low) + history
         at = np.where(at >= M, at - M, at)
         decay = np.exp(-sigma / rate_hz * at)
-        alive = (at < v.size).astype(float)
+        alive = (at < len(v)).astype(float)
         made = cls(low, n, s, np.zeros(0, complex), decay, alive, times, history, rate_hz)
-        return replace(made, v=made.spectrum(v))
+        return replace(made, v=made.spectrum(v.reshape(len(v), -1)))
 
     def spectrum(self, x: Float) -> Complex:
-        """(M//2 + 1,) damped, of x (history + n,) at the record's rate."""
+        """(M//2 + 1, ...) damped, of x (history + n, ...) at the record's rate."""
         M = round(self.decay.size * self.samples / self.n)
         sigma = float(self.s[0].real)
-        damped = fft.rfft(x * np.exp(-sigma / self.rate_hz * np.arange(x.size)), M)[: self.s.size]
+        own = (-1,) + (1,) * (x.ndim - 1)
+        decay = np.exp(-sigma / self.rate_hz * np.arange(len(x))).reshape(own)
+        damped = fft.rfft(x * decay, M, axis=0)[: self.s.size]
         # Instants run from the record's first sample; the input before it stands at the end.
-        turn = np.exp(1j * self.s.imag * (self.history / self.rate_hz))
+        turn = np.exp(1j * self.s.imag * (self.history / self.rate_hz)).reshape(own)
         return np.asarray(damped * turn * (self.decay.size / M))
 
     def motion(self, H: Complex) -> Float:
-        """(M,) of H (M//2 + 1,) under the command."""
-        return np.asarray(fft.irfft(H * self.v, self.decay.size) / self.decay * self.alive)
+        """(M,) of H (M//2 + 1, m) under the commands."""
+        moved = np.sum(H * self.v, axis=1)
+        return np.asarray(fft.irfft(moved, self.decay.size) / self.decay * self.alive)
 
     def damped(self, force: Float) -> Complex:
         """(M//2 + 1,) damped spectrum of a force (M,) at the low rate."""
@@ -93,7 +97,7 @@ class Span:
 
 @dataclass(frozen=True)
 class Ports:
-    """One place: (M//2 + 1, ...) of each piece what drives a force there, per command; and the
+    """One place: (M//2 + 1, m) of each piece what drives a force there, per command; and the
     recorded lines per unit force, the loop's answer in them. y1 : (n,) of all lines in the band,
     how much a unit force moves what drives it."""
 
@@ -109,10 +113,10 @@ class Reach:
     whole: Whole
     model: Model
     x: Float
-    actuator: int
     spans: list[Span] = field(default_factory=list)
     _ports: dict[tuple[Place, bool], Ports | None] = field(default_factory=dict)
     _motion: dict[tuple[Place, bool], list[Float]] = field(default_factory=dict)
+    _commands: dict[int, list[Float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         records = self.whole.records
@@ -121,29 +125,45 @@ class Reach:
             for piece, band in zip(records.pieces, records.bands, strict=True)
         ]
 
-    @property
-    def largest(self) -> float:
-        """Amplitude of the command."""
-        pieces = self.whole.records.pieces
-        return max(float(np.max(np.abs(c.v))) for p in pieces for c in p.commands[:1])
+    def largest(self, place: Place) -> float:
+        """Amplitude of the command that a force is on."""
+        on, pieces = self.column(place), self.whole.records.pieces
+        each = [by_input(c.v)[on] for p in pieces for c in p.commands[:1]]
+        return max(float(np.max(np.abs(v))) for v in each)
+
+    def column(self, place: Place) -> int:
+        """Which input a force is on; the first where it has one of its own."""
+        if place.own_input:
+            return 0
+        return self.whole.wired.column(place.command(self.model.built))
 
     def scale(self, key: Key | None) -> float:
         """The rig's parameter that multiplies a force, 1 of none."""
         return 1.0 if key is None else {**self.model.nominal, **self.model.values(self.x)}[key]
 
-    @cached_property
-    def commands(self) -> list[Float]:
-        """(M,) of each piece the command as it is held, after the dead time."""
-        rig = self.whole.rig
-        delay = rig.actuator[self.actuator].delay + float(dead_time(rig)[self.actuator])
-        return [s.motion(hold_at(s.s, rig.rate_hz, delay) * self._given(s.s)) for s in self.spans]
+    def commands(self, place: Place) -> list[Float]:
+        """(M,) of each piece the command that a force is on, as it is held, after the dead time;
+        the first one where it is on none."""
+        on = self.column(place)
+        if on not in self._commands:
+            late = dead_time(self.whole.rig)
+            each = (self._held(s.s, late) for s in self.spans)
+            only = np.arange(self.whole.acting.size) == on
+            self._commands[on] = [
+                s.motion(only * held) for s, held in zip(self.spans, each, strict=True)
+            ]
+        return self._commands[on]
 
-    def _given(self, s: Complex) -> Complex:
-        """(n,) what effects on the input do to the command."""
-        out = np.ones(s.size, np.complex128)
+    def _held(self, s: Complex, late: Float | float = 0.0) -> Complex:
+        """(n, m) the hold of each command, with what effects on the input do to it."""
+        rig, names = self.whole.rig, [x.command for x in self.whole.wired.inputs]
+        more = np.broadcast_to(late, len(rig.actuator))
+        each = [hold_at(s, rig.rate_hz, rig.actuator[a].delay + more[a]) for a in self.whole.acting]
+        out = np.stack(each, axis=1)
         for effect, theta in zip(self.model.effects, self.model.parts(self.x), strict=True):
-            if effect.factor is not None and effect.factor.kind == "input":
-                out *= effect.factor.value(s, theta)[0]
+            factor = effect.factor
+            if factor is not None and factor.kind == "input" and factor.channel in names:
+                out[:, names.index(factor.channel)] *= factor.value(s, theta)[0]
         return out
 
     def motion(self, place: Place, *, of_speed: bool) -> list[Float]:
@@ -170,25 +190,26 @@ class Reach:
         told = place.kind == "command"
         chain = self.model.chain_of(rig if told else place.widened(rig))
         chain = chain.with_values(self.model.values(self.x))
-        n, on, wired = len(rig.sensor), self.whole.sensor, self.whole.wired
+        n, on, acting, loop = len(rig.sensor), self.whole.sensor, self.whole.acting, self.whole.loop
+        at = place.acts_on(rig)
         reading, sensors, y1 = [], [], []
         for span, band in zip(self.spans, records.bands, strict=True):
             s = span.s
             G = chain.evaluate(s)
-            hold = hold_at(s, rig.rate_hz, rig.actuator[self.actuator].delay) * self._given(s)
+            hold = self._held(s)
             seen = sensors_at(rig.sensor, s)[:, on]
-            H = G[:, on, self.actuator] * seen * hold[:, None]
-            own = len(rig.actuator) if place.own_input else self.actuator
-            by_force = H if told else G[:, on, own] * seen
-            for kp, c, _ in wired.loops:
-                by_force = by_force - H * (kp * by_force[:, c] / (1 + kp * H[:, c]))[:, None]
+            H = G[:, on[:, None], acting] * seen[:, :, None] * hold[:, None]
+            by_force = H[:, :, self.column(place)] if told else G[:, on, at] * seen
+            if loop is not None:
+                closed = loop.closed(H.reshape(len(H), -1))
+                by_force = loop.around(closed, by_force[:, :, None])[:, :, 0]
             sensors.append(by_force)
             if told:
                 continue
             rate = s if of_speed else np.ones_like(s)
-            reading.append(rate * G[:, n, self.actuator] * hold)
+            reading.append(rate[:, None] * G[:, n, acting] * hold)
             inside = (s.imag >= 2 * np.pi * band[0]) & (s.imag <= 2 * np.pi * band[1])
-            y1.append(np.abs(rate * G[:, n, -1])[inside])
+            y1.append(np.abs(rate * G[:, n, at])[inside])
         if told:
             return Ports([], sensors, np.zeros(0))
         moved = np.concatenate(y1)

@@ -27,6 +27,7 @@ from samii_rig.diagnose.forces.laws import (
 from samii_rig.diagnose.forces.problem import ForceProblem
 from samii_rig.diagnose.forces.reach import Reach, Span
 from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.likelihood.reduce import by_input
 from samii_rig.types import Complex, Float
 
 # Widths of a gap over the largest motion at which it is tried: what it does to the rest has its
@@ -158,19 +159,25 @@ def weakly(effects: Sequence[Effect], reach: Reach, looks: Looks) -> list[Hope]:
     return sorted(best.values(), key=lambda h: -float(np.max(h.may)))
 
 
+def _summed(each: Sequence[Float]) -> Float:
+    return np.asarray(np.sum(each, axis=0))
+
+
 def _forces(force: Force, p: Float, reach: Reach) -> tuple[list[Complex], float]:
     """Of each piece the damped spectrum of a force under the motion that it does not change, and
     the share by which it would change that, at the worst lines."""
     if force.law.told is not None:
-        told = force.law.told
+        told, on = force.law.told, reach.column(force.place)
         each = [
-            s.spectrum(np.asarray(sum(c.part * told(c.v, p)[0] for c in piece.commands)) / s.times)
+            s.spectrum(_summed([c.part * told(by_input(c.v)[on], p)[0] for c in piece.commands]))
+            / s.times
             for s, piece in zip(reach.spans, reach.whole.records.pieces, strict=True)
         ]
         return each, 0.0
     assert force.law.weak is not None
     motion = reach.motion(force.place, of_speed=force.law.of_speed)
-    e = [force.law.weak(y, v, p) for y, v in zip(motion, reach.commands, strict=True)]
+    commands = reach.commands(force.place)
+    e = [force.law.weak(y, v, p) for y, v in zip(motion, commands, strict=True)]
     ports = reach.ports(force.place, of_speed=force.law.of_speed)
     assert ports is not None
     moved = max(float(np.sqrt(np.mean(x**2))) for x in e) * math.sqrt(np.mean(ports.y1**2))

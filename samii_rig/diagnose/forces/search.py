@@ -59,10 +59,10 @@ class ForceSearch(RecordSearch):
     def __init__(self, linear: RecordSearch) -> None:
         assert isinstance(linear.whole, Whole)  # of one state
         self.levels = whole = linear.whole.by_level().with_harmonics()
-        self._ways = Ways()
+        self._ways = Ways(acting=tuple(whole.acting.tolist()))
         self.linear = linear
         moved = _of_data(linear).fitted
-        self.reach = Reach(whole, moved.model, moved.x, int(linear.grid.actuator[0]))
+        self.reach = Reach(whole, moved.model, moved.x)
         self.forces = tuple(forces(whole.rig, self.reach))
         super().__init__(whole, linear.by_line)
         self.use((*linear.table, *self.forces))
@@ -261,7 +261,7 @@ class ForceSearch(RecordSearch):
             if not times > 0:
                 break
             times = min(max(times, TIMES[0]), TIMES[1]) if best else times
-            law, largest = effect.quasi.law, self.reach.largest
+            law, largest = effect.quasi.law, self.reach.largest(effect.quasi.place)
             there = np.clip(scaled(law, strengths, times, largest), low, high)
             try:
                 g = self._force_problem.change(model, np.append(known, np.log(there)))

@@ -63,14 +63,15 @@ def forces(rig: Rig, reach: Reach) -> Iterator[Effect]:
             ]
             for across in ((e.name,), *near):
                 yield from _between(reach, Place("joint", across), e)
-    actuator = rig.actuator[reach.actuator]
-    source = next(
-        (e for e in rig.element if isinstance(e, SOURCES) and e.input == actuator.name), None
-    )
-    if source is None:
-        return
-    turns = isinstance(source, ANGLE_SOURCES)
-    yield from _drive(reach, source.name, actuator, turns=turns)
+    for index in reach.whole.acting:
+        actuator = rig.actuator[index]
+        source = next(
+            (e for e in rig.element if isinstance(e, SOURCES) and e.input == actuator.name), None
+        )
+        if source is None:
+            continue
+        turns = isinstance(source, ANGLE_SOURCES)
+        yield from _drive(reach, source.name, actuator, turns=turns)
 
 
 def _between(reach: Reach, place: Place, spring: Spring) -> Iterator[Effect]:
@@ -103,13 +104,13 @@ def _between(reach: Reach, place: Place, spring: Spring) -> Iterator[Effect]:
 
 def _drive(reach: Reach, source: str, actuator: ActuatorSpec, *, turns: bool) -> Iterator[Effect]:
     """Forces on the command. turns : whether the source gives an angle."""
-    alias, unit = actuator.name, actuator.unit
-    largest, across = reach.largest, (source,)
+    alias, unit, across = actuator.name, actuator.unit, (source,)
+    drive, flow = Place("drive", across), Place("flow", across)
+    largest = reach.largest(drive)
     # What is narrower than a step of the command's converter is that converter's rounding.
     low, high = max(WIDTHS[0] * largest, actuator.resolution), WIDTHS[1] * largest
     if low >= high:
         return
-    drive, flow = Place("drive", across), Place("flow", across)
     if turns and reach.ports(drive, of_speed=True) is not None:
         yield effect(FRICTION, drive, source, alias, (_log("T_c", unit, low, high),))
     top = _largest(reach, flow, of_speed=False) if turns else 0.0

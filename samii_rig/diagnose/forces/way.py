@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from samii_rig.diagnose.fit.rigfile import valued
-from samii_rig.diagnose.forces.march import march, read
+from samii_rig.diagnose.forces.march import march, moved, read
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.errors import InputError
 from samii_rig.model.realise import Realisation, realise
@@ -33,25 +34,34 @@ class Sensed:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """A rig's partial fractions from command and force to what drives the force, by exact steps.
+    """A rig's partial fractions from commands and force to what drives the force, by exact steps.
 
-    The rig has one actuator. grow, by_v, by_e : (2, n_pole) what a step makes of a state, and of
-    command and force held over it, real and imaginary parts. direct, g : as `march` has them.
-    late : steps of dead time. structure : the chain's own poles.
+    grow, by_e : (2, n_pole) what a step makes of a state and of a force held over it, real and
+    imaginary parts; by_v (m, 2, n_pole) of each command. direct (m,), g : as `march` has them.
+    late : (m,) steps of dead time. own : the command in whose drive the force acts, 0 for none.
+    structure : the chain's own poles.
     """
 
     grow: Float
     by_v: Float
     by_e: Float
-    direct: float
+    direct: Float
     g: float
-    late: int
+    late: Int
+    own: int
     structure: Complex
     sensed: Sensed
 
     @classmethod
-    def of(cls, model: ForceModel, x: Float, near: Complex | None = None) -> Way:
-        """Of a force that the motion drives. near : as `realise` has it.
+    def of(
+        cls,
+        model: ForceModel,
+        x: Float,
+        near: Complex | None = None,
+        acting: Sequence[int] = (0,),
+    ) -> Way:
+        """Of a force that the motion drives. near : as `realise` has it. acting : the actuators
+        whose commands drive the rig.
 
         Raises InputError as that does.
         """
@@ -61,18 +71,21 @@ class Way:
         h = 1 / (rig.rate_hz * INNER)
         grow, push = _steps(made.poles, h)
         pairs = np.where(made.poles.imag > 0, 2.0, 1.0)
-        by_e = made.residues[:, :n, -1].T * (pairs * push)
+        at = model.force.place.acts_on(rig)
+        by_e = made.residues[:, :n, at].T * (pairs * push)
         late = np.array([round(s.delay / h) for s in rig.sensor], np.int64)
         parts = np.ascontiguousarray(_parts(by_e))
-        sensed = Sensed(_parts(grow), parts, np.ascontiguousarray(made.direct[:n, -1]), late)
-        return cls._made(model, made, sensed)
+        sensed = Sensed(_parts(grow), parts, np.ascontiguousarray(made.direct[:n, at]), late)
+        return cls._made(model, made, sensed, list(acting))
 
     @classmethod
-    def _made(cls, model: ForceModel, made: Realisation, sensed: Sensed) -> Way:
+    def _made(cls, model: ForceModel, made: Realisation, sensed: Sensed, acting: list[int]) -> Way:
         """From partial fractions whose last sensor is what drives the force."""
         rig = model.built
         h = 1 / (rig.rate_hz * INNER)
-        late = round((rig.actuator[0].delay + float(made.late[0])) / h)
+        late = np.array([round((rig.actuator[a].delay + made.late[a]) / h) for a in acting])
+        place = model.force.place
+        at = place.acts_on(rig)
         on = np.any(made.residues[:, -1] != 0, axis=1)  # the others are of sensors' filters
         poles = made.poles[on]
         grow, push = _steps(poles, h)
@@ -82,15 +95,16 @@ class Way:
             D = R.sum(axis=0).real
             R = R * poles[:, None]
         both = push[:, None] * R
-        g = float(D[-1] + both[:, -1].real.sum())
+        g = float(D[at] + both[:, at].real.sum())
         return cls(
-            _parts(grow), _parts(both[:, 0]), _parts(both[:, -1]), float(D[0]), g, late,
-            made.structure.poles, sensed,
+            _parts(grow), np.stack([_parts(both[:, a]) for a in acting]), _parts(both[:, at]),
+            D[acting], g, late, 0 if place.own_input else acting.index(at), made.structure.poles,
+            sensed,
         )  # fmt: skip
 
     def force(self, model: ForceModel, v: Float, p: Float, seeds: Float) -> Float:
-        """(1 + m, n INNER) a force of numbers p under a command v (n,) that begins when the rig is
-        at rest, and its slopes along `seeds` (m, 2).
+        """(1 + k, n INNER) a force of numbers p under commands v (n,) or (n, m) that begin when the
+        rig is at rest, and its slopes along `seeds` (k, 2).
 
         Raises InputError where it is no number: the numbers are of no stable rig.
         """
@@ -99,16 +113,22 @@ class Way:
             raise InputError(
                 model.rig.name, "force", model.force.law.tag, "a law that a motion drives"
             )
-        v = np.ascontiguousarray(v, np.float64)
+        each = np.ascontiguousarray(v.reshape(len(v), -1).T, np.float64)
+        others = np.zeros(len(v) * INNER if len(each) > 1 else 0)
+        for j, command in enumerate(each):
+            if j != self.own and command.any():
+                by_v, late = self.by_v[j], int(self.late[j])
+                others += moved(command, self.grow, by_v, float(self.direct[j]), late, INNER)
         e = march(
             step,
             self.grow,
-            self.by_v,
+            self.by_v[self.own],
             self.by_e,
-            self.direct,
+            float(self.direct[self.own]),
             self.g,
-            v,
-            self.late,
+            each[self.own],
+            others,
+            int(self.late[self.own]),
             INNER,
             p,
             seeds,
@@ -126,6 +146,7 @@ class Ways:
     kept: dict[str, Way] = field(default_factory=dict)
     marched: int = 0  # samples, under which forces were computed through any of them
     near: Complex | None = None  # poles, which are the same wherever a force acts
+    acting: tuple[int, ...] = (0,)  # actuators whose commands drive the rig
 
     def at(self, model: ForceModel, x: Float) -> Way:
         """Of a model near x, whatever the strength.
@@ -135,7 +156,7 @@ class Ways:
         speed = str(model.force.law.of_speed)
         key = " ".join((model.force.place.name, speed, *_beside(model)))
         if key not in self.kept:
-            self.kept[key] = Way.of(model, x, self.near)
+            self.kept[key] = Way.of(model, x, self.near, self.acting)
             self.near = self.kept[key].structure
         return self.kept[key]
 

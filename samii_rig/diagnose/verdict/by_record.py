@@ -23,10 +23,6 @@ SPENT = (
     "not every force that may act was computed to the end, as the records are long; fewer of them "
     "or a narrower band would let it"
 )
-SEVERAL = (
-    "friction, play, hardening and the like were not looked for, as the recordings have {} inputs "
-    "({}); recordings of one of them alone would show these"
-)
 # Of what is left, that a stiffness which is not constant must explain: what a linear model lacks
 # is another stiffness to every excitation.
 NEARLY_ALL = 0.8
@@ -73,7 +69,6 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
             looked = replace(looked, said=(*looked.said, SPENT))
     if forces is not None:
         looked = _constant(forces, looked, (forced or search).problem.expected)
-    looked = replace(looked, said=(*looked.said, *_unasked(search)))
     given = Given.of(search, case.runs, case.clean.samples)
     return _agreeing(case, forced or search, first, bands, looked, [given])
 
@@ -91,7 +86,6 @@ def by_samples(
     for those of one state, for each; left : as of `states_apart`."""
     search.begin("what cannot be told apart")
     looked = _consistent(search, _looked(search))
-    looked = replace(looked, said=(*looked.said, *_unasked(search)))
     return _agreeing(case, search, first, bands, looked, given, left)
 
 
@@ -200,9 +194,7 @@ def _of_lengths(
 
 def forces_on(search: RecordSearch) -> ForceSearch | None:
     """The search among forces; None where the rig has no partial fractions in which they could be
-    computed, or where it has several inputs."""
-    if len(search.whole.wired.inputs) > 1:
-        return None
+    computed."""
     try:
         return compete_on_records(search)
     except SamiiRigError:
@@ -212,12 +204,6 @@ def forces_on(search: RecordSearch) -> ForceSearch | None:
 def _winning(forces: ForceSearch | None) -> ForceSearch | None:
     """The same where a force explains the records best."""
     return forces if forces is not None and forces.won else None
-
-
-def _unasked(search: RecordSearch) -> tuple[str, ...]:
-    """In words what was not looked for."""
-    names = [x.command for x in search.whole.wired.inputs]
-    return (SEVERAL.format(len(names), ", ".join(names)),) if len(names) > 1 else ()
 
 
 def _constant(forces: ForceSearch, looked: _Looked, expected: float) -> _Looked:
