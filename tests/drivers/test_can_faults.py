@@ -246,7 +246,7 @@ def lossy(wire: CanWire, rig: Rig, device: OpenRig) -> None:
         (
             "ft",
             {"driver": "serial_node"},
-            "device.settings.port: is missing; see docs/reference/serial",
+            "device.settings.ft.port: is missing; see docs/reference/serial",
         ),
         ("ft", {"driver": ""}, "ft.driver is ''; expected a device"),
         ("main", {"sensors": ["a_0"]}, r"main.sensors is \('a_0',\); expected left out"),
