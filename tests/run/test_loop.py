@@ -450,6 +450,7 @@ def raising_always(error):
 # Real time
 
 
+@pytest.mark.real_time
 def test_on_real_time_a_slow_recorder_does_not_slow_the_output():
     class Slow(Memory):
         def write(self, block):
@@ -486,6 +487,7 @@ def test_what_the_recorders_thread_raised_comes_out_of_every_later_call():
         queued.close()
 
 
+@pytest.mark.real_time
 def test_a_recorder_that_lost_samples_makes_a_stopped_run_a_failed_one():
     stop = run(
         plan(duration=0.4),

@@ -75,6 +75,7 @@ def test_a_latch_that_cannot_be_read_is_a_fault(state, text):
     Latch("SAMII").refuse()
 
 
+@pytest.mark.real_time
 def test_a_latch_that_cannot_be_written_is_said(state):
     state.write_text("a file where the folder should be")
     with pytest.raises(GateError, match="cannot be read"):
@@ -115,6 +116,7 @@ with Latch("SAMII").held(device):
 """
 
 
+@pytest.mark.real_time
 def test_a_second_program_is_told_which_one_drives_the_rig():
     here = Path(__file__).resolve().parents[1] / "kits"
     first = subprocess.Popen(
@@ -172,6 +174,7 @@ def test_a_run_that_trips_latches_and_the_next_one_opens_nothing(tmp_path, monke
     assert not (tmp_path / "b.mcap").exists()
 
 
+@pytest.mark.real_time
 def test_how_a_fault_was_cleared_is_in_the_next_recording(tmp_path, monkeypatch):
     Latch(RIG.name, RIG.device.driver).set("smoke")
     Latch(RIG.name, RIG.device.driver).clear("Ada", "aired the room")
@@ -190,6 +193,7 @@ def test_a_simulated_rig_trips_without_a_latch(tmp_path, monkeypatch):
     assert Latch(RIG.name, RIG.device.driver).fault is None
 
 
+@pytest.mark.real_time
 def test_a_device_that_tripped_while_nobody_was_there_is_a_fault(tmp_path, monkeypatch):
     device = RealTime()
     opened = device.open()
