@@ -15,9 +15,9 @@ Kind = Literal["line", "dashed", "points", "broad"]
 Corner = Literal["upper left", "upper right", "lower left", "lower right", "lower center"]
 
 
-# What a number beside a published one shows. Computed: from what the papers print alone.
-# Calibrated: values that they do not print were chosen or solved for so that it comes out. Found
-# again: a method finds in the simulated rig what was put there.
+# What a number beside a published one shows. Computed: it follows from what the papers print, or
+# holds whatever they leave out. Calibrated: values that they do not print were chosen or solved for
+# so that it comes out. Found again: a method finds in the simulated rig what was put there.
 Agreement = Literal["", "computed", "calibrated", "found again"]
 
 PLAIN = (-4, 6)  # powers of ten between which a number is written without one

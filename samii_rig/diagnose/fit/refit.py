@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -61,6 +62,13 @@ class Problem:
     def expected(self) -> float:
         """Mean of chi-square at the truth."""
         return float(np.sum(self.data.expected))
+
+    @cached_property
+    def log_weight(self) -> Float:
+        """(n, q) of the logarithms of the responses: the same for all that are fitted to them."""
+        precision = np.diagonal(self.data.W, axis1=1, axis2=2).real * np.abs(self.data.H) ** 2
+        # An entry that was not measured has none, and no weight.
+        return np.asarray(np.sqrt(precision / (LOG_FLOOR**2 * precision + 2)))
 
     def toward(self, h: Complex) -> Problem:
         """The same had `h` (n, q) been measured without noise."""
@@ -326,10 +334,10 @@ def move(model: Model, x: Float, by: Normal, damping: float) -> Float | None:
 def _logarithm(model: Model, problem: Problem, first: _Point) -> _Point:
     """A few steps on log(model/measurement), line by line; kept only if chi-square fell too."""
     lines = problem.lines
-    weight, same, best = _of_logarithms(lines), lines is problem, first
+    same, best = lines is problem, first
 
     def left(h: Complex) -> Float:
-        r = _left_of_logarithms(lines, weight, h)
+        r = _left_of_logarithms(lines, h)
         return np.concatenate([r.real.ravel(), r.imag.ravel()])
 
     def point(x: Float, h: Complex, dh: Complex | None) -> _Point:
@@ -338,7 +346,7 @@ def _logarithm(model: Model, problem: Problem, first: _Point) -> _Point:
 
     def normal(now: _Point) -> _Normal:
         dh = model.gradient(now.x, lines.at)[1] if now.dh is None else now.dh
-        slope = (weight / now.h)[:, :, None] * dh
+        slope = (lines.log_weight / now.h)[:, :, None] * dh
         J = np.concatenate([slope.real.reshape(-1, model.n), slope.imag.reshape(-1, model.n)])
         return _Normal.of(model, now.x, J, left(now.h))
 
@@ -376,18 +384,11 @@ def far_off(model: Model, problem: Problem, x: Float) -> float:
         h = model.response(x, lines.at)
     except SamiiRigError:
         return math.inf
-    off = float(np.sum(np.abs(_left_of_logarithms(lines, _of_logarithms(lines), h)) ** 2))
+    off = float(np.sum(np.abs(_left_of_logarithms(lines, h)) ** 2))
     return off if math.isfinite(off) else math.inf
 
 
-def _of_logarithms(lines: Problem) -> Float:
-    """(n, q) weights of the logarithms of the responses."""
-    precision = np.diagonal(lines.data.W, axis1=1, axis2=2).real * np.abs(lines.data.H) ** 2
-    # An entry that was not measured has none, and no weight.
-    return np.asarray(np.sqrt(precision / (LOG_FLOOR**2 * precision + 2)))
-
-
-def _left_of_logarithms(lines: Problem, weight: Float, h: Complex) -> Complex:
-    """(n, q) what a response leaves of them."""
+def _left_of_logarithms(lines: Problem, h: Complex) -> Complex:
+    """(n, q) what a response leaves of the logarithms."""
     d = lines.data.H
-    return np.asarray(weight * np.log(h / np.where(d == 0, h, d)))
+    return np.asarray(lines.log_weight * np.log(h / np.where(d == 0, h, d)))
