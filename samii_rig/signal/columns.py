@@ -7,8 +7,9 @@ rows behind what was sent: each row is read at another time than the one before.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,12 @@ from samii_rig.rig.load import tables
 from samii_rig.types import Finding, Float, Int, Recording
 
 FARTHEST = 5  # samples; a logger that is later has another fault
-# Of what is fed back, what the law leaves at most where it holds: a command that is measured keeps
-# a few per cent. One that is rounded keeps a quarter of its step in the median. A shift is seen
-# where none leaves a fifth more.
-LEFT, ROUNDED, SEEN = 0.2, 0.3, 1.2
+LEFT = 0.2  # part of what is fed back, or of a command's size, by which a law that holds is off
+# Of a law that holds, log likelihood by which a shift is seen: 1e-5 by chance among eleven.
+SEEN = 14.0
+# Part of a command's step that rounding leaves, and medians from which a residual is a spike.
+ROUNDED, SPIKE = 0.3, 8.0
+TAPS = 1  # rows to each side of which what a voltmeter shows of a command is made
 ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same
 LOOKED_AT = 1 << 14  # samples about the largest reference: thousands tell a shift, millions cost
 QUIETER = 0.5  # of a command's fourth differences, those without what a loop would have added
@@ -76,24 +79,57 @@ def shift_of(recording: Recording) -> int:
 
     theta, v = column(sensor), column(command[0])
     sent = asked(recording, command[0], kp, around)
-    inside = slice(FARTHEST, theta.size - FARTHEST)
     shifts = range(-FARTHEST, FARTHEST + 1)
-
-    def left(sent: Float, theta: Float) -> list[float]:
-        off = (np.abs(v - sent + kp * np.roll(theta, -m)) for m in shifts)
-        return [float(np.nanmedian(x[inside])) for x in off]
-
-    # What a voltmeter shows is halfway between two commands.
-    off = min(left(sent, theta), left(_halfway(sent), _halfway(theta)), key=min)
-    if not np.isfinite(off).all():
+    laws = [_Law.of(v, sent, -kp * np.roll(theta, -m)) for m in shifts]
+    if not all(law.known for law in laws):
         return 0
-    best, fed_back = int(np.argmin(off)), float(np.nanmedian(np.abs(v - sent)))
-    holds = off[best] < max(LEFT * fed_back, ROUNDED * names[command[0]].resolution)
-    return shifts[best] if holds and off[FARTHEST] > SEEN * off[best] else 0
+    best = int(np.argmin([law.left for law in laws]))
+    rounded = (ROUNDED * names[command[0]].resolution) ** 2
+    least = max(laws[best].left, rounded)
+    gain = 0.5 * theta.size * np.log(max(laws[FARTHEST].left, rounded) / least)
+    return shifts[best] if laws[best].holds and gain > SEEN else 0
 
 
-def _halfway(x: Float) -> Float:
-    return np.asarray((x + np.append(x[0], x[:-1])) / 2)
+@dataclass(frozen=True)
+class _Law:
+    """v = F (sent + fed back), F a short filter: a voltmeter shows what is between two commands.
+
+    left : variance of the rest, without spikes. fed, gain : what the rest of v without `fed back` is
+    of it, and the filter's gain; both 1 where the law holds.
+    """
+
+    left: float
+    fed: float
+    gain: float
+
+    @classmethod
+    def of(cls, v: Float, sent: Float, back: Float) -> _Law:
+        inside = slice(FARTHEST + TAPS, v.size - FARTHEST - TAPS)
+
+        def around(x: Float) -> Float:
+            return np.stack([np.roll(x, j)[inside] for j in range(-TAPS, TAPS + 1)], axis=1)
+
+        asked, fed, v = around(sent), around(back), v[inside]
+        known = np.isfinite(v) & np.isfinite(asked).all(axis=1) & np.isfinite(fed).all(axis=1)
+        asked, fed, v = (x[known] - x[known].mean(axis=0) for x in (asked, fed, v))
+        if len(v) <= 2 * FARTHEST:
+            return cls(np.nan, np.nan, np.nan)
+        kept = np.ones(len(v), bool)
+        for _ in range(2):  # again without spikes
+            taps = np.linalg.lstsq((asked + fed)[kept], v[kept], rcond=None)[0]
+            rest = v - (asked + fed) @ taps
+            kept = np.abs(rest) <= SPIKE * np.median(np.abs(rest))
+        b = (fed @ taps)[kept]
+        own = float((v - asked @ taps)[kept] @ b) / max(float(b @ b), np.finfo(float).tiny)
+        return cls(float(np.mean(rest[kept] ** 2)), own, float(taps.sum()))
+
+    @property
+    def known(self) -> bool:
+        return math.isfinite(self.left)
+
+    @property
+    def holds(self) -> bool:
+        return abs(self.fed - 1) < LEFT and abs(self.gain - 1) < LEFT
 
 
 def asked(recording: Recording, command: str, kp: float, rows: slice = slice(None)) -> Float:
@@ -148,10 +184,10 @@ def aligned(recordings: Sequence[Recording]) -> list[tuple[Recording, Finding | 
 
 def _alike(one: Recording, other: Recording) -> bool:
     """Whether two recordings are of one input, but for its size."""
-    if one.names("command") != other.names("command") or not one.names("command"):
+    names = _driving(one)
+    if names != _driving(other) or not names:
         return False
     a, b = _overlap(one, other)
-    names = list(one.names("command"))
     v = one.values[a][:, [one.column(n) for n in names]]
     w = other.values[b][:, [other.column(n) for n in names]]
     if len(v) <= 2 * FARTHEST or not np.all(np.isfinite(v) & np.isfinite(w)):
@@ -160,6 +196,16 @@ def _alike(one: Recording, other: Recording) -> bool:
         size = np.max(np.abs(np.concatenate([v, w])), axis=0)
         v, w = (x / np.where(size > 0, size, 1.0) for x in (v, w))
     return proportional(v.ravel(), w.ravel())
+
+
+def _driving(recording: Recording) -> list[str]:
+    """Columns that drive a run: the references that move, in which no loop is; without, commands."""
+    references = [n for n in recording.names("reference") if np.ptp(_column(recording, n)) > 0]
+    return references or list(recording.names("command"))
+
+
+def _column(recording: Recording, name: str) -> Float:
+    return np.asarray(recording.values[:, recording.column(name)], np.float64)
 
 
 def _overlap(one: Recording, other: Recording) -> tuple[slice, slice]:
@@ -200,8 +246,8 @@ def _against(first: Recording, recording: Recording) -> int:
     """Samples by which the sensors of a recording stand behind those of another of the same input;
     0 where no shift makes them clearly more alike."""
     a, b = _overlap(first, recording)
-    command = first.names("command")[0]
-    v, w = first.values[a, first.column(command)], recording.values[b, recording.column(command)]
+    driving = _driving(first)[0]
+    v, w = _column(first, driving)[a], _column(recording, driving)[b]
     size = float(v @ w) / float(v @ v)
     inside = slice(FARTHEST, v.size - FARTHEST)
     names = [n for n in first.names("sensor") if n in recording.names("sensor")]

@@ -93,7 +93,7 @@ def test_recordings_of_one_input_are_set_beside_each_other_where_no_law_is_known
 def test_recordings_of_other_inputs_are_left_as_they_are():
     other = late(loop(rig_toml=""), 2)
     values = other.values.copy()
-    values[:, 1] = np.random.default_rng(5).standard_normal(len(values))
+    values[:, :2] = np.random.default_rng(5).standard_normal((len(values), 2))
     other = replace(other, values=values)
     assert [said for _, said in aligned([loop(rig_toml=""), other])] == [None, None]
 
@@ -133,6 +133,28 @@ def test_a_shift_shows_beside_an_encoder_that_is_as_coarse_as_a_sample_of_motion
     values[:, 1] = (v + np.append(v[0], v[:-1])) / 2
     for m in (-1, 0, 2):
         assert shift_of(late(replace(run, values=values), m)) == m
+
+
+@pytest.mark.parametrize("m", [-2, 0, 1])
+def test_a_shift_shows_where_a_voltmeter_is_noisier_than_what_is_fed_back(m: int):
+    """Of every fourth sample of a loop that ran faster than the record."""
+    rng = np.random.default_rng(4)
+    t = np.arange(4 * N) / (4 * RATE)
+    u = np.sin(2 * np.pi * (0.5 + 1.0 * t) * t)
+    theta = 5e-4 * np.sin(2 * np.pi * (0.5 + 1.0 * t) * t - 1.0)
+    v = u - KP * theta
+    seen = (v + np.append(v[0], v[:-1])) / 2 + 2e-3 * rng.standard_normal(4 * N)
+    values = np.column_stack([u, seen, theta, np.gradient(theta)])[::4]
+    assert shift_of(late(replace(loop(0.0), values=values), m)) == m
+
+
+def test_recordings_of_one_reference_are_set_beside_each_other_though_their_loops_answer():
+    """What a loop feeds back of disturbances makes commands of one reference differ."""
+    first, other = loop(rig_toml=""), loop(seed=2, rig_toml="")
+    values = other.values.copy()
+    values[:, 1] += 0.05 * np.random.default_rng(6).standard_normal(N)
+    (_, _), (_, finding) = aligned([first, late(replace(other, values=values), 2)])
+    assert finding is not None and "2 samples later" in finding.message
 
 
 def test_a_law_that_does_not_hold_moves_nothing():
