@@ -94,8 +94,8 @@ def shift_of(recording: Recording) -> int:
 class _Law:
     """v = F (sent + fed back), F a short filter: a voltmeter shows what is between two commands.
 
-    left : variance of the rest, without spikes. fed, gain : what the rest of v without `fed back` is
-    of it, and the filter's gain; both 1 where the law holds.
+    left : variance of the rest, without spikes. fed, gain : what v holds of `fed back`, and the
+    filter's gain; both 1 where the law holds.
     """
 
     left: float
@@ -199,7 +199,7 @@ def _alike(one: Recording, other: Recording) -> bool:
 
 
 def _driving(recording: Recording) -> list[str]:
-    """Columns that drive a run: the references that move, in which no loop is; without, commands."""
+    """Columns that drive a run: references that move, in which no loop is, or the commands."""
     references = [n for n in recording.names("reference") if np.ptp(_column(recording, n)) > 0]
     return references or list(recording.names("command"))
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from samii_rig.signal.columns import FARTHEST, aligned, is_open, shift_of
 from samii_rig.signal.estimate import estimate
@@ -141,7 +142,8 @@ def test_a_shift_shows_where_a_voltmeter_is_noisier_than_what_is_fed_back(m: int
     rng = np.random.default_rng(4)
     t = np.arange(4 * N) / (4 * RATE)
     u = np.sin(2 * np.pi * (0.5 + 1.0 * t) * t)
-    theta = 5e-4 * np.sin(2 * np.pi * (0.5 + 1.0 * t) * t - 1.0)
+    turn, grow = 2 * np.pi * 5.0 / (4 * RATE), 1 - 0.05 * 2 * np.pi * 5.0 / (4 * RATE)
+    theta = 2e-7 * lfilter([1.0], [1.0, -2 * grow * np.cos(turn), grow**2], u)  # a mode of 5 Hz
     v = u - KP * theta
     seen = (v + np.append(v[0], v[:-1])) / 2 + 2e-3 * rng.standard_normal(4 * N)
     values = np.column_stack([u, seen, theta, np.gradient(theta)])[::4]
@@ -154,7 +156,8 @@ def test_recordings_of_one_reference_are_set_beside_each_other_though_their_loop
     values = other.values.copy()
     values[:, 1] += 0.05 * np.random.default_rng(6).standard_normal(N)
     (_, _), (_, finding) = aligned([first, late(replace(other, values=values), 2)])
-    assert finding is not None and "2 samples later" in finding.message
+    assert finding is not None
+    assert "2 samples later" in finding.message
 
 
 def test_a_law_that_does_not_hold_moves_nothing():
