@@ -12,9 +12,10 @@ from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.likelihood.contour import EXACT, Contour
 from samii_rig.model.realise import realise
 from samii_rig.model.sampled import sampled_response
+from samii_rig.model.tmm import Chain
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
-from samii_rig.types import Float
+from samii_rig.types import Complex, Float
 
 N = 3000
 
@@ -85,3 +86,28 @@ def test_what_is_late_is_late_in_every_alias(physics: str, unknown: float, late:
     assert np.all(off < 1e-4)
     near_alone = model.response(x, replace(at, far=None))
     assert np.max(np.abs(near_alone - theirs)[:, -1]) > 1e-3 * np.max(np.abs(theirs)[:, -1])
+
+
+def test_a_model_of_other_parameters_folds_back_what_is_its_own():
+    """At 250 samples/s modes of SAMII stand above half the rate: what they fold back is that of
+    each model, with its slopes, once a grid is told so."""
+    rig = load_rig("samii_joint_3")[0].model_copy(update={"rate_hz": 250.0})
+    f = np.linspace(0.5, 40.0, 60)
+    sensor, actuator = np.arange(len(rig.sensor)), np.zeros(len(rig.sensor), np.int64)
+    model = Model(rig)
+    x = model.prior * np.random.default_rng(1).standard_normal(model.n)
+    nominal = grid(rig, f, sensor, actuator, Chain(rig), 0.1)
+    live = grid(rig, f, sensor, actuator, Chain(rig), 0.1, live=True)
+    own = model.response(x, grid(rig, f, sensor, actuator, model.plain(x), 0.1))
+
+    def off(h: Complex) -> float:
+        return float(np.max(np.abs(h - own)) / np.max(np.abs(own)))
+
+    assert off(model.response(x, nominal)) > 1e-3
+    assert off(model.response(x, live)) < 1e-4
+    h, dh = model.gradient(x, live)
+    step = 1e-6
+    for j in range(model.n):
+        there = x + step * (np.arange(model.n) == j)
+        slope = (model.response(there, live) - h) / step
+        np.testing.assert_allclose(dh[:, :, j], slope, atol=1e-4 * np.max(np.abs(dh[:, :, j])))

@@ -97,6 +97,15 @@ class InPoses:
         """As of `Recorded`."""
         return tuple(one for whole in self.each for one in whole.left_out)
 
+    @property
+    def live(self) -> bool:
+        """As of `Recorded`."""
+        return self.each[0].live
+
+    def lively(self) -> InPoses:
+        """As of `Recorded`."""
+        return replace(self, each=tuple(w.lively() for w in self.each))
+
     def about(self, fitted: Fitted) -> Summed:
         """As of `Recorded`."""
         each = zip(self.each, _each(fitted), strict=True)

@@ -93,6 +93,7 @@ class Whole:
     left_out: tuple[tuple[str, str], ...] = ()
     apart: Records | None = None  # the same, every level by itself
     asked: bool = False  # whether somebody said which lines count
+    live: bool = False  # whether every model folds back what is its own from above the rate
 
     @classmethod
     def of(
@@ -192,7 +193,13 @@ class Whole:
             return self._aliases[key][1]
 
         chain = model.plain(fitted.x)
-        return grid(self.rig, frequency, sensor, actuator, chain, sigma, self.loop, aliases)
+        return grid(
+            self.rig, frequency, sensor, actuator, chain, sigma, self.loop, aliases, self.live
+        )
+
+    def lively(self) -> Whole:
+        """As of `Recorded`."""
+        return replace(self, live=True)
 
     @cached_property
     def _aliases(self) -> dict[tuple[int, bytes, bytes], tuple[Model, Aliases]]:
@@ -420,6 +427,15 @@ class Recorded(Protocol):
         """What a fit leaves, line by line."""
         ...
 
+    @property
+    def live(self) -> bool:
+        """Whether every model folds back what is its own from above the rate."""
+        ...
+
+    def lively(self) -> Recorded:
+        """The same, where it does."""
+        ...
+
 
 @dataclass(frozen=True)
 class RecordProblem(Problem):
@@ -573,9 +589,19 @@ class RecordSearch(Search):
         noise of so many times the power, and to what the fit leaves: where that is more than noise,
         no less can be told from it."""
         between, reference = self._between
-        d = fitted.model.response(fitted.x, self.problem.at) - self.reduced.reference
+        there = fitted.model.response(fitted.x, self.problem.at)
         middle = fitted.model.response(fitted.x, between) - reference
-        return self.reduced.bent(d, middle) < BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
+        most = BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
+        if self.reduced.bent(there - self.reduced.reference, middle) > most:
+            return False
+        # What folds back from above is that of the fit about which the likelihood was made, or of
+        # each model itself once that shows.
+        own = fitted.model.response(fitted.x, self.whole.nodes(self.reduced, fitted))
+        if float(np.linalg.norm(self.reduced.slopes((own - there)[:, :, None]))) < most:
+            return True
+        if not self.whole.live:
+            self.whole = self.whole.lively()
+        return False
 
     @property
     def reduced(self) -> Reduced:

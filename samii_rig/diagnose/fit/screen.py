@@ -125,7 +125,7 @@ class Screen:
         assert factor is not None
         model, at = self.base.model, self.problem.at
         on = model.entries(effect, at)
-        plain = self.base.model.response(self.base.x, replace(at, loop=None)) - at.aliases
+        plain = self.base.model.response(self.base.x, at.without_aliases())
         b = np.zeros_like(plain)
         rows = at.changed
         b[rows, on] = plain[rows, on]

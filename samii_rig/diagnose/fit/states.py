@@ -150,6 +150,15 @@ class Both:
         """As of `Recorded`."""
         return self.after.left_out + self.before.left_out
 
+    @property
+    def live(self) -> bool:
+        """As of `Recorded`."""
+        return self.after.live
+
+    def lively(self) -> Both:
+        """As of `Recorded`."""
+        return replace(self, after=self.after.lively(), before=self.before.lively())
+
     def about(self, fitted: Fitted) -> Summed:
         """As of `Recorded`."""
         before = self.before.about(_before(fitted))

@@ -38,6 +38,7 @@ class Stacked(Grid):
             sigma=np.concatenate([np.full(g.frequency.size, g.sigma) for g in each]),
             loop=first.loop,
             far=first.far,  # hardly differs: far above what a pose or a part moves
+            live=_joined([g.live for g in each]),
             sizes=tuple(g.frequency.size for g in each),
         )
 
@@ -48,10 +49,15 @@ class Stacked(Grid):
             Grid(
                 self.frequency[own], self.factor[own], self.aliases[own], self.folded[:, own],
                 self.rate_hz, self.sensor, self.actuator, sigma=sigma[own], loop=self.loop,
-                far=self.far,
+                far=self.far, live=None if self.live is None else self.live[:, own],
             )
             for own in runs(self.sizes)
         )  # fmt: skip
+
+
+def _joined(each: Sequence[Complex | None]) -> Complex | None:
+    known = [one for one in each if one is not None]
+    return np.concatenate(known, axis=1) if len(known) == len(each) else None
 
 
 def runs(sizes: Sequence[int]) -> Iterator[slice]:

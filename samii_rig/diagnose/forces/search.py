@@ -144,7 +144,26 @@ class ForceSearch(RecordSearch):
                 break
         self._either_way(self.ranked()[0])
         self.pair()
+        self._rivals()
         self.temper()
+
+    def _rivals(self) -> None:
+        """The force of the best explanation beside what does as well as its linear effects do: what
+        the linear search cannot tell apart, a force beside it does not either."""
+        best = self.ranked()[0]
+        force = [i for i, e in enumerate(best.effects) if e.quasi is not None]
+        beside = frozenset(e.key for e in best.effects if e.quasi is None)
+        own = self.linear.found.get(beside)
+        if not force or not beside or own is None:
+            return
+        strengths = [best.fitted.x[k] for i in force for k in best.fitted.model.own(i)]
+        ranked = self.linear.ranked()
+        near = [e for e in ranked if e.key != beside and e.weight > own.weight - NEAR]
+        for rival in self.each(near[:RIVALS], lambda e: named(e.effects)):
+            effects = (*rival.effects, *(best.effects[i] for i in force))
+            end = self.refitted(effects, rival, strengths) if self.model(effects) else None
+            if end is not None:
+                self.keep(effects, end)
 
     def _try(self, hopes: Sequence[Hope], base: Explanation, look: int) -> None:
         """Refit the forces that may be the best beside `base`, by the gains of that look."""

@@ -37,7 +37,7 @@ from samii_rig.rig.schema import (
 Spring = TorsionalSpring | TranslationalSpring | TorsionalGroundSpring | TranslationalGroundSpring
 
 STARTS = 14  # of a strength over its range
-RANGE = (1e-6, 30.0)  # of a strength over the one that doubles or halves the motion at its place
+RANGE = (1e-9, 30.0)  # of a strength over the one that doubles or halves the motion at its place
 SOFTEST = 1.0  # the same of a stiffness that falls: beyond, a spring would push
 WIDTHS = (1e-6, 2.0)  # of a gap or limit over the largest amplitude that meets it
 LEAST_LIMIT = 0.02  # of the largest command

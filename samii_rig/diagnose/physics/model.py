@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smoo
 # Aliases that are computed at every frequency, as a mode in one may be sharp, and that a factor on
 # a channel changes.
 NEAR = (-1, 1, -2, 2)
+LIVE = 2  # of them, those of each model itself where that shows: modes are seldom above 1.5 rates
 # Aliases beyond those, each by itself at a few frequencies, as a factor changes each otherwise:
 # what it leaves of them is smooth between. Behind the last of `FAR` every term falls as the one
 # before it did; up to the last of all a delay is 7e-5 of the largest off, and 2e-3 without any.
@@ -163,6 +164,8 @@ class Grid:
 
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
     folded : (order, n, q) of these the ones of `NEAR`, or none. far : of these those beyond.
+    live : (`LIVE`, n, q) hold, filters and delays of the first of `folded`, if every model has its
+        own there; None where those of one chain are near enough.
     rate_hz : of the samples.
     sensor, actuator : (q,) entries. loop : closed around them, if responses are to the references.
     sigma : of all, or (n,) of each.
@@ -178,6 +181,7 @@ class Grid:
     sigma: float | Float = field(default=0.0, kw_only=True)
     loop: Closed | None = field(default=None, kw_only=True)
     far: Far | None = field(default=None, kw_only=True)
+    live: Complex | None = field(default=None, kw_only=True)
 
     @property
     def changed(self) -> slice:
@@ -196,7 +200,14 @@ class Grid:
         return Grid(
             frequency, self.factor[i], self.aliases[i], self.folded[:, i], self.rate_hz,
             self.sensor, self.actuator, sigma=self.sigma, loop=self.loop, far=self.far,
+            live=None if self.live is None else self.live[:, i],
         )  # fmt: skip
+
+    def without_aliases(self) -> Grid:
+        """The same of the rig before it is sampled, no loop closed."""
+        none = np.zeros((0, *self.factor.shape), complex)
+        bare = np.zeros_like(self.factor)
+        return replace(self, aliases=bare, folded=none, far=None, live=None, loop=None)
 
     def orders(self) -> list[Complex]:
         """s (n,) of each order of `folded`."""
@@ -239,10 +250,20 @@ def _held(s: Complex, rate_hz: float) -> Complex:
 
 def _term(rig: Rig, chain: Chain, s: Complex, k: int, sensor: Int, actuator: Int) -> Complex:
     """(n, q) alias k of a chain at s (n,)."""
-    there = s + 2j * np.pi * k * rig.rate_hz
-    # What answers a real input at s* with the conjugate of what it answers at s.
-    upper = there if k >= 0 else there.conj()
+    upper = _upper(s, k, rig.rate_hz)
     term = chain.evaluate(upper)[:, sensor, actuator] * _around(rig, upper, sensor, actuator)
+    return _lower(term, k)
+
+
+def _upper(s: Complex, k: int, rate_hz: float) -> Complex:
+    """Where to ask for alias k: what answers a real input at s* with the conjugate of what it
+    answers at s is asked above the real axis alone."""
+    there = s + 2j * np.pi * k * rate_hz
+    return np.asarray(there if k >= 0 else there.conj())
+
+
+def _lower(term: Complex, k: int) -> Complex:
+    """What was asked there, of alias k."""
     return np.asarray(term if k >= 0 else term.conj())
 
 
@@ -261,11 +282,12 @@ def grid(
     sigma: float = 0.0,
     loop: Closed | None = None,
     aliases: Callable[[Chain, Float], Aliases] | None = None,
+    live: bool = False,
 ) -> Grid:
     """The grid of a rig at sorted frequencies, Hz. chain : whose aliases these are, if they are
     not the rig's own. sigma : 1/s, how far beside the imaginary axis.
     loop : closed around the entries. aliases : of a chain at a few frequencies, where they may be
-    known from before."""
+    known from before. live : whether every model folds back what is its own."""
     f = np.unique(frequency)
     few = np.geomspace(f[f > 0][0], f[-1], min(ALIAS_POINTS, f.size))
     few[-1] = f[-1]
@@ -275,9 +297,13 @@ def grid(
     folded = np.stack([_term(rig, chain, s, k, sensor, actuator) for k in NEAR])
     every = made.spread(s, rig.rate_hz) + folded.sum(axis=0)
     factor = _around(rig, s, sensor, actuator)
+    own: Complex | None = None
+    if live:
+        upper = [(_upper(s, k, rig.rate_hz), k) for k in NEAR[:LIVE]]
+        own = np.stack([_lower(_around(rig, u, sensor, actuator), k) for u, k in upper])
     return Grid(
         f, factor, every, folded, rig.rate_hz, sensor, actuator,
-        sigma=sigma, loop=loop, far=made.far,
+        sigma=sigma, loop=loop, far=made.far, live=own,
     )  # fmt: skip
 
 
@@ -297,11 +323,17 @@ class _Passed:
         return ((j, on, self.F[:, :, on] * slope) for j, on, slope in self.parts)
 
 
-def _through(at: Grid, near: _Passed | None, beyond: _Passed | None) -> tuple[Complex, Complex]:
-    """(n, q) hold, filters and delays of a grid and its aliases, each times its factors."""
+def _through(
+    at: Grid, folded: Complex, near: _Passed | None, beyond: _Passed | None
+) -> tuple[Complex, Complex]:
+    """(n, q) hold, filters and delays of a grid and its aliases, each times its factors. folded :
+    as of the grid, of the model."""
+    aliases = at.aliases
+    if folded is not at.folded:
+        aliases = aliases + np.sum(folded - at.folded, axis=0)
     if near is None:
-        return at.factor, at.aliases
-    aliases = at.aliases + np.sum(at.folded * (near.F[1:] - 1), axis=0)
+        return at.factor, aliases
+    aliases = aliases + np.sum(folded * (near.F[1:] - 1), axis=0)
     if beyond is not None and at.far is not None:
         aliases = aliases + at.far.changed(beyond.F[0] - 1, at.s, at.rate_hz)
     return np.asarray(at.factor * near.F[0]), np.asarray(aliases)
@@ -395,8 +427,8 @@ class Model:
     def response(self, x: Float, at: Grid) -> Complex:
         """(n, q) at the grid's frequencies."""
         chain = self.chain.with_values(self.values(x))
-        G = chain.evaluate(at.s)[:, at.sensor, at.actuator]
-        factor, aliases = _through(at, *self._passed(x, at))
+        G, folded = self._folded(chain.evaluate, at)
+        factor, aliases = _through(at, folded, *self._passed(x, at))
         H = np.asarray(G * factor + aliases)
         return H if at.loop is None else at.loop.closed(H)
 
@@ -405,11 +437,22 @@ class Model:
         values = self.values(x)
         keys = tuple(values)
         chain = self.chain.with_values(values)
-        G, dG = chain.gradient_at(at.s, keys)
-        G, dG = G[:, at.sensor, at.actuator], dG[:, at.sensor, at.actuator]
+        slopes: list[Complex] = []
+
+        def evaluate(s: Complex) -> Complex:
+            G, dG = chain.gradient_at(s, keys)
+            slopes.append(dG[:, at.sensor, at.actuator])
+            return G
+
+        G, folded = self._folded(evaluate, at)
         near, beyond = self._passed(x, at)
-        factor, aliases = _through(at, near, beyond)
-        dG *= factor[:, :, None]
+        factor, aliases = _through(at, folded, near, beyond)
+        own, *folds = np.split(slopes[0], 1 if at.live is None else 1 + LIVE)
+        dG = own * factor[:, :, None]
+        for i, (k, d) in enumerate(zip(NEAR, folds, strict=False)):
+            assert at.live is not None
+            passed = at.live[i] if near is None else at.live[i] * near.F[1 + i]
+            dG += _lower(d, k) * passed[:, :, None]
         dH = np.zeros((*G.shape, self.n), complex)
         n = self.n_nominal
         dH[:, :, :n] = dG[:, :, :n] * np.array([values[k] for k in self.keys])
@@ -423,7 +466,7 @@ class Model:
                 map_[:, i] = [(there[k] - values[k]) / STEP for k in keys]
             dH[:, :, read] = dG @ map_
         if near is not None:
-            terms = np.concatenate([(G * at.factor)[None], at.folded])
+            terms = np.concatenate([(G * at.factor)[None], folded])
             for j, on, slope in near.slopes():
                 dH[:, on, j] += np.sum(terms[:, :, on] * slope, axis=0)
         if beyond is not None and at.far is not None:
@@ -433,6 +476,18 @@ class Model:
                 dH[:, :, j] += at.far.changed(whole, at.s, at.rate_hz)
         H = G * factor + aliases
         return (H, dH) if at.loop is None else (at.loop.closed(H), at.loop.slopes(H, dH))
+
+    @staticmethod
+    def _folded(evaluate: Callable[[Complex], Complex], at: Grid) -> tuple[Complex, Complex]:
+        """(n, q) of a chain at a grid, and what folds back (order, n, q): of the chain itself where
+        the grid says so."""
+        if at.live is None:
+            return evaluate(at.s)[:, at.sensor, at.actuator], at.folded
+        there = [_upper(at.s, k, at.rate_hz) for k in NEAR[:LIVE]]
+        each = np.split(evaluate(np.concatenate([at.s, *there])), 1 + LIVE)
+        G, *terms = (G[:, at.sensor, at.actuator] for G in each)
+        own = [_lower(t, k) * f for t, k, f in zip(terms, NEAR, at.live, strict=False)]
+        return G, np.concatenate([np.stack(own), at.folded[LIVE:]])
 
     def _reading(self) -> list[int]:
         """Entries of x that reach the chain's parameters through an effect."""

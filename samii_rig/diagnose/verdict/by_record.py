@@ -52,11 +52,12 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     search.begin("amplitude levels")
     forces = forces_on(search)
     forced = _winning(forces)
-    if forced is None or not (case.search.lines.torn() or forced.is_enough()):
+    if forced is None or _may_be_linear(forced, torn=case.search.lines.torn()):
         search.begin("what is missing, in pairs")
+        single = search.ranked()[0].key
         search.run()
         search.begin("amplitude levels, beside pairs")
-        if forced is not None:
+        if forced is not None and search.ranked()[0].key != single:
             forces = forces_on(search)
             forced = _winning(forces)
     search.begin("what cannot be told apart")
@@ -199,6 +200,13 @@ def forces_on(search: RecordSearch) -> ForceSearch | None:
         return compete_on_records(search)
     except SamiiRigError:
         return None
+
+
+def _may_be_linear(forced: ForceSearch, *, torn: bool) -> bool:
+    """Whether pairs of linear effects may do what the best explanation with a force does: beside a
+    linear effect a part that never slips is a spring. torn : no linear response explains all."""
+    real = [e for e in forced.ranked()[0].effects if e.physical]
+    return len(real) > 1 or not (torn or forced.is_enough())
 
 
 def _winning(forces: ForceSearch | None) -> ForceSearch | None:

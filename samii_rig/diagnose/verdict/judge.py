@@ -139,19 +139,20 @@ def _evidence(
     # Sums, not 1 - p: odds of a million are told from odds of a billion.
     others = sum(c.probability for c in ordered[1:])
     empty = next((e.weight for e in ranked if not e.effects), -math.inf)
+    physics = [e.physics for e in first.effects if e.physical]
     base = as_meant(search, first).fitted
     before, left = search.ratio(base), search.ratio(first.fitted)
     return Evidence(
         odds=math.log(max(chosen.probability, TINY) / max(others, TINY)),
         left=left,
         held=_held(search, decide, first.fitted) if decide is not None else 1.0,
-        effects=len(first.effects),
+        effects=len(physics),
         forced=any(e.quasi is not None for e in first.effects),
         confirmed=False,
         gain=min(first.weight - empty, 1e6),
         drop=(base.chi2 - first.fitted.chi2) / search.temperature,
         names=chosen.names(),
-        pair=len(first.effects) == 2 and len({e.physics for e in first.effects}) == 1,
+        pair=len(physics) == 2 and physics[0] == physics[1],
         closed=(before - left) / (before - 1) if before > 1 else 0.0,
         worth=search.worth,
     )
