@@ -85,23 +85,32 @@ class Drive(NamedTuple):
     memory: float
 
 
-class Guide(NamedTuple):
-    """Dry friction of a guide on a body that slides, held over one inner step.
+class Contact(NamedTuple):
+    """A force of contact, held over one inner step: min(max(gain y, -most), most), see
+    `sim.contact`.
 
-    force : N, 0 for none. row, row_extra : as of `Tables`, of sensor values from a force on the
-    body. push : (2, n) what a force of 1 N adds to its states in one step. speed, own : (2, n) the
-    body's speed from the states of the output and of the force. gain : m/s that 1 N makes of it in
+    most : N or N m, 0 for none. look, own : (2, n) the motion y from the states of the output and
+    of the force at the start of a step; of_old, of_new : from the inputs before and after the
+    change. at_once, look_now, own_now, of_now : the same of the force at the instant itself, which
+    a sensor reads; at_once is 0 of one that is known over a step alone. row, row_extra : as of
+    `Tables`, of sensor values from the force. push : (2, n) what a force of 1 adds to its states in
     one step. x : (2, n) states of the force; held : (1,) the force of this step; both are changed
     in place.
     """
 
-    force: float
+    most: float
+    gain: float
+    look: Float
+    of_old: float
+    of_new: float
+    own: Float
+    at_once: float
+    look_now: Float
+    own_now: Float
+    of_now: float
     row: Float
     row_extra: Float
     push: Float
-    speed: Float
-    own: Float
-    gain: float
     x: Float
     held: Float
 
@@ -144,35 +153,47 @@ def rest(tables: Tables) -> State:
     )
 
 
-def free(tables: Tables) -> Guide:
-    """No friction."""
+def free(tables: Tables) -> Contact:
+    """No force of contact."""
     m, _, n = tables.row.shape
     none = np.zeros((2, n))
     x, held = np.zeros((2, n)), np.zeros(1)
-    return Guide(0.0, np.zeros((m, 2, n)), np.zeros(m), none, none, none, 1.0, x, held)
+    rows = np.zeros((m, 2, n))
+    now = 0.0, none, none, 0.0
+    return Contact(0.0, 0.0, none, 0.0, 0.0, none, *now, rows, np.zeros(m), none, x, held)
 
 
 @njit(cache=True)
-def _rub(t: Tables, g: Guide, s: State, before: float, both: float) -> None:
-    """Set the guide's force of one step: what stops the body by its end, as far as it can.
-
-    Coulomb's law at the end of the step (Moreau 1988), so that a body that sticks stays where it
-    is. before, both : the input on both sides of its change.
-    """
-    speed = 0.0
-    for q in range(s.x.shape[1]):
-        a, b = t.decay[0, q], t.decay[1, q]
-        re = a * s.x[0, q] - b * s.x[1, q] + t.old[0, q] * before + t.new[0, q] * both
-        im = b * s.x[0, q] + a * s.x[1, q] + t.old[1, q] * before + t.new[1, q] * both
-        speed += g.speed[0, q] * re + g.speed[1, q] * im
-        re, im = a * g.x[0, q] - b * g.x[1, q], b * g.x[0, q] + a * g.x[1, q]
-        speed += g.own[0, q] * re + g.own[1, q] * im
-    g.held[0] = min(max(-speed / g.gain, -g.force), g.force)
+def _touch(g: Contact, s: State, before: float, both: float) -> None:
+    """Set the force of contact of one step. before, both : the input on both sides of its
+    change."""
+    y = g.of_old * before + g.of_new * both + _motion(s.x, g.x, g.look, g.own)
+    g.held[0] = min(max(g.gain * y, -g.most), g.most)
 
 
 @njit(cache=True)
-def _slide(t: Tables, g: Guide) -> None:
-    """Move the states of the guide's force on by one step."""
+def _motion(x: Float, of_force: Float, look: Float, own: Float) -> float:
+    """The motion that a force of contact looks at, from the states of the output and its own."""
+    y = 0.0
+    for q in range(x.shape[1]):
+        y += look[0, q] * x[0, q] + look[1, q] * x[1, q]
+        y += own[0, q] * of_force[0, q] + own[1, q] * of_force[1, q]
+    return y
+
+
+@njit(cache=True)
+def contact_now(g: Contact, s: State) -> float:
+    """The force of contact at the state's instant."""
+    if g.at_once == 0.0:
+        return float(g.held[0])
+    y = g.of_now * (s.number[APPLIED] + s.number[EXTRA])
+    y += _motion(s.x, g.x, g.look_now, g.own_now)
+    return float(min(max(g.at_once * y, -g.most), g.most))
+
+
+@njit(cache=True)
+def _push(t: Tables, g: Contact) -> None:
+    """Move the states of the force of contact on by one step."""
     for q in range(g.x.shape[1]):
         re = t.decay[0, q] * g.x[0, q] - t.decay[1, q] * g.x[1, q]
         im = t.decay[1, q] * g.x[0, q] + t.decay[0, q] * g.x[1, q]
@@ -181,9 +202,9 @@ def _slide(t: Tables, g: Guide) -> None:
 
 
 @njit(cache=True)
-def rubbed(g: Guide, i: int) -> float:
-    """What sensor i reads of the guide's force."""
-    y = g.row_extra[i] * g.held[0]
+def touched(g: Contact, i: int, force: float) -> float:
+    """What sensor i reads of the force of contact, which is `force` at its instant."""
+    y = g.row_extra[i] * force
     for k in range(g.x.shape[1]):
         y += g.row[i, 0, k] * g.x[0, k] + g.row[i, 1, k] * g.x[1, k]
     return float(y)
@@ -292,16 +313,17 @@ def _friction(d: Drive, speed: float, u: float) -> tuple[float, float]:
 
 @njit(cache=True)
 def sense(
-    t: Tables, c: Converters, g: Guide, s: State, noise: Float, values: Float, quality: Flags
+    t: Tables, c: Converters, g: Contact, s: State, noise: Float, values: Float, quality: Flags
 ) -> None:
     """Read all sensors at the state's sample into values and quality, (m,). noise : (m,)."""
     sample = s.flag[SAMPLE]
     slot = sample % s.early.shape[0]
+    force = contact_now(g, s) if g.most > 0.0 else 0.0
     for i in range(t.ahead.shape[0]):
         if t.ahead[i] == 0:
             y = _read(t, s, i, s.number[APPLIED], 0.0, s.number[EXTRA])
-            if g.force > 0.0:
-                y += rubbed(g, i)
+            if g.most > 0.0:
+                y += touched(g, i, force)
         else:
             y = s.early[slot, i]
         y, q = _convert(c, i, sample, y, noise[i])
@@ -312,7 +334,7 @@ def sense(
 
 
 @njit(cache=True)
-def move(t: Tables, d: Drive, g: Guide, s: State, v: float, disturbance: Float) -> None:
+def move(t: Tables, d: Drive, g: Contact, s: State, v: float, disturbance: Float) -> None:
     """Put v out at the state's sample and go on to the next. disturbance : (inner,)."""
     m = t.ahead.shape[0]
     slots = s.early.shape[0]
@@ -331,14 +353,14 @@ def move(t: Tables, d: Drive, g: Guide, s: State, v: float, disturbance: Float) 
             push = share * old + (1.0 - share) * new + extra
             pull, number[SPEED] = _friction(d, number[SPEED], push)
             extra += pull
-        if g.force > 0.0:
-            _rub(t, g, s, old + extra, new + extra)
+        if g.most > 0.0:
+            _touch(g, s, old + extra, new + extra)
         for i in range(m):
             if t.ahead[i] > 0 and (j + t.ahead[i]) % t.inner == 0:
                 at = (sample + (j + t.ahead[i]) // t.inner) % slots
                 s.early[at, i] = _read(t, s, i, old, new, extra)
-                if g.force > 0.0:
-                    s.early[at, i] += rubbed(g, i)
+                if g.most > 0.0:
+                    s.early[at, i] += touched(g, i, g.held[0])
         both = new + extra
         before = old + extra
         for q in range(s.x.shape[1]):
@@ -346,8 +368,8 @@ def move(t: Tables, d: Drive, g: Guide, s: State, v: float, disturbance: Float) 
             im = t.decay[1, q] * s.x[0, q] + t.decay[0, q] * s.x[1, q]
             s.x[0, q] = re + t.old[0, q] * before + t.new[0, q] * both
             s.x[1, q] = im + t.old[1, q] * before + t.new[1, q] * both
-        if g.force > 0.0:
-            _slide(t, g)
+        if g.most > 0.0:
+            _push(t, g)
         number[APPLIED], number[EXTRA] = new, extra
     s.flag[SAMPLE] = sample + 1
 
@@ -359,7 +381,7 @@ def advance(
     k: Control,
     f: Filters,
     d: Drive,
-    g: Guide,
+    g: Contact,
     s: State,
     u: Float,
     theta_ref: Float,

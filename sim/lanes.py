@@ -20,11 +20,11 @@ from sim.kernel import (
     LIMITED,
     SAMPLE,
     TRIPPED,
+    Contact,
     Control,
     Converters,
     Drive,
     Filters,
-    Guide,
     State,
     _command,
     _convert,
@@ -45,7 +45,7 @@ class Lane(NamedTuple):
     control: Control
     filters: Filters
     drive: Drive
-    guide: Guide
+    contact: Contact
     state: State
 
 
@@ -113,4 +113,4 @@ def advance(
                 lane.filters.memory[:] = 0.0
                 values[n, 2 * k + j], quality[n, 2 * k + j] = 0.0, LIMITED
             pushed = disturbance[j, n] if disturbance.shape[0] > 0 else none
-            move(lane.tables, lane.drive, lane.guide, lane.state, values[n, 2 * k + j], pushed)
+            move(lane.tables, lane.drive, lane.contact, lane.state, values[n, 2 * k + j], pushed)

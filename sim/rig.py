@@ -28,8 +28,8 @@ from samii_rig.errors import DeviceError
 from samii_rig.rig.schema import Rig
 from sim import kernel
 from sim.base import SimulatedRig, device_channels
+from sim.contact import check_contact, tables_of
 from sim.electronics import check_block, control, converters, drive, filters, references
-from sim.guide import check_guide, tables_of
 from sim.settings import SimSettings, read_settings
 from sim.several import SimulatedOutputs
 
@@ -41,7 +41,7 @@ class SimulatedDevice(SimulatedRig):
         super().__init__(rig, settings)
         (spec,) = rig.actuator
         self.name = spec.name
-        self._tables, self._guide = tables_of(rig, self.realisation, settings)
+        self._tables, self._contact = tables_of(rig, self.realisation, settings)
         self._converters = converters(rig, settings)
         self._drive = drive(rig, settings)
         self._state = kernel.rest(self._tables)
@@ -89,7 +89,7 @@ class SimulatedDevice(SimulatedRig):
             self._control,
             self._filters,
             self._drive,
-            self._guide,
+            self._contact,
             self._state,
             u,
             theta_ref,
@@ -104,7 +104,7 @@ class SimulatedDevice(SimulatedRig):
 
 def check_rig(rig: Rig, settings: Mapping[str, object]) -> None:
     """InputError for a wrong setting, or a channel with the name of a reference."""
-    check_guide(rig, read_settings(rig, settings))
+    check_contact(rig, read_settings(rig, settings))
     device_channels(rig)
 
 
@@ -114,7 +114,7 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
     InputError for an unknown or wrong setting, or a chain that cannot be simulated.
     """
     chosen = read_settings(rig, settings)
-    check_guide(rig, chosen)
+    check_contact(rig, chosen)
     device: SimulatedDevice | SimulatedOutputs
     device = (
         SimulatedDevice(rig, chosen) if len(rig.actuator) == 1 else SimulatedOutputs(rig, chosen)

@@ -45,6 +45,9 @@ class SimSettings(Strict):
         A number is that of every drive; by an actuator's name it is of that one alone.
     guide_friction : dry friction, N, of the guide of a mass that slides, by the mass's name. The
         force stops the mass where it can and opposes its speed else. One mass may have it.
+    play : width of a gap, m or rad, by the name of the spring that has it: the spring does not push
+        within half the width to either side, its damper does. One spring may have it, where no
+        guide has friction.
     hum : by sensor name.
     stuck, nan : by sensor name, s from which the sensor repeats its last value, or gives NaN.
     pace : times real time at which simulated time passes at most, for who wants to watch; 0 for
@@ -64,6 +67,7 @@ class SimSettings(Strict):
         Discriminator(_which),  # one reading of what was given, and so one line of what is wrong
     ] = 0.0
     guide_friction: dict[Name, NonNegative] = Field(default_factory=dict)
+    play: dict[Name, NonNegative] = Field(default_factory=dict)
     hum: dict[Name, Hum] = Field(default_factory=dict)
     stuck: dict[Name, NonNegative] = Field(default_factory=dict)
     nan: dict[Name, NonNegative] = Field(default_factory=dict)

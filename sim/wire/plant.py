@@ -13,7 +13,7 @@ from samii_rig.errors import InputError
 from samii_rig.rig.schema import Rig
 from sim import kernel
 from sim.base import UNRELATED, realised
-from sim.guide import check_guide, tables_of
+from sim.contact import check_contact, tables_of
 from sim.lanes import sense_all
 from sim.settings import SimSettings
 from sim.several import plant_of
@@ -161,12 +161,12 @@ class Plant:
             )
             for m in rig.monitor
         }
-        check_guide(rig, settings)
+        check_contact(rig, settings)
         self._lanes = tuple(plant_of(rig, made, settings, i) for i in range(len(rig.actuator)))
         if len(self._lanes) == 1:
-            tables, guide = tables_of(rig, made, settings)
+            tables, contact = tables_of(rig, made, settings)
             (lane,) = self._lanes
-            self._lanes = (lane._replace(tables=tables, guide=guide),)
+            self._lanes = (lane._replace(tables=tables, contact=contact),)
         self._outputs = [wired.output[a.name] for a in rig.actuator]
         m = len(rig.sensor)
         self._values, self._quality = np.zeros(m), np.zeros(m, dtype=np.uint8)
@@ -178,8 +178,8 @@ class Plant:
         """Everything still, as at the start."""
         self._lanes = tuple(lane._replace(state=kernel.rest(lane.tables)) for lane in self._lanes)
         for lane in self._lanes:
-            lane.guide.x[:] = 0.0
-            lane.guide.held[:] = 0.0
+            lane.contact.x[:] = 0.0
+            lane.contact.held[:] = 0.0
 
     def sense(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Counts of the encoders and of the analogue inputs at this sample."""
@@ -189,7 +189,7 @@ class Plant:
         if len(self._lanes) == 1:
             (one,) = self._lanes
             kernel.sense(
-                one.tables, one.converters, one.guide, one.state, noise, values, self._quality
+                one.tables, one.converters, one.contact, one.state, noise, values, self._quality
             )
         else:
             sense_all(self._lanes, noise, values, self._quality)
@@ -206,7 +206,7 @@ class Plant:
         for lane, o in zip(self._lanes, self._outputs, strict=True):
             disturbance = self._rng.standard_normal(s.inner) if pushed else self._still
             v = (dac[o.index] - o.null) / o.counts_per_unit
-            kernel.move(lane.tables, lane.drive, lane.guide, lane.state, v, disturbance)
+            kernel.move(lane.tables, lane.drive, lane.contact, lane.state, v, disturbance)
 
     def load(self, i: int) -> float:
         """What is at sensor i at the sample to come, without noise and converter."""
@@ -215,7 +215,9 @@ class Plant:
             t, s = lane.tables, lane.state
             applied, extra = s.number[kernel.APPLIED], s.number[kernel.EXTRA]
             inputs = t.row_old[i] * applied + t.row_extra[i] * extra
-            total += float((t.row[i] * s.x).sum() + inputs + kernel.rubbed(lane.guide, i))
+            force = kernel.contact_now(lane.contact, s)
+            touch = kernel.touched(lane.contact, i, force)
+            total += float((t.row[i] * s.x).sum() + inputs + touch)
         return total
 
 
