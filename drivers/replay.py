@@ -36,46 +36,46 @@ class ReplaySettings(Strict):
     pace: Literal["real", "fast"] = "fast"
 
 
-class Replay:
-    """Actuator, sensor and clock of a recording.
+class _Recorded:
+    """Sensor and clock of a recording, and what all its outputs share.
 
     start : sequence number at which the recorded plan begins.
     """
 
     def __init__(self, rig: Rig, recording: Recording, start: int, *, real: bool) -> None:
-        spec = rig.actuator[0]
-        self.name, self.deadman = spec.name, spec.deadman
+        self._names = tuple(spec.name for spec in rig.actuator)
+        held = [spec.deadman for spec in rig.actuator if spec.deadman is not None]
+        self.deadman = min(held) if len(held) == len(rig.actuator) else None
         self.channels = recording.channels
         self._recording, self._start, self._real = recording, start, real
         self._period = NS / recording.rate_hz
-        self._v = recording.values[:, recording.column(spec.name)]
+        commands = recording.values[:, [recording.column(name) for name in self._names]]
+        moving = np.flatnonzero(np.nan_to_num(commands).any(axis=1))
+        self._end = int(moving[-1]) + 1 if len(moving) else 0  # row from which all rest
         self._now = 0
         self._next = 0  # row that comes next
         self._live = False
         self._count = 0  # what is added to the recorded sequence numbers
         self._ahead = self.now() - int(recording.time[0])  # and to the recorded times, ns
 
-    # Actuator: nothing is behind it
+    # Outputs: nothing is behind them
 
-    def configure(self, loop: DeviceLoop) -> None:
-        """Taken as it is: the device that was recorded kept its own. DeviceError while live."""
+    def _configured(self, loop: DeviceLoop) -> None:
         if self._live:
-            raise DeviceError(f"{self.name}: configured during the replay of {loop.sensor}")
+            names = ", ".join(self._names)
+            raise DeviceError(f"{names}: configured during the replay of {loop.sensor}")
 
-    def write(self, block: CommandBlock) -> None:
-        """Goes nowhere. The first one says where the plan begins now."""
+    def _written(self, block: CommandBlock) -> None:
         if not self._live:
             self._live = True
             self._align(block.first)
 
     def zero(self) -> None:
-        """On to the recorded end, where the output is at zero; what is left out is a gap."""
+        """On to the recorded end, where all outputs are at zero; what is left out is a gap."""
         if self._live:
             self._live = False
-            moving = np.flatnonzero(np.nan_to_num(self._v))
-            end = int(moving[-1]) + 1 if len(moving) else 0
-            if end > self._next:
-                self._jump(end)
+            if self._end > self._next:
+                self._jump(self._end)
 
     # Sensor
 
@@ -132,6 +132,38 @@ class Replay:
         self._next = row
 
 
+class Replay(_Recorded):
+    """A recording of one output as its actuator, sensor and clock."""
+
+    def __init__(self, rig: Rig, recording: Recording, start: int, *, real: bool) -> None:
+        super().__init__(rig, recording, start, real=real)
+        (self.name,) = self._names
+
+    def configure(self, loop: DeviceLoop) -> None:
+        """Taken as it is: the device that was recorded kept its own. DeviceError while live."""
+        self._configured(loop)
+
+    def write(self, block: CommandBlock) -> None:
+        """Goes nowhere. The first one says where the plan begins now."""
+        self._written(block)
+
+
+class ReplayOutputs(_Recorded):
+    """A recording of several outputs as their actuators, sensor and clock."""
+
+    def __init__(self, rig: Rig, recording: Recording, start: int, *, real: bool) -> None:
+        super().__init__(rig, recording, start, real=real)
+        self.names = self._names
+
+    def configure(self, loops: tuple[DeviceLoop, ...]) -> None:
+        """As of a `Replay`, of all outputs."""
+        self._configured(loops[0])
+
+    def write(self, blocks: tuple[CommandBlock, ...]) -> None:
+        """As of a `Replay`, of all outputs."""
+        self._written(blocks[0])
+
+
 def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
     """The recording of the settings as this rig's device.
 
@@ -149,9 +181,10 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
         plans = [e for e in read_events(path) if e.name == "plan"]
     except RecordingError as error:
         raise InputError.saying(rig.name, "device.settings.recording", str(error)) from error
-    check_rig(rig, settings)
     _check(rig, recording, str(path), bool(plans))
-    device = Replay(rig, recording, int(plans[0].payload["start"]), real=chosen.pace == "real")
+    device: Replay | ReplayOutputs
+    outputs = Replay if len(rig.actuator) == 1 else ReplayOutputs
+    device = outputs(rig, recording, int(plans[0].payload["start"]), real=chosen.pace == "real")
     return OpenRig(
         device,
         device,
@@ -166,12 +199,6 @@ def open_rig(rig: Rig, settings: Mapping[str, object]) -> OpenRig:
             "timing": recording.metadata.get("device_timing", "{}"),
         },
     )
-
-
-def check_rig(rig: Rig, settings: Mapping[str, object]) -> None:
-    """InputError for a rig with several outputs: the samples of one run are aligned by one."""
-    if len(rig.actuator) != 1:
-        raise InputError(rig.name, "actuator", len(rig.actuator), "one; a replay drives one output")
 
 
 def _check(rig: Rig, recording: Recording, path: str, planned: bool) -> None:

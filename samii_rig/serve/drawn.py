@@ -12,7 +12,7 @@ import numpy as np
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.schema import Rig
 from samii_rig.run.plan import Plan
-from samii_rig.serve.sofar import first
+from samii_rig.serve.sofar import driven, first
 from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_width
 from samii_rig.types import Complex, Float, FrequencyResponse, Int
 
@@ -97,17 +97,20 @@ def curves(r: FrequencyResponse) -> dict[str, Any]:
 
 
 def _curves_of_model(rig: Rig, plan: Plan, f: Float, H: Complex) -> dict[str, Any]:
-    j = [a.name for a in rig.actuator].index(plan.actuator)
+    inputs = driven(plan)
     entries = [
         {
             "output": sensor.name,
-            "unit": f"{sensor.unit}/{rig.actuator[j].unit}",
+            "input": actuator.name,
+            "unit": f"{sensor.unit}/{actuator.unit}",
             "gain": _short(np.abs(H[:, i, j])),
             "phase": _short(np.degrees(np.unwrap(np.angle(H[:, i, j])))),
         }
         for i, sensor in enumerate(rig.sensor)
+        for j, actuator in enumerate(rig.actuator)
+        if actuator.name in inputs
     ]
-    return {"frequency": _short(f), "input": plan.actuator, "curves": entries}
+    return {"frequency": _short(f), "curves": entries}
 
 
 def _grid(plan: Plan) -> Float:

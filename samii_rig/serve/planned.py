@@ -13,9 +13,9 @@ def averages(plan: Plan, segment: int) -> tuple[int, int]:
     """How many segments like the one that goes on are whole, and how many the plan has.
 
     segment : the number of the one that goes on, from 1. Alike are those that are averaged
-    together: of one kind and level.
+    together: of one kind and level, that drive the same actuators.
     """
-    alike = [(s.kind, s.level, s.unit) for s in plan.segments]
+    alike = [(s.kind, s.level, s.unit, s.excited) for s in plan.segments]
     now = alike[segment - 1]
     return alike[: segment - 1].count(now), alike.count(now)
 

@@ -30,9 +30,9 @@ from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.order import PlannedRun, RunOrder
 from samii_rig.run.outcome import Outcome
+from samii_rig.run.outputs import plan_limits
 from samii_rig.run.plan import Plan
 from samii_rig.run.progress import Progress
-from samii_rig.safety.limits import gate_limits
 from samii_rig.serve.following import following
 from samii_rig.serve.job import DIAGNOSIS, ESTIMATE, LOST_AFTER, Job, JobState
 from samii_rig.serve.live import LiveWriter, live_folder
@@ -53,7 +53,7 @@ class Runner:
         self.live: LiveWriter | None = None
         self.stop = Event()
         self.lost = False
-        self._shown = math.nan  # the output, by the newest sample that says it
+        self._shown: dict[str, float] = {}  # each output, by the newest sample that says it
         self._enough_in = 0  # the segment in which the service asked for no more
 
     def go(self) -> None:
@@ -103,7 +103,7 @@ class Runner:
         )
 
     def _watch(self, plan: Plan, live: Path, block: SampleBlock) -> None:
-        self._note_output(block, plan.actuator)
+        self._note_outputs(block, plan)
         # A display that fails is none of the run's business.
         with suppress(Exception):
             if self.live is None:
@@ -130,24 +130,27 @@ class Runner:
     def _at_rest(self, order: RunOrder, ended: StopRecord) -> None:
         """Whoever asked for the stop waits for this, not for the estimate."""
         plan = order.plan
-        limits = gate_limits(order.rig, plan.actuator, plan.kp, plan.centring_sensor)
-        at_zero = abs(self._shown) <= limits.output.slack / 2
+        slack = {x.output.channel: x.output.slack / 2 for x in plan_limits(plan, order.rig)}
+        at_zero = all(abs(self._shown.get(name, math.nan)) <= x for name, x in slack.items())
+        known = self._shown.keys() >= slack.keys()
         # A disk that is full for this word may still take the recording's end.
         with suppress(OSError):
             self._set(
                 phase="analysing",
                 status=ended.status,
                 reason=ended.reason,
-                at_zero=None if math.isnan(self._shown) else at_zero,
+                at_zero=at_zero if known else None,
                 ended=datetime.now(UTC).isoformat(timespec="seconds"),
             )
 
-    def _note_output(self, block: SampleBlock, actuator: str) -> None:
-        """What a sample last said of the output."""
-        column = [c.name for c in block.channels].index(actuator)
-        known = block.values[np.isfinite(block.values[:, column]), column]
-        if len(known):
-            self._shown = float(known[-1])
+    def _note_outputs(self, block: SampleBlock, plan: Plan) -> None:
+        """What a sample last said of each output."""
+        names = [c.name for c in block.channels]
+        for output in plan.outputs:
+            v = block.values[:, names.index(output.actuator)]
+            known = v[np.isfinite(v)]
+            if len(known):
+                self._shown[output.actuator] = float(known[-1])
 
     def _end_at_rest(self, now: Progress) -> None:
         """Once the service asks for no more: end after the segment that goes on, at rest."""

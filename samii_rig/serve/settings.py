@@ -65,9 +65,6 @@ class Settings:
 
     def check(self) -> None:
         """InputError for what cannot work or would let strangers drive."""
-        if len(self.rig.actuator) > 1:
-            expected = "one, as the service shows one output; samii-rig run drives several"
-            raise InputError(self.rig.name, "actuator", len(self.rig.actuator), expected)
         if not 0 <= self.port <= 65535:
             raise InputError(WHERE, "--port", self.port, "0 to 65535")
         if self.stop_port is not None and not 0 <= self.stop_port <= 65535:

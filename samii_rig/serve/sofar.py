@@ -2,12 +2,13 @@
 
 The project's estimator is asked, of what is whole: segments that are done, of each level together;
 and where a level has none yet, of the one that goes on: whole periods, or the part of a sweep that
-has been passed. Levels of which nothing new is whole are not estimated again.
+has been passed. Levels of which nothing new is whole are not estimated again. With several inputs
+a level is estimated once each of them was driven at it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.signal.choose import Method
 from samii_rig.signal.estimate import estimate
 from samii_rig.signal.spectra import period
-from samii_rig.types import FrequencyResponse, Recording, Segment
+from samii_rig.types import Float, FrequencyResponse, Recording, Segment
 
 # Of a sweep that goes on: less than this ratio of frequencies says nothing yet.
 LEAST_PASSED = 1.5
@@ -51,6 +52,8 @@ class SoFar:
     @property
     def growing(self) -> bool:
         """Whether the next segment's samples tell something before it is whole."""
+        if len(driven(self._plan)) > 1:
+            return False  # nothing is known of one input while the others are not
         if self.done >= len(self._plan.segments):
             return False
         s = self._plan.segments[self.done]
@@ -107,7 +110,8 @@ class SoFar:
             if s.kind != "transient":
                 levels.setdefault(_key(s), []).append(s)
         for key, segments in levels.items():
-            yield Part(key, tuple(segments))
+            if _all_driven(self._plan, key, segments):
+                yield Part(key, tuple(segments))
         if self.growing:
             planned = self._plan.segments[self.done]
             before = sum(len(s.u) for s in self._plan.segments[: self.done])
@@ -125,7 +129,7 @@ class SoFar:
             return Part(_key(s), (segment,), going_on=True, band=band)
 
         if s.kind == "periodic":
-            length = period((s.u + self._plan.kp * s.theta_ref)[first:last])
+            length = period(_reference(self._plan, s)[first:last])
             whole = max(0, n - first) // length
             return part(first + whole * length, "periodic", None) if whole >= 2 else None
         passed = s.frequency[: max(n, 0)]
@@ -139,20 +143,49 @@ class SoFar:
 def first(plan: Plan) -> int | None:
     """Samples of the plan after which the first response can be estimated; None where none ever
     can."""
-    before = 0
+    before, done = 0, dict[Hashable, list[PlannedSegment]]()
+    several = len(driven(plan)) > 1
     for s in plan.segments:
         if s.kind != "transient":
-            return before + _first_of(s, plan.kp)
+            own = done.setdefault(_key(s), [])
+            own.append(s)
+            if not several:
+                return before + _first_of(plan, s)
+            if _all_driven(plan, _key(s), own):
+                return before + len(s.u)
         before += len(s.u)
     return None
 
 
-def _first_of(s: PlannedSegment, kp: float) -> int:
+def driven(plan: Plan) -> tuple[str, ...]:
+    """The actuators that a plan drives, in its order; those that rest throughout are none."""
+    named = {name for s in plan.segments for name in s.excited} or {plan.actuator}
+    return tuple(o.actuator for o in plan.outputs if o.actuator in named)
+
+
+def _all_driven(
+    plan: Plan, key: Hashable, done: Sequence[Segment] | Sequence[PlannedSegment]
+) -> bool:
+    """Whether each input that the plan drives at a level was driven, in as many experiments as
+    there are inputs: two that are driven together are not told apart by one."""
+    wanted = {name for s in plan.segments if _key(s) == key for name in s.excited}
+    return wanted <= {name for s in done for name in s.excited} and len(done) >= len(wanted)
+
+
+def _reference(plan: Plan, s: PlannedSegment) -> Float:
+    """(n,) what drives a segment: u + kp theta_ref, of several outputs of the one driven."""
+    if s.u.ndim == 1:
+        return s.u + plan.kp * s.theta_ref
+    kp = np.array([o.kp for o in plan.outputs])
+    return np.asarray((s.u + kp * s.theta_ref).sum(axis=1))
+
+
+def _first_of(plan: Plan, s: PlannedSegment) -> int:
     begin, last = s.recorded or (0, len(s.u))
     if s.dwell is not None:
         return len(s.u)
     if s.kind == "periodic":
-        return min(begin + 2 * period((s.u + kp * s.theta_ref)[begin:last]), last)
+        return min(begin + 2 * period(_reference(plan, s)[begin:last]), last)
     f = s.frequency[:last]
     high = np.fmax.accumulate(f)
     passed = np.flatnonzero(high > LEAST_PASSED * np.fmin.accumulate(f))

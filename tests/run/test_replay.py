@@ -56,6 +56,25 @@ def test_a_run_that_is_replayed_gives_the_same_again(first, rig, tmp_path):
     np.testing.assert_array_equal(first.responses[0].H, third.responses[0].H)
 
 
+def test_a_run_of_two_outputs_is_replayed_too(tmp_path):
+    rig = load_rig("samii_two_joints")[0]
+    both = SHORT.model_copy(update={"beside": ("v_3",), "realisations": 2, "amplitudes": (0.2,)})
+    first = done(rig, tmp_path / "first.mcap", both, seed=3)
+    assert first.trouble == ""
+    device = Device(driver="replay", settings={"recording": str(first.path)})
+    again = done(rig.model_copy(update={"device": device}), tmp_path / "again.mcap", both)
+    assert again.stop.status == "completed", again.stop.reason
+    for old, new in zip(first.recording.segments, again.recording.segments, strict=True):
+        np.testing.assert_array_equal(
+            first.recording.cut(old).values, again.recording.cut(new).values
+        )
+    np.testing.assert_array_equal(first.responses[0].H, again.responses[0].H)
+    # A sample of another command on the second output alone is seen.
+    other = both.model_copy(update={"seed": 2})
+    ended = done(rig.model_copy(update={"device": device}), tmp_path / "other.mcap", other)
+    assert ended.stop.status == "tripped"
+
+
 def test_another_experiment_on_it_is_ended_by_the_gate(rig, tmp_path):
     other = SHORT.model_copy(update={"seed": 2})
     ended = done(rig, tmp_path / "other.mcap", other)

@@ -69,6 +69,38 @@ def test_every_sample_is_shown_and_a_gap_is_one(service: Service, browser: Brows
     browser.until("scope.why === 'No run'")
 
 
+def test_a_rig_with_two_outputs_shows_the_responses_to_both(tmp_path: Path) -> None:
+    """Live, after the run, and replayed."""
+    text = sweep(duration=12.0, repeats=1).replace('"v_2"', '"v_2"\nbeside = ["v_3"]')
+    options = "--rig", "samii_two_joints", "--pace", "8"
+    with Service(tmp_path / "runs", *options) as service, Browser(tmp_path / "browser") as browser:
+        browser.size(1440, 900)
+        browser.go(service.url)
+        browser.until("document.getElementById('link').textContent === 'live'")
+        with service.lease() as lease:
+            job = service.start(lease, text)
+            browser.until("['v_2', 'v_3'].every((n) => scope.channels.some((c) => c.name === n))")
+            names = ["v_2", "v_3", "theta_2", "theta_3", "a_0", "a_1", "a_2"]
+            lamps = "[...document.querySelectorAll('.lamp b')].map((b) => b.textContent)"
+            browser.until(f"{lamps}.length === {len(names)}")
+            assert browser.value(lamps) == names
+            service.until(lambda: service.job(job)["phase"] == "done")
+        assert service.job(job)["at_zero"]
+        pairs = [f"{y} / {v}" for y in names[2:] for v in names[:2]]
+        browser.until("panel.live?.final && panel.live.responses.length === 1")
+        assert browser.value("panel.entries().map((e) => e.title)") == pairs
+        drawn = "panel.entries().map((e) => panel.curves(e.output, e.input).map((c) => c.name))"
+        assert browser.value(drawn) == [["model", "measured"]] * len(pairs)
+        name = service.job(job)["recording"]
+        opened(browser, name)
+        path = service.folder / name
+        assert replayed(browser, path) == len(read_recording(path))
+        assert browser.value("scope.channels.map((c) => c.name)") == [
+            c.name for c in read_recording(path).channels
+        ]
+        assert browser.errors == []
+
+
 def test_a_run_that_begins_ends_a_replay(service: Service, browser: Browser) -> None:
     opened(browser, GAPPED)
     browser.choose("replay-speed", "0.1")

@@ -29,6 +29,7 @@ from samii_rig.index.remarks import read_remarks
 from samii_rig.model.sampled import sampled_response
 from samii_rig.record.reader import read_events, read_recording
 from samii_rig.rig.load import load_rig
+from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
@@ -66,14 +67,16 @@ seed = 1
 """
 
 
-def made(folder: Path, text: str) -> tuple[Plan, Recording, int]:
+def made(
+    folder: Path, text: str, rig: Rig = RIG, rig_toml: str = RIG_TOML
+) -> tuple[Plan, Recording, int]:
     """Plan, whole recording and number of the plan's first sample of a simulated run."""
     file = folder / "experiment.toml"
     file.write_text(text)
-    experiment, _ = load_experiment(str(file), RIG)
-    plan = experiment.plan(RIG)
+    experiment, _ = load_experiment(str(file), rig)
+    plan = experiment.plan(rig)
     path = folder / "run.mcap"
-    carry_out(RunOrder(RIG, RIG_TOML, text, plan, predict(plan, RIG), {"seed": 1}), path)
+    carry_out(RunOrder(rig, rig_toml, text, plan, predict(plan, rig), {"seed": 1}), path)
     start = next(e.payload["start"] for e in read_events(path) if e.name == "plan")
     return plan, read_recording(path), int(start)
 
@@ -116,6 +119,26 @@ def test_a_sweep_grows_with_what_it_has_passed(swept: tuple[Plan, Recording, int
     assert reached[-1] > 10.0
     # Nothing new, nothing done.
     assert not so_far.take(until(recording, start + n), start)
+
+
+def test_of_two_inputs_a_level_is_known_once_both_were_driven(tmp_path: Path) -> None:
+    rig, rig_toml = load_rig("samii_two_joints")
+    text = sweep(duration=20.0, repeats=1).replace('"v_2"', '"v_2"\nbeside = ["v_3"]')
+    plan, recording, start = made(tmp_path, text, rig, rig_toml)
+    one, both = (start + sum(len(s.u) for s in plan.segments[:k]) for k in (1, 2))
+    assert first(plan) == both - start
+    so_far = SoFar(plan)
+    so_far.take(until(recording, one + 500), start)
+    assert (so_far.responses(), so_far.trouble, so_far.growing) == ([], "", False)
+    assert so_far.take(until(recording, both), start)
+    ((r, going_on),) = so_far.responses()
+    assert not going_on
+    (whole,) = estimate([recording])
+    np.testing.assert_array_equal(r.H, whole.H)
+    told = Drawn(rig, plan).told(so_far.responses(), 2)
+    pairs = {(s.name, a.name) for s in rig.sensor for a in rig.actuator}
+    assert {(c["output"], c["input"]) for c in told["model"]["curves"]} == pairs
+    assert {(c["output"], c["input"]) for c in told["responses"][0]["curves"]} == pairs
 
 
 @pytest.mark.parametrize("text", [SWEEPS, PERIODS])

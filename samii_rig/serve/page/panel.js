@@ -82,10 +82,8 @@ export class Panel {
     const at = this.$("frf-level").value;
     const chosen = at === "" ? (live?.responses.length ?? 0) - 1 : Number(at);
     const of = (r) => r.curves.find((c) => c.output === output && c.input === input);
-    if (live && live.model.input === input) {
-      const m = live.model.curves.find((c) => c.output === output);
-      if (m) found.push({ name: "model", f: live.model.frequency, curve: m, ink: "--ink", dash: [6, 4], width: 1.3 });
-    }
+    const m = live && of(live.model);
+    if (m) found.push({ name: "model", f: live.model.frequency, curve: m, ink: "--ink", dash: [6, 4], width: 1.3 });
     (live?.responses ?? []).forEach((r, k) => {
       const c = of(r), main = k === chosen;
       if (c) found.push({ name: main ? "measured" : "", f: r.frequency, curve: c, ink: "--c0", alpha: main ? 1 : 0.4, width: main ? 1.6 : 1, banded: main });
@@ -100,9 +98,9 @@ export class Panel {
   // Which outputs over which inputs there are, with their units.
   entries() {
     const found = new Map(), { live } = this;
-    const add = (c, input) => found.set(`${c.output} / ${input}`, { output: c.output, input, unit: pretty(c.unit) });
-    for (const c of live?.model.curves ?? []) add(c, live.model.input);
-    for (const l of this.laid) for (const c of l.responses.at(-1)?.curves ?? []) add(c, c.input);
+    const add = ({ output, input, unit }) => found.set(`${output} / ${input}`, { output, input, unit: pretty(unit) });
+    for (const c of live?.model.curves ?? []) add(c);
+    for (const l of this.laid) for (const c of l.responses.at(-1)?.curves ?? []) add(c);
     return [...found].map(([title, e]) => ({ title, ...e }));
   }
 
