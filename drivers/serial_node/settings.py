@@ -7,7 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from drivers.serial_node.wire import OVERHEAD, Hello
+from drivers.serial_node.wire import MOST_OUTPUTS, OVERHEAD, Hello
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Finite, Name, NonNegative, Positive, Rig, Strict
 from samii_rig.rig.settings import checked, wrong
@@ -97,6 +97,9 @@ def _check_outputs(rig: Rig, s: SerialSettings) -> None:
     held = [a.deadman for a in rig.actuator]
     if len(set(held)) > 1:
         raise InputError(rig.name, "actuator.deadman", held, "one for all: the node has one")
+    if len(names) > MOST_OUTPUTS:
+        expected = f"at most {MOST_OUTPUTS}, whose limits fit a frame of a serial node"
+        raise InputError(rig.name, "actuator", len(names), expected)
     if not s.output:
         if len(names) > 1:
             expected = f"{', '.join(names)}, each with its index and counts_per_unit"

@@ -27,6 +27,8 @@ _OUTPUT = struct.Struct("<hhhHHi")  # of HELLO in version 2, of each output besi
 _SAMPLES = struct.Struct("<IIBBHH")
 _EVENT = struct.Struct("<IBB")
 _CONFIGURE = struct.Struct("<BBHiHHiii")
+# Of a node: the CONFIGURE of all is one frame, so that it is taken whole or not at all.
+MOST_OUTPUTS = (MAX_PAYLOAD - _HEAD.size - _CRC.size) // _CONFIGURE.size
 REPORTED = 9  # bytes of one output in a sample of SAMPLES
 OVERHEAD = _HEAD.size + _SAMPLES.size + _CRC.size  # bytes of a SAMPLES frame beside its samples
 

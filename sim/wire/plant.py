@@ -89,6 +89,9 @@ class Board:
 def board(rig: Rig) -> Board:
     """The wiring that the rig file states for its serial node, or one that fits its sensors."""
     given = rig.device.settings
+    if len(rig.actuator) > MAX_OUTPUTS:
+        expected = f"at most {MAX_OUTPUTS}, the outputs of a simulated node"
+        raise InputError(rig.name, "actuator", len(rig.actuator), expected)
     if rig.device.driver == "serial_node":
         try:
             enc, adc = (
@@ -112,9 +115,6 @@ def board(rig: Rig) -> Board:
     for m in rig.monitor:
         end = max((abs(x) for x in (m.low, m.high) if math.isfinite(x)), default=2 * abs(m.usual))
         analogue[m.name] = Wiring(len(analogue), MOST_COUNTS / (end or 1.0))
-    if len(rig.actuator) > MAX_OUTPUTS:
-        expected = f"at most {MAX_OUTPUTS}, the outputs of a node"
-        raise InputError(rig.name, "actuator", len(rig.actuator), expected)
     outputs = {
         spec.name: Put(i, 1.0 / (spec.resolution or spec.high / MOST_COUNTS), NULLS[i])
         for i, spec in enumerate(rig.actuator)
@@ -133,6 +133,10 @@ def _stated(rig: Rig, given: Mapping[str, Any]) -> dict[str, Put]:
     for spec in rig.actuator:
         o = table[spec.name]
         i = int(o["index"])
+        if not 0 <= i < MAX_OUTPUTS:
+            where = f"device.settings.output.{spec.name}.index"
+            expected = f"below {MAX_OUTPUTS}, the outputs of a simulated node"
+            raise InputError(rig.name, where, i, expected)
         made[spec.name] = Put(i, float(o["counts_per_unit"]), int(o.get("null", NULLS[i])))
     return made
 

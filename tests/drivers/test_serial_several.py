@@ -11,6 +11,10 @@ from serial_pair_kit import BOARD, BOOT, CONFIG, LOOPS, NULLS, PATIENCE, PLAIN, 
 
 from drivers.serial_node.settings import read_settings
 from drivers.serial_node.wire import (
+    MAX_PAYLOAD,
+    MOST_OUTPUTS,
+    OVERHEAD,
+    REPORTED,
     Answer,
     Code,
     Decoder,
@@ -29,6 +33,7 @@ from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Device
 from samii_rig.types import Quality
 from sim.wire.node import Node
+from sim.wire.plant import board
 from sim.wire.protocol import NodeConfig
 
 BOTH = [0, 1]
@@ -365,3 +370,42 @@ def test_a_rig_of_several_outputs_is_refused_by_a_node_with_one(monkeypatch):
     node = Node(NodeConfig(2_000_000, 50, 2, 3, null=37, max_jump=1304), BOOT)
     with pytest.raises(InputError, match=r"output.v_3.index is 1; expected below 1"):
         Desk(RIG, node, monkeypatch.setattr)
+
+
+# How many
+
+
+def many(k):
+    """The rig's first actuator k times."""
+    (first, _) = RIG.actuator
+    names = [f"v_{i}" for i in range(k)]
+    actuators = tuple(first.model_copy(update={"name": name}) for name in names)
+    output = {name: {"index": i, "counts_per_unit": 3276.8} for i, name in enumerate(names)}
+    return changed(output=output).model_copy(update={"actuator": actuators})
+
+
+def test_the_limits_of_all_outputs_fit_one_frame_and_those_of_one_more_are_refused():
+    body = configure_body(**LIMITS)
+    payload = 8 + MOST_OUTPUTS * len(body) + 4  # head and crc
+    assert payload <= MAX_PAYLOAD < payload + len(body)
+    rig = many(MOST_OUTPUTS)
+    assert len(read_settings(rig, rig.device.settings).outputs(rig)) == MOST_OUTPUTS
+    rig = many(MOST_OUTPUTS + 1)
+    with pytest.raises(InputError, match=r"actuator is 21; expected at most 20") as caught:
+        read_settings(rig, rig.device.settings)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_simulated_node_says_how_many_outputs_it_has():
+    with pytest.raises(InputError, match=r"actuator is 4; expected at most 3"):
+        board(many(4))
+    rig = changed(output={**OUTPUT, "v_3": {**OUTPUT["v_3"], "index": 3}})
+    with pytest.raises(InputError, match=r"output.v_3.index is 3; expected below 3"):
+        board(rig)
+
+
+def test_samples_of_three_outputs_and_all_inputs_fit_a_frame_and_of_four_do_not():
+    """As docs/reference/serial-node.md reckons it."""
+    assert [26 + 8 * (REPORTED * k + 4 * 4 + 2 * 8) for k in (3, 4)] == [498, 570]
+    assert OVERHEAD == 26
+    assert 498 <= MAX_PAYLOAD < 570
