@@ -130,7 +130,7 @@ def test_the_responses_are_shown_in_every_view_with_cursors(page: Browser) -> No
     run = {"level": 1, "unit": "V", "n": 2, "frequency": F, "low_hz": 0.5, "high_hz": 4.0}
     run["curves"] = [{**curve, **bands, "input": "v_2", "coherence": [0.99] * 4}]
     data = {"low_hz": 0.5, "high_hz": 4.0, "responses": [run]}
-    data["model"] = {"frequency": F, "input": "v_2", "curves": [curve]}
+    data["model"] = {"frequency": F, "curves": [{**curve, "input": "v_2"}]}
     laid = {"level": 1, "level_unit": "V", "frequency": F}
     re, im = zip(*PARTS, strict=True)
     parts = {"re": re, "im": im, "sd": [0.01] * 4, "coherence": [0.98] * 4}
@@ -198,7 +198,7 @@ undefined
 """
 NO_RESPONSE = {"low_hz": 1, "high_hz": 20, "first_s": 30, "done": 0, "of": 6, "took_s": 0}
 NO_RESPONSE |= {"trouble": "", "final": False, "responses": []}
-NO_RESPONSE["model"] = {"input": "v_2", "frequency": [1, 20], "curves": []}
+NO_RESPONSE["model"] = {"frequency": [1, 20], "curves": []}
 
 
 def test_before_there_is_an_estimate_the_page_says_when_one_is_expected(page: Browser) -> None:
