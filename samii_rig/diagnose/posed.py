@@ -100,6 +100,9 @@ def in_poses(
     pose cannot be used whole, or not together.
     """
     rigs = [at_pose(rig, one.pose) for one in each]
+    if rig.bent and len(each) > 1:
+        expected = "recordings in one pose, as a weight turns otherwise beyond a bend"
+        raise InputError(rig.name, "pose", ", ".join(one.told for one in each), expected)
     if len(each) == 1:
         (one,) = each
         return diagnose(

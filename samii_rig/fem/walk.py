@@ -27,6 +27,7 @@ from samii_rig.rig.schema import (
     AngularVelocitySource,
     AngularVelocitySource2,
     Beam,
+    Bend,
     Branch,
     Current,
     Cylinder,
@@ -108,7 +109,8 @@ class Walk:
         self._loads: list[Load] = []
         self._places: list[tuple[float, str, Row, Row]] = []
         self._chambers: dict[str, tuple[Row, Row]] = {}  # pressures of each cylinder
-        self._weight = rig.pull * sum(map(_mass, rig.element))  # N, of what lies beyond
+        self._beyond = sum(map(_mass, rig.element))  # kg
+        self._pull = rig.pull  # m/s^2 along the chain at the place reached
         self.w: Row = {}
         self.theta: Row = {}
         self.x = 0.0
@@ -129,15 +131,15 @@ class Walk:
         feedback: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         """Add one element and go on to its other end."""
-        before, carried = self.theta, self._weight
-        self._weight -= self._rig.pull * _mass(e)
+        before = self.theta
+        self._beyond -= _mass(e)
         match e:
             case Beam() | TimoshenkoBeam():
                 self._beam(e)
             case RigidLink():
                 self._body(e.L.value, e.r.value, e.m.value, e.I.value, e.name)
-                turned = self._weight * e.L.value + (carried - self._weight) * e.r.value
-                self._spring(self._nodes[e.name] + 1, turned)
+                arm = self._beyond * e.L.value + e.m.value * e.r.value
+                self._spring(self._nodes[e.name] + 1, self._pull * arm)
             case LumpedMass():
                 self._body(0.0, 0.0, e.m.value, e.I.value, e.name)
             case Rod():
@@ -150,6 +152,8 @@ class Walk:
             case Spindle():
                 node = self._point(e.name)
                 self.w, self.theta = {node + 1: e.lead.value}, {}
+            case Bend():
+                self._bend(e)
             case TorsionalSpring():
                 j = self._joint(e.name)
                 if e.name in rigid:
@@ -198,12 +202,12 @@ class Walk:
         phi, J = _shear(e, h), e.J.value if isinstance(e, TimoshenkoBeam) else 0.0
         k = hermite.stiffness(e.EI.value, h, phi)
         m = hermite.consistent_mass(e.mu.value, h, phi, J)
-        own = self._rig.pull * e.mu.value * h
+        own = self._pull * e.mu.value * h
         for i in range(n):
             at = list(range(first + 2 * i, first + 2 * i + 4))
             self._K.add(at, k)
             if own:
-                beyond = self._weight + own * (n - i - 1)
+                beyond = self._pull * self._beyond + own * (n - i - 1)
                 self._K.add(at, hermite.tension((beyond + own, beyond), h, phi))
             self._M.add(at, m)
             self._C.add(at, e.tau.value * k)
@@ -264,6 +268,13 @@ class Walk:
         self._body(0.0, 0.0, 0.0, 0.0, name)
         return self._nodes[name]
 
+    def _bend(self, e: Bend) -> None:
+        """All that lies beyond moves along itself as one, by the part of w in that direction."""
+        node, angle = self._point(e.name), e.angle.value
+        self._M.add([node], self._beyond * np.sin(angle) ** 2)
+        self.w = {node: float(np.cos(angle))}
+        self._pull = self._rig.pulls[[x.name for x in self._rig.element].index(e.name)]
+
     def _spring(self, coordinate: int, k: float, c: float = 0.0) -> None:
         self._K.add([coordinate], k)
         self._C.add([coordinate], c)
@@ -303,13 +314,13 @@ class Walk:
 
     def _branch(self, e: Branch, rigid: Collection[str]) -> None:
         self._point(e.name)
-        here = self.w, self.theta, self.x, self._waiting, self._pulling, self._weight
+        here = self.w, self.theta, self.x, self._waiting, self._pulling, self._beyond
         self._waiting, self._pulling = [], []  # no sensor stands on a branch
-        self._weight = self._rig.pull * _mass(e)
+        self._beyond = _mass(e)
         for part in e.element:
             self.over(part, rigid)
         self.tip(e.tip)
-        self.w, self.theta, self.x, self._waiting, self._pulling, self._weight = here
+        self.w, self.theta, self.x, self._waiting, self._pulling, self._beyond = here
 
     def tip(self, end: End) -> None:
         """Fix the end reached as the rig file says."""
@@ -406,7 +417,7 @@ class Walk:
                     theta = self._span[sensor.on][1]
                 else:
                     theta = self._along(sensor, hermite.rotation, {1: 1.0})
-                g = self._rig.tilt_gravity()
+                g = self._rig.tilt_gravity(sensor.on)
                 return {i: sensor.tilt * g * x for i, x in theta.items() if sensor.tilt}
             case RelativeAngle():
                 return _minus(self._span[sensor.across[-1]][1], self._span[sensor.across[0]][0])

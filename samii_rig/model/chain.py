@@ -38,6 +38,7 @@ from samii_rig.rig.schema import (
     SOURCES,
     Acceleration,
     Beam,
+    Bend,
     Branch,
     Element,
     Gear,
@@ -171,7 +172,7 @@ def _kind(element: Element, pull: float) -> int:
     match element:
         case Beam() if pull == 0:
             return BEAM_KIND
-        case Beam() | TimoshenkoBeam() | Branch() | Rod() | Gear() | Spindle():
+        case Beam() | TimoshenkoBeam() | Branch() | Rod() | Gear() | Spindle() | Bend():
             return WAVES
         case RigidLink() | LumpedMass():
             return LINK
@@ -189,7 +190,7 @@ def _cuts(rig: Rig, extra: Mapping[str, Sequence[float]]) -> dict[str, list[floa
     for name in extra:
         if name not in beams:
             raise InputError("positions", "", name, f"a beam of {beams}")
-    for element in rig.element:
+    for element, pull in zip(rig.element, rig.pulls, strict=True):
         if not isinstance(element, BEAMS):
             continue
         wanted = {float(x) for x in extra.get(element.name, ())}
@@ -201,7 +202,7 @@ def _cuts(rig: Rig, extra: Mapping[str, Sequence[float]]) -> dict[str, list[floa
             if not 0 <= x <= L:
                 raise InputError(element.name, "position", x, f"between 0 and L = {L:g} m")
         inner = sorted(x for x in wanted if 0 < x < L)
-        cuts[element.name] = _in_segments(element, rig.pull, inner)
+        cuts[element.name] = _in_segments(element, pull, inner)
     return cuts
 
 
@@ -219,9 +220,12 @@ class _Parts:
     """The elements of the kernels as they are listed, one list for each array."""
 
     def __init__(
-        self, cuts: Mapping[str, Sequence[float]], inputs: Sequence[str], pull: float
+        self, cuts: Mapping[str, Sequence[float]], inputs: Sequence[str], *, weighs: bool
     ) -> None:
-        self.cuts, self.inputs, self.pull = cuts, inputs, pull
+        self.cuts, self.inputs, self.weighs = cuts, inputs, weighs
+        self.pull = 0.0  # along the chain at the element that is added
+        self.pulls: list[float] = []
+        self.bends: list[tuple[int, float]] = []
         self.keys: list[tuple[str, str]] = []
         self.values: list[float] = []
         self.op: list[tuple[int, int, int]] = []  # kind, pair, row
@@ -237,7 +241,8 @@ class _Parts:
         self.rigid: set[int] = set()
         self.rows = {JUMP: 0, WAVES: 0}
 
-    def add(self, element: Element) -> None:
+    def add(self, element: Element, pull: float) -> None:
+        self.pull = pull
         first = len(self.keys)
         own = parameters(element)
         self.keys += [(element.name, symbol) for symbol in own]
@@ -254,16 +259,20 @@ class _Parts:
         elif isinstance(element, LumpedMass):
             index = [-1, -1, *index]  # a link of no length
         elif isinstance(element, Branch):
-            inner = compile_branch(element, self.pull)
+            inner = compile_branch(element, pull, weighs=self.weighs)
             self.keys += inner.parameters
             self.values += list(inner.values)
             self.branches.append((len(self.op), inner, first))
-        if self.pull and isinstance(element, RigidLink):
+        if pull and isinstance(element, RigidLink):
             self._moment(element)
+        if isinstance(element, Bend):
+            self._carried(element)
         length = element.L.value if isinstance(element, (*BEAMS, RigidLink, Rod)) else 0.0
         inside = self.cuts.get(element.name, ())
         for start, stop in pairwise([0.0, *inside, length]):
             slot, fixed = index + [-1] * (WIDTH - len(index)), [0.0] * WIDTH
+            if isinstance(element, Bend):
+                fixed[0] = math.cos(element.angle.value)
             if isinstance(element, BEAMS):
                 if stop == length:
                     # A position is fixed, so a longer beam is longer behind the last one.
@@ -279,23 +288,38 @@ class _Parts:
         """The moment of gravity on a body, before it."""
         self.op.append((JUMP, POINTS["gravity_stiffness"].pair, self.rows[JUMP]))
         self.rows[JUMP] += 1
-        self.kinds.append("gravity_stiffness")
+        self._loaded("gravity_stiffness", element)
+
+    def _carried(self, element: Bend) -> None:
+        """The mass of what lies beyond a bend, before it, as far as w moves it along itself."""
+        self.bends.append((len(self.op), math.sin(element.angle.value) ** 2))
+        self.op.append((LINK, -1, -1))
+        self._loaded("carried", element)
+
+    def _loaded(self, kind: str, element: Element) -> None:
+        """An operation whose only parameter is a load."""
+        self.kinds.append(kind)
         self.slots.append([-1] * WIDTH)
         self.fixed.append([0.0] * WIDTH)
+        self.pulls.append(self.pull)
         self.places.append((element.name, 0.0))
 
     def weight(self) -> Weight | None:
-        """What gravity loads."""
-        if not self.pull:
+        """What gravity and a bend load."""
+        if not self.weighs:
             return None
         kinds = [kind for kind, _, _ in self.op]
-        bodies = [e for e, kind in enumerate(kinds) if kind == LINK]
+        bends = {e for e, _ in self.bends}
+        bodies = [e for e, kind in enumerate(kinds) if kind == LINK and e not in bends]
+        beams = [e for e, kind in enumerate(self.kinds) if kind in ("beam", "timoshenko_beam")]
         found = Weight(
-            self.pull,
-            tuple(e for e, kind in enumerate(self.kinds) if kind in ("beam", "timoshenko_beam")),
+            tuple(self.pulls),
+            tuple(beams),
+            tuple(e for e in beams if self.pulls[e]),
             tuple(bodies),
-            tuple(e - 1 if self.kinds[e] == "rigid_link" else -1 for e in bodies),
+            tuple(e - 1 if self.kinds[e] == "rigid_link" and self.pulls[e] else -1 for e in bodies),
             tuple(e for e, _, _ in self.branches),
+            tuple(self.bends),
         )
         found.slots(self.slots, len(self.keys))
         return found
@@ -310,6 +334,7 @@ class _Parts:
             row = self.rows[WAVES]
             self.rows[WAVES] += 1
         self.op.append((kind, pair, row))
+        self.pulls.append(self.pull)
         self.kinds.append(element.kind)
         self.slots.append(slot)
         self.fixed.append(fixed)
@@ -329,9 +354,11 @@ def compile_chain(rig: Rig, extra: Mapping[str, Sequence[float]] | None = None) 
 
     Raises InputError for a position that does not lie on its beam.
     """
-    parts = _Parts(_cuts(rig, extra or {}), [a.name for a in rig.actuator], rig.pull)
-    for element in rig.element:
-        parts.add(element)
+    pulls = rig.pulls
+    weighs = any(pulls) or rig.bent
+    parts = _Parts(_cuts(rig, extra or {}), [a.name for a in rig.actuator], weighs=weighs)
+    for element, pull in zip(rig.element, pulls, strict=True):
+        parts.add(element, pull)
     term, term_c = terms(rig, parts.places)
     beam_ends = {(e.name, e.L.value) for e in rig.element if isinstance(e, BEAMS)}
     at_end = tuple(
@@ -366,14 +393,14 @@ def _readings(rig: Rig, places: Sequence[tuple[str, float]]) -> Iterator[tuple[i
             yield i, found[0], behind[found[1]] - 1
 
 
-def compile_branch(branch: Branch, pull: float = 0.0) -> CompiledChain:
+def compile_branch(branch: Branch, pull: float = 0.0, *, weighs: bool = False) -> CompiledChain:
     """A side chain with its root clamped: sources that move the root by w and theta of 1, and
     sensors of M and V there, so that its response is the impedance of the branch. pull : gravity
-    along it, as of the chain that it stands on."""
+    along it, as of the chain that it stands on. weighs : whether its mass is asked for."""
     beams = [e for e in branch.element if isinstance(e, BEAMS)]
-    parts = _Parts({e.name: _in_segments(e, pull) for e in beams}, [], pull)
+    parts = _Parts({e.name: _in_segments(e, pull) for e in beams}, [], weighs=weighs)
     for element in branch.element:
-        parts.add(element)
+        parts.add(element, pull)
     dual = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, -1.0, 0.0]])  # w and theta jump by +1
     term = np.array([[0, 0, 0, -1], [1, 0, 0, -1]])
     term_c = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])

@@ -15,12 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from samii_rig.errors import InputError
 from samii_rig.model.laws import POINTS, SOURCE_LAWS
 from samii_rig.model.transformer import plain
 from samii_rig.rig.schema import (
     MOTION_SOURCES,
     SOURCES,
     Beam,
+    Bend,
     Branch,
     Element,
     ForceSource,
@@ -199,6 +201,9 @@ def matrix(element: Element, s: Complex) -> Complex:
             return torsional_spring_matrix(s, **p)
         case Rod():
             return rod_matrix(s, **p)
+        case Bend():
+            expected = "none by itself: its matrix holds the mass of what lies beyond"
+            raise InputError("element", element.name, element.kind, expected)
         case Gear() | Spindle():
             U = _identity(np.asarray(s, dtype=complex))
             U[..., :4, :4] = plain(element.kind, *p.values())

@@ -17,7 +17,7 @@ from samii_rig.model.laws import LINE_FILTERS, POINTS, READINGS, SOURCE_LAWS
 from samii_rig.types import Complex, Float
 
 _TURN = np.array([1.0, -1.0, 1.0, -1.0])  # theta and V of a mirrored chain
-TRANSFORMERS = ("gear", "spindle")
+TRANSFORMERS = ("gear", "spindle", "bend")
 
 
 def bind(c: CompiledChain, s: Complex, slopes: bool = False) -> Factors:

@@ -129,7 +129,7 @@ def terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Int, Float]:
                     port = behind[sensor.on]  # a table moves what is behind it
                 add(i, port, w=1.0, theta=arm, factor=ACCELERATION)
                 if sensor.tilt:
-                    add(i, port, theta=sensor.tilt * rig.tilt_gravity())
+                    add(i, port, theta=sensor.tilt * rig.tilt_gravity(sensor.on))
     return (
         np.array(term, dtype=np.int64).reshape(-1, 4),
         np.array(term_c, dtype=np.float64).reshape(-1, 4),

@@ -324,7 +324,7 @@ def _element_with(element: Element, values: Mapping[tuple[str, str], float]) -> 
 
 
 def _tilt(sensor: Sensor, rig: Rig) -> float:
-    return sensor.tilt * rig.tilt_gravity() if isinstance(sensor, Acceleration) else 0.0
+    return sensor.tilt * rig.tilt_gravity(sensor.on) if isinstance(sensor, Acceleration) else 0.0
 
 
 def _s(frequency_hz: ArrayLike) -> Complex:

@@ -1,9 +1,10 @@
-"""Gears and spindles: their matrices in the form of `timoshenko.matrix`, and their gradients.
+"""Gears, spindles and bends: matrices in the form of `timoshenko.matrix`, and their gradients.
 
     gear      theta+ = theta-/n,   M+ = n M-
     spindle   w+ = lead theta-,    V+ = -M-/lead,    theta+ = w-,    M+ = -V-
+    bend      w+ = across w-,      V+ = V-/across,   across the cosine of its angle
 
-Both keep the symplectic product. Behind a spindle theta and M are what w and V were before it,
+All keep the symplectic product. Behind a spindle theta and M are what w and V were before it,
 which rest there as these rested.
 """
 
@@ -18,9 +19,11 @@ _TURN = np.diag([1.0, -1.0, 1.0, -1.0])  # theta and V of a mirrored chain
 
 
 def plain(kind: str, ratio: float) -> Float:
-    """(4, 4) of a gear with n or a spindle with lead = `ratio`."""
+    """(4, 4) of a gear with n, a spindle with lead or a bend with across = `ratio`."""
     if kind == "gear":
         return np.diag([1.0, 1 / ratio, ratio, 1.0])
+    if kind == "bend":
+        return np.diag([ratio, 1.0, 1.0, 1 / ratio])
     U = np.zeros((4, 4))
     U[0, 1], U[3, 2], U[1, 0], U[2, 3] = ratio, -1 / ratio, 1.0, -1.0
     return U

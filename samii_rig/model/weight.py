@@ -1,13 +1,19 @@
-"""What gravity does to a straight chain: the tension that its weight makes, and what that resists.
+"""What gravity does to a chain: the tension that its weight makes, and what that resists; and what
+lies beyond a bend, as the bend carries it along.
 
 The chain hangs on its base (or stands on it), so the tension at a place is the weight of all that
-lies beyond, pull = g cos(pose) a kilogram. Turned by theta, each piece of the chain is shorter
-along the pull by theta^2/2 of its length: the energy is 1/2 integral N theta^2 dx. So
+lies beyond, pull = g cos(pose) a kilogram; beyond a bend its angle adds to the pose. Turned by
+theta, each piece of the chain is shorter along the pull by theta^2/2 of its length: the energy is
+1/2 integral N theta^2 dx. So
 
     rigid body   M jumps by k theta, k = N_beyond L + pull m r
     beam         M' = V + N(x) theta, N' = -pull mu
 
-With N = 0 beyond, a body on a pinned base is the physical pendulum, k = m g r.
+With N = 0 beyond, a body on a pinned base is the physical pendulum, k = m g r. The height of a mass
+is a sum of terms of one angle each, so a bend adds none that couples two.
+
+At a bend all that lies beyond moves as one along itself, by w sin(angle): before it stands a mass
+m_beyond sin^2(angle), which resists w alone.
 
 A beam is cut into segments. In each, N(x) = N + N'(x - middle) is replaced by the constant matrix
 of Magnus (the exponent, to fourth order in the length h): N in the middle, and the commutator
@@ -50,28 +56,35 @@ def segments(beam: Beam | TimoshenkoBeam, pull: float, start: float, stop: float
 class Weight:
     """Which operations of a compiled chain weigh something, and what the weight loads.
 
-    beams : operations with tension. bodies : rigid bodies; moments : the operation before each of
-    them that holds its moment, -1 for one without extent. branches : operations that are branches.
+    pulls : at each operation. beams : all; taut : those with tension. bodies : rigid bodies;
+    moments : the operation before each of them that holds its moment, -1 for one without.
+    branches : operations that are branches. bends : masses that stand before a bend, and
+    sin^2 of its angle.
     """
 
-    pull: float
+    pulls: tuple[float, ...]
     beams: tuple[int, ...]
+    taut: tuple[int, ...]
     bodies: tuple[int, ...]
     moments: tuple[int, ...]
     branches: tuple[int, ...]
+    bends: tuple[tuple[int, float], ...]
 
     @property
     def size(self) -> int:
-        """Loads: N and N' of each beam, then k of each body."""
-        return 2 * len(self.beams) + len(self.bodies)
+        """Loads: N and N' of each taut beam, then k of each body, then m of each bend."""
+        return 2 * len(self.taut) + len(self.bodies) + len(self.bends)
 
     def slots(self, slots: list[list[int]], first: int) -> None:
         """Number the loads in the operations' slots from `first` on."""
-        for i, e in enumerate(self.beams):
+        for i, e in enumerate(self.taut):
             slots[e][TENSION], slots[e][SLOPE] = first + 2 * i, first + 2 * i + 1
+        first += 2 * len(self.taut)
         for j, e in enumerate(self.moments):
             if e >= 0:
-                slots[e][0] = first + 2 * len(self.beams) + j
+                slots[e][0] = first + j
+        for k, (e, _) in enumerate(self.bends):
+            slots[e][BODY_M] = first + len(self.bodies) + k
 
     def masses(self, pars: Float, branches: Sequence[float]) -> Float:
         """(n_op,) kg of each operation."""
@@ -85,13 +98,16 @@ class Weight:
     def load(self, pars: Float, branches: Sequence[float]) -> None:
         """Write the loads into the parameters (n_op, WIDTH); branches : kg of each."""
         m = self.masses(pars, branches)
-        beyond = self.pull * (np.cumsum(m[::-1])[::-1] - m)
-        for e in self.beams:
-            pars[e, TENSION] = beyond[e] + self.pull * m[e] / 2
-            pars[e, SLOPE] = -self.pull * pars[e, MU]
+        beyond, pulls = np.cumsum(m[::-1])[::-1] - m, self.pulls
+        for e in self.taut:
+            pars[e, TENSION] = pulls[e] * (beyond[e] + m[e] / 2)
+            pars[e, SLOPE] = -pulls[e] * pars[e, MU]
         for at, e in zip(self.moments, self.bodies, strict=True):
             if at >= 0:
-                pars[at, 0] = beyond[e] * pars[e, BODY_L] + self.pull * m[e] * pars[e, BODY_R]
+                arm = beyond[e] * pars[e, BODY_L] + m[e] * pars[e, BODY_R]
+                pars[at, 0] = pulls[e] * arm
+        for e, part in self.bends:
+            pars[e, BODY_M] = part * beyond[e]
 
     def mass_slopes(self, pars: Float, by: Float, branches: Sequence[Float]) -> Float:
         """(n_op, n_values) of `masses`; by (n_op, WIDTH, n_values) of the parameters."""
@@ -110,10 +126,11 @@ class Weight:
         beyond = np.cumsum(masses[::-1])[::-1] - masses
         d_beyond = np.cumsum(dm[::-1], axis=0)[::-1] - dm
         out: list[Float] = []
-        for e in self.beams:
-            out += [d_beyond[e] + dm[e] / 2, -by[e, MU]]
+        for e in self.taut:
+            out += [self.pulls[e] * (d_beyond[e] + dm[e] / 2), -self.pulls[e] * by[e, MU]]
         for e in self.bodies:
             turned = beyond[e] * by[e, BODY_L] + d_beyond[e] * pars[e, BODY_L]
             own = masses[e] * by[e, BODY_R] + dm[e] * pars[e, BODY_R]
-            out.append(turned + own)
-        return self.pull * np.array(out).reshape(self.size, by.shape[2])
+            out.append(self.pulls[e] * (turned + own))
+        out += [part * d_beyond[e] for e, part in self.bends]
+        return np.array(out).reshape(self.size, by.shape[2])

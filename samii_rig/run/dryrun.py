@@ -235,7 +235,7 @@ def _refuse_falling(rig: Rig) -> None:
     Only what stands on a joint can do that. A chain with stiffness and gravity falls without
     swinging: its pole is real, where D, which is real there, changes its sign.
     """
-    stands = rig.pull < 0 or any(
+    stands = min(rig.pulls) < 0 or any(
         isinstance(e, GravityStiffness) and e.k.value < 0 for e in flattened(rig.element)
     )
     if not stands:

@@ -9,16 +9,17 @@ from samii_rig.diagnose.physics.effect import Effect, Key, Values
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Float
 
-WEIGHTY = ("added_mass", "attached_oscillator")  # do more than their jump where there is gravity
+WEIGHTY = ("added_mass", "attached_oscillator")  # do more than their jump where something is loaded
 OF_WEIGHT = "gravity_stiffness"
 
 
 def weighty(table: Sequence[Effect], rig: Rig, *, poses: bool) -> list[Effect]:
-    """The table of a rig with gravity, where parts at one place no longer differ in x(s) alone:
-    those that load the chain have a place of their own. poses : there are several; then the
+    """The table of a rig with gravity or a bend, where parts at one place no longer differ in x(s)
+    alone: those that load the chain have a place of their own. poses : there are several; then the
     stiffness of gravity has one too, as it turns with the chain."""
     own = (*WEIGHTY, *((OF_WEIGHT,) if poses else ()))
-    return [_by_itself(e) if rig.gravity and e.physics in own else e for e in table]
+    loaded = bool(rig.gravity) or rig.bent
+    return [_by_itself(e) if loaded and e.physics in own else e for e in table]
 
 
 def _by_itself(effect: Effect) -> Effect:

@@ -35,6 +35,7 @@ from samii_rig.rig.schema.base import (
     some_stiffness,
     zero,
 )
+from samii_rig.rig.schema.pose import BendAngle
 
 __all__ = [
     "Finite",
@@ -138,6 +139,18 @@ class Spindle(ElementBase):
 
     kind: Literal["spindle"]
     lead: Annotated[Parameter, AfterValidator(Quantity("m/rad", "any"))]
+
+
+class Bend(ElementBase):
+    """A joint at rest at an angle: what lies beyond leaves the line of the chain by `angle`.
+
+    What is across the chain before it is across and along what lies beyond, which is as stiff along
+    itself as a rigid body: w+ = w- cos(angle), V+ = (V- - m s^2 sin^2(angle) w-)/cos(angle), m the
+    mass of all that lies beyond.
+    """
+
+    kind: Literal["bend"]
+    angle: BendAngle
 
 
 class TorsionalSpring(ElementBase):
@@ -412,7 +425,7 @@ MOTION_SOURCES = (DisplacementSource, VelocitySource, AccelerationSource)  # pre
 SOURCES = (*ANGLE_SOURCES, TorqueSource, ForceSource, *MOTION_SOURCES)
 BEAMS = (Beam, TimoshenkoBeam)
 LINES = (HydraulicLine, LumpedLine)
-TRANSFORMERS = (Gear, Spindle)
+TRANSFORMERS = (Gear, Spindle, Bend)
 
 Element = Annotated[
     Beam
@@ -422,6 +435,7 @@ Element = Annotated[
     | Inertia
     | Gear
     | Spindle
+    | Bend
     | TorsionalSpring
     | TranslationalSpring
     | TorsionalGroundSpring

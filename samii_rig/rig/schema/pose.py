@@ -1,4 +1,4 @@
-"""Gravity and the chain's angle to it, as the rig file gives them."""
+"""Gravity, the chain's angle to it, and where it is bent, as the rig file gives them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import AfterValidator, Field
 
 from samii_rig.rig.schema.base import Finite, Strict
+from samii_rig.rig.schema.sensors import Displacement, Velocity
 from samii_rig.units import convert
 
 if TYPE_CHECKING:
     from samii_rig.rig.schema.rig import Rig
 
+# Least |cos| of a bend, 0.1 deg from a right angle. There what lies beyond has no motion across it
+# that the base could give; what is divided by cos loses three digits on the way.
+LEAST_ACROSS = 1.7e-3
 LEVEL = 1e-12  # |cos(pose)| below which a chain is level: 90 deg in rad is rounded to 1e-16
 
 
@@ -36,10 +40,71 @@ def _in_rad(angle: Angle) -> Angle:
 Pose = Annotated[Angle, AfterValidator(_in_rad)]
 
 
+def _bent(angle: Angle) -> Angle:
+    if abs(math.cos(angle.value)) < LEAST_ACROSS:
+        raise ValueError(
+            f"{math.degrees(angle.value):.5g} deg; expected at least 0.1 deg from a right angle, "
+            "where what lies beyond has no motion across it that comes from the base"
+        )
+    return angle
+
+
+BendAngle = Annotated[Angle, AfterValidator(_in_rad), AfterValidator(_bent)]
+
+
 def pull(gravity: float, pose: Angle | None) -> float:
     """Gravity along the chain, base to tip, m/s^2: g where it hangs, -g where it stands."""
     along = math.cos(pose.value) if pose else 1.0
     return gravity * along if abs(along) > LEVEL else 0.0
+
+
+def pulls(rig: Rig) -> tuple[float, ...]:
+    """`pull` at each element of the chain: a bend turns all that lies beyond it."""
+    at, out = rig.pose.value if rig.pose else 0.0, []
+    for e in rig.element:
+        if e.kind == "bend":
+            at += e.angle.value
+        out.append(pull(rig.gravity, Angle(value=at, unit="rad")))
+    return tuple(out)
+
+
+def check_bend(rig: Rig) -> None:
+    """ValueError, in one line, for a bent chain whose motion along itself is more than one number:
+    the state of a chain has none along it."""
+    bends = [i for i, e in enumerate(rig.element) if e.kind == "bend"]
+    if not bends:
+        return
+    first, *more = (rig.element[i].name for i in bends)
+    if more:
+        raise ValueError(
+            f"element {more[0]}: a second bend; expected {first} alone, as the motion along the "
+            "chain between two bends is none of its states"
+        )
+    if rig.base == "free":
+        raise ValueError(
+            f"element {first}: a bend behind base 'free', which moves along the chain too; "
+            "expected base 'clamped' or 'pinned'"
+        )
+    if rig.tip != "free":
+        raise ValueError(
+            f"element {first}: a bend before tip {rig.tip!r}, which would hold the chain along "
+            "itself; expected tip 'free'"
+        )
+    _check_sides(rig, bends[0])
+
+
+def _check_sides(rig: Rig, bend: int) -> None:
+    """No displacement of one side is read against the other, where it has another direction."""
+    beyond = {e.name for e in rig.element[bend:]}
+    for s in rig.sensor:
+        if not isinstance(s, Displacement | Velocity) or s.against is None:
+            continue
+        if (s.after in beyond) != (s.against in beyond):
+            raise ValueError(
+                f"sensor {s.name}: against {s.against!r}, on the other side of the bend "
+                f"{rig.element[bend].name}; expected a place on the same side, where w has the "
+                "same direction"
+            )
 
 
 def check_gravity(rig: Rig) -> None:

@@ -22,7 +22,7 @@ from samii_rig.rig.schema.elements import (
     flattened,
     input_unit,
 )
-from samii_rig.rig.schema.pose import check_gravity
+from samii_rig.rig.schema.pose import check_bend, check_gravity
 from samii_rig.rig.schema.sensors import (
     Acceleration,
     Current,
@@ -43,6 +43,7 @@ def check_references(rig: Rig) -> None:
     unlike(e.name for e in flattened(rig.element))
     check_motion(rig)
     check_gravity(rig)
+    check_bend(rig)
     _check_inputs(rig)
     _check_sensors(rig)
     _check_channels(rig)

@@ -11,10 +11,10 @@ from samii_rig.rig.schema.actuators import ActuatorSpec
 from samii_rig.rig.schema.base import NonNegative, Positive, Strict
 from samii_rig.rig.schema.conversion import in_si
 from samii_rig.rig.schema.device import Device, Service
-from samii_rig.rig.schema.elements import Element, End, Motion
+from samii_rig.rig.schema.elements import Bend, Element, End, Motion
 from samii_rig.rig.schema.limits import Agreement, Limit, Monitor
 from samii_rig.rig.schema.loops import Centring, Feedback
-from samii_rig.rig.schema.pose import Pose, pull
+from samii_rig.rig.schema.pose import Pose, pull, pulls
 from samii_rig.rig.schema.references import check_references, unlike
 from samii_rig.rig.schema.sensors import Sensor
 from samii_rig.units import STANDARD_GRAVITY
@@ -24,8 +24,8 @@ class Rig(Strict):
     """A rig file. Elements stand in the order base to tip.
 
     motion : "lateral" for a chain that bends and turns, "axial" for one that moves along itself.
-    gravity : m/s^2, 0 for none. pose : angle of the straight chain, base to tip, to the way down:
-        0 (if left out) it hangs, 90 deg it is level, 180 deg it stands.
+    gravity : m/s^2, 0 for none. pose : angle of the chain at its base to the way down: 0 (if left
+        out) it hangs, 90 deg it is level, 180 deg it stands.
     """
 
     name: str = Field(min_length=1)
@@ -75,10 +75,22 @@ class Rig(Strict):
         """Gravity along the chain, base to tip, m/s^2: negative where it stands."""
         return pull(self.gravity, self.pose)
 
-    def tilt_gravity(self) -> float:
-        """What a tilting accelerometer reads a rad, m/s^2: `pull`, or with no gravity in the rig
-        file that of a hanging chain."""
-        return self.pull if self.gravity else STANDARD_GRAVITY
+    @property
+    def pulls(self) -> tuple[float, ...]:
+        """The same at each element: a bend turns all that lies beyond it."""
+        return pulls(self)
+
+    @property
+    def bent(self) -> bool:
+        """Whether a bend is in the chain."""
+        return any(isinstance(e, Bend) for e in self.element)
+
+    def tilt_gravity(self, on: str) -> float:
+        """What an accelerometer that tilts with the element `on` reads a rad, m/s^2: gravity along
+        the chain there, or with no gravity in the rig file that of a hanging chain."""
+        if not self.gravity:
+            return STANDARD_GRAVITY
+        return self.pulls[[e.name for e in self.element].index(on)]
 
     def units(self) -> dict[str, str]:
         """Unit of every channel, actuators, sensors and monitors, by name."""
