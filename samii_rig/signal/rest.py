@@ -27,6 +27,9 @@ TAIL_LOUD = 0.03
 # What a burst still knows of the start from rest may reach this many standard deviations of the
 # tail's strongest line: spread over the whole burst it is then below the noise of the estimate.
 FORGOTTEN = 5.0
+AROUND = 5  # lines over which a tail's scatter is told at the least: two repeats have one each
+# Of the power of the tail's strongest line: noise that bursts without any are taken to have.
+NOISELESS = 1e-24
 NEVER = 1_000_000
 
 
@@ -75,29 +78,43 @@ def ringing(pieces: Sequence[Piece], channels: Sequence[Channel], highest: float
         f"{part:.2g} % of its peak) in the last {tail} samples of {pieces[0].name}"
     )
     finding = Finding("leakage", "warning", message, channel=channels[i + 1].name)
-    return Ringing(finding, _settled_after(ends.mean(axis=0), snr, n) if row else NEVER)
+    after = _settled_after(ends, highest, n) if row else NEVER
+    return Ringing(finding, after)
 
 
-def _settled_after(tail: Float, snr: Float, n: int) -> int:
+def _settled_after(ends: Float, highest: float, n: int) -> int:
     """After how many bursts of `n` samples the memory of the start is below the noise.
 
     What rings at the end is forgotten over a burst by the factor by which it decays in that
-    time, read off the two halves of the mean tail, at the strongest line of the output that
-    shows it best.
+    time, read off the two halves of the mean tail, at the line where the ring stands out most and
+    of all outputs together. One output by itself may take a slow disturbance for a ring that does
+    not decay. ends : (n_burst, tail, p) of those that started in a tail.
     """
-    half = tail.shape[0] // 2
-    i = int(np.argmax(snr))
-    first, second = (_hann(x[:, None])[:, 0] for x in (tail[:half, i], tail[-half:, i]))
-    line = 1 + int(np.argmax(np.abs(first[1:])))
-    decay = float(abs(second[line])) / max(float(abs(first[line])), 1e-300)
+    count, tail, _ = ends.shape
+    own = np.stack([_hann(x) for x in ends])[:, 1 : max(2, int(highest * tail) + 1)]
+    ring, half = own.mean(axis=0), tail // 2
+    noise = np.mean(np.abs(own - ring) ** 2, axis=0) / max(count - 1, 1)
+    near = [np.convolve(x, np.ones(AROUND) / AROUND, "same") for x in noise.T]
+    size = np.maximum(np.stack(near, axis=1), noise.mean(axis=0))
+    weight = 1 / (size + NOISELESS * np.max(np.abs(ring) ** 2, axis=0) + 1e-300)
+    power = np.sum(weight * np.abs(ring) ** 2, axis=1)
+    line = int(np.argmax(power))
+    first, second = (
+        _hann(x)[max(1, round((line + 1) * half / tail))]
+        for x in (ends.mean(axis=0)[:half], ends.mean(axis=0)[-half:])
+    )
+    w = weight[line]
+    decay = float(abs(np.vdot(first, w * second))) / max(np.vdot(first, w * first).real, 1e-300)
     if decay >= 1:
         return NEVER
-    forgotten = -math.log(max(decay, 1e-300)) * n / half
-    loudness = math.log(min(max(float(snr[i]) / FORGOTTEN, 1.0), 1e12))
+    forgotten: float = -math.log(max(decay, 1e-300)) * n / half
+    loudness = math.log(max(math.sqrt(float(power[line])) / FORGOTTEN, 1.0))
     return max(1, math.ceil(float(loudness / forgotten)))
 
 
 def _hann(x: Float) -> Complex:
+    """Lines of the columns of x less their mean."""
+    x = x - x.mean(axis=0)
     return np.asarray(np.fft.rfft(x * np.hanning(x.shape[0])[:, None], axis=0))
 
 
