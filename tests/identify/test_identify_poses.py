@@ -50,6 +50,20 @@ def test_two_poses_tell_a_spring_a_mass_and_an_inertia_which_one_pose_does_not()
     assert not identify(seen, weaker(rig), FREE, starts=2).fit.holds
 
 
+def test_a_bent_arm_has_one_set_of_parameters_in_several_poses() -> None:
+    """Each of its parts has its own pose; what the bend carries along is not told again."""
+    elbow = {"name": "bent", "kind": "bend", "angle": {"value": 60.0, "unit": "deg"}}
+    spring = part("torsional_ground_spring", "hinge", k=40.0, c=0.2)
+    fore = arm("fore", L=0.4, r=0.2, m=0.8, I=0.012)
+    wrist = part("torsional_spring", "wrist", k=15.0, c=0.02)
+    rig = hanging(spring, arm(), elbow, wrist, fore, pose=0.0, rate_hz=100.0)
+    poses = [read_pose(text) for text in POSES]
+    seen = [drawn(at_pose(rig, pose), i, n=80, band=(0.1, 5.0)) for i, pose in enumerate(poses)]
+    found = identify(seen, weaker(rig), FREE, starts=2, poses=poses)
+    assert found.fit.holds
+    assert found.values == pytest.approx([40.0, 2.0, 0.3], rel=0.03)
+
+
 def blank(rig_toml: str = "") -> Recording:
     empty = np.zeros((0, 0))
     none = np.zeros(0, np.int64)
