@@ -7,7 +7,7 @@ a lag 1/p.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,8 +18,8 @@ from sim.assumed_modes.parts import (
     EXTENDED,
     JOINTS,
     MOTION_SOURCES,
-    SOURCES,
     Attachment,
+    Drive,
     Lag,
     Part,
     Setup,
@@ -306,64 +306,79 @@ def oscillator(rng: Rng, setup: Setup) -> Draft:
     )  # fmt: skip
 
 
-def _source(setup: Setup) -> Part:
-    return next(p for p in setup.parts if p.kind in SOURCES)
+def drawn_drive(rng: Rng, drives: Sequence[Drive]) -> Drive:
+    """One of them; nothing is drawn where there is but one."""
+    return drives[0 if len(drives) == 1 else int(rng.integers(len(drives)))]
 
 
-def angle_source(setup: Setup) -> Part:
-    """The source that turns an angle; LookupError where the drive is a force or a torque."""
-    for part in setup.parts:
-        if part.kind in ANGLE_SOURCES:
-            return part
-    raise LookupError("no angular velocity source")
+def turning_drives(setup: Setup) -> list[Drive]:
+    """Drives that turn an angle; LookupError where all are forces or torques."""
+    turn = {p.name for p in setup.parts if p.kind in ANGLE_SOURCES}
+    found = [d for d in setup.drives if turn.intersection(d.sources)]
+    if not found:
+        raise LookupError("no angular velocity source")
+    return found
+
+
+def _angle_source(rng: Rng, setup: Setup) -> str:
+    drive = drawn_drive(rng, turning_drives(setup))
+    return next(p.name for p in setup.parts if p.name in drive.sources and p.kind in ANGLE_SOURCES)
+
+
+def _filtering(physics: str, drive: Drive, units: Mapping[str, str], values: Callable[
+    [float], Numbers], most: float) -> Draft:  # fmt: skip
+    """A filter in a drive's path."""
+
+    def apply(s: Setup, v: Numbers) -> Setup:
+        own = next(d for d in s.drives if d.name == drive.name)
+        return s.driven(replace(own, path=(*own.path, Lag(**v))))
+
+    return Draft(
+        physics, drive.sources[0], None, dict(units), values, apply, 1e-7, most,
+        also=((physics, drive.name),),
+    )  # fmt: skip
+
+
+def _lag(drive: Drive) -> Draft:
+    return _filtering("actuator_lag", drive, {"p": "rad/s"}, lambda x: {"p": 1 / x}, 0.1)
 
 
 def lag(rng: Rng, setup: Setup) -> Draft:
-    """A first-order lag of the drive."""
+    """A first-order lag of a drive."""
+    return _lag(drawn_drive(rng, setup.drives))
 
-    def apply(s: Setup, v: Numbers) -> Setup:
-        return replace(s, path=(*s.path, Lag(p=v["p"])))
 
-    site = _source(setup).name
-    return Draft(
-        "actuator_lag", site, None, {"p": "rad/s"}, lambda x: {"p": 1 / x}, apply, 1e-7, 0.1,
-        also=(("actuator_lag", setup.actuator.name),),
+def _valve(zeta: float, drive: Drive) -> Draft:
+    return _filtering(
+        "valve_dynamics", drive, {"omega": "rad/s", "zeta": "1"},
+        lambda x: {"omega": 1 / x, "zeta": zeta}, 0.05,
     )  # fmt: skip
 
 
 def valve(rng: Rng, setup: Setup) -> Draft:
     """A valve of second order."""
-    return _valve(float(rng.uniform(0.3, 1.0)), setup)
+    return _valve(float(rng.uniform(0.3, 1.0)), drawn_drive(rng, setup.drives))
 
 
-def _valve(zeta: float, setup: Setup) -> Draft:
+def _dead_time(drive: Drive) -> Draft:
     def apply(s: Setup, v: Numbers) -> Setup:
-        return replace(s, path=(*s.path, Lag(omega=v["omega"], zeta=v["zeta"])))
+        own = next(d for d in s.drives if d.name == drive.name)
+        return s.driven(replace(own, delay=own.delay + v["tau"]))
 
-    site = _source(setup).name
     return Draft(
-        "valve_dynamics", site, None, {"omega": "rad/s", "zeta": "1"},
-        lambda x: {"omega": 1 / x, "zeta": zeta}, apply, 1e-7, 0.05,
-        also=(("valve_dynamics", setup.actuator.name),),
+        "transport_delay", drive.sources[0], None, {"tau": "s"}, lambda x: {"tau": x}, apply,
+        1e-7, 0.02, also=(("transport_delay", drive.name),),
     )  # fmt: skip
 
 
 def dead_time(rng: Rng, setup: Setup) -> Draft:
-    """Dead time in the input's path."""
-
-    def apply(s: Setup, v: Numbers) -> Setup:
-        return replace(s, delay=s.delay + v["tau"])
-
-    site = _source(setup).name
-    return Draft(
-        "transport_delay", site, None, {"tau": "s"}, lambda x: {"tau": x}, apply, 1e-7, 0.02,
-        also=(("transport_delay", setup.actuator.name),),
-    )  # fmt: skip
+    """Dead time in an input's path."""
+    return _dead_time(drawn_drive(rng, setup.drives))
 
 
 def velocity_feedback(rng: Rng, setup: Setup) -> Draft:
     """The drive gives way to the torque: M = g_v (g_a v - theta')."""
-    site = angle_source(setup).name
+    site = _angle_source(rng, setup)
 
     def apply(s: Setup, v: Numbers) -> Setup:
         return s.inserted(
@@ -379,7 +394,7 @@ def velocity_feedback(rng: Rng, setup: Setup) -> Draft:
 def oil(rng: Rng, setup: Setup) -> Draft:
     """Compressible oil between valve and vane."""
     D = 1.475e-5  # m^3/rad, the motor of paper 2, section 2
-    site = angle_source(setup).name
+    site = _angle_source(rng, setup)
 
     def apply(s: Setup, v: Numbers) -> Setup:
         return s.inserted(site, Part(f"oil_{site}", "oil_column", {"D": D, "C_h": v["C_h"]}))
@@ -519,11 +534,10 @@ RIVAL_ZETA = 0.7  # of a valve that stands in for something else
 
 def late_rivals(draft: Draft, setup: Setup) -> list[Draft]:
     """Other physics that make the same drive or sensor late."""
-    rng = np.random.default_rng(0)
-    drive = ("actuator_lag", "valve_dynamics", "transport_delay")
-    if draft.physics in drive:
-        return [_valve(RIVAL_ZETA, setup) if x == "valve_dynamics" else LINEAR[x](rng, setup)
-                for x in drive if x != draft.physics]  # fmt: skip
+    if draft.physics in ("actuator_lag", "valve_dynamics", "transport_delay"):
+        drive = next(d for d in setup.drives if draft.site in d.sources)
+        late = (_lag(drive), _valve(RIVAL_ZETA, drive), _dead_time(drive))
+        return [x for x in late if x.physics != draft.physics]
     if draft.physics in ("sensor_delay", "sensor_lag"):
         s = next(s for s in setup.sensors if s.name == draft.site)
         return [_sensor_lag(s) if draft.physics == "sensor_delay" else _sensor_delay(s)]

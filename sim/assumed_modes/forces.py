@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sim.assumed_modes.effects import Draft, Numbers, angle_source
-from sim.assumed_modes.parts import ANGLE_SOURCES, JOINTS, SOURCES, Force, Setup
+from sim.assumed_modes.effects import Draft, Numbers, drawn_drive, turning_drives
+from sim.assumed_modes.parts import ANGLE_SOURCES, JOINTS, Drive, Force, Setup
 
 Rng = np.random.Generator
 START = 1e-3  # of a joint's swing, or its spring's largest moment: what a force begins with
@@ -17,11 +17,11 @@ START = 1e-3  # of a joint's swing, or its spring's largest moment: what a force
 @dataclass(frozen=True, slots=True)
 class Swing:
     """What the nominal rig does at the trial's largest level: peaks of the joints' relative motion
-    (rad or m), of the moment at the source (N m) and of the command (actuator unit)."""
+    (rad or m); by actuator, of the moment at its source (N m) and of the command (its unit)."""
 
     joints: dict[str, float]
-    moment: float
-    command: float
+    moment: dict[str, float]
+    command: dict[str, float]
 
 
 def joint(rng: Rng, setup: Setup, swing: Swing) -> tuple[str, float, float]:
@@ -86,11 +86,10 @@ def hardening(rng: Rng, setup: Setup, swing: Swing) -> Draft:
 
 
 def _of_drive(
-    physics: str, setup: Setup, units: dict[str, str], values: Callable[[float], Numbers],
+    physics: str, drive: Drive, units: dict[str, str], values: Callable[[float], Numbers],
     start: float, most: float,
 ) -> Draft:  # fmt: skip
-    source = next(p.name for p in setup.parts if p.kind in SOURCES)
-    on = setup.actuator.name
+    source, on = drive.sources[0], drive.name
 
     def apply(s: Setup, v: Numbers) -> Setup:
         return replace(s, forces=(*s.forces, Force(physics, on, v)))
@@ -100,26 +99,29 @@ def _of_drive(
 
 def dead_zone(rng: Rng, setup: Setup, swing: Swing) -> Draft:
     """Overlap of the valve's spool."""
+    drive = drawn_drive(rng, setup.drives)
+    peak = swing.command[drive.name]
     return _of_drive(
-        "valve_deadband", setup, {"width": setup.actuator.unit}, lambda x: {"width": x},
-        START * swing.command, swing.command,
+        "valve_deadband", drive, {"width": drive.actuator.unit}, lambda x: {"width": x},
+        START * peak, peak,
     )  # fmt: skip
 
 
 def clipping(rng: Rng, setup: Setup, swing: Swing) -> Draft:
     """The command is clipped behind the converter that is recorded."""
+    drive = drawn_drive(rng, setup.drives)
     return _of_drive(
-        "output_saturation", setup, {"limit": setup.actuator.unit},
-        lambda x: {"limit": swing.command * (1.0 - x)}, START, 0.8,
+        "output_saturation", drive, {"limit": drive.actuator.unit},
+        lambda x: {"limit": swing.command[drive.name] * (1.0 - x)}, START, 0.8,
     )  # fmt: skip
 
 
 def orifice(rng: Rng, setup: Setup, swing: Swing) -> Draft:
     """Flow through the valve falls as the load takes the pressure: v sqrt(1 + sgn(v) M/M_stall)."""
-    angle_source(setup)
+    drive = drawn_drive(rng, turning_drives(setup))
     return _of_drive(
-        "flow_saturation", setup, {"M_stall": "N m"}, lambda x: {"M_stall": swing.moment / x},
-        START, 0.8,
+        "flow_saturation", drive, {"M_stall": "N m"},
+        lambda x: {"M_stall": swing.moment[drive.name] / x}, START, 0.8,
     )  # fmt: skip
 
 

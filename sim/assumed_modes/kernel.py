@@ -22,7 +22,7 @@ N_VALUES = 5
 
 
 class Pieces(NamedTuple):
-    """The arrays of a `Timeline` and of the plant; see there. g (p, n_law): how far a unit force
+    """The arrays of a `Timeline` and of the plant, see there. g (p, n_law): how far a unit force
     of each law moves its own place in a piece; gv the same for its velocity."""
 
     Phi: Float
@@ -30,7 +30,7 @@ class Pieces(NamedTuple):
     new: Int
     read: Int
     late: Int
-    wait: int
+    wait: Int
     h: Float
     C: Float
     D: Float
@@ -40,23 +40,25 @@ class Pieces(NamedTuple):
 
 
 class Laws(NamedTuple):
-    """law (n_law,) of the numbers above; value (n_law, N_VALUES)."""
+    """law (n_law,) of the numbers above; value (n_law, N_VALUES). drive (n_law,) : the drive on
+    whose command a law of the flow acts."""
 
     law: Int
     value: Float
+    drive: Int
 
 
 class Controller(NamedTuple):
-    """The loop: v = r - kp theta, rounded to `step` and clipped to low, high. dead, clip : width
-    of a dead zone, and a limit, between the converter and the source; 0 for none."""
+    """The loops: v = r - feedback y, rounded to `step` and clipped to low, high. dead, clip :
+    width of a dead zone, and a limit, between converter and source; 0 for none. feedback
+    (n_in, n_y), the others (n_in,)."""
 
-    theta: int
-    kp: float
-    step: float
-    low: float
-    high: float
-    dead: float
-    clip: float
+    feedback: Float
+    step: Float
+    low: Float
+    high: Float
+    dead: Float
+    clip: Float
 
 
 class Converters(NamedTuple):
@@ -109,16 +111,17 @@ def run(
     x: Float,
     t: float,
 ) -> tuple[Float, Float]:
-    """Samples (n, n_y) and commands (n,) of a run from the state x at time t; x moves on.
+    """Samples (n, n_y) and commands (n, n_in) of a run from the state x at time t; x moves on.
 
-    r (n,) : what the loop is asked for. noise (n, n_y), push (n, n_d) : sensors' errors and
+    r (n, n_in) : what the loops are asked for. noise (n, n_y), push (n, n_d) : sensors' errors and
     disturbances. A step of 0 leaves a value as it is.
     """
-    n, n_y, n_law = r.size, pieces.C.shape[0], laws.law.size
-    y, v = np.zeros((n, n_y)), np.zeros(n)
+    n, n_in = r.shape
+    n_y, n_law = pieces.C.shape[0], laws.law.size
+    y, v = np.zeros((n, n_y)), np.zeros((n, n_in))
     deep = pieces.late.max()
     line = np.zeros((deep + 1, n_y))  # line[k]: what is shown k samples from now
-    old = np.zeros(pieces.wait + 2)  # outputs, the newest first
+    old = np.zeros((n_in, pieces.wait.max() + 2))  # outputs, the newest first
     u = np.zeros(pieces.Gamma.shape[2])
     f = np.zeros(n_law)
     memory = np.zeros(n_law)
@@ -129,25 +132,29 @@ def run(
             if converters.step[i] > 0.0:
                 value = np.rint(value / converters.step[i]) * converters.step[i]
             y[k, i] = min(max(value, converters.low[i]), converters.high[i])
-        out = r[k] - control.kp * y[k, control.theta]
-        if control.step > 0.0:
-            out = np.rint(out / control.step) * control.step
-        out = min(max(out, control.low), control.high)
-        v[k] = out
-        if control.dead > 0.0:
-            half = 0.5 * control.dead
-            out = out - min(max(out, -half), half)
-        if control.clip > 0.0:
-            out = min(max(out, -control.clip), control.clip)
-        for j in range(old.size - 1, 0, -1):
-            old[j] = old[j - 1]
-        old[0] = out
+        for i in range(n_in):
+            out = r[k, i]
+            for j in range(n_y):
+                out -= control.feedback[i, j] * y[k, j]
+            if control.step[i] > 0.0:
+                out = np.rint(out / control.step[i]) * control.step[i]
+            out = min(max(out, control.low[i]), control.high[i])
+            v[k, i] = out
+            if control.dead[i] > 0.0:
+                half = 0.5 * control.dead[i]
+                out = out - min(max(out, -half), half)
+            if control.clip[i] > 0.0:
+                out = min(max(out, -control.clip[i]), control.clip[i])
+            for j in range(old.shape[1] - 1, 0, -1):
+                old[i, j] = old[i, j - 1]
+            old[i, 0] = out
         for j in range(deep):
             line[j] = line[j + 1]
         for j in range(push.shape[1]):
-            u[1 + n_law + j] = push[k, j]
+            u[n_in + n_law + j] = push[k, j]
         for p in range(pieces.h.size):
-            u[0] = old[pieces.wait + 1 - pieces.new[p]]
+            for i in range(n_in):
+                u[i] = old[i, pieces.wait[i] + 1 - pieces.new[p, i]]
             t += pieces.h[p]
             if n_law == 0:
                 x[:] = np.dot(pieces.Phi[p], x) + np.dot(pieces.Gamma[p], u)
@@ -173,13 +180,15 @@ def _with_laws(
 ) -> None:
     """One piece with laws: x, the forces f at its end, the memories and z move on."""
     n_law, h = laws.law.size, pieces.h[p]
+    first = pieces.wait.size  # behind the drives
     for i in range(n_law):
-        u[1 + i] = 0.0
+        u[first + i] = 0.0
         # Flow through an orifice: less under load, which is a chain's moment against v.
         if laws.law[i] == 5:
-            u[0] *= np.sqrt(max(0.0, 1.0 + np.sign(u[0]) * z[2 * i] / laws.value[i, 0]))
+            d = laws.drive[i]
+            u[d] *= np.sqrt(max(0.0, 1.0 + np.sign(u[d]) * z[2 * i] / laws.value[i, 0]))
         elif laws.law[i] != 2:
-            u[1 + i] = 0.5 * f[i]
+            u[first + i] = 0.5 * f[i]
     x[:] = np.dot(pieces.Phi[p], x) + np.dot(pieces.Gamma[p], u)
     z[:] = np.dot(pieces.Z, x)
     for i in range(n_law):
@@ -208,7 +217,7 @@ def _with_laws(
             if law == 3:
                 memory[i] = bouc_wen(value, speed + pieces.gv[p, i] * push, memory[i], h)
             f[i] = force
-        u[1 + i] += push
+        u[first + i] += push
         for j in range(x.size):
-            x[j] += pieces.Gamma[p, j, 1 + i] * push
+            x[j] += pieces.Gamma[p, j, first + i] * push
         z[:] = np.dot(pieces.Z, x)

@@ -1,4 +1,4 @@
-"""What is simulated: a chain of parts with what hangs on it, its sensors and its input's path.
+"""What is simulated: a chain of parts with what hangs on it, its sensors and its inputs' paths.
 
 It begins as the rig file says, with the nominal parameters that were drawn; an effect returns
 another one with something added or changed.
@@ -109,22 +109,38 @@ class Lag:
 
 
 @dataclass(frozen=True, slots=True)
-class Setup:
-    """The whole of what is simulated.
+class Drive:
+    """One input: its converter, and what lies between that and the sources that it moves.
 
-    motion : "lateral" or "axial", as of the rig file. delay : s by which the source acts later than
-    the converter's output changes.
+    sources : names of these parts, base to tip. path : filters in series. delay : s by which the
+    sources act later than the converter's output changes.
+    """
+
+    actuator: ActuatorSpec
+    sources: tuple[str, ...]
+    path: tuple[Lag, ...] = ()
+    delay: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """The actuator's."""
+        return self.actuator.name
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """The whole of what is simulated. drives : in the order of the rig file's actuators.
+
+    motion : "lateral" or "axial", as of the rig file.
     """
 
     base: str
     parts: tuple[Part, ...]
     sensors: tuple[SensorBase, ...]
-    actuator: ActuatorSpec
+    drives: tuple[Drive, ...]
     attachments: tuple[Attachment, ...] = ()
     relaxations: tuple[Relaxation, ...] = ()
     forces: tuple[Force, ...] = ()
-    path: tuple[Lag, ...] = ()
-    delay: float = 0.0
     motion: str = "lateral"
 
     def part(self, name: str) -> Part:
@@ -133,6 +149,12 @@ class Setup:
             if part.name == name:
                 return part
         raise KeyError(name)
+
+    def driven(self, drive: Drive) -> Setup:
+        """The same with `drive` in place of the one of its name."""
+        return replace(
+            self, drives=tuple(drive if d.name == drive.name else d for d in self.drives)
+        )
 
     def turning(self) -> set[str]:
         """Names of the parts that may turn: of an axial chain those before its spindle."""
@@ -196,11 +218,9 @@ def nominal(rig: Rig) -> Nominal:
 def setup_of(rig: Rig, values: Values) -> Setup:
     """The rig as its file says, with `values` in place of the file's.
 
-    InputError for what this plant cannot simulate: more than one actuator, feedback beside the
-    centring, a tip that is not free, elements outside `KINDS`.
+    InputError for what this plant cannot simulate: feedback beside the centring, a tip that is
+    not free, elements outside `KINDS`.
     """
-    if len(rig.actuator) != 1:
-        raise InputError(rig.name, "actuator", len(rig.actuator), "one actuator for this plant")
     if rig.feedback:
         raise InputError(rig.name, "feedback", rig.feedback[0].name, "none for this plant")
     if rig.tip != "free":
@@ -214,9 +234,16 @@ def setup_of(rig: Rig, values: Values) -> Setup:
             raise InputError(rig.name, f"element[{e.name}].kind", e.kind, f"one of {KINDS}")
         own = {s: values.get((e.name, s), p.value) for s, p in parameters(e).items()}
         parts.append(Part(e.name, kind, own))
-    delays = {p.values["tau"] for p in parts if p.kind in SOURCES}
+    drives = tuple(_drive(rig, a, parts) for a in rig.actuator)
+    return Setup(rig.base, tuple(parts), rig.sensor, drives, motion=rig.motion)
+
+
+def _drive(rig: Rig, actuator: ActuatorSpec, parts: list[Part]) -> Drive:
+    moved = {e.name for e in rig.element if getattr(e, "input", None) == actuator.name}
+    sources = [p for p in parts if p.name in moved]
+    delays = {p.values["tau"] for p in sources}
     if len(delays) != 1:
-        raise InputError(rig.name, "tau", sorted(delays), "one dead time for all sources")
-    return Setup(
-        rig.base, tuple(parts), rig.sensor, rig.actuator[0], delay=delays.pop(), motion=rig.motion
-    )
+        raise InputError(
+            rig.name, "tau", sorted(delays), f"one dead time for all sources of {actuator.name}"
+        )
+    return Drive(actuator, tuple(p.name for p in sources), delay=delays.pop())

@@ -1,8 +1,8 @@
-"""The continuous plant: mechanism, sources, the input's path and the sensors' filters as one
+"""The continuous plant: mechanism, sources, the inputs' paths and the sensors' filters as one
 
     x' = A x + B u,    y = C x + D u,    z = Z x
 
-with the inputs u = [v at the source, the forces' laws, the disturbances], y what the converters
+with the inputs u = [v of each drive, the forces' laws, the disturbances], y what the converters
 sample and z the motions that the laws read. Everything is linear here and a matrix.
 """
 
@@ -35,8 +35,9 @@ GRAVITY = 9.80665  # m/s^2, as the rig file's `tilt` means it
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """A disturbance's place: `floor` (m/s^2), `valve` (actuator unit at the source), or a force
-    `w` (N), a torque `theta` (N m) at `x` m along the part `on`, or `joint` (N m across one)."""
+    """A disturbance's place: `floor` (m/s^2), `valve` (before the sources of the actuator `on`, in
+    its unit), or a force `w` (N), a torque `theta` (N m) at `x` m along the part `on`, or `joint`
+    (N m across one)."""
 
     kind: str
     on: str = ""
@@ -49,7 +50,8 @@ class Plant:
 
     A (n, n), B (n, n_u), C (n_y, n), D (n_y, n_u). Z : (2 n_law, n), displacement and velocity of
     each law in turn, or the moment at the source and 0 for a law of the flow.
-    n_law : laws; the inputs are v, then n_law forces, then the disturbances.
+    n_in, n_law : drives and laws; the inputs are v (n_in), then n_law forces, then the
+    disturbances.
     """
 
     A: Float
@@ -57,6 +59,7 @@ class Plant:
     C: Float
     D: Float
     Z: Float
+    n_in: int
     n_law: int
 
 
@@ -165,33 +168,37 @@ def plant(setup: Setup, pushes: tuple[Push, ...] = ()) -> Plant:
     mech = Mechanism(setup)
     sources = [p for p in setup.parts if p.kind in SOURCES]
     filters = [sensor_sections(s) for s in setup.sensors]
-    path = _path_sections(setup.path)
+    paths = [_path_sections(d.path) for d in setup.drives]
     f = mech.free
     heavy, light = _split(mech.M[np.ix_(f, f)])
     n_p, n_r = heavy.shape[1], light.shape[1]
     n_x = 2 * n_p + n_r + len(mech.maxwell) + sum(_source_states(p) for p in sources)
-    n_x += sum(len(a) for s in (*filters, path) for a, *_ in s)
-    n_law, n_u = len(setup.forces), 1 + len(setup.forces) + len(pushes)
+    n_x += sum(len(a) for s in (*filters, *paths) for a, *_ in s)
+    n_in, n_law = len(setup.drives), len(setup.forces)
+    first_law, first_push = n_x + n_in, n_x + n_in + n_law
+    n_u = n_in + n_law + len(pushes)
     sig = _Signals(n_x, n_u)
     place, speed, between = sig.states(n_p), sig.states(n_p), sig.states(n_r)
     n = mech.size
     Q, dQ, ddQ = (np.zeros((n, n_x + n_u)) for _ in range(3))
     Q[f, place], Q[f, between], dQ[f, speed] = heavy, light, heavy
-    v = sig.unit(n_x)
-    for j, push in enumerate(pushes):
-        if push.kind == "valve":
-            v = v + sig.unit(n_x + 1 + n_law + j)
-    drive = sig.filtered(v, path)
+    moves: dict[str, Float] = {}  # what reaches a source, by its name
+    for i, (drive, path) in enumerate(zip(setup.drives, paths, strict=True)):
+        v = sig.unit(n_x + i)
+        for j, push in enumerate(pushes):
+            if push.kind == "valve" and push.on == drive.name:
+                v = v + sig.unit(first_push + j)
+        moves |= dict.fromkeys(drive.sources, sig.filtered(v, path))
     load = np.zeros((n, n_x + n_u))  # generalised forces
     pushed: dict[str, Float] = {}  # of the sources that push
     for part in sources:
-        row = _source(sig, mech, part, drive, (Q, dQ, ddQ), load)
+        row = _source(sig, mech, part, moves[part.name], (Q, dQ, ddQ), load)
         if row is not None:
             pushed[part.name] = row
     for i, force in enumerate(setup.forces):
         if force.on in mech.joints:
-            load[mech.joints[force.on], n_x + 1 + i] += 1.0
-    _pushes(mech, pushes, n_x + 1 + n_law, load, ddQ)
+            load[mech.joints[force.on], first_law + i] += 1.0
+    _pushes(mech, pushes, first_push, load, ddQ)
     slipped: dict[int, Float] = {}  # what a branch's dashpot has given, by its coordinate
     for branch in mech.maxwell:
         own = sig.states(1)
@@ -221,7 +228,7 @@ def plant(setup: Setup, pushes: tuple[Push, ...] = ()) -> Plant:
     Y = np.array(rows)
     Z = np.array([row for x in setup.forces for row in _read(x.on, mech, Q, dQ, inside)])
     Z = Z.reshape(2 * n_law, n_x + n_u)[:, :n_x]
-    return Plant(sig.rate[:, :n_x], sig.rate[:, n_x:], Y[:, :n_x], Y[:, n_x:], Z, n_law)
+    return Plant(sig.rate[:, :n_x], sig.rate[:, n_x:], Y[:, :n_x], Y[:, n_x:], Z, n_in, n_law)
 
 
 def _source(
@@ -334,5 +341,6 @@ def _read(on: str, mech: Mechanism, Q: Float, dQ: Float, inside: Float) -> tuple
     """Displacement and velocity of a joint; of an actuator's law the moment at its source."""
     if on in mech.joints:
         return Q[mech.joints[on]], dQ[mech.joints[on]]
-    at = next(iter(mech.sources.values()))
+    drive = next(d for d in mech.setup.drives if d.name == on)
+    at = next(mech.sources[name] for name in drive.sources if name in mech.sources)
     return inside[at], np.zeros_like(inside[at])

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from samii_rig.devices.channels import command_channel, reference_channels
 from samii_rig.record.writer import RunWriter
-from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema import ActuatorSpec, Rig
 from samii_rig.types import Channel, Flags, Float, Quality, SampleBlock, Segment, StopRecord
 from sim.assumed_modes.styles import Piece, Style
 
@@ -50,10 +51,15 @@ def draw_faults(rng: np.random.Generator, style: Style, n: int) -> Faults:
     return Faults(shift, tuple(sorted(gaps)) if "gaps" in style.options else ())
 
 
-def reference(pieces: tuple[Piece, ...], level: float, style: Style) -> tuple[Float, list[Segment]]:
-    """The reference of a file at the loop's rate, and its segments in recorded samples."""
+def reference(
+    pieces: tuple[Piece, ...], level: float, style: Style, drives: Sequence[str]
+) -> tuple[Float, list[Segment]]:
+    """The references (n, n_in) of a file at the loop's rate, and its segments in recorded samples.
+
+    drives : names of the inputs.
+    """
     lead = round(LEAD * style.rate_hz / style.every) * style.every
-    parts, segments, at = [np.zeros(lead)], [], lead
+    parts, segments, at = [np.zeros((lead, len(drives)))], [], lead
     for p in pieces:
         parts.append(level * p.level * p.r)
         start, stop = at + p.skip, at + len(p.r)
@@ -61,47 +67,51 @@ def reference(pieces: tuple[Piece, ...], level: float, style: Style) -> tuple[Fl
         segments.append(
             Segment(
                 p.name, p.kind, -(-start // style.every), -(-stop // style.every),
-                level * p.level, "", p.repeat,
+                level * p.level, "", p.repeat, tuple(drives[i] for i in p.driven),
             )
         )  # fmt: skip
     # Where the record ends with its excitation, nothing follows.
     if pieces[-1].kind in ("burst", "transient"):
-        parts.append(np.zeros(lead))
+        parts.append(np.zeros((lead, len(drives))))
     return np.concatenate(parts), segments
 
 
 def channels_of(rig: Rig, style: Style) -> tuple[Channel, ...]:
     """The columns of a recording, in the order in which a run has them."""
-    a = rig.actuator[0]
     measured = "measured" in style.options
-    angle = rig.units()[rig.centring.sensor] if rig.centring else "1"
-    references = (
-        Channel("u", a.unit, "reference", description="reference of the excitation"),
-        Channel("theta_ref", angle, "reference", description="reference of the centring"),
-    )
-    resolution = (a.high - a.low) / VOLTMETER_STEPS if measured else a.resolution
     how = "input as a voltmeter shows it, not held" if measured else "output as held"
-    command = Channel(a.name, a.unit, "command", a.low, a.high, resolution, how)
+    commands = [
+        command_channel(a, _voltmeter_step(a) if measured else a.resolution, how)
+        for a in rig.actuator
+    ]
     sensors = tuple(
         Channel(s.name, s.unit, "sensor", s.low, s.high, s.resolution, s.calibration)
         for s in rig.sensor
     )
-    return (*(() if "no_reference" in style.options else references), command, *sensors)
+    references = () if "no_reference" in style.options else reference_channels(rig)
+    return (*references, *commands, *sensors)
+
+
+def _voltmeter_step(a: ActuatorSpec) -> float:
+    return (a.high - a.low) / VOLTMETER_STEPS
 
 
 def columns(
     rig: Rig, style: Style, u: Float, v: Float, y: Float, rng: np.random.Generator
 ) -> Float:
-    """(n, n_channels) recorded values from the loop's u (m,), v (m,) and y (m, n_y)."""
-    every, a = style.every, rig.actuator[0]
+    """(n, n_channels) recorded values from the loops' u (m, n_in), v (m, n_in), y (m, n_y)."""
+    every = style.every
     shown = v[::every]
     if "measured" in style.options:
         # Mean of both sides of the sample's instant: a voltmeter sees no edge.
-        before = np.concatenate([[v[0]], v[:-1]])[::every]
-        step = (a.high - a.low) / VOLTMETER_STEPS
-        noise = VOLTMETER_NOISE * (a.high - a.low) * rng.standard_normal(shown.size)
+        before = np.concatenate([v[:1], v[:-1]])[::every]
+        step = np.array([_voltmeter_step(a) for a in rig.actuator])
+        noise = VOLTMETER_NOISE * VOLTMETER_STEPS * step * rng.standard_normal(shown.shape)
         shown = np.rint((0.5 * (shown + before) + noise) / step) * step
-    out = [u[::every], np.zeros(shown.size)] if "no_reference" not in style.options else []
+    out: list[Float] = []
+    if "no_reference" not in style.options:
+        for column in u[::every].T:
+            out += [column, np.zeros_like(column)]
     return np.column_stack([*out, shown, y[::every]])
 
 
@@ -110,10 +120,10 @@ def write(
     rig: Rig,
     rig_toml: str,
     style: Style,
-    kp: float,
+    loops: Sequence[tuple[str, float]],
     log: Log,
 ) -> None:
-    """One file."""
+    """One file. loops : sensor and kp of each."""
     values, segments, faults = log.values, log.segments, log.faults
     channels = channels_of(rig, style)
     rate = style.rate_hz / style.every
@@ -138,12 +148,12 @@ def write(
         values[kept], quality[kept],
     )  # fmt: skip
     notes = {"experiment": style.excitation, "operator": "", "started": STARTED, **log.notes}
-    if rig.centring:
-        notes["centring"] = f"{rig.centring.sensor} {kp}"
+    if loops:
+        notes["centring"] = "; ".join(f"{sensor} {kp}" for sensor, kp in loops)
     with RunWriter(path, channels, rate, rig_toml=rig_toml, metadata=notes) as writer:
         writer.write(block)
         unit = rig.actuator[0].unit
         for s in segments:
             stop = min(s.stop, int(sequence[kept][-1]) + 1)
-            writer.segment(Segment(s.name, s.kind, s.start, stop, s.level, unit, s.repeat))
+            writer.segment(replace(s, stop=stop, unit=unit))
         writer.close(StopRecord("completed", f"all {len(segments)} segments done", 0, lost))

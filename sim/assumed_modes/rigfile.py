@@ -45,12 +45,13 @@ def varied(rng: np.random.Generator, rig: Rig, rate_hz: float, options: tuple[st
 
 
 def _chosen(rng: np.random.Generator, rig: Rig) -> list[Any]:
-    """Two to six sensors, that of the centring among them; new ones are accelerometers."""
+    """Two to six sensors, those of the centring among them; new ones are accelerometers."""
     n = int(rng.integers(LEAST_SENSORS, MOST_SENSORS + 1))
-    centring = rig.centring.sensor if rig.centring else rig.sensor[0].name
-    order = [s for s in rig.sensor if s.name == centring]
-    others = [s for s in rig.sensor if s.name != centring]
-    keep = order + [others[i] for i in rng.permutation(len(others))][: n - 1]
+    loops = [rig.centring_of(a.name) for a in rig.actuator]
+    centring = {loop.sensor for loop in loops if loop} or {rig.sensor[0].name}
+    order = [s for s in rig.sensor if s.name in centring]
+    others = [s for s in rig.sensor if s.name not in centring]
+    keep = order + [others[i] for i in rng.permutation(len(others))][: max(n - len(order), 0)]
     keep.sort(key=[*rig.sensor].index)
     hosts = [
         e for e in rig.element

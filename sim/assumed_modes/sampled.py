@@ -1,6 +1,6 @@
 """From sample to sample: the exact map of the plant between converters, delays included.
 
-The converter holds its output from a sample to the next; the source acts `delay` later, so within
+A converter holds its output from a sample to the next; its sources act `delay` later, so within
 one period the old value acts first, then the new one. A sensor with a delay is read between two
 samples. Each period is cut at those instants (and into equal steps where a law is not
 linear); over each piece all inputs are held, so that
@@ -29,9 +29,9 @@ SAME = 1e-9  # of a period: instants nearer than this are one
 class Timeline:
     """One period in pieces.
 
-    Phi (p, n, n), Gamma (p, n, n_u) : of each piece. new : (p,) 1 where the new output acts.
+    Phi (p, n, n), Gamma (p, n, n_u) : of each piece. new : (p, n_in) 1 where the new output acts.
     read : (n_y,) the piece at whose end each sensor is read. late : (n_y,) how many samples
-    later it is shown, 1 or more. wait : whole samples before an output acts.
+    later it is shown, 1 or more. wait : (n_in,) whole samples before an output acts.
     h : (p,) s, length of each piece.
     """
 
@@ -40,7 +40,7 @@ class Timeline:
     new: Int
     read: Int
     late: Int
-    wait: int
+    wait: Int
     h: Float
 
 
@@ -59,14 +59,14 @@ def held(A: Float, B: Float, h: float) -> tuple[Float, Float]:
 def timeline(setup: Setup, made: Plant, rate_hz: float, steps: int = 1) -> Timeline:
     """The pieces of one period of a loop at `rate_hz`; `steps` equal ones at least."""
     T = 1.0 / rate_hz
-    lag = (setup.actuator.delay + setup.delay) / T
-    wait = math.floor(lag + SAME)
-    switch = max(0.0, lag - wait)
+    lag = np.array([(d.actuator.delay + d.delay) / T for d in setup.drives], dtype=np.float64)
+    wait = np.floor(lag + SAME).astype(np.int64)
+    switch = np.maximum(0.0, lag - wait)
     late = np.array([math.floor(s.delay / T + SAME) + 1 for s in setup.sensors], dtype=np.int64)
     at = np.array(
         [m - s.delay / T for m, s in zip(late, setup.sensors, strict=True)], dtype=np.float64
     )
-    marks = np.concatenate([np.arange(steps + 1) / steps, [switch], at])
+    marks = np.concatenate([np.arange(steps + 1) / steps, switch, at])
     marks = np.sort(np.clip(marks, 0.0, 1.0))
     ends = marks[np.concatenate([[True], np.diff(marks) > SAME])]
     h = np.diff(ends) * T
@@ -79,7 +79,7 @@ def timeline(setup: Setup, made: Plant, rate_hz: float, steps: int = 1) -> Timel
     return Timeline(
         np.array([p for p, _ in pairs]),
         np.array([g for _, g in pairs]),
-        (ends[:-1] > switch - SAME).astype(np.int64),
+        (ends[:-1, None] > switch - SAME).astype(np.int64),
         np.array([int(np.argmin(np.abs(ends[1:] - e))) for e in at], dtype=np.int64),
         late,
         wait,
@@ -91,7 +91,7 @@ def timeline(setup: Setup, made: Plant, rate_hz: float, steps: int = 1) -> Timel
 class Discrete:
     """The plant as a controller sees it: s' = A s + b v + E d, y = C s (y read before v acts).
 
-    A (m, m), b (m,), E (m, n_d), C (n_y, m): delays of output and sensors are states.
+    A (m, m), b (m, n_in), E (m, n_d), C (n_y, m): delays of output and sensors are states.
     """
 
     A: Float
@@ -102,45 +102,52 @@ class Discrete:
 
 def discrete(made: Plant, line: Timeline) -> Discrete:
     """The map of one whole period, laws of `made` at rest."""
-    n = len(made.A)
-    first = 1 + made.n_law
+    n, n_in = len(made.A), made.n_in
+    first = n_in + made.n_law
     n_d = made.B.shape[1] - first
     n_y = len(made.C)
-    n_old = line.wait + 1  # v[n-1] ... v[n-1-wait], of which the last acts before the switch
-    m = n + n_old + int(line.late.sum())
-    start = [n + n_old + int(line.late[:i].sum()) for i in range(n_y)]
+    # Of each v: v[n-1] ... v[n-1-wait], of which the last acts before the switch.
+    n_old = line.wait + 1
+    held_at = n + np.concatenate([[0], np.cumsum(n_old)])
+    m = int(held_at[-1] + line.late.sum())
+    start = [int(held_at[-1] + line.late[:i].sum()) for i in range(n_y)]
     # Columns of what a period's motion depends on: s, v, d.
-    now = np.zeros((n, m + 1 + n_d))
+    now = np.zeros((n, m + n_in + n_d))
     now[:, :n] = np.eye(n)
-    acting = [n + line.wait, m if line.wait == 0 else n + line.wait - 1]  # old, new
-    u = np.zeros((made.B.shape[1], m + 1 + n_d))
-    u[first:, m + 1 :] = np.eye(n_d)
-    rows = np.zeros((m, m + 1 + n_d))
+    acting = [  # old, new
+        (held_at[i] + wait, m + i if wait == 0 else held_at[i] + wait - 1)
+        for i, wait in enumerate(line.wait)
+    ]
+    u = np.zeros((made.B.shape[1], m + n_in + n_d))
+    u[first:, m + n_in :] = np.eye(n_d)
+    rows = np.zeros((m, m + n_in + n_d))
     for p in range(len(line.h)):
-        u[0] = 0.0
-        u[0, acting[line.new[p]]] = 1.0
+        u[:n_in] = 0.0
+        for i in range(n_in):
+            u[i, acting[i][line.new[p, i]]] = 1.0
         now = line.Phi[p] @ now + line.Gamma[p] @ u
         for i in range(n_y):
             if line.read[i] == p:
                 rows[start[i]] = made.C[i] @ now + made.D[i] @ u
     rows[:n] = now
-    rows[n, m] = 1.0
-    for k in range(1, n_old):
-        rows[n + k, n + k - 1] = 1.0
+    for i in range(n_in):
+        rows[held_at[i], m + i] = 1.0
+        for k in range(1, n_old[i]):
+            rows[held_at[i] + k, held_at[i] + k - 1] = 1.0
     C = np.zeros((n_y, m))
     for i in range(n_y):
         begin, last = start[i], start[i] + int(line.late[i]) - 1
         for k in range(begin, last):
             rows[k + 1, k] = 1.0
         C[i, last] = 1.0
-    return Discrete(rows[:, :m], rows[:, m], rows[:, m + 1 :], C)
+    return Discrete(rows[:, :m], rows[:, m : m + n_in], rows[:, m + n_in :], C)
 
 
 @dataclass(frozen=True, slots=True)
 class Loop:
     """The loop closed at the loop's rate, s' = A s + b r + E d + f e, y = C s + e.
 
-    r = u + kp theta_ref is what the reference asks for, e what the converters add.
+    r (n_in,) : what the references ask for, u + kp theta_ref each; e : what the converters add.
     f (m, n_y): the sensors' errors go round as well.
     """
 
@@ -151,10 +158,9 @@ class Loop:
     C: Float
 
 
-def closed(system: Discrete, theta: int, kp: float) -> Loop:
-    """The loop v = r - kp (y_theta + e_theta) around `system`; kp = 0 leaves it open."""
-    f = np.zeros((len(system.A), len(system.C)))
-    f[:, theta] = -kp * system.b
+def closed(system: Discrete, feedback: Float) -> Loop:
+    """The loops v = r - feedback (y + e) around `system`; feedback (n_in, n_y), 0 where open."""
+    f = -system.b @ feedback
     return Loop(system.A + f @ system.C, system.b, system.E, f, system.C)
 
 

@@ -36,7 +36,7 @@ Records = Sequence[Sequence[Float]]
 
 @dataclass(frozen=True, slots=True)
 class Waveform:
-    """A reference r (n,) at unit level from rest, with the levels and repeats that it has."""
+    """References r (n, n_in) at unit level from rest, with the levels and repeats that it has."""
 
     r: Float
     levels: tuple[float, ...]
@@ -45,16 +45,16 @@ class Waveform:
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """What does not depend on the parameters: loop, waveforms, whitening.
+    """What does not depend on the parameters: loops, waveforms, whitening.
 
-    rate_hz : of the loop; every : loop samples a recorded one. response : (n, n_y, n_y) of the
-    whitener, at the record's rate, as long as the longest waveform. hum_hz : 0 for none.
+    rate_hz : of the loops; every : loop samples a recorded one. feedback : (n_in, n_y), as of
+    `closed`. response : (n, n_y, n_y) of the whitener, at the record's rate, as long as the
+    longest waveform. hum_hz : 0 for none.
     """
 
     rate_hz: float
     every: int
-    theta: int
-    kp: float
+    feedback: Float
     waveforms: tuple[Waveform, ...]
     response: Float
     hum_hz: float = 0.0
@@ -66,16 +66,14 @@ class Bench:
         UnphysicalError for a setup that no rig can be, or a loop that runs away.
         """
         made = plant(setup)
-        loop = closed(discrete(made, timeline(setup, made, self.rate_hz)), self.theta, self.kp)
+        loop = closed(discrete(made, timeline(setup, made, self.rate_hz)), self.feedback)
         longest = max(len(w.r) for w in self.waveforms)
         # y[k] = C s[k]; s[k+1] takes in r[k], so the response begins one sample late.
-        h = np.zeros((longest, len(loop.C)))
-        h[1:] = impulse(loop.A, loop.b[:, None], loop.C, longest - 1)[:, :, 0]
+        h = np.zeros((longest, len(loop.C), loop.b.shape[1]))
+        h[1:] = impulse(loop.A, loop.b, loop.C, longest - 1)
         if not np.all(np.isfinite(h)):
             raise UnphysicalError("the loop runs away")
-        return [
-            convolved(h[: len(w.r), :, None], w.r[:, None])[:: self.every] for w in self.waveforms
-        ]
+        return [convolved(h[: len(w.r)], w.r)[:: self.every] for w in self.waveforms]
 
     def white(self, y: Float) -> Float:
         """W y: (n, n_y) whitened."""

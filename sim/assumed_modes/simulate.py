@@ -33,10 +33,10 @@ STATIC = {"valve_deadband": "width", "output_saturation": "limit"}
 
 @dataclass(frozen=True, slots=True)
 class Control:
-    """The loop as it is closed: index of the centring sensor, kp, samples/s."""
+    """The loops as they are closed, v = r - feedback y. feedback : (n_in, n_y), rate_hz :
+    samples/s."""
 
-    theta: int
-    kp: float
+    feedback: Float
     rate_hz: float
 
 
@@ -66,7 +66,7 @@ def _slope(force: Force) -> float:
 
 
 def _pieces(made: Plant, line: Timeline) -> kernel.Pieces:
-    force = line.Gamma[:, :, 1 : 1 + made.n_law]
+    force = line.Gamma[:, :, made.n_in : made.n_in + made.n_law]
     moved = np.einsum("ij,pjk->pik", made.Z, force)
     i = np.arange(made.n_law)
     return kernel.Pieces(
@@ -84,25 +84,28 @@ def _laws(setup: Setup) -> kernel.Laws:
         names = NUMBERS[f.law][1]
         row[: len(names)] = [f.values[name] for name in names]
     law = np.array([NUMBERS[f.law][0] for f in dynamic], dtype=np.int64)
-    return kernel.Laws(law, value)
+    drives = [d.name for d in setup.drives]
+    on = [drives.index(f.on) if f.on in drives else 0 for f in dynamic]
+    return kernel.Laws(law, value, np.array(on, dtype=np.int64))
 
 
 def _controller(setup: Setup, control: Control, *, ideal: bool) -> kernel.Controller:
-    static = {f.law: f.values[STATIC[f.law]] for f in setup.forces if f.law in STATIC}
-    a = setup.actuator
+    static = {(f.law, f.on): f.values[STATIC[f.law]] for f in setup.forces if f.law in STATIC}
+    actuators = [d.actuator for d in setup.drives]
+    n = len(actuators)
     return kernel.Controller(
-        control.theta,
-        control.kp,
-        0.0 if ideal else a.resolution,
-        -np.inf if ideal else a.low,
-        np.inf if ideal else a.high,
-        static.get("valve_deadband", 0.0),
-        static.get("output_saturation", 0.0),
+        np.ascontiguousarray(control.feedback),
+        np.zeros(n) if ideal else np.array([a.resolution for a in actuators]),
+        np.full(n, -np.inf) if ideal else np.array([a.low for a in actuators]),
+        np.full(n, np.inf) if ideal else np.array([a.high for a in actuators]),
+        np.array([static.get(("valve_deadband", a.name), 0.0) for a in actuators]),
+        np.array([static.get(("output_saturation", a.name), 0.0) for a in actuators]),
     )
 
 
 def clean(setup: Setup, control: Control, r: Float) -> Float:
-    """(n, n_y) samples of a run from rest: no noise, no rounding, no limits but the laws'."""
+    """(n, n_y) samples of a run from rest under r (n, n_in): no noise, no rounding, no limits but
+    the laws'."""
     made, pieces = ready(setup, control)
     n_y = len(made.C)
     endless = np.full(n_y, np.inf)
@@ -118,10 +121,11 @@ def clean(setup: Setup, control: Control, r: Float) -> Float:
 def recorded(
     setup: Setup, control: Control, noise: Noise, r: Float, rng: np.random.Generator
 ) -> tuple[Float, Float]:
-    """Samples (n, n_y) as the converters show them, and commands (n,), of a run with all noise."""
+    """Samples (n, n_y) as the converters show them, and commands (n, n_in), of a run under
+    r (n, n_in) with all noise."""
     made, pieces = ready(setup, control, noise.pushes)
     rest = round(SETTLE * control.rate_hz)
-    r = np.concatenate([np.zeros(rest), r])
+    r = np.concatenate([np.zeros((rest, r.shape[1])), r])
     n, n_y, rate = len(r), len(made.C), control.rate_hz
     errors = rng.standard_normal((n, n_y)) * noise.white
     for i in range(n_y):

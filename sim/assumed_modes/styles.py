@@ -1,7 +1,9 @@
 """How a trial is recorded: what excites the rig, what is recorded of it, and how badly.
 
-An excitation is a list of files, a file a list of segments, a segment a reference from sample to
-sample. Faults of the recording (no reference, shifted columns, gaps, hum) are drawn beside it.
+An excitation is a list of files, a file a list of segments, a segment the references from sample
+to sample. Of a rig with several inputs it is made once in as many experiments as tell them apart:
+the inputs in turn, or together with signs that are orthogonal over the experiments. Faults of the
+recording (no reference, shifted columns, gaps, hum) are drawn beside it.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.linalg import hadamard
 
 from samii_rig.types import Float, Kind
 
@@ -25,6 +28,11 @@ EXCITATIONS = (
     "random",
     "steps",
 )
+SEVERAL = ("in_turn", "together")  # how several inputs are driven, one of these
+# What no estimate of several inputs takes: `samii_rig.signal.several`.
+OF_ONE_INPUT = ("stepped", "gaps")
+# Excitations that are drawn anew for each input where they are driven together.
+BY_INPUT = ("multisine", "multisine_once", "random")
 RUNS = ("bursts", "cut", "updown", "multisine", "random")  # that make several runs
 # Faults and choices, with the probability that a trial has them.
 OPTIONS: dict[str, float] = {
@@ -49,10 +57,10 @@ LEAST_PERIODS = 2  # measured periods of a multisine of many
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One segment: its reference at unit level (n,) at the loop's rate.
+    """One segment: its references at unit level (n, n_in) at the loop's rate.
 
     skip : samples at its beginning that are recorded outside of the segment. level, repeat : as in
-    `samii_rig.types.Segment`.
+    `samii_rig.types.Segment`. driven : of several inputs the numbers of those that it drives.
     """
 
     name: str
@@ -61,6 +69,7 @@ class Piece:
     level: float
     repeat: int
     skip: int = 0
+    driven: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,17 +87,19 @@ class Style:
     high_hz: float
     levels: tuple[float, ...]
     repeats: int
+    inputs: int = 1
     files: tuple[tuple[Piece, ...], ...] = field(default=(), repr=False)
 
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """What a style is drawn for: the rig's samples/s, its first resonance (Hz), and s of
-    records at most, for which there is room within `BUDGET`."""
+    """What a style is drawn for: the rig's samples/s, its first resonance (Hz), s of records at
+    most, for which there is room within `BUDGET`, and how many inputs it has."""
 
     rate_hz: float
     first_hz: float = 0.0
     seconds: float = np.inf
+    inputs: int = 1
 
 
 def draw(rng: Rng, forced: tuple[str, ...], about: About, *, runs: bool = False) -> Style:
@@ -96,11 +107,15 @@ def draw(rng: Rng, forced: tuple[str, ...], about: About, *, runs: bool = False)
     named = [x for x in forced if x in EXCITATIONS]
     choice = [x for x in EXCITATIONS if x in RUNS] if runs else list(EXCITATIONS)
     choice = [x for x in named if x in choice] or choice
-    excitation = str(rng.choice(choice))
+    beyond = OF_ONE_INPUT if about.inputs > 1 else ()
+    excitation = str(rng.choice([x for x in choice if x not in beyond]))
     chosen = [name for name, p in OPTIONS.items() if rng.random() < p]
     if "clean" in forced:
         chosen = []
-    chosen = [x for x in OPTIONS if x in chosen or x in forced]
+    chosen = [x for x in OPTIONS if (x in chosen or x in forced) and x not in beyond]
+    if about.inputs > 1:
+        how = [x for x in SEVERAL if x in forced] or list(SEVERAL)
+        chosen.append(str(rng.choice(how)))
     rate, every = _rates(rng, about.rate_hz, tuple(chosen))
     low = float(rng.uniform(0.3, 0.8))
     # A rig that has no resonance within is driven to twice its first one.
@@ -113,7 +128,7 @@ def draw(rng: Rng, forced: tuple[str, ...], about: About, *, runs: bool = False)
     if runs:
         repeats = max(2, repeats)
     levels = tuple(float(x) for x in np.geomspace(1.0, 0.25, 4)[:n_levels][::-1])
-    style = Style(excitation, tuple(chosen), rate, every, low, high, levels, repeats)
+    style = Style(excitation, tuple(chosen), rate, every, low, high, levels, repeats, about.inputs)
     return _filled(rng, style, min(about.seconds, BUDGET / rate), runs=runs)
 
 
@@ -130,9 +145,25 @@ def _rates(rng: Rng, rig_rate_hz: float, options: tuple[str, ...]) -> tuple[floa
     return rate, every
 
 
+def _signs(style: Style) -> Float:
+    """(n_experiment, n_in) by what the references are multiplied in each experiment."""
+    if "together" not in style.options:
+        return np.eye(style.inputs)
+    block = 1 << (style.inputs - 1).bit_length()
+    return np.asarray(hadamard(block)[:, : style.inputs], dtype=np.float64)
+
+
+def _signals(style: Style) -> int:
+    """How many references are drawn: one, or one for each input."""
+    apart = "together" in style.options and style.excitation in BY_INPUT
+    return style.inputs if apart else 1
+
+
 def _filled(rng: Rng, style: Style, seconds: float, *, runs: bool) -> Style:
     """The style with its references, all records together `seconds` long at most."""
     levels, repeats = style.levels, style.repeats
+    signs = _signs(style)
+    seconds /= len(signs)  # of each experiment
     while len(levels) * repeats > (2 if runs else 1) and seconds / (len(levels) * repeats) < 18.0:
         if len(levels) > 1 and (repeats == 1 or runs):
             levels = levels[1:]
@@ -145,10 +176,23 @@ def _filled(rng: Rng, style: Style, seconds: float, *, runs: bool) -> Style:
         "stepped": _stepped, "multisine": _multisine, "multisine_once": _multisine_once,
         "random": _random, "steps": _steps,
     }[style.excitation]  # fmt: skip
-    files = tuple(tuple(f) for f in make(rng, style, each))
-    if runs:
-        files = tuple((piece,) for f in files for piece in f)
-    return replace(style, files=files)
+    made = make(rng, style, each)
+    shared: dict[tuple[int, int], Float] = {}  # equal references are one array
+
+    def driven(p: Piece, e: int) -> Piece:
+        key = id(p.r), e
+        if key not in shared:
+            shared[key] = p.r.reshape(len(p.r), -1) * signs[e]
+        if style.inputs == 1:
+            return replace(p, r=shared[key])
+        inputs = tuple(np.flatnonzero(signs[e]).tolist())
+        return replace(p, name=f"{p.name}_{e + 1}", r=shared[key], driven=inputs)
+
+    files: list[tuple[Piece, ...]] = []
+    for file in made:
+        pieces = tuple(driven(p, e) for e in range(len(signs)) for p in file)
+        files += [(p,) for p in pieces] if runs or len(file) == 1 else [pieces]
+    return replace(style, files=tuple(files))
 
 
 def _sweep(rng: Rng, style: Style, seconds: float, ramp: float, *, fade: bool = True) -> Float:
@@ -220,7 +264,11 @@ def _stepped(rng: Rng, style: Style, each: float) -> list[list[Piece]]:
 
 
 def _one_period(rng: Rng, style: Style, n: int) -> Float:
-    """A random-phase multisine of n samples with all lines of the band, unit peak."""
+    """(n, n_signal) random-phase multisines with all lines of the band, unit peak."""
+    return np.stack([_one_signal(rng, style, n) for _ in range(_signals(style))], axis=1)
+
+
+def _one_signal(rng: Rng, style: Style, n: int) -> Float:
     f = np.arange(n // 2 + 1) * style.rate_hz / n
     band = (f >= style.low_hz) & (f <= style.high_hz)
     best = np.zeros(n)
@@ -236,9 +284,9 @@ def _multisine(rng: Rng, style: Style, each: float) -> list[list[Piece]]:
     periods = int(rng.integers(LEAST_PERIODS, 5))
     settle = int(rng.integers(1, 3))
     n = round(each / (periods + settle) * style.rate_hz / style.every) * style.every
-    r = np.tile(_one_period(rng, style, n), periods + settle)
+    r = np.tile(_one_period(rng, style, n), (periods + settle, 1))
     m = round(0.2 * style.rate_hz)
-    r[:m] *= 0.5 - 0.5 * np.cos(np.pi * np.arange(m) / m)
+    r[:m] *= (0.5 - 0.5 * np.cos(np.pi * np.arange(m) / m))[:, None]
     return [
         [Piece(p.name, "periodic", p.r, p.level, p.repeat, skip=settle * n)]
         for p in _each(style, "periodic", r, "multisine")
@@ -257,9 +305,13 @@ def _random(rng: Rng, style: Style, each: float) -> list[list[Piece]]:
         n = round(each * style.rate_hz)
         f = np.arange(n + 1) * style.rate_hz / (2 * n)
         band = (f >= style.low_hz) & (f <= style.high_hz)
-        spectrum = band * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size))
-        x = np.fft.irfft(spectrum, 2 * n)[:n]  # half of a longer period: it does not close
-        files.append([Piece(piece.name, "single", x / np.abs(x).max(), piece.level, piece.repeat)])
+        signals = []
+        for _ in range(_signals(style)):
+            spectrum = band * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size))
+            x = np.fft.irfft(spectrum, 2 * n)[:n]  # half of a longer period: it does not close
+            signals.append(x / np.abs(x).max())
+        r = np.stack(signals, axis=1)
+        files.append([Piece(piece.name, "single", r, piece.level, piece.repeat)])
     return files
 
 

@@ -99,14 +99,17 @@ def make(kind: str, seed: int, out: Path, rig_toml: str, style: tuple[str, ...] 
     """
     if kind not in KINDS:
         raise InputError("make", "kind", kind, f"one of {', '.join(KINDS)}")
-    known = (*styles.EXCITATIONS, *styles.OPTIONS, "clean")
+    rig = parse(Rig, rig_toml, "rig file")
+    known: tuple[str, ...] = (*styles.EXCITATIONS, *styles.OPTIONS, "clean")
+    if len(rig.actuator) > 1:
+        known = (*(x for x in known if x not in styles.OF_ONE_INPUT), *styles.SEVERAL)
     for name in style:
         if name not in known:
             raise InputError("make", "style", name, f"one of {', '.join(known)}")
     folder = out / f"{kind}_{seed}"
     if folder.exists():
         raise InputError(str(folder), "", "there already", "a trial that was not made yet")
-    made = conceal(kind, seed, parse(Rig, rig_toml, "rig file"), style)
+    made = conceal(kind, seed, rig, style)
     scene, rngs = made.scene, made.rngs
     folder.mkdir(parents=True)
     (folder / "rig.toml").write_text(scene.rig_toml, encoding="utf-8")
@@ -186,7 +189,7 @@ def scene_of(
     """A rig with its nominal parameters, style and noise drawn."""
     # The torque tests are of the band below their resonance; a bench that slides is driven to it.
     first = first_hz(setup_of(rig, {})) if rig.motion == "axial" else 0.0
-    about_rig = styles.About(rig.rate_hz, first, seconds)
+    about_rig = styles.About(rig.rate_hz, first, seconds, len(rig.actuator))
     style = styles.draw(rng, forced, about_rig, runs=runs)
     measured = "measured" in style.options
     shown = style.rate_hz / style.every if measured else style.rate_hz
@@ -194,10 +197,8 @@ def scene_of(
     about = nominal(rig)
     drawn = np.array([_offset(rng, tolerance) for tolerance in about.tolerance])
     setup = _built(rig, about, drawn, np.ones(len(drawn)))
-    names = [s.name for s in rig.sensor]
-    theta = names.index(rig.centring.sensor) if rig.centring else 0
-    kp = rig.centring.kp if rig.centring and "open_loop" not in style.options else 0.0
-    control = Control(theta, kp, style.rate_hz)
+    closed_loops = "open_loop" not in style.options
+    control = Control(feedback_of(rig) * float(closed_loops), style.rate_hz)
     level = _level(rng, rig, setup, style, control)
     noise = _noise(disturb, setup, style, control)
     loop = _loop(setup, control, noise.pushes)
@@ -207,8 +208,19 @@ def scene_of(
     )
     hum = noise.hum_hz if np.any(noise.hum) else 0.0
     waveforms = _waveforms(style, level, runs=runs)
-    bench = Bench(style.rate_hz, style.every, theta, kp, waveforms, response, hum)
+    bench = Bench(style.rate_hz, style.every, control.feedback, waveforms, response, hum)
     return Scene(rig, rigfile.text(rig), style, setup, about, drawn, control, level, noise, bench)
+
+
+def feedback_of(rig: Rig) -> Float:
+    """(n_in, n_y) gains of the rig file's loops: v = r - feedback y."""
+    names = [s.name for s in rig.sensor]
+    gains = np.zeros((len(rig.actuator), len(names)))
+    for row, actuator in zip(gains, rig.actuator, strict=True):
+        loop = rig.centring_of(actuator.name)
+        if loop is not None:
+            row[names.index(loop.sensor)] = loop.kp
+    return gains
 
 
 def _offset(rng: Rng, tolerance: float) -> float:
@@ -221,7 +233,7 @@ def _offset(rng: Rng, tolerance: float) -> float:
 def _loop(setup: Setup, control: Control, pushes: tuple[Push, ...] = ()) -> Loop:
     made = plant(setup, pushes)
     line = timeline(setup, made, control.rate_hz)
-    return closed(discrete(made, line), control.theta, control.kp)
+    return closed(discrete(made, line), control.feedback)
 
 
 def _waveforms(style: Style, level: float, *, runs: bool = False) -> tuple[Waveform, ...]:
@@ -241,13 +253,13 @@ def _waveforms(style: Style, level: float, *, runs: bool = False) -> tuple[Wavef
 def _level(rng: Rng, rig: Rig, setup: Setup, style: Style, control: Control) -> float:
     """Amplitude at which the limit that is met first is used by 10 to 90 %."""
     waveforms = _waveforms(style, 1.0)
-    bench = Bench(style.rate_hz, 1, control.theta, control.kp, waveforms, np.zeros((1, 1, 1)))
+    bench = Bench(style.rate_hz, 1, control.feedback, waveforms, np.zeros((1, 1, 1)))
     most = np.inf
     limits = {x.channel: x.max for x in rig.limit}
     for w, y in zip(waveforms, bench.linear(setup), strict=True):
-        v = w.r - control.kp * y[:, control.theta]
+        v = w.r - y @ control.feedback.T
         for name, column in [
-            (rig.actuator[0].name, v),
+            *((a.name, v[:, i]) for i, a in enumerate(rig.actuator)),
             *((s.name, y[:, i]) for i, s in enumerate(rig.sensor)),
         ]:
             s = next(s for s in (*rig.sensor, *rig.actuator) if s.name == name)
@@ -291,37 +303,44 @@ def _pushes(rng: Rng, setup: Setup) -> tuple[Push, ...]:
     hosts = [p for p in setup.parts if p.kind in (*EXTENDED, "lumped_mass")]
     hosts = [p for p in hosts if p.name in setup.shifting()] or hosts
     host = hosts[int(rng.integers(len(hosts)))]
+    valve = Push("valve", table.drawn_drive(rng, setup.drives).name)
     choice = [
-        Push("joint", str(rng.choice(joints))) if joints else Push("valve"),
+        Push("joint", str(rng.choice(joints))) if joints else valve,
         Push("w", host.name, host.values.get("L", 0.0) * float(rng.uniform(0.5, 1.0))),
         Push("floor"),
-        Push("valve"),
+        valve,
     ]
     order = rng.permutation(len(choice))[: int(rng.integers(1, 4))]
     return tuple(choice[i] for i in sorted(order))
 
 
 def _swing(scene: Scene) -> Swing:
-    """What the nominal rig's joints and source do at the largest level."""
+    """What the nominal rig's joints and sources do at the largest level."""
     joints = [p.name for p in scene.setup.parts if p.kind in JOINTS]
-    turned = any(p.kind in ANGLE_SOURCES for p in scene.setup.parts)
-    places = (*joints, scene.setup.actuator.name) if turned else tuple(joints)
-    probes = [Force("probe", name, {}) for name in places]
+    angles = {p.name for p in scene.setup.parts if p.kind in ANGLE_SOURCES}
+    drives = [d.name for d in scene.setup.drives]
+    turned = [d.name for d in scene.setup.drives if angles.intersection(d.sources)]
+    probes = [Force("probe", name, {}) for name in (*joints, *turned)]
     made = plant(replace(scene.setup, forces=tuple(probes)))
     c = scene.control
-    loop = closed(discrete(made, timeline(scene.setup, made, c.rate_hz)), c.theta, c.kp)
+    loop = closed(discrete(made, timeline(scene.setup, made, c.rate_hz)), c.feedback)
     rows = np.zeros((len(probes), len(loop.A)))
     rows[:, : made.Z.shape[1]] = made.Z[::2]
-    # Beside the laws' places the command, v = r - kp y.
-    rows = np.vstack([rows, -c.kp * loop.C[c.theta]])
+    # Beside the laws' places the commands, v = r - feedback y.
+    rows = np.vstack([rows, -c.feedback @ loop.C])
+    commands = slice(len(probes), None)
     peak = np.zeros(len(rows))
     for w in scene.bench.waveforms:
-        h = impulse(loop.A, loop.b[:, None], rows, len(w.r))
-        moved = convolved(h, w.r[:, None])
-        moved[1:, -1] = moved[:-1, -1] + w.r[1:]  # rows act on the state after r
+        moved = convolved(impulse(loop.A, loop.b, rows, len(w.r)), w.r)
+        # Rows act on the state after r.
+        moved[1:, commands] = moved[:-1, commands] + w.r[1:]
         peak = np.maximum(peak, max(w.levels) * np.abs(moved).max(axis=0))
-    each = dict(zip(joints, peak.tolist(), strict=False))
-    return Swing(each, float(peak[len(joints)]) if turned else 0.0, float(peak[-1]))
+    each, n = peak.tolist(), len(joints)
+    return Swing(
+        dict(zip(joints, each[:n], strict=True)),
+        dict(zip(turned, each[n : len(probes)], strict=True)),
+        dict(zip(drives, each[commands], strict=True)),
+    )
 
 
 def nominal_refit(scene: Scene) -> Refit:
@@ -469,7 +488,8 @@ def logged(i: int, scene: Scene, found: list[Concealed], rng: Rng, logger: Rng) 
     for effect in found:
         setup = effect.draft.put_in(setup, effect.strength, i)
     pieces = style.files[i]
-    u, segments = record.reference(pieces, scene.level, style)
+    drives = [d.name for d in setup.drives]
+    u, segments = record.reference(pieces, scene.level, style, drives)
     y, v = recorded(setup, scene.control, scene.noise, u, rng)
     values = record.columns(scene.rig, style, u, v, y, logger)
     return record.Log(values, segments, record.draw_faults(logger, style, len(values)))
@@ -478,7 +498,18 @@ def logged(i: int, scene: Scene, found: list[Concealed], rng: Rng, logger: Rng) 
 def save(folder: Path, i: int, scene: Scene, log: record.Log) -> None:
     """Write record i of a scene."""
     path = folder / f"run_{i + 1:02d}.mcap"
-    record.write(path, scene.rig, scene.rig_toml, scene.style, scene.control.kp, log)
+    record.write(path, scene.rig, scene.rig_toml, scene.style, _loops(scene), log)
+
+
+def _loops(scene: Scene) -> list[tuple[str, float]]:
+    """Sensor and kp of each loop of the rig file; 0 where it is left open."""
+    names = [s.name for s in scene.rig.sensor]
+    found = []
+    for row, actuator in zip(scene.control.feedback, scene.rig.actuator, strict=True):
+        loop = scene.rig.centring_of(actuator.name)
+        if loop is not None:
+            found.append((loop.sensor, float(row[names.index(loop.sensor)])))
+    return found
 
 
 def file_of(
@@ -560,7 +591,7 @@ def _truth(made: Conceals, faults: list[record.Faults], *, rivals: bool) -> dict
             **{k: v for k, v in asdict(replace(style, files=())).items() if k != "files"},
             "samples": [sum(len(p.r) for p in f) // style.every for f in style.files],
             "level": scene.level,
-            "kp": scene.control.kp,
+            "loops": _loops(scene),
             "faults": [asdict(f) for f in faults],
         },
         "noise": {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in noise.items()},

@@ -73,13 +73,17 @@ BENCHES = (
 
 
 def loop_of(setup: Setup, rig: Rig) -> Loop:
-    theta = [s.name for s in rig.sensor].index(rig.centring.sensor) if rig.centring else 0
     made = plant(setup)
-    kp = rig.centring.kp if rig.centring else 0.0
-    return closed(discrete(made, timeline(setup, made, rig.rate_hz)), theta, kp)
+    return closed(discrete(made, timeline(setup, made, rig.rate_hz)), trial.feedback_of(rig))
 
 
 def response(loop: Loop, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
+    """(n_freq, n_y), of the first input."""
+    return responses(loop, frequency, rate_hz)[:, :, 0]
+
+
+def responses(loop: Loop, frequency: np.ndarray, rate_hz: float) -> np.ndarray:
+    """(n_freq, n_y, n_in)."""
     z = np.exp(2j * np.pi * frequency / rate_hz)
     return np.array([loop.C @ np.linalg.solve(x * np.eye(len(loop.A)) - loop.A, loop.b) for x in z])
 
@@ -150,6 +154,97 @@ def test_what_cannot_move_so_conceals_nothing() -> None:
                               (effects.mass, joint), (effects.sideways, joint)):  # fmt: skip
         with pytest.raises(LookupError):
             make_draft(rng, setup)
+
+
+def _two_joints() -> tuple[Rig, Setup]:
+    rig, _ = load_rig("samii_two_joints")
+    return rig, setup_of(rig, {})
+
+
+@pytest.mark.parametrize("gain", [0.0, 1.0], ids=["open loops", "closed loops"])
+def test_two_driven_joints_answer_as_the_transfer_matrices_say(gain: float) -> None:
+    rig, setup = _two_joints()
+    feedback = gain * trial.feedback_of(rig)
+    made = plant(setup)
+    loop = closed(discrete(made, timeline(setup, made, rig.rate_hz)), feedback)
+    f = np.geomspace(0.2, 60.0, 40)
+    H = sampled_response(rig, f)
+    # v = u - F y and y = H v: both loops close at once.
+    expected = H @ np.linalg.inv(np.eye(2) + feedback @ H)
+    found = responses(loop, f, rig.rate_hz)
+    assert found.shape == (40, 5, 2)
+    assert np.max(np.abs(found / expected - 1)) < 1e-6
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_a_drive_s_effect_is_in_the_answers_to_its_own_input(k: int) -> None:
+    _, setup = _two_joints()
+    f = np.geomspace(0.5, 40.0, 20)
+    s = 2j * np.pi * f
+
+    def answers(setup: Setup) -> np.ndarray:
+        p = plant(setup)
+        eye = np.eye(len(p.A))
+        return np.array([p.C @ np.linalg.solve(x * eye - p.A, p.B[:, :2]) for x in s])
+
+    drafts = [effects.lag(np.random.default_rng(seed), setup) for seed in range(8)]
+    draft = next(d for d in drafts if d.site == ("joint_2_source", "joint_3_source")[k])
+    ratio = answers(draft.put(setup, 1 / 300.0)) / answers(setup)
+    lagging = 300.0 / (s + 300.0)
+    assert np.max(np.abs(ratio[:, :, 1 - k] - 1.0)) < 1e-7
+    assert np.max(np.abs(ratio[:, :, k] / lagging[:, None] - 1.0)) < 1e-7
+
+
+@pytest.mark.parametrize("k", [0, 1])
+@pytest.mark.parametrize(("law", "values"), [
+    ("valve_deadband", {"width": 1.0}), ("output_saturation", {"limit": 0.2}),
+    ("flow_saturation", {"M_stall": 30.0}),
+])  # fmt: skip
+def test_a_drive_s_law_acts_on_its_own_command(law: str, values: dict[str, float], k: int) -> None:
+    rig, setup = _two_joints()
+    bent = replace(setup, forces=(Force(law, f"v_{2 + k}", values),))
+    open_loops = Control(np.zeros((2, 5)), rig.rate_hz)
+    sine = 2.0 * np.sin(2 * np.pi * 4.0 * np.arange(300) / rig.rate_hz)
+    for driven in (0, 1):
+        r = np.zeros((300, 2))
+        r[:, driven] = sine
+        plain, with_law = clean(setup, open_loops, r), clean(bent, open_loops, r)
+        change = np.abs(with_law - plain).max(axis=0) / np.abs(plain).max(axis=0)
+        if driven == k:
+            assert np.all(change > 0.03)
+        else:
+            assert np.all(change < 1e-9)
+
+
+@pytest.mark.parametrize("how", styles.SEVERAL)
+@pytest.mark.parametrize(
+    "excitation", [x for x in styles.EXCITATIONS if x not in styles.OF_ONE_INPUT]
+)
+def test_experiments_of_two_inputs_tell_them_apart(excitation: str, how: str) -> None:
+    about = styles.About(500.0, inputs=2)
+    style = styles.draw(np.random.default_rng(8), ("clean", excitation, how), about)
+    pieces = [p for f in style.files for p in f]
+    assert style.options == (how,)
+    assert {p.driven for p in pieces} == ({(0,), (1,)} if how == "in_turn" else {(0, 1)})
+    assert max(float(np.abs(p.r).max()) for p in pieces) <= 1.0 + 1e-9
+    # Over all experiments of a level the inputs' products cancel.
+    level = [p.r for p in pieces if p.level == 1.0 and p.repeat == 0]
+    products = sum(r.T @ r for r in level)
+    assert abs(products[0, 1]) < 1e-9 * min(products[0, 0], products[1, 1])
+
+
+def test_a_trial_of_two_inputs_has_the_columns_of_both_and_both_loops(tmp_path: Path) -> None:
+    rig, text = load_rig("samii_two_joints")
+    folder = make("nothing", 1, tmp_path, text, ("clean", "bursts", "in_turn"))
+    run = read_recording(folder / "run_01.mcap")
+    assert run.names("reference") == ("u_v_2", "theta_ref_v_2", "u_v_3", "theta_ref_v_3")
+    assert run.names("command") == ("v_2", "v_3")
+    assert {s.excited for s in run.segments} == {("v_2",), ("v_3",)}
+    for name in ("v_2", "v_3"):
+        loop = rig.centring_of(name)
+        assert loop is not None
+        u, v, theta = (run.values[:, run.column(x)] for x in (f"u_{name}", name, loop.sensor))
+        assert np.abs(v - (u - loop.kp * theta)).max() <= 0.51 * 20.0 / 2**16
 
 
 def _parameter(value: float, unit: str) -> Parameter:
@@ -237,7 +332,7 @@ def test_the_drive_s_effects_are_filters_of_the_input() -> None:
         draft = effects.LINEAR[name](rng, setup)
         put = draft.put(setup, strength)
         ratio = _continuous(put, s) / _continuous(setup, s)
-        late = np.exp(-s * (put.delay - setup.delay))
+        late = np.exp(-s * (put.drives[0].delay - setup.drives[0].delay))
         np.testing.assert_allclose(ratio * late, expected, rtol=1e-8)
 
 
@@ -264,7 +359,8 @@ def _brute(setup: Setup, control: Control, r: np.ndarray, force: Law | None = No
     """The loop by a general integrator, sample by sample; the sensors' delays as a history."""
     made = plant(setup)
     T = 1.0 / control.rate_hz
-    lag = setup.actuator.delay + setup.delay
+    (drive,) = setup.drives
+    lag = drive.actuator.delay + drive.delay
     wait, switch = int(lag / T), lag % T
     x, history, shown = np.zeros(len(made.A)), [0.0] * (wait + 2), []
     lines: list[list[float]] = [[] for _ in setup.sensors]
@@ -281,7 +377,7 @@ def _brute(setup: Setup, control: Control, r: np.ndarray, force: Law | None = No
         for i, s in enumerate(setup.sensors):
             late = int(s.delay / T + 1e-9) + 1
             y[k, i] = lines[i][k - late] if k >= late else 0.0
-        history = [r[k] - control.kp * y[k, control.theta], *history[:-1]]
+        history = [float(r[k, 0] - control.feedback[0] @ y[k]), *history[:-1]]
         marks = sorted({0.0, switch, T, *(T - s.delay % T for s in setup.sensors)})
         for a, b in pairwise(marks):
             v = history[wait + 1] if b <= switch + 1e-12 else history[wait]
@@ -297,17 +393,19 @@ def _brute(setup: Setup, control: Control, r: np.ndarray, force: Law | None = No
 def _delayed(name: str) -> tuple[Setup, Control]:
     rig, _ = load_rig(name)
     setup = setup_of(rig, {})
-    assert rig.centring is not None
     sensors = (
         setup.sensors[0].model_copy(update={"delay": 0.0027}),
         *(s.model_copy(update={"delay": 0.0004}) for s in setup.sensors[1:]),
     )
-    return replace(setup, sensors=sensors, delay=0.0033), Control(0, rig.centring.kp, rig.rate_hz)
+    late = setup
+    for k, drive in enumerate(setup.drives):  # each input by another part of a sample
+        late = late.driven(replace(drive, delay=0.0033 - 0.0008 * k))
+    return replace(late, sensors=sensors), Control(trial.feedback_of(rig), rig.rate_hz)
 
 
 def test_exact_steps_with_delays_agree_with_brute_force() -> None:
     setup, control = _delayed("samii_torque_vertical")
-    r = np.random.default_rng(3).standard_normal(60)
+    r = np.random.default_rng(3).standard_normal((60, 1))
     expected = _brute(setup, control, r)
     found = clean(setup, control, r)
     assert np.abs(found - expected).max(axis=0) == pytest.approx(
@@ -317,13 +415,13 @@ def test_exact_steps_with_delays_agree_with_brute_force() -> None:
 
 def _bench(setup: Setup, control: Control, r: np.ndarray, answer: np.ndarray) -> Bench:
     waveform = Waveform(r, (1.0,), 1)
-    return Bench(control.rate_hz, 1, control.theta, control.kp, (waveform,), answer)
+    return Bench(control.rate_hz, 1, control.feedback, (waveform,), answer)
 
 
-@pytest.mark.parametrize("name", ["samii", "samii_torque_vertical"])
+@pytest.mark.parametrize("name", ["samii", "samii_torque_vertical", "samii_two_joints"])
 def test_the_compiled_loop_is_the_convolution_with_its_impulse_response(name: str) -> None:
     setup, control = _delayed(name)
-    r = np.random.default_rng(4).standard_normal(3000)
+    r = np.random.default_rng(4).standard_normal((3000, len(setup.drives)))
     expected = clean(setup, control, r)
     found = _bench(setup, control, r, np.zeros((1, 1, 1))).linear(setup)[0]
     np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())
@@ -345,9 +443,10 @@ def test_the_predictor_makes_all_noise_white(scene: trial.Scene) -> None:
     loop = trial._loop(scene.setup, scene.control, noise.pushes)
     n = 20_000
     answer = whitener(noise_model(loop, noise, 500.0)).response(n)
-    y, v = recorded(scene.setup, scene.control, noise, np.zeros(n), np.random.default_rng(6))
+    quiet = np.zeros((n, 1))
+    y, v = recorded(scene.setup, scene.control, noise, quiet, np.random.default_rng(6))
     # What the output's converter rounds is known, as v is recorded.
-    r = v + scene.control.kp * y[:, scene.control.theta]
+    r = v + y @ scene.control.feedback.T
     bench = _bench(scene.setup, scene.control, r, answer)
     white = bench.white(y - bench.linear(scene.setup)[0])[500:]
     within = 5.0 / np.sqrt(n)
@@ -451,7 +550,7 @@ def test_the_truth_explains_the_record_and_the_rig_file_does_not(tmp_path: Path)
     (hidden,) = trial._concealed(rngs[2], wanted, scene, trial.nominal_refit(scene))
     run = read_recording(folder / "run_01.mcap")
     y = run.values[:, -4:] - scene.noise.offset
-    r = run.values[:, run.column("v_2")] + scene.control.kp * y[:, 0]
+    r = run.values[:, [run.column("v_2")]] + y @ scene.control.feedback.T
     n = len(y)
     setup = hidden.draft.put(scene.setup, hidden.strength)
     loop = trial._loop(setup, scene.control, scene.noise.pushes)
@@ -511,8 +610,9 @@ def _with_law(law: str, values: dict[str, float]) -> tuple[Setup, Control, np.nd
     """The torque test's link on its joint with a law, driven hard enough to need it."""
     rig, _ = load_rig("samii_torque_vertical")
     setup = setup_of(rig, {})
-    r = 4.0 * np.sin(2 * np.pi * 12.0 * np.arange(150) / 500.0)
-    return replace(setup, forces=(Force(law, "joint_2", values),)), Control(0, 2.0, 500.0), r
+    r = 4.0 * np.sin(2 * np.pi * 12.0 * np.arange(150)[:, None] / 500.0)
+    control = Control(np.array([[2.0, 0.0]]), 500.0)
+    return replace(setup, forces=(Force(law, "joint_2", values),)), control, r
 
 
 @pytest.mark.parametrize(
@@ -552,9 +652,9 @@ def test_friction_over_one_period_takes_four_times_its_moment_times_the_swing() 
     setup = setup_of(rig, {}).with_value("joint_2", "k", 1e-6).with_value("joint_2", "c", 1e-9)
     T_c, J = 0.05, 2.0 * 0.15**2 + 0.015
     setup = replace(setup, forces=(Force("coulomb_friction", "joint_2", {"T_c": T_c}),))
-    r = np.zeros(400)
+    r = np.zeros((400, 1))
     r[:50] = 4.0
-    y = clean(setup, Control(0, 0.0, 500.0), r)
+    y = clean(setup, Control(np.zeros((1, 2)), 500.0), r)
     speed = np.diff(y[:, 0]) * 500.0
     # Sensor M_2 reads the moment that the link's inertia asks for: T_c while it slides.
     sliding = np.abs(np.abs(y[:, 1]) - T_c) < 0.02 * T_c
@@ -621,7 +721,7 @@ def test_masses_on_springs_are_a_rig_as_well(tmp_path: Path) -> None:
     rig = parse(Rig, MASSES, "masses")
     f = np.geomspace(1.0, 60.0, 30)
     made = plant(setup_of(rig, {}))
-    loop = closed(discrete(made, timeline(setup_of(rig, {}), made, 500.0)), 0, 0.0)
+    loop = closed(discrete(made, timeline(setup_of(rig, {}), made, 500.0)), np.zeros((1, 2)))
     expected = sampled_response(rig, f)[:, :, 0]
     assert np.max(np.abs(response(loop, f, 500.0) / expected - 1)) < 1e-4
     for seed in range(2):
