@@ -22,6 +22,7 @@ NOISE = 0.5  # of what was measured, sd, that may be the meter's: of more the la
 FAR, EDGES = 7.0, 1e-3
 LOUDER = 2.0  # noise among the lines of the command, over that of all lines: no noise above
 BUSY = 0.01  # of the command's largest line, in power, above which a line is the command's
+LOWEST = 1 / 8  # of all lines; a rig that is recorded well moves in these
 NEIGHBOURS = np.arange(-3.0, 4.0)  # samples: of a twentieth of the rate they are exact to 1e-7
 ORDER = np.arange(NEIGHBOURS.size, dtype=np.float64)
 ROUNDS, STEP = 4, 1e-3  # of Gauss and Newton, and samples for a slope
@@ -55,7 +56,11 @@ def sent(
     each = [_shown(recording, v, _law(recording, command, k, theta)) for k in {kp, 0.0}]
     law, late, off = min(each, key=lambda one: float(np.nansum(one[2] ** 2)))
     far = _far(off)
-    if not _noise(off, v, far, channel.resolution):
+    rests = not np.any(asked(recording, channel.name, kp))
+    # What moves at rest is the loop's answer to the rig, and may be far below a meter's noise.
+    moves = law if rests else v
+    small = rests or _sd(off) < NOISE * float(np.std(v[np.isfinite(off) & np.isfinite(v)]))
+    if not small or not _noise(off, moves, far, channel.resolution):
         return v, none
     drawn = _filtered(recording, law, _held(late))
     return np.where(np.isfinite(drawn), drawn, v), far
@@ -188,13 +193,15 @@ def _far(off: Float) -> NDArray[np.bool_]:
     return np.asarray(np.abs(off) > FAR * _sd(off))
 
 
-def _noise(off: Float, v: Float, far: NDArray[np.bool_], step: float) -> bool:
+def _noise(off: Float, moves: Float, far: NDArray[np.bool_], step: float) -> bool:
     """Whether what the law leaves of a command is a meter's noise: more than its converter's steps,
-    small, with next to no sample far out, and no louder where the command is."""
-    known = np.isfinite(off) & np.isfinite(v)
-    if not step < _sd(off) < NOISE * float(np.std(v[known])) or np.mean(far) > EDGES:
+    with next to no sample far out, and no louder where the command moves."""
+    known = np.isfinite(off) & np.isfinite(moves)
+    if not step < _sd(off) or np.mean(far) > EDGES:
         return False
     rest = np.where(far, 0.0, off)[known]
-    power, own = (np.abs(np.fft.rfft(x - np.mean(x)))[1:] ** 2 for x in (rest, v[known]))
+    power, own = (np.abs(np.fft.rfft(x - np.mean(x)))[1:] ** 2 for x in (rest, moves[known]))
     busy = own > BUSY * np.max(own)
+    if not busy.any():  # no loop around an input at rest: rigs move in the lowest lines
+        busy[: int(LOWEST * busy.size)] = True
     return bool(np.mean(power[busy]) < LOUDER * np.mean(power))

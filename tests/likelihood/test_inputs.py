@@ -69,6 +69,27 @@ def test_a_command_that_was_recorded_as_sent_is_left_as_it_is() -> None:
     np.testing.assert_array_equal(v, values[:, 1])
 
 
+@pytest.mark.parametrize("kp", [0.0, KP])
+def test_of_a_command_at_rest_the_loop_s_law_is_left_however_loud_the_meter(kp: float) -> None:
+    run = recorded(2, kp)
+    theta = 1e-3 * run.values[:, 2]  # another joint moves this one a little
+    noise = METER * np.random.default_rng(2).standard_normal(N)
+    run.values[:, 0], run.values[:, 1], run.values[:, 2] = 0.0, noise - kp * theta, theta
+    assert kp * np.std(theta) < METER / 10
+    v, _ = sent(run, 1, kp, theta)
+    assert np.std((v + kp * theta)[5:-5]) < METER / 100
+
+
+def test_of_a_command_at_rest_what_the_law_does_not_say_is_left_as_it_is() -> None:
+    run = recorded(2)
+    theta = run.values[:, 2]
+    noise = METER * np.random.default_rng(2).standard_normal(N)
+    # A loop of twice the gain that is stated.
+    run.values[:, 0], run.values[:, 1] = 0.0, noise - 2 * KP * theta
+    v, _ = sent(run, 1, KP, theta)
+    np.testing.assert_array_equal(v, run.values[:, 1])
+
+
 def test_a_clipped_command_is_no_meters_noise() -> None:
     run = recorded(2)
     run.values[:, 1] = np.clip(run.values[:, 1], -0.6, 0.6)
