@@ -38,8 +38,9 @@ class Sized:
 def size_of(truth: Mapping[str, Any], arrays: Mapping[str, Any], rig: Rig) -> Sized:
     """The size of what `truth` conceals from the nominal `rig`.
 
-    arrays : of the truth: `frequency` (n,) Hz, `linear` (n, q) or `settled` (levels, n, q),
-        `level`, `reference` (n,), `sensitivity` (n,), `open_noise` (n, q, q).
+    arrays : of the truth, of q entries (sensor, actuator) with indices `sensor` (q,) and `actuator`
+        (q,): `frequency` (n,) Hz, `linear` (n, q) or `settled` (levels, n, q), `level`, `reference`
+        (n,), `noise` (n, q, q) a sample of the response to reference 1.
     """
     lines = _lines(truth, arrays, rig)
     every = table(rig, float(lines.frequency[0]), float(lines.frequency[-1]))
@@ -87,8 +88,8 @@ def _lines(truth: Mapping[str, Any], arrays: Mapping[str, Any], rig: Rig) -> Mea
     f: Float = arrays["frequency"]
     design = truth["design"]
     samples = design["burst"] * rig.rate_hz
-    unit = np.abs(arrays["reference"] * arrays["sensitivity"]) ** 2 * (design["bursts"] - 1)
-    C = arrays["open_noise"].astype(complex) * (samples / unit)[:, None, None]
+    unit = np.abs(arrays["reference"]) ** 2 * (design["bursts"] - 1)
+    C = arrays["noise"].astype(complex) * (samples / unit)[:, None, None]
     # Twice the inverse covariance: real and imaginary parts have half the variance each.
     W: Complex = 2 * np.linalg.inv(C)
     settled = arrays.get("settled")
@@ -103,8 +104,7 @@ def _lines(truth: Mapping[str, Any], arrays: Mapping[str, Any], rig: Rig) -> Mea
         W = np.concatenate([W * x**2 for x in levels])[order]
         level = np.repeat(np.arange(len(levels)), f.size)[order]
         f = np.tile(f, len(levels))[order]
-    names = [s.name for s in rig.sensor]
-    sensors = truth["design"]["sensors"] or names
+    sensor = np.asarray(arrays["sensor"], dtype=np.int64)
     return Measured(
         frequency=f,
         H=np.asarray(H, complex).reshape(f.size, q),
@@ -115,9 +115,9 @@ def _lines(truth: Mapping[str, Any], arrays: Mapping[str, Any], rig: Rig) -> Mea
         levels=tuple((x, rig.actuator[0].unit) for x in levels),
         periodic=(False,) * len(levels),
         ringing=(False,) * len(levels),
-        sensor=np.array([names.index(s) for s in sensors], dtype=np.int64),
-        actuator=np.zeros(q, dtype=np.int64),
-        outputs=tuple(sensors),
+        sensor=sensor,
+        actuator=np.asarray(arrays["actuator"], dtype=np.int64),
+        outputs=tuple(rig.sensor[i].name for i in sensor),
         inside=(0.0, 0.0),
         rate_hz=rig.rate_hz,
     )

@@ -3,7 +3,7 @@
 Every displacement of the chain is a linear form of the coordinates, carried as a row from base to
 tip: w and theta of the current place. A spring adds a coordinate of its own (the angle across it),
 a beam the displacement and rotation of its nodes, a rigid link none. So no constraint is left, and
-the angle of the driven joint is one coordinate among the others, prescribed by the drive.
+the angle of a driven joint is one coordinate among the others, prescribed by its drive.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Relaxation:
 class Structure:
     """The chain's matrices, (n, n), and rows to read it by.
 
-    driven : the coordinate that the source prescribes.
+    driven : by element name, the coordinate that a source prescribes.
     ends : by element name, rows (w, theta) behind it. starts : before it.
     inside : of beams, (x0, h, rows (4, n)) of each finite element.
     joints : by element name, the coordinates of the angles across all its parts.
@@ -52,7 +52,7 @@ class Structure:
     M: Float
     C: Float
     K: Float
-    driven: int
+    driven: dict[str, int]
     ends: dict[str, tuple[Float, Float]]
     starts: dict[str, tuple[Float, Float]]
     inside: dict[str, list[tuple[float, float, Float]]]
@@ -116,7 +116,7 @@ class Assembly:
         self.joints: dict[str, list[int]] = {}
         self.inside: dict[str, list[tuple[float, float, Float]]] = {}
         self.relaxations: list[Relaxation] = []
-        self.driven = -1
+        self.driven: dict[str, int] = {}
         if base == "free":
             self.w = self.unit(self.coordinate())
         if base in ("free", "pinned"):
@@ -159,12 +159,12 @@ class Assembly:
             case "translational_ground_spring":
                 self._spring(self.w, v["k"], v.get("c", 0.0))
             case "angular_velocity_source":
-                self.driven = self.coordinate()
-                self.theta = self.theta + self.unit(self.driven)
-                self.joints.setdefault(part.name, []).append(self.driven)
+                i = self.driven[part.name] = self.coordinate()
+                self.theta = self.theta + self.unit(i)
+                self.joints.setdefault(part.name, []).append(i)
             case "oil":
                 i = self._joint(part, v["k"], v["c"])
-                line = self.unit(i) + self.unit(self.driven)
+                line = self.unit(i) + self.unit(self.driven[part.name])
                 self.M += v["J"] * np.outer(line, line)
             case "oscillator":
                 i = self.coordinate()
@@ -245,7 +245,7 @@ def assemble(plant: Description, like: Structure | None = None) -> Structure:
     fastest = np.where(spring == 0, 0.1 * FASTEST_POLE, FASTEST_POLE)
     slow = np.maximum(damper / fastest, spring / fastest**2)
     spare[own] = np.maximum(SPARE_INERTIA * np.diag(M)[own], slow)
-    spare[work.driven] = 0.0
+    spare[list(work.driven.values())] = 0.0
     # Springs across the chain: nothing but the chain's mass behind them.
     spare[np.diag(M) == 0] = SPARE_INERTIA
     cut = {k: (a[:n], b[:n]) for k, (a, b) in starts.items()}

@@ -171,10 +171,7 @@ def draw_values(rig: Rig, rng: np.random.Generator) -> tuple[Description, dict[s
             z = float(np.clip(rng.standard_normal(), -WIDEST, WIDEST))
             value = p.value * math.exp(z * math.sqrt(math.log1p(p.tolerance**2)))
             values[f"{element.name}.{symbol}"] = value
-            if element.name == plant.drive.element:
-                setattr(plant.drive, symbol, value)
-            else:
-                plant.part(element.name).values[symbol] = value
+            plant.set_value(element.name, symbol, value)
     return plant, values
 
 
@@ -239,7 +236,7 @@ class _Sizing:
         self.believed = poles = poles_of(nominal) if effects[0].edits else clean
         fixed = {key for e in effects for key in e.edits}
         self.yard: Yardstick = yardstick(_exact(rig, fixed), design, nominal, poles, errors)
-        self.nominal = poles.sampled(self.yard.f)
+        self.nominal = poles.response(self.yard.f)
 
     def sigma(self, x: float) -> float:
         """Size at a multiple."""

@@ -27,13 +27,15 @@ MOST_SLIDING = 3  # sweeps through the laws of one step, so that they see each o
 
 
 class Tables(NamedTuple):
-    """Pieces of a sample, the same for every sample. S pieces, n poles, m sensors, L laws.
+    """Pieces of a sample, the same for every sample. S pieces, n poles, m sensors, L laws and d
+    drives.
 
     decay, drive : (S, 2, n) real and imaginary parts of exp(p h) and phi(h). length : (S,) s.
-    late : (S,) 1 where the output has its new value. read : (S, m) 1 where the sensor is read at
-    the end. behind : (m,) samples by which that is late. waits : samples the command waits before
-    the change. b (n_in, 2, n), c (n_out, 2, n), D : of `Poles`, in parts. gain : (S, L, 2, L) of
-    the probes at a piece's end by the laws' forces. kind, values, memory : of the laws.
+    late : (S, d) 1 where an output has its new value. read : (S, m) 1 where the sensor is read at
+    the end. behind : (m,) samples by which that is late. waits : (d,) samples a command waits
+    before the change. b (n_in, 2, n), c (n_out, 2, n), D : of `Poles`, in parts. gain :
+    (S, L, 2, L) of the probes at a piece's end by the laws' forces. kind, values, memory : of the
+    laws.
     """
 
     decay: Float
@@ -42,7 +44,7 @@ class Tables(NamedTuple):
     late: Int
     read: Int
     behind: Int
-    waits: int
+    waits: Int
     b: Float
     c: Float
     D: Float
@@ -53,29 +55,30 @@ class Tables(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """Converters and control: v = u + kp (theta_ref - theta), clipped and rounded.
+    """Converters and control: v = u + kp (theta_ref - theta) of each drive, clipped and rounded.
 
-    sensor, kp : of the centring. low, high, step : of the output; bottom, top, grain : (m,) of
-    the sensors' converters. deadband, limit : hidden behind the output, see `parts.Drive`.
+    (d,) each: sensor, kp of the centring; low, high, step of the output; deadband, limit hidden
+    behind the output, see `parts.Drive`. bottom, top, grain : (m,) of the sensors' converters.
     """
 
-    sensor: int
-    kp: float
-    low: float
-    high: float
-    step: float
+    sensor: Int
+    kp: Float
+    low: Float
+    high: Float
+    step: Float
     bottom: Float
     top: Float
     grain: Float
-    deadband: float
-    limit: float
+    deadband: Float
+    limit: Float
 
 
 def tabulate(poles: Poles, plant: Description, inner: int = INNER) -> Tables:
     """The pieces of a sample."""
     T = 1.0 / poles.rate_hz
-    waits, change = _whole(poles.input_delay / T)
-    cuts = {0.0, 1.0, change}
+    waited = [_whole(float(delay) / T) for delay in poles.input_delay]
+    change = np.array([rest for _, rest in waited])
+    cuts = {0.0, 1.0, *change.tolist()}
     behind, instants = [], []
     for delay in poles.delay:
         whole, rest = _whole(delay / T)
@@ -92,19 +95,19 @@ def tabulate(poles: Poles, plant: Description, inner: int = INNER) -> Tables:
     p = poles.pole
     decay = np.exp(np.outer(h, p))
     drive = np.stack([phi(p, x) for x in h])
-    L, m = len(plant.laws), poles.delay.size
+    L, m, first = len(plant.laws), poles.delay.size, poles.push + 1
     probes = poles.c[m:].reshape(L, 2, -1) if L else np.zeros((0, 2, p.size), complex)
-    static = poles.D[m:, 2:].reshape(L, 2, L)
-    gain = np.real(np.einsum("lpk,sk,kj->slpj", probes, drive, poles.b[:, 2:])) + static
+    static = poles.D[m:, first:].reshape(L, 2, L)
+    gain = np.real(np.einsum("lpk,sk,kj->slpj", probes, drive, poles.b[:, first:])) + static
     ends = np.array(edges[1:])
     return Tables(
         _parts(decay),
         _parts(drive),
         h,
-        (np.array(edges[:-1]) >= change - CLOSE).astype(np.int64),
+        (np.array(edges[:-1])[:, None] >= change - CLOSE).astype(np.int64),
         np.array([[abs(e - x) <= 2 * CLOSE for x in instants] for e in ends]).astype(np.int64),
         np.array(behind, dtype=np.int64),
-        waits,
+        np.array([whole for whole, _ in waited], dtype=np.int64),
         _parts(poles.b.T),
         _parts(poles.c),
         np.ascontiguousarray(poles.D),
@@ -131,23 +134,26 @@ def _whole(periods: float) -> tuple[int, float]:
 def run(
     tables: Tables, loop: Loop, u: Float, theta_ref: Float, push: Float, error: Float
 ) -> tuple[Float, Float, Float]:
-    """From rest: v (n,), the sensors' samples (n, m) and the largest values of the probes.
+    """From rest: v (n, d), the sensors' samples (n, m) and the largest values of the probes.
 
-    u, theta_ref, push : (n,). error : (n, m), what adds to the sensors before they are rounded.
+    u, theta_ref : (n, d). push : (n,). error : (n, m), what adds to the sensors before they are
+    rounded.
     """
     n, m = error.shape
-    v, y = np.zeros(n), np.zeros((n, m))
+    v, y = np.zeros(u.shape), np.zeros((n, m))
     peak = np.zeros(2 * tables.kind.size)
     _run(tables, loop, u, theta_ref, push, error, v, y, peak)
     return v, y, peak
 
 
 @njit(cache=True, fastmath=REORDERED)
-def _move(t: Tables, piece: int, x: Float, first: float, second: float) -> None:
-    """The state over a piece, under v and the disturbing force."""
+def _move(t: Tables, piece: int, x: Float, held: Float) -> None:
+    """The state over a piece, under v of each drive and the disturbing force."""
     for q in range(x.shape[1]):
-        rate = t.b[0, 0, q] * first + t.b[1, 0, q] * second
-        turn = t.b[0, 1, q] * first + t.b[1, 1, q] * second
+        rate = turn = 0.0
+        for i in range(held.size):
+            rate += t.b[i, 0, q] * held[i]
+            turn += t.b[i, 1, q] * held[i]
         re, im = t.decay[piece, 0, q], t.decay[piece, 1, q]
         by, beside = t.drive[piece, 0, q], t.drive[piece, 1, q]
         a, b = x[0, q], x[1, q]
@@ -156,9 +162,11 @@ def _move(t: Tables, piece: int, x: Float, first: float, second: float) -> None:
 
 
 @njit(cache=True, fastmath=REORDERED)
-def _seen(t: Tables, row: int, x: Float) -> float:
-    """An output's part that comes from the state."""
+def _seen(t: Tables, row: int, x: Float, held: Float) -> float:
+    """An output's part that comes from the state and from what is held."""
     total = 0.0
+    for i in range(held.size):
+        total += t.D[row, i] * held[i]
     for q in range(x.shape[1]):
         total += t.c[row, 0, q] * x[0, q] - t.c[row, 1, q] * x[1, q]
     return total
@@ -187,13 +195,14 @@ def _run(
     peak: Float,
 ) -> None:
     n, m = error.shape
-    pieces = t.length.size
+    drives, pieces = u.shape[1], t.length.size
     laws = t.kind.size
     x = np.zeros((2, t.decay.shape[2]))
     slots = t.behind.max() + 2
     waiting = np.zeros((slots, m))
-    queue = np.zeros(t.waits + 1)
-    applied, time = 0.0, 0.0
+    queue = np.zeros((drives, t.waits.max() + 1))
+    applied, new, held = np.zeros(drives), np.zeros(drives), np.zeros(drives + 1)
+    time = 0.0
     probe, free, base = np.zeros((laws, 2)), np.zeros((laws, 2)), np.zeros(2)
     f = np.zeros(laws)
     memory = np.zeros((laws, VALUES))
@@ -203,26 +212,31 @@ def _run(
             if k.grain[s] > 0.0:
                 value = np.rint(value / k.grain[s]) * k.grain[s]
             y[i, s] = min(max(value, k.bottom[s]), k.top[s])
-        out = u[i] + k.kp * (theta_ref[i] - y[i, k.sensor])
-        out = min(max(out, k.low), k.high)
-        if k.step > 0.0:
-            out = min(max(np.rint(out / k.step) * k.step, k.low), k.high)
-        v[i] = out
-        queue[i % queue.size] = dead_zone(min(max(out, -k.limit), k.limit), k.deadband)
-        new = queue[(i - t.waits) % queue.size] if i >= t.waits else 0.0
+        for d in range(drives):
+            out = u[i, d] + k.kp[d] * (theta_ref[i, d] - y[i, k.sensor[d]])
+            out = min(max(out, k.low[d]), k.high[d])
+            if k.step[d] > 0.0:
+                out = min(max(np.rint(out / k.step[d]) * k.step[d], k.low[d]), k.high[d])
+            v[i, d] = out
+            size = queue.shape[1]
+            out = dead_zone(min(max(out, -k.limit[d]), k.limit[d]), k.deadband[d])
+            queue[d, i % size] = out
+            new[d] = queue[d, (i - t.waits[d]) % size] if i >= t.waits[d] else 0.0
+        held[drives] = push[i]
         for piece in range(pieces):
-            now = new if t.late[piece] else applied
-            _move(t, piece, x, now, push[i])
+            for d in range(drives):
+                held[d] = new[d] if t.late[piece, d] else applied[d]
+            _move(t, piece, x, held)
             if laws > 0:
-                _answer(t, piece, x, now, push[i], time, probe, free, base, f, memory, peak)
+                _answer(t, piece, x, held, time, probe, free, base, f, memory, peak)
             time += t.length[piece]
             for s in range(m):
                 if t.read[piece, s]:
-                    total = _seen(t, s, x) + t.D[s, 0] * now + t.D[s, 1] * push[i]
+                    total = _seen(t, s, x, held)
                     for j in range(laws):
-                        total += t.D[s, 2 + j] * f[j]
+                        total += t.D[s, drives + 1 + j] * f[j]
                     waiting[(i + 1 + t.behind[s]) % slots, s] = total
-        applied = new
+        applied[:] = new
 
 
 @njit(cache=True)
@@ -230,8 +244,7 @@ def _answer(
     t: Tables,
     piece: int,
     x: Float,
-    first: float,
-    second: float,
+    held: Float,
     time: float,
     probe: Float,
     free: Float,
@@ -244,8 +257,7 @@ def _answer(
     laws, m = t.kind.size, t.behind.size
     for j in range(laws):
         for p in range(2):
-            row = m + 2 * j + p
-            free[j, p] = _seen(t, row, x) + t.D[row, 0] * first + t.D[row, 1] * second
+            free[j, p] = _seen(t, m + 2 * j + p, x, held)
     middle = time + 0.5 * t.length[piece]
     for _ in range(1 if laws == 1 else MOST_SLIDING):
         for j in range(laws):
@@ -271,4 +283,4 @@ def _answer(
                 probe[j, p] += t.gain[piece, j, p, other] * f[other]
             peak[2 * j + p] = max(peak[2 * j + p], abs(probe[j, p]))
         keep(t.kind[j], t.values[j], memory[j, : t.memory[j]], probe[j, 0])
-        _push(t, piece, 2 + j, f[j], x)
+        _push(t, piece, held.size + j, f[j], x)

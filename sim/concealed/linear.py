@@ -139,7 +139,7 @@ def oscillator(plant: Description, site: str, dose: Dose) -> Concealed:
 def lag(plant: Description, site: str, dose: Dose) -> Concealed:
     """A lag of the valve before the one that the rig file knows."""
     p = dose("p", 1e3 / dose.x)
-    plant.drive.lags.append(1 / p)
+    plant.drive(site).lags.append(1 / p)
     return Concealed("actuator_lag", site, {"p": p})
 
 
@@ -148,14 +148,14 @@ def valve(plant: Description, site: str, dose: Dose) -> Concealed:
     zeta = dose("zeta", float(dose.rng.uniform(0.4, 0.9)))
     # A phase of x ms, as the lag's, where it is small.
     omega = dose("omega", 2 * zeta * 1e3 / dose.x)
-    plant.drive.valves.append((omega, zeta))
+    plant.drive(site).valves.append((omega, zeta))
     return Concealed("valve_dynamics", site, {"omega": omega, "zeta": zeta})
 
 
 def dead_time(plant: Description, site: str, dose: Dose) -> Concealed:
     """Dead time in the input's path."""
     tau = dose("tau", 1e-3 * dose.x)
-    plant.drive.delay += tau
+    plant.drive(site).delay += tau
     return Concealed("transport_delay", site, {"tau": tau})
 
 

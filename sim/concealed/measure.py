@@ -40,7 +40,7 @@ def draw_errors(rig: Rig, poles: Poles, scale: float, rng: np.random.Generator) 
     analogue = np.array([s.kind == "acceleration" for s in rig.sensor])
     floor = np.sqrt(white**2 + step**2 / 12)
     f = np.linspace(*BAND, 80)
-    moved = np.sqrt(np.mean(np.abs(poles.sampled(f, 1)) ** 2, axis=0))
+    moved = np.sqrt(np.mean(np.abs(poles.sampled(f, poles.push)) ** 2, axis=0))
     part = 2 * (BAND[1] - BAND[0]) / rig.rate_hz
     push = float(np.min(floor * np.sqrt(part) / np.maximum(moved * np.sqrt(part), 1e-300)))
     m = len(rig.sensor)
@@ -56,29 +56,28 @@ def draw_errors(rig: Rig, poles: Poles, scale: float, rng: np.random.Generator) 
 
 def loop_of(rig: Rig, plant: Description, *, ideal: bool = False) -> Loop:
     """Converters and centring of a rig file; `ideal` ones do not round or clip."""
-    spec, sensors = rig.actuator[0], rig.sensor
-    centring = rig.centring
-    names = [s.name for s in sensors]
+    sensors, names = rig.sensor, [s.name for s in rig.sensor]
+    loops = [rig.centring_of(a.name) for a in rig.actuator]
     wide = np.full(len(sensors), np.inf)
     return Loop(
-        names.index(centring.sensor) if centring else 0,
-        centring.kp if centring else 0.0,
-        spec.low,
-        spec.high,
-        0.0 if ideal else spec.resolution,
+        np.array([names.index(c.sensor) if c else 0 for c in loops], dtype=np.int64),
+        np.array([c.kp if c else 0.0 for c in loops]),
+        np.array([a.low for a in rig.actuator]),
+        np.array([a.high for a in rig.actuator]),
+        np.array([0.0 if ideal else a.resolution for a in rig.actuator]),
         -wide if ideal else np.array([s.low for s in sensors]),
         wide if ideal else np.array([s.high for s in sensors]),
         np.zeros(len(sensors)) if ideal else np.array([s.resolution for s in sensors]),
-        plant.drive.deadband,
-        plant.drive.limit,
+        np.array([d.deadband for d in plant.drives]),
+        np.array([d.limit for d in plant.drives]),
     )
 
 
 def measured(
     run_: Run, tables: Tables, loop: Loop, errors: Errors, rate_hz: float, rng: np.random.Generator
 ) -> tuple[Float, Float]:
-    """v (n,) and the sensors (n, m) of one run with its errors."""
-    n, m = run_.u.size, errors.white.size
+    """v (n, d) and the sensors (n, m) of one run with its errors."""
+    n, m = len(run_.u), errors.white.size
     t = np.arange(n) / rate_hz
     error = rng.standard_normal((n, m)) * errors.white + errors.offset
     phase = rng.uniform(0, 2 * np.pi, m)
@@ -95,5 +94,5 @@ def measured(
 
 def ideally(run_: Run, tables: Tables, loop: Loop) -> tuple[Float, Float, Float]:
     """v, sensors and the probes' peaks of one run without any error; `loop` an ideal one."""
-    n, m = run_.u.size, loop.grain.size
+    n, m = len(run_.u), loop.grain.size
     return run(tables, loop, run_.u, run_.theta_ref, np.zeros(n), np.zeros((n, m)))

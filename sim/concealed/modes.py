@@ -14,7 +14,7 @@ import numpy as np
 from samii_rig.errors import InputError
 from samii_rig.types import Complex, Float
 from sim.concealed.assemble import Structure, assemble
-from sim.concealed.parts import GRAVITY, Description, Law, SensorPath
+from sim.concealed.parts import GRAVITY, Description, Drive, Law, SensorPath
 
 # Poles above this multiple of the sample rate act at once. Their static part stays; what is
 # lost at 50 Hz and 500 samples/s is (50/1500)^2 of it.
@@ -29,11 +29,11 @@ DRIVE_LAWS = ("drive_friction", "flow_saturation")
 
 @dataclass(frozen=True)
 class Poles:
-    """The plant as n poles. Inputs: v, the disturbing force, then one a law.
+    """The plant as n poles. Inputs: v of each drive, the disturbing force, then one a law.
     Outputs: the sensors as they reach the converter, then two probes a law.
 
     pole : (n,). b : (n, n_in). c : (n_out, n), weighted so that y = Re(c x) + D u.
-    D : (n_out, n_in). delay : (n_sensor,) s, of the sensors. input_delay : s, of v.
+    D : (n_out, n_in). delay : (n_sensor,) s, of the sensors. input_delay : (n_drive,) s, of v.
     """
 
     pole: Complex
@@ -41,8 +41,18 @@ class Poles:
     c: Complex
     D: Float
     delay: Float
-    input_delay: float
+    input_delay: Float
     rate_hz: float
+
+    @property
+    def push(self) -> int:
+        """The disturbing force among the inputs."""
+        return self.input_delay.size
+
+    def response(self, frequency_hz: Float) -> Complex:
+        """(n_freq, n_sensor n_drive) of each sensor to each drive: the drives side by side."""
+        each = [self.sampled(frequency_hz, k) for k in range(self.push)]
+        return np.stack(each, axis=2).reshape(len(each[0]), -1)
 
     def sampled(self, frequency_hz: Float, source: int = 0) -> Complex:
         """Response of the sampled sensors to an input held for each sample, (n_freq, n_sensor).
@@ -55,7 +65,7 @@ class Poles:
         z = np.exp(-2j * np.pi * np.asarray(frequency_hz) * T)  # one sample later
         z = np.concatenate([z, z.conj()])  # the real part, half from each side of the axis
         out = np.zeros((z.size, self.delay.size), dtype=np.complex128)
-        start = self.input_delay if source == 0 else 0.0
+        start = float(self.input_delay[source]) if source < self.push else 0.0
         p = self.pole
         for i, own in enumerate(self.delay):
             k = math.floor((start + own) / T + 1e-9)
@@ -94,27 +104,92 @@ class StateSpace:
 
 
 def state_space(plant: Description, structure: Structure | None = None) -> StateSpace:
-    """First-order form: x = [q, q', relaxations, phi, phi', drive], phi the source's angle."""
+    """First-order form: x = [q, q', relaxations, then phi, phi' and the filters of each drive], phi
+    a source's angle."""
     s = assemble(plant) if structure is None else structure
-    n, d = s.M.shape[0], s.driven
+    n, d = s.M.shape[0], np.array([s.driven[drive.element] for drive in plant.drives])
     free = np.delete(np.arange(n), d)
     nf, nz = free.size, len(s.relaxations)
-    drive = plant.drive
-    nd = len(drive.lags) + 2 * len(drive.valves)
-    size = 2 * nf + nz + 2 + nd
-    inputs = 2 + len(plant.laws)
-    at_phi, at_speed, at_drive = 2 * nf + nz, 2 * nf + nz + 1, 2 * nf + nz + 2
+    wide = [2 + len(drive.lags) + 2 * len(drive.valves) for drive in plant.drives]
+    start = 2 * nf + nz + np.concatenate([[0], np.cumsum(wide)])
+    size, phis = int(start[-1]), start[:-1]
+    push = len(plant.drives)
+    inputs = push + 1 + len(plant.laws)
     # Rows of q and q' of all coordinates, in the state.
     Q, Qd = np.zeros((n, size)), np.zeros((n, size))
     Q[free, np.arange(nf)] = 1.0
     Qd[free, nf + np.arange(nf)] = 1.0
-    Q[d, at_phi] = Qd[d, at_speed] = 1.0
+    Q[d, phis] = Qd[d, phis + 1] = 1.0
     A, B = np.zeros((size, size)), np.zeros((size, inputs))
 
-    # The command through its lags, as a row over (x, u), then the source.
+    force = np.zeros((n, inputs))
+    force[:, push] = s.ends[plant.push][0]
+    for j, law in enumerate(plant.laws):
+        if law.kind not in DRIVE_LAWS:
+            force[s.joints[law.site][-1], push + 1 + j] += 1.0
+    seen_by: dict[str, _Source] = {}
+    for k, (drive, at_phi) in enumerate(zip(plant.drives, phis.tolist(), strict=True)):
+        command = _command(drive, k, at_phi + 2, A, B)
+        x_row, u_row = command[0], command[1].copy()
+        for j, law in enumerate(plant.laws):
+            if law.kind in DRIVE_LAWS and law.site == drive.element:
+                u_row[push + 1 + j] += 1.0
+        at_speed = at_phi + 1
+        A[at_phi, at_speed] = 1.0
+        A[at_speed] = drive.K * drive.p * x_row
+        A[at_speed, at_speed] -= drive.p
+        B[at_speed] = drive.K * drive.p * u_row
+        seen_by[drive.element] = _Source(at_speed, command)
+    speeds = phis + 1
+
+    # Elastic forces, then the accelerations they leave.
+    elastic = s.C @ Qd + s.K @ Q
+    for i, r in enumerate(s.relaxations):
+        z = 2 * nf + i
+        elastic[:, z] += r.row * r.stiffness
+        A[z] = r.row @ Qd
+        A[z, z] -= r.rate
+    pull = np.linalg.inv(s.M[np.ix_(free, free)])
+    carried = s.M[np.ix_(free, d)]
+    acc_x = -pull @ (elastic[free] + carried @ A[speeds])
+    acc_u = pull @ (force[free] - carried @ B[speeds])
+    A[:nf] = Qd[free]
+    A[nf : 2 * nf], B[nf : 2 * nf] = acc_x, acc_u
+    Ax, Au = np.zeros((n, size)), np.zeros((n, inputs))
+    Ax[free], Au[free] = acc_x, acc_u
+    Ax[d], Au[d] = A[speeds], B[speeds]
+
+    C: list[Float] = []
+    D: list[Float] = []
+    for sensor in plant.sensors:
+        x, u = _seen(sensor, s, Q, Ax, Au)
+        C.append(x)
+        D.append(u)
+    for law in plant.laws:
+        rows, feeds = _joint_probes(law, s, Q, Qd, inputs)
+        if law.kind in DRIVE_LAWS:
+            i = s.driven[law.site]
+            moment = -(s.M[i] @ Ax + elastic[i]), -(s.M[i] @ Au - force[i])
+            rows, feeds = _drive_probes(law, seen_by[law.site], moment)
+        C += rows
+        D += feeds
+    return StateSpace(A, B, np.array(C), np.array(D))
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """Of a drive: the state that is its source's speed, and its command behind the filters as rows
+    over x and over u."""
+
+    at_speed: int
+    command: tuple[Float, Float]
+
+
+def _command(drive: Drive, k: int, at: int, A: Float, B: Float) -> tuple[Float, Float]:
+    """The command k through its drive's filters, whose states begin at `at`: rows over x and u."""
+    size, inputs = B.shape
     x_row, u_row = np.zeros(size), np.zeros(inputs)
-    u_row[0] = 1.0
-    at = at_drive
+    u_row[k] = 1.0
     for lag in drive.lags:
         A[at] = x_row / lag
         A[at, at] -= 1 / lag
@@ -129,48 +204,7 @@ def state_space(plant: Description, structure: Structure | None = None) -> State
         B[at + 1] = omega**2 * u_row
         x_row, u_row = unit(size, at), np.zeros(inputs)
         at += 2
-    command_x, command_u = x_row.copy(), u_row.copy()
-    force = np.zeros((n, inputs))
-    force[:, 1] = s.ends[plant.push][0]
-    for j, law in enumerate(plant.laws):
-        if law.kind in DRIVE_LAWS:
-            u_row[2 + j] += 1.0
-        else:
-            force[s.joints[law.site][-1], 2 + j] += 1.0
-    A[at_phi, at_speed] = 1.0
-    A[at_speed] = drive.K * drive.p * x_row
-    A[at_speed, at_speed] -= drive.p
-    B[at_speed] = drive.K * drive.p * u_row
-
-    # Elastic forces, then the accelerations they leave.
-    elastic = s.C @ Qd + s.K @ Q
-    for i, r in enumerate(s.relaxations):
-        z = 2 * nf + i
-        elastic[:, z] += r.row * r.stiffness
-        A[z] = r.row @ Qd
-        A[z, z] -= r.rate
-    pull = np.linalg.inv(s.M[np.ix_(free, free)])
-    acc_x = -pull @ (elastic[free] + np.outer(s.M[free, d], A[at_speed]))
-    acc_u = pull @ (force[free] - np.outer(s.M[free, d], B[at_speed]))
-    A[:nf] = Qd[free]
-    A[nf : 2 * nf], B[nf : 2 * nf] = acc_x, acc_u
-    Ax, Au = np.zeros((n, size)), np.zeros((n, inputs))
-    Ax[free], Au[free] = acc_x, acc_u
-    Ax[d], Au[d] = A[at_speed], B[at_speed]
-
-    C: list[Float] = []
-    D: list[Float] = []
-    for sensor in plant.sensors:
-        x, u = _seen(sensor, s, Q, Ax, Au)
-        C.append(x)
-        D.append(u)
-    moment_x = -(s.M[d] @ Ax + elastic[d])
-    moment_u = -(s.M[d] @ Au - force[d])
-    for law in plant.laws:
-        rows, feeds = _probes(law, s, Q, Qd, (moment_x, moment_u), (command_x, command_u), at_speed)
-        C += rows
-        D += feeds
-    return StateSpace(A, B, np.array(C), np.array(D))
+    return x_row, u_row
 
 
 def unit(size: int, i: int) -> Float:
@@ -199,23 +233,20 @@ def _seen(sensor: SensorPath, s: Structure, Q: Float, Ax: Float, Au: Float) -> t
     raise InputError("plant", f"sensor.{sensor.name}", sensor.kind, "an angle or acceleration")
 
 
-def _probes(
-    law: Law,
-    s: Structure,
-    Q: Float,
-    Qd: Float,
-    moment: tuple[Float, Float],
-    command: tuple[Float, Float],
-    at_speed: int,
+def _joint_probes(
+    law: Law, s: Structure, Q: Float, Qd: Float, inputs: int
 ) -> tuple[list[Float], list[Float]]:
-    none = np.zeros(moment[1].size)
-    if law.kind == "flow_saturation":
-        return [moment[0], command[0]], [moment[1], command[1]]
-    if law.kind == "drive_friction":
-        speed = unit(Q.shape[1], at_speed)
-        return [speed, speed], [none, none]
     i = s.joints[law.site][-1]
-    return [Q[i], Qd[i]], [none, none]
+    return [Q[i], Qd[i]], [np.zeros(inputs), np.zeros(inputs)]
+
+
+def _drive_probes(
+    law: Law, source: _Source, moment: tuple[Float, Float]
+) -> tuple[list[Float], list[Float]]:
+    if law.kind == "flow_saturation":
+        return [moment[0], source.command[0]], [moment[1], source.command[1]]
+    speed, none = unit(moment[0].size, source.at_speed), np.zeros(moment[1].size)
+    return [speed, speed], [none, none]
 
 
 def filter_poles(sensor: SensorPath) -> Complex:
@@ -313,7 +344,7 @@ def _filtered(plant: Description, pole: Complex, b: Complex, c: Complex, D: Floa
         wide[:, slow],
         out_D + static,
         np.array([s.delay for s in plant.sensors]),
-        plant.drive.delay,
+        np.array([d.delay for d in plant.drives]),
         plant.rate_hz,
     )
 

@@ -13,7 +13,7 @@ from sim.concealed.scales import Concealed, Dose, Scales
 
 def friction(plant: Description, site: str, dose: Dose) -> Concealed:
     """Dry friction beside a joint's spring, N m, or in the drive, in command units."""
-    if site == plant.drive.element:
+    if any(site == drive.element for drive in plant.drives):
         T_c = dose("T_c", 0.1 * dose.x)
         plant.laws.append(Law("drive_friction", site, (T_c,)))
         return Concealed("coulomb_friction", site, {"T_c": T_c}, where="command units")
@@ -24,7 +24,7 @@ def friction(plant: Description, site: str, dose: Dose) -> Concealed:
 
 def overlap(plant: Description, site: str, dose: Dose) -> Concealed:
     """A dead zone of the valve, full width in command units."""
-    plant.drive.deadband = width = dose("width", 0.1 * dose.x)
+    plant.drive(site).deadband = width = dose("width", 0.1 * dose.x)
     return Concealed("valve_deadband", site, {"width": width})
 
 
@@ -51,7 +51,7 @@ def flow(plant: Description, site: str, dose: Dose) -> Concealed:
 
 def clipped(plant: Description, site: str, dose: Dose) -> Concealed:
     """A command that is cut off behind where it is recorded."""
-    plant.drive.limit = limit = dose("limit", 1.0 / dose.x)
+    plant.drive(site).limit = limit = dose("limit", 1.0 / dose.x)
     return Concealed("output_saturation", site, {"limit": limit})
 
 

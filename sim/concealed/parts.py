@@ -1,4 +1,4 @@
-"""What the concealed plant is built of: parts, a drive, sensors, laws that are not linear.
+"""What the concealed plant is built of: parts, drives, sensors, laws that are not linear.
 
 A rig file gives the nominal description (`described`). An effect changes it: it inserts a part,
 changes a number, or adds a law. Nothing here knows how a diagnosis would look for it.
@@ -63,7 +63,8 @@ class SensorPath:
 
 @dataclass(slots=True)
 class Drive:
-    """From the recorded command to the source's velocity: K p/(s + p) and what is before it.
+    """From the recorded command of an actuator to its source's velocity: K p/(s + p) and what is
+    before it. element : the source.
 
     delay : s. lags : s, first-order. valves : (omega, zeta) second-order.
     deadband : full width of the dead zone. limit : largest output, both in command units.
@@ -93,19 +94,42 @@ class Law:
 
 @dataclass(slots=True)
 class Description:
-    """A whole plant. `push` is the place of the disturbing force, an element's downstream end."""
+    """A whole plant. `drives` are in the rig file's order of actuators. `push` is the place of the
+    disturbing force, an element's downstream end."""
 
     base: str
     rate_hz: float
     parts: list[Part]
     sensors: list[SensorPath]
-    drive: Drive
+    drives: list[Drive]
     push: str
     laws: list[Law] = field(default_factory=list)
 
     def part(self, name: str) -> Part:
         """The part that the rig file's element of this name became."""
         return next(p for p in self.parts if p.name == name)
+
+    def drive(self, element: str) -> Drive:
+        """The drive whose source this element is; KeyError for another element."""
+        for drive in self.drives:
+            if drive.element == element:
+                return drive
+        raise KeyError(element)
+
+    def value(self, element: str, symbol: str) -> float:
+        """A number of the rig file's element, be it a part's or a drive's."""
+        for drive in self.drives:
+            if drive.element == element:
+                return float(getattr(drive, symbol))
+        return self.part(element).values[symbol]
+
+    def set_value(self, element: str, symbol: str, value: float) -> None:
+        """Give it another value."""
+        for drive in self.drives:
+            if drive.element == element:
+                setattr(drive, symbol, value)
+                return
+        self.part(element).values[symbol] = value
 
     def insert(self, part: Part, *, after: str) -> None:
         """Put a part behind the last one that belongs to an element."""
@@ -120,12 +144,13 @@ class Description:
 def described(rig: Rig) -> Description:
     """The plant that a rig file describes, nothing hidden.
 
-    InputError for a chain that this plant cannot be: not exactly one angular velocity source
-    and actuator, a tip that is held, or an element of another kind.
+    InputError for a chain that this plant cannot be: not exactly one angular velocity source for
+    each actuator, a tip that is held, or an element of another kind.
     """
-    sources = [e for e in rig.element if isinstance(e, AngularVelocitySource)]
-    if len(sources) != 1 or len(rig.actuator) != 1:
-        raise InputError(rig.name, "element", len(sources), "one angular_velocity_source")
+    sources = {e.input: e for e in rig.element if isinstance(e, AngularVelocitySource)}
+    count = sum(isinstance(e, AngularVelocitySource) for e in rig.element)
+    if count != len(rig.actuator) or len(sources) != count:
+        raise InputError(rig.name, "element", count, "one angular_velocity_source an actuator")
     if rig.tip != "free":
         raise InputError(rig.name, "tip", rig.tip, "'free', to conceal something in")
     if rig.pull:
@@ -137,13 +162,11 @@ def described(rig: Rig) -> Description:
             raise InputError(rig.name, f"element.{element.name}", element.kind, f"one of {known}")
         values = {symbol: p.value for symbol, p in parameters(element).items()}
         parts.append(Part(element.kind, element.name, values))
-    source = sources[0]
-    drive = Drive(
-        source.name,
-        source.K.value,
-        source.p.value,
-        rig.actuator[0].delay + source.tau.value,
-    )
+    drives = [
+        Drive(source.name, source.K.value, source.p.value, a.delay + source.tau.value)
+        for a in rig.actuator
+        for source in [sources[a.name]]
+    ]
     sensors = []
     for s in rig.sensor:
         match s:
@@ -170,7 +193,7 @@ def described(rig: Rig) -> Description:
         if (lag := float(getattr(s, "lag", 0.0))) > 0:
             path.lags.append(lag)
         sensors.append(path)
-    return Description(rig.base, rig.rate_hz, parts, sensors, drive, rig.element[-1].name)
+    return Description(rig.base, rig.rate_hz, parts, sensors, drives, rig.element[-1].name)
 
 
 SUPPORTED = (

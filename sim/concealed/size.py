@@ -34,21 +34,24 @@ SWEEPS = 30  # fixed-point sweeps for an amplitude that depends on itself
 
 
 def tangent(plant: Description, rig: Rig, f: Float) -> tuple[Float, Complex]:
-    """Tolerances (n_par,) and dH (n_par, n_freq, m) by relative change of each parameter to which
+    """Tolerances (n_par,) and dH (n_par, n_freq, q) by relative change of each parameter to which
     `rig` gives a tolerance, at the plant's own values.
 
     From (s - A) x = B u and y = C x + D u, with its adjoint; hold, filters and delays as factors.
+    q = m d: for each sensor the drives side by side.
     """
     s = np.asarray(2j * np.pi * f, np.complex128)
     structure = assemble(plant)
     system = state_space(plant, structure)
     inverse = np.linalg.inv(s[:, None, None] * np.eye(system.A.shape[0]) - system.A)
-    m = len(plant.sensors)
-    x = inverse @ system.B[:, 0]
+    m, d = len(plant.sensors), len(plant.drives)
+    x = inverse @ system.B[:, :d]
     y = np.einsum("oi,fij->foj", system.C[:m], inverse)
-    lag = np.exp(-s * (plant.drive.delay + 0.5 / plant.rate_hz)) * np.sinc(f / plant.rate_hz)
-    filters = [filter_response(p, s) * np.exp(-s * p.delay) * lag for p in plant.sensors]
-    chain = np.stack(filters, axis=1)
+    hold = np.sinc(f / plant.rate_hz)
+    late = np.array([drive.delay + 0.5 / plant.rate_hz for drive in plant.drives])
+    lag = np.exp(-s[:, None] * late) * hold[:, None]
+    filters = [filter_response(p, s) * np.exp(-s * p.delay) for p in plant.sensors]
+    chain = np.stack(filters, axis=1)[:, :, None] * lag[:, None, :]
     tolerance, rows = [], []
     for element in rig.element:
         for symbol, parameter in parameters(element).items():
@@ -56,21 +59,17 @@ def tangent(plant: Description, rig: Rig, f: Float) -> tuple[Float, Complex]:
                 continue
             both = [changed(plant, element.name, symbol, 1 + by) for by in (STEP, -STEP)]
             up, down = (state_space(other, assemble(other, structure)) for other in both)
-            dx = x @ (up.A - down.A).T + (up.B - down.B)[:, 0]
-            change = np.einsum("foj,fj->fo", y, dx) + x @ (up.C - down.C)[:m].T
-            change += (up.D - down.D)[:m, 0]
+            dx = (up.A - down.A) @ x + (up.B - down.B)[:, :d]
+            change = y @ dx + (up.C - down.C)[:m] @ x + (up.D - down.D)[:m, :d]
             tolerance.append(parameter.tolerance)
-            rows.append(change * chain / (2 * STEP))
+            rows.append((change * chain / (2 * STEP)).reshape(f.size, -1))
     return np.array(tolerance), np.array(rows)
 
 
 def changed(plant: Description, name: str, symbol: str, ratio: float) -> Description:
     """A copy of a plant with one parameter of the rig file's element `name` times a ratio."""
     other = copy.deepcopy(plant)
-    if name == plant.drive.element:
-        setattr(other.drive, symbol, getattr(other.drive, symbol) * ratio)
-    else:
-        other.part(name).values[symbol] *= ratio
+    other.set_value(name, symbol, other.value(name, symbol) * ratio)
     return other
 
 
@@ -78,8 +77,9 @@ def changed(plant: Description, name: str, symbol: str, ratio: float) -> Descrip
 class Yardstick:
     """Measures responses in sigma.
 
-    f : (n_freq,) Hz. level : (n_level, n_freq) amplitude of v at each level and line.
-    white : (n_level, n_freq, m, m) rows that make an error dH of unit variance.
+    f : (n_freq,) Hz. amplitude : (n_level, n_freq, d) of v at each level and line, of each drive
+    where it is the one that is driven. white : (n_level, n_freq, q, q) rows that make an error dH
+    of unit variance; q = m d, for each sensor the drives side by side.
     tolerance, dH : of `tangent`.
     """
 
@@ -90,7 +90,7 @@ class Yardstick:
     dH: Complex
 
     def __call__(self, change: Complex) -> float:
-        """Sigma of a change (n_level, n_freq, m) of the response, the nominal refitted."""
+        """Sigma of a change (n_level, n_freq, q) of the response, the nominal refitted."""
         r = np.einsum("lfab,lfb->lfa", self.white, change).ravel()
         J = np.einsum("lfab,pfb->lfap", self.white, self.dH).reshape(r.size, -1)
         J = np.concatenate([J.real, J.imag]) * self.tolerance
@@ -118,18 +118,17 @@ def yardstick(
     n = wave.size
     at = np.fft.rfftfreq(n, 1 / rig.rate_hz)
     R = np.interp(f, at, np.abs(np.fft.rfft(wave)))
-    H = poles.sampled(f)
-    kp, i = loop_gain(rig)
-    S = np.abs(1 / (1 + kp * H[:, i]))
+    back = returned(rig, poles, f)
     step = np.array([s.resolution for s in rig.sensor])
-    Ce = n * open_noise(poles, errors, step, f)
+    Ce = n * in_turn(open_noise(poles, errors, step, f), back)
     repeats = max(design.bursts - 1, 1)
     each = (design.high_hz - design.low_hz) * n / rig.rate_hz / LINES
     levels = np.array(design.levels)
-    V = levels[:, None] * R * S
+    V = levels[:, None] * R
     CH = Ce[None] / (repeats * V[:, :, None, None] ** 2)
     white = np.asarray(np.linalg.inv(np.linalg.cholesky(CH)) * math.sqrt(2 * each), np.complex128)
-    return Yardstick(f, levels[:, None] * factor(f) * S, white, tolerance, dH)
+    S = np.abs(np.diagonal(np.linalg.inv(back), axis1=1, axis2=2))
+    return Yardstick(f, levels[:, None, None] * factor(f)[:, None] * S, white, tolerance, dH)
 
 
 def factor(f: Float) -> Float:
@@ -137,41 +136,59 @@ def factor(f: Float) -> Float:
     return schedule_factor(f, SCHEDULE, "logarithmic")
 
 
-def loop_gain(rig: Rig) -> tuple[float, int]:
-    """kp and the index of the sensor that centres."""
-    if rig.centring is None:
-        return 0.0, 0
-    return rig.centring.kp, [s.name for s in rig.sensor].index(rig.centring.sensor)
+def returned(rig: Rig, poles: Poles, f: Float) -> Complex:
+    """(n_freq, d, d) return difference 1 + F H of the loops, so that v = (1 + F H)^-1 u."""
+    names, loops = [s.name for s in rig.sensor], [rig.centring_of(a.name) for a in rig.actuator]
+    F = np.zeros((len(loops), len(names)))
+    for row, loop in zip(F, loops, strict=True):
+        if loop is not None:
+            row[names.index(loop.sensor)] = loop.kp
+    H = poles.response(f).reshape(f.size, len(names), len(loops))
+    return np.asarray(np.eye(len(loops)) + F @ H)
+
+
+def in_turn(noise: Complex, back: Complex) -> Complex:
+    """(n_freq, q, q) power of the noise of a response from inputs in turn with reference 1.
+
+    dH = E V^-1 with V = (1 + F H)^-1. noise : (n_freq, m, m), of the open loop in each experiment.
+    back : 1 + F H. q = m d, for each sensor the drives side by side.
+    """
+    own = np.einsum("fej,fek->fjk", back, back.conj())
+    both = np.einsum("fab,fjk->fajbk", noise, own)
+    q = noise.shape[1] * back.shape[1]
+    return np.asarray(both.reshape(len(noise), q, q))
 
 
 def open_noise(poles: Poles, errors: Errors, step: Float, f: Float) -> Complex:
     """(n_freq, m, m) power of the open loop's noise, a sample: of E dY dY^H over n."""
-    G = poles.sampled(f, 1)
+    G = poles.sampled(f, poles.push)
     pushed = errors.push**2 * G[:, :, None] * G[:, None, :].conj()
     return np.asarray(pushed + np.diag(errors.white**2 + step**2 / 12))
 
 
 def response_change(yard: Yardstick, true: Poles, nominal: Complex, plant: Description) -> Complex:
-    """(n_level, n_freq, m) of the truth's response, its laws linearised, less the nominal's."""
-    H = np.repeat(true.sampled(yard.f)[None], yard.amplitude.shape[0], axis=0)
-    A = yard.amplitude
-    drive = plant.drive
-    if drive.deadband > 0 or drive.limit < math.inf:
-        H = H * (_clip(A, drive.limit) * (1 - _clip(A, drive.deadband / 2)))[:, :, None]
+    """(n_level, n_freq, q) of the truth's response, its laws linearised, less the nominal's."""
+    m, d, levels = true.delay.size, true.push, len(yard.amplitude)
+    H = np.repeat(true.response(yard.f)[None], levels, axis=0).reshape(levels, yard.f.size, m, d)
     s = np.asarray(2j * np.pi * yard.f, np.complex128)
     G = true.continuous(s)
-    m = true.delay.size
-    for j, law in enumerate(plant.laws):
-        probe = m + 2 * j
-        to, own = G[:, probe, 0], G[:, probe, 2 + j]
-        N = np.zeros(A.shape, complex)
-        size = A * np.abs(to)
-        for _ in range(SWEEPS):
-            size = np.sqrt(size * np.abs(A * to / (1 - own * N)))
-            N = describing(law, size, A, s)
-        share = to * N / (1 - own * N)
-        H = H + share[:, :, None] * G[:, :m, 2 + j] * np.exp(-s * true.input_delay)[:, None]
-    return np.asarray(H - nominal)
+    for k, drive in enumerate(plant.drives):
+        A = yard.amplitude[:, :, k]
+        if drive.deadband > 0 or drive.limit < math.inf:
+            cut = _clip(A, drive.limit) * (1 - _clip(A, drive.deadband / 2))
+            H[..., k] *= cut[:, :, None]
+        late = np.exp(-s * true.input_delay[k])[:, None]
+        for j, law in enumerate(plant.laws):
+            probe, force = m + 2 * j, d + 1 + j
+            to, own = G[:, probe, k], G[:, probe, force]
+            N = np.zeros(A.shape, complex)
+            size = A * np.abs(to)
+            for _ in range(SWEEPS):
+                size = np.sqrt(size * np.abs(A * to / (1 - own * N)))
+                N = describing(law, size, A, s)
+            share = to * N / (1 - own * N)
+            H[..., k] += share[:, :, None] * G[:, :m, force] * late
+    return np.asarray(H.reshape(levels, yard.f.size, m * d) - nominal)
 
 
 def describing(law: Law, a: Float, v: Float, s: Complex) -> Complex:

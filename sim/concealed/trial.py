@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from samii_rig.devices.channels import command_channel, reference_channels
 from samii_rig.record.writer import RunWriter
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Float, Quality, SampleBlock, StopRecord
@@ -31,7 +32,7 @@ from sim.concealed.integrate import INNER, Tables, tabulate
 from sim.concealed.measure import ideally, loop_of, measured
 from sim.concealed.parts import Description
 from sim.concealed.runs import Design, Run, runs
-from sim.concealed.size import loop_gain, open_noise
+from sim.concealed.size import in_turn, open_noise, returned
 from sim.concealed.stated import Stated
 
 PARTIAL = ".partial"
@@ -62,23 +63,23 @@ def make(
     drawn = draw(kind, seed, rig_toml, design, stated)
     rig = drawn.nominal
     tables = tabulate(drawn.poles, drawn.plant)
-    units = (rig.actuator[0].unit, _centring_unit(rig))
-    planned = runs(design, rig.rate_hz, units, seed)
+    planned = runs(design, rig, seed)
     quiet = quiet_runs(drawn, design, planned, tables)
-    y = quiet[-1][1]
+    y = np.vstack([one[1] for one in loudest(drawn, quiet)])
     if not np.all(np.isfinite(y)):
         raise ArithmeticError(f"the concealed plant of {kind} {seed} is not stable in its loop")
     share = _share(rig, y)
     if share > HEADROOM:
         design = scaled(design, TURNED_DOWN / share)
-        planned = runs(design, rig.rate_hz, units, seed)
+        planned = runs(design, rig, seed)
         quiet = quiet_runs(drawn, design, planned, tables)
     arrays = responses(drawn, design, planned, quiet)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)
     _write(truths / f"{name}.npz", buffer.getvalue())
     digest = hashlib.sha256(buffer.getvalue()).hexdigest()
-    record = truth(drawn, design, quiet[-1][2], digest, sized(drawn, arrays))
+    peaks = np.max([one[2] for one in loudest(drawn, quiet)], axis=0)
+    record = truth(drawn, design, peaks, digest, sized(drawn, arrays))
     text = json.dumps(record, indent=1, allow_nan=False).encode()
     _write(truths / f"{name}.json", text)
     digest = hashlib.sha256(text).hexdigest()
@@ -89,7 +90,7 @@ def make(
         v, y = measured(run, tables, loop, drawn.errors, rig.rate_hz, rng)
         start += 10 * round(rig.rate_hz)  # s between runs
         _record(work / f"{run.name}.mcap", run, v, y, drawn, digest, start)
-        start += v.size
+        start += len(v)
     work.rename(folder)
     return folder
 
@@ -105,7 +106,7 @@ def sized(drawn: Drawn, arrays: dict[str, Any]) -> tuple[float, str]:
         return drawn.sizes[0], how
     every = arrays["frequency"]
     near = [int(np.argmin(np.abs(every - f))) for f in drawn.yard.f]
-    change = arrays["settled"][:, near] - drawn.believed.sampled(every[near])
+    change = arrays["settled"][:, near] - drawn.believed.response(every[near])
     return drawn.yard(change), f"noise-free runs, {how}"
 
 
@@ -149,23 +150,32 @@ def truth(
 
 def not_linear(plant: Description) -> bool:
     """Whether its response depends on the level or on time."""
-    return bool(plant.laws) or plant.drive.deadband > 0 or math.isfinite(plant.drive.limit)
+    cut = any(d.deadband > 0 or math.isfinite(d.limit) for d in plant.drives)
+    return bool(plant.laws) or cut
 
 
 def quiet_runs(
     drawn: Drawn, design: Design, planned: tuple[Run, ...], tables: Tables
 ) -> list[tuple[Float, Float, Float]]:
     """v, sensors and probes' peaks of the swept sines' bursts without errors, repeated until the
-    rig repeats itself: of all levels where the plant is not linear, else of the loudest alone,
-    which comes last."""
+    rig repeats itself, one for each input: of all levels where the plant is not linear, else of
+    the loudest alone, which comes last."""
     plant, n = drawn.plant, round(design.burst * drawn.nominal.rate_hz)
-    swept = sorted(zip(design.levels, planned, strict=False), key=lambda pair: pair[0])
+    d = len(plant.drives)
+    swept = sorted(planned[: d * len(design.levels)], key=lambda run: run.level)
     loop = loop_of(drawn.nominal, plant, ideal=True)
     out = []
-    for _, run in swept if not_linear(plant) else swept[-1:]:
-        u, reference = (np.tile(x[:n], SETTLED) for x in (run.u, run.theta_ref))
+    for run in swept if not_linear(plant) else swept[-d:]:
+        u, reference = (np.tile(x[:n], (SETTLED, 1)) for x in (run.u, run.theta_ref))
         out.append(ideally(replace(run, u=u, theta_ref=reference), tables, loop))
     return out
+
+
+def loudest(
+    drawn: Drawn, quiet: list[tuple[Float, Float, Float]]
+) -> list[tuple[Float, Float, Float]]:
+    """Of `quiet_runs` those of the highest level, one for each input."""
+    return quiet[-len(drawn.plant.drives) :]
 
 
 def responses(
@@ -176,34 +186,41 @@ def responses(
 ) -> dict[str, Any]:
     """Noise-free responses of the truth at the lines of the swept sine.
 
-    frequency (n_freq,) Hz; linear (n_freq, m): of the finite element plant without its laws, held
-    and sampled, v to sensors. level (n_level,); settled (n_level, n_freq, m): of the last burst
-    of each noise-free run, where the plant has laws or a dead zone. open_noise (n_freq, m, m):
-    power of the open loop's noise a sample. reference (n_freq,): |DFT| of a burst of level 1;
-    sensitivity (n_freq,): v by u of the linear loop. The noise of one response from r settled
-    repeats has the covariance n open_noise/(r |level reference sensitivity|^2), n samples a burst.
+    q = m d entries, for each sensor the drives side by side: sensor (q,), actuator (q,).
+
+    frequency (n_freq,) Hz; linear (n_freq, q): of the finite element plant without its laws, held
+    and sampled, v to sensors. level (n_level,); settled (n_level, n_freq, q): of the last burst
+    of each noise-free run, where the plant has laws or a dead zone. noise (n_freq, q, q): power a
+    sample of the noise of a response to reference 1, from inputs in turn, the loops closed.
+    reference (n_freq,): |DFT| of a burst of level 1. The noise of one response from r settled
+    repeats has the covariance n noise/(r |level reference|^2), n samples a burst.
     """
     rig = drawn.nominal
     n = round(design.burst * rig.rate_hz)
     at = np.asarray(np.arange(n // 2 + 1) * (rig.rate_hz / n), np.float64)
     band = (at >= design.low_hz) & (at <= design.high_hz)
     f: Float = at[band]
-    H = drawn.poles.sampled(f)
-    kp, i = loop_gain(rig)
+    H = drawn.poles.response(f)
+    m, d = len(rig.sensor), len(rig.actuator)
     step = np.array([s.resolution for s in rig.sensor])
     first = planned[0]
-    wave = first.u[:n] / design.levels[0]
+    wave = first.u[:n, 0] / design.levels[0]
+    noise = in_turn(open_noise(drawn.poles, drawn.errors, step, f), returned(rig, drawn.poles, f))
     out: dict[str, Any] = {
         "frequency": f,
         "linear": H,
         "level": np.sort(design.levels),
         "reference": np.abs(np.fft.rfft(wave))[band],
-        "sensitivity": 1 / (1 + kp * H[:, i]),
-        "open_noise": open_noise(drawn.poles, drawn.errors, step, f).astype(np.complex64),
+        "noise": noise.astype(np.complex64),
+        "sensor": np.repeat(np.arange(m), d),
+        "actuator": np.tile(np.arange(d), m),
     }
     if not_linear(drawn.plant):
-        spectra = [(np.fft.rfft(v[-n:]), np.fft.rfft(y[-n:], axis=0)) for v, y, _ in quiet]
-        out["settled"] = np.array([(Y / V[:, None])[band] for V, Y in spectra])
+        # Of each level Y = H V, a column an input that was driven.
+        V, Y = (np.array([np.fft.rfft(one[k][-n:], axis=0)[band] for one in quiet]) for k in (0, 1))
+        V, Y = (np.moveaxis(x.reshape(-1, d, *x.shape[1:]), 1, 3) for x in (V, Y))
+        settled = Y @ np.linalg.inv(V)
+        out["settled"] = settled.reshape(*settled.shape[:2], m * d)
     return out
 
 
@@ -213,28 +230,12 @@ def _share(rig: Rig, y: Float) -> float:
     return float(np.max(np.abs(y).max(axis=0) / reach))
 
 
-def _centring_unit(rig: Rig) -> str:
-    return rig.units()[rig.centring.sensor] if rig.centring else rig.sensor[0].unit
-
-
 def channels(rig: Rig, sensors: tuple[str, ...]) -> tuple[Channel, ...]:
-    """Columns as a device reports them: u, theta_ref, the command, then the sensors."""
-    spec = rig.actuator[0]
-    centring = rig.centring.sensor if rig.centring else rig.sensor[0].name
+    """Columns as a device reports them: references, commands, then the sensors."""
+    held = "output as held by the converter"
     return (
-        Channel("u", spec.unit, "reference", description="reference of the excitation"),
-        Channel(
-            "theta_ref", _centring_unit(rig), "reference", description=f"reference of {centring}"
-        ),
-        Channel(
-            spec.name,
-            spec.unit,
-            "command",
-            spec.low,
-            spec.high,
-            spec.resolution,
-            "output as held by the converter",
-        ),
+        *reference_channels(rig),
+        *(command_channel(a, a.resolution, held) for a in rig.actuator),
         *(
             Channel(s.name, s.unit, "sensor", s.low, s.high, s.resolution, s.calibration)
             for s in rig.sensor
@@ -249,11 +250,13 @@ def _record(
     rig, wanted = drawn.nominal, drawn.design.sensors
     columns = channels(rig, wanted)
     kept = [i for i, s in enumerate(rig.sensor) if not wanted or s.name in wanted]
-    values = np.column_stack([run.u, run.theta_ref, v, y[:, kept]])
+    references = np.stack([run.u, run.theta_ref], axis=2).reshape(len(v), -1)
+    values = np.column_stack([references, v, y[:, kept]])
     low = np.array([c.low for c in columns])
     high = np.array([c.high for c in columns])
     quality = np.where((values <= low) | (values >= high), Quality.CLIPPED, 0).astype(np.uint8)
-    quality[:, 2] = np.where(quality[:, 2] > 0, Quality.LIMITED, 0)
+    sent = slice(references.shape[1], references.shape[1] + v.shape[1])
+    quality[:, sent] = np.where(quality[:, sent] > 0, Quality.LIMITED, 0)
     n = values.shape[0]
     time = np.rint((start + np.arange(n)) * (1e9 / rig.rate_hz)).astype(np.int64)
     block = SampleBlock(columns, time, np.arange(n, dtype=np.int64), values, quality)

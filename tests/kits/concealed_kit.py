@@ -19,27 +19,31 @@ SAMII, SAMII_TOML = load_rig("samii")
 FREQUENCY = np.geomspace(0.4, 50.0, 60)
 
 
-def loop(sensors: int, kp: float = 0.0) -> Loop:
-    """Converters that round and clip nothing."""
-    wide = np.full(sensors, np.inf)
-    return Loop(0, kp, -1e9, 1e9, 0.0, -wide, wide, np.zeros(sensors), 0.0, np.inf)
+def loop(sensors: int, kp: float = 0.0, drives: int = 1) -> Loop:
+    """Converters that round and clip nothing; each drive is centred by the sensor of its number."""
+    wide, far, none = np.full(sensors, np.inf), np.full(drives, 1e9), np.zeros(drives)
+    return Loop(
+        np.arange(drives), np.full(drives, kp), -far, far, none, -wide, wide, np.zeros(sensors),
+        none, np.full(drives, np.inf),
+    )  # fmt: skip
 
 
 def driven(
     plant: Description, u: Float, kp: float = 0.0, inner: int = INNER
 ) -> tuple[Float, Float, Float]:
-    """v, sensors and the probes' peaks without noise."""
-    m = len(plant.sensors)
+    """v (n, d), sensors and the probes' peaks without noise; u (n, d), or (n,) for one drive."""
+    m, d = len(plant.sensors), len(plant.drives)
     tables = tabulate(poles_of(plant), plant, inner)
-    rest = np.zeros_like(u)
-    return run(tables, loop(m, kp), u, rest, rest, np.zeros((u.size, m)))
+    u = u.reshape(-1, d)
+    push, error = np.zeros(len(u)), np.zeros((len(u), m))
+    return run(tables, loop(m, kp, d), u, np.zeros_like(u), push, error)
 
 
 def settled(plant: Description, u: Float, periods: int, kp: float = 0.0) -> tuple[Float, Complex]:
     """(lines Hz, response) from the last of many periods of u, lines where it is driven."""
     n = u.size
     v, y, _ = driven(plant, np.tile(u, periods), kp)
-    U, V, Y = np.fft.rfft(u), np.fft.rfft(v[-n:]), np.fft.rfft(y[-n:], axis=0)
+    U, V, Y = np.fft.rfft(u), np.fft.rfft(v[-n:, 0]), np.fft.rfft(y[-n:], axis=0)
     lines = np.flatnonzero(np.abs(U) > 1e-6 * np.abs(U).max())
     return lines * plant.rate_hz / n, Y[lines] / V[lines, None]
 

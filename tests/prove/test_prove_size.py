@@ -29,8 +29,9 @@ def size(gain: float, force: float) -> float:
         "linear": linear,
         "level": np.array([1.0, 2.0]),
         "reference": np.ones(F.size),
-        "sensitivity": np.ones(F.size),
-        "open_noise": noise[:, :, None] * np.eye(4),
+        "noise": noise[:, :, None] * np.eye(4),
+        "sensor": np.arange(4),
+        "actuator": np.zeros(4, dtype=int),
         "settled": np.stack([(1 - force) * linear, (1 + force) * linear]),
     }
     return size_of(TRUTH, arrays, RIG).size

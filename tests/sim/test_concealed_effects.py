@@ -23,6 +23,7 @@ from concealed_kit import (
     quantity,
 )
 
+from samii_rig.rig.load import load_rig
 from samii_rig.types import Complex, Float
 from sim.concealed import linear, nonlinear
 from sim.concealed.draw import edited
@@ -164,7 +165,7 @@ def test_oil_line_makes_the_source_second_order() -> None:
     plant.sensors = plant.sensors[:1]
     effect = linear.oil(plant, "joint_2_source", Dose(1.0, np.random.default_rng(seed)))
     omega, zeta = effect.parameters["omega"], effect.parameters["zeta"]
-    d = plant.drive
+    d = plant.drives[0]
     line = omega**2 / (S**2 + 2 * zeta * omega * S + omega**2)
     damped = line * (1 + 2 * zeta * S / omega)  # its damper lies beside the oil's spring
     closed = d.K * d.p / (S * (S + d.p)) * damped
@@ -226,7 +227,7 @@ def test_tilted_accelerometer_feels_gravity_by_its_angle() -> None:
 
 def test_noncollocated_encoder_reads_the_perfect_source() -> None:
     plant, _ = put("encoder", "theta_2", 1.0)
-    d = plant.drive
+    d = plant.drives[0]
     closed = d.K * d.p / (S * (S + d.p))
     assert continuous(plant, FREQUENCY)[:, 0] == pytest.approx(closed, rel=1e-4)
 
@@ -322,7 +323,7 @@ def test_deadband_and_clipping_act_as_theirs() -> None:
     u = np.sin(2 * np.pi * np.arange(PERIOD) / PERIOD)
     for width, limit in ((0.4, np.inf), (0.0, 0.5)):
         plant = described(SAMII)
-        plant.drive.deadband, plant.drive.limit = width, limit
+        plant.drives[0].deadband, plant.drives[0].limit = width, limit
         from sim.concealed.integrate import dead_zone
 
         applied = np.array([dead_zone(min(max(x, -limit), limit), width) for x in u])
@@ -357,6 +358,33 @@ def test_halving_the_step_converges(law: Law, order: float) -> None:
     ]
     assert error[1] < 5e-3
     assert error[0] / error[2] > order
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_friction_in_either_drive_holds_that_drive_alone(k: int) -> None:
+    rig, _ = load_rig("samii_two_joints")
+    plant = described(rig)
+    t = np.arange(1000) / plant.rate_hz
+    sources = [drive.element for drive in plant.drives]
+    plant.laws = [Law("drive_friction", sources[k], (0.2,))]
+    still, moving = np.zeros((1000, 2)), np.zeros((1000, 2))
+    still[:, k] = moving[:, 1 - k] = 0.19 * np.sin(2 * np.pi * 2 * t)
+    assert np.abs(driven(plant, still)[1]).max() < 1e-9
+    held = driven(plant, moving)[1]
+    # The held drive is what it is without a command: the other's answers are the linear ones.
+    free = driven(described(rig), moving)[1]
+    np.testing.assert_allclose(held, free, atol=1e-9 * np.abs(held).max())
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_an_effect_of_either_drive_is_in_the_answers_to_its_own_input(k: int) -> None:
+    rig, _ = load_rig("samii_two_joints")
+    plant, nominal = described(rig), described(rig)
+    linear.lag(plant, plant.drives[k].element, Dose(1.0, np.random.default_rng(0)))
+    s = 2j * np.pi * FREQUENCY
+    G, base = (poles_of(p).continuous(s)[:, :5, :2] for p in (plant, nominal))
+    assert np.abs(G[:, :, 1 - k] / base[:, :, 1 - k] - 1).max() < 1e-6
+    assert np.abs(G[:, :, k] / base[:, :, k] * (1 + s[:, None] * 1e-3) - 1).max() < 1e-6
 
 
 def test_friction_that_holds_stops_the_drive() -> None:

@@ -115,8 +115,8 @@ def test_estimated_response_is_the_truth_within_its_own_noise(trials: Path) -> N
     chi2 = np.einsum("fa,fab,fb->f", wrong.conj(), np.linalg.inv(C), wrong).real / p
     assert chi2.mean() == pytest.approx(nu / (nu - p), rel=0.08)
     n = 18000
-    drive = arrays["level"][0] * arrays["reference"] * np.abs(arrays["sensitivity"])
-    stated = n * arrays["open_noise"] / (3 * drive[:, None, None] ** 2)
+    drive = arrays["level"][0] * arrays["reference"]
+    stated = n * arrays["noise"] / (3 * drive[:, None, None] ** 2)
     ratio = [np.median(stated[at][inside][:, i, i].real / C[:, i, i].real) for i in range(p)]
     assert ratio == pytest.approx([1.0] * p, rel=0.15)
 
