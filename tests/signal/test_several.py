@@ -158,6 +158,19 @@ def test_random_inputs_together_are_solved_by_local_polynomials(rng):
     assert near(windows) < 0.1
 
 
+def test_records_that_differ_by_some_samples_are_cut_to_the_shortest(rng):
+    u = rng.normal(size=(2, 3000, 2))
+    both = [driven(x, rng, loop=50.0) for x in u]
+    made = [recording([x[: 3000 - 3 * k]], "single", source=f"{k}") for k, x in enumerate(both)]
+    (found,) = estimate(made, band=(0.5, 10.0))
+    assert found.method.startswith("local")
+    assert near(found) < 0.02
+    assert agrees(found)
+    half = recording([both[1][:1500]], "single", source="half")
+    with pytest.raises(EstimateError, match="the records differ in length"):
+        estimate([made[0], half], band=(0.5, 10.0))
+
+
 def test_measured_inputs_take_the_place_of_commands(rng):
     made = [
         recording([repeated(u, 3, rng)], "periodic", source=f"{k}", keep=(*INPUTS, *OUTPUTS))

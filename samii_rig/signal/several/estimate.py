@@ -24,6 +24,9 @@ from samii_rig.signal.several.sets import Set, sets_of
 from samii_rig.signal.stepped import is_stepped
 from samii_rig.types import Complex, Finding, Float, FrequencyResponse, Int, Recording
 
+# Of the longest record of a set, what the shortest must have: loggers differ by some samples, and
+# local models need no whole period; of a record half as long, half of the others would be lost.
+CUT = 0.9
 LOCAL_LINES = 2000  # of a local estimate at most; neighbours share their data anyhow
 
 
@@ -223,16 +226,21 @@ def _at_passing(own: Set, parts: Sequence[lines.Measured], columns: Columns, at:
 
 
 def _local(own: Set, columns: Columns, how: How, why: str, *, recorded: bool) -> FrequencyResponse:
-    """Local polynomials over all records of the set, which have one length."""
+    """Local polynomials over all records of the set, cut to the shortest."""
     records = _records(own, columns, recorded=recorded)
     rate = own.experiments[0].group.rate_hz
-    if len({len(p) for p in records}) > 1:
+    shortest, longest = (f(len(p) for p in records) for f in (min, max))
+    if shortest < CUT * longest:
         raise EstimateError("the records differ in length; expected one length for all of them")
+    records = [replace(p, z=p.z[:shortest], r=p.r[:shortest]) for p in records]
     found = [spectra.spectrum(p, rate) for p in records]
     at = spectra.excited(found, how.band)
     at = at[:: max(1, -(-at.size // LOCAL_LINES))]
     n_in = len(columns.inputs)
-    still = all(at_rest(outputs_of(e.group, columns)) for e in own.experiments)
+    # A record that was cut need not end at rest.
+    still = shortest == longest and all(
+        at_rest(outputs_of(e.group, columns)) for e in own.experiments
+    )
     fit = polynomial.fit(found, at, n_in, at_rest=still)
     names = [c.name for c in columns.inputs]
     solve.require_independent(fit.apart, n_in, names, f"{len(records)} records")
