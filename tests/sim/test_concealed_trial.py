@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
 from samii_rig.record.reader import read_recording
-from samii_rig.rig.load import parse
+from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.estimate import estimate
 from sim.concealed.__main__ import main
@@ -119,6 +119,41 @@ def test_estimated_response_is_the_truth_within_its_own_noise(trials: Path) -> N
     stated = n * arrays["noise"] / (3 * drive[:, None, None] ** 2)
     ratio = [np.median(stated[at][inside][:, i, i].real / C[:, i, i].real) for i in range(p)]
     assert ratio == pytest.approx([1.0] * p, rel=0.15)
+
+
+def test_two_inputs_are_driven_in_turn_and_together_and_their_truth_is_that_of_all_entries(
+    tmp_path: Path,
+) -> None:
+    text = load_rig("samii_two_joints")[1]
+    late = Stated("transport_delay", "joint_3_source", {"tau": 2e-3})
+    folder = make("stated", 1, tmp_path, text, QUIET, [late])
+    runs = {p.stem: read_recording(p) for p in sorted(folder.glob("*.mcap"))}
+    assert len(runs) == 3 * 2
+    driven = {name: {s.excited for s in run.segments} for name, run in runs.items()}
+    assert driven["swept_sine_1_v_2"] == driven["steps_1_v_2"] == {("v_2",)}
+    assert driven["multisine_1_1"] == driven["multisine_1_2"] == {("v_2", "v_3")}
+    first, second = (runs[f"multisine_1_{k}"] for k in (1, 2))
+    for name, sign in (("u_v_2", 1.0), ("u_v_3", -1.0)):
+        u, w = (run.values[:, run.column(name)] for run in (first, second))
+        np.testing.assert_allclose(w, sign * u)
+    (response, *_) = estimate([run for name, run in runs.items() if name.startswith("swept")])
+    arrays = np.load(tmp_path / "truth" / f"{folder.name}.npz")
+    at = [int(np.argmin(np.abs(arrays["frequency"] - f))) for f in response.frequency]
+    inside = np.abs(arrays["frequency"][at] - response.frequency) < 1e-9
+    wrong = (response.H.reshape(len(at), -1) - arrays["linear"][at])[inside]
+    C = response.covariance[inside]
+    p, nu = wrong.shape[1], np.median(response.dof)
+    chi2 = np.einsum("fa,fab,fb->f", wrong.conj(), np.linalg.inv(C), wrong).real / p
+    assert chi2.mean() == pytest.approx(nu / (nu - p), rel=0.1)
+    drive = arrays["level"][0] * arrays["reference"]
+    one = 18_000 * arrays["noise"] / drive[:, None, None] ** 2
+    repeats = [np.median(one[at][inside][:, i, i].real / C[:, i, i].real) for i in range(p)]
+    # Of four bursts of each input those that are settled: three, or two.
+    used = np.tile(np.round(np.reshape(repeats, (-1, 2)).mean(axis=0)), p // 2)
+    assert set(used) <= {2.0, 3.0}
+    assert repeats == pytest.approx(used, rel=0.15)
+    (effect,) = json.loads((tmp_path / "truth" / f"{folder.name}.json").read_text())["effects"]
+    assert effect["size"] > 10.0
 
 
 def test_noise_free_response_is_settled_where_the_rig_still_rings_after_a_burst(
