@@ -21,6 +21,7 @@ from samii_rig.errors import EstimateError, InputError
 from samii_rig.signal import statistics
 from samii_rig.signal.coherence import partial_coherence
 from samii_rig.signal.estimate import estimate
+from samii_rig.types import Channel
 
 TRUTH = masses().response
 
@@ -156,6 +157,30 @@ def test_random_inputs_together_are_solved_by_local_polynomials(rng):
         [recording([driven(u, rng)], "single")], band=(0.5, 10.0), method="h1", nperseg=512
     )
     assert near(windows) < 0.1
+
+
+def test_one_set_is_driven_by_the_outputs_and_another_by_set_points(rng):
+    loop, made = 50.0, []
+    points = tuple(Channel(f"theta_ref_{k}", "m", "reference") for k in (1, 2))
+    for k, unit in enumerate("NNmm"):
+        columns = driven(rng.normal(size=(3000, 2)), rng, loop=loop)
+        plain = recording([columns], "single", source=f"{k}")
+        u, none = columns[:, :2], np.zeros((3000, 2))
+        sent = [u, none] if unit == "N" else [none, u / loop]
+        made.append(
+            replace(
+                plain,
+                channels=(*plain.channels[:2], *points, *plain.channels[2:]),
+                values=np.hstack([*sent, columns[:, 2:]]),
+                quality=np.zeros((3000, 9), np.uint8),
+                segments=tuple(replace(s, unit=unit) for s in plain.segments),
+            )
+        )
+    both = estimate(made, band=(0.5, 10.0))
+    assert [r.level_unit for r in both] == ["N", "m"]
+    for found in both:
+        assert near(found) < 0.02
+        assert agrees(found)
 
 
 def test_records_that_differ_by_some_samples_are_cut_to_the_shortest(rng):

@@ -251,10 +251,14 @@ def _records(own: Set, columns: Columns, *, recorded: bool) -> list[Piece]:
     """All pieces with z of as many references as inputs, the inputs and the outputs."""
     refs, n_in = columns.part("references"), len(columns.inputs)
     names = [c.name for c in columns.inputs]
+    used = np.arange(refs.stop)
+    if used.size > n_in:  # others may move in other sets: set points where here it is the outputs
+        moved = {n for e in own.experiments for n in e.used}
+        used = np.array([k for k, c in enumerate(columns.references) if c.name in moved])
     out = []
     for e, label in zip(own.experiments, own.labels, strict=True):
         for p in e.group.pieces:
-            r = p.z[:, refs]
+            r = p.z[:, used]
             if recorded and r.shape[1] < n_in:
                 single, r = r.sum(axis=1), np.zeros((len(p), n_in))
                 r[:, names.index(label[0])] = single
