@@ -49,6 +49,12 @@ class Design:
     noise: float = 4.0
     sensors: tuple[str, ...] = ()
 
+    @classmethod
+    def usual(cls, inputs: int) -> Design:
+        """That of a trial: of several inputs two levels and three bursts, so that two inputs are
+        recorded for 760 s where one is for 678."""
+        return cls() if inputs == 1 else cls(levels=(0.5, 1.0), bursts=3)
+
 
 @dataclass(frozen=True, slots=True)
 class Run:

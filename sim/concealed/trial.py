@@ -25,6 +25,7 @@ import numpy as np
 
 from samii_rig.devices.channels import command_channel, reference_channels
 from samii_rig.record.writer import RunWriter
+from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Float, Quality, SampleBlock, StopRecord
 from sim.concealed.draw import KINDS, Drawn, Kind, draw, scaled, trial_id
@@ -51,7 +52,7 @@ def make(
 ) -> Path:
     """Make one trial, or find it made; returns the folder of its recordings. stated : what it
     conceals, of the kind of this name; the rig file says what is there besides."""
-    design = design or Design()
+    design = design or Design.usual(len(parse(Rig, rig_toml, "rig file").actuator))
     name = trial_id(kind, seed, stated)
     folder, truths = out / "recordings" / name, out / "truth"
     if folder.is_dir():
