@@ -8,6 +8,7 @@ channel's `unit` says otherwise (an actuator's input may be counts).
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any, Literal
@@ -174,6 +175,14 @@ class Recording:
             if channel.name == name:
                 return i
         raise KeyError(name)
+
+    def columns(self, names: Sequence[str]) -> Float:
+        """(n, len(names)) values of some channels; those that stand beside each other in this
+        order are not copied. KeyError if there is none of a name."""
+        at = [self.column(n) for n in names]
+        beside = bool(at) and at == list(range(at[0], at[0] + len(at)))
+        # Of an hour a copy is as large as the recording itself.
+        return self.values[:, at[0] : at[0] + len(at)] if beside else self.values[:, at]
 
     def names(self, role: Role) -> tuple[str, ...]:
         """Names of all channels with this role, in column order."""

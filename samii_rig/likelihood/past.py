@@ -137,11 +137,16 @@ def likely(shapes: Complex, e: Complex, N: Complex, W: Complex) -> Float | None:
     """(m,) amplitudes of shapes (n, q, m), of sd 1 beforehand, that lines e (n, q) show beside
     nuisances N (n, q, p); None where they show none. W : (n, q, q) twice the inverse of the noise.
     """
-    m = shapes.shape[2]
     every = np.concatenate([shapes, N], axis=2)
     flat = every.reshape(-1, every.shape[2])
     square = (flat.conj().T @ (W @ every).reshape(flat.shape)).real
     head = (flat.conj().T @ (W @ e[:, :, None]).ravel()).real
+    return shown(square, head, shapes.shape[2])
+
+
+def shown(square: Float, head: Float, m: int) -> Float | None:
+    """(m,) as `likely`, from the products of all columns with each other (m + p, m + p) and with
+    the lines (m + p,)."""
     values, turn = directions(square[m:, m:])
     kept = values > SAME * np.max(values, initial=0.0)
     others = turn[:, kept] / np.sqrt(values[kept])

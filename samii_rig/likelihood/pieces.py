@@ -196,7 +196,7 @@ def pieces_of(
     found: list[Piece] = []
     for recording in recordings:
         columns = [recording.column(n) for n in wired.sensors]
-        values = recording.values[:, columns]
+        values = recording.columns(wired.sensors)
         bad = (recording.quality[:, columns] & SPOILT) != 0
         whole = np.all(np.isfinite(values) & ~bad, axis=1)
         slower = round(rig.rate_hz / recording.rate_hz) > 1
@@ -266,7 +266,7 @@ def _cut(
         # Whatever came before the history may still ring.
         moving = low > history
         part = r[low - history : high]
-        told = Command(v[low - history : high].copy(), 1.0)
+        told = Command(v[low - history : high], 1.0)
         z, struck = spikes.mended(values[low:high], step)
         piece = Piece(name, part, z, history, (level,), moving, commands=(told,))
         own = edges[low - history : high].reshape(high - low + history, -1)

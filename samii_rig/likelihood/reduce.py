@@ -25,7 +25,7 @@ from samii_rig.likelihood import rounding, spikes
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Disturbances, Noise
-from samii_rig.likelihood.past import SAME, directions, likely
+from samii_rig.likelihood.past import SAME, directions, likely, shown
 from samii_rig.likelihood.pieces import Loops, Piece, Samples
 from samii_rig.likelihood.seen import Answers, Seen
 from samii_rig.types import Complex, Float, Int
@@ -311,16 +311,6 @@ class Rows:
         counts = [np.flatnonzero(np.any(some[on], axis=0)) for on in lines]
         return [(on, int(c[-1]) + 1 if c.size else 0) for on, c in zip(lines, counts, strict=True)]
 
-    def apart(self) -> Rows:
-        """The same, the nuisances of every piece in columns of their own."""
-        each = self.each()
-        N = np.zeros((*self.N.shape[:2], sum(m for _, m in each)), complex)
-        first = 0
-        for on, m in each:
-            N[on, :, first : first + m] = self.N[on, :, :m]
-            first += m
-        return replace(self, N=N)
-
 
 def reduced(
     records: Records,
@@ -409,19 +399,11 @@ def _with_past(
         one = rows.take(on)
         Q = orthonormal(as_real(one.X))
         own = [(i, seen[i]) for i in np.unique(one.piece)]
-        past, beside, first = [], [], 0
+        blocks = []
         for i, s in own:
-            shapes = np.zeros((*one.e.shape, s.past.likely.shape[2]), complex)
-            shapes[one.piece == i] = s.past.likely
-            past.append(shapes)
-            beside.append(one.N[:, :, first + s.beside.start : first + s.beside.stop])
-            first += s.N.shape[2] if len(own) > 1 else 0
-        found = likely(
-            _beyond(Q, np.concatenate(past, axis=2)),
-            _beyond(Q, one.e[:, :, None])[:, :, 0],
-            _beyond(Q, np.concatenate(beside, axis=2)),
-            W[on],
-        )
+            at = np.flatnonzero(one.piece == i)
+            blocks.append((at, s.past.likely, one.N[at][:, :, s.beside]))
+        found = _past_of(Q, blocks, one.e, W[on])
         if found is None:
             continue
         for i, s in own:
@@ -466,6 +448,47 @@ def _as_changes(rows: Rows, seen: Sequence[Seen], noise: Noise) -> Float:
             shows = float(np.sum((Q.T @ as_real(errors)) ** 2)) / rounding.LIKELY
             out[c] = max(shows / independent, 1.0)
     return out
+
+
+def _past_of(
+    Q: Float, blocks: Sequence[tuple[Int, Complex, Complex]], e: Complex, W: Complex
+) -> Float | None:
+    """The amplitudes of what moved the rig before pieces that share one change, as `past.likely`.
+
+    Q : (2 n, p) directions of the change, of each sensor. blocks : of each piece its lines, the
+    shapes of what was before, and those beside them. e : (n, q) lines. W : as of `likely`.
+    """
+    if len(blocks) == 1:
+        ((_, before, beside),) = blocks
+        return likely(_beyond(Q, before), _beyond(Q, e[:, :, None])[:, :, 0], _beyond(Q, beside), W)
+    # Side by side the shapes of many pieces would be many times as much as all lines: of each its
+    # products, and what all lose to the change by its p directions.
+    n, q = e.shape
+    C, We = as_complex(Q), (W @ e[:, :, None])[:, :, 0]
+    K = np.array([[(C.conj().T @ (W[:, c, d, None] * C)).real for d in range(q)] for c in range(q)])
+    K = K.transpose(0, 2, 1, 3).reshape(q * Q.shape[1], -1)
+
+    def along(at: Int, x: Complex) -> Float:
+        """(q p, m) of lines x (k, q, m) along the change."""
+        there = Q[np.concatenate([at, n + at])].T
+        return np.concatenate([there @ as_real(x[:, c]) for c in range(q)])
+
+    every, last = np.arange(n), sum(before.shape[2] for _, before, _ in blocks)
+    m = last + sum(beside.shape[2] for _, _, beside in blocks)
+    square, head, first = np.zeros((m, m)), np.zeros(m), 0
+    B, T = np.zeros((len(K), m)), np.zeros((len(K), m))
+    for at, before, beside in blocks:
+        A = np.concatenate([before, beside], axis=2)
+        place = np.r_[first : first + before.shape[2], last : last + beside.shape[2]]
+        first, last = first + before.shape[2], last + beside.shape[2]
+        WA, flat = W[at] @ A, A.reshape(-1, A.shape[2]).conj().T
+        square[np.ix_(place, place)] = (flat @ WA.reshape(-1, A.shape[2])).real
+        head[place] = (flat @ We[at].ravel()).real
+        B[:, place], T[:, place] = along(at, A), along(at, WA)
+    square += B.T @ (K @ B) - T.T @ B - B.T @ T
+    own, pull = along(every, e[:, :, None])[:, 0], along(every, We[:, :, None])[:, 0]
+    head += B.T @ (K @ own - pull) - T.T @ own
+    return shown(square, head, sum(before.shape[2] for _, before, _ in blocks))
 
 
 def _beyond(Q: Float, x: Complex) -> Complex:
@@ -597,7 +620,7 @@ def _residual(rows: Rows, spare: Float) -> tuple[Complex, Float]:
     n, q = rows.e.shape
     left, free = np.zeros((n, q), complex), np.zeros(n)
     for on in groups:
-        left[on], free[on] = _of_piece(rows.take(on))
+        left[on], free[on] = _of_pieces(rows.take(on))
     return left, free
 
 
@@ -611,7 +634,7 @@ def _grouped(rows: Rows, spare: Float) -> tuple[Rows, list[Int]]:
     if len(parts) > 2:
         rows = _excited(rows, pieces, len(parts) // 2)
     if any(len(on) < ENOUGH * _free(rows.X[on]) for on in pieces):
-        return rows.apart(), [np.arange(len(rows.e))]
+        return rows, [np.arange(len(rows.e))]
     return rows, pieces
 
 
@@ -629,27 +652,39 @@ def _free(X: Complex) -> int:
     return int(np.count_nonzero(np.any(X != 0, axis=0)))
 
 
-def _of_piece(rows: Rows) -> tuple[Complex, Float]:
-    Q = orthonormal(as_real(rows.X))
-    n, q = rows.e.shape
-    left, used = np.zeros((n, q), complex), np.sum(Q**2, axis=1) * q
+def _of_pieces(rows: Rows) -> tuple[Complex, Float]:
+    """As `_residual`, of pieces that share one change. Nuisances are projected out piece by piece:
+    side by side those of many pieces would be many times as much as all lines."""
+    X, (n, q) = as_real(rows.X), rows.e.shape
+    size = np.linalg.norm(X, axis=0)
+    X /= np.where(size > 0, size, 1.0)
+    left, used = np.zeros((n, q), complex), np.zeros(2 * n)
+    each = [(np.concatenate([on, n + on]), on, m) for on, m in rows.each()]
     for c in range(q):
-        goal, more = as_real(rows.e[:, c]), as_real(rows.N[:, c])
-        more = more[:, np.any(more != 0, axis=0)]
-        more = orthonormal(more - Q @ (Q.T @ more))
-        goal = goal - Q @ (Q.T @ goal)
-        goal -= more @ (more.T @ goal)
-        used += np.sum(more**2, axis=1)
-        left[:, c] = goal[:n] + 1j * goal[n:]
+        change, goal = X.copy(), as_real(rows.e[:, c])
+        for at, on, m in each:
+            more = as_real(rows.N[on, c, :m])
+            Q = orthonormal(more[:, np.any(more != 0, axis=0)])
+            change[at] -= Q @ (Q.T @ change[at])
+            goal[at] -= Q @ (Q.T @ goal[at])
+            used[at] += np.sum(Q**2, axis=1)
+        Q = _spanned(change)
+        goal -= Q @ (Q.T @ goal)
+        used += np.sum(Q**2, axis=1)
+        left[:, c] = as_complex(goal)
     return left, np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
 
 
 def orthonormal(X: Float) -> Float:
     """The directions of the columns of X (n, m), n > m."""
     scale = np.linalg.norm(X, axis=0)
-    X = X / np.where(scale > 0, scale, 1.0)
+    return _spanned(X / np.where(scale > 0, scale, 1.0))
+
+
+def _spanned(X: Float) -> Float:
+    """The directions of columns that are of size 1, or were before something was projected out."""
     values, vectors = np.linalg.eigh(X.T @ X)
-    kept = values > SAME * values[-1]
+    kept = values > SAME * np.max(values, initial=0.0)
     return np.asarray(X @ (vectors[:, kept] / np.sqrt(values[kept])))
 
 

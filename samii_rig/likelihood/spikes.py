@@ -32,11 +32,12 @@ def mended(z: Float, step: Float) -> tuple[Float, NDArray[np.int64]]:
     off = np.stack([_missed(z[:, i]) for i in range(q)], axis=1)
     scale = np.stack([_scale(off[:, i], step[i]) for i in range(q)], axis=1)
     loud = np.abs(off) > QUIET * scale
-    out = z.copy()
+    out = z
     for i in range(q):
         others = _widened(np.any(np.delete(loud, i, axis=1), axis=1))
         found = _alone(z[:, i], off[:, i], scale[:, i], others)
         if 0 < found.size <= MOST * n:
+            out = z.copy() if out is z else out
             out[found, i] -= off[found, i]
             count[i] = found.size
     return out, count

@@ -231,12 +231,16 @@ def knocks(
     Over all frequencies a knock is little; in its half second it stands out of the noise.
     """
     width = max(int(KNOCK_SECONDS * rate_hz), 2)
-    z = np.stack(records)
-    n, count = len(z), z.shape[1] // width
+    n, count = len(records), len(records[0]) // width if records else 0
     if n < 3 or count < 2:
         return {}
-    apart = (z - z.mean(axis=0))[:, : count * width] * (n / (n - 1))
-    rms = apart.reshape(n, count, width, -1).std(axis=2)
+    mean = np.asarray(sum(records) / n)
+
+    def apart(z: Float) -> Float:
+        parts = (z - mean)[: count * width] * (n / (n - 1))
+        return np.asarray(parts.reshape(count, width, -1).std(axis=1))
+
+    rms = np.stack([apart(z) for z in records])
     usual = np.median(rms, axis=(0, 1))
     over = rms / np.where(usual > 0, usual, np.inf)
     out: dict[int, Finding] = {}

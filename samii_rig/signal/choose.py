@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -9,9 +10,10 @@ import numpy as np
 
 from samii_rig.errors import EstimateError
 from samii_rig.signal import checks
-from samii_rig.signal.groups import Group, Selection
+from samii_rig.signal.groups import Group, Piece, Selection
 from samii_rig.signal.rest import Ringing, ringing
 from samii_rig.signal.spectra import burst_spectra, excited, period, spectrum
+from samii_rig.types import Complex
 
 Method = Literal["auto", "burst", "periodic", "local", "h1", "h2", "hv"]
 
@@ -45,6 +47,13 @@ def drop_stuck(group: Group, *, chosen: bool) -> None:
     group.pieces = [replace(p, z=p.z[:, columns]) for p in group.pieces]
 
 
+def _lines(pieces: Sequence[Piece], rate_hz: float) -> Complex:
+    """(n, lines, channels) of bursts, the lines that are excited."""
+    spectra, _ = burst_spectra(pieces, rate_hz)
+    lines = excited(spectra, None)
+    return np.stack([s.Z[lines] for s in spectra])
+
+
 def drop_foreign(group: Group) -> None:
     """Exclude repeats that do not repeat; of only two, neither can be trusted."""
     if len(group.pieces) < 2 or not group.equal_length:
@@ -54,10 +63,7 @@ def drop_foreign(group: Group) -> None:
     skip = (_settling(group, ring) or 1) if ring else 0
     pieces = group.pieces[skip:]
     names = [p.name for p in pieces]
-    spectra, _ = burst_spectra(pieces, group.rate_hz)
-    lines = excited(spectra, None)
-    Z = np.stack([s.Z[lines] for s in spectra])
-    foreign = checks.foreign_repeats(Z, names, group.selection.names)
+    foreign = checks.foreign_repeats(_lines(pieces, group.rate_hz), names, group.selection.names)
     if foreign and len(pieces) == 2:
         raise EstimateError(
             f"{foreign[min(foreign)].message}; a third repeat would tell which is wrong, or "

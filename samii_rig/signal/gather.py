@@ -59,10 +59,12 @@ def gather(
             group.findings.append(remark)
         group.findings += seen.found
         name = recording.place(segment)
-        z = cut.values[:, [cut.column(n) for n in own.names]]
         kept, breaks = whole_rows(cut, seen.names)
-        measured = np.ptp(z[kept][:, 1:]) > 0
-        if measured and any(np.array_equal(p.z, z[kept]) for p in group.pieces):
+        z = cut.columns(own.names)
+        if not kept.all():
+            r, z = r[kept], z[kept]
+        measured = np.ptp(z[:, 1:]) > 0
+        if measured and any(np.array_equal(p.z, z) for p in group.pieces):
             raise EstimateError(
                 f"{name} holds the very samples of another repeat: the same file twice, or a "
                 "simulation with the same seed; leave one out"
@@ -70,7 +72,7 @@ def gather(
         place = id(group), id(recording)
         follows = ends.get(place) == segment.start and not breaks
         ends[place] = segment.stop
-        group.pieces.append(Piece(name, r[kept], z[kept], breaks, follows))
+        group.pieces.append(Piece(name, r, z, breaks, follows))
         if recording.source and recording.source not in group.sources:
             group.sources.append(recording.source)
     if not groups and not lost:

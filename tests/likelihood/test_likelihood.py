@@ -13,9 +13,18 @@ from samii_rig.likelihood import pieces
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
-from samii_rig.likelihood.past import Past
+from samii_rig.likelihood.past import Past, likely
 from samii_rig.likelihood.pieces import Input, Piece, Wiring, pieces_of, wiring
-from samii_rig.likelihood.reduce import Records, left_by, reduced
+from samii_rig.likelihood.reduce import (
+    Records,
+    Rows,
+    _beyond,
+    _of_pieces,
+    _past_of,
+    as_real,
+    left_by,
+    reduced,
+)
 from samii_rig.likelihood.rounding import Added, Rounding, repeating
 from samii_rig.likelihood.spikes import mended
 from samii_rig.rig.load import load_rig
@@ -168,6 +177,58 @@ def test_a_past_of_one_mode_has_its_two_states_however_long_it_rings(damping: fl
     assert found.shapes.shape[2] == 2
 
 
+def test_the_residual_of_pieces_that_share_a_change_is_what_no_change_and_nuisance_makes():
+    """The projection with the nuisances of every piece in columns of their own, side by side."""
+    rng = np.random.default_rng(3)
+    lines, q, b, m = (12, 15), 2, 3, 2
+    n = sum(lines)
+
+    def drawn(*shape: int) -> Complex:
+        return rng.normal(size=shape) + 1j * rng.normal(size=shape)
+
+    piece = np.repeat(np.arange(2), lines)
+    k = np.arange(n)
+    rows = Rows(drawn(n, b), drawn(n, q), drawn(n, q, m), k + 1.0, k, piece, k)
+    left, free = _of_pieces(rows)
+    freedom = 0.0
+    for c in range(q):
+        own = [np.where((piece == i)[:, None], rows.N[:, c], 0) for i in range(2)]
+        A = as_real(np.concatenate([rows.X, *own], axis=1))
+        Q = np.linalg.qr(A)[0]
+        e = as_real(rows.e[:, c])
+        np.testing.assert_allclose(as_real(left[:, c]), e - Q @ (Q.T @ e), atol=1e-9)
+        freedom += 2 * n - A.shape[1]
+    np.testing.assert_allclose(np.sum(free) * 2 * q, freedom, rtol=1e-9)
+
+
+def test_what_moved_the_rig_before_pieces_of_one_change_is_told_without_their_shapes_side_by_side():
+    """By blocks as with the columns of every piece beside each other, zero in the others."""
+    rng = np.random.default_rng(4)
+    lines, q, before, beside = (7, 9), 2, (3, 2), (2, 4)
+
+    def drawn(*shape: int) -> Complex:
+        return rng.normal(size=shape) + 1j * rng.normal(size=shape)
+
+    n = sum(lines)
+    e, L = 20 * drawn(n, q), drawn(n, q, q)
+    W = L.conj().swapaxes(1, 2) @ L
+    Q = np.linalg.qr(rng.normal(size=(2 * n, 5)))[0]
+    at = np.split(np.arange(n), [lines[0]])
+    blocks = [
+        (own, drawn(own.size, q, a), drawn(own.size, q, b))
+        for own, a, b in zip(at, before, beside, strict=True)
+    ]
+    wide = [np.zeros((n, q, sum(m)), complex) for m in (before, beside)]
+    for i, (own, *both) in enumerate(blocks):
+        for all_, one, counts in zip(wide, both, (before, beside), strict=True):
+            all_[own, :, sum(counts[:i]) : sum(counts[: i + 1])] = one
+    alike = likely(_beyond(Q, wide[0]), _beyond(Q, e[:, :, None])[:, :, 0], _beyond(Q, wide[1]), W)
+    found = _past_of(Q, blocks, e, W)
+    assert found is not None
+    assert alike is not None
+    np.testing.assert_allclose(found, alike, rtol=1e-9)
+
+
 def test_a_long_stretch_is_several_pieces_with_the_input_before_each(monkeypatch):
     whole = recording()
     wired = without_loop(wiring([whole], SAMII))
@@ -180,6 +241,13 @@ def test_a_long_stretch_is_several_pieces_with_the_input_before_each(monkeypatch
     for p in found:
         end += len(p.z)
         np.testing.assert_array_equal(p.r, v[end - len(p.r) : end])
+
+
+def test_the_samples_of_a_long_record_are_not_held_twice():
+    """An hour of eight channels at 1 kHz is a quarter of a GB, as often as it is copied."""
+    whole = recording()
+    found = pieces_of([whole], SAMII, without_loop(wiring([whole], SAMII)))
+    assert all(np.shares_memory(p.z, whole.values) for p in found if not any(p.struck))
 
 
 def test_above_what_is_driven_noise_that_is_in_the_input_too_is_no_response():
