@@ -156,6 +156,7 @@ def page(rows: list[tuple[str, dict[str, Any], dict[str, Any]]]) -> str:
     place = sum(right(t, a)[0] for t, a in changes)
     wrong = sum(a["verdict"] == "named" and not right(t, a)[1] for t, a in changes)
     kept = [h for t, a in changes for h in holds(t, a)]
+    large = [right(t, a)[1] for t, a in changes if t["change"][0]["sigma"] >= SIZES[-1][0]]
     still = [a["two"]["verdict"] for _, t, a in rows if not t["change"]]
     answers = ", ".join(still)
     out = [
@@ -165,7 +166,8 @@ def page(rows: list[tuple[str, dict[str, Any], dict[str, Any]]]) -> str:
         "state. Every third pair has an effect in both states that the rig file does not know.",
         "Sigma is what the records of both states hold of the change.\n",
         f"Of {len(changes)} changes {place} were told at the right place and {named} by the right",
-        f"name, up to what the answer calls equivalent; {wrong} were named wrongly. Of {len(kept)}",
+        f"name, up to what the answer calls equivalent; {wrong} were named wrongly. From",
+        f"{SIZES[-1][0]:g} sigma on it is {sum(large)} of {len(large)} by name. Of {len(kept)}",
         f"intervals {sum(kept)} hold. Where nothing changed the answers were: {answers}.\n",
         "| rig | what changed | sigma | answer | told | 90 % interval |",
         "|---|---|---|---|---|---|",
