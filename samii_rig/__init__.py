@@ -6,7 +6,7 @@ from typing import Any
 
 from samii_rig.display import FORMS
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 
 def _form(module: str, name: str, *of: Any) -> Any:

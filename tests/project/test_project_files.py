@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+import samii_rig
+
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 
@@ -16,7 +18,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 def test_one_version_everywhere():
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
     released = re.findall(r"^## \[(\d\S*)\]", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.M)
-    assert cited["version"] == released[0] == PROJECT["version"]
+    assert cited["version"] == released[0] == PROJECT["version"] == samii_rig.__version__
     assert cited["license"] == PROJECT["license"]
 
 
