@@ -165,3 +165,17 @@ def model_modes(rig: Rig, high_hz: float) -> tuple[Known, ...]:
         }
         out.append(Known(float(hz), float(ratio), m.readings, m.x, m.w, places))
     return tuple(sorted(out, key=lambda k: k.frequency_hz))
+
+
+def placed(found: ModalModel, mode: Mode, known: Known) -> tuple[Float, Complex, Float] | None:
+    """Where the accelerometers sit, their displacement in the model's scale, half widths."""
+    shared = [k for k, name in enumerate(found.outputs) if name in known.shape]
+    seen = [k for k in shared if found.outputs[k] in known.sensors]
+    if not seen:
+        return None
+    a, b = mode.shape[shared], np.array([known.shape[found.outputs[k]] for k in shared])
+    S = scales(a, [found.units[k] for k in shared])
+    # The factor that brings the measured shape to the model's, and acceleration to displacement.
+    factor = np.sum(S * a.conj() * b) / np.sum(S * np.abs(a) ** 2) / mode.pole**2
+    x = np.array([known.sensors[found.outputs[k]] for k in seen])
+    return x, factor * mode.shape[seen], np.abs(factor) * mode.shape_interval()[0][seen]

@@ -12,8 +12,8 @@ from html import escape
 import numpy as np
 from markupsafe import Markup
 
+from samii_rig.modal.match import placed
 from samii_rig.report.modes import Modes, best_known, pm
-from samii_rig.report.modes_plots import placed
 from samii_rig.types import Complex, Float
 
 _WIDTH, _HEIGHT, _EDGE = 360.0, 150.0, 16.0  # user units, about a pixel

@@ -7,12 +7,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Picture
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from samii_rig.modal.match import Known, scales
+from samii_rig.modal.match import placed
 from samii_rig.modal.modes import ModalModel, Mode
 from samii_rig.modal.stabilisation import Stability
 from samii_rig.report.canvas import Figure, axis, base_layout, log_scale, packed, ticked
 from samii_rig.report.modes import Modes
-from samii_rig.types import Complex, Float, FrequencyResponse
+from samii_rig.types import Float, FrequencyResponse
 
 # What is said of a pole, its sign and colour: by the page's names, and for a picture on paper.
 _SIGNS = {
@@ -149,20 +149,6 @@ def shape(m: Modes, i: int) -> Figure:
     at = np.arange(len(names), dtype=float)
     figure["data"] = [_marks("measured", at, mode.shape.real, mode.shape_interval()[0])]
     return figure
-
-
-def placed(found: ModalModel, mode: Mode, known: Known) -> tuple[Float, Complex, Float] | None:
-    """Where the accelerometers sit, their displacement in the model's scale, half widths."""
-    shared = [k for k, name in enumerate(found.outputs) if name in known.shape]
-    seen = [k for k in shared if found.outputs[k] in known.sensors]
-    if not seen:
-        return None
-    a, b = mode.shape[shared], np.array([known.shape[found.outputs[k]] for k in shared])
-    S = scales(a, [found.units[k] for k in shared])
-    # The factor that brings the measured shape to the model's, and acceleration to displacement.
-    factor = np.sum(S * a.conj() * b) / np.sum(S * np.abs(a) ** 2) / mode.pole**2
-    x = np.array([known.sensors[found.outputs[k]] for k in seen])
-    return x, factor * mode.shape[seen], np.abs(factor) * mode.shape_interval()[0][seen]
 
 
 def _line(name: str, x: Float, y: Float, colour: str, dash: str) -> dict[str, object]:
