@@ -44,7 +44,8 @@ SITE: list[str | Path] = [
 TRUST = {"UV_SYSTEM_CERTS": "1", "UV_NATIVE_TLS": "1"}
 # Whether this user's processes may come before others; a system without priorities has none to ask.
 FIRST = "import os; os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))"
-OTHERS = ".pytest_cache/others"
+# A check starts hundreds of processes; without kept bytecode each compiles 1,600 modules, 2 s.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 UV_PATIENCE = "20"  # s; pip is there when uv's way is closed, so nobody waits for uv for minutes
 
 
@@ -146,9 +147,7 @@ def tests(arguments: list[str]) -> None:
     """All tests: those in real time one after another, the others side by side.
 
     What runs in real time comes before the rest of the machine's work (tests/conftest.py), so the
-    others run beside it; who may not ask for that has nothing beside it. What failed of it is tried
-    once more, alone, and told: another program may have had the cores for longer than a device
-    waits.
+    others run beside it; who may not ask for that has nothing beside it.
     """
     cores = min(os.cpu_count() or 1, 4)
     pytest: list[str | Path] = [BIN / "pytest", "-q", "--durations=10"]
@@ -157,17 +156,13 @@ def tests(arguments: list[str]) -> None:
         call(*pytest, *workers, *arguments)
         return
     real_time = [*pytest, "-m", "real_time and not slow"]
-    # Each run keeps what failed in it by itself.
-    others = [*pytest, *workers, "-m", "not real_time and not slow", "-o", f"cache_dir={OTHERS}"]
+    others = [*pytest, *workers, "-m", "not real_time and not slow"]
     beside = run(PYTHON, "-c", FIRST, quiet=True) == 0
     failed, late = side_by_side(others, real_time) if beside else (0, run(*real_time))
-    if late:
-        say("what failed in real time is tried once more, alone")
-        call(*real_time, "--last-failed")
     if not beside:
         failed = run(*others)
-    if failed:
-        sys.exit(failed)
+    if late or failed:
+        sys.exit(late or failed)
 
 
 def side_by_side(*commands: Sequence[str | Path]) -> list[int]:

@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-# Of tests side by side each has one thread for linear algebra: matrices are small, and threads that
-# wait for each other on a busy machine take thirty times as long. Read when numpy is imported.
-if "PYTEST_XDIST_WORKER" in os.environ:
-    for library in ("OMP", "OPENBLAS", "MKL"):
-        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+# One thread for linear algebra: matrices are small, and threads that wait for each other on a busy
+# machine take thirty times as long, whether they run in real time or beside it. Read when numpy is
+# imported.
+for library in ("OMP", "OPENBLAS", "MKL"):
+    os.environ.setdefault(f"{library}_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 # What runs a device in real time, on ports whose names the system gives out again.
 KITS = {"wire_kit", "can_kit", "faults_kit"}

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from can_kit import CanWire, moment_rig, patient, until
+from can_kit import CanWire, moment_rig, until
+from wait_kit import patient
 
 import drivers.composite.rig as composite
 from samii_rig.devices.opening import open_device

@@ -3,8 +3,9 @@
 from collections.abc import Iterator
 
 import pytest
-from can_kit import CanWire, moment_rig, patient
+from can_kit import CanWire, moment_rig
 from contract import DeviceContract
+from wait_kit import patient
 
 import drivers.composite.rig as composite
 from samii_rig.devices.opening import open_device

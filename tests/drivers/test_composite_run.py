@@ -5,8 +5,9 @@ import json
 
 import numpy as np
 import pytest
-from can_kit import CanWire, moment_rig, patient
+from can_kit import CanWire, moment_rig
 from experiment_kit import SHORT
+from wait_kit import patient
 
 from samii_rig.record.reader import read_events
 from samii_rig.rig.load import load_rig

@@ -33,12 +33,6 @@ reason = "the end of the force/torque sensor's range is 500"
 """
 
 
-def patient(rig: Rig, seconds: float) -> Rig:
-    """The rig with sensors that may be silent for so long, for a machine that is loaded."""
-    own = tuple(s.model_copy(update={"stale_after": seconds}) for s in rig.sensor)
-    return rig.model_copy(update={"sensor": own})
-
-
 def moment_rig(folder: Path, deadman: float = 0.05) -> Path:
     """The shipped rig with a moment sensor after joint 2, which the gate needs."""
     text = load_rig("samii")[1].replace("deadman = 0.05", f"deadman = {deadman}")
@@ -67,4 +61,4 @@ class CanWire(Wire):
         super().rest()
 
 
-__all__ = ["CanWire", "moment_rig", "patient", "until"]
+__all__ = ["CanWire", "moment_rig", "until"]

@@ -5,10 +5,12 @@ from __future__ import annotations
 import time
 
 import numpy as np
-from fake_device import RATE, FakeDevice
+from fake_device import RATE, FakeDevice, fake_rig
+from wait_kit import patient
 
 from samii_rig.devices.clock import MonotonicClock
 from samii_rig.devices.protocols import OpenRig
+from samii_rig.rig.schema import Rig
 from samii_rig.run.plan import Plan, PlannedSegment
 from samii_rig.signal.excitation import swept_sine
 
@@ -82,11 +84,22 @@ class Broken(Memory):
             raise self.error
 
 
+PATIENCE = 0.5  # s for which a busy machine may hold up what runs by its clock
+
+
+def patient_rig() -> Rig:
+    """The fake rig, for `RealTime`: neither its deadman nor its sensors are sooner than that."""
+    rig = patient(fake_rig(), PATIENCE)
+    own = tuple(a.model_copy(update={"deadman": PATIENCE}) for a in rig.actuator)
+    return rig.model_copy(update={"actuator": own})
+
+
 class RealTime(FakeDevice):
     """The same device, on the host's clock."""
 
     def __init__(self):
         super().__init__()
+        self.deadman = PATIENCE
         self.clock, self.zero_at = MonotonicClock(), time.monotonic_ns()
 
     def read(self):

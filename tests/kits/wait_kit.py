@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
+from samii_rig.rig.schema import Rig
+
 T = TypeVar("T")
 WITHIN = 90.0  # s for what takes a few on a machine with nothing else to do
 
@@ -17,3 +19,9 @@ def found(what: Callable[[], T], within: float, every: float = 0.05, said: str =
         assert time.monotonic() < end, f"it did not happen: {said}"
         time.sleep(every)
     return it
+
+
+def patient(rig: Rig, seconds: float) -> Rig:
+    """The rig with sensors that may be silent for so long, for a machine that is loaded."""
+    own = tuple(s.model_copy(update={"stale_after": seconds}) for s in rig.sensor)
+    return rig.model_copy(update={"sensor": own})

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fake_device import RATE, FakeDevice, fake_rig
-from loop_kit import Broken, Memory, RealTime, after, plan
+from loop_kit import Broken, Memory, RealTime, after, patient_rig, plan
 
 from samii_rig.errors import DeviceError, GateError, InputError
 from samii_rig.run.dwell import Reference
@@ -458,8 +458,8 @@ def test_on_real_time_a_slow_recorder_does_not_slow_the_output():
             super().write(block)
 
     device, sink = RealTime(), Slow()
-    stop = run(plan(duration=0.4), RIG, device.open(), sink)
-    assert stop.status == "completed"
+    stop = run(plan(duration=0.4), patient_rig(), device.open(), sink)
+    assert stop.status == "completed", stop.reason
     assert not device.live
     assert [s.name for s in sink.segments] == ["burst_0", "burst_1"]
     sequence = sink.column("sequence")
@@ -491,7 +491,7 @@ def test_what_the_recorders_thread_raised_comes_out_of_every_later_call():
 def test_a_recorder_that_lost_samples_makes_a_stopped_run_a_failed_one():
     stop = run(
         plan(duration=0.4),
-        RIG,
+        patient_rig(),
         RealTime().open(),
         Broken("stop", OSError("disk full")),
         stop=after(0.3),

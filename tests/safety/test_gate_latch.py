@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fake_device import FakeDevice, fake_rig
-from loop_kit import Memory, RealTime, plan
+from fake_device import FakeDevice
+from loop_kit import Memory, RealTime, patient_rig, plan
 
 from samii_rig.errors import DeviceError, GateError, InputError
 from samii_rig.run import campaign
@@ -23,7 +23,7 @@ from samii_rig.run.order import RunOrder
 from samii_rig.run.pace import LoopSettings
 from samii_rig.safety.latch import Latch, state_folder
 
-RIG = fake_rig()
+RIG = patient_rig()
 
 
 @pytest.fixture(autouse=True)
