@@ -7,6 +7,7 @@ A number in a shipped experiment's file that no rig can be asked is refused by i
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import replace
 from importlib.metadata import EntryPoint
@@ -17,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 from burst_kit import PLAN, RIG, SEGMENT
+from conftest import ROOT
 from fake_device import RIG as TEXT
 from fake_device import FakeDevice
 from pydantic import BaseModel
@@ -231,3 +233,24 @@ def test_no_number_in_an_experiment_file_is_too_large_or_too_small_for_a_line(na
             except InputError:
                 continue  # refused by its field
             assert plan.duration * plan.rate_hz <= 1.1 * MOST_SAMPLES, (field, extreme)
+
+
+def test_the_kind_of_the_page_runs_by_the_file_of_the_page(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    page = (ROOT / "docs" / "guide" / "experiments.md").read_text("utf-8")
+    own = page.split("## A kind of your own")[1]
+    code, _, file = re.findall(r"```(?:python|toml)\n(.*?)```", own, re.S)
+    package = ModuleType("my_lab.chirps")
+    monkeypatch.setitem(sys.modules, "my_lab", ModuleType("my_lab"))
+    monkeypatch.setitem(sys.modules, "my_lab.chirps", package)
+    exec(compile(code, "chirps.py", "exec"), vars(package))
+    point = EntryPoint("chirps", "my_lab.chirps:Chirps", "samii_rig.experiments")
+    known = experiments.kinds()
+    monkeypatch.setattr(experiments, "kinds", lambda: {**known, "chirps": point})
+    (tmp_path / "first.toml").write_text(file)
+    rig = load_rig("samii")[0]
+    plan = plan_of(load_experiment(str(tmp_path / "first.toml"), rig)[0], rig)
+    (segment,) = plan.segments
+    assert (segment.u[0], segment.u[-1]) == (0.0, 0.0)
+    assert np.abs(segment.u).max() == pytest.approx(0.1, rel=0.01)
