@@ -18,7 +18,8 @@ Corner = Literal["upper left", "upper right", "lower left", "lower right", "lowe
 # What a number beside a published one shows. Computed: it follows from what the papers print, or
 # holds whatever they leave out. Calibrated: values that they do not print were chosen or solved for
 # so that it comes out. Found again: a method finds in the simulated rig what was put there.
-Agreement = Literal["", "computed", "calibrated", "found again"]
+# Does not agree: ours lies where the theory asks for it, the published number does not.
+Agreement = Literal["", "computed", "calibrated", "found again", "does not agree"]
 
 PLAIN = (-4, 6)  # powers of ten between which a number is written without one
 

@@ -70,7 +70,7 @@ def table_1() -> Result:
             BOTH,
             theirs[i],
             2,
-            "computed",
+            "does not agree",
         )
         numbers.append(over)
     rotary = tmm_hz(locked(with_rotary_inertia(samii()), JOINTS))
