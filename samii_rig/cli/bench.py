@@ -220,46 +220,56 @@ def calibrate(
         raise InputError("calibrate", "--to", str(to), "a new name")
     check_folder("--out", out)
 
-    import numpy as np
-
+    from samii_rig.record.export import replacing
     from samii_rig.rig.load import load_rig
-    from samii_rig.run import calibrate as c
 
     the_rig, text = load_rig(rig)
-    if sensor != "null":
-        c.wiring(the_rig, sensor)
-
-    from samii_rig.record.export import replacing
-    from samii_rig.run.session import column, listen, opened
-
     if sensor == "null":
         new_text, said = _null(the_rig, text, rig, seconds, out, actuator)
     else:
         known = reads or [0.0]
-        if len(known) > 2:
-            raise InputError("calibrate", "--reads", known, "one or two values")
-        old = c.wiring(the_rig, sensor)
-        unit = the_rig.units()[sensor]
-        read = []
-        for value in known:
-            if not yes:
-                typer.confirm(f"{sensor} is at {value:g} {unit}, and still?", abort=True, err=True)
-            with opened(the_rig) as device:
-                read.append(float(np.mean(column(listen(device, seconds), sensor))))
-        if len(known) == 1:
-            new = c.one_point(old, read[0], known[0])
-        else:
-            new = c.two_points(old, (read[0], read[1]), (known[0], known[1]))
-        new_text = c.rewritten(text, rig, sensor, new)
-        said = (
-            f"{sensor} read {', '.join(f'{x:.5g}' for x in read)} {unit}; counts_per_unit "
-            f"{old.counts_per_unit:.8g} -> {new.counts_per_unit:.8g}, "
-            f"offset {old.offset} -> {new.offset}"
-        )
+        new_text, said = _input(the_rig, text, rig, sensor, known, seconds, ask=not yes)
     with replacing(to) as part:
         part.write_text(new_text, encoding="utf-8")
     typer.echo(said)
     typer.echo(f"written    {to}")
+
+
+def _input(
+    rig: Rig, text: str, where: str, sensor: str, known: list[float], seconds: float, *, ask: bool
+) -> tuple[str, str]:
+    """The rig file's text with an input's offset, or gain and offset; and in words.
+
+    known : the true values to which the rig is brought by hand, one or two.
+    """
+    import numpy as np
+
+    from samii_rig.errors import InputError
+    from samii_rig.run import calibrate as c
+
+    old = c.wiring(rig, sensor)
+    if len(known) > 2:
+        raise InputError("calibrate", "--reads", known, "one or two values")
+
+    from samii_rig.run.session import column, listen, opened
+
+    unit = rig.units()[sensor]
+    read = []
+    for value in known:
+        if ask:
+            typer.confirm(f"{sensor} is at {value:g} {unit}, and still?", abort=True, err=True)
+        with opened(rig) as device:
+            read.append(float(np.mean(column(listen(device, seconds), sensor))))
+    if len(known) == 1:
+        new = c.one_point(old, read[0], known[0])
+    else:
+        new = c.two_points(old, (read[0], read[1]), (known[0], known[1]))
+    said = (
+        f"{sensor} read {', '.join(f'{x:.5g}' for x in read)} {unit}; counts_per_unit "
+        f"{old.counts_per_unit:.8g} -> {new.counts_per_unit:.8g}, "
+        f"offset {old.offset} -> {new.offset}"
+    )
+    return c.rewritten(text, where, sensor, new), said
 
 
 def _null(

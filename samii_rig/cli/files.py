@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from samii_rig.record.verify import Verdict
+    from samii_rig.types import Recording
 
 
 def import_(
@@ -55,43 +56,61 @@ def import_(
     if layout:
         check_folder("--out", out)
 
-    from samii_rig.errors import InputError
-    from samii_rig.record.channel_table import load_channels
-    from samii_rig.record.importer import import_file
-    from samii_rig.record.maps import load_map, shipped_maps
     from samii_rig.record.store import write_recording
 
     if describe or write_map:
         _describe(files, write_map, json=json)
         return
+    targets = _targets(files, layout, out)
+    recordings = _imported(files, layout, channels)
+    make_folder("--out", out)
+    for recording, target in zip(recordings, targets, strict=True):
+        write_recording(target, recording)
+        if not json:
+            typer.echo(f"{target}: {_held(recording)}")
+    if json:
+        say_json({"written": targets, "samples": [len(r) for r in recordings]})
+
+
+def _targets(files: list[Path], layout: str, out: Path) -> list[Path]:
+    """Where the recordings will be; InputError without a map, or where one is already."""
+    from samii_rig.errors import InputError
+    from samii_rig.record.maps import shipped_maps
+
     if not layout:
         said = (
             f"missing; expected a map file or one of {', '.join(shipped_maps())}; "
             "--describe says what a file holds and writes a first one"
         )
         raise InputError.saying("--map", "", said)
-    the_map, text = load_map(layout)
     targets = [out / f"{path.stem}.mcap" for path in files]
     for path, target in zip(files, targets, strict=True):
         if target.exists():
             raise InputError(str(path), "", str(target), "no recording of that name yet")
     if len(set(targets)) < len(targets):
         raise InputError("FILES", "", [p.name for p in files], "files of different names")
+    return targets
+
+
+def _imported(files: list[Path], layout: str, channels: Path | None) -> list[Recording]:
+    """The files as recordings, by a map and a table of the sensors."""
+    from samii_rig.record.channel_table import load_channels
+    from samii_rig.record.importer import import_file
+    from samii_rig.record.maps import load_map
+
+    the_map, text = load_map(layout)
     table = load_channels(channels) if channels else None
-    recordings = [import_file(path, the_map, text, table) for path in files]
-    make_folder("--out", out)
-    for recording, target in zip(recordings, targets, strict=True):
-        write_recording(target, recording)
-        if not json:
-            lost = recording.stop.missing_samples
-            typer.echo(
-                f"{target}: {len(recording):,} samples of "
-                f"{', '.join(c.name for c in recording.channels)}"
-                + (f"; {len(recording.segments)} segments" if len(recording.segments) > 1 else "")
-                + (f"; {lost} missing" if lost else "")
-            )
-    if json:
-        say_json({"written": targets, "samples": [len(r) for r in recordings]})
+    return [import_file(path, the_map, text, table) for path in files]
+
+
+def _held(recording: Recording) -> str:
+    """What is in a recording, in a line."""
+    lost, segments = recording.stop.missing_samples, len(recording.segments)
+    return (
+        f"{len(recording):,} samples of {', '.join(c.name for c in recording.channels)}"
+        + (f"; {segments} segments" if segments > 1 else "")
+        + (f"; {lost} missing" if lost else "")
+    )
 
 
 def _describe(files: list[Path], write_map: Path | None, *, json: bool) -> None:

@@ -11,6 +11,9 @@ import typer
 from samii_rig.cli.common import JsonOption, say_json
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from rich.console import Console
     from rich.table import Table
 
     from samii_rig.papers.catalogue import Entry
@@ -54,12 +57,7 @@ def papers(
 
     console = Console(highlight=False)
     if list_:
-        if json:
-            say_json(
-                {"results": [{"id": e.id, "where": e.where, "title": e.title} for e in chosen]}
-            )
-        for e in () if json else chosen:
-            console.print(f"{e.id:14} {e.where}: {e.title}", soft_wrap=True)
+        _list(chosen, console, json=json)
         return
     if out is not None:
         make_folder("--out", out)
@@ -75,12 +73,7 @@ def papers(
         done[entry.id] = result
         plain.append(_plain(entry, result, written))
         if not json:
-            console.print(_table(entry, result))
-            for sentence in result.sentences:
-                console.print(sentence)
-            for path in written:
-                console.print(f"written  {path}", soft_wrap=True)
-            console.print()
+            _say(entry, result, written, console)
     if page is not None:
         from samii_rig.papers.page import renew
 
@@ -89,6 +82,24 @@ def papers(
         say_json({"results": plain})
     if not all(result.holds for result in done.values()):
         raise typer.Exit(1)
+
+
+def _list(chosen: Sequence[Entry], console: Console, *, json: bool) -> None:
+    """Name the results."""
+    if json:
+        say_json({"results": [{"id": e.id, "where": e.where, "title": e.title} for e in chosen]})
+    for e in () if json else chosen:
+        console.print(f"{e.id:14} {e.where}: {e.title}", soft_wrap=True)
+
+
+def _say(entry: Entry, result: Result, written: list[Path], console: Console) -> None:
+    """One result for a person."""
+    console.print(_table(entry, result))
+    for sentence in result.sentences:
+        console.print(sentence)
+    for path in written:
+        console.print(f"written  {path}", soft_wrap=True)
+    console.print()
 
 
 def _draw(result: Result, out: Path | None, format_: str) -> list[Path]:

@@ -113,75 +113,96 @@ def _width(element: Element) -> float:
 
 
 def _element(element: Element, a: float, b: float, along: bool) -> str:
+    """What stands between a and b, pixels; along : the chain slides."""
     y, middle = _AXIS, (a + b) / 2
+    line = f'<path class="spring" d="M{a:.1f} {y}H{b:.1f}"/>'
+    box = (
+        f'<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
+        f'height="{2 * _HALF}"/>'
+    )
     match element:
         case Beam() | TimoshenkoBeam() | Rod():
             return f'<rect class="beam" x="{a:.1f}" y="{y - 4}" width="{b - a:.1f}" height="8"/>'
         case RigidLink():
-            span = element.L.value
-            at = a + (b - a) * (min(element.r.value / span, 1.0) if span > 0 else 0.5)
-            return (
-                f'<rect class="link" x="{a:.1f}" y="{y - _HALF}" width="{b - a:.1f}" '
-                f'height="{2 * _HALF}" rx="7"/>'
-                f'<circle class="centre" cx="{at:.1f}" cy="{y}" r="3.5"/>'
-            )
+            return _link(element, a, b)
         case TranslationalSpring() if element.k.value == 0:
             return _dashpot(a, b)
         case TorsionalSpring() | TranslationalSpring():
-            steps = 6
-            w = (b - a - 12) / steps
-            path = f"M{a:.1f} {y}h6" + "".join(
-                f"l{w / 2:.1f} {-9 if k % 2 == 0 else 9}l{w / 2:.1f} {9 if k % 2 == 0 else -9}"
-                for k in range(steps)
-            )
-            return f'<path class="spring" d="{path}h6"/>'
-    line = f'<path class="spring" d="M{a:.1f} {y}H{b:.1f}"/>'
-    if isinstance(element, SOURCES):
-        up = y + 17
-        if isinstance(element, (ForceSource, *MOTION_SOURCES)):
-            arrow = f"M{middle:.1f} {y + 9}v-18m-5 5l5 -5l5 5"
-            if along:
-                arrow = f"M{middle - 9:.1f} {y}h18m-5 -5l5 5l-5 5"
+            return _zigzag(a, b)
+        case Gear():
             return (
-                f'{line}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
-                f'<path class="arrow" d="{arrow}"/>'
+                f'{line}<circle class="link" cx="{middle - 11:.1f}" cy="{y}" r="10"/>'
+                f'<circle class="link" cx="{middle + 16:.1f}" cy="{y}" r="17"/>'
             )
-        return (
-            f'{line}<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
-            f'<path class="arrow" d="M{middle - 8:.1f} {up - 12:.1f}a10 10 0 1 1 15 0'
-            f'm-5 -1l5 1l1 -6"/>'
-        )
+        case Cylinder():
+            return _piston(a, b)
+        case Spindle():
+            thread = "".join(f"M{a + 10 + 8 * k:.1f} {y + _HALF}l8 {-2 * _HALF}" for k in range(6))
+            return f'{line}{box}<path class="spring" d="{thread}"/>'
+    if isinstance(element, SOURCES):
+        slides = isinstance(element, (ForceSource, *MOTION_SOURCES))
+        return line + _source(middle, "along" if along and slides else "across" if slides else "")
     if isinstance(element, _TO_GROUND):
         damps = not isinstance(element, GravityStiffness) and element.k.value == 0
-        turns = "".join(
-            f"l{7 if k % 2 == 0 else -7} 3l{-7 if k % 2 == 0 else 7} 3" for k in range(4)
-        )
-        hatch = "".join(f"M{middle - 14 + 7 * k:.1f} {y + _DROP}l-5 5" for k in range(5))
-        return (
-            f'{line}<path class="spring" d="M{middle:.1f} {y}v5{_POT if damps else turns}v5"/>'
-            f'<path class="ground" d="M{middle - 16:.1f} {y + _DROP}h32{hatch}"/>'
-        )
-    if isinstance(element, Gear):
-        return (
-            f'{line}<circle class="link" cx="{middle - 11:.1f}" cy="{y}" r="10"/>'
-            f'<circle class="link" cx="{middle + 16:.1f}" cy="{y}" r="17"/>'
-        )
-    if isinstance(element, Cylinder):
-        piston = f"M{middle - 6:.1f} {y - _HALF}v{2 * _HALF}m5 0v{-2 * _HALF}"
-        return (
-            f'<rect class="link" x="{a + 4:.1f}" y="{y - _HALF}" width="{b - a - 18:.1f}" '
-            f'height="{2 * _HALF}"/><path class="spring" d="M{a:.1f} {y}h4{piston}'
-            f'M{middle - 1:.1f} {y}H{b:.1f}"/>'
-        )
-    if isinstance(element, Spindle):
-        thread = "".join(f"M{a + 10 + 8 * k:.1f} {y + _HALF}l8 {-2 * _HALF}" for k in range(6))
-        return (
-            f'{line}<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
-            f'height="{2 * _HALF}"/><path class="spring" d="{thread}"/>'
-        )
+        return line + _grounded(middle, damps)
+    return line + box
+
+
+def _link(link: RigidLink, a: float, b: float) -> str:
+    """A body with its centre of mass."""
+    span = link.L.value
+    at = a + (b - a) * (min(link.r.value / span, 1.0) if span > 0 else 0.5)
     return (
-        f'{line}<rect class="link" x="{a + 6:.1f}" y="{y - _HALF}" width="{b - a - 12:.1f}" '
-        f'height="{2 * _HALF}"/>'
+        f'<rect class="link" x="{a:.1f}" y="{_AXIS - _HALF}" width="{b - a:.1f}" '
+        f'height="{2 * _HALF}" rx="7"/>'
+        f'<circle class="centre" cx="{at:.1f}" cy="{_AXIS}" r="3.5"/>'
+    )
+
+
+def _zigzag(a: float, b: float) -> str:
+    """A spring in the chain."""
+    steps = 6
+    w = (b - a - 12) / steps
+    path = f"M{a:.1f} {_AXIS}h6" + "".join(
+        f"l{w / 2:.1f} {-9 if k % 2 == 0 else 9}l{w / 2:.1f} {9 if k % 2 == 0 else -9}"
+        for k in range(steps)
+    )
+    return f'<path class="spring" d="{path}h6"/>'
+
+
+def _source(middle: float, slides: str) -> str:
+    """What drives the chain. slides : "along" or "across" it; "" for one that turns."""
+    y = _AXIS
+    arrow = {
+        "along": f"M{middle - 9:.1f} {y}h18m-5 -5l5 5l-5 5",
+        "across": f"M{middle:.1f} {y + 9}v-18m-5 5l5 -5l5 5",
+        "": f"M{middle - 8:.1f} {y + 5:.1f}a10 10 0 1 1 15 0m-5 -1l5 1l1 -6",
+    }[slides]
+    return (
+        f'<circle class="source" cx="{middle:.1f}" cy="{y}" r="17"/>'
+        f'<path class="arrow" d="{arrow}"/>'
+    )
+
+
+def _grounded(middle: float, damps: bool) -> str:
+    """A spring or a damper to the ground."""
+    y = _AXIS
+    turns = "".join(f"l{7 if k % 2 == 0 else -7} 3l{-7 if k % 2 == 0 else 7} 3" for k in range(4))
+    hatch = "".join(f"M{middle - 14 + 7 * k:.1f} {y + _DROP}l-5 5" for k in range(5))
+    return (
+        f'<path class="spring" d="M{middle:.1f} {y}v5{_POT if damps else turns}v5"/>'
+        f'<path class="ground" d="M{middle - 16:.1f} {y + _DROP}h32{hatch}"/>'
+    )
+
+
+def _piston(a: float, b: float) -> str:
+    """A cylinder with its rod."""
+    y, middle = _AXIS, (a + b) / 2
+    piston = f"M{middle - 6:.1f} {y - _HALF}v{2 * _HALF}m5 0v{-2 * _HALF}"
+    return (
+        f'<rect class="link" x="{a + 4:.1f}" y="{y - _HALF}" width="{b - a - 18:.1f}" '
+        f'height="{2 * _HALF}"/><path class="spring" d="M{a:.1f} {y}h4{piston}'
+        f'M{middle - 1:.1f} {y}H{b:.1f}"/>'
     )
 
 
