@@ -9,7 +9,7 @@ reduced model has the natural frequencies of the full one.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,7 @@ from scipy.sparse.linalg import splu
 
 from samii_rig.errors import InputError
 from samii_rig.fem.drive import Load, Prescribed, refuse_dead_time, states
+from samii_rig.fem.modal import Basis
 from samii_rig.fem.model import Fem, multiplier_unit, positive_hz, saddle
 from samii_rig.types import Complex, Float
 
@@ -134,25 +135,11 @@ def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced
     m, rig = fem.mechanism, fem.rig
     refuse_dead_time(rig.name, (*m.sources, *m.loads))
     driven = [*(a.element for a in m.sources), *(a.element for a in m.feedback)]
-    passive = [name for name in m.joints if name not in driven]
-    for name in torque:
-        if name not in passive or [*torque].count(name) > 1:
-            expected = f"joints without a source, each once, of {passive}"
-            raise InputError(rig.name, "torque", name, expected)
+    _refuse_torque(fem, driven, torque)
     names = (*driven, *torque)
     joints = [m.joints[name] for name in names]
     basis = fem.basis(joints)
-    omega = basis.modes.omega
-    if not 0 <= flexible <= omega.size:
-        raise InputError(rig.name, "flexible", flexible, f"0 to {omega.size} modes")
-    adrift = np.max(np.abs(basis.massless), initial=0.0) * ROUNDING
-    for load in m.loads:
-        if np.any(np.abs(basis.massless[load.coordinate]) > adrift):
-            raise InputError.saying(
-                rig.name, load.element, "acts on a part without mass; expected a mass beside it"
-            )
-    if omega.size and omega[0] ** 2 < FLOATS * basis.scale:
-        raise InputError.saying(rig.name, "base", "the chain floats; expected an end that holds it")
+    _refuse_basis(fem, basis, flexible)
 
     static = _Static(fem, joints)
     turned = [static.unit(static.lock(j))[0][:, None] for j in joints]
@@ -167,20 +154,6 @@ def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced
             rig.name, "flexible", flexible, "fewer modes: these leave a joint without inertia"
         )
 
-    position, velocity, acceleration = m.angle @ phi, m.velocity @ phi, m.acceleration @ phi
-    carried = np.zeros((len(position), len(m.loads)))
-    at_loads = [load.coordinate for load in m.loads]
-    for sensor, row, factor in m.moment:
-        # By reciprocity the multiplier that holds the load r is v^T r, v the static shape of a
-        # unit gap at that constraint; r are the loads and the forces of inertia and damping, so
-        # that the moment has the static part of all modes left out.
-        v, reaction = (factor * x for x in static.unit(row))
-        position[sensor, : len(joints)] = [reaction[static.lock(j)] for j in joints]
-        velocity[sensor] = -v @ (fem.C @ phi)
-        acceleration[sensor] = -v @ (m.M @ phi)
-        carried[sensor] = v[at_loads]
-    for sensor, index, factor in m.feed:
-        carried[sensor, index] += factor
     inputs = (*(a.name for a in rig.actuator), *(f"T_{name}" for name in torque))
     force = np.zeros((len(K), len(inputs)))
     for i, joint in enumerate(m.feedback, len(m.sources)):
@@ -198,12 +171,56 @@ def reduce(fem: Fem, flexible: int = 4, torque: Collection[str] = ()) -> Reduced
         force,
         m.sources,
         m.loads,
-        phi[at_loads].T,
-        position,
-        velocity,
-        acceleration,
-        carried,
+        phi[[load.coordinate for load in m.loads]].T,
+        *_readings(fem, static, joints, phi),
     )
+
+
+def _refuse_torque(fem: Fem, driven: Sequence[str], torque: Collection[str]) -> None:
+    """InputError for a joint that no torque can be given."""
+    passive = [name for name in fem.mechanism.joints if name not in driven]
+    for name in torque:
+        if name not in passive or [*torque].count(name) > 1:
+            expected = f"joints without a source, each once, of {passive}"
+            raise InputError(fem.rig.name, "torque", name, expected)
+
+
+def _refuse_basis(fem: Fem, basis: Basis, flexible: int) -> None:
+    """InputError for modes that are not there, a load that moves no mass, a chain that floats."""
+    omega, name = basis.modes.omega, fem.rig.name
+    if not 0 <= flexible <= omega.size:
+        raise InputError(name, "flexible", flexible, f"0 to {omega.size} modes")
+    adrift = np.max(np.abs(basis.massless), initial=0.0) * ROUNDING
+    for load in fem.mechanism.loads:
+        if np.any(np.abs(basis.massless[load.coordinate]) > adrift):
+            raise InputError.saying(
+                name, load.element, "acts on a part without mass; expected a mass beside it"
+            )
+    if omega.size and omega[0] ** 2 < FLOATS * basis.scale:
+        raise InputError.saying(name, "base", "the chain floats; expected an end that holds it")
+
+
+def _readings(
+    fem: Fem, static: _Static, joints: Sequence[int], phi: Float
+) -> tuple[Float, Float, Float, Float]:
+    """What the sensors read of the coordinates, their speeds and accelerations, (n_sensor, n)
+    each, and of the loads (n_sensor, n_loads)."""
+    m = fem.mechanism
+    position, velocity, acceleration = m.angle @ phi, m.velocity @ phi, m.acceleration @ phi
+    carried = np.zeros((len(position), len(m.loads)))
+    at_loads = [load.coordinate for load in m.loads]
+    for sensor, row, factor in m.moment:
+        # By reciprocity the multiplier that holds the load r is v^T r, v the static shape of a
+        # unit gap at that constraint; r are the loads and the forces of inertia and damping, so
+        # that the moment has the static part of all modes left out.
+        v, reaction = (factor * x for x in static.unit(row))
+        position[sensor, : len(joints)] = [reaction[static.lock(j)] for j in joints]
+        velocity[sensor] = -v @ (fem.C @ phi)
+        acceleration[sensor] = -v @ (m.M @ phi)
+        carried[sensor] = v[at_loads]
+    for sensor, index, factor in m.feed:
+        carried[sensor, index] += factor
+    return position, velocity, acceleration, carried
 
 
 def _derivatives(
