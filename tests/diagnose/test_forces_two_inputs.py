@@ -108,10 +108,8 @@ def found_in(runs: list[Recording]) -> Diagnosis:
     return diagnose(estimate(runs), RIG, runs=runs, effects=FEW)
 
 
-@pytest.mark.parametrize(
-    ("how", "joint"),
-    [(together, 3), pytest.param(in_turn, 2, marks=pytest.mark.slow)],  # a minute each
-)
+@pytest.mark.slow  # a minute each; the search is that of one input, which test_diagnose_forces asks
+@pytest.mark.parametrize(("how", "joint"), [(together, 3), (in_turn, 2)])
 def test_friction_in_one_drive_is_named_there_and_not_at_the_other(how, joint: int) -> None:
     found = found_in(recorded(RIG, how(), coulomb_friction={f"v_{joint}": RUBS}))
     assert found.verdict == "named"
