@@ -149,9 +149,10 @@ def tests(arguments: list[str]) -> None:
     What runs in real time comes before the rest of the machine's work (tests/conftest.py), so the
     others run beside it; who may not ask for that has nothing beside it.
     """
-    cores = min(os.cpu_count() or 1, 4)
+    # One more than cores: a test of the service waits for its processes most of the time.
+    side_by = min(os.cpu_count() or 1, 4) + 1
     pytest: list[str | Path] = [BIN / "pytest", "-q", "--durations=10"]
-    workers = ["-n", str(cores), "--dist", "worksteal"]  # neighbours stay together: one fixture
+    workers = ["-n", str(side_by), "--dist", "worksteal"]  # neighbours stay together: one fixture
     if arguments:
         call(*pytest, *workers, *arguments)
         return
