@@ -21,7 +21,10 @@ def found_in(runs):
     return diagnose(estimate(runs), RIG, runs=runs, effects=FEW)
 
 
-@pytest.mark.parametrize("how", HOW)
+IN_TURN = pytest.param("in turn", marks=pytest.mark.slow)  # half a minute each
+
+
+@pytest.mark.parametrize("how", [IN_TURN, "together"])
 def test_where_nothing_is_missing_two_inputs_say_so(how):
     found = found_in(recorded(RIG, HOW[how]()))
     assert found.verdict == "no_mismatch"
@@ -30,10 +33,7 @@ def test_where_nothing_is_missing_two_inputs_say_so(how):
     assert found.causes == ()  # of forces neither
 
 
-@pytest.mark.parametrize(
-    "how",
-    [pytest.param("in turn", marks=pytest.mark.slow), "together"],  # half a minute each
-)
+@pytest.mark.parametrize("how", [IN_TURN, "together"])
 def test_a_dead_time_of_one_input_is_named_there_and_not_at_the_other(how):
     found = found_in(recorded(late("v_3", 1e-3), HOW[how]()))
     assert found.verdict == "named"
