@@ -3,7 +3,7 @@ ones with intervals, and what could be the offset that the paper had to take off
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,105 +126,80 @@ def scan() -> Scan:
 
 def figures_8_9() -> Result:
     """Mode shapes with and without joint flexibility, and measured."""
-    flexible = [model_shape(samii(), m) for m in (ONE, TWO)]
-    rigid = [model_shape(locked(samii(), JOINTS), m) for m in (ONE, TWO)]
-    numbers: list[Number] = []
     measured = scan()
-    pictures = []
+    shapes = [model_shape(samii(), mode) for mode in (ONE, TWO)]
+    numbers = [n for mode in (ONE, TWO) for n in _numbers(mode, shapes[mode], measured)]
+    return Result(
+        tuple(numbers), (), tuple(_picture(mode, shapes[mode], measured) for mode in (ONE, TWO))
+    )
+
+
+def _by_mesh(mode: int, shape: Shape) -> tuple[Float, Float]:
+    """Places and displacements of the finite elements, with the sign of `shape`."""
+    x, w = fem_shape(samii(), mode)
+    return x, w * np.sign(w[-1] * shape.w[-1])
+
+
+def _numbers(mode: int, shape: Shape, measured: Scan) -> Iterator[Number]:
+    """What is said of one mode's shape."""
+    begin, name = starts(samii()), f"mode {mode + 1}"
+    x, w = _by_mesh(mode, shape)
+    off = 100 * np.max(np.abs(np.interp(x, shape.x, shape.w) - w))
+    yield between(f"{name}: FEM against TMM, most", off, "% of w", 0, 0.5, "", 1)
+    for joint in ("joint_1", "joint_2"):
+        change = 100 * abs(_slope_change(shape, begin[joint])) / float(np.abs(shape.theta).max())
+        what = f"{name}: slope change at {joint}, of the largest slope"
+        yield between(what, change, "%", 1.0, np.inf, "distinct", 3)
+    w, half, truth = _scaled(measured, mode, shape)
+    free = half > 0
+    inside = 100 * float((np.abs(w - truth) <= half)[free].mean())
+    what = f"{name}: measured places within their 90 % interval of the rig's own"
+    yield shown(what, inside, "%", "", 3)
+    median = 100 * float(np.median(half[free]))
+    yield shown(f"{name}: half width of an interval, median", median, "% of w", "", 2)
+    most = 100 * float(np.max(np.abs(truth - np.interp(measured.x, shape.x, shape.w))))
+    yield shown(f"{name}: damped shape against undamped, most", most, "% of w", "", 2)
+
+
+def _picture(mode: int, shape: Shape, measured: Scan) -> Picture:
+    """One mode's displacement and slope, by both models, with perfect joints, and measured."""
     begin = starts(samii())
-    for mode in (ONE, TWO):
-        shape = flexible[mode]
-        fem_x, fem_w = fem_shape(samii(), mode)
-        fem_w = fem_w * np.sign(fem_w[-1] * shape.w[-1])
-        off = np.max(np.abs(np.interp(fem_x, shape.x, shape.w) - fem_w))
-        numbers.append(
-            between(f"mode {mode + 1}: FEM against TMM, most", 100 * off, "% of w", 0, 0.5, "", 1)
-        )
-        for joint in ("joint_1", "joint_2"):
-            change = _slope_change(shape, begin[joint])
-            numbers.append(
-                between(
-                    f"mode {mode + 1}: slope change at {joint}, of the largest slope",
-                    100 * abs(change) / float(np.abs(shape.theta).max()),
-                    "%",
-                    1.0,
-                    np.inf,
-                    "distinct",
-                    3,
-                )
-            )
-        w, half, truth = _scaled(measured, mode, shape)
-        inside = np.abs(w - truth) <= half
-        free = half > 0
-        numbers += [
-            shown(
-                f"mode {mode + 1}: measured places within their 90 % interval of the rig's own",
-                100 * float(inside[free].mean()),
-                "%",
-                "",
-                3,
-            ),
-            shown(
-                f"mode {mode + 1}: half width of an interval, median",
-                100 * float(np.median(half[free])),
-                "% of w",
-                "",
-                2,
-            ),
-        ]
-        numbers.append(
-            shown(
-                f"mode {mode + 1}: damped shape against undamped, most",
-                100 * float(np.max(np.abs(truth - np.interp(measured.x, shape.x, shape.w)))),
-                "% of w",
-                "",
-                2,
-            )
-        )
-        other = rigid[mode]
-        sign = np.sign(np.interp(begin["link_0"], other.x, other.w)) * np.sign(
-            np.interp(begin["link_0"], shape.x, shape.w)
-        )
-        panel = Panel(
-            "distance from the base [m]",
-            "w over its largest",
-            (
-                Curve(f"TMM, joints flexible, {shape.hz:.3f} Hz", shape.x, shape.w, "broad", 0),
-                Curve("FEM, joints flexible", fem_x, fem_w, "dashed", 0),
-                Curve(
-                    f"TMM, perfect joints, {other.hz:.3f} Hz", other.x, sign * other.w, "line", 1
-                ),
-                Curve("measured, 90 % interval", measured.x, w, "points", 2, w - half, w + half),
-            ),
-            "",
-            (
-                Mark("joint 1", begin["joint_1"]),
-                Mark("joint 2", begin["joint_2"]),
-                Mark("joint 3", begin["joint_3"]),
-            ),
-            log_x=False,
-            legend="upper left",
-        )
-        slopes = Panel(
-            "distance from the base [m]",
-            "slope [1/m]",
-            (
-                Curve("", shape.x, shape.theta, "line", 0),
-                Curve("", other.x, sign * other.theta, "line", 1),
-            ),
-            "",
-            tuple(Mark("", begin[j]) for j in ("joint_1", "joint_2", "joint_3")),
-            log_x=False,
-            weight=0.6,
-        )
-        pictures.append(
-            Picture(
-                f"p1-fig-{8 + mode}",
-                f"Paper 1, Fig. {8 + mode}: mode {mode + 1}, the slope changes at joints 1 and 2",
-                (panel, slopes),
-            )
-        )
-    return Result(tuple(numbers), (), tuple(pictures))
+    joints = ("joint_1", "joint_2", "joint_3")
+    other = model_shape(locked(samii(), JOINTS), mode)
+    at_0 = [np.interp(begin["link_0"], one.x, one.w) for one in (other, shape)]
+    sign = np.sign(at_0[0]) * np.sign(at_0[1])
+    w, half, _ = _scaled(measured, mode, shape)
+    panel = Panel(
+        "distance from the base [m]",
+        "w over its largest",
+        (
+            Curve(f"TMM, joints flexible, {shape.hz:.3f} Hz", shape.x, shape.w, "broad", 0),
+            Curve("FEM, joints flexible", *_by_mesh(mode, shape), "dashed", 0),
+            Curve(f"TMM, perfect joints, {other.hz:.3f} Hz", other.x, sign * other.w, "line", 1),
+            Curve("measured, 90 % interval", measured.x, w, "points", 2, w - half, w + half),
+        ),
+        "",
+        tuple(Mark(joint.replace("_", " "), begin[joint]) for joint in joints),
+        log_x=False,
+        legend="upper left",
+    )
+    slopes = Panel(
+        "distance from the base [m]",
+        "slope [1/m]",
+        (
+            Curve("", shape.x, shape.theta, "line", 0),
+            Curve("", other.x, sign * other.theta, "line", 1),
+        ),
+        "",
+        tuple(Mark("", begin[joint]) for joint in joints),
+        log_x=False,
+        weight=0.6,
+    )
+    return Picture(
+        f"p1-fig-{8 + mode}",
+        f"Paper 1, Fig. {8 + mode}: mode {mode + 1}, the slope changes at joints 1 and 2",
+        (panel, slopes),
+    )
 
 
 @dataclass(frozen=True, slots=True)
