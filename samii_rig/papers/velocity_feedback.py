@@ -9,7 +9,7 @@ theta' = g_a v + M/g_v, for the moment M in the chain is -T.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -197,60 +197,58 @@ def section_4a() -> Result:
     rig = collocated(samii())
     tmm = curves(rig, SOURCE, GAINS.tolist())
     fem = curves(rig, SOURCE, GAINS[::FEW].tolist(), by="fem")
+    both = np.abs(fem.frequency_hz / tmm.frequency_hz[::FEW] - 1)
+    most = between("TMM against FEM, frequencies, most", np.nanmax(both), "", 0.0, 1e-4, digits=1)
+    return Result(
+        (*_at_the_papers_gain(rig), *_where_it_leaves(tmm), most),
+        (
+            "The statement holds at the paper's own g_v and not much below it. Mode 2 leaves "
+            "first, and is overdamped in the end.",
+        ),
+        (
+            Picture(
+                "p1-section-4a",
+                "Paper 1, section IV-A: velocity feedback changes the damping, not the frequencies",
+                _gain_panels((("TMM", tmm, "line"), ("FEM", fem, "points"))),
+            ),
+        ),
+    )
+
+
+def _at_the_papers_gain(rig: Rig) -> Iterator[Number]:
+    """What g_v does to both modes, beside the velocity source."""
     table = curves(rig, SOURCE, [float(GAINS[-1]), G_V])
-    numbers: list[Number] = []
     for i in range(2):
-        change = abs(table.frequency_hz[1, i] / table.frequency_hz[0, i] - 1)
-        numbers += [
-            between(
-                f"mode {i + 1} at g_v = {G_V:g}, change of frequency",
-                100 * change,
-                "%",
-                0.0,
-                3.0,
-                "almost unaffected",
-                2,
-            ),
-            between(
-                f"mode {i + 1} at g_v = {G_V:g}, damping over that of the velocity source",
-                table.damping[1, i] / table.damping[0, i],
-                "times",
-                1.2,
-                np.inf,
-                "modified",
-                3,
-            ),
-        ]
+        at = f"mode {i + 1} at g_v = {G_V:g}"
+        change = 100 * abs(table.frequency_hz[1, i] / table.frequency_hz[0, i] - 1)
+        what = f"{at}, change of frequency"
+        yield between(what, change, "%", 0.0, 3.0, "almost unaffected", 2)
+        damped = table.damping[1, i] / table.damping[0, i]
+        what = f"{at}, damping over that of the velocity source"
+        yield between(what, damped, "times", 1.2, np.inf, "modified", 3)
+
+
+def _where_it_leaves(tmm: GainCurves) -> Iterator[Number]:
+    """Down to which g_v the statement holds."""
     for i in range(2):
         for moved in MOVED:
-            where = tmm.leaves(i, moved)
             what = f"mode {i + 1} is {100 * moved:g} % away from the velocity source's below g_v"
-            numbers.append(shown(what, where, "N m s/rad", "", 3))
+            yield shown(what, tmm.leaves(i, moved), "N m s/rad", "", 3)
     gone = float(tmm.g_v[np.flatnonzero(~np.isnan(tmm.frequency_hz[:, 1]))[-1]])
-    numbers.append(shown("mode 2 is overdamped below g_v", gone, "N m s/rad", "", 2))
-    both = np.abs(fem.frequency_hz / tmm.frequency_hz[::FEW] - 1)
-    numbers.append(
-        between("TMM against FEM, frequencies, most", np.nanmax(both), "", 0.0, 1e-4, digits=1)
-    )
+    yield shown("mode 2 is overdamped below g_v", gone, "N m s/rad", "", 2)
+
+
+def _gain_panels(both: Sequence[tuple[str, GainCurves, Kind]]) -> tuple[Panel, Panel]:
+    """Frequency and damping of both modes over g_v, by each model."""
     marks = (Mark("g_v2 = 500", G_V), Mark("g_v3 = 150", 150.0))
-    both_ways: tuple[tuple[str, GainCurves, Kind], ...] = (
-        ("TMM", tmm, "line"),
-        ("FEM", fem, "points"),
-    )
-    panels = (
+    each = [(i, name, c, kind) for i in range(2) for name, c, kind in both]
+    return (
         Panel(
             "g_v [N m s/rad]",
             "frequency over that of\nthe velocity source",
             tuple(
-                Curve(
-                    f"mode {i + 1}, {name}",
-                    c.g_v,
-                    _over_first(c.frequency_hz[:, i]),
-                    k,
-                    i,
-                )
-                for i in range(2)
-                for name, c, k in both_ways
+                Curve(f"mode {i + 1}, {name}", c.g_v, _over_first(c.frequency_hz[:, i]), kind, i)
+                for i, name, c, kind in each
             ),
             "",
             (*marks, Mark("within 5 %", 0.95, 1.05, "y")),
@@ -260,26 +258,10 @@ def section_4a() -> Result:
         Panel(
             "g_v [N m s/rad]",
             "damping ratio",
-            tuple(
-                Curve("", c.g_v, c.damping[:, i], k, i) for i in range(2) for _, c, k in both_ways
-            ),
+            tuple(Curve("", c.g_v, c.damping[:, i], kind, i) for i, _, c, kind in each),
             "",
             tuple(Mark("", m.low) for m in marks),
             log_y=True,
-        ),
-    )
-    return Result(
-        tuple(numbers),
-        (
-            "The statement holds at the paper's own g_v and not much below it. Mode 2 leaves "
-            "first, and is overdamped in the end.",
-        ),
-        (
-            Picture(
-                "p1-section-4a",
-                "Paper 1, section IV-A: velocity feedback changes the damping, not the frequencies",
-                panels,
-            ),
         ),
     )
 
