@@ -36,8 +36,9 @@ class Draft:
 
     values : the numbers at a strength; units of each, in the same order. apply : the setup with
     the effect of these numbers. start : a strength that surely shows little; most : the largest
-    that makes sense. fixed : it has no size, and is in or not. run : in place of apply, for an
-    effect that is another one in each run, by the run's number.
+    that makes sense. least : a strength below which noise-free records, in which no converter
+    rounds, do not say how large it is. fixed : it has no size, and is in or not. run : in place of
+    apply, for an effect that is another one in each run, by the run's number.
     also : other names that mean the same here, (physics, site).
     """
 
@@ -49,6 +50,7 @@ class Draft:
     apply: Callable[[Setup, Numbers], Setup]
     start: float = 1e-6
     most: float = np.inf
+    least: float = 0.0
     fixed: bool = False
     run: Callable[[Setup, Numbers, int], Setup] | None = None
     also: tuple[tuple[str, str], ...] = ()

@@ -101,10 +101,13 @@ def dead_zone(rng: Rng, setup: Setup, swing: Swing) -> Draft:
     """Overlap of the valve's spool."""
     drive = drawn_drive(rng, setup.drives)
     peak = swing.command[drive.name]
-    return _of_drive(
+    drawn = _of_drive(
         "valve_deadband", drive, {"width": drive.actuator.unit}, lambda x: {"width": x},
         START * peak, peak,
     )  # fmt: skip
+    # A loop comes to rest within a step of its converter; a narrower band only shows where it
+    # does not.
+    return replace(drawn, least=drive.actuator.resolution)
 
 
 def clipping(rng: Rng, setup: Setup, swing: Swing) -> Draft:

@@ -410,7 +410,9 @@ def _solved(
         got = solve(refit, draft, of, target, close)
     except UnphysicalError:
         return None
-    return None if got is None else Concealed(draft, got[0], target, got[1])
+    if got is None or got[0] < draft.least:
+        return None
+    return Concealed(draft, got[0], target, got[1])
 
 
 def _records_of(scene: Scene, draft: Draft, strength: float) -> Records:

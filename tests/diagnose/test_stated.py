@@ -16,9 +16,10 @@ from samii_rig.prove.trial import Hidden, Truth
 SURE = Evidence(9.0, 1.0, 1.0, 1, False, False, 200.0, 400.0, 1, False, 1.0)
 
 
-def test_a_clear_single_effect_is_sure_and_an_ill_fitting_one_is_not():
+def test_a_clear_single_effect_is_sure_and_an_ill_fitting_one_is_not_named():
     assert probability(SURE) > 0.8
-    assert probability(replace(SURE, left=4.0, held=6.0)) < 0.5
+    assert probability(replace(SURE, left=4.0, held=6.0)) < 0.8
+    assert probability(replace(SURE, left=20.0, held=20.0)) < 0.5
 
 
 def test_a_force_that_time_confirms_is_surer_than_one_that_it_does_not():

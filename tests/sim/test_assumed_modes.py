@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -734,3 +735,18 @@ def test_a_trial_is_not_made_twice(tmp_path: Path) -> None:
     make("nothing", 0, tmp_path, TORQUE, STYLE)
     with pytest.raises(InputError, match="there already"):
         make("nothing", 0, tmp_path, TORQUE, STYLE)
+
+
+def test_no_dead_band_is_drawn_that_is_narrower_than_a_step_of_its_converter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Noise-free records know no rounding, and call one large that a rounded loop never shows."""
+    rig, setup = _two_joints()
+    step = rig.actuator[0].resolution
+    swing = SimpleNamespace(command={a.name: 1.0 for a in rig.actuator})
+    draft = forces.dead_zone(np.random.default_rng(0), setup, swing)
+    left = SimpleNamespace(sigma=20.0)
+    for strength, drawn in ((0.5 * step, False), (2.0 * step, True)):
+        monkeypatch.setattr(trial, "solve", lambda *_, x=strength: (x, left))
+        found = trial._solved(None, None, draft, 20.0, 1.1)
+        assert (found is not None) == drawn
