@@ -4,7 +4,7 @@
         --outside 0 --joints 0 --force 0 --out kept
     python benchmarks/data_needed.py kept
 
-makes docs/evidence/data-needed.md and docs/images/data-needed.png. The swept sines of each kept
+makes kept/data-needed.md and its picture beside it. The swept sines of each kept
 trial are diagnosed with less: more noise, fewer channels, levels and repeats, a shorter part of
 each sweep; and with one part of the method taken out. Every row is of the same trials, so that rows
 compare. Answers are kept in OUT/needed and not made again: with --minutes it stops there, and the
@@ -49,8 +49,7 @@ from samii_rig.signal.estimate import estimate
 from samii_rig.types import Complex, Float, Recording, Segment
 
 FROM = 10.0  # sigma that a refit leaves in the whole data, from which an effect should be found
-PAGE = Path(__file__).parents[1] / "docs/evidence/data-needed.md"
-PICTURE = PAGE.parents[1] / "images/data-needed.png"
+PAGE, PICTURE = "data-needed.md", "data-needed.png"
 WIDE, HIGH, DPI = 11.0, 6.0, 110  # inches of the picture, and dots per inch
 
 Recordings = Sequence[Recording]
@@ -304,7 +303,7 @@ class Row:
 
 def page(rows: Sequence[Row], nothing: int, one: int) -> str:
     """The tables, with how they were made."""
-    git = ["git", "-C", str(PAGE.parent), "describe", "--always", "--dirty"]
+    git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
     return "\n".join(
         [
@@ -315,7 +314,7 @@ def page(rows: Sequence[Row], nothing: int, one: int) -> str:
             "read by four sensors. A row changes one thing and keeps the rest. Intervals are 90 %.",
             f"With {one} trials a share is known to some {_width(one):.0%} either way. Only what",
             "is larger than that counts.\n",
-            "![Effects told right, by what the recordings have](../images/data-needed.png)\n",
+            "![Effects told right, by what the recordings have](data-needed.png)\n",
             "| recordings or method | missing where nothing is | place right | name right | "
             "confidently wrong | sigma kept, named right |",
             "|---|---|---|---|---|---|",
@@ -342,7 +341,7 @@ def _width(n: int) -> float:
     return (half.high - half.low) / 2
 
 
-def picture(rows: Sequence[Row]) -> None:
+def picture(rows: Sequence[Row], path: Path) -> None:
     """Names right, a panel a curve and one of the parts taken out."""
     own: dict[str, list[Row]] = defaultdict(list)
     for r in rows:
@@ -367,7 +366,7 @@ def picture(rows: Sequence[Row]) -> None:
     axes[0].legend()
     axes[0].set_ylabel("told right")
     axes[3].set_ylabel("told right")
-    figure.savefig(PICTURE, dpi=DPI)
+    figure.savefig(path, dpi=DPI)
 
 
 def main() -> None:
@@ -393,8 +392,8 @@ def main() -> None:
     if not one or not nothing:
         sys.exit(f"{len(whole)} trials have all answers: expected some of one effect, some of none")
     rows = [Row.of(case, whole) for case in CASES]
-    PAGE.write_text(page(rows, nothing, one), encoding="utf-8")
-    picture(rows)
+    (chosen.out / PAGE).write_text(page(rows, nothing, one), encoding="utf-8")
+    picture(rows, chosen.out / PICTURE)
     print("\n".join(r.line() for r in rows))
 
 

@@ -94,11 +94,14 @@ def shift_of(recording: Recording) -> int:
 class _Law:
     """v = F (sent + fed back), F a short filter: a voltmeter shows what is between two commands.
 
-    left : variance of the rest, without spikes. fed, gain : what v holds of `fed back`, and the
+    left : variance of the rest, without spikes; part : the same of what is fed back. alike :
+    correlation of the rest with the sample before. fed, gain : what v holds of `fed back`, and the
     filter's gain; both 1 where the law holds.
     """
 
     left: float
+    part: float
+    alike: float
     fed: float
     gain: float
 
@@ -113,7 +116,7 @@ class _Law:
         known = np.isfinite(v) & np.isfinite(asked).all(axis=1) & np.isfinite(fed).all(axis=1)
         asked, fed, v = (x[known] - x[known].mean(axis=0) for x in (asked, fed, v))
         if len(v) <= 2 * FARTHEST:
-            return cls(np.nan, np.nan, np.nan)
+            return cls(*[np.nan] * 5)
         kept = np.ones(len(v), bool)
         for _ in range(2):  # again without spikes
             taps = np.linalg.lstsq((asked + fed)[kept], v[kept], rcond=None)[0]
@@ -121,7 +124,10 @@ class _Law:
             kept = np.abs(rest) <= SPIKE * np.median(np.abs(rest))
         b = (fed @ taps)[kept]
         own = float((v - asked @ taps)[kept] @ b) / max(float(b @ b), np.finfo(float).tiny)
-        return cls(float(np.mean(rest[kept] ** 2)), own, float(taps.sum()))
+        left = float(np.mean(rest[kept] ** 2))
+        rest = np.where(kept, rest, 0.0)
+        alike = float(rest[1:] @ rest[:-1]) / max(float(rest @ rest), np.finfo(float).tiny)
+        return cls(left, left / max(float(np.mean(b**2)), 1e-300), alike, own, float(taps.sum()))
 
     @property
     def known(self) -> bool:
@@ -129,7 +135,9 @@ class _Law:
 
     @property
     def holds(self) -> bool:
-        return abs(self.fed - 1) < LEFT and abs(self.gain - 1) < LEFT
+        """What it leaves is little, or a meter's noise; another loop leaves what moves slowly."""
+        rest = self.part < LEFT**2 or abs(self.alike) < LEFT
+        return rest and abs(self.fed - 1) < LEFT and abs(self.gain - 1) < LEFT
 
 
 def asked(recording: Recording, command: str, kp: float, rows: slice = slice(None)) -> Float:

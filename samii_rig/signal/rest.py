@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from samii_rig.signal.groups import Piece
 from samii_rig.signal.noise import pooled
@@ -94,8 +95,8 @@ def _settled_after(ends: Float, highest: float, n: int) -> int:
     own = np.stack([_hann(x) for x in ends])[:, 1 : max(2, int(highest * tail) + 1)]
     ring, half = own.mean(axis=0), tail // 2
     noise = np.mean(np.abs(own - ring) ** 2, axis=0) / max(count - 1, 1)
-    near = [np.convolve(x, np.ones(AROUND) / AROUND, "same") for x in noise.T]
-    size = np.maximum(np.stack(near, axis=1), noise.mean(axis=0))
+    near = uniform_filter1d(noise, AROUND, axis=0, mode="constant")
+    size = np.maximum(near, noise.mean(axis=0))
     weight = 1 / (size + NOISELESS * np.max(np.abs(ring) ** 2, axis=0) + 1e-300)
     power = np.sum(weight * np.abs(ring) ** 2, axis=1)
     line = int(np.argmax(power))
