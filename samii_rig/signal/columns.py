@@ -46,8 +46,8 @@ def is_open(recording: Recording, command: str, sensor: str, kp: float) -> bool:
 
     By the reference; without one, by the sensor's noise, which a loop has in its command.
     """
-    v = np.asarray(recording.values[:, recording.column(command)], np.float64)
-    back = kp * recording.values[:, recording.column(sensor)]
+    v = _column(recording, command)
+    back = kp * _column(recording, sensor)
 
     def size(x: Float) -> float:
         known = x[np.isfinite(x)]
@@ -74,10 +74,7 @@ def shift_of(recording: Recording) -> int:
     if around.stop - around.start <= 2 * FARTHEST:
         return 0
 
-    def column(name: str) -> Float:
-        return np.asarray(recording.values[around, recording.column(name)], np.float64)
-
-    theta, v = column(sensor), column(command[0])
+    theta, v = (_column(recording, name)[around] for name in (sensor, command[0]))
     sent = asked(recording, command[0], kp, around)
     shifts = range(-FARTHEST, FARTHEST + 1)
     laws = [_Law.of(v, sent, -kp * np.roll(theta, -m)) for m in shifts]
@@ -196,8 +193,7 @@ def _alike(one: Recording, other: Recording) -> bool:
     if names != _driving(other) or not names:
         return False
     a, b = _overlap(one, other)
-    v = one.values[a][:, [one.column(n) for n in names]]
-    w = other.values[b][:, [other.column(n) for n in names]]
+    v, w = one.columns(names)[a], other.columns(names)[b]
     if len(v) <= 2 * FARTHEST or not np.all(np.isfinite(v) & np.isfinite(w)):
         return False
     if len(names) > 1:  # each in units of its largest, by which they compare
@@ -261,8 +257,7 @@ def _against(first: Recording, recording: Recording) -> int:
     names = [n for n in first.names("sensor") if n in recording.names("sensor")]
     off = np.zeros((len(names), 2 * FARTHEST + 1))
     for row, name in zip(off, names, strict=True):
-        x = size * first.values[a, first.column(name)]
-        y = recording.values[b, recording.column(name)]
+        x, y = size * _column(first, name)[a], _column(recording, name)[b]
         x, y = (np.nan_to_num(z - np.nanmean(z)) for z in (x, y))
         for i, m in enumerate(range(-FARTHEST, FARTHEST + 1)):
             row[i] = np.mean((np.roll(y, -m) - x)[inside] ** 2)

@@ -209,6 +209,24 @@ class Grid:
         bare = np.zeros_like(self.factor)
         return replace(self, aliases=bare, folded=none, far=None, live=None, loop=None)
 
+    def asked(self) -> Complex:
+        """s at which a model's chain is asked: of the grid, and of its own aliases behind."""
+        own = () if self.live is None else NEAR[:LIVE]
+        return np.concatenate([self.s, *(_upper(self.s, k, self.rate_hz) for k in own)])
+
+    def apart(self, answers: Complex) -> list[Complex]:
+        """Answers there, as rows, of the grid and of each of these aliases."""
+        return np.split(answers, 1 if self.live is None else 1 + LIVE)
+
+    def told(self, answers: Complex) -> tuple[Complex, Complex]:
+        """Answers (n ..., q) there as those of the grid (n, q), and what folds back
+        (order, n, q): of the chain itself where it was asked."""
+        G, *terms = self.apart(answers)
+        if self.live is None:
+            return G, self.folded
+        own = [_lower(t, k) * f for t, k, f in zip(terms, NEAR, self.live, strict=False)]
+        return G, np.concatenate([np.stack(own), self.folded[LIVE:]])
+
     def orders(self) -> list[Complex]:
         """s (n,) of each order of `folded`."""
         known = NEAR[: len(self.folded)]
@@ -427,7 +445,7 @@ class Model:
     def response(self, x: Float, at: Grid) -> Complex:
         """(n, q) at the grid's frequencies."""
         chain = self.chain.with_values(self.values(x))
-        G, folded = self._folded(chain.evaluate, at)
+        G, folded = at.told(chain.evaluate(at.asked())[:, at.sensor, at.actuator])
         factor, aliases = _through(at, folded, *self._passed(x, at))
         H = np.asarray(G * factor + aliases)
         return H if at.loop is None else at.loop.closed(H)
@@ -437,17 +455,11 @@ class Model:
         values = self.values(x)
         keys = tuple(values)
         chain = self.chain.with_values(values)
-        slopes: list[Complex] = []
-
-        def evaluate(s: Complex) -> Complex:
-            G, dG = chain.gradient_at(s, keys)
-            slopes.append(dG[:, at.sensor, at.actuator])
-            return G
-
-        G, folded = self._folded(evaluate, at)
+        every, slopes = chain.gradient_at(at.asked(), keys)
+        G, folded = at.told(every[:, at.sensor, at.actuator])
         near, beyond = self._passed(x, at)
         factor, aliases = _through(at, folded, near, beyond)
-        own, *folds = np.split(slopes[0], 1 if at.live is None else 1 + LIVE)
+        own, *folds = at.apart(slopes[:, at.sensor, at.actuator])
         dG = own * factor[:, :, None]
         for i, (k, d) in enumerate(zip(NEAR, folds, strict=False)):
             assert at.live is not None
@@ -476,18 +488,6 @@ class Model:
                 dH[:, :, j] += at.far.changed(whole, at.s, at.rate_hz)
         H = G * factor + aliases
         return (H, dH) if at.loop is None else (at.loop.closed(H), at.loop.slopes(H, dH))
-
-    @staticmethod
-    def _folded(evaluate: Callable[[Complex], Complex], at: Grid) -> tuple[Complex, Complex]:
-        """(n, q) of a chain at a grid, and what folds back (order, n, q): of the chain itself where
-        the grid says so."""
-        if at.live is None:
-            return evaluate(at.s)[:, at.sensor, at.actuator], at.folded
-        there = [_upper(at.s, k, at.rate_hz) for k in NEAR[:LIVE]]
-        each = np.split(evaluate(np.concatenate([at.s, *there])), 1 + LIVE)
-        G, *terms = (G[:, at.sensor, at.actuator] for G in each)
-        own = [_lower(t, k) * f for t, k, f in zip(terms, NEAR, at.live, strict=False)]
-        return G, np.concatenate([np.stack(own), at.folded[LIVE:]])
 
     def _reading(self) -> list[int]:
         """Entries of x that reach the chain's parameters through an effect."""
