@@ -25,6 +25,8 @@ SEEN = 14.0
 # Part of a command's step that rounding leaves, and medians from which a residual is a spike.
 ROUNDED, SPIKE = 0.3, 8.0
 TAPS = 1  # rows to each side of which what a voltmeter shows of a command is made
+# Rows of that filter's delay: a voltmeter between two commands has half a row, another shift one.
+CENTRED = 0.75
 ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same
 LOOKED_AT = 1 << 14  # samples about the largest reference: thousands tell a shift, millions cost
 QUIETER = 0.5  # of a command's fourth differences, those without what a loop would have added
@@ -80,11 +82,13 @@ def shift_of(recording: Recording) -> int:
     laws = [_Law.of(v, sent, -kp * np.roll(theta, -m)) for m in shifts]
     if not all(law.known for law in laws):
         return 0
-    best = int(np.argmin([law.left for law in laws]))
+    left = [law.left if law.centred else math.inf for law in laws]
+    best = int(np.argmin(left))
+    if not laws[best].holds:
+        return 0
     rounded = (ROUNDED * names[command[0]].resolution) ** 2
-    least = max(laws[best].left, rounded)
-    gain = 0.5 * theta.size * np.log(max(laws[FARTHEST].left, rounded) / least)
-    return shifts[best] if laws[best].holds and gain > SEEN else 0
+    gain = 0.5 * theta.size * np.log(max(left[FARTHEST], rounded) / max(left[best], rounded))
+    return shifts[best] if gain > SEEN else 0
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,7 @@ class _Law:
 
     left : variance of the rest, without spikes; part : the same of what is fed back. alike :
     correlation of the rest with the sample before. fed, gain : what v holds of `fed back`, and the
-    filter's gain; both 1 where the law holds.
+    filter's gain; both 1 where the law holds. late : rows of the filter's delay.
     """
 
     left: float
@@ -101,6 +105,7 @@ class _Law:
     alike: float
     fed: float
     gain: float
+    late: float
 
     @classmethod
     def of(cls, v: Float, sent: Float, back: Float) -> _Law:
@@ -113,7 +118,7 @@ class _Law:
         known = np.isfinite(v) & np.isfinite(asked).all(axis=1) & np.isfinite(fed).all(axis=1)
         asked, fed, v = (x[known] - x[known].mean(axis=0) for x in (asked, fed, v))
         if len(v) <= 2 * FARTHEST:
-            return cls(*[np.nan] * 5)
+            return cls(*[np.nan] * 6)
         kept = np.ones(len(v), bool)
         for _ in range(2):  # again without spikes
             taps = np.linalg.lstsq((asked + fed)[kept], v[kept], rcond=None)[0]
@@ -124,17 +129,24 @@ class _Law:
         left = float(np.mean(rest[kept] ** 2))
         rest = np.where(kept, rest, 0.0)
         alike = float(rest[1:] @ rest[:-1]) / max(float(rest @ rest), np.finfo(float).tiny)
-        return cls(left, left / max(float(np.mean(b**2)), 1e-300), alike, own, float(taps.sum()))
+        gain, late = float(taps.sum()), float(taps @ np.arange(-TAPS, TAPS + 1))
+        part = left / max(float(np.mean(b**2)), 1e-300)
+        return cls(left, part, alike, own, gain, late)
 
     @property
     def known(self) -> bool:
         return math.isfinite(self.left)
 
     @property
+    def centred(self) -> bool:
+        """No law of another shift, that the filter delays."""
+        return abs(self.late) < CENTRED
+
+    @property
     def holds(self) -> bool:
         """What it leaves is little, or a meter's noise; another loop leaves what moves slowly."""
         rest = self.part < LEFT**2 or abs(self.alike) < LEFT
-        return rest and abs(self.fed - 1) < LEFT and abs(self.gain - 1) < LEFT
+        return rest and self.centred and abs(self.fed - 1) < LEFT and abs(self.gain - 1) < LEFT
 
 
 def asked(recording: Recording, command: str, kp: float, rows: slice = slice(None)) -> Float:
