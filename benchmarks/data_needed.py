@@ -1,7 +1,7 @@
 """What data a diagnosis needs, and what each part of the method buys.
 
     samii-rig prove --keep --plant concealed --rig samii --nothing 100 --one 100 --two 0 \\
-        --outside 0 --joints 0 --force 0 --out kept
+        --outside 0 --joints 0 --force 0 --varying 0 --out kept
     python benchmarks/data_needed.py kept
 
 makes kept/data-needed.md and its picture beside it. The swept sines of each kept

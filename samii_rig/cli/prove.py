@@ -44,6 +44,9 @@ class ProveOptions:
     force: Annotated[
         int, typer.Option(min=0, help="Trials that conceal one effect that depends on the level.")
     ] = 150
+    varying: Annotated[
+        int, typer.Option(min=0, help="Trials that conceal a stiffness that is not constant.")
+    ] = 60
     outside: Annotated[
         int, typer.Option(min=0, help="Trials that conceal what the vocabulary has no word for.")
     ] = 150
@@ -78,7 +81,7 @@ class ProveOptions:
     @property
     def counts(self) -> dict[str, int]:
         """Trials of each kind."""
-        kinds = ("nothing", "one", "two", "outside", "joints", "force")
+        kinds = ("nothing", "one", "two", "outside", "joints", "force", "varying")
         return {kind: getattr(self, kind) for kind in kinds}
 
 

@@ -256,14 +256,14 @@ class Diagnosis:
         the causes, each on the lines fitted and on those shown.
     rig : the nominal rig with the causes; traces : the best places, law-free.
     evidence : what the probability of the answer rests on (`stated.Evidence`), whether something
-        `beyond` the table was found instead, and the causes of the most probable explanation,
+        is told in `beyond` instead, and the causes of the most probable explanation,
         whether they are told or not.
     before : of two states, what both have; the causes are then what changed between them.
     moved : the largest first. sigma : root of the chi-square that the causes explain. gain : noise
         units by which the next experiment would tell the rivals apart; None where none was found.
     states : the recordings of each state of the rig, where they are of more than one. exact : what
-        is no missing physics, but one or two wrong numbers of the rig file. beyond : what is in no
-        table and was found instead, in words.
+        is no missing physics, but one or two wrong numbers of the rig file. beyond : a
+        stiffness that is not constant, where it is not sure enough for a cause, in words.
     """
 
     verdict: Verdict
@@ -409,7 +409,7 @@ class Diagnosis:
                 place = f" It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
                 what = "Something changed" if two else "Something is missing"
                 if self.beyond:
-                    return f"{what} that is in no table: {self.beyond}."
+                    return f"{what} that is not named for sure: {self.beyond}."
                 return f"{what} that the table does not name for sure.{place}"
         named = " and ".join(_said(c) for c in self.causes)
         what = "Changed" if two else "Left out"

@@ -13,7 +13,7 @@ import numpy as np
 from samii_rig.errors import InputError, one_of
 
 GROUP = "samii_rig.plants"
-KINDS = ("nothing", "one", "two", "outside", "joints", "force")
+KINDS = ("nothing", "one", "two", "outside", "joints", "force", "varying")
 _DRAW = 77  # of the generator that draws plant and rig: another stream than any plant's
 
 

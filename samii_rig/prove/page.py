@@ -39,7 +39,8 @@ def render(trials: Sequence[Trial], title: str, failed: int = 0) -> str:
         title=title,
         subtitle=f"{len(trials)} concealed trials: {kinds['nothing']} hide nothing, "
         f"{kinds['one']} one effect, {kinds['two']} two, "
-        f"{kinds['joints']} the give of every joint, {kinds['force']} a force, {kinds['outside']} "
+        f"{kinds['joints']} the give of every joint, {kinds['force']} a force, "
+        f"{kinds['varying']} a stiffness that is not constant, {kinds['outside']} "
         "something outside the vocabulary. Every interval holds 90 %.",
         style=Markup(style),
         scores=[cells(s) for s in scores(trials, failed)],

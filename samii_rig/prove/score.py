@@ -255,7 +255,8 @@ def _name_scores(trials: Sequence[Trial]) -> list[Score]:
 
 
 def _outside_scores(trials: Sequence[Trial]) -> list[Score]:
-    # A fractional damper and hysteresis have rows of their own now.
+    # A fractional damper and hysteresis have rows of their own now; so had a stiffness that is not
+    # constant in older trials.
     strange, familiar = above(trials, 30.0, "outside"), above(trials, 30.0, "one")
     unknown = [t for t in strange if not t.right]
     return [
@@ -277,7 +278,7 @@ def _outside_scores(trials: Sequence[Trial]) -> list[Score]:
 
 
 def _honest_scores(trials: Sequence[Trial]) -> list[Score]:
-    known = above(trials, 10.0, "one", "two", "force", "joints")
+    known = above(trials, 10.0, "one", "two", "force", "joints", "varying")
     errors, covered = parameter_errors(known)
     gaps = [
         t.answer.gap_closed
@@ -300,11 +301,13 @@ def _honest_scores(trials: Sequence[Trial]) -> list[Score]:
     ]
 
 
-FORCES = ("cubic_stiffness", "backlash", "coulomb_friction", "output_saturation")
+FORCES = (
+    "cubic_stiffness", "backlash", "coulomb_friction", "output_saturation", "stiffness_variation",
+)  # fmt: skip
 
 
 def _force_scores(trials: Sequence[Trial]) -> list[Score]:
-    big = above(trials, 10.0, "one", "force")
+    big = above(trials, 10.0, "one", "force", "varying")
     return [
         frequency(
             f"{name} by name, from 10 sigma",
@@ -344,7 +347,7 @@ def by_size(trials: Sequence[Trial]) -> list[tuple[str, list[Score]]]:
 
 def by_physics(trials: Sequence[Trial], sigma: float = 10.0) -> list[tuple[str, list[Score]]]:
     """The same by row of the vocabulary, single effects from `sigma`."""
-    big = above(trials, sigma, "one", "force")
+    big = above(trials, sigma, "one", "force", "varying")
     names = sorted({t.truth.effects[0].physics for t in big})
     return [
         (name, _short([t for t in big if t.truth.effects[0].physics == name])) for name in names

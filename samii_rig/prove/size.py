@@ -76,7 +76,7 @@ def _away(search: Search, e: Explanation) -> float:
 
 def _smaller(truth: Mapping[str, Any], every: Sequence[Effect]) -> Sequence[Effect]:
     """Effects of which one may explain the truth before it counts as more."""
-    if truth["kind"] not in ("two", "outside"):
+    if truth["kind"] not in ("two", "outside", "varying"):
         return []
     names = {(e["physics"], e["site"]) for e in truth["effects"]}
     if truth["kind"] == "two":

@@ -22,7 +22,12 @@ NAMED = ("named", "ambiguous")
 REFUSED = "refused"  # in place of a verdict: the recordings are none that a diagnosis takes
 WHOLE = "whole records"  # a truth's `size_is` where its size is of these
 # What plants call a part that has a row in the table under another name.
-IN_TABLE = {"fractional_damper": "fractional_damping"}
+IN_TABLE = {
+    "fractional_damper": "fractional_damping",
+    "parametric_stiffness": "stiffness_variation",
+    "run_to_run_stiffness": "stiffness_variation",
+    "time_varying_joint": "stiffness_variation",
+}
 ALL_BUT_TENTH = 0.9  # probability that a set of sites holds
 
 
@@ -56,8 +61,8 @@ class Hidden:
 class Truth:
     """What a trial conceals.
 
-    kind : `nothing`, `one`, `two`, `outside`, `joints` (every joint gives), or `force` (one effect
-        that depends on the level).
+    kind : `nothing`, `one`, `two`, `outside`, `joints` (every joint gives), `force` (one effect
+        that depends on the level), or `varying` (a stiffness that is not constant).
     size : sigma that are left when the nearest smaller explanation has been refitted. whole :
         whether that is of whole records, or of the bursts alone. twins : other sites that a single
         effect might as well be told to be at, by structure. styles : how it was recorded, the

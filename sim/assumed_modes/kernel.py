@@ -16,7 +16,7 @@ from numba import njit
 from samii_rig.types import Float, Int
 
 # Laws by number, as the compiled loop knows them, with their numbers in order.
-CUBIC, BACKLASH, FRICTION, BOUC_WEN, PARAMETRIC, FLOW = range(6)
+CUBIC, BACKLASH, FRICTION, BOUC_WEN, PARAMETRIC, FLOW, DRAG = range(7)
 ITERATIONS = 6  # of a smooth law; each gains a factor k h^2/2m, about 1 %
 N_VALUES = 5
 
@@ -80,6 +80,8 @@ def smooth(law: int, p: Float, z: float, dz: float, t: float, memory: float, h: 
         return float(p[0] * min(max(z, -half), half))
     if law == 3:  # Bouc-Wen, p = force at yield, displacement at yield, beta, (1 - beta), n
         return float(-p[0] * bouc_wen(p, dz, memory, h))
+    if law == 6:  # a damper that grows with the speed, p = c2
+        return float(-p[0] * abs(dz) * dz)
     # parametric, p = k, depth 1, w1, depth 2, w2
     return float(-p[0] * z * (p[1] * np.sin(p[2] * t) + p[3] * np.sin(p[4] * t)))
 

@@ -62,40 +62,18 @@ def fractional(rng: Rng, setup: Setup, swing: Swing) -> Draft:
     )  # fmt: skip
 
 
-def between_runs(rng: Rng, setup: Setup, swing: Swing) -> Draft:
-    """A joint whose stiffness is another one in each run."""
-    on, _, _ = joint(rng, setup, swing)
-    seed = int(rng.integers(2**31))
-
-    def run(s: Setup, v: Numbers, number: int) -> Setup:
-        step = float(np.random.default_rng([seed, number]).standard_normal())
-        return s.with_value(on, "k", s.part(on).values["k"] * float(np.exp(v["spread"] * step)))
-
+def drag(rng: Rng, setup: Setup, swing: Swing) -> Draft:
+    """A joint with a damper that grows with the speed: c2 |x'| x', as of oil through an orifice."""
+    on, k, peak = joint(rng, setup, swing)
+    force, motion = units(setup, on)
     return Draft(
-        "run_to_run_stiffness", on, None, {"spread": "1"}, lambda x: {"spread": x},
-        lambda s, v: run(s, v, 0), 1e-6, 0.3, run=run,
+        "quadratic_damper", on, None, {"c2": f"{force} s^2/{motion}^2"}, lambda x: {"c2": x},
+        on_joint("drag", on), 1e-6 * k / peak, k / peak,
     )  # fmt: skip
-
-
-def parametric(rng: Rng, setup: Setup, swing: Swing) -> Draft:
-    """A joint whose stiffness swings in time at two frequencies."""
-    on, _, _ = joint(rng, setup, swing)
-    w = 2 * np.pi * np.exp(rng.uniform(np.log(0.1), np.log(3.0), 2))
-    share = float(rng.uniform(0.3, 1.0))
-    law = on_joint("parametric", on)
-
-    def apply(s: Setup, v: Numbers) -> Setup:
-        numbers = {"depth_1": v["depth"], "depth_2": share * v["depth"], "w_1": w[0], "w_2": w[1]}
-        return law(s, numbers)
-
-    return Draft(
-        "parametric_stiffness", on, None, {"depth": "1"}, lambda x: {"depth": x}, apply, 1e-5, 0.4
-    )
 
 
 OUTSIDE: dict[str, Callable[[Rng, Setup, Swing], Draft]] = {
     "hysteresis": hysteresis,
     "fractional_damper": fractional,
-    "run_to_run_stiffness": between_runs,
-    "parametric_stiffness": parametric,
+    "quadratic_damper": drag,
 }

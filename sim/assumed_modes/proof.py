@@ -22,7 +22,7 @@ from samii_rig.record.export import replacing
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from sim.assumed_modes.parts import JOINTS, setup_of
-from sim.assumed_modes.trial import KINDS, Conceals, conceal, logged, save
+from sim.assumed_modes.trial import KINDS, POOLS, Conceals, conceal, logged, save
 
 NAME = "assumed_modes"
 # s of records of a trial, drawn evenly in the logarithm: what a lab records of one rig in one go.
@@ -44,7 +44,7 @@ class Plant:
         except InputError as error:
             return str(error)
         springs = [p for p in setup.parts if p.kind in JOINTS and p.values["k"] > 0]
-        if kind == "outside" and not springs:
+        if kind in POOLS and not springs:
             return f"{rig.name}: element has no spring that could be another; expected one"
         return ""
 

@@ -39,8 +39,10 @@ from sim.assumed_modes.sigma import FURTHEST, STEP, Bench, Left, Records, Refit,
 from sim.assumed_modes.simulate import Control, recorded
 from sim.assumed_modes.size import CLOSE, LEAST, MOST, records, records_by_run, solve
 from sim.assumed_modes.styles import Style
+from sim.assumed_modes.varying import BETWEEN, VARYING
 
-KINDS = ("nothing", "one", "two", "outside", "force")
+KINDS = ("nothing", "one", "two", "outside", "force", "varying")
+POOLS = {"outside": OUTSIDE, "varying": VARYING}  # what is drawn by itself
 FARTHEST = 2.5  # tolerances that a nominal parameter is drawn from the file's value at most
 SMALLEST = 0.2  # of the file's value: no damping is drawn to nothing
 FORCED_TRIES = 40  # effects drawn until one has a size
@@ -156,8 +158,8 @@ def conceal(
     Raises SamiiRigError where no effect has a size.
     """
     rngs = [np.random.default_rng([seed, KINDS.index(kind), k]) for k in range(5)]
-    beyond = str(rngs[2].choice(list(OUTSIDE))) if kind == "outside" else ""
-    runs = beyond == "run_to_run_stiffness"
+    beyond = str(rngs[2].choice(list(POOLS[kind]))) if kind in POOLS else ""
+    runs = beyond == BETWEEN
     scene = scene_of(rngs[0], rngs[1], rig, style, runs=runs, seconds=seconds)
     refit = None if kind == "nothing" else nominal_refit(scene)
     found: list[Concealed] = []
@@ -390,7 +392,7 @@ def _draft(
     rng: Rng, names: tuple[str, ...], beyond: str, scene: Scene, swing: Swing
 ) -> Draft | None:
     if beyond:
-        return OUTSIDE[beyond](rng, scene.setup, swing)
+        return {**OUTSIDE, **VARYING}[beyond](rng, scene.setup, swing)
     name = str(rng.choice(names))
     try:
         if name in FORCES:
@@ -553,7 +555,7 @@ def _truth(made: Conceals, faults: list[record.Faults], *, rivals: bool) -> dict
     for effect in found:
         others = [o for o in found if o is not effect]
         left = effect.alone if refit is None else _beside(scene, refit, effect, others)
-        if kind == "outside" and refit is not None:
+        if kind in POOLS and refit is not None:
             left = min(left, _mimicked(scene, refit, effect), key=lambda x: x.data)
         draft, numbers = effect.draft, effect.draft.values(effect.strength)
         effects.append(

@@ -16,7 +16,7 @@ from samii_rig.errors import InputError
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.elements import parameters
-from sim.concealed.effects import OUTSIDE, ROWS, Row, clamp_of, places
+from sim.concealed.effects import ROWS, TABLES, Row, clamp_of, places
 from sim.concealed.measure import Errors, draw_errors
 from sim.concealed.modes import Poles, poles_of
 from sim.concealed.parts import Description, described
@@ -25,9 +25,9 @@ from sim.concealed.scales import RIGID, RIGID_SOURCE, UNDAMPED_SOURCE, Concealed
 from sim.concealed.size import Yardstick, response_change, yardstick
 from sim.concealed.stated import Stated, as_stated, row_of
 
-Kind = Literal["nothing", "one", "two", "outside", "joints", "stated"]
-KINDS: tuple[Kind, ...] = ("nothing", "one", "two", "outside", "joints", "stated")
-DRAWN = KINDS[:-1]
+Kind = Literal["nothing", "one", "two", "outside", "joints", "stated", "varying"]
+KINDS: tuple[Kind, ...] = ("nothing", "one", "two", "outside", "joints", "stated", "varying")
+DRAWN = tuple(kind for kind in KINDS if kind != "stated")
 SMALLEST, LARGEST = 1.0, 1000.0  # sigma aimed at
 LEAST_OF_TWO = 5.0  # of each of two, and of what lies outside
 INNOCENT = 0.3  # of the trials have a joint that is as rigid or undamped as the rig file says
@@ -176,7 +176,7 @@ def draw_values(rig: Rig, rng: np.random.Generator) -> tuple[Description, dict[s
 
 
 def _chosen(kind: Kind, seed: int, plant: Description, rng: np.random.Generator) -> list[Chosen]:
-    table = [row for row in (OUTSIDE if kind == "outside" else ROWS) if places(plant, row)]
+    table = [row for row in TABLES.get(kind, ROWS) if places(plant, row)]
 
     def at(number: int) -> Chosen:
         row = table[number % len(table)]

@@ -98,9 +98,10 @@ ROWS = (
 )
 OUTSIDE = (
     Row("hysteresis", "joint", nonlinear.slip, linear=False, most=10.0, outside=True),
-    Row("time_varying_joint", "joint", nonlinear.drift, linear=False, most=6.0, outside=True),
     Row("fractional_damper", "joint", linear.fractional, most=20.0, outside=True),
 )
+VARYING = (Row("stiffness_variation", "joint", nonlinear.drift, linear=False, most=6.0),)
+TABLES = {"outside": OUTSIDE, "varying": VARYING}  # rows of a kind, where it has its own
 
 
 def physics() -> Iterator[str]:

@@ -74,4 +74,4 @@ def drift(plant: Description, site: str, dose: Dose) -> Concealed:
     share = dose("share", -min(0.1 * dose.x, 0.9))
     tau = dose("tau", float(dose.rng.uniform(20.0, 60.0)))
     plant.laws.append(Law("drift", site, (plant.part(site).values["k"], share, tau)))
-    return Concealed("time_varying_joint", site, {"share": share, "tau": tau})
+    return Concealed("stiffness_variation", site, {"share": share, "tau": tau})

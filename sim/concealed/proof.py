@@ -9,7 +9,7 @@ from samii_rig.errors import InputError, SamiiRigError
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from sim.concealed.draw import DRAWN, Kind
-from sim.concealed.effects import OUTSIDE, ROWS, places
+from sim.concealed.effects import ROWS, TABLES, places
 from sim.concealed.parts import described
 from sim.concealed.trial import make
 
@@ -30,8 +30,8 @@ class Plant:
         joints = sum(p.kind == "torsional_spring" for p in plant.parts)
         if kind == "joints" and joints < 2:
             return "fewer than two joints"
-        if kind == "outside" and not any(places(plant, row) for row in OUTSIDE):
-            return "no joint for what is outside the table"
+        if kind in TABLES and not any(places(plant, row) for row in TABLES[kind]):
+            return "no joint for such an effect"
         if kind in ("one", "two") and not any(places(plant, row) for row in ROWS):
             return "no place for any effect"
         return ""

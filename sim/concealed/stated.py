@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from samii_rig.errors import InputError
-from sim.concealed.effects import OUTSIDE, ROWS, Row, clamp_of, places
+from sim.concealed.effects import OUTSIDE, ROWS, VARYING, Row, clamp_of, places
 from sim.concealed.parts import Description
 from sim.concealed.scales import Concealed
 
@@ -51,9 +51,9 @@ def row_of(plant: Description, effect: Stated) -> Row:
     for symbol, value in effect.parameters.items():
         if not math.isfinite(value):
             raise InputError(effect.physics, symbol, value, "a finite number")
-    rows = [row for row in (*ROWS, *OUTSIDE) if row.physics == effect.physics]
+    rows = [row for row in (*ROWS, *OUTSIDE, *VARYING) if row.physics == effect.physics]
     if not rows:
-        known = ", ".join(dict.fromkeys(row.physics for row in (*ROWS, *OUTSIDE)))
+        known = ", ".join(dict.fromkeys(row.physics for row in (*ROWS, *OUTSIDE, *VARYING)))
         raise InputError("effect", "physics", effect.physics, f"one of {known}")
     sites = []
     for row in rows:

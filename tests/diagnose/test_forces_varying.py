@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +15,15 @@ from cut_kit import DESIGN, cut_sweeps
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.search import ForceSearch
-from samii_rig.diagnose.forces.varying import Pulled, _between, pulled, varying
+from samii_rig.diagnose.forces.variation import _less, variation
+from samii_rig.diagnose.forces.varying import Pulled, _between, pulled, pulls
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.record.reader import read_recording
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
 from sim.assumed_modes import trial
-from sim.assumed_modes.outside import between_runs, parametric
+from sim.assumed_modes.varying import VARYING
 
 FEW = [e for e in table(SAMII, 0.5, 20.0) if e.physics in ("actuator_lag", "added_mass")]
 
@@ -30,39 +32,51 @@ def found_in(runs: list[Recording]) -> Diagnosis:
     return diagnose(estimate(runs), SAMII, runs=runs, effects=FEW)
 
 
-def test_a_spring_that_swings_is_found_where_how_fast_and_by_how_much(
+def concealed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str, seed: int, *style: str
+) -> tuple[dict[str, Any], list[Recording]]:
+    """The truth of a trial of the second plant, and its recordings."""
+    monkeypatch.setitem(trial.POOLS, "varying", {how: VARYING[how]})
+    folder = trial.make("varying", seed, tmp_path, SAMII_TOML, (*style, "clean"))
+    (truth,) = json.loads((tmp_path / "truth" / f"varying_{seed}.json").read_text())["effects"]
+    return truth, [read_recording(path) for path in sorted(folder.glob("*.mcap"))]
+
+
+def test_a_spring_that_swings_is_named_with_its_place_how_fast_and_by_how_much(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A plant of another kind, under noise that says nothing of when it swings: 49 sigma, of which
-    the nominal model leaves no more than noise."""
-    monkeypatch.setattr(trial, "OUTSIDE", {"parametric_stiffness": parametric})
-    folder = trial.make("outside", 3, tmp_path, SAMII_TOML, ("random", "clean"))
-    (truth,) = json.loads((tmp_path / "truth" / "outside_3.json").read_text())["effects"]
-    runs = [read_recording(path) for path in sorted(folder.glob("*.mcap"))]
+    """A plant of another kind, under noise that says nothing of when it swings, and of which the
+    nominal model leaves no more than noise."""
+    truth, runs = concealed(tmp_path, monkeypatch, "in time", 3, "random")
     found = found_in(runs)
-    assert found.chi2_per_dof < found.threshold
-    assert found.verdict == "unknown"
-    assert found.sites[0][0] == truth["site"] == "joint_1"
-    assert found.sites[0][1] > 0.99
-    words = (
-        "the stiffness of joint_1 is not constant: it varies, as by a swing at 1.46 Hz, by 0.11 % "
-        "(+/- 0.00"  # 8 or 9, by how the machine rounds
-    )
-    assert found.lines()[0].startswith(f"Something is missing that is in no table: {words}")
-    assert truth["parameters"]["depth"]["value"] == pytest.approx(0.0011, rel=0.1)
+    assert found.verdict == "named"
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("stiffness_variation", truth["site"])
+    for symbol, near in (("depth", 0.1), ("f", 0.01)):
+        true = truth["parameters"][symbol]["value"]
+        told = cause.parameters[symbol]
+        assert told.value == pytest.approx(true, rel=near)
+        assert told.low is not None
+        assert told.high is not None
+        assert told.low < told.value < told.high
+    assert found.gap.low > 0  # on lines that it was not fitted to
+    assert found.lines()[0].startswith("Left out: stiffness variation at ")
 
 
-def test_a_joint_that_differs_from_run_to_run_is_found(
+def test_a_joint_that_differs_from_run_to_run_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Four sweeps, cut off where they end: a clamp that differs by 0.04 %, 11 sigma."""
-    monkeypatch.setattr(trial, "OUTSIDE", {"run_to_run_stiffness": between_runs})
-    folder = trial.make("outside", 1, tmp_path, SAMII_TOML, ("cut", "clean"))
-    (truth,) = json.loads((tmp_path / "truth" / "outside_1.json").read_text())["effects"]
-    found = found_in([read_recording(path) for path in sorted(folder.glob("*.mcap"))])
-    assert found.verdict == "unknown"
-    assert found.sites[0][0] == truth["site"] == "clamp"
-    assert found.beyond.startswith("the stiffness of clamp is not constant: it varies between rec")
+    """Sweeps, cut off where they end: a clamp that differs by 3 %, 40 noise units."""
+    truth, runs = concealed(tmp_path, monkeypatch, "between runs", 5, "cut")
+    found = found_in(runs)
+    assert found.verdict in ("named", "ambiguous")
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("stiffness_variation", truth["site"])
+    spread = cause.parameters["spread"]
+    assert spread.low is not None
+    assert spread.high is not None
+    assert spread.low < truth["parameters"]["spread"]["value"] < spread.high
+    assert not found.states
 
 
 @pytest.fixture(scope="module")
@@ -123,4 +137,50 @@ def test_under_noise_alone_every_frequency_has_chi_square_of_two_freedoms(
 
 
 def test_where_nothing_is_missing_every_stiffness_is_constant(nothing: ForceSearch) -> None:
-    assert varying(nothing, nothing.nominal) is None
+    assert variation(nothing, nothing.nominal, 3) is None
+
+
+def test_what_a_swing_adds_in_time_is_what_it_adds_to_the_lines(nothing: ForceSearch) -> None:
+    reach, span = nothing.reach, nothing.reach.spans[0]
+    left = nothing.unexplained(nothing.nominal.fitted)[0]
+    spring = next(e.quasi for e in nothing.forces if e.quasi and e.quasi.law is HARDENING)
+    ports = reach.ports(spring.place, of_speed=False)
+    assert ports is not None
+    phi = reach.motion(spring.place, of_speed=False)[0]
+    piece = Pulled.of(span, phi, ports.sensors[0], left)
+    changes = np.zeros((len(left.white), 3))
+    changes[0] = 0.0, 3.0, 4.0
+    added = piece.added(changes, [0.4])
+    assert added.shape == (len(left.white), span.samples, ports.sensors[0].shape[1])
+    assert not added[1:].any()
+    lines = np.fft.rfft(added[0], axis=0)[left.k] / np.sqrt(span.samples)
+    force = phi * (changes[0] @ np.array(piece._waves([0.4])))
+    same = span.lines(span.damped(force), ports.sensors[0], left.k) / span.times
+    assert np.linalg.norm(lines - same) < 1e-6 * np.linalg.norm(same)
+
+
+def test_a_swing_that_is_put_into_the_records_is_taken_out_again(nothing: ForceSearch) -> None:
+    """By as much as it was put in, to first order in all else that is refitted."""
+    spring = next(
+        e.quasi for e in nothing.forces if e.quasi and e.quasi.law is HARDENING and "2" in e.site
+    )
+    k = nothing.reach.scale((spring.place.across[-1], "k"))
+    pieces = pulls(nothing, spring.place, nothing.unexplained(nothing.nominal.fitted))
+    hz, depth, made = 0.7, 0.02, []
+    for one, piece in zip(pieces, nothing.levels.records.pieces, strict=True):
+        changes = np.zeros((one.times.size, 3))
+        changes[0, 1] = -depth * k * one.times[0]
+        made.append(_less(piece, -one.added(changes, [hz])))
+    records = replace(nothing.levels.records, pieces=tuple(made))
+    fitted = nothing.nominal.fitted
+    other = nothing.on(replace(nothing.levels, records=records), fitted)
+    found = variation(other, replace(nothing.nominal, fitted=fitted), 3)
+    assert found is not None
+    assert found.sites[0][0] == spring.place.across[-1]
+    told = found.parameters["depth"]
+    assert told.low is not None
+    assert told.high is not None
+    assert told.value == pytest.approx(depth, abs=2 * (told.high - told.low))
+    assert found.parameters["f"].value == pytest.approx(hz, rel=0.02)
+    assert found.inside
+    assert found.after[0] < found.before[0]

@@ -62,7 +62,7 @@ def answers(out: Path) -> dict[str, Any]:
 def test_a_campaign_on_a_cluster_says_what_it_says_here(tmp_path: Path, scheduler: str) -> None:
     here, there = tmp_path / "here", tmp_path / "there"
     options = ["--nothing", 1, "--one", 0, "--two", 0, "--outside", 0, "--joints", 0, "--force", 0,
-               "--seed", 3, "--rig", "samii"]  # fmt: skip
+               "--varying", 0, "--seed", 3, "--rig", "samii"]  # fmt: skip
     said = call("prove", "--out", there, *options, "--scheduler", scheduler, "--json")
     assert said["failures"] == []
     assert said["trials"] == 1

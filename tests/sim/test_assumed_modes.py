@@ -42,6 +42,7 @@ from sim.assumed_modes import (
     size,
     styles,
     trial,
+    varying,
 )
 from sim.assumed_modes.noise import noise_model, whitener
 from sim.assumed_modes.parts import Attachment, Force, Part, Setup, nominal, setup_of
@@ -683,13 +684,14 @@ def test_fractional_damper_is_a_power_of_s_over_its_band() -> None:
     assert np.max(np.abs(found / s**alpha - 1)) < 0.03
 
 
-@pytest.mark.parametrize("name", [*forces.FORCES, *outside.OUTSIDE])
+@pytest.mark.parametrize("name", [*forces.FORCES, *outside.OUTSIDE, *varying.VARYING])
 def test_every_force_finds_its_size(name: str) -> None:
     rngs = [np.random.default_rng([9, k]) for k in range(3)]
     rig, _ = load_rig("samii_torque_vertical")
-    runs = name == "run_to_run_stiffness"
+    runs = name == varying.BETWEEN
     scene = trial.scene_of(rngs[0], rngs[1], rig, ("clean", "cut"), runs=runs)
-    draft = {**forces.FORCES, **outside.OUTSIDE}[name](rngs[2], scene.setup, trial._swing(scene))
+    pools = {**forces.FORCES, **outside.OUTSIDE, **varying.VARYING}
+    draft = pools[name](rngs[2], scene.setup, trial._swing(scene))
     found = trial._solved(scene, trial.nominal_refit(scene), draft, 30.0, size.CLOSE)
     assert found is not None
     assert found.alone.sigma == pytest.approx(30.0, rel=0.3)

@@ -7,19 +7,24 @@ in common; the one that explains most of what is left is the place.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from samii_rig.diagnose.data.measured import Measured, binned
+from samii_rig.diagnose.fit.intervals import TAIL
 from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.model import Model
+from samii_rig.diagnose.result import Value
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Parameter, parameters
 from samii_rig.types import Float
 
+VARIATION = "stiffness_variation"  # its name in the table
 STIFFNESS = "k"  # symbol of the parameters that may change
 WIDTH = 0.5  # of the logarithm of a stiffness, before the data, from one series to the next
 LARGEST = 3.0  # of that logarithm
@@ -43,6 +48,12 @@ class Changing:
     series: tuple[tuple[float, str, bool], ...]
     change: Float
     sd: Float
+
+    @property
+    def parameters(self) -> dict[str, Value]:
+        """By symbol, with its interval."""
+        free = self.change.size - 1
+        return {"spread": spread_of(float(np.sum(self.change**2)) / free, free)}
 
     def told(self) -> str:
         """In words."""
@@ -87,6 +98,13 @@ def between_runs(search: Search, base: Fitted, decide: Measured) -> Changing | N
         change=np.expm1(apart @ change),
         sd=np.sqrt(np.diag(apart @ cov @ apart)),
     )
+
+
+def spread_of(square: float, free: int) -> Value:
+    """Standard deviation of stiffnesses that are normal, with its 90 % interval. square : their
+    mean square, of so many degrees of freedom."""
+    low, high = (math.sqrt(square * free / stats.chi2.ppf(q, free)) for q in (1 - TAIL, TAIL))
+    return Value(math.sqrt(square), "1", low, high)
 
 
 def _every_joint(search: Search, base: Fitted) -> Fitted:

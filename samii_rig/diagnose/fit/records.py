@@ -275,16 +275,18 @@ class Whole:
         """The likelihood near a fit, on the lines that are fitted. at : Hz of its nodes. response :
         that of the fit, where it is known."""
         response = self.response(fitted) if response is None else response
-        return reduced(self.records, response, self.disturbed(fitted), self._loop, _fitted, at)
+        return reduced(self.records, response, self.disturbed(fitted), self._loop, fitted_lines, at)
 
     def complete(self, fitted: Fitted) -> Complete:
         """The same, with what no linear model explains."""
         disturbed = self.disturbed(fitted)
-        return Complete.about(self.records, self.response(fitted), disturbed, self._loop, _fitted)
+        return Complete.about(
+            self.records, self.response(fitted), disturbed, self._loop, fitted_lines
+        )
 
     def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
         """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
-        part = _shown if shown else _fitted
+        part = _shown if shown else fitted_lines
         return left_by(self.records, self.response(fitted), noise, self._loop, part)
 
 
@@ -380,7 +382,8 @@ def _named_in(messages: Sequence[str], places: Iterable[str]) -> dict[str, str]:
     return out
 
 
-def _fitted(k: Int) -> NDArray[np.bool_]:
+def fitted_lines(k: Int) -> NDArray[np.bool_]:
+    """Which lines k (n,) are fitted; the others show what was gained."""
     return ~_shown(k)
 
 

@@ -94,6 +94,19 @@ class Span:
         Z = fft.rfft(y, axis=0)[k]
         return np.asarray(Z * (np.sqrt(self.samples) / self.n))
 
+    @property
+    def before(self) -> int:
+        """Instants of the input before the record, which stand at the end."""
+        return int(np.count_nonzero(self.alive[self.decay.size // 2 :]))
+
+    def sampled(self, E: Complex, T: Complex) -> Float:
+        """(samples, q) what `lines` are those of, by itself and at the record's rate."""
+        M = round(self.decay.size * self.samples / self.n)
+        y = fft.irfft(T * E[:, None], M, axis=0)[: self.samples] * (M / self.decay.size)
+        sigma = float(self.s[0].real)
+        at = self.history + np.arange(self.samples)
+        return np.asarray(y * np.exp(sigma / self.rate_hz * at)[:, None])
+
 
 @dataclass(frozen=True)
 class Ports:

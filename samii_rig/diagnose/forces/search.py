@@ -91,6 +91,14 @@ class ForceSearch(RecordSearch):
         between = self.levels.between(self.reduced, fitted)
         self._between = between, fitted.model.response(fitted.x, between)
 
+    def on(self, levels: Whole, fitted: Fitted) -> ForceSearch:
+        """The same on other records of these inputs, the likelihood about a fit of them."""
+        other = copy(self)
+        other.levels = other.whole = levels
+        other.found = {}
+        other._about(fitted)
+        return other
+
     def made(self, effects: tuple[Effect, ...]) -> Model:
         """As of `Explanations`; of a force and linear effects beside it, or of those alone."""
         return model_of(self.rig, effects)
@@ -160,6 +168,8 @@ class ForceSearch(RecordSearch):
         ranked = self.linear.ranked()
         near = [e for e in ranked if e.key != beside and e.weight > own.weight - NEAR]
         for rival in self.each(near[:RIVALS], lambda e: named(e.effects)):
+            if self.spent:
+                return
             effects = (*rival.effects, *(best.effects[i] for i in force))
             end = self.refitted(effects, rival, strengths) if self.model(effects) else None
             if end is not None:

@@ -17,15 +17,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import optimize, stats
 
 from samii_rig.diagnose.fit.between_runs import STIFFNESS
-from samii_rig.diagnose.fit.exact import NINETY
-from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.forces.laws import HARDENING
+from samii_rig.diagnose.forces.place import Place
 from samii_rig.diagnose.forces.reach import Span
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.likelihood.reduce import CYCLES
@@ -36,70 +35,61 @@ FASTEST = 0.2  # of the highest frequency in the records: what varies faster is 
 FINE = 4  # frequencies for each that the longest record tells apart
 ALARM = 2e-3  # chance that noise alone makes any stiffness vary
 ONE_PHASE = 1e-3  # of V: less variance is that of a phase which the motion does not show
+FLAT = 1e-2  # of the distance between frequencies that are tried: nearer, chi-square is flat
 ROUNDED = 1e-6  # of the largest variance: less is rounding
 
 
 @dataclass(frozen=True, slots=True)
-class Varying:
-    """A stiffness that varies.
+class Springs:
+    """The springs of a rig, and what noise may make of their search.
 
-    sites : (site, probability), the likeliest first. hz : at which it varies most there; 0 where it
-    differs from record to record. depth, sd : relative to the stiffness; amplitude of a swing, rms
-    of what records differ by. gain : of chi-square, beyond what noise makes in the mean.
+    each : (site, its place). f : (m,) Hz, at which a swing is looked for. longest : s, record.
     """
 
-    sites: tuple[tuple[str, float], ...]
-    hz: float
-    depth: float
-    sd: float
-    gain: float
+    each: tuple[tuple[str, Place], ...]
+    f: Float
+    longest: float
 
-    def told(self) -> str:
-        """In words."""
-        swing = f", as by a swing at {self.hz:.3g} Hz," if self.hz > 0 else " between records"
-        return (
-            f"the stiffness of {self.sites[0][0]} is not constant: it varies{swing} by "
-            f"{100 * self.depth:.2g} % (+/- {100 * NINETY * self.sd:.1g})"
+    @classmethod
+    def of(cls, search: ForceSearch) -> Springs:
+        """Of a rig that moves."""
+        records, reach = search.levels.records, search.reach
+        longest = max(len(p.z) for p in records.pieces) / records.rate_hz
+        # What is slower than the lines that count is as a sensor that wanders.
+        f = np.arange(CYCLES / longest, FASTEST * records.band[1], 1 / (FINE * longest))
+        laws = [e for e in search.forces if e.quasi is not None and e.quasi.law is HARDENING]
+        each = ((e.site, e.quasi.place) for e in laws if e.quasi is not None)
+        return cls(
+            tuple(one for one in each if f.size and reach.scale((one[0], STIFFNESS)) > 0),
+            f,
+            longest,
         )
 
+    def strongest(
+        self, search: ForceSearch, left: Sequence[Unexplained], only: str = ""
+    ) -> list[tuple[str, Swing]]:
+        """Of each spring what explains most of what is `left` of all pieces, the best first; none
+        where noise could do as much. only : the spring that is looked at, of all if none."""
+        found = [
+            (site, Swing.of(pieces, self.f, 2 * self.longest * float(self.f[-1])))
+            for site, place in self.each
+            if only in ("", site) and (pieces := pulls(search, place, left))
+        ]
+        found.sort(key=lambda one: -one[1].gain)
+        if not found or len(found) * found[0][1].chance > ALARM:
+            return []
+        return found
 
-def varying(search: ForceSearch, best: Explanation) -> Varying | None:
-    """The stiffness that varies, by what an explanation leaves of the records; None where noise
-    could do that."""
-    left = search.unexplained(best.fitted)
-    records, reach = search.levels.records, search.reach
-    longest = max(len(p.z) for p in records.pieces) / records.rate_hz
-    # What is slower than the lines that count is as a sensor that wanders.
-    f = np.arange(CYCLES / longest, FASTEST * records.band[1], 1 / (FINE * longest))
-    found: list[tuple[str, Swing]] = []
-    for spring in (e for e in search.forces if e.quasi is not None and e.quasi.law is HARDENING):
-        assert spring.quasi is not None
-        ports = reach.ports(spring.quasi.place, of_speed=False)
-        if ports is None or not f.size or not reach.scale((spring.site, STIFFNESS)) > 0:
-            continue
-        motion = reach.motion(spring.quasi.place, of_speed=False)
-        each = zip(reach.spans, motion, ports.sensors, left, strict=True)
-        found.append((spring.site, Swing.of([Pulled.of(*one) for one in each], f)))
-    if not found:
-        return None
-    found.sort(key=lambda one: -one[1].gain)
-    site, most = found[0]
-    if len(found) * 2 * longest * f[-1] * most.chance > ALARM:
-        return None
-    k = reach.scale((site, STIFFNESS))
-    depth, sd = (math.sqrt(x / most.known) / k for x in (most.gain, 1.0))
-    if depth > 1:  # no stiffness varies by more than all of it: something else is missing
-        return None
-    p = np.exp([(one.gain - most.gain) / 2 for _, one in found])
-    return Varying(
-        sites=tuple(
-            (name, float(share)) for (name, _), share in zip(found, p / p.sum(), strict=True)
-        ),
-        hz=most.hz,
-        depth=depth,
-        sd=sd,
-        gain=most.gain,
-    )
+
+def pulls(search: ForceSearch, place: Place, left: Sequence[Unexplained]) -> list[Pulled]:
+    """What is left of all pieces, taken back to a place; none where no force acts there."""
+    reach = search.reach
+    ports = reach.ports(place, of_speed=False)
+    if ports is None:
+        return []
+    motion = reach.motion(place, of_speed=False)
+    each = zip(reach.spans, motion, ports.sensors, left, strict=True)
+    return [Pulled.of(*one) for one in each]
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +97,8 @@ class Pulled:
     """Of one piece and its repeats.
 
     span, left : of the piece. phi : (M,) the way over the spring. sensors : (M//2 + 1, q) lines of
-    a unit force. times : (rows,) of each the motion. f : (m,) Hz. P : (rows, m). V : (m,) of a row
-    that is once the motion.
+    a unit force. times : (rows,) of each the motion. along : (rows, M) phi pull. f : (m,) Hz.
+    P : (rows, m). V : (m,) of a row that is once the motion.
     """
 
     span: Span
@@ -116,6 +106,7 @@ class Pulled:
     phi: Float
     sensors: Complex
     times: Float
+    along: Float
     f: Float
     P: Complex
     V: Float
@@ -131,8 +122,9 @@ class Pulled:
         size = 2 * phi.size  # nothing wraps around
         phi = phi * span.alive
         f = np.arange(size // 2 + 1) * (span.rate_hz * span.n / span.samples / size)
-        P, V = np.fft.rfft(phi * pull, size, axis=1), _variance(span, phi, sensors, left)
-        return cls(span, left, phi, sensors, times, np.asarray(f, np.float64), P, V)
+        along = phi * pull
+        P, V = np.fft.rfft(along, size, axis=1), _variance(span, phi, sensors, left)
+        return cls(span, left, phi, sensors, times, along, np.asarray(f, np.float64), P, V)
 
     def chi_square(self) -> Float:
         """(m,) 2 |P|^2/V of all rows; none where no sensor shows the force."""
@@ -143,10 +135,7 @@ class Pulled:
     def exact(self, hz: float) -> tuple[float, int, float]:
         """Chi-square of all rows at a frequency, beyond what another constant stiffness of each
         does, its degrees of freedom, and what is known of both phases of a swing."""
-        at = int(np.argmin(np.abs(self.f - hz)))
-        t = np.pi * self.f[at] / self.f[-1] * np.arange(self.phi.size)
-        G = self._products([np.ones(t.size), np.cos(t), np.sin(t)])
-        pull = np.stack([self.P[:, 0].real, self.P[:, at].real, -self.P[:, at].imag]) / self.times
+        G, pull = self._normal([hz])
         if not G[0, 0] > ROUNDED * self.V.max():
             return 0.0, 0, 0.0
         share = G[1:, :1] / G[0, 0]
@@ -154,13 +143,50 @@ class Pulled:
         shown = power > ONE_PHASE * np.trace(G[1:, 1:])
         along = phases.T @ (pull[1:] - share * pull[:1])
         chi2 = np.sum(along[shown] ** 2 / power[shown, None])
-        known = float(np.sum(power[shown])) * float(self.times @ self.times)
+        # Records that repeat each other are turned, by which their sum of squares stays.
+        known = float(np.sum(power[shown])) * float(self.times[0] ** 2)
         return float(chi2), int(np.count_nonzero(shown)) * self.times.size, known
 
-    def constants(self) -> tuple[Float, Float]:
-        """(rows,) how far a constant change lies along what is left, and what is known of it."""
+    def constants(self) -> tuple[Float, Float, Float]:
+        """(rows,) how far a constant change lies along what is left, what is known of it, and of
+        one that is as large in each record as the motion is."""
         known = self._products([np.ones(self.phi.size)])[0, 0]
-        return self.P[:, 0].real, np.asarray(known * self.times**2)
+        return self.P[:, 0].real / self.times, np.full(self.times.size, known), self.times
+
+    def changes(self, each: Sequence[float]) -> Float:
+        """(rows, 1 + 2 m) of a row that is once the motion: a constant, and the cosine and sine by
+        which a stiffness swings at m frequencies."""
+        G, pull = self._normal(each)
+        return np.asarray(np.linalg.lstsq(G, pull, rcond=ONE_PHASE**2)[0].T)
+
+    def without(self, hz: float) -> Pulled:
+        """The same less what a constant and a swing do at their best."""
+        span, left = self.span, self.left
+        forces = self.phi * (self.changes([hz]) @ np.array(self._waves([hz])))
+        lines = [span.lines(span.damped(e), self.sensors, left.k) / span.times for e in forces]
+        white = left.white - np.einsum("nij,rnj->rni", left.root, np.stack(lines))
+        return Pulled.of(span, self.phi, self.sensors, replace(left, white=white))
+
+    def added(self, changes: Float, each: Sequence[float]) -> Float:
+        """(rows, samples, q) what sensors show of these, at the record's rate."""
+        forces = self.phi * (changes @ np.array(self._waves(each)))
+        return np.stack([self.span.sampled(self.span.damped(e), self.sensors) for e in forces])
+
+    def _waves(self, each: Sequence[float]) -> list[Float]:
+        """(M,) a constant, then cosine and sine of each frequency. Time runs from the record's
+        first sample; the input before it stands at the end."""
+        M, span = self.phi.size, self.span
+        t = np.arange(M, dtype=float)
+        t[M - span.before :] -= M
+        turn = 2 * np.pi * t * (span.samples / span.n / span.rate_hz)
+        both = (wave(hz * turn) for hz in each for wave in (np.cos, np.sin))
+        return [np.ones(M), *both]
+
+    def _normal(self, each: Sequence[float]) -> tuple[Float, Float]:
+        """Normal equations (1 + 2 m, 1 + 2 m) of a constant and both phases of each frequency, of
+        a row that is once the motion, and their right sides (1 + 2 m, rows)."""
+        shapes = self._waves(each)
+        return self._products(shapes), np.array(shapes) @ self.along.T / self.times
 
     def _products(self, shapes: Sequence[Float]) -> Float:
         """Of what forces phi x (M,) add to the whitened lines of a row that is once the motion."""
@@ -199,25 +225,56 @@ def _variance(span: Span, phi: Float, sensors: Complex, left: Unexplained) -> Fl
 @dataclass(frozen=True, slots=True)
 class Swing:
     """At one spring, where most is explained. hz : 0 for what differs from record to record. chi2,
-    with `free` degrees of freedom. known : of its amplitude's square, or of its mean square."""
+    with `free` degrees of freedom. known : of its amplitude's square, or of its mean square. off :
+    Hz, standard deviation of its frequency. tries : independent ones at this spring, of which it
+    is the best: half the chance is that of a swing at any frequency. louder : the noise there
+    than it is told."""
 
     hz: float
     chi2: float
     free: int
     known: float
+    tries: float = 2.0
+    off: float = 0.0
+    louder: float = 1.0
 
     @classmethod
-    def of(cls, pieces: Sequence[Pulled], f: Float) -> Swing:
-        """Of all pieces, at one of f (m,) Hz or from record to record."""
-        scan = np.sum([np.interp(f, one.f, one.chi_square()) for one in pieces], axis=0)
-        hz = float(f[np.argmax(scan)])
-        chi2, free, known = zip(*(one.exact(hz) for one in pieces), strict=True)
-        # Where noise is louder than it is told, at the lowest lines say, it is so beside too.
-        near = scan[(f > hz / 2) & (f < 2 * hz)]
+    def of(cls, pieces: Sequence[Pulled], f: Float, many: float) -> Swing:
+        """Of all pieces, at one frequency of f (m,) Hz, of which so many are independent, or from
+        record to record."""
+        hz = float(f[np.argmax(_scan(pieces, f))])
+        # Where noise is louder than it is told, at the lowest lines say, it is so beside too, also
+        # without the swing, which is as wide as the motion is short.
+        near = _scan([one.without(hz) for one in pieces], f)[(f > hz / 2) & (f < 2 * hz)]
         usual = stats.chi2.median(2 * sum(one.times.size for one in pieces))
         louder = max(float(np.median(near)) / float(usual), 1.0)
-        swing = cls(hz, sum(chi2) / louder, sum(free), sum(known) / 2 / louder)
-        return min(swing, _between(pieces), key=lambda one: one.chance)
+        return min(
+            cls._at(pieces, hz, 2 * many, louder), _between(pieces), key=lambda one: one.chance
+        )
+
+    @classmethod
+    def _at(
+        cls, pieces: Sequence[Pulled], hz: float, tries: float, louder: float, off: float = 0.0
+    ) -> Swing:
+        chi2, free, known = zip(*(one.exact(hz) for one in pieces), strict=True)
+        return cls(hz, sum(chi2) / louder, sum(free), sum(known) / 2 / louder, tries, off, louder)
+
+    def closer(self, pieces: Sequence[Pulled], step: float) -> Swing:
+        """The same at the best frequency within a step (Hz) of its own."""
+        if not self.hz > 0:
+            return self
+
+        def lost(hz: float) -> float:
+            return -sum(one.exact(hz)[0] for one in pieces)
+
+        ends = (self.hz - step, self.hz + step)
+        found = optimize.minimize_scalar(
+            lost, bounds=ends, method="bounded", options={"xatol": FLAT * step}
+        )
+        hz, half = float(found.x), step / 2
+        fall = (lost(hz - half) + lost(hz + half)) / 2 - float(found.fun)
+        off = half / math.sqrt(max(fall / self.louder, 1.0))
+        return self._at(pieces, hz, self.tries, self.louder, off)
 
     @property
     def gain(self) -> float:
@@ -226,16 +283,30 @@ class Swing:
 
     @property
     def chance(self) -> float:
-        """That noise makes as much at one frequency."""
-        return float(stats.chi2.sf(self.chi2, self.free)) if self.free else 1.0
+        """That noise makes as much at this spring."""
+        return self.tries * float(stats.chi2.sf(self.chi2, self.free)) if self.free else 1.0
+
+    @property
+    def evidence(self) -> float:
+        """Logarithm of the likelihood that it adds, of random phases whose variance is the most
+        likely one: (chi2 - free - free log(chi2/free))/2, less that of all that was tried."""
+        if not 0 < self.free < self.chi2:
+            return 0.0
+        added = (self.gain - self.free * math.log(self.chi2 / self.free)) / 2
+        return added - math.log(self.tries)
+
+
+def _scan(pieces: Sequence[Pulled], f: Float) -> Float:
+    """Chi-square (m,) of all pieces at f (m,) Hz."""
+    return np.asarray(np.sum([np.interp(f, one.f, one.chi_square()) for one in pieces], axis=0))
 
 
 def _between(pieces: Sequence[Pulled]) -> Swing:
     """What differs from record to record: a constant of each, but for what all have in common.
     Repeats differ by what they do not have in common."""
-    each = [one.constants() for one in pieces]
-    P, known = (np.concatenate(x) for x in zip(*each, strict=True))
-    first = np.cumsum([0, *(len(x) for x, _ in each[:-1])])
+    P, known, times = (np.concatenate(x) for x in zip(*(one.constants() for one in pieces),
+                                                       strict=True))  # fmt: skip
+    first = np.cumsum([0, *(one.times.size for one in pieces[:-1])])
     seen = known > ROUNDED * known.max(initial=0.0)
     common = first[seen[first]]
     free = int(np.count_nonzero(seen)) - min(len(common), 1)
@@ -243,5 +314,6 @@ def _between(pieces: Sequence[Pulled]) -> Swing:
         return Swing(0.0, 0.0, 0, 1.0)
     chi2 = float(np.sum(P[seen] ** 2 / known[seen]))
     if len(common):
-        chi2 -= float(np.sum(P[common])) ** 2 / float(np.sum(known[common]))
-    return Swing(0.0, chi2, free, float(np.sum(known[seen])))
+        t = times[common]
+        chi2 -= float(t @ P[common]) ** 2 / float(t**2 @ known[common])
+    return Swing(0.0, chi2, free, float(np.mean(known[seen])) * free)

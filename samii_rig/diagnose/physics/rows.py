@@ -55,6 +55,7 @@ _ROWS = (
     Physics("valve_deadband", "a dead band of the valve"),
     Physics("backlash", "play"),
     Physics("cubic_stiffness", "a joint that stiffens or softens"),
+    Physics("stiffness_variation", "a stiffness that is not constant"),
     Physics("hysteresis", "a part that sticks, then slips"),
     Physics("flow_saturation", "a flow that saturates"),
     Physics("output_saturation", "a clipped command"),

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from samii_rig.diagnose.data.measured import Measured
+from samii_rig.diagnose.fit.between_runs import VARIATION
 from samii_rig.diagnose.fit.classes import Class
 from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.intervals import values_of
@@ -46,6 +47,14 @@ def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> t
         place = found[POSITION].value if POSITION in found else effect.position
         out.append(Cause(*effect.name, min(p, 1.0), equivalents, found, place))
     return tuple(out)
+
+
+def varying(judged: Judgement) -> tuple[Cause, ...]:
+    """The stiffness that is not constant, if one is."""
+    if (found := judged.varies) is None:
+        return ()
+    site, p = found.sites[0]
+    return (Cause(VARIATION, site, p * judged.right, (), found.parameters),)
 
 
 def unit_of(effect: Effect, found: dict[str, Value]) -> str:
@@ -112,8 +121,8 @@ def told(judged: Judgement) -> list[str]:
 def sites(judged: Judgement) -> list[tuple[str, float]]:
     """Probability of each site over all explanations and what they are not told apart from, the
     most probable first. Sites of what was chosen are there however improbable."""
-    if judged.beyond is not None:
-        return [(s, p) for s, p in judged.beyond.sites if p >= SHOWN]
+    if judged.varies is not None:
+        return [(s, p) for s, p in judged.varies.sites if p >= SHOWN]
     total: dict[str, float] = defaultdict(float)
     for c, share in zip(judged.classes, judged.placed, strict=True):
         for member, part in c.parts():

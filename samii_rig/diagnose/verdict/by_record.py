@@ -12,7 +12,7 @@ from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
-from samii_rig.diagnose.forces.varying import varying
+from samii_rig.diagnose.forces.variation import Variation, variation
 from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
@@ -23,9 +23,6 @@ SPENT = (
     "not every force that may act was computed to the end, as the records are long; fewer of them "
     "or a narrower band would let it"
 )
-# Of what is left, that a stiffness which is not constant must explain: what a linear model lacks
-# is another stiffness to every excitation.
-NEARLY_ALL = 0.8
 MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 
 
@@ -69,7 +66,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         if forced.spent:
             looked = replace(looked, said=(*looked.said, SPENT))
     if forces is not None:
-        looked = _constant(forces, looked, (forced or search).problem.expected)
+        search.begin("whether stiffnesses are constant")
+        looked = _constant(forces, forced or search, looked, len(case.runs))
     given = Given.of(search, case.runs, case.clean.samples)
     return _agreeing(case, forced or search, first, bands, looked, [given])
 
@@ -100,9 +98,11 @@ def _agreeing(
     left: float | None = None,
 ) -> Diagnosis:
     """The answer, with what the recordings of one state differ by, where they are of several."""
-    if any(len(one.runs) > 1 for one in given):
+    # What was found to differ from record to record is what they do not agree in.
+    between = looked.judged.verdict in verdict.SAID and looked.judged.between
+    if not between and any(len(one.runs) > 1 for one in given):
         search.begin("whether the recordings agree")
-    apart = states_apart(given, left)
+    apart = [] if between else states_apart(given, left)
     for one in apart:
         looked = replace(looked, judged=verdict.of_several_states(looked.judged, one.part))
     return of_states(_answer(case, search, first, bands, looked), apart)
@@ -152,6 +152,8 @@ def _answer(
         gap=looked.gap,
         used=search.used(),
     )
+    if isinstance(varies := looked.judged.varies, Variation):
+        shown = replace(shown, with_causes=varies.after)
     of_lines = case.clean.of_lines
     clean = replace(case.clean, told=tuple(w for w in case.clean.told if w not in of_lines))
     return told(replace(case, clean=clean), search, looked.judged, shown, looked.said)
@@ -214,24 +216,23 @@ def _winning(forces: ForceSearch | None) -> ForceSearch | None:
     return forces if forces is not None and forces.won else None
 
 
-def _constant(forces: ForceSearch, looked: _Looked, expected: float) -> _Looked:
-    """The same, but where a stiffness varies something is missing; and that in words. expected : of
-    chi-square."""
+def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files: int) -> _Looked:
+    """The same, but where a stiffness varies that is the answer: in the place of another that the
+    data make less likely, or in words beside it. search : what was looked at. files : recordings.
+    """
     judged = looked.judged
-    drop = judged.evidence.drop
-    if judged.verdict in verdict.SAID:
-        # In the place of what is said, or beside it.
-        base = verdict.as_meant(forces, judged.best)
-        other = varying(forces, base)
-        left = base.fitted.chi2 - forces.problem.expected
-        if other is not None and other.gain > max(drop, NEARLY_ALL * left):
-            return replace(looked, judged=replace(judged, verdict="unknown", beyond=other))
-    found = varying(forces, judged.best)
-    if found is None or found.gain < NEARLY_ALL * (judged.best.fitted.chi2 - expected):
-        return looked
-    if judged.verdict in verdict.SAID and drop > found.gain:
-        return replace(looked, said=(*looked.said, found.told()))
-    return replace(looked, judged=replace(judged, verdict="unknown", beyond=found))
+    base = verdict.as_meant(forces, judged.best)
+    own = verdict.as_meant(search, judged.best)
+    rival = judged.best.weight - own.weight
+    found = variation(forces, base, files)
+    if found is not None and found.evidence > rival:
+        varies = verdict.varying(judged, own, found, max(rival, 0.0))
+        return _Looked(varies, found.before[1], found.after[1], found.gap, looked.said)
+    if judged.best.effects and judged.best.key != base.key:
+        beside = variation(forces, judged.best, files)
+        if beside is not None and beside.closed >= verdict.PARTLY:
+            return replace(looked, said=(*looked.said, beside.told()))
+    return looked
 
 
 def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:

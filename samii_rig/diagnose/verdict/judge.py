@@ -12,10 +12,11 @@ from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.between_runs import Changing, between_runs
 from samii_rig.diagnose.fit.classes import Class, classes
 from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, threshold
+from samii_rig.diagnose.fit.records import TURN
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.stated import IN_DATA, PLACE, TINY, Evidence, probability
-from samii_rig.diagnose.forces.varying import Varying
+from samii_rig.diagnose.forces.variation import Variation
 from samii_rig.diagnose.result import Gap, Verdict
 
 NOTHING = 0.2  # probability of nothing missing below which it is called missing
@@ -35,7 +36,8 @@ class Judgement:
 
     nothing : probability of nothing missing. right : that the chosen explanation is right, up to
         its class, by its evidence. inflation : factor on covariances for what it leaves.
-    beyond : what is in no table and explains the data better; the place is then its own.
+    varies : a stiffness that is not constant, where that explains the data better than all classes;
+    the place is then its own.
     partly : whether the effects leave much of the mismatch, and more than noise.
     """
 
@@ -45,7 +47,7 @@ class Judgement:
     right: float
     evidence: Evidence
     inflation: float
-    beyond: Changing | Varying | None = None
+    varies: Variation | Changing | None = None
     partly: bool = False
 
     @property
@@ -54,15 +56,20 @@ class Judgement:
         return self.classes[0].first
 
     @property
+    def between(self) -> bool:
+        """Whether a stiffness differs from record to record."""
+        return self.varies is not None and "spread" in self.varies.parameters
+
+    @property
     def shares(self) -> tuple[float, ...]:
         """Probability of each class; what is left to one is of what was not looked at."""
-        shares = self._shared(self.right)
-        if self.beyond is None:
-            return shares
-        return tuple((1 - max(p for _, p in self.beyond.sites)) * share for share in shares)
+        return self._shared(self.right)
 
     def _shared(self, first: float) -> tuple[float, ...]:
         """Of each class, where that of the first is known."""
+        if self.varies is not None:
+            total = sum(c.probability for c in self.classes)
+            return tuple((1 - first) * c.probability / total for c in self.classes)
         if not self.best.effects:
             return tuple(c.probability for c in self.classes)
         others = [c.probability for c in self.classes[1:]]
@@ -97,35 +104,75 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
     ordered = tuple(_chosen_first(grouped, nothing))
     evidence = _evidence(search, ordered, ranked, decide)
     said = _verdict(ordered[0], evidence, search, decide)
-    beyond = _beyond(search, ordered[0].first, evidence, decide) if said != "no_mismatch" else None
+    varies = (
+        _changing(search, ordered[0].first, evidence, decide) if said != "no_mismatch" else None
+    )
     # Beside more than noise that nothing explains, an effect is believed for the part that is its.
     partly = evidence.closed < PARTLY and _unexplained(evidence, search, decide)
     if partly:
         said = _most(said, evidence)
     return Judgement(
-        verdict="unknown" if beyond else said,
+        # No lines are kept apart on which it could show.
+        verdict="unknown" if varies else said,
         classes=ordered,
         nothing=nothing,
-        right=probability(evidence),
+        right=max(p for _, p in varies.sites) if varies else probability(evidence),
         evidence=evidence,
         inflation=search.temperature,
-        beyond=beyond,
+        varies=varies,
         partly=partly,
     )
 
 
-def _beyond(
+def _changing(
     search: Search, best: Explanation, evidence: Evidence, decide: Measured | None
 ) -> Changing | None:
-    """What is in no table and explains the data better."""
+    """A joint that changes from run to run, where that explains the data better."""
     if any(e.quasi is not None for e in best.effects):
         return None
     if decide is not None and evidence.held > threshold(decide.spread):
         absorbed = evidence.drop <= search.worth
         base = search.nominal if absorbed else best
-        if (changing := between_runs(search, base.fitted, decide)) is not None:
-            return changing
+        return between_runs(search, base.fitted, decide)
     return None
+
+
+def varying(judged: Judgement, base: Explanation, found: Variation, rival: float) -> Judgement:
+    """The same where a stiffness that is not constant explains more than all that was judged.
+    base : what else is right, whose mismatch it explains. rival : logarithm of the evidence of what
+    was judged, over that."""
+    ahead = found.evidence - rival
+    others = sum(p for _, p in found.sites[1:])
+    evidence = Evidence(
+        odds=-math.log(max(others + math.exp(-max(ahead, 0.0)), TINY)),
+        left=found.after[0],
+        held=1.0,
+        effects=1,
+        forced=True,
+        confirmed=found.gap.low > 0,
+        gain=found.evidence,
+        drop=found.gain,
+        names=1,
+        pair=False,
+        closed=found.closed,
+        worth=judged.evidence.worth,
+    )
+    said = _said(evidence)
+    if said == "named" and not (evidence.confirmed and found.again):
+        said = "ambiguous"
+    partly = evidence.closed < PARTLY and not found.inside
+    if partly:
+        said = _most(said, evidence)
+    made = replace(
+        judged,
+        verdict=said,
+        classes=(Class((base,), (0.0,), 0.0), *judged.classes),
+        right=probability(evidence),
+        evidence=evidence,
+        varies=found,
+        partly=partly,
+    )
+    return shown(made, found.gap, evidence.drop / (TURN - 1))
 
 
 def _evidence(
@@ -161,8 +208,14 @@ def _evidence(
 def as_meant(search: Explanations, best: Explanation) -> Explanation:
     """The nominal model of what was meant to be recorded: with what is no physics of `best`, which
     no physics gets the credit for."""
-    meant = frozenset(e.key for e in best.effects if not e.physical)
-    return search.found.get(meant, search.nominal)
+    meant = tuple(e for e in best.effects if not e.physical)
+    key = frozenset(e.key for e in meant)
+    if key not in search.found:
+        own = zip(best.effects, map(best.fitted.model.own, range(len(best.effects))), strict=True)
+        more = [best.fitted.x[k] for e, at in own if not e.physical for k in at]
+        if (end := search.refitted(meant, search.nominal, more)) is not None:
+            search.keep(meant, end)
+    return search.found.get(key, search.nominal)
 
 
 def confirmed(judged: Judgement) -> Judgement:

@@ -98,11 +98,11 @@ def told(
     if len(set(case.lines.outputs)) == 1 and len(best.effects) > 1:
         # Trials of four channels say nothing of how often one curve tells several places apart.
         judged = verdict.doubted(judged, "ambiguous")
-    causes = answer.causes_of(judged.classes[0], judged) if judged.verdict in verdict.SAID else ()
+    own = answer.varying(judged) or answer.causes_of(judged.classes[0], judged)
+    causes = own if judged.verdict in verdict.SAID else ()
     if not causes:
         judged = verdict.without_causes(judged)
     missing = judged.verdict != "no_mismatch"
-    own = answer.causes_of(judged.classes[0], judged)
     if not missing and best.effects and not own:
         # The model is held against what was meant to be recorded.
         shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
@@ -111,11 +111,13 @@ def told(
         words += answer.told(judged)
     words += (*said, *clean.lacks)
     why, experiment, gain = next_levels(judged) or next_experiment(search, judged)
-    if judged.beyond is not None:
-        why, experiment, gain = (*REPEAT, None)
+    if judged.varies is not None:
+        named = judged.verdict == "named"
+        why, experiment, gain = ("", "", None) if named else (*REPEAT, None)
     if doubt and missing:
         why, experiment, gain = doubt.why, doubt.experiment, None
     ranked = list(zip(judged.classes, judged.shares, strict=True))[len(causes) > 0 :]
+    untold = judged.varies.told() if judged.varies is not None and not causes else ""
     alternatives = tuple(
         (answer.causes_of(c, judged, share), share)
         for c, share in ranked[:ALTERNATIVES]
@@ -138,16 +140,16 @@ def told(
         experiment=experiment,
         outside=judged.outside,
         rig=explained(best.fitted) if best.effects else None,
-        traces=traces(search, judged) if missing and judged.beyond is None else (),
+        traces=traces(search, judged) if missing and judged.varies is None else (),
         moved=answer.moved(best.fitted),
         could_hide=could_hide(*search.beside(best)),
         used=shown.used,
-        sigma=math.sqrt(max(judged.evidence.drop, 0.0)) if best.effects else 0.0,
+        sigma=math.sqrt(max(judged.evidence.drop, 0.0)) if best.effects or judged.varies else 0.0,
         gain=gain,
         evidence={
             **judged.evidence.plain(),
-            "beyond": judged.beyond is not None,
+            "beyond": bool(untold),
             "causes": [c.plain() for c in own],
         },
-        beyond=judged.beyond.told() if judged.beyond is not None else "",
+        beyond=untold,
     )

@@ -196,7 +196,7 @@ def _verdict(found: Diagnosis) -> tuple[Mark, str, str]:
             title = "Two numbers of the rig file are wrong"
         return "bad", title, f"{' and '.join(one.told() for one in found.exact)}."
     if found.beyond:
-        return "bad", "Something is missing that is in no table", sentence(found.beyond)
+        return "bad", "Something is missing that is not named for sure", sentence(found.beyond)
     places = suspects(found)
     where = "The data do not tell where it is."
     site, p = next(iter(places.items()), ("", 0.0))

@@ -1,0 +1,235 @@
+"""A stiffness that is not constant, as an explanation: what it does is taken out of the records.
+
+What varies passes for noise, so the noise that is told with it in the records is too much. So, as
+with every force, what it adds to the sensors is computed in time, the records less that are those
+of a linear rig, and the likelihood is made anew about them: its noise, its parameters, and what
+varies still. A swing is linear in its two phases (Born's approximation, `varying`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from samii_rig.diagnose.fit.between_runs import STIFFNESS, spread_of
+from samii_rig.diagnose.fit.exact import NINETY
+from samii_rig.diagnose.fit.explanations import Explanation, threshold
+from samii_rig.diagnose.fit.gap import gap_of
+from samii_rig.diagnose.fit.records import Whole, fitted_lines
+from samii_rig.diagnose.fit.refit import Fitted
+from samii_rig.diagnose.forces.search import ForceSearch
+from samii_rig.diagnose.forces.varying import Pulled, Springs, Swing, pulls
+from samii_rig.diagnose.result import Gap, Value
+from samii_rig.likelihood.pieces import Piece
+from samii_rig.likelihood.unexplained import Unexplained
+from samii_rig.types import Float
+
+ROUNDS = 6  # times that the likelihood is made anew at most: 2 to 4 were usual
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """A stiffness that is not constant.
+
+    sites : (site, probability among springs), the likeliest first. parameters : of the largest
+    change there, by symbol. evidence : logarithm of the likelihood that it adds, in units of the
+    noise without it, which holds what varies. All else is in units of the noise with it. gain : of
+    chi-square on the lines fitted. before, after : chi-square per degree of freedom without it and
+    with it, on the lines fitted and on those shown. gap : on those shown. inside : whether what it
+    leaves of the lines fitted is no more than noise. again : whether records of one level differ,
+    or one in itself, so that it is no law of the amplitude.
+    """
+
+    sites: tuple[tuple[str, float], ...]
+    parameters: dict[str, Value]
+    evidence: float
+    gain: float
+    before: tuple[float, float]
+    after: tuple[float, float]
+    gap: Gap
+    inside: bool
+    again: bool
+
+    @property
+    def closed(self) -> float:
+        """Part of what is left over noise that it explains, on the lines fitted."""
+        gap = self.before[0] - 1
+        return (self.before[0] - self.after[0]) / gap if gap > 0 else 0.0
+
+    def told(self) -> str:
+        """In words."""
+        if "depth" in self.parameters:
+            depth, f = self.parameters["depth"].times(100.0), self.parameters["f"]
+            how = f"swings at {f.value:.3g} Hz by {depth.value:.2g} % ({depth.within()} %)"
+        else:
+            spread = self.parameters["spread"].times(100.0)
+            how = f"varies between records by {spread.value:.2g} % ({spread.within()} %)"
+        return f"the stiffness of {self.sites[0][0]} is not constant: it {how}"
+
+
+def variation(search: ForceSearch, best: Explanation, files: int) -> Variation | None:
+    """The stiffness that varies, by what a linear explanation leaves of the records; None where
+    noise could do that. files : recordings, each of which may have a stiffness of its own."""
+    springs = Springs.of(search)
+    found = springs.strongest(search, _some(search.unexplained(best.fitted)))
+    if not found:
+        return None
+    site, first = found[0]
+    k = search.reach.scale((site, STIFFNESS))
+    if first.gain > first.known * k**2:  # none varies by more than all of it: something else does
+        return None
+    taken = _Taken(search, best.fitted, springs, site)
+    for _ in range(ROUNDS):
+        if not taken.closer(best):
+            break
+    before = taken.left(search.levels, best.fitted)
+    after = taken.left(taken.search.levels, taken.fitted)
+    each = 2.0 * search.levels.sensor.size
+    p = np.exp([(one.gain - first.gain) / 2 for _, one in found])
+    names = [name for name, _ in found]
+    return Variation(
+        sites=tuple(zip(names, (p / p.sum()).tolist(), strict=True)),
+        parameters=taken.parameters(k, files),
+        evidence=first.evidence - math.log(len(springs.each)),
+        gain=float(np.sum(before[0] - after[0])) * each,
+        before=(float(np.mean(before[0])), float(np.mean(before[1]))),
+        after=(float(np.mean(after[0])), float(np.mean(after[1]))),
+        gap=gap_of(before[1], after[1], np.ones(after[1].size)),
+        inside=bool(np.mean(after[0]) < threshold(taken.search.spread)),
+        again=taken.again,
+    )
+
+
+@dataclass
+class _Taken:
+    """The records less what the variation of one spring adds to them.
+
+    search, fitted : of these, and a model of them. swings : what varies. changes : of each piece,
+    as `Pulled.changes` has them, with none at first.
+    """
+
+    search: ForceSearch
+    fitted: Fitted
+    springs: Springs
+    site: str
+    swings: list[Swing] = field(default_factory=list)
+    changes: list[Float] = field(default_factory=list)
+    pieces: list[Pulled] = field(default_factory=list)
+
+    @property
+    def hz(self) -> list[float]:
+        """Frequencies at which it swings."""
+        return [one.hz for one in self.swings if one.hz > 0]
+
+    def closer(self, best: Explanation) -> bool:
+        """Take out what varies still, and make the likelihood anew. False if noise could do it."""
+        place, step = dict(self.springs.each)[self.site], 1 / self.springs.longest
+        left = _some(self.search.unexplained(self.fitted))
+        self.pieces = pulls(self.search, place, left)
+        more = self.springs.strongest(self.search, left, self.site)
+        if more and all(abs(more[0][1].hz - one.hz) > step for one in self.swings):
+            self.swings.append(more[0][1].closer(self.pieces, step))
+        found = self._changes()
+        levels = self.search.levels
+        taken = tuple(
+            _less(piece, one.added(x, self.hz))
+            for piece, one, x in zip(levels.records.pieces, self.pieces, found, strict=True)
+        )
+        levels = replace(levels, records=replace(levels.records, pieces=taken))
+        self.search = self.search.on(levels, self.fitted)
+        again = self.search.refitted(best.effects, replace(best, fitted=self.fitted))
+        self.fitted = again or self.fitted
+        before = self.changes or [np.zeros((len(x), 0)) for x in found]
+        self.changes = [_summed(x, y) for x, y in zip(before, found, strict=True)]
+        return bool(more)
+
+    def _changes(self) -> list[Float]:
+        """Of each piece what the records still vary by. A constant counts where it is not the same
+        in all records."""
+        found = [one.changes(self.hz) for one in self.pieces]
+        if any(one.hz == 0 for one in self.swings):
+            known = [one.constants()[1][0] for one in self.pieces]
+            times = [one.times[0] for one in self.pieces]
+            mean = sum(g * t * x[0, 0] for g, t, x in zip(known, times, found, strict=True))
+            mean /= sum(g * t**2 for g, t in zip(known, times, strict=True))
+            for x, t in zip(found, times, strict=True):
+                x[0, 0] -= t * mean
+        else:
+            for x in found:
+                x[:, 0] = 0.0
+        return found
+
+    @property
+    def again(self) -> bool:
+        """Whether records of one level are held against each other."""
+        levels = [p.levels for p in self.search.levels.records.pieces]
+        more = any(one.times.size > 1 for one in self.pieces)
+        return more or len(set(levels)) < len(levels) or any(self.hz)
+
+    def parameters(self, k: float, files: int) -> dict[str, Value]:
+        """Of the deepest swing, with intervals of 90 %, or of what records differ by where that is
+        more. k : the stiffness."""
+        swings = [self._depth(one, k) for one in self.swings if one.hz > 0]
+        apart = [self._spread(k, files) for one in self.swings if one.hz == 0]
+        return max((*swings, *apart), key=lambda found: next(iter(found.values())).value)
+
+    def _depth(self, swing: Swing, k: float) -> dict[str, Value]:
+        """Of phases that are random in each record."""
+        at = 1 + 2 * self.hz.index(swing.hz)
+        power = [one.exact(swing.hz)[2] for one in self.pieces]
+        size = [float(np.sum(x[:, at : at + 2] ** 2)) / one.times[0] ** 2
+                for x, one in zip(self.changes, self.pieces, strict=True)]  # fmt: skip
+        depth = math.sqrt(float(np.average(size, weights=power)))
+        sd = math.sqrt(2 / sum(power) * swing.louder)
+        low, high = max(depth - NINETY * sd, 0.0), depth + NINETY * sd
+        f, off = swing.hz, NINETY * swing.off
+        return {
+            "depth": Value(depth / k, "1", low / k, high / k),
+            "f": Value(f, "Hz", f - off, f + off),
+        }
+
+    def _spread(self, k: float, files: int) -> dict[str, Value]:
+        """Of normal stiffnesses, as many as there are recordings; chi-square."""
+        x = np.concatenate([x[:, 0] for x in self.changes])
+        known = np.concatenate([one.constants()[1] for one in self.pieces])
+        free = x.size - 1
+        square = max(float(known @ x**2) - free, 0.0) / float(np.mean(known))
+        # Records of one recording have its stiffness.
+        own = min(free, files - 1) if files > 1 else free
+        return {"spread": spread_of(square / free / k**2, own)}
+
+    def left(self, levels: Whole, fitted: Fitted) -> tuple[Float, Float]:
+        """Of the lines fitted (n,) and of those shown (m,), what a fit leaves of records, 1 in the
+        mean; what repeats differ by, too."""
+        other = copy(self.search)
+        other.levels = levels
+        left = other.unexplained(fitted)
+        own = [np.sum(np.abs(x.white) ** 2, axis=2) / (2 * x.white.shape[2]) for x in left]
+        on = [fitted_lines(x.k) for x in left]
+        seen = [x[:, m].ravel() for x, m in zip(own, on, strict=True)]
+        kept = [x[:, ~m].ravel() for x, m in zip(own, on, strict=True)]
+        return np.concatenate(seen), np.concatenate(kept)
+
+
+def _summed(before: Float, more: Float) -> Float:
+    """Changes (rows, m), and those (rows, m or more) that come to them."""
+    out = more.copy()
+    out[:, : before.shape[1]] += before
+    return out
+
+
+def _some(left: Sequence[Unexplained]) -> list[Unexplained]:
+    """On the lines that are fitted."""
+    each = [(x, fitted_lines(x.k)) for x in left]
+    return [replace(x, k=x.k[on], root=x.root[on], white=x.white[:, on]) for x, on in each]
+
+
+def _less(piece: Piece, added: Float) -> Piece:
+    """A piece and its repeats less what is added to each (1 + repeats, n, q)."""
+    rest = zip(piece.repeats, added[1:], strict=True)
+    repeats = tuple(replace(x, z=x.z - y) for x, y in rest)
+    return replace(piece, z=piece.z - added[0], repeats=repeats)
