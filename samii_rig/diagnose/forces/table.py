@@ -109,15 +109,15 @@ def _drive(reach: Reach, source: str, actuator: ActuatorSpec, *, turns: bool) ->
     largest = reach.largest(drive)
     # What is narrower than a step of the command's converter is that converter's rounding.
     low, high = max(WIDTHS[0] * largest, actuator.resolution), WIDTHS[1] * largest
-    if low >= high:
-        return
-    if turns and reach.ports(drive, of_speed=True) is not None:
+    wide = low < high
+    if wide and turns and reach.ports(drive, of_speed=True) is not None:
         yield effect(FRICTION, drive, source, alias, (_log("T_c", unit, low, high),))
     top = _largest(reach, flow, of_speed=False) if turns else 0.0
     if top > 0:
         yield effect(ORIFICE, flow, source, alias, (_log("T_s", "N m", top, WEAKEST_SUPPLY * top),))
     told = Place("command", across)
-    yield effect(OVERLAP, told, source, alias, (_log("width", unit, low, high),))
+    if wide:
+        yield effect(OVERLAP, told, source, alias, (_log("width", unit, low, high),))
     limit = _log("limit", unit, LEAST_LIMIT * largest, largest)
     yield effect(CLIPPED, told, source, alias, (limit,))
 
