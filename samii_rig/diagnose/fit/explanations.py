@@ -83,6 +83,7 @@ class Explanations:
     temperature: float = 1.0
     progress: Progress = lambda _stage: None
     stage: str = "nominal model"
+    partial: ClassVar[bool] = False  # whether all that can be told leaves much of the mismatch
     usual: ClassVar[Usual] = {}  # how long the rest takes, by where it is
     _round: int = 0
     _gross: float = 0.0  # chi-square that the nominal model leaves
@@ -196,6 +197,15 @@ class Explanations:
                 break
             alike += 2 * rho
         return left * alike
+
+    def holds(self, explanation: Explanation) -> bool:
+        """Whether it may be told at all, however probable it is."""
+        return True
+
+    def closed(self, before: Fitted, after: Fitted) -> float:
+        """Part of what one leaves over the noise that the other explains."""
+        a, b = self.ratio(before), self.ratio(after)
+        return (a - b) / (a - 1) if a > 1 else 0.0
 
     def ratio(self, fitted: Fitted) -> float:
         """Chi-square per degree of freedom over all lines, also inside the bins."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.measured import DIFFER
 from samii_rig.diagnose.fit.agreeing import Given, states_apart
+from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
@@ -69,7 +70,21 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         search.begin("whether stiffnesses are constant")
         looked = _constant(forces, forced or search, looked, len(case.runs))
     given = Given.of(search, case.runs, case.clean.samples)
-    return _agreeing(case, forced or search, first, bands, looked, [given])
+    last = forced or search
+    if _not_explained(looked.judged, forced):
+        search.begin("what is missing, beside a discrepancy")
+        last = discrepant = DiscrepantSearch(search)
+        discrepant.settle()
+        looked = _consistent(discrepant, _looked(discrepant))
+    return _agreeing(case, last, first, bands, looked, [given])
+
+
+def _not_explained(judged: Judgement, forced: ForceSearch | None) -> bool:
+    """Whether all that was tried leaves much of the mismatch, and more than noise. A force that is
+    told all the same keeps its answer: it is told by how levels differ, and no response that is
+    the same at all of them does that."""
+    told = forced is not None and judged.verdict in verdict.SAID
+    return judged.partly and judged.beyond is None and not told
 
 
 def by_samples(

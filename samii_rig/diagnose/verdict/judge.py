@@ -95,7 +95,7 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
     thin = _thin(search)
     for key, e in search.found.items():
         search.found[key] = replace(e, fitted=e.fitted.roughly())
-    kept = [e for e in search.ranked() if e.key not in thin]
+    kept = [e for e in search.ranked() if e.key not in thin and search.holds(e)]
     ranked = _decided(search, decide, kept) if decide is not None else kept
     weights = np.array([e.weight for e in ranked])
     p = np.exp(weights - np.max(weights))
@@ -108,7 +108,8 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
         _changing(search, ordered[0].first, evidence, decide) if said != "no_mismatch" else None
     )
     # Beside more than noise that nothing explains, an effect is believed for the part that is its.
-    partly = evidence.closed < PARTLY and _unexplained(evidence, search, decide)
+    much = search.partial or evidence.closed < PARTLY
+    partly = much and _unexplained(evidence, search, decide)
     if partly:
         said = _most(said, evidence)
     return Judgement(
@@ -188,10 +189,9 @@ def _evidence(
     empty = next((e.weight for e in ranked if not e.effects), -math.inf)
     physics = [e.physics for e in first.effects if e.physical]
     base = as_meant(search, first).fitted
-    before, left = search.ratio(base), search.ratio(first.fitted)
     return Evidence(
         odds=math.log(max(chosen.probability, TINY) / max(others, TINY)),
-        left=left,
+        left=search.ratio(first.fitted),
         held=_held(search, decide, first.fitted) if decide is not None else 1.0,
         effects=len(physics),
         forced=any(e.quasi is not None for e in first.effects),
@@ -200,7 +200,7 @@ def _evidence(
         drop=(base.chi2 - first.fitted.chi2) / search.temperature,
         names=chosen.names(),
         pair=len(physics) == 2 and physics[0] == physics[1],
-        closed=(before - left) / (before - 1) if before > 1 else 0.0,
+        closed=search.closed(base, first.fitted),
         worth=search.worth,
     )
 
