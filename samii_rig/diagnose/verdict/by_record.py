@@ -84,7 +84,7 @@ def _not_explained(judged: Judgement, forced: ForceSearch | None) -> bool:
     told all the same keeps its answer: it is told by how levels differ, and no response that is
     the same at all of them does that."""
     told = forced is not None and judged.verdict in verdict.SAID
-    return judged.partly and judged.beyond is None and not told
+    return judged.partly and judged.varies is None and not told
 
 
 def by_samples(
