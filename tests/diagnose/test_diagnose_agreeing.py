@@ -59,19 +59,18 @@ def apart(*runs: Recording) -> Apart | None:
     return found[0] if found else None
 
 
-def test_a_spring_that_differs_between_recordings_is_no_cause_that_both_have(runs):
+def test_a_spring_that_differs_between_two_recordings_is_told_at_its_place(runs):
     both = [runs["one"], runs["stiffer"]]
     few = [e for e in table(RIG, 0.8, 35.0) if e.physics in ("attached_oscillator", "added_mass")]
     found = diagnose(estimate(both), RIG, runs=both, effects=few)
-    assert found.verdict == "unknown"
-    assert found.states == (("one.mcap",), ("stiffer.mcap",))
-    assert not found.causes
-    assert not found.sites
-    what, _, next_ = found.lines()
-    assert what.startswith("The recordings are not of one state of the rig")
-    assert "stiffer.mcap as if of another state of the rig than one.mcap" in next_
-    assert "--before one.mcap --after stiffer.mcap" in next_
-    assert found.plain()["states"] == [["one.mcap"], ["stiffer.mcap"]]
+    assert found.verdict == "named"
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("stiffness_variation", "spring_1")
+    spread = cause.parameters["spread"]
+    assert spread.low is not None
+    assert spread.low < 0.3 / 2**0.5  # of 12 and 15.6 N/m
+    assert spread.high is None or spread.high > 0.3 / 2**0.5
+    assert "spread" in found.lines()[0]
 
 
 def test_recordings_of_one_rig_agree_as_well_as_their_own_noise_lets_them(runs):

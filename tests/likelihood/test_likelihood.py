@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from samii_rig.diagnose.fit.records import _fitted, _shown
+from samii_rig.diagnose.fit.records import _shown, fitted_lines
 from samii_rig.likelihood import pieces
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
@@ -647,4 +647,4 @@ def test_a_spike_that_a_fast_motion_hides_shows_beside_the_prediction():
 def test_one_line_in_ten_is_kept_apart_of_any_comb(every: int):
     k = np.arange(every, 400 * every, every)
     assert np.mean(_shown(k)) == pytest.approx(0.1, abs=0.03)
-    assert np.array_equal(_fitted(k), ~_shown(k))
+    assert np.array_equal(fitted_lines(k), ~_shown(k))
