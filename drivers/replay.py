@@ -49,7 +49,7 @@ class _Recorded:
         self.channels = recording.channels
         self._recording, self._start, self._real = recording, start, real
         self._period = NS / recording.rate_hz
-        commands = recording.values[:, [recording.column(name) for name in self._names]]
+        commands = recording.columns(self._names)
         moving = np.flatnonzero(np.nan_to_num(commands).any(axis=1))
         self._end = int(moving[-1]) + 1 if len(moving) else 0  # row from which all rest
         self._now = 0

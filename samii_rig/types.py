@@ -176,6 +176,14 @@ class Recording:
                 return i
         raise KeyError(name)
 
+    def values_of(self, name: str) -> Float:
+        """(n,) values of one channel, not copied; KeyError if there is none."""
+        return self.values[:, self.column(name)]
+
+    def largest(self, name: str) -> float:
+        """Largest absolute value of a channel, in its unit; 0 where no sample has one."""
+        return float(np.nanmax(np.abs(self.values_of(name)), initial=0.0))
+
     def columns(self, names: Sequence[str]) -> Float:
         """(n, len(names)) values of some channels; those that stand beside each other in this
         order are not copied. KeyError if there is none of a name."""

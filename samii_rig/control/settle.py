@@ -79,7 +79,7 @@ def settling(recording: Recording, sensor: str) -> Settling:
     loops = loops_of(rig)
     reference, edges = _steps(recording, rig, loops, where)
     n = min(b - a for a, b in zip(edges, [*edges[1:], len(reference)], strict=True))
-    y = recording.values[:, recording.column(sensor)]
+    y = recording.values_of(sensor)
     sizes = np.array([reference[e] - reference[e - 1] for e in edges])
     rows = np.array([y[e : e + n] * np.sign(size) for e, size in zip(edges, sizes, strict=True)])
     mean = np.nanmean(rows, axis=0)

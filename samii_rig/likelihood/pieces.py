@@ -171,9 +171,7 @@ def _has(recording: Recording, name: str) -> bool:
 
 
 def _moves(recording: Recording, command: str) -> bool:
-    return _has(recording, command) and bool(
-        np.any(np.nan_to_num(recording.values[:, recording.column(command)]))
-    )
+    return _has(recording, command) and bool(np.any(np.nan_to_num(recording.values_of(command))))
 
 
 def pieces_of(
@@ -203,7 +201,7 @@ def pieces_of(
         each = [_driving(recording, x, values, wired.sensors, slower=slower) for x in wired.inputs]
         for x in wired.inputs:  # what went out is known, limited or not
             if _has(recording, x.command):
-                whole &= np.isfinite(recording.values[:, recording.column(x.command)])
+                whole &= np.isfinite(recording.values_of(x.command))
         v, r, edges = (_beside([one[i] for one in each]) for i in range(3))
         for segment in segments_of(recording):
             if recording.place(segment) in without:

@@ -48,8 +48,8 @@ def is_open(recording: Recording, command: str, sensor: str, kp: float) -> bool:
 
     By the reference; without one, by the sensor's noise, which a loop has in its command.
     """
-    v = _column(recording, command)
-    back = kp * _column(recording, sensor)
+    v = recording.values_of(command)
+    back = kp * recording.values_of(sensor)
 
     def size(x: Float) -> float:
         known = x[np.isfinite(x)]
@@ -76,7 +76,7 @@ def shift_of(recording: Recording) -> int:
     if around.stop - around.start <= 2 * FARTHEST:
         return 0
 
-    theta, v = (_column(recording, name)[around] for name in (sensor, command[0]))
+    theta, v = (recording.values_of(name)[around] for name in (sensor, command[0]))
     sent = asked(recording, command[0], kp, around)
     shifts = range(-FARTHEST, FARTHEST + 1)
     laws = [_Law.of(v, sent, -kp * np.roll(theta, -m)) for m in shifts]
@@ -216,12 +216,8 @@ def _alike(one: Recording, other: Recording) -> bool:
 
 def _driving(recording: Recording) -> list[str]:
     """Columns that drive a run: references that move, in which no loop is, or the commands."""
-    references = [n for n in recording.names("reference") if np.ptp(_column(recording, n)) > 0]
+    references = [n for n in recording.names("reference") if np.ptp(recording.values_of(n)) > 0]
     return references or list(recording.names("command"))
-
-
-def _column(recording: Recording, name: str) -> Float:
-    return np.asarray(recording.values[:, recording.column(name)], np.float64)
 
 
 def _overlap(one: Recording, other: Recording) -> tuple[slice, slice]:
@@ -263,13 +259,13 @@ def _against(first: Recording, recording: Recording) -> int:
     0 where no shift makes them clearly more alike."""
     a, b = _overlap(first, recording)
     driving = _driving(first)[0]
-    v, w = _column(first, driving)[a], _column(recording, driving)[b]
+    v, w = first.values_of(driving)[a], recording.values_of(driving)[b]
     size = float(v @ w) / float(v @ v)
     inside = slice(FARTHEST, v.size - FARTHEST)
     names = [n for n in first.names("sensor") if n in recording.names("sensor")]
     off = np.zeros((len(names), 2 * FARTHEST + 1))
     for row, name in zip(off, names, strict=True):
-        x, y = size * _column(first, name)[a], _column(recording, name)[b]
+        x, y = size * first.values_of(name)[a], recording.values_of(name)[b]
         x, y = (np.nan_to_num(z - np.nanmean(z)) for z in (x, y))
         for i, m in enumerate(range(-FARTHEST, FARTHEST + 1)):
             row[i] = np.mean((np.roll(y, -m) - x)[inside] ** 2)
@@ -306,8 +302,7 @@ def _moved(recording: Recording, m: int, law: str) -> tuple[Recording, Finding |
 
 
 def _about_the_largest(recording: Recording, references: tuple[str, ...]) -> slice:
-    columns = [recording.column(n) for n in references]
-    size = np.max(np.abs(np.nan_to_num(recording.values[:, columns])), axis=1, initial=0.0)
+    size = np.max(np.abs(np.nan_to_num(recording.columns(references))), axis=1, initial=0.0)
     middle = int(np.argmax(size)) if size.size and size.max() > 0 else 0
     first = max(0, min(middle - LOOKED_AT // 2, size.size - LOOKED_AT))
     return slice(first, min(first + LOOKED_AT, size.size) if size.size and size.max() > 0 else 0)

@@ -87,9 +87,7 @@ def select(recording: Recording, input: str | None, outputs: Sequence[str] | Non
                 'one of role "command": what went out to the actuator; a map file says the role'
             )
             raise InputError(where, "channels", list(by_name), expected)
-        moving = [
-            n for n in commands if np.nanmax(np.abs(_column(recording, n)), initial=0.0) > 0.0
-        ]
+        moving = [n for n in commands if recording.largest(n) > 0.0]
         if not moving:
             raise EstimateError(f"{where}: the input {', '.join(commands)} never moves")
         if len(moving) != 1:
@@ -118,7 +116,7 @@ def segments_of(recording: Recording) -> tuple[Segment, ...]:
         )
     references = [c for c in recording.channels if c.role == "reference"]
     driven = references or [c for c in recording.channels if c.role == "command"]
-    peaks = {c: float(np.nanmax(np.abs(_column(recording, c.name)), initial=0.0)) for c in driven}
+    peaks = {c: recording.largest(c.name) for c in driven}
     loudest = max(peaks, key=lambda c: peaks[c]) if peaks else None
     return (
         Segment(
@@ -145,8 +143,8 @@ def reference_of(
         if reference not in {c.name for c in cut.channels}:
             names = ", ".join(c.name for c in cut.channels)
             raise InputError(where, "reference", reference, one_of(reference, names))
-        return _column(cut, reference), reference, None
-    used = [n for n in cut.names("reference") if np.nanmax(np.abs(_column(cut, n)), initial=0) > 0]
+        return cut.values_of(reference), reference, None
+    used = [n for n in cut.names("reference") if cut.largest(n) > 0]
     if not used:
         finding = Finding(
             "closed_loop",
@@ -155,16 +153,16 @@ def reference_of(
             "on it, noise that came through the loop biases the estimate",
             channel=selection.input.name,
         )
-        return _column(cut, selection.input.name), selection.input.name, finding
+        return cut.values_of(selection.input.name), selection.input.name, finding
     if len(used) == 1:
-        return _column(cut, used[0]), used[0], None
+        return cut.values_of(used[0]), used[0], None
     units = {n: cut.channels[cut.column(n)].unit for n in used}
     direct = [n for n in used if units[n] == selection.input.unit]
     angle = [n for n in used if units[n] != selection.input.unit]
     centring = centring_of(cut)
     if len(direct) == 1 and len(angle) == 1 and centring is not None:
         _, kp = centring
-        r = _column(cut, direct[0]) + kp * _column(cut, angle[0])
+        r = cut.values_of(direct[0]) + kp * cut.values_of(angle[0])
         return r, f"{direct[0]} + {kp:g} {angle[0]}", None
     raise InputError(where, "reference", used, "one reference column that is in use, by name")
 
@@ -204,7 +202,3 @@ def _alike(a: Float, b: Float) -> bool:
         return False  # another amplitude, whatever the level is said to be
     size = norms[0] * norms[1]
     return size > 0 and float(a[:n] @ b[:n]) / size > SAME_REFERENCE
-
-
-def _column(recording: Recording, name: str) -> Float:
-    return recording.values[:, recording.column(name)]

@@ -103,7 +103,7 @@ def is_stepped(recording: Recording, segment: Segment) -> bool:
     if segment.kind != "periodic":
         return False
     cut = recording.cut(segment)
-    used = [cut.values[:, cut.column(n)] for n in cut.names("reference")]
+    used = [cut.values_of(n) for n in cut.names("reference")]
     used = [r for r in used if r.size and np.isfinite(r).all() and np.any(r)]
     return len(used) == 1 and one_line(used[0]) is not None
 

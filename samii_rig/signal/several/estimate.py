@@ -56,12 +56,7 @@ def inputs_of(
                     where = r.source or "recording"
                     raise InputError(where, "input", name, one_of(name, known))
         return given
-    moving = [
-        n
-        for r in recordings
-        for n in r.names("command")
-        if np.nanmax(np.abs(r.values[:, r.column(n)]), initial=0.0) > 0
-    ]
+    moving = [n for r in recordings for n in r.names("command") if r.largest(n) > 0]
     names = tuple(dict.fromkeys(moving))
     return names if len(names) > 1 else ()
 

@@ -135,7 +135,7 @@ def gather(
 
 def references_in_use(recording: Recording) -> list[str]:
     """Reference columns that are not zero throughout."""
-    return [n for n in recording.names("reference") if _peak(recording, n) > 0]
+    return [n for n in recording.names("reference") if recording.largest(n) > 0]
 
 
 def outputs_of(group: Group, columns: Columns) -> Group:
@@ -168,14 +168,9 @@ def _without_foreign(e: Experiment, columns: Columns) -> None:
     e.group.findings = seen.findings
 
 
-def _peak(recording: Recording, name: str) -> float:
-    x = recording.values[:, recording.column(name)]
-    return float(np.nanmax(np.abs(x), initial=0.0))
-
-
 def _scale(recordings: Sequence[Recording], columns: Columns) -> Float:
     """(n_ref,) largest value of each reference anywhere, by which volts and radians compare."""
-    peaks = [[_peak(r, c.name) for c in columns.references] for r in recordings]
+    peaks = [[r.largest(c.name) for c in columns.references] for r in recordings]
     top = np.max(peaks, axis=0)
     return np.where(top > 0, top, 1.0)
 
@@ -195,7 +190,7 @@ def _piece(
     kept, _ = whole_rows(cut, names)
     if broken or np.count_nonzero(kept) < LEAST_SAMPLES:
         return None, found
-    z = cut.values[:, [cut.column(n) for n in columns.names]]
+    z = cut.columns(columns.names)
     moves = np.count_nonzero(np.diff(z[:, columns.part("inputs")], axis=0), axis=0)
     driven = Selection(columns.inputs[int(np.argmax(moves))], columns.outputs)
     rest = Selection(columns.inputs[0], (*columns.inputs[1:], *columns.outputs))
@@ -248,11 +243,11 @@ def _waveform(cut: Recording, segment: Segment, columns: Columns, scale: Float) 
     them than inputs also the inputs, which show what a reference drives."""
     shown = columns.references
     if len(shown) < len(columns.inputs):
-        peaks = [np.abs(cut.values[:, cut.column(c.name)]).max() for c in columns.inputs]
+        peaks = [np.abs(cut.values_of(c.name)).max() for c in columns.inputs]
         scale = np.append(scale, np.full(len(peaks), max(*peaks, _TINY)))
         shown = (*shown, *columns.inputs)
     parts = [
-        Waveform.of(cut, segment, cut.values[:, cut.column(c.name)] / x)
+        Waveform.of(cut, segment, cut.values_of(c.name) / x)
         for c, x in zip(shown, scale, strict=True)
     ]
     return Waveform(

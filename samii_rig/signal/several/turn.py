@@ -37,7 +37,7 @@ def by_input(
 
 
 def _moves(cut: Recording, name: str) -> bool:
-    x = cut.values[:, cut.column(name)]
+    x = cut.values_of(name)
     x = x[np.isfinite(x)]
     return bool(x.size) and bool(np.ptp(x) > 0)
 
