@@ -14,6 +14,7 @@ import pytest
 from poses_kit import in_pose, loaded, two_links
 from poses_kit import recorded as swept_in_pose
 from sweep_kit import swept
+from table_kit import table_of
 from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
@@ -61,7 +62,7 @@ def apart(*runs: Recording) -> Apart | None:
 
 def test_a_spring_that_differs_between_two_recordings_is_told_at_its_place(runs):
     both = [runs["one"], runs["stiffer"]]
-    few = [e for e in table(RIG, 0.8, 35.0) if e.physics in ("attached_oscillator", "added_mass")]
+    few = table_of(RIG, 0.8, 35.0, "attached_oscillator", "added_mass")
     found = diagnose(estimate(both), RIG, runs=both, effects=few)
     assert found.verdict == "named"
     (cause,) = found.causes
@@ -87,7 +88,7 @@ def test_the_odd_one_of_three_is_told_though_its_repeats_are_foreign_to_the_othe
 
 
 def between(before: list[Recording], after: list[Recording]) -> Diagnosis:
-    few = [e for e in table(RIG, 0.8, 35.0, signed=True) if e.physics == "added_mass"]
+    few = table_of(RIG, 0.8, 35.0, "added_mass", signed=True)
     states = (State(estimate(runs), runs) for runs in (before, after))
     return changed(*states, RIG, effects=few)
 
@@ -135,7 +136,7 @@ def test_responses_of_two_states_are_told_without_their_samples(runs, tmp_path):
         paths.append(tmp_path / f"{name}.mcap")
         save_frequency_responses(paths[-1], estimate([runs[name]]), [], rig_toml=TOML)
     kept = [read_saved_responses(path) for path in paths]
-    few = [e for e in table(RIG, 0.8, 35.0) if e.physics == "added_mass"]
+    few = table_of(RIG, 0.8, 35.0, "added_mass")
 
     def found_by(some):
         files = [(file.source, file.responses) for file in some]

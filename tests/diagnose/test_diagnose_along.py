@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from elements_kit import ANGLE, BEAM, SOURCE, part
 from elements_kit import rig as made_of
+from table_kit import Effects, table_of
 
-from samii_rig.diagnose.diagnose import table
 from samii_rig.diagnose.fit.intervals import Drawn
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.rigfile import explained, toml
@@ -42,7 +42,7 @@ def _rig(*elements: dict[str, object], sensors: dict[str, tuple[str, float]]) ->
 RIG = _rig(
     part("beam", **BEAM, tau=2e-4), SOURCE, part("rigid_link", "link", **LINK), sensors=SENSORS
 )
-TABLE = table(RIG, *BAND)
+TABLE = Effects(lambda: table_of(RIG, *BAND))
 # What stands at a place, values of its unknowns, and the same part in a rig file.
 PARTS = {
     "added_mass": ([0.2], part("lumped_mass", "part", m=0.2)),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 from poses_kit import BAND, in_pose, loaded, two_links
+from table_kit import Effects, table_of
 
-from samii_rig.diagnose.diagnose import table
 from samii_rig.diagnose.posed import in_poses
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Rig
@@ -23,7 +23,7 @@ def bent(angle: float) -> Rig:
 
 
 RIG = bent(60.0)
-FEW = [e for e in table(RIG, *BAND) if e.physics in KINDS]
+FEW = Effects(lambda: table_of(RIG, *BAND, *KINDS))
 
 
 def test_a_mass_beyond_a_bend_has_its_place_and_size() -> None:
@@ -41,7 +41,7 @@ def test_a_mass_beyond_a_bend_has_its_place_and_size() -> None:
 def test_masses_have_places_of_their_own_where_a_bend_carries_them() -> None:
     level = RIG.model_copy(update={"gravity": 0.0, "pose": None})
     places = {
-        kind: {e.jump.place for e in table(level, *BAND) if e.physics == kind and e.jump}
+        kind: {e.jump.place for e in table_of(level, *BAND, kind) if e.jump}
         for kind in ("added_mass", "viscous_damping")
     }
     assert places["added_mass"]

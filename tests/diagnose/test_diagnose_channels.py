@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from identify_kit import noiseless, samii
+from table_kit import Effects, table_of
 
-from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.model.sampled import sensors_at
@@ -14,13 +15,16 @@ from samii_rig.model.tmm import Chain
 RIG = samii()
 BAND = (0.5, 40.0)
 LINES = np.geomspace(*BAND, 160)
-ALL = table(RIG, *BAND)
-(NOT_HELD,) = (e for e in ALL if e.name == ("input_not_held", "v_2"))
 SENSORS = np.arange(len(RIG.sensor))
+ALL = Effects(lambda: table_of(RIG, *BAND))
+
+
+def not_held():
+    return next(e for e in ALL if e.name == ("input_not_held", "v_2"))
 
 
 def test_an_input_that_is_not_held_has_the_response_of_the_chain_itself():
-    model = Model(RIG, (NOT_HELD,))
+    model = Model(RIG, (not_held(),))
     at = grid(RIG, LINES, SENSORS, np.zeros(SENSORS.size, np.int64))
     found = model.response(np.zeros(model.n), at)
     chain = Chain(RIG).response(LINES)[:, :, 0]
@@ -31,7 +35,7 @@ def test_an_input_that_is_not_held_has_the_response_of_the_chain_itself():
 
 
 def test_it_is_told_and_no_physics_is_named():
-    model = Model(RIG, (NOT_HELD,))
+    model = Model(RIG, (not_held(),))
     at = grid(RIG, LINES, SENSORS, np.zeros(SENSORS.size, np.int64))
     exact = model.response(np.zeros(model.n), at)[:, :, None]
     measured = redraw(noiseless(RIG, LINES), exact, np.random.default_rng(3), 10)

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import pytest
 from sweep_kit import swept
+from table_kit import table_of
 
-from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.exact import lengths
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.report.diagnosis.words import banner
@@ -30,7 +31,7 @@ def run() -> Recording:
 
 def found_by(toml: str, run: Recording) -> Diagnosis:
     rig = parse(Rig, toml, "the rig file")
-    few = [e for e in table(rig, 0.8, 35.0) if e.physics in PHYSICS]
+    few = table_of(rig, 0.8, 35.0, *PHYSICS)
     return diagnose(estimate([run]), rig, runs=[run], effects=few)
 
 
@@ -74,7 +75,7 @@ def longer(*links: str) -> Rig:
 
 
 def test_a_link_with_hardly_any_inertia_about_its_middle_has_a_table():
-    names = {e.name for e in table(longer("link_2"), 0.8, 35.0)}
+    names = {e.name for e in table_of(longer("link_2"), 0.8, 35.0)}
     assert ("added_mass", "link_2") in names
 
 
@@ -83,7 +84,7 @@ def test_two_lengths_that_are_wrong_are_told_together():
     assert lengths(SAMII) == ("link_0.L", "link_1.L", "link_2.L", "link_3_6.L")
     run = swept(SAMII, 0.5, repeats=3, duration=10.0, ring_down=8.0)
     rig = longer("link_1", "link_2")
-    few = [e for e in table(rig, 0.8, 35.0) if e.name == ("added_mass", "link_0")]
+    few = [e for e in table_of(rig, 0.8, 35.0) if e.name == ("added_mass", "link_0")]
     found = diagnose(estimate([run]), rig, runs=[run], effects=few)
     assert found.verdict == "unknown"
     one, other = found.exact

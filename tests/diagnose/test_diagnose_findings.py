@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from identify_kit import noiseless, samii, without_tolerances
 from sweep_kit import swept
+from table_kit import table_of
 
 from samii_rig.diagnose.data import findings, wiring
 from samii_rig.diagnose.diagnose import diagnose, table
@@ -38,7 +39,7 @@ def sound():
 
 @pytest.fixture(scope="module")
 def rivals():
-    return [e for e in table(samii(), 0.8, 35.0) if e.physics in (*RIVALS, "time_offset")]
+    return table_of(samii(), 0.8, 35.0, *RIVALS, "time_offset")
 
 
 def faulty(runs, fault, which=None):

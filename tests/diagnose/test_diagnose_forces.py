@@ -11,10 +11,11 @@ import pytest
 from concealed_kit import SAMII
 from cut_kit import DESIGN, cut_sweeps
 from diagnose_kit import effect
+from table_kit import table_of
 from weak_forces_kit import weak_ones
 
 from samii_rig.diagnose.data.measured import measured
-from samii_rig.diagnose.diagnose import case_of, diagnose, table
+from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.records import RecordProblem, Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
@@ -44,7 +45,7 @@ HARD = 3e7  # N m/rad^3 at joint_1, some 40 noise units
 
 def found_in(runs: list[Recording]) -> Diagnosis:
     """With a table of few linear effects, and all forces."""
-    few = [e for e in table(SAMII, 0.5, 20.0) if e.physics in FEW]
+    few = table_of(SAMII, 0.5, 20.0, *FEW)
     return diagnose(estimate(runs), SAMII, runs=runs, effects=few)
 
 
@@ -65,7 +66,7 @@ def test_a_force_is_named_beside_a_column_that_stands_late(tmp_path: Path):
     (run,) = cut_sweeps(tmp_path, f"cubic_stiffness joint_1 k3={HARD / 3:g}", design=ONE)
     values, late = run.values.copy(), run.column("a_2")
     values[:, late] = np.roll(values[:, late], 3)
-    few = [e for e in table(SAMII, 0.5, 20.0) if e.physics in (*FEW, "column_shifted")]
+    few = table_of(SAMII, 0.5, 20.0, *FEW, "column_shifted")
     runs = [replace(run, values=values)]
     found = diagnose(estimate(runs), SAMII, runs=runs, effects=few)
     assert [(c.physics, c.site) for c in found.causes] == [("cubic_stiffness", "joint_1")]
@@ -142,7 +143,7 @@ def test_no_dead_band_is_narrower_than_a_step_of_the_commands_converter(
 
 
 def forces_of(runs: list[Recording]) -> ForceSearch:
-    few = [e for e in table(SAMII, 0.5, 20.0) if e.physics in FEW]
+    few = table_of(SAMII, 0.5, 20.0, *FEW)
     linear = on_records(case_of(estimate(runs), SAMII, None, few, runs), None)
     assert linear is not None
     return ForceSearch(linear)
@@ -168,7 +169,7 @@ def test_without_recordings_levels_that_differ_are_unknown_and_say_what_is_asked
     runs = cut_sweeps(
         tmp_path, "cubic_stiffness joint_1 k3=3e8", design=replace(ONE, levels=(0.4, 1.0))
     )
-    few = [e for e in table(SAMII, 0.5, 20.0) if e.physics in FEW]
+    few = table_of(SAMII, 0.5, 20.0, *FEW)
     found = diagnose(estimate(runs), SAMII, effects=few)
     assert found.verdict == "unknown"
     assert found.causes == ()
@@ -255,7 +256,7 @@ def test_the_real_motor_has_dry_friction(recordings: Path) -> None:
         for n in (50, 100, 150)
         for f in sorted(recordings.glob(f"*motor-only_swept*amp-{n}_*"))
     ]
-    rivals = [e for e in table(motor, *band) if e.physics in ("viscous_damping", "actuator_lag")]
+    rivals = table_of(motor, *band, "viscous_damping", "actuator_lag")
     linear = on_records(case_of(estimate(runs, band=band), motor, band, rivals, runs), band)
     assert linear is not None
     linear.run(briefly=True)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from identify_kit import samii
+from table_kit import table_of
 
-from samii_rig.diagnose.diagnose import table
 from samii_rig.diagnose.forces.laws import FRICTION, Force
 from samii_rig.diagnose.forces.model import model_of
 from samii_rig.diagnose.forces.place import Place
@@ -62,7 +62,7 @@ def test_its_derivatives_are_those_of_differences() -> None:
 def test_it_stands_beside_a_lossy_beam() -> None:
     """A causal loss factor and a fractional damper in one model, with its derivatives."""
     rig = samii()
-    every = table(rig, 0.5, 40.0)
+    every = table_of(rig, 0.5, 40.0)
     names = (("structural_damping", "beam"), ("fractional_damping", "joint_1"))
     model = Model(rig, [next(e for e in every if e.name == n) for n in names])
     at = grid(rig, F, np.arange(len(rig.sensor)), np.zeros(len(rig.sensor), dtype=np.int64))
@@ -76,7 +76,7 @@ def test_it_stands_beside_a_lossy_beam() -> None:
 
 def test_beside_a_force_the_chain_is_that_without_both() -> None:
     """A force and a fractional damper of one joint ended with "expected a known parameter"."""
-    every = table(samii(), 0.5, 40.0)
+    every = table_of(samii(), 0.5, 40.0)
     damper = next(e for e in every if e.fractional is not None and e.site == "joint_2")
     strength = Unknown("T_c", "N m", 1e-3, 1e3, (1.0,))
     force = Force(Place("joint", ("joint_1",)), FRICTION)

@@ -5,8 +5,9 @@ import pytest
 from elements_kit import ANGLE, BEAM, SOURCE, part
 from elements_kit import rig as made_of
 from identify_kit import noiseless, samii
+from table_kit import Effects, table_of
 
-from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.rigfile import toml
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.diagnose.result import Gap
@@ -27,7 +28,7 @@ F = np.geomspace(0.2, 200.0, 40)
 BAND = (0.5, 40.0)
 LINES = np.geomspace(*BAND, 200)
 NAMES = ("hydraulic_compressibility", "valve_dynamics", "actuator_lag", "torsional_compliance")
-FEW = [e for e in table(samii(), *BAND) if e.physics in NAMES]
+FEW = Effects(lambda: table_of(samii(), *BAND, *NAMES))
 
 
 def lined(kind: str = "lumped_line", **values: float) -> Rig:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from poses_kit import BAND, held, in_pose, loaded, two_links, weighed
+from table_kit import Effects
 from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
@@ -30,11 +31,11 @@ from samii_rig.record.store import write_recording
 RIG = two_links()
 POSES = ("0 deg", "110 deg")
 RIGS = [at_pose(RIG, read_pose(pose)) for pose in POSES]
-TABLE = table(RIGS[0], *BAND, poses=RIGS)
+TABLE = Effects(lambda: table(RIGS[0], *BAND, poses=RIGS))
 
 
 def some(*names):
-    return [e for e in TABLE if e.name in names]
+    return Effects(lambda: [e for e in TABLE if e.name in names])
 
 
 FEW = some(("added_mass", "upper"), ("added_mass", "fore"), ("torsional_compliance", "elbow"))

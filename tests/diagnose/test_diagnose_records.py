@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from concealed_kit import SAMII
 from cut_kit import cut_sweeps
+from table_kit import Effects, table_of
 
 from samii_rig.diagnose.data.measured import measured
-from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.records import RecordProblem, Whole, _unfolded
 from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
 from samii_rig.diagnose.physics.model import Model, grid
@@ -23,11 +24,8 @@ from samii_rig.types import Recording
 
 SLOW_VALVE = "actuator_lag joint_2_source p=150"
 # What a valve that lags could be taken for.
-FEW = [
-    e
-    for e in table(SAMII, 0.5, 40.0)
-    if e.physics in ("actuator_lag", "transport_delay", "velocity_feedback", "input_not_held")
-]
+_FEW = ("actuator_lag", "transport_delay", "velocity_feedback", "input_not_held")
+FEW = Effects(lambda: table_of(SAMII, 0.5, 40.0, *_FEW))
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +118,7 @@ def test_what_could_hide_is_what_a_refit_leaves(nothing: list[Recording], answer
     """The size is told from weak effects; a refit of the stated size leaves that many sigma."""
     found, _ = answer
     told = next(h for h in found.could_hide if h.physics == "transport_delay")
-    every = table(SAMII, 0.5, 40.0)
+    every = table_of(SAMII, 0.5, 40.0)
     whole = Whole.of(nothing, SAMII, None)
     model = Model(SAMII)
     none = Fitted(model, np.zeros(model.n), 0.0, 0.0, np.zeros((0, model.n)), np.eye(model.n))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from identify_kit import noiseless, samii
+from table_kit import table_of
 
 from samii_rig.diagnose.data.measured import measured
-from samii_rig.diagnose.diagnose import table
 from samii_rig.diagnose.fit.moebius import place_of
 from samii_rig.diagnose.fit.refit import Problem, refit
 from samii_rig.diagnose.fit.screen import Screen
@@ -20,7 +20,7 @@ from samii_rig.model.tmm import Chain
 
 BAND = (0.5, 40.0)
 LINES = np.geomspace(*BAND, 160)
-ALL = table(samii(), *BAND)
+ALL = table_of(samii(), *BAND)
 PARTS = [e for e in ALL if e.jump is not None]
 ROWS = {f"{e.physics} {e.jump.states or e.jump.place.split()[0]} {e.jump.fixed}": e for e in PARTS}
 

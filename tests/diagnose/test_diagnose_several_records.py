@@ -4,16 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from table_kit import Effects, table_of
 from two_joints_kit import BAND, RIG, in_turn, late, recorded, together
 
-from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.physics.model import JointLoops, Loop
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.pieces import wiring
 from samii_rig.signal.estimate import estimate
 
-FEW = [e for e in table(RIG, *BAND) if e.physics in ("transport_delay", "torsional_compliance")]
+FEW = Effects(lambda: table_of(RIG, *BAND, "transport_delay", "torsional_compliance"))
 HOW = {"in turn": in_turn, "together": together}
 
 

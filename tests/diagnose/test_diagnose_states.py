@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from states_kit import RIG, effects, late, mass, recorded, scene, stiffness
+from table_kit import table_of
 from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
 from samii_rig.diagnose.changed import State, changed, common_rig
-from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.known import stated, with_known
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
@@ -134,7 +135,7 @@ def test_what_both_have_is_free_in_the_model_of_both():
 
 @pytest.fixture(scope="module")
 def summed(plain):
-    every = table(RIG, 0.5, 30.0)
+    every = table_of(RIG, 0.5, 30.0)
     wholes = [Whole.of(plain.runs, RIG, None) for _ in range(2)]
     model = States(Model(RIG), RIG, (next(e for e in every if e.physics == "added_mass"),))
     starts = [u.starts[0] for u in model.effects[0].unknowns]

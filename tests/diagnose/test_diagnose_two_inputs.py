@@ -5,8 +5,9 @@ what is wrong with one input in those to it alone.
 import numpy as np
 import pytest
 from identify_kit import samii
+from table_kit import Effects, table_of
 
-from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.model.sampled import sampled_response
@@ -34,8 +35,8 @@ def shaken() -> Rig:
 
 
 RIG = shaken()
-ALL = table(RIG, *BAND)
-FEW = [e for e in ALL if e.physics in PHYSICS]
+ALL = Effects(lambda: table_of(RIG, *BAND))
+FEW = Effects(lambda: table_of(RIG, *BAND, *PHYSICS))
 
 
 def measured_twice(*effects, seed=1):

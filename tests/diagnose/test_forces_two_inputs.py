@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from table_kit import Effects, table_of
 from two_joints_kit import BAND, INPUTS, RIG, in_turn, recorded, together
 from weak_forces_kit import weak_ones
 
 from samii_rig.devices.protocols import CommandBlock, DeviceLoop
-from samii_rig.diagnose.diagnose import case_of, diagnose, table
+from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.forces import laws
 from samii_rig.diagnose.forces.laws import Force
 from samii_rig.diagnose.forces.model import ForceModel
@@ -27,7 +28,7 @@ from samii_rig.types import Float, Recording
 from sim.rig import open_rig
 
 RUBS = 0.05  # V, of sweeps of 0.2 and 0.4 V
-FEW = [e for e in table(RIG, *BAND) if e.physics in ("transport_delay", "torsional_compliance")]
+FEW = Effects(lambda: table_of(RIG, *BAND, "transport_delay", "torsional_compliance"))
 
 
 def fine(*late: float) -> Rig:

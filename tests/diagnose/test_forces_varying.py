@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from concealed_kit import SAMII, SAMII_TOML
 from cut_kit import DESIGN, cut_sweeps
+from table_kit import Effects, table_of
 
-from samii_rig.diagnose.diagnose import case_of, diagnose, table
+from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.variation import _less, variation
@@ -25,7 +26,7 @@ from samii_rig.types import Recording
 from sim.assumed_modes import trial
 from sim.assumed_modes.varying import VARYING
 
-FEW = [e for e in table(SAMII, 0.5, 20.0) if e.physics in ("actuator_lag", "added_mass")]
+FEW = Effects(lambda: table_of(SAMII, 0.5, 20.0, "actuator_lag", "added_mass"))
 
 
 def found_in(runs: list[Recording]) -> Diagnosis:

@@ -2,8 +2,8 @@
 
 import numpy as np
 from identify_kit import noiseless, samii
+from table_kit import Effects, table_of
 
-from samii_rig.diagnose.diagnose import table
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.identify.bootstrap import redraw
 
@@ -13,14 +13,11 @@ BAND = (0.5, 40.0)
 LINES = np.geomspace(*BAND, 200)
 
 
-ALL = table(samii(), *BAND)
+ALL = Effects(lambda: table_of(samii(), *BAND))
 
 
-FEW = [
-    e
-    for e in ALL
-    if e.physics in ("torsional_compliance", "velocity_feedback", "sensor_delay", "sensor_gain")
-]
+_FEW = ("torsional_compliance", "velocity_feedback", "sensor_delay", "sensor_gain")
+FEW = Effects(lambda: table_of(samii(), *BAND, *_FEW))
 
 
 def effect(physics, site, variant=""):

@@ -9,9 +9,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from table_kit import table_of
 
 from samii_rig.diagnose.changed import State
-from samii_rig.diagnose.diagnose import table
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import load_rig
@@ -67,5 +67,5 @@ def late(tau: float) -> Change:
 
 def effects(*physics: str, site: str = "") -> Sequence[Effect]:
     """Part of the signed table: a search over all of it takes too long for a test."""
-    known = [e for e in table(RIG, 0.4, 30.0, signed=True) if e.physics in (physics or LOOKED_FOR)]
+    known = table_of(RIG, 0.4, 30.0, *(physics or LOOKED_FOR), signed=True)
     return [e for e in known if site in ("", e.site)]
