@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -57,80 +58,106 @@ def reading_of(sensor: Sensor) -> tuple[str, str] | None:
     return None
 
 
+@dataclass(frozen=True, slots=True)
+class _Term:
+    """What is read of the state z at a port: (w theta M V) z, times a factor; see `System`."""
+
+    port: int
+    w: float = 0.0
+    theta: float = 0.0
+    M: float = 0.0
+    V: float = 0.0
+    factor: int = ONE
+    spring: int = -1
+
+
+class _Ports:
+    """The numbers of the ports about each element; places : all ports, see `CompiledChain`."""
+
+    def __init__(self, rig: Rig, places: Sequence[tuple[str, float]]) -> None:
+        self.elements = {e.name: e for e in rig.element}
+        self.behind = {name: port for port, (name, _) in enumerate(places)}  # the last of its ports
+        self.before: dict[str, int] = {}
+        self._places = places
+        port = 0
+        for name in self.elements:
+            self.before[name] = port
+            port = self.behind[name]
+
+    def within(self, name: str, position: float) -> int:
+        """The port at `position` m from the element's upstream end."""
+        return self._places.index((name, position)) if position > 0 else self.before[name]
+
+
 def terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Int, Float]:
     """`term` and `term_c` of `System`; places : the ports, see `CompiledChain`."""
-    elements = {e.name: e for e in rig.element}
-    behind = {name: port for port, (name, _) in enumerate(places)}  # the last of its ports
-    before = {}
-    port = 0
-    for name in elements:
-        before[name] = port
-        port = behind[name]
-    term: list[tuple[int, int, int, int]] = []
-    term_c: list[tuple[float, float, float, float]] = []
-
-    def add(
-        i: int,
-        port: int,
-        w: float = 0.0,
-        theta: float = 0.0,
-        M: float = 0.0,
-        V: float = 0.0,
-        factor: int = ONE,
-        spring: int = -1,
-    ) -> None:
-        term.append((i, port, factor, spring))
-        term_c.append((w, theta, M, V))
-
-    for i, sensor in enumerate(rig.sensor):
-        match sensor:
-            case RelativeAngle():
-                # Summed over the parts, not theta behind less theta before: the rotation of
-                # the whole may be much larger than that of the joint.
-                for name in sensor.across:
-                    element = elements[name]
-                    law = POINTS.get(element.kind)
-                    if law and law.pair == THETA_M:
-                        add(i, before[name], M=1.0, factor=COMPLIANCE, spring=before[name])
-                    elif isinstance(element, (*BEAMS, Gear)):
-                        add(i, behind[name], theta=1.0)
-                        add(i, before[name], theta=-1.0)
-            case AbsoluteAngle():
-                add(i, behind[sensor.after], theta=1.0)
-            case Moment():
-                add(i, behind[sensor.after], M=1.0)
-            case Displacement() | Velocity():
-                factor = VELOCITY if isinstance(sensor, Velocity) else ONE
-                add(i, behind[sensor.after], w=1.0, factor=factor)
-                if sensor.against is not None:
-                    add(i, behind[sensor.against], w=-1.0, factor=factor)
-            case Force():
-                add(i, behind[sensor.after], V=-1.0)
-            case Pressure():
-                add(i, behind[sensor.after], V=1.0 / (sensor.area or 1.0))
-            case Strain():
-                port = before[sensor.on]
-                if sensor.position > 0:
-                    port = places.index((sensor.on, sensor.position))
-                add(i, port, M=-sensor.height)
-            case Current():
-                source = elements[sensor.of]
-                if isinstance(source, ANGLE_SOURCES):
-                    add(i, behind[sensor.of], M=-1.0 / sensor.constant)
-                elif isinstance(source, MOTION_SOURCES):
-                    add(i, behind[sensor.of], V=1.0 / sensor.constant)
-            case Acceleration():
-                port, arm = before[sensor.on], sensor.position
-                if isinstance(elements[sensor.on], BEAMS):
-                    arm = 0.0
-                    if sensor.position > 0:
-                        port = places.index((sensor.on, sensor.position))
-                elif not isinstance(elements[sensor.on], RigidLink):
-                    port = behind[sensor.on]  # a table moves what is behind it
-                add(i, port, w=1.0, theta=arm, factor=ACCELERATION)
-                if sensor.tilt:
-                    add(i, port, theta=sensor.tilt * rig.tilt_gravity(sensor.on))
+    ports = _Ports(rig, places)
+    found = [(i, t) for i, sensor in enumerate(rig.sensor) for t in _terms(sensor, rig, ports)]
+    term = [(i, t.port, t.factor, t.spring) for i, t in found]
+    term_c = [(t.w, t.theta, t.M, t.V) for _, t in found]
     return (
         np.array(term, dtype=np.int64).reshape(-1, 4),
         np.array(term_c, dtype=np.float64).reshape(-1, 4),
     )
+
+
+def _terms(sensor: Sensor, rig: Rig, ports: _Ports) -> list[_Term]:
+    """What a sensor reads, as a sum."""
+    behind = ports.behind
+    match sensor:
+        case RelativeAngle():
+            return _angle(sensor, ports)
+        case AbsoluteAngle():
+            return [_Term(behind[sensor.after], theta=1.0)]
+        case Moment():
+            return [_Term(behind[sensor.after], M=1.0)]
+        case Displacement() | Velocity():
+            factor = VELOCITY if isinstance(sensor, Velocity) else ONE
+            after = [_Term(behind[sensor.after], w=1.0, factor=factor)]
+            if sensor.against is None:
+                return after
+            return [*after, _Term(behind[sensor.against], w=-1.0, factor=factor)]
+        case Force():
+            return [_Term(behind[sensor.after], V=-1.0)]
+        case Pressure():
+            return [_Term(behind[sensor.after], V=1.0 / (sensor.area or 1.0))]
+        case Strain():
+            return [_Term(ports.within(sensor.on, sensor.position), M=-sensor.height)]
+        case Current():
+            source = ports.elements[sensor.of]
+            if isinstance(source, ANGLE_SOURCES):
+                return [_Term(behind[sensor.of], M=-1.0 / sensor.constant)]
+            if isinstance(source, MOTION_SOURCES):
+                return [_Term(behind[sensor.of], V=1.0 / sensor.constant)]
+            return []  # it pushes by its input alone: `source_feed`
+        case Acceleration():
+            return _acceleration(sensor, rig, ports)
+
+
+def _angle(sensor: RelativeAngle, ports: _Ports) -> list[_Term]:
+    """Summed over the parts, not theta behind less theta before: the rotation of the whole may be
+    much larger than that of the joint."""
+    found = []
+    for name in sensor.across:
+        element = ports.elements[name]
+        law = POINTS.get(element.kind)
+        before = ports.before[name]
+        if law and law.pair == THETA_M:
+            found.append(_Term(before, M=1.0, factor=COMPLIANCE, spring=before))
+        elif isinstance(element, (*BEAMS, Gear)):
+            found += [_Term(ports.behind[name], theta=1.0), _Term(before, theta=-1.0)]
+    return found
+
+
+def _acceleration(sensor: Acceleration, rig: Rig, ports: _Ports) -> list[_Term]:
+    on, arm = ports.elements[sensor.on], 0.0
+    if isinstance(on, BEAMS):
+        port = ports.within(sensor.on, sensor.position)
+    elif isinstance(on, RigidLink):
+        port, arm = ports.before[sensor.on], sensor.position
+    else:
+        port, arm = ports.behind[sensor.on], sensor.position  # a table moves what is behind it
+    found = [_Term(port, w=1.0, theta=arm, factor=ACCELERATION)]
+    if sensor.tilt:
+        found.append(_Term(port, theta=sensor.tilt * rig.tilt_gravity(sensor.on)))
+    return found

@@ -14,6 +14,7 @@ from samii_rig.types import Role
 _MAX_NAME = 40  # characters of a channel's name, as the map's schema has it
 # Names that people give to what was chosen and to what went out, in lower case.
 _REFERENCES = {"u", "ref", "reference", "setpoint", "excitation", "soll", "w"}
+_SET_POINTS = "theta_ref"  # beside u, or one a joint: as our own recordings name them
 _COMMANDS = {"v", "cmd", "command", "drive", "output", "voltage", "current"}
 _LEVELS = {"level", "amp", "amplitude", "stufe"}
 _NUMBERS = {"segment", "seg", "run", "test", "part", "burst"}
@@ -80,8 +81,11 @@ def _time(found: Description) -> list[str]:
 
 
 def _roles(channels: list[Column]) -> dict[str, Role]:
-    """A role by column, from its name; one reference and one command at most."""
-    roles: dict[str, Role] = {c.name: "sensor" for c in channels}
+    """A role by column, from its name; one command at most, and one reference beside set points."""
+    roles: dict[str, Role] = {
+        c.name: "reference" if c.name.lower().startswith(_SET_POINTS) else "sensor"
+        for c in channels
+    }
     kinds: tuple[tuple[set[str], Role], ...] = ((_REFERENCES, "reference"), (_COMMANDS, "command"))
     for names, role in kinds:
         first = next((c.name for c in channels if c.name.lower() in names), "")

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from html import escape
+from typing import assert_never
 
 from samii_rig.rig.schema import (
     AbsoluteAngle,
@@ -285,6 +286,8 @@ def _sensors(
                 )
                 at = a + (b - a) * (sensor.position / length if length > 0 else 0.5)
                 span = (at, at)
+            case _:
+                assert_never(sensor)
         places.append((sum(span) / 2, span, sensor))
     out = []
     for number, (x, (a, b), sensor) in enumerate(sorted(places, key=lambda p: p[0])):

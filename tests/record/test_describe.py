@@ -126,6 +126,13 @@ def test_where_no_column_drives_by_its_name_the_map_asks_which_does(tmp_path):
     assert asked not in text
 
 
+def test_set_points_of_joints_are_references_beside_the_one_of_the_output(tmp_path):
+    path = write(tmp_path, "time,u,theta_ref,v,y\n" + rows("{ms},{u},0,{u},{y}\n"))
+    channels = parse(ImportMap, first_map(describe(path)), "first map").channel
+    roles = {c.name: c.role for c in channels}
+    assert roles == {"u": "reference", "theta_ref": "reference", "v": "command", "y": "sensor"}
+
+
 def test_matlab_json_and_universal_files(tmp_path, recordings):
     t, u = np.arange(N) / 100, np.arange(N) % 7.0
     mat = tmp_path / "run.mat"

@@ -17,21 +17,9 @@ from samii_rig.units import convert
 
 Table = dict[str, Any]
 
-# Unit of each kind of sensor.
 SENSOR_UNITS = {
-    get_args(kind.model_fields["kind"].annotation)[0]: unit
-    for kind, unit in (
-        (sensors.RelativeAngle, "rad"),
-        (sensors.AbsoluteAngle, "rad"),
-        (sensors.Acceleration, "m/s^2"),
-        (sensors.Moment, "N m"),
-        (sensors.Displacement, "m"),
-        (sensors.Velocity, "m/s"),
-        (sensors.Force, "N"),
-        (sensors.Pressure, "Pa"),
-        (sensors.Strain, "m/m"),
-        (sensors.Current, "A"),
-    )
+    get_args(kind.model_fields["kind"].annotation)[0]: kind.si_unit
+    for kind in get_args(get_args(sensors.Sensor)[0])
 }
 IN_SENSOR_UNIT = ("noise_rms", "resolution", "offset", "low", "high")
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from samii_rig.rig.schema.base import Finite, Name, NonNegative, Positive, Strict
 
@@ -20,6 +20,7 @@ class AntiAlias(Strict):
 class SensorBase(Strict):
     """What every sensor has beside its place on the chain.
 
+    si_unit : of what its kind measures.
     noise_rms : white noise of the converted samples, in `unit`.
     resolution : one step of the converter, in `unit`; 0 for none.
     offset : constant error in `unit`.
@@ -31,6 +32,7 @@ class SensorBase(Strict):
     stale_after : s without a new sample after which the channel is stale.
     """
 
+    si_unit: ClassVar[str]
     name: Name
     unit: str
     noise_rms: NonNegative = 0.0
@@ -46,20 +48,18 @@ class SensorBase(Strict):
     stale_after: Positive = 0.05
     calibration: str = Field(default="", description="how unit and scale are known")
 
+    @field_validator("unit")
+    @classmethod
+    def _of_its_kind(cls, unit: str) -> str:
+        if unit != cls.si_unit:
+            raise ValueError(f"is {unit!r}; expected {cls.si_unit!r}")
+        return unit
+
     @model_validator(mode="after")
     def _range(self) -> Self:
         if not self.low < self.high:
             raise ValueError(f"low {self.low:g}, high {self.high:g}; expected low below high")
         return self
-
-
-def _unit(expected: str) -> AfterValidator:
-    def check(unit: str) -> str:
-        if unit != expected:
-            raise ValueError(f"is {unit!r}; expected {expected!r}")
-        return unit
-
-    return AfterValidator(check)
 
 
 class RelativeAngle(SensorBase):
@@ -69,17 +69,17 @@ class RelativeAngle(SensorBase):
     `across = ["source", "spring"]` one that sees the joint's spring too (paper 2, eq. 11).
     """
 
+    si_unit = "rad"
     kind: Literal["relative_angle"]
     across: Annotated[tuple[Name, ...], Field(min_length=1)]
-    unit: Annotated[str, _unit("rad")]
 
 
 class AbsoluteAngle(SensorBase):
     """Rotation after the element named, against the ground."""
 
+    si_unit = "rad"
     kind: Literal["absolute_angle"]
     after: Name
-    unit: Annotated[str, _unit("rad")]
 
 
 class Acceleration(SensorBase):
@@ -88,46 +88,46 @@ class Acceleration(SensorBase):
     with it in the vertical plane and reads gravity as an acceleration towards positive w, -1 the
     other way round."""
 
+    si_unit = "m/s^2"
     kind: Literal["acceleration"]
     on: Name
     position: NonNegative = 0.0
     tilt: Finite = 0.0
-    unit: Annotated[str, _unit("m/s^2")]
 
 
 class Moment(SensorBase):
     """Internal moment M after the element named."""
 
+    si_unit = "N m"
     kind: Literal["moment"]
     after: Name
-    unit: Annotated[str, _unit("N m")]
 
 
 class Displacement(SensorBase):
     """Displacement w behind the element `after`, less that behind `against`; without `against`
     it is one against the ground."""
 
+    si_unit = "m"
     kind: Literal["displacement"]
     after: Name
     against: Name | None = None
-    unit: Annotated[str, _unit("m")]
 
 
 class Velocity(SensorBase):
     """Velocity s w of the same places as `Displacement`."""
 
+    si_unit = "m/s"
     kind: Literal["velocity"]
     after: Name
     against: Name | None = None
-    unit: Annotated[str, _unit("m/s")]
 
 
 class Force(SensorBase):
     """A load cell behind the element `after`: -V, which of an axial chain is tension."""
 
+    si_unit = "N"
     kind: Literal["force"]
     after: Name
-    unit: Annotated[str, _unit("N")]
 
 
 class Pressure(SensorBase):
@@ -135,11 +135,11 @@ class Pressure(SensorBase):
     over the one at rest; with `area`, m^2, the load pressure (A_1 p_1 - A_2 p_2)/area, its push
     over the area."""
 
+    si_unit = "Pa"
     kind: Literal["pressure"]
     after: Name
     area: Positive | None = None
     chamber: Literal[1, 2] | None = None
-    unit: Annotated[str, _unit("Pa")]
 
     @model_validator(mode="after")
     def _one_of(self) -> Self:
@@ -156,11 +156,11 @@ class Strain(SensorBase):
     full bridge of bending reads a multiple of it, its `gain`.
     """
 
+    si_unit = "m/m"
     kind: Literal["strain"]
     on: Name
     position: NonNegative = 0.0
     height: Finite
-    unit: Annotated[str, _unit("m/m")]
 
     @model_validator(mode="after")
     def _off_the_fibre(self) -> Self:
@@ -178,10 +178,10 @@ class Current(SensorBase):
     what its load asks of it, one of a force or torque with K v.
     """
 
+    si_unit = "A"
     kind: Literal["current"]
     of: Name
     constant: Positive
-    unit: Annotated[str, _unit("A")]
 
 
 Sensor = Annotated[
@@ -199,7 +199,7 @@ Sensor = Annotated[
 ]
 
 
-def places(sensor: SensorBase) -> tuple[str, ...]:
+def places(sensor: Sensor) -> tuple[str, ...]:
     """Names of the elements that a sensor's place refers to."""
     match sensor:
         case RelativeAngle():
@@ -212,4 +212,3 @@ def places(sensor: SensorBase) -> tuple[str, ...]:
             return (sensor.on,)
         case Current():
             return (sensor.of,)
-    raise TypeError(type(sensor))
