@@ -133,22 +133,7 @@ def mode_shape(
         }
     places = chain.places(positions)
     ports = _last_ports(rig, places)
-    jumps: list[tuple[int, State]] = [(port, k) for port in ports for k in ("V", "M")]
-
-    def answer(s: Complex) -> Complex:
-        z = chain.field_at(s, jumps, positions)
-        return z.reshape(s.size, len(jumps), -1)
-
-    R = contour_residues(answer, np.array([p]), np.array([CIRCLE * abs(p)]), ON_CIRCLE)[0][0]
-    z = (2j * p.imag * R).reshape(len(jumps), len(places), 4)
-    _refuse_several(rig, start, R)
-    # A jump of V is a force on w, one of M is a torque on -theta.
-    squares = np.array([z[i, port, 0] if k == "V" else -z[i, port, 1]
-                        for i, (port, k) in enumerate(jumps)])  # fmt: skip
-    length = sum(_length(e) for e in rig.element) or 1.0
-    unit = np.where([k == "V" for _, k in jumps], 1.0, length**2)  # m^2 of both
-    best = int(np.argmax(np.abs(squares) * unit))
-    state = z[best] / np.sqrt(squares[best])
+    state = _state(chain, p, start, positions, ports, len(places))
     top = state[np.argmax(np.abs(state[:, 0])), 0]
     if abs(top) == 0 or not np.isfinite(state).all():
         raise InputError("mode shape", "at", at, "a mode with a displacement")
@@ -169,6 +154,34 @@ def mode_shape(
         _slope_changes(rig, ports, state),
         {sensor.name: _reading(sensor, rig, places, ports, state, p) for sensor in rig.sensor},
     )
+
+
+def _state(
+    chain: Chain,
+    p: complex,
+    start: complex,
+    positions: Mapping[str, Sequence[float]],
+    ports: Sequence[int],
+    n: int,
+) -> Complex:
+    """(n, 4) state vectors of the mode at the root p, for a modal mass of 1: from the residue of
+    the answer to the force or torque that moves it most. n : places."""
+    jumps: list[tuple[int, State]] = [(port, k) for port in ports for k in ("V", "M")]
+
+    def answer(s: Complex) -> Complex:
+        z = chain.field_at(s, jumps, positions)
+        return z.reshape(s.size, len(jumps), -1)
+
+    R = contour_residues(answer, np.array([p]), np.array([CIRCLE * abs(p)]), ON_CIRCLE)[0][0]
+    z = (2j * p.imag * R).reshape(len(jumps), n, 4)
+    _refuse_several(chain.rig, start, R)
+    # A jump of V is a force on w, one of M is a torque on -theta.
+    squares = np.array([z[i, port, 0] if k == "V" else -z[i, port, 1]
+                        for i, (port, k) in enumerate(jumps)])  # fmt: skip
+    length = sum(_length(e) for e in chain.rig.element) or 1.0
+    unit = np.where([k == "V" for _, k in jumps], 1.0, length**2)  # m^2 of both
+    best = int(np.argmax(np.abs(squares) * unit))
+    return np.asarray(z[best] / np.sqrt(squares[best]))
 
 
 def root(chain: Chain, start: complex) -> complex:

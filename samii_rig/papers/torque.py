@@ -96,73 +96,42 @@ def closed_form(rig: Rig) -> tuple[float, float]:
 
 def slopes() -> tuple[Number, ...]:
     """What the paper reads off Fig. 8 to 10, from the models alone."""
-    numbers: list[Number] = []
-    thetas = []
-    for name in CONFIGURATIONS:
-        rig, theta, M = model(name)
-        thetas.append(theta)
-        J, k = closed_form(rig)
-        low, high = slope(GRID, M, LOW), slope(GRID, M, HIGH)
-        first = -1.0 if k else 1.0
-        said = "1/s" if k else "s (eq. 5)"
-        numbers += [
-            between(
-                f"{name}: slope of M/v at low frequency",
-                low,
-                "",
-                first - STRAIGHT,
-                first + STRAIGHT,
-                said,
-                3,
-            ),
-            between(
-                f"{name}: slope of M/v at high frequency",
-                high,
-                "",
-                1 - STRAIGHT,
-                1 + STRAIGHT,
-                "s",
-                3,
-            ),
-        ]
-        s = 2j * np.pi * GRID
-        numbers.append(
-            between(
-                f"{name}: M/theta against J s^2 + m g r (eq. {4 if k else 5}), most",
-                float(np.max(np.abs((M / theta) / (J * s**2 + k) - 1))),
-                "",
-                0.0,
-                1e-6,
-                digits=1,
-            )
-        )
-    numbers.append(
-        between(
-            "theta/v, vertical against horizontal, most",
-            100 * float(np.max(np.abs(thetas[0] / thetas[1] - 1))),
-            "%",
-            0.0,
-            1.0,
-            "the same",
-            2,
-        )
+    each = (number for name in CONFIGURATIONS for number in _moments(name))
+    return (*each, *_angles())
+
+
+def _moments(name: str) -> tuple[Number, ...]:
+    """The moment of one configuration: its slopes, and against the equation of motion."""
+    rig, theta, M = model(name)
+    J, k = closed_form(rig)
+    s = 2j * np.pi * GRID
+    first, said = (-1.0, "1/s") if k else (1.0, "s (eq. 5)")
+
+    def of(band: str, at: tuple[float, float], want: float, said: str) -> Number:
+        what = f"{name}: slope of M/v at {band} frequency"
+        return between(what, slope(GRID, M, at), "", want - STRAIGHT, want + STRAIGHT, said, 3)
+
+    motion = float(np.max(np.abs((M / theta) / (J * s**2 + k) - 1)))
+    equation = f"{name}: M/theta against J s^2 + m g r (eq. {4 if k else 5}), most"
+    return (
+        of("low", LOW, first, said),
+        of("high", HIGH, 1.0, "s"),
+        between(equation, motion, "", 0.0, 1e-6, digits=1),
     )
-    rig, theta, _ = model("vertical")
+
+
+def _angles() -> tuple[Number, ...]:
+    """The angle in both configurations, and against the source alone."""
+    (rig, theta, _), (_, other, _) = (model(name) for name in CONFIGURATIONS)
     source = next(e for e in rig.element if e.kind == "angular_velocity_source")
     eq_1 = first_order(laplace(GRID), source.K.value, source.p.value)
-    below = HIGH[1] > GRID
-    numbers.append(
-        between(
-            "theta/v against eq. 1 to 12 Hz, most",
-            100 * float(np.max(np.abs(theta / eq_1 - 1)[below])),
-            "%",
-            0.0,
-            10.0,
-            "that of eq. 1",
-            2,
-        )
+    differ = 100 * float(np.max(np.abs(theta / other - 1)))
+    off = 100 * float(np.max(np.abs(theta / eq_1 - 1)[HIGH[1] > GRID]))
+    what = "theta/v, vertical against horizontal, most"
+    return (
+        between(what, differ, "%", 0.0, 1.0, "the same", 2),
+        between("theta/v against eq. 1 to 12 Hz, most", off, "%", 0.0, 10.0, "that of eq. 1", 2),
     )
-    return tuple(numbers)
 
 
 def figures_8_9_10() -> Result:

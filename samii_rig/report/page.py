@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,31 +69,36 @@ def write_report(
         found = section(diagnosis, responses, rig, band_hz)
     if modes is None:
         modes = modes_of_all(responses, rig)
-    page = render(
-        recordings, responses, rig, model, title, spectrogram_channel, band_hz, events, found, modes
-    )
-    return put(path, page)
+    about = _About(recordings, responses, rig, model, band_hz, events, modes)
+    return put(path, _text(about, found, title, spectrogram_channel))
 
 
-def render(
-    recordings: Sequence[Recording],
-    responses: Sequence[FrequencyResponse],
-    rig: Rig | None,
-    model: ModelCurve | None,
-    title: str,
-    spectrogram_channel: str,
-    band_hz: tuple[float, float],
-    events: Sequence[Event],
-    diagnosis: Section | None,
-    modes: Sequence[Modes] = (),
-) -> str:
-    """The page as text; `responses` in the order in which they are drawn."""
-    comparisons = (
-        []
-        if model is None
-        else [c for r in responses for c in compare(r, model, band_hz, len(responses))]
-    )
-    bode = _bode(responses, model, comparisons, modes)
+@dataclass(frozen=True, slots=True)
+class _About:
+    """What a page is about: recordings, what was estimated from them, and what they are held to.
+    Responses in the order in which they are drawn; the rest as of `write_report`."""
+
+    recordings: Sequence[Recording]
+    responses: Sequence[FrequencyResponse]
+    rig: Rig | None
+    model: ModelCurve | None
+    band_hz: tuple[float, float]
+    events: Sequence[Event]
+    modes: Sequence[Modes]
+
+    def comparisons(self) -> list[Comparison]:
+        """Of the model with every response; none without a model."""
+        if self.model is None:
+            return []
+        among = len(self.responses)
+        return [c for r in self.responses for c in compare(r, self.model, self.band_hz, among)]
+
+
+def _text(about: _About, diagnosis: Section | None, title: str, spectrogram_channel: str) -> str:
+    """The page as text."""
+    recordings, responses, rig, modes = about.recordings, about.responses, about.rig, about.modes
+    comparisons = about.comparisons()
+    bode = _bode(responses, about.model, comparisons, modes)
     time, spectrum = _recorded(recordings, spectrogram_channel)
     plots_ = [p for p in (bode, time, spectrum) if p]
     return page_text(
@@ -112,7 +118,7 @@ def render(
         series=time,
         spectrogram=spectrum,
         done=facts.done(recordings, rig),
-        events=facts.event_rows(events, recordings),
+        events=facts.event_rows(about.events, recordings),
         chain=Markup(draw(rig)) if rig else "",
         chain_caption=rig.description if rig else "",
         limits=facts.limit_rows(recordings, rig) if rig else [],

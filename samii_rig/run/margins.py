@@ -59,11 +59,12 @@ def margins(
     series : predicted v and sensors, (n,) each by name; added : outputs of the feedback loops by
     name, before they are clipped. parts : the samples of each segment.
     """
-    found = [
-        *_margins(plan, rig, limits, series, parts),
-        *_feedback_margins(plan, rig, limits, added, parts),
+    gate = [
+        *_output_margins(plan, rig, limits, series, parts),
+        *_sensor_margins(plan, rig, limits, series, parts),
     ]
-    return worst_first(found)
+    limited = [m for m in gate if math.isfinite(m.limit)]
+    return worst_first([*limited, *_feedback_margins(plan, rig, limits, added, parts)])
 
 
 def worst_first(found: Iterable[Margin]) -> tuple[Margin, ...]:
@@ -86,19 +87,12 @@ def _noise(sensor: Sensor) -> float:
     return abs(sensor.offset) + SIGMAS * sensor.noise_rms + sensor.resolution / 2
 
 
-def _margins(
+def _output_margins(
     plan: Plan, rig: Rig, limits: GateLimits, series: Mapping[str, Float], parts: Sequence[slice]
-) -> list[Margin]:
+) -> Iterable[Margin]:
+    """Of the output and its slew, by the bounds that the gate judges a reference by."""
     sensors = {s.name: s for s in rig.sensor}
     rate, kp, output = plan.rate_hz, abs(plan.kp), limits.output
-    out: list[Margin] = []
-
-    def add(
-        channel: str, what: str, unit: str, x: list[float], fixed: float, limit: float, reason: str
-    ) -> None:
-        if math.isfinite(limit):
-            out.append(_worst(plan, channel, what, unit, x, fixed, limit, reason))
-
     authority = sum(a.loop.max for a in limits.feedback)
     slewing = [(a.slew, sensors[a.loop.sensor]) for a in limits.feedback]
     slew_noise = sum(slew * _noise(sensor) for slew, sensor in slewing)
@@ -123,33 +117,35 @@ def _margins(
         step = steps[part.start : part.stop + 1].max()
         turn_of = sum(k * float(np.abs(series[x.name][seen]).max()) for k, x in slewing)
         slew.append(float(step + kp * turning[seen].max()) * rate + turn_of)
-    fixed_bound = kp * theta_noise + authority
-    add(output.channel, "limit", output.unit, bound, fixed_bound, output.max, output.reason)
-    add(
-        output.channel,
-        "rate",
-        f"{output.unit}/s",
-        slew,
-        2 * kp * theta_noise * rate + slew_noise,
-        output.max_rate,
-        output.reason,
-    )
+    name, unit, reason = output.channel, output.unit, output.reason
+    fixed = kp * theta_noise + authority
+    yield _worst(plan, name, "limit", unit, bound, fixed, output.max, reason)
+    fixed = 2 * kp * theta_noise * rate + slew_noise
+    yield _worst(plan, name, "rate", f"{unit}/s", slew, fixed, output.max_rate, reason)
+
+
+def _sensor_margins(
+    plan: Plan, rig: Rig, limits: GateLimits, series: Mapping[str, Float], parts: Sequence[slice]
+) -> Iterable[Margin]:
+    """Of what the sensors read and how fast it changes, and of the ends of their converters."""
+    sensors, rate = {s.name: s for s in rig.sensor}, plan.rate_hz
     for c in limits.sensors:
         if c.channel not in series:
             continue  # a monitor, which no model predicts
         x, fixed = series[c.channel], _noise(sensors[c.channel])
         size = [float(np.abs(x[part]).max()) for part in parts]
-        add(c.channel, "limit", c.unit, size, fixed, c.max, c.reason)
+        yield _worst(plan, c.channel, "limit", c.unit, size, fixed, c.max, c.reason)
         turns = np.abs(np.diff(x, prepend=0.0))
         turn = [float(turns[part].max()) * rate for part in parts]
-        add(c.channel, "rate", f"{c.unit}/s", turn, 2 * fixed * rate, c.max_rate, c.reason)
+        noise = 2 * fixed * rate
+        yield _worst(plan, c.channel, "rate", f"{c.unit}/s", turn, noise, c.max_rate, c.reason)
     for sensor in rig.sensor:
         reason = "end of the converter's range"
         up = [float(series[sensor.name][part].max()) for part in parts]
         down = [float(-series[sensor.name][part].min()) for part in parts]
-        add(sensor.name, "range", sensor.unit, up, _noise(sensor), sensor.high, reason)
-        add(sensor.name, "range", sensor.unit, down, _noise(sensor), -sensor.low, reason)
-    return out
+        for peaks, end in ((up, sensor.high), (down, -sensor.low)):
+            noise = _noise(sensor)
+            yield _worst(plan, sensor.name, "range", sensor.unit, peaks, noise, end, reason)
 
 
 def _feedback_margins(
