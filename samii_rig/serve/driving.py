@@ -16,6 +16,7 @@ from samii_rig.serve.access import COOKIE, DRIVES, STOP
 from samii_rig.serve.job import DIAGNOSIS, ESTIMATE, RESPONSES, SO_FAR
 from samii_rig.serve.lease import EVERY, LASTS
 from samii_rig.serve.rooms import NotThereError, Rooms, counted, operator, person
+from samii_rig.serve.supervisor import Order
 from samii_rig.serve.viewers import MOST_VIEWERS
 
 Answer = dict[str, Any]
@@ -57,6 +58,7 @@ def routes(rooms: Rooms) -> APIRouter:
     router = APIRouter(prefix="/api")
     _describe(router, rooms)
     _drive(router, rooms)
+    _queue(router, rooms)
     _lease(router, rooms)
     _live(router, rooms)
     return router
@@ -117,18 +119,18 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
             raise LimitError(planned["refused"])
         # The lease may have gone to another while it was predicted.
         rooms.drives(request)
-        jobs = rooms.supervisor.add(
+        order = Order(
             planned["experiment"],
             planned["text"],
             planned["runs"],
             asked.operator or who.name or who.signed,
-            diagnosis=asked.diagnosis,
-            seed=asked.seed,
-            stop_when_certain=asked.stop_when_certain,
-            rig_toml=rig_toml,
-            pose=asked.pose,
+            asked.diagnosis,
+            asked.seed,
+            asked.stop_when_certain,
+            rig_toml,
+            asked.pose,
         )
-        return {"jobs": [rooms.supervisor.plain(j) for j in jobs]}
+        return {"jobs": [rooms.supervisor.plain(j) for j in rooms.supervisor.add(order)]}
 
     @router.get("/jobs/{id_}")
     async def job(id_: str) -> Answer:
@@ -148,6 +150,8 @@ def _drive(router: APIRouter, rooms: Rooms) -> None:
         """The diagnosis of a run so far; `next_toml` is the experiment that it asks for."""
         return _told(rooms, id_, DIAGNOSIS, SO_FAR)
 
+
+def _queue(router: APIRouter, rooms: Rooms) -> None:
     @router.post(STOP.removeprefix("/api"))
     async def stop(request: Request) -> Answer:
         """Zero output now. Works for everybody, always: no token, no lease."""

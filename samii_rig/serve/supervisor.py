@@ -11,7 +11,7 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,25 @@ from samii_rig.serve.live import LiveReader
 
 MOST_QUEUED = 50
 KEPT = 200  # jobs that are over
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """An experiment that somebody wants to be run.
+
+    runs : of each, as it was predicted, its `setup`, `instruction` and `duration_s`. rig_toml : the
+    rig file in the pose of these runs, "" as it is. pose : as it was asked for, for those who look.
+    """
+
+    experiment: str
+    experiment_toml: str
+    runs: list[dict[str, Any]]
+    operator: str
+    diagnosis: bool
+    seed: int | None
+    stop_when_certain: bool = False
+    rig_toml: str = ""
+    pose: str = ""
 
 
 class Supervisor:
@@ -77,65 +96,55 @@ class Supervisor:
         """The rig hurts nobody."""
         return self._rig.device.simulated
 
-    def add(
-        self,
-        name: str,
-        experiment_toml: str,
-        predicted: list[dict[str, Any]],
-        operator: str,
-        *,
-        diagnosis: bool,
-        seed: int | None,
-        stop_when_certain: bool = False,
-        rig_toml: str = "",
-        pose: str = "",
-    ) -> list[Job]:
-        """Queue the runs of an experiment, one job each; InputError if that cannot be,
-        GateError while the queue is held.
-
-        predicted : of each run its `setup`, `instruction` and `duration_s`. rig_toml : the rig file
-        in the pose of these runs, "" as it is. pose : as it was asked for, for those who look.
-        """
+    def add(self, order: Order) -> list[Job]:
+        """Queue the runs of an order, one job each; InputError if that cannot be, GateError while
+        the queue is held."""
+        self._refuse(order)
         simulated = self.simulated
-        waiting = self.queue()
-        if self.held and waiting:
-            raise GateError(f"the queue is held: {self.held}; expected POST /api/queue/resume")
-        if len(waiting) + len(predicted) > MOST_QUEUED:
-            raise InputError("queue", "", len(predicted), f"at most {MOST_QUEUED} jobs in it")
-        if len(predicted) > 1 and not simulated:
-            expected = "one run; between several a person changes the rig: use samii-rig run"
-            raise InputError("experiment", "", f"{name}, {len(predicted)} runs", expected)
-        if stop_when_certain and not diagnosis:
-            expected = "false, or diagnosis: without one nothing becomes certain"
-            raise InputError("order", "stop_when_certain", True, expected)
-        if stop_when_certain and len(predicted) > 1:
-            expected = "false: the runs of an experiment of several are diagnosed together, later"
-            raise InputError("order", "stop_when_certain", True, expected)
         settings: dict[str, Any] = {"pace": self._pace} if simulated and self._pace > 0 else {}
-        stem = recording_stem(self._rig, name)
+        stem = recording_stem(self._rig, order.experiment)
         made = []
-        for i, run in enumerate(predicted):
+        for i, run in enumerate(order.runs):
             own = f"{stem}_{run['setup']}" if run["setup"] else stem
-            with_seed = {} if seed is None or not simulated else {"seed": seed + i}
+            with_seed = {} if order.seed is None or not simulated else {"seed": order.seed + i}
             request = Request(
-                experiment=name,
+                experiment=order.experiment,
                 recording=self._free(own),
-                operator=operator,
+                operator=order.operator,
                 setup=i,
                 instruction=run["instruction"],
-                diagnosis=diagnosis and len(predicted) == 1,
+                diagnosis=order.diagnosis and len(order.runs) == 1,
                 duration_s=run["duration_s"],
-                stop_when_certain=stop_when_certain,
+                stop_when_certain=order.stop_when_certain,
                 settings={**settings, **with_seed},
-                pose=pose,
+                pose=order.pose,
             )
-            own_toml = rig_toml or self._rig_toml
-            made.append(Job.make(self._jobs, request, own_toml, experiment_toml))
+            rig_toml = order.rig_toml or self._rig_toml
+            made.append(Job.make(self._jobs, request, rig_toml, order.experiment_toml))
             self._open.append(made[-1])
         # Who starts anew, with nothing left to wait for, has looked.
         self.held = ""
         self.turn()
         return made
+
+    def _refuse(self, order: Order) -> None:
+        """GateError or InputError for an order that cannot be queued now."""
+        waiting = self.queue()
+        if self.held and waiting:
+            raise GateError(f"the queue is held: {self.held}; expected POST /api/queue/resume")
+        if len(waiting) + len(order.runs) > MOST_QUEUED:
+            raise InputError("queue", "", len(order.runs), f"at most {MOST_QUEUED} jobs in it")
+        if len(order.runs) > 1 and not self.simulated:
+            expected = "one run; between several a person changes the rig: use samii-rig run"
+            raise InputError(
+                "experiment", "", f"{order.experiment}, {len(order.runs)} runs", expected
+            )
+        if order.stop_when_certain and not order.diagnosis:
+            expected = "false, or diagnosis: without one nothing becomes certain"
+            raise InputError("order", "stop_when_certain", True, expected)
+        if order.stop_when_certain and len(order.runs) > 1:
+            expected = "false: the runs of an experiment of several are diagnosed together, later"
+            raise InputError("order", "stop_when_certain", True, expected)
 
     def _forget(self) -> None:
         """Jobs that are over for long are taken away; their recordings stay."""
