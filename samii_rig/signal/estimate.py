@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -182,6 +182,52 @@ def _one(
     return out
 
 
+@dataclass(frozen=True, slots=True)
+class _Spectra:
+    """Repeats of one excitation in frequency. shared, correlation : as of `repeats.over_repeats`.
+    periods : of a periodic one, what its pieces were cut into."""
+
+    pieces: Sequence[Piece]
+    each: Sequence[Spectrum]
+    shared: float = 1.0
+    correlation: float = 0.0
+    periods: periodic.Periods | None = None
+
+
+def _spectra(group: Group, method: Literal["burst", "settled", "periodic"]) -> _Spectra:
+    """The spectra of what a method takes for repeats; the group is told what was left out."""
+    pieces = group.pieces
+    if method == "burst":
+        spectra, shared = burst_spectra(pieces, group.rate_hz)
+        if rests(pieces[0].r)[0] < LEAD_IN * len(pieces[0]):
+            group.findings.append(_no_lead_in(pieces[0].name))
+        return _Spectra(pieces, spectra, shared=shared)
+    if method == "settled":
+        skip = group.unsettled
+        spectra, correlation = settled_spectra(pieces[skip - 1 :], group.rate_hz)
+        for piece in pieces[:skip]:
+            text = f"{piece.name} left out: the motion had not settled since it started from rest"
+            group.findings.append(Finding("leakage", "note", text, segment=piece.name))
+        return _Spectra(pieces[skip:], spectra, correlation=correlation)
+    periods = periodic.periods(group)
+    return _Spectra(periods.pieces, periods.independent, periods=periods)
+
+
+def _raised(
+    group: Group, scatter: Float, floor: Float, findings: Mapping[int, str]
+) -> Iterable[Finding]:
+    """What is said of outputs whose repeats scatter less than their converter rounds.
+
+    scatter : (n_freq, p) variances over the repeats. floor : (p,). findings : by output.
+    """
+    for i, message in findings.items():
+        part = float(np.mean(scatter[:, i] < floor[i]))
+        if part > 0:
+            text = f"{message} in {part:.0%} of the lines; what is missing was added"
+            name = group.selection.outputs[i].name
+            yield Finding("dof", "note", text, channel=name)
+
+
 def _repeats(
     group: Group,
     method: Literal["burst", "settled", "periodic"],
@@ -189,24 +235,10 @@ def _repeats(
     band: tuple[float, float] | None,
     pooling: int | None,
 ) -> FrequencyResponse:
-    pieces = group.pieces
-    periods: periodic.Periods | None = None
-    shared, correlation = 1.0, 0.0
-    if method == "burst":
-        spectra, shared = burst_spectra(pieces, group.rate_hz)
-        if rests(pieces[0].r)[0] < LEAD_IN * len(pieces[0]):
-            group.findings.append(_no_lead_in(pieces[0].name))
-    elif method == "settled":
-        skip = group.unsettled
-        spectra, correlation = settled_spectra(pieces[skip - 1 :], group.rate_hz)
-        for piece in pieces[:skip]:
-            text = f"{piece.name} left out: the motion had not settled since it started from rest"
-            group.findings.append(Finding("leakage", "note", text, segment=piece.name))
-        pieces = pieces[skip:]
-    else:
-        periods = periodic.periods(group)
-        pieces, spectra = periods.pieces, periods.independent
-        why = f"{why}; {periods.why}" if periods.why else why
+    taken = _spectra(group, method)
+    pieces, spectra, periods = taken.pieces, taken.each, taken.periods
+    if periods is not None and periods.why:
+        why = f"{why}; {periods.why}"
     lines = comb(spectra, band) if method == "periodic" else excited(spectra, band)
     lines = _driven(group, pieces, spectra, lines)
     n, p = len(spectra), len(group.selection.outputs)
@@ -226,14 +258,9 @@ def _repeats(
         if len(periods.spectra) > 1:
             # Each realisation is rounded in its own way, so that the scatter shows it.
             floor, findings = np.zeros_like(floor), {}
-    result = repeats.over_repeats(R, Z, wanted, floor, shared, correlation)
+    result = repeats.over_repeats(R, Z, wanted, floor, taken.shared, taken.correlation)
     scatter = np.diagonal(result.noise, axis1=1, axis2=2).real
-    for i, message in findings.items():
-        part = float(np.mean(scatter[:, i] < floor[i]))
-        if part > 0:
-            text = f"{message} in {part:.0%} of the lines; what is missing was added"
-            name = group.selection.outputs[i].name
-            group.findings.append(Finding("dof", "note", text, channel=name))
+    group.findings += _raised(group, scatter, floor, findings)
     if periods is not None:
         names = [c.name for c in group.selection.outputs]
         seen = distortion(periods.spectra, lines, result.H, rounding, names)
