@@ -265,6 +265,9 @@ class FrequencyResponse:
         does not show them.
     noise, distortion : (n_freq, n_out) rms of the noise of one repeat, and of what is not linear
         in one realisation, relative to the output at the line; None where nothing told them apart.
+    followers, follow : commands that nothing drove and their loops moved, and (n_freq,
+        n_followers, n_in) how far, per unit of each input; None without any. H is that with
+        these loops closed (`samii_rig.signal.several.undriven`).
     method, why : which estimator, and why it was chosen, in plain words.
     sources : names or hashes of the recordings it came from.
     """
@@ -289,6 +292,8 @@ class FrequencyResponse:
     distortion: Float | None = None
     findings: tuple[Finding, ...] = ()
     sources: tuple[str, ...] = ()
+    followers: tuple[Channel, ...] = ()
+    follow: Complex | None = None
 
     @property
     def estimator(self) -> str:

@@ -22,6 +22,8 @@ class Lines:
     root : (n, p, p) with root^H root = C^-1. sd : (n, p) standard deviation of each entry.
     factor : (n,) w of `whitening.factor` over the number of lines that share data.
     dof : (n,). shared : lines that went into one covariance, and into one estimate.
+    follow : actuators that nothing drove, each with how far it moved (n, p) per unit of each
+        entry's input: the entry is H + the sum of H of these by it.
     """
 
     response: FrequencyResponse
@@ -37,6 +39,7 @@ class Lines:
     factor: Float
     dof: Float
     shared: tuple[float, float]
+    follow: tuple[tuple[int, Complex], ...] = ()
 
     @property
     def p(self) -> int:
@@ -116,7 +119,7 @@ def _lines(
     for i in chosen:
         if names[i] not in sensors:
             raise InputError("response", "output", names[i], f"a sensor of {rig.name}: {sensors}")
-    for channel in response.inputs:
+    for channel in (*response.inputs, *response.followers):
         if channel.name not in actuators:
             expected = f"an actuator of {rig.name}: {actuators}"
             raise InputError("response", "input", channel.name, expected)
@@ -141,4 +144,15 @@ def _lines(
         factor=factor(dof, len(used)) / sharing[1],
         dof=dof,
         shared=sharing,
+        follow=_follow(response, mask, actuators, len(chosen)),
     )
+
+
+def _follow(
+    response: FrequencyResponse, mask: np.ndarray, actuators: Sequence[str], n_out: int
+) -> tuple[tuple[int, Complex], ...]:
+    if response.follow is None:
+        return ()
+    of_entries = np.tile(response.follow[mask], (1, 1, n_out))
+    names = [c.name for c in response.followers]
+    return tuple((actuators.index(n), of_entries[:, k]) for k, n in enumerate(names))

@@ -89,7 +89,11 @@ class Predictor:
         return [H + a for H, a in zip(sampled, self.aliases, strict=True)]
 
     def _split(self, H: list[Complex]) -> list[Complex]:
-        return [
-            H[k][d.place[:, None], row, d.actuator]
-            for d, row, k in zip(self._data.lines, self._row, self._chain_of, strict=True)
-        ]
+        out = []
+        for d, row, k in zip(self._data.lines, self._row, self._chain_of, strict=True):
+            at = d.place[:, None]
+            own = H[k][at, row, d.actuator]
+            for actuator, moved in d.follow:
+                own = own + (H[k][at, row, actuator].T * moved.T).T
+            out.append(own)
+        return out

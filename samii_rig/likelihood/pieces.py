@@ -15,6 +15,7 @@ from samii_rig.likelihood import inputs, spikes
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import is_open, of_input, proportional
 from samii_rig.signal.groups import segments_of
+from samii_rig.signal.several.undriven import driven_of
 from samii_rig.types import Float, Quality, Recording, Segment
 
 SPOILT = Quality.MISSING | Quality.CLIPPED | Quality.STALE
@@ -86,12 +87,14 @@ class Piece:
 class Input:
     """An input of the rig and the loop around it: v = r - kp theta, if kp is not 0.
 
-    command : its column. centring : the column of theta.
+    command : its column. centring : the column of theta. driven : whether any reference moves it;
+    of what its loop alone does, rounded by its converter, the sensors' noise is a part.
     """
 
     command: str
     centring: str = ""
     kp: float = 0.0
+    driven: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +140,9 @@ def wiring(
     commands = [n for n in having if any(_moves(r, n) for r in recordings)] or having[:1]
     if not found or not commands:
         raise EstimateError("the recordings have no command and no sensor of the rig in common")
-    return Wiring(tuple(_input(recordings, rig, n, common, found) for n in commands), found)
+    _, undriven = driven_of([r for r in recordings if all(_has(r, n) for n in commands)], commands)
+    each = [_input(recordings, rig, n, common, found) for n in commands]
+    return Wiring(tuple(replace(x, driven=x.command not in undriven) for x in each), found)
 
 
 def _input(

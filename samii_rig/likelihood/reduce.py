@@ -94,6 +94,12 @@ class Reduced:
         return np.asarray(linalg.blas.dtrmm(1.0, C, flat, lower=1, trans_a=1))
 
     @property
+    def excited(self) -> NDArray[np.bool_]:
+        """(q 2 b,) directions of d at inputs that something excites; the others have the ridge."""
+        size = np.linalg.norm(self.factor.reshape(len(self.target), -1), axis=0)
+        return np.asarray(size > 2 * SAME)
+
+    @property
     def between(self) -> Float:
         """(b - 1,) Hz, in the middle between nodes."""
         return np.asarray((self.frequency[:-1] + self.frequency[1:]) / 2)
@@ -124,7 +130,8 @@ class Records:
     bands : Hz, of the lines of each that take part. steps : of each sensor's converter, none where
     they are not known. least : samples for which the contours are long
     enough at least, so that those of other records are the same. driven : Hz up to which the input
-    is more than noise, so that a change of the response shows.
+    is more than noise, so that a change of the response shows. undriven : inputs that nothing
+    excites. What they did is known; a change of the response to it would fit the noise in it.
     """
 
     pieces: tuple[Piece, ...]
@@ -133,6 +140,7 @@ class Records:
     steps: tuple[float, ...] = ()
     least: int = 0
     driven: float = np.inf
+    undriven: tuple[int, ...] = ()
 
     @property
     def changing(self) -> tuple[float, float]:
@@ -595,6 +603,8 @@ def _columns(records: Records, contour: Contour, nodes: Int) -> list[Complex]:
         lines = records.lines(records.pieces[own[0]])
         both = columns(contour, np.stack(X), nodes, *shape[:2], lines.k)
         m = len(both) // len(own)
+        for j in records.undriven:
+            both[j::m] = 0.0
         for j, i in enumerate(own):
             out[i] = both[j] if m == 1 else np.concatenate(both[j * m : (j + 1) * m], axis=1)
     return [out[i] for i in range(len(records.pieces))]
@@ -711,6 +721,7 @@ def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     M -= cross @ cross.T
     g -= cross @ own_head
     largest = np.repeat(np.max(diagonal.reshape(q, -1), axis=1), 2 * b)  # in its own unit
+    largest = np.where(largest > 0, largest, 1.0)  # `Reduced.excited`
     C, ridge = _factor(M, SAME * np.maximum(diagonal, SAME * largest))
     turned, _ = linalg.lapack.dtrtri(C)
     return _Form(

@@ -349,7 +349,9 @@ def _of(d: Lines) -> str:
     if roles == {"reference"}:
         return f"poles of {named}: of the closed loop, as the reference drives it"
     if roles == {"command"}:
-        return f"poles of {named}: of what the command drives, whatever loop computes it"
+        loops = ", ".join(c.name for c in d.response.followers)
+        closed = f", the loop of {loops} closed" if loops else ""
+        return f"poles of {named}: of what the command drives, whatever loop computes it{closed}"
     return f"poles of {named}: of what lies between them"
 
 

@@ -60,6 +60,8 @@ def arrays(response: FrequencyResponse) -> Arrays:
     }
     if len(r.inputs) > 1:
         out["partial_coherence"] = partial_coherence(r)
+    if r.follow is not None:
+        out |= {"followers": np.array([c.name for c in r.followers]), "follow": r.follow}
     return out | told(r)
 
 

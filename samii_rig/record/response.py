@@ -42,9 +42,19 @@ _FIELDS: tuple[tuple[cdr.Kind, str, str], ...] = (
     ("float64[]", "odd", ""),
     ("float64[]", "noise", "n_freq * n_out, of one repeat over the output; NaN where unknown"),
     ("float64[]", "distortion", "n_freq * n_out, of one realisation over the output"),
+    ("string", "followers", "JSON: commands that nothing drove and their loops moved"),
+    (
+        "float64[]",
+        "follow_real",
+        "n_freq * n_followers * n_in, of each over each input; NaN of none",
+    ),
+    ("float64[]", "follow_imag", ""),
 )
 _KINDS = tuple(kind for kind, _, _ in _FIELDS)
-_FEWER = len(_KINDS) - 2  # fields of recordings from before noise and distortion were apart
+_NONE = np.array([np.nan])  # a message holds no array that is empty
+# Fields of recordings from before loops were told that nothing drove, and from before noise and
+# distortion were apart.
+_FEWER = (len(_KINDS) - 3, len(_KINDS) - 5)
 SCHEMA_TEXT = "".join(
     f"{kind} {name}" + (f"  # {comment}\n" if comment else "\n") for kind, name, comment in _FIELDS
 )
@@ -53,7 +63,9 @@ SCHEMA_TEXT = "".join(
 def encode(response: FrequencyResponse) -> bytes:
     """The message; RecordingError if the arrays do not have the shapes that types.py says."""
     n, n_out, n_in = response.H.shape
-    p = n_out * n_in
+    p, n_followers = n_out * n_in, len(response.followers)
+    none = np.zeros((n, n_followers, n_in), complex)
+    follow = none if response.follow is None else response.follow
     unknown = np.full((n, n_out), np.nan)
     shapes: dict[str, tuple[Any, tuple[int, ...]]] = {
         "frequency": (response.frequency, (n,)),
@@ -69,6 +81,7 @@ def encode(response: FrequencyResponse) -> bytes:
             unknown if response.distortion is None else response.distortion,
             (n, n_out),
         ),
+        "follow": (follow, none.shape),
     }
     for name, (array, shape) in shapes.items():
         if np.shape(array) != shape:
@@ -101,6 +114,8 @@ def encode(response: FrequencyResponse) -> bytes:
         shapes["odd"][0],
         shapes["noise"][0],
         shapes["distortion"][0],
+        json.dumps([channel_to_json(c) for c in response.followers]),
+        *((follow.real, follow.imag) if n_followers else (_NONE, _NONE)),
     ]
     return cdr.encode(_KINDS, values)
 
@@ -115,6 +130,8 @@ def decode(data: bytes) -> FrequencyResponse:
         )
         channels_in = tuple(channel_from_json(item) for item in inputs)
         channels_out = tuple(channel_from_json(item) for item in outputs)
+        told = json.loads(cast(str, values.get("followers", "[]")))
+        followers = tuple(channel_from_json(item) for item in told)
         noticed = tuple(_finding_from_json(item) for item in findings)
         named = tuple(str(item) for item in sources)
     except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
@@ -162,6 +179,8 @@ def decode(data: bytes) -> FrequencyResponse:
         distortion=known("distortion"),
         findings=noticed,
         sources=named,
+        followers=followers,
+        follow=both("follow", n, len(followers), n_in) if followers else None,
     )
 
 
@@ -169,12 +188,14 @@ def _values(data: bytes) -> dict[str, cdr.Value]:
     names = [name for _, name, _ in _FIELDS]
     try:
         return dict(zip(names, cdr.decode(_KINDS, data), strict=True))
-    except RecordingError as error:
-        try:
-            older = cdr.decode(_KINDS[:_FEWER], data)
-        except RecordingError:
-            raise error from None
-        return dict(zip(names[:_FEWER], older, strict=True))
+    except RecordingError:
+        for fewer in _FEWER:
+            try:
+                older = cdr.decode(_KINDS[:fewer], data)
+            except RecordingError:
+                continue
+            return dict(zip(names[:fewer], older, strict=True))
+        raise
 
 
 def summary(response: FrequencyResponse) -> dict[str, str]:

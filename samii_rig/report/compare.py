@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import Rig
+from samii_rig.signal.several.undriven import as_measured
 from samii_rig.signal.statistics import CERTAIN, model_difference
 from samii_rig.types import Complex, Float, FrequencyResponse
 
@@ -60,11 +61,12 @@ class ModelCurve:
 
     def like(self, response: FrequencyResponse) -> Complex:
         """(n_freq, n_out, n_in) the curve at the lines of `response`."""
-        out = np.full(response.H.shape, np.nan + 0j)
+        acting = [c.name for c in (*response.inputs, *response.followers)]
+        H = np.full((len(response.frequency), len(response.outputs), len(acting)), np.nan + 0j)
         for i, y in enumerate(response.outputs):
-            for j, u in enumerate(response.inputs):
-                out[:, i, j] = self.at(response.frequency, y.name, u.name)
-        return out
+            for j, u in enumerate(acting):
+                H[:, i, j] = self.at(response.frequency, y.name, u)
+        return as_measured(response, H, acting)
 
 
 def model_curve(rig: Rig, responses: Sequence[FrequencyResponse]) -> ModelCurve | None:

@@ -19,6 +19,7 @@ from samii_rig.signal.groups import Group, Piece
 from samii_rig.signal.quantisation import floor_of
 from samii_rig.signal.several import turn
 from samii_rig.signal.several.estimate import How, inputs_of, together
+from samii_rig.signal.several.undriven import apart
 from samii_rig.signal.skew import skews_of, with_skew
 from samii_rig.signal.spectra import (
     Spectrum,
@@ -99,7 +100,10 @@ def estimate(
     skews = skews_of(recordings)
     moved = aligned(recordings)
     recordings = [r for r, _ in moved]
-    inputs = inputs_of(recordings, input)
+    inputs, undriven = inputs_of(recordings, input)
+    if undriven:
+        sensors = [n for n in recordings[0].names("sensor") if n not in inputs]
+        outputs = [*(sensors if outputs is None else outputs), *undriven]
     how = How(outputs, method, gaps, band, pooling, nperseg)
     if len(inputs) > 1:
         references = [reference] if isinstance(reference, str) else reference
@@ -110,7 +114,7 @@ def estimate(
         out = _one(recordings, named, single, how)
     shifted = tuple(finding for _, finding in moved if finding)
     out[0] = replace(out[0], findings=(*out[0].findings, *shifted))
-    return tuple(with_skew(response, skews) for response in out)
+    return tuple(apart(with_skew(response, skews), undriven) for response in out)
 
 
 def _several(

@@ -56,6 +56,34 @@ def test_a_record_in_which_one_input_rests_tells_of_the_other_alone():
         assert power[driven] > 1e5 * power[1 - driven]
 
 
+def one_joint(hidden):
+    """Two sweeps of joint 2 alone; the loop of joint 3 moves within some steps of its command."""
+    runs = recorded(hidden, in_turn()[:1] * 2)
+    moved = [run.values[:, run.column("v_3")] for run in runs]
+    assert all(0 < np.abs(v).max() < 20 * RIG.actuator[1].resolution for v in moved)
+    return runs
+
+
+def test_of_one_joint_driven_nothing_is_missing_where_nothing_is():
+    """What the other's loop does follows the noise of its encoder: no change of its response is
+    free, which would fit that noise."""
+    runs = one_joint(RIG)
+    whole = Whole.of(runs, RIG)
+    assert [x.driven for x in whole.wired.inputs] == [True, False]
+    assert whole.records.undriven == (1,)
+    found = found_in(runs)
+    assert found.verdict == "no_mismatch"
+    assert 0.8 < found.chi2_per_dof < found.threshold < 1.2
+
+
+def test_of_one_joint_driven_a_dead_time_of_it_is_named():
+    found = found_in(one_joint(late("v_2", 1e-3)))
+    assert found.verdict == "named"
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("transport_delay", "joint_2_source")
+    assert cause.parameters["tau"].value == pytest.approx(1e-3, rel=0.01)
+
+
 def test_a_loop_around_an_input_without_a_column_is_told_in_one_line():
     run, other = recorded(RIG, in_turn())
     keep = [i for i, c in enumerate(other.channels) if c.name != "v_3"]

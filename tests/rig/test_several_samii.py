@@ -6,10 +6,19 @@ Y = H V. H is the response of the sampled rig by transfer matrices alone.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from samii_rig.diagnose.data.measured import binned, measured
+from samii_rig.identify.data import collect
+from samii_rig.identify.parameters import space
+from samii_rig.identify.predict import Predictor
 from samii_rig.model.sampled import sampled_response
+from samii_rig.record.convert import arrays
+from samii_rig.record.response import decode, encode
+from samii_rig.report.compare import model_curve
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Parameter, Rig
 from samii_rig.signal.estimate import estimate
@@ -116,3 +125,68 @@ def test_sweeps_one_after_the_other_give_the_same_eight(lines, loop):
     assert found.frequency.size == number.size
     assert gain < 0.002
     assert angle < 0.2
+
+
+def of_one_joint(lines, level=1.0):
+    """A recording in which v_2 is driven; v_3 has a reference that rests, and a loop."""
+    rng, number = np.random.default_rng(6), lines[0]
+    U = np.zeros((number.size, 2), complex)
+    U[:, 0] = level * np.exp(2j * np.pi * rng.random(number.size))
+    made = experiment(U, lines, LOOP, rng, "one joint")
+    names = {"u_2": "u_v_2", "u_3": "u_v_3"}
+    channels = tuple(replace(c, name=names.get(c.name, c.name)) for c in made.channels)
+    return replace(made, channels=channels)
+
+
+def test_of_one_joint_driven_the_other_is_said_not_to_be_excited(lines):
+    """v_3 moves, as its loop feeds back what v_2 does: no column of it is estimated, and that of
+    v_2 is the transfer matrices' with this loop closed."""
+    made = of_one_joint(lines)
+    (found,) = estimate([made])
+    number, H = lines
+    assert [c.name for c in found.inputs] == ["v_2"]
+    assert [c.name for c in found.outputs] == ["theta_2", "a_0", "a_1", "a_2"]
+    assert found.covariance.shape == (found.frequency.size, 4, 4)
+    assert np.linalg.eigvalsh(found.covariance).min() > 0
+    assert [c.name for c in found.followers] == ["v_3"]
+    at = np.searchsorted(number, np.round(found.frequency * PERIOD).astype(int))
+    moved = -LOOP[1, 0] * H[at, 0, 0] / (1 + LOOP[1, 0] * H[at, 0, 1])  # v_3 = -F theta_2
+    assert np.allclose(found.follow[:, 0, 0], moved, rtol=2e-3)
+    closed = H[at, :, 0] + H[at, :, 1] * moved[:, None]
+    assert np.abs(found.H[:, :, 0] / closed - 1).max() < 0.002
+    assert np.abs(H[at, :, 0] / closed - 1).max() > 0.02  # the loop shows
+    (note,) = [f for f in found.findings if f.kind == "closed_loop"]
+    assert note.message.startswith("v_3 was not excited, its loop alone moved it")
+    assert (note.severity, note.channel) == ("note", "v_3")
+    (named,) = estimate([made], input="v_2")
+    assert np.array_equal(named.H, found.H)
+
+
+def test_a_model_is_held_against_it_with_that_loop_closed(lines):
+    """By the report, by `identify` and by the lines of `diagnose`, which fit both columns."""
+    (found,) = estimate([of_one_joint(lines)])
+    rig = two_joints()
+    curve = model_curve(rig, [found])
+    assert np.abs(curve.like(found) / found.H - 1).max() < 0.002
+    data = collect([found], rig)
+    (own,) = Predictor(rig, data, space(rig, ["joint_3.k"])).response(np.zeros(1))
+    assert np.abs(own / data.lines[0].H - 1).max() < 0.01  # but for the aliases
+    fitted = measured([found], rig)
+    at, where = fitted.frequency, list(zip(fitted.sensor, fitted.actuator, strict=True))
+    H = sampled_response(rig, at)
+    truth = np.stack([H[:, s, a] for s, a in where], axis=1)
+    assert {a for _, a in where} == {0, 1}
+    open_loop = truth * np.array([a == 0 for _, a in where])
+    assert fitted.per_dof(truth) * 100 < fitted.per_dof(open_loop)
+    # Bins of lines know the sum of both columns alone, and no direction of it is made up.
+    few = binned(fitted, truth, bins=20)
+    left = truth[np.searchsorted(at, few.frequency)]
+    assert few.per_dof(left) * 100 < few.per_dof(left * np.array([a == 0 for _, a in where]))
+
+
+def test_a_recording_keeps_what_was_not_excited(lines):
+    (found,) = estimate([of_one_joint(lines)])
+    again = decode(encode(found))
+    assert again.followers == found.followers
+    assert np.array_equal(again.follow, found.follow)
+    assert arrays(found)["followers"].tolist() == ["v_3"]

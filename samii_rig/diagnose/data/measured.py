@@ -31,6 +31,9 @@ WHOLE = ("burst", "settled", "periodic")
 # Cycles a record up to which a slow drift leaves more than the covariance, pooled over
 # neighbouring lines, says: what is left of it falls with the square of the frequency.
 DRIFTING = 4.5
+SUMS = (
+    1e-12  # of a bin's precision, what is below is rounding: its lines know a sum of entries alone
+)
 DIFFER = 1.5  # chi-square per degree of freedom of levels against each other
 TRANSIENTS = "local"  # method of responses from single transients: see `usable`
 
@@ -41,7 +44,8 @@ class Measured:
 
     frequency : (n,) Hz. H : (n, q) of the entries (sensor, actuator), (q,) indices into the
         rig's. W : (n, q, q) precision such that e^H W e of the truth has the mean `expected`
-        (n,), about twice the entries measured there; 0 where an entry was not measured.
+        (n,), about twice the entries measured there; 0 where an entry was not measured. Of
+        entries that an undriven loop ties together W knows their sum alone.
     level : (n,) index into `levels`, -1 where several were combined; a periodic excitation
         and a transient of one level have an index each (`periodic`: of each level, whether it
         is one). ringing : of each level, whether its runs ended while the rig still moved, so
@@ -194,20 +198,31 @@ def measured(
     data = collect(responses, rig, band)
     rate = data.lines[0].response.rate_hz
     whole_part(rate, rig)
+    columns = [[d.actuator, *(np.full(d.p, a) for a, _ in d.follow)] for d in data.lines]
     pairs = sorted(
-        {(int(s), int(a)) for d in data.lines for s, a in zip(d.sensor, d.actuator, strict=True)}
+        {
+            (int(s), int(a))
+            for d, each in zip(data.lines, columns, strict=True)
+            for own in each
+            for s, a in zip(d.sensor, own, strict=True)
+        }
     )
     levels = tuple(dict.fromkeys(_level(d.response) for d in data.lines))
     ringing = {_level(d.response) for d in data.lines if d.response.estimator == TRANSIENTS}
     blocks = []
-    for d in data.lines:
-        at = [pairs.index((int(s), int(a))) for s, a in zip(d.sensor, d.actuator, strict=True)]
+    for d, each in zip(data.lines, columns, strict=True):
         n, q = len(d.frequency), len(pairs)
         H = np.zeros((n, q), complex)
-        W = np.zeros((n, q, q), complex)
-        H[:, at] = d.H
-        precision = d.root.conj().swapaxes(1, 2) @ d.root
-        W[:, np.array(at)[:, None], np.array(at)] = 2 * d.factor[:, None, None] * precision
+        half = np.zeros((n, d.p, q), complex)  # half H is what was measured, in units of its noise
+        for actuator, moved in zip(
+            each, (np.ones((n, d.p)), *(x for _, x in d.follow)), strict=True
+        ):
+            at = [pairs.index((int(s), int(a))) for s, a in zip(d.sensor, actuator, strict=True)]
+            half[:, :, at] += d.root * moved[:, None, :]
+        H[:, [pairs.index((int(s), int(a))) for s, a in zip(d.sensor, d.actuator, strict=True)]] = (
+            d.H
+        )
+        W = 2 * d.factor[:, None, None] * (half.conj().swapaxes(1, 2) @ half)
         expected = 2 * d.factor * d.mean()
         index = levels.index(_level(d.response))
         groups = max(1.0, n / d.shared[0])
@@ -320,12 +335,10 @@ def combined(lines: Measured, shape: Complex, starts: Int) -> tuple[Measured, Fl
         np.einsum("ni,nij,nj->n", lines.H.conj(), lines.W, lines.H).real, starts
     )
     diagonal = np.diagonal(W, axis1=1, axis2=2).real
-    empty = (diagonal <= 0)[:, :, None] * np.eye(W.shape[1])
     scale = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    solved = np.linalg.solve(
-        W / (scale[:, :, None] * scale[:, None, :]) + empty, (right / scale)[:, :, None]
-    )[:, :, 0]
-    H = solved / scale
+    unit = W / (scale[:, :, None] * scale[:, None, :])
+    inverse = np.linalg.pinv(unit, rcond=SUMS, hermitian=True)
+    H = (inverse @ (right / scale)[:, :, None])[:, :, 0] / scale
     chi = np.maximum(power - np.einsum("ni,ni->n", H.conj(), right).real, 0.0)
     expected = np.add.reduceat(lines.expected, starts)
     mean = expected * (1 - 1 / counts)

@@ -16,6 +16,7 @@ import numpy as np
 from samii_rig.diagnose.physics.confusions import UNITS, nearest
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.schema import SOURCES, Rig, parameters
+from samii_rig.signal.several.undriven import as_measured
 from samii_rig.types import Complex, Float, FrequencyResponse, Recording
 
 POINTS = 300  # lines of a response that are looked at
@@ -101,8 +102,8 @@ def _mended(
     names = [s.name for s in rig.sensor]
     on = [names.index(c.name) for c in r.outputs]
     acting = [a.name for a in rig.actuator]
-    by = [acting.index(c.name) for c in r.inputs]
-    model = sampled_response(rig, r.frequency[pick])[:, on][:, :, by]
+    model = sampled_response(rig, r.frequency[pick])[:, on]
+    model = as_measured(lines_of(r, pick), model, acting)
     H, said = r.H[pick], []
     order = list(range(len(on)))
     for a, b in _swaps(H, model):
@@ -218,6 +219,7 @@ def lines_of(r: FrequencyResponse, keep: np.ndarray) -> FrequencyResponse:
         odd=None if r.odd is None else r.odd[keep],
         noise=None if r.noise is None else r.noise[keep],
         distortion=None if r.distortion is None else r.distortion[keep],
+        follow=None if r.follow is None else r.follow[keep],
     )
 
 

@@ -228,7 +228,8 @@ def _records_differ(each: Sequence[_Alone], i: int, j: int) -> tuple[float, floa
 def _difference(a: Reduced, b: Reduced) -> tuple[float, float, float]:
     """Chi-square of what no one response explains of two, its mean and its standard deviation."""
     m = a.factor.shape[0]
-    factor = np.concatenate([x.factor.reshape(x.factor.shape[0], -1) for x in (a, b)])
+    factor = np.concatenate([x.factor.reshape(m, -1) for x in (a, b)])
+    factor = factor[:, a.excited | b.excited]
     target = np.concatenate([a.target, b.target])
     Q = orthonormal(factor)
     chi2 = float(target @ target) - float(np.sum((Q.T @ target) ** 2))

@@ -127,6 +127,8 @@ class Whole:
         all_, apart = (
             _records(p, rate, band, step, rounding, slower=slower) for p in (joined(levels), levels)
         )
+        rests = tuple(j for j, x in enumerate(wired.inputs) if not x.driven)
+        all_, apart = (replace(one, undriven=rests) for one in (all_, apart))
         return cls(rig, all_, wired, tuple(without.items()), apart, band is not None)
 
     @property

@@ -21,6 +21,7 @@ from samii_rig.signal.several.experiments import (
     references_in_use,
 )
 from samii_rig.signal.several.sets import Set, sets_of
+from samii_rig.signal.several.undriven import driven_of
 from samii_rig.signal.stepped import is_stepped
 from samii_rig.types import Complex, Finding, Float, FrequencyResponse, Int, Recording
 
@@ -44,9 +45,14 @@ class How:
 
 def inputs_of(
     recordings: Sequence[Recording], input: str | Sequence[str] | None
-) -> tuple[str, ...]:
-    """Names of the inputs: those asked for, else the commands that move in any recording; none
-    where a single one moves or none does, which the estimate of one input finds by itself."""
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names of the inputs, and of commands that move beside them and that nothing drives.
+
+    The inputs are those asked for, else the commands that are driven in any recording; none where
+    a single one moves or none does, which the estimate of one input finds by itself.
+    """
+    moving = [n for r in recordings for n in r.names("command") if r.largest(n) > 0]
+    driven, undriven = driven_of(recordings, tuple(dict.fromkeys(moving)))
     if input is not None:
         given = (input,) if isinstance(input, str) else tuple(dict.fromkeys(input))
         for r in recordings if len(given) > 1 else ():
@@ -55,10 +61,9 @@ def inputs_of(
                 if name not in known:
                     where = r.source or "recording"
                     raise InputError(where, "input", name, one_of(name, known))
-        return given
-    moving = [n for r in recordings for n in r.names("command") if r.largest(n) > 0]
-    names = tuple(dict.fromkeys(moving))
-    return names if len(names) > 1 else ()
+        sent = all(name in moving for name in given)
+        return given, tuple(n for n in undriven if sent and n not in given)
+    return driven if len(driven) > 1 or undriven else (), undriven
 
 
 def together(
