@@ -22,7 +22,7 @@ from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError, InputError
-from samii_rig.identify.poses import at_pose, by_pose
+from samii_rig.identify.poses import at_pose, by_pose, pose_of, told
 from samii_rig.progress import Begun, Progress
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
@@ -47,11 +47,7 @@ class InPose:
     @property
     def told(self) -> str:
         """The pose in words."""
-        return _told(self.pose)
-
-
-def _told(pose: Angle) -> str:
-    return f"{math.degrees(pose.value):.4g} deg"
+        return told(self.pose)
 
 
 def sorted_by_pose(
@@ -68,7 +64,7 @@ def one_pose(poses: Sequence[Angle], option: str, expected: str) -> Angle:
     """The pose of recordings that have one; InputError of an option where they have several."""
     first, *others = dict.fromkeys(poses)
     if others:
-        raise InputError(option, "pose", ", ".join(_told(p) for p in (first, *others)), expected)
+        raise InputError(option, "pose", ", ".join(told(p) for p in (first, *others)), expected)
     return first
 
 
@@ -78,7 +74,12 @@ def same_rig(toml: str, rig: Rig) -> bool:
         other = parse(Rig, toml, "the rig file of a recording")
     except InputError:
         return False
-    return bool(rig.gravity) and at_pose(other, None) == at_pose(rig, None)
+    if not (rig.gravity or rig.bent):
+        return False
+    try:
+        return at_pose(other, pose_of(rig)) == at_pose(rig, pose_of(rig))
+    except InputError:
+        return False
 
 
 def in_poses(
@@ -100,9 +101,6 @@ def in_poses(
     pose cannot be used whole, or not together.
     """
     rigs = [at_pose(rig, one.pose) for one in each]
-    if rig.bent and len(each) > 1:
-        expected = "recordings in one pose, as a weight turns otherwise beyond a bend"
-        raise InputError(rig.name, "pose", ", ".join(one.told for one in each), expected)
     if len(each) == 1:
         (one,) = each
         return diagnose(

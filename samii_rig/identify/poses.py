@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 from samii_rig.errors import InputError
 from samii_rig.rig.load import parse
+from samii_rig.rig.pose import HANGING, posed, read_whole_pose
 from samii_rig.rig.pose import at_pose as at_pose
-from samii_rig.rig.pose import posed
+from samii_rig.rig.pose import pose_of as pose_of
 from samii_rig.rig.pose import read_pose as read_pose
+from samii_rig.rig.pose import told as told
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
 from samii_rig.types import Recording
-
-HANGING = Angle(value=0.0, unit="rad")
 
 
 def by_pose(
@@ -28,26 +28,27 @@ def by_pose(
 
 def given_poses(n: int, rig: Rig, given: Sequence[str]) -> list[Angle]:
     """The pose of each of n recordings in words; InputError as of `poses_of`."""
-    posed(rig, given[0])
+    if not rig.bent:
+        posed(rig, given[0])
     if len(given) != n:
         expected = f"one --pose for each of {n} recordings, in their order"
         raise InputError("--pose", "", f"{len(given)} poses", expected)
-    return [read_pose(text) for text in given]
+    return [read_whole_pose(text, rig) for text in given]
 
 
 def poses_of(recordings: Sequence[Recording], rig: Rig, given: Sequence[str]) -> list[Angle]:
     """The pose of each recording: as `given`, else that of the rig file that it carries, if
-    that has gravity, else that of `rig`.
+    that has gravity or a bend, else that of `rig`.
 
     Raises InputError for another number of poses than of recordings, for one that is no angle, and
     for poses of a rig without gravity.
     """
     if given:
         return given_poses(len(recordings), rig, given)
-    if rig.gravity == 0:
+    if not (rig.gravity or rig.bent):
         return [HANGING] * len(recordings)
     out = []
     for recording in recordings:
         own = parse(Rig, recording.rig_toml, recording.source) if recording.rig_toml else rig
-        out.append((own if own.gravity else rig).pose or HANGING)
+        out.append(pose_of(own if own.gravity or own.bent else rig) or HANGING)
     return out

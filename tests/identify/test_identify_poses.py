@@ -8,7 +8,7 @@ from identify_kit import drawn
 
 from samii_rig.errors import InputError
 from samii_rig.identify.maximum_likelihood import identify
-from samii_rig.identify.poses import HANGING, at_pose, poses_of, read_pose
+from samii_rig.identify.poses import HANGING, at_pose, given_poses, poses_of, read_pose
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Recording
@@ -51,17 +51,21 @@ def test_two_poses_tell_a_spring_a_mass_and_an_inertia_which_one_pose_does_not()
 
 
 def test_a_bent_arm_has_one_set_of_parameters_in_several_poses() -> None:
-    """Each of its parts has its own pose; what the bend carries along is not told again."""
+    """Each of its parts has its own pose, and the elbow is at another angle in each."""
     elbow = {"name": "bent", "kind": "bend", "angle": {"value": 60.0, "unit": "deg"}}
     spring = part("torsional_ground_spring", "hinge", k=40.0, c=0.2)
     fore = arm("fore", L=0.4, r=0.2, m=0.8, I=0.012)
     wrist = part("torsional_spring", "wrist", k=15.0, c=0.02)
     rig = hanging(spring, arm(), elbow, wrist, fore, pose=0.0, rate_hz=100.0)
-    poses = [read_pose(text) for text in POSES]
+    bends = ("", ", bent -20 deg", ", bent 0 deg")
+    poses = given_poses(3, rig, [a + b for a, b in zip(POSES, bends, strict=True)])
     seen = [drawn(at_pose(rig, pose), i, n=80, band=(0.1, 5.0)) for i, pose in enumerate(poses)]
     found = identify(seen, weaker(rig), FREE, starts=2, poses=poses)
     assert found.fit.holds
     assert found.values == pytest.approx([40.0, 2.0, 0.3], rel=0.03)
+    # With the elbow at one angle in all of them nothing fits.
+    alike = given_poses(3, rig, POSES)
+    assert not identify(seen, weaker(rig), FREE, starts=2, poses=alike).fit.holds
 
 
 def blank(rig_toml: str = "") -> Recording:

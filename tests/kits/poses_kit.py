@@ -12,7 +12,8 @@ from gravity_kit import hanging
 from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.diagnose.physics.insert import element_of, inserted
 from samii_rig.diagnose.posed import InPose
-from samii_rig.identify.poses import at_pose, read_pose
+from samii_rig.identify.poses import at_pose
+from samii_rig.rig.pose import read_whole_pose
 from samii_rig.rig.schema import GravityStiffness, LumpedMass, Rig, TorsionalGroundSpring
 from samii_rig.rig.schema.elements import quantities
 from samii_rig.signal.estimate import estimate
@@ -85,7 +86,7 @@ def _channels(rig: Rig) -> tuple[Channel, ...]:
 
 def in_pose(rig: Rig, pose: str, seed: int, *changes: Change, repeats: int = 2) -> InPose:
     """Recordings of the rig in a pose, with changes that its file does not have."""
-    at = read_pose(pose)
+    at = read_whole_pose(pose, rig)
     hidden = at_pose(rig, at)
     for change in changes:
         hidden = change(hidden)
@@ -113,4 +114,4 @@ def held(k: float) -> Change:
 
 def weighed(k: float) -> Change:
     """A weight whose moment about the elbow is k (N m) a rad where the chain hangs."""
-    return lambda rig: _hidden(GravityStiffness, k=k * rig.pull / rig.gravity)(rig)
+    return lambda rig: _hidden(GravityStiffness, k=k * rig.pulls[-1] / rig.gravity)(rig)

@@ -31,19 +31,29 @@ def _by_itself(effect: Effect) -> Effect:
 
 def in_pose(effect: Effect, rig: Rig) -> Effect:
     """An effect as it is in the pose of a rig, its unknowns those of a chain that hangs: the
-    stiffness of gravity is k cos(pose)."""
-    return _times(effect, rig.pull / rig.gravity) if rig.gravity else effect
+    stiffness of gravity is k cos(pose), the pose that the chain has there."""
+    if effect.physics != OF_WEIGHT or not rig.gravity:
+        return effect
+    return _times(effect, _pull_at(effect, rig) / rig.gravity)
 
 
 def turned(effect: Effect, old: Rig, new: Rig) -> Effect:
     """An effect with the unknowns that it has in the pose of one rig, in that of another."""
-    return _times(effect, new.pull / old.pull) if old.pull and new.pull != old.pull else effect
+    if effect.physics != OF_WEIGHT:
+        return effect
+    before, after = _pull_at(effect, old), _pull_at(effect, new)
+    return _times(effect, after / before) if before and after != before else effect
+
+
+def _pull_at(effect: Effect, rig: Rig) -> float:
+    """Gravity along the chain, m/s^2, at what an effect puts in: beyond a bend it is another."""
+    built, known = effect.build(rig), {e.name for e in rig.element}
+    at = [k for k, e in enumerate(built.element) if e.name not in known]
+    return built.pulls[at[0]] if at else rig.pull
 
 
 def _times(effect: Effect, part: float) -> Effect:
     """The same, a stiffness of gravity so many times what it was."""
-    if effect.physics != OF_WEIGHT:
-        return effect
 
     def parameters(x: Float, nominal: Values) -> dict[Key, float]:
         return {key: part * v for key, v in effect.parameters(x, nominal).items()}

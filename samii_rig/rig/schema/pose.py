@@ -28,6 +28,12 @@ class Angle(Strict):
     written: str = Field(default="", description="unit that the value was given in")
 
 
+class Pose(Angle):
+    """The angle of the chain, and those of its joints at rest at one: (name of the bend, angle)."""
+
+    bends: tuple[tuple[str, Angle], ...] = ()
+
+
 def _in_rad(angle: Angle) -> Angle:
     value = convert(angle.value, angle.unit, "rad")
     if value is None:
@@ -37,7 +43,7 @@ def _in_rad(angle: Angle) -> Angle:
     return Angle(value=value, unit="rad", written=angle.unit)
 
 
-Pose = Annotated[Angle, AfterValidator(_in_rad)]
+PoseAngle = Annotated[Angle, AfterValidator(_in_rad)]
 
 
 def _bent(angle: Angle) -> Angle:
@@ -47,6 +53,11 @@ def _bent(angle: Angle) -> Angle:
             "where what lies beyond has no motion across it that comes from the base"
         )
     return angle
+
+
+def bend_angle(angle: Angle) -> Angle:
+    """The same; ValueError for one that a bend cannot have."""
+    return _bent(_in_rad(angle))
 
 
 BendAngle = Annotated[Angle, AfterValidator(_in_rad), AfterValidator(_bent)]

@@ -14,7 +14,7 @@ from samii_rig.rig.schema.device import Device, Service
 from samii_rig.rig.schema.elements import Bend, Element, End, Motion
 from samii_rig.rig.schema.limits import Agreement, Limit, Monitor
 from samii_rig.rig.schema.loops import Centring, Feedback
-from samii_rig.rig.schema.pose import Pose, pull, pulls
+from samii_rig.rig.schema.pose import PoseAngle, pull, pulls
 from samii_rig.rig.schema.references import check_references, unlike
 from samii_rig.rig.schema.sensors import Sensor
 from samii_rig.units import STANDARD_GRAVITY
@@ -35,7 +35,7 @@ class Rig(Strict):
     tip: End
     rate_hz: Positive
     gravity: NonNegative = 0.0
-    pose: Pose | None = None
+    pose: PoseAngle | None = None
     element: Annotated[tuple[Element, ...], Field(min_length=1)]
     sensor: Annotated[tuple[Sensor, ...], Field(min_length=1)]
     actuator: Annotated[tuple[ActuatorSpec, ...], Field(min_length=1)]
