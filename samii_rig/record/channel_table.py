@@ -256,14 +256,20 @@ def calibrated(layout: ImportMap, table: ChannelTable, units: dict[str, str]) ->
 
 def _scale(where: str, channel: ColumnMap, sensor: Sensor, stated: str) -> float:
     """What the column is multiplied by: value = (raw - offset) * scale."""
-    if sensor.sensitivity is None:
-        return channel.scale * sensor.sign
     field = f"channel {channel.name!r}"
+    raw = channel.raw_unit or stated
+    already = factor(raw, channel.unit) if raw else None
+    if sensor.sensitivity is None:
+        if channel.scale != 1.0 or not raw:
+            return channel.scale * sensor.sign
+        if already is None:
+            expected = f"a number, as the column is in {raw} and the channel in {channel.unit}"
+            raise InputError(where, f"{field}: sensitivity", "missing", expected)
+        return already * sensor.sign
     if channel.scale != 1.0:
         expected = "no scale in the map where the table gives a sensitivity"
         raise InputError(where, f"{field}: scale in the map", channel.scale, expected)
     signal, _, measured = sensor.sensitivity_unit.partition("/")
-    raw = channel.raw_unit or stated
     if not raw:
         expected = f"raw_unit in the map, the unit of its column: {signal}, or what it is"
         raise InputError(where, f"{field}: unit of the column", "missing", expected)
@@ -271,7 +277,6 @@ def _scale(where: str, channel: ColumnMap, sensor: Sensor, stated: str) -> float
     if to_unit is None:
         expected = f"{channel.unit} under the line, the channel's unit, or what converts to it"
         raise InputError(where, f"{field}: sensitivity_unit", sensor.sensitivity_unit, expected)
-    already = factor(raw, channel.unit)
     if already is not None:
         return already * sensor.sign  # the acquisition applied the sensitivity itself
     to_signal = factor(raw, signal)

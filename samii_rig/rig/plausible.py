@@ -1,14 +1,28 @@
-"""Numbers of a rig file that may be meant, and hardly are: told, never refused.
+"""What a rig file may mean, and hardly does: told, never refused.
 
 A length in millimetres that is said to be metres passes every check of its unit and sign.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
-from samii_rig.rig.schema import Rig, parameters
-from samii_rig.rig.schema.elements import flattened
+from samii_rig.rig.schema import (
+    Branch,
+    ForceSource,
+    GravityStiffness,
+    LumpedMass,
+    Rig,
+    RigidLink,
+    Rod,
+    TorqueSource,
+    TorsionalGroundSpring,
+    TranslationalGroundSpring,
+    parameters,
+)
+from samii_rig.rig.schema.elements import ANGLE_SOURCES, BEAMS, MOTION_SOURCES, flattened
 from samii_rig.units import pretty
 
 
@@ -26,10 +40,17 @@ class Usual:
 # less, a machine of ten tons. Other units span too much for a bound to tell anything.
 USUAL = {"m": Usual(1e-4, 30.0, "mm"), "kg": Usual(1e-6, 1e4, "g")}
 
+# What a source of motion can push against: it has inertia, or is held by the ground.
+PUSHED = (
+    *(*BEAMS, Rod, RigidLink, LumpedMass, Branch),
+    *(TorsionalGroundSpring, TranslationalGroundSpring, GravityStiffness),
+)
+
 
 def remarks(rig: Rig) -> list[str]:
-    """A line for each parameter outside of what is usual: element, field, value, what would be."""
-    out = []
+    """A line for each parameter outside of what is usual: element, field, value, what would be; for
+    a motor that pushes against nothing, and for sources side by side that add up."""
+    out = [*_pushing_nothing(rig), *_adding_up(rig)]
     for e in flattened(rig.element):
         for symbol, p in parameters(e).items():
             usual, size = USUAL.get(p.unit), abs(p.value)
@@ -42,3 +63,25 @@ def remarks(rig: Rig) -> list[str]:
                 f"{usual.low:g} to {usual.high:g} {pretty(p.unit)}{meant}"
             )
     return out
+
+
+def _pushing_nothing(rig: Rig) -> Iterator[str]:
+    for e in rig.element:
+        if isinstance(e, PUSHED):
+            return
+        turns = isinstance(e, ANGLE_SOURCES) and rig.base != "clamped"
+        if turns or (isinstance(e, MOTION_SOURCES) and rig.base == "free"):
+            yield (
+                f"element {e.name}: moves nothing, as base {rig.base!r} gives way and nothing "
+                "before it can be pushed against; was base 'clamped' or an inertia before it meant?"
+            )
+
+
+def _adding_up(rig: Rig) -> Iterator[str]:
+    for before, e in pairwise(rig.element):
+        for alike in (ANGLE_SOURCES, MOTION_SOURCES, TorqueSource, ForceSource):
+            if isinstance(before, alike) and isinstance(e, alike) and before.input == e.input:
+                yield (
+                    f"element {e.name}: adds up with {before.name}, which acts on the same point "
+                    f"by the same input {e.input!r}; was a spring between them meant?"
+                )

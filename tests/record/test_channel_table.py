@@ -112,6 +112,10 @@ BAD = {
         TABLE.replace("2026-03-01", ""),
         "'a_0': calibration_date is 'missing'",
     ),
+    "no sensitivity where the column has another unit": (
+        TABLE.replace("10.2", ""),
+        r"'a_0': sensitivity is 'missing'; expected a number, as the column is in V and the",
+    ),
     "a sensor without a row": (
         TABLE.replace("theta,,,+RZ,7,\n", ""),
         "channel 'theta' is 'missing'",

@@ -41,3 +41,29 @@ def test_a_file_is_told_once_with_its_name_and_is_no_error(tmp_path, caplog):
             load_rig(str(path))
     (record,) = caplog.records
     assert record.getMessage().startswith(f"samii-rig: look: {path}, element strip: L is 450 m")
+
+
+MOTOR = load_rig("flexible_joint")[1]
+BASE = 'base = "clamped"'
+
+
+@pytest.mark.parametrize("base", ["pinned", "free"])
+def test_a_motor_that_pushes_against_nothing_is_told(base):
+    text = MOTOR.replace(BASE, f'base = "{base}"')
+    (line,) = remarks(parse(Rig, text, "bench.toml"))
+    assert line.startswith(f"element motor: moves nothing, as base '{base}' gives way")
+    stator = '[[element]]\nname = "stator"\nkind = "inertia"\n'
+    stator += 'I = { value = 0.1, unit = "kg m^2", source = "test" }\n\n'
+    first = text.index("[[element]]")
+    assert remarks(parse(Rig, text[:first] + stator + text[first:], "bench.toml")) == []
+
+
+def test_two_motors_side_by_side_on_one_input_are_told():
+    first = MOTOR.index("[[element]]")
+    source = MOTOR[first : MOTOR.index("[[element]]", first + 1)]
+    twin = source.replace('name = "motor"', 'name = "twin"')
+    (line,) = remarks(parse(Rig, MOTOR[:first] + twin + MOTOR[first:], "bench.toml"))
+    assert line == (
+        "element motor: adds up with twin, which acts on the same point by the same input 'v'; "
+        "was a spring between them meant?"
+    )
