@@ -13,10 +13,14 @@ from table_kit import Effects, table_of
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.records import RecordProblem, Whole, _unfolded
 from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
+from samii_rig.diagnose.forces.search import ForceSearch
+from samii_rig.diagnose.forces.variation import Variation
 from samii_rig.diagnose.physics.model import Model, grid
-from samii_rig.diagnose.result import Diagnosis
+from samii_rig.diagnose.result import Diagnosis, Gap, Value
+from samii_rig.diagnose.verdict import by_record
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.progress import Counted
 from samii_rig.signal.estimate import estimate
@@ -103,7 +107,22 @@ def test_a_segment_in_which_a_sensor_freezes_is_left_out_and_told(nothing: list[
     assert every.verdict == "no_mismatch"
 
 
-def test_a_valve_that_lags_is_named_though_every_sweep_ends_with_its_record(tmp_path: Path):
+def anything(_search: ForceSearch, best: Explanation, _files: int) -> Variation | None:
+    """A joint that swings in any phase, which does the work of every linear effect."""
+    if best.effects:
+        return None
+    return Variation(
+        sites=(("joint_1", 1.0),),
+        parameters={"depth": Value(0.01, "1", 0.009, 0.011), "f": Value(1.0, "Hz", 0.99, 1.01)},
+        evidence=1e9, gain=1e9, before=(9.0, 9.0), after=(1.0, 1.0), gap=Gap(1.0, 0.99, 1.0),
+        inside=True, again=True,
+    )  # fmt: skip
+
+
+def test_a_valve_that_lags_is_named_though_every_sweep_ends_with_its_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr(by_record, "variation", anything)
     runs = cut_sweeps(tmp_path, SLOW_VALVE, design=replace(DESIGN, levels=(1.0,)))
     found = diagnose(estimate(runs), SAMII, runs=runs, effects=FEW)
     names = {(c.physics, c.site) for c in found.causes}

@@ -238,8 +238,9 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
     judged = looked.judged
     base = verdict.as_meant(forces, judged.best)
     own = verdict.as_meant(search, judged.best)
-    rival = judged.best.weight - own.weight
-    found = variation(forces, base, files)
+    # At the noise itself: while a mismatch is gross all weights are smaller, a variation's not.
+    rival = max(judged.best.weight - own.weight, (own.fitted.cost - judged.best.fitted.cost) / 2)
+    found = None if _is_linear(judged) else variation(forces, base, files)
     if found is not None and found.evidence > rival:
         varies = verdict.varying(judged, own, found, max(rival, 0.0))
         return _Looked(varies, found.before[1], found.after[1], found.gap, looked.said)
@@ -248,6 +249,13 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
         if beside is not None and beside.closed >= verdict.PARTLY:
             return replace(looked, said=(*looked.said, beside.told()))
     return looked
+
+
+def _is_linear(judged: Judgement) -> bool:
+    """Whether a linear response is told and leaves no more than noise: what varies is then beside
+    it. Swings of any phase in every record would do the work of such a response, too."""
+    linear = all(e.quasi is None for e in judged.best.effects)
+    return linear and judged.verdict in verdict.SAID and not judged.partly
 
 
 def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
