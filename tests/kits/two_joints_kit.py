@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from samii_rig.devices.channels import reference_channels
 from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import LumpedMass, Parameter, Rig
@@ -85,8 +86,7 @@ def _driven(u: Float) -> tuple[str, ...]:
 
 
 def _channels() -> tuple[Channel, ...]:
-    references = [Channel(f"u_{n}", "V", "reference") for n in INPUTS]
-    references += [Channel(f"theta_ref_{n}", "rad", "reference") for n in INPUTS]
+    references = reference_channels(RIG)
     commands = [Channel(a.name, a.unit, "command", resolution=a.resolution) for a in RIG.actuator]
     sensors = [Channel(s.name, RIG.units()[s.name], resolution=s.resolution) for s in RIG.sensor]
     return (*references, *commands, *sensors)
