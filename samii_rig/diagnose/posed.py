@@ -22,9 +22,10 @@ from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError, InputError
-from samii_rig.identify.poses import at_pose, by_pose, pose_of, told
+from samii_rig.identify.poses import at_pose, by_pose
 from samii_rig.progress import Begun, Progress
 from samii_rig.rig.load import parse
+from samii_rig.rig.pose import pose_of, told
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
 from samii_rig.types import FrequencyResponse, Recording

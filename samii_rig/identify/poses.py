@@ -6,11 +6,9 @@ from collections.abc import Sequence
 
 from samii_rig.errors import InputError
 from samii_rig.rig.load import parse
-from samii_rig.rig.pose import HANGING, posed, read_whole_pose
+from samii_rig.rig.pose import HANGING, pose_of, posed, read_whole_pose
 from samii_rig.rig.pose import at_pose as at_pose
-from samii_rig.rig.pose import pose_of as pose_of
 from samii_rig.rig.pose import read_pose as read_pose
-from samii_rig.rig.pose import told as told
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
 from samii_rig.types import Recording

@@ -176,7 +176,7 @@ def _has(recording: Recording, name: str) -> bool:
 
 
 def _moves(recording: Recording, command: str) -> bool:
-    return _has(recording, command) and bool(np.any(np.nan_to_num(recording.values_of(command))))
+    return _has(recording, command) and recording.largest(command) > 0
 
 
 def pieces_of(

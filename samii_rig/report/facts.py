@@ -96,14 +96,10 @@ def limit_rows(recordings: Sequence[Recording], rig: Rig) -> list[dict[str, obje
     predicted = _predictions(recordings)
     rows: list[dict[str, object]] = []
     for limit in rig.limit:
-        columns = [
-            (r, r.column(limit.channel))
-            for r in recordings
-            if limit.channel in {c.name for c in r.channels}
-        ]
-        if not columns:
+        having = [r for r in recordings if limit.channel in {c.name for c in r.channels}]
+        if not having:
             continue
-        peak = max(float(np.nanmax(np.abs(r.values[:, k]), initial=0.0)) for r, k in columns)
+        peak = max(r.largest(limit.channel) for r in having)
         used = peak / limit.max
         said = predicted.get(limit.channel)
         rows.append(

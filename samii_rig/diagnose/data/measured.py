@@ -31,9 +31,8 @@ WHOLE = ("burst", "settled", "periodic")
 # Cycles a record up to which a slow drift leaves more than the covariance, pooled over
 # neighbouring lines, says: what is left of it falls with the square of the frequency.
 DRIFTING = 4.5
-SUMS = (
-    1e-12  # of a bin's precision, what is below is rounding: its lines know a sum of entries alone
-)
+# Of a bin's precision, what is below is rounding: its lines know a sum of entries alone.
+SUMS = 1e-12
 DIFFER = 1.5  # chi-square per degree of freedom of levels against each other
 TRANSIENTS = "local"  # method of responses from single transients: see `usable`
 
@@ -214,14 +213,13 @@ def measured(
         n, q = len(d.frequency), len(pairs)
         H = np.zeros((n, q), complex)
         half = np.zeros((n, d.p, q), complex)  # half H is what was measured, in units of its noise
-        for actuator, moved in zip(
-            each, (np.ones((n, d.p)), *(x for _, x in d.follow)), strict=True
-        ):
-            at = [pairs.index((int(s), int(a))) for s, a in zip(d.sensor, actuator, strict=True)]
-            half[:, :, at] += d.root * moved[:, None, :]
-        H[:, [pairs.index((int(s), int(a))) for s, a in zip(d.sensor, d.actuator, strict=True)]] = (
-            d.H
-        )
+        at = [
+            [pairs.index((int(s), int(a))) for s, a in zip(d.sensor, own, strict=True)]
+            for own in each
+        ]
+        H[:, at[0]] = d.H
+        for own, moved in zip(at, (np.ones((n, d.p)), *(x for _, x in d.follow)), strict=True):
+            half[:, :, own] += d.root * moved[:, None, :]
         W = 2 * d.factor[:, None, None] * (half.conj().swapaxes(1, 2) @ half)
         expected = 2 * d.factor * d.mean()
         index = levels.index(_level(d.response))

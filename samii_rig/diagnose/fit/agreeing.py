@@ -177,7 +177,7 @@ def _alone(given: Given) -> list[_Alone]:
     whole = given.whole
     records, sensors = whole.records, whole.wired.sensors
     band = records.bands[0] if whole.asked else None
-    response = _kept(whole.response(given.fitted))
+    response = kept(whole.response(given.fitted))
     out = []
     for i, (run, _) in enumerate(aligned(given.runs)):
         try:
@@ -194,7 +194,7 @@ def _alone(given: Given) -> list[_Alone]:
     return out
 
 
-def _kept(response: Response) -> Response:
+def kept(response: Response) -> Response:
     """The same, computed once on each contour: those of all recordings are as long."""
     made: dict[tuple[int, complex], Complex] = {}
 

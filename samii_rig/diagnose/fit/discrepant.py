@@ -18,6 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg, stats
 
+from samii_rig.diagnose.fit.agreeing import kept
 from samii_rig.diagnose.fit.discrepancy import Discrepancy, weighed
 from samii_rig.diagnose.fit.explanations import UNEXPLAINED, Explanation, named
 from samii_rig.diagnose.fit.ranking import moved
@@ -190,7 +191,7 @@ class DiscrepantSearch(RecordSearch):
         if len(levels) < 2:
             return []
         fitted, at = self.ranked()[0].fitted, self.plain.reduced.frequency
-        response = whole.response(fitted)
+        response = kept(whole.response(fitted))
         out = []
         for level in levels:
             of = [i for i, p in enumerate(records.pieces) if p.levels == level]

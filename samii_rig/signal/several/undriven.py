@@ -28,7 +28,7 @@ def driven_of(
     """
     driven: set[str] = set()
     for recording in recordings:
-        used = [n for n in recording.names("reference") if _moves(recording, n)]
+        used = [n for n in recording.names("reference") if recording.largest(n) > 0]
         own = {c for c in moving for n in used if n.endswith(f"_{c}")}
         if not used or len(own) < len(used):
             return tuple(moving), ()
@@ -36,11 +36,6 @@ def driven_of(
     if not driven:
         return tuple(moving), ()
     return tuple(n for n in moving if n in driven), tuple(n for n in moving if n not in driven)
-
-
-def _moves(recording: Recording, name: str) -> bool:
-    x = recording.values[:, recording.column(name)]
-    return bool(np.nanmax(np.abs(x), initial=0.0) > 0)
 
 
 def apart(response: FrequencyResponse, undriven: Sequence[str]) -> FrequencyResponse:
