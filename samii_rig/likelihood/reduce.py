@@ -44,7 +44,7 @@ RIDGES, MORE = 5, 30.0  # tries of a ridge, each so many times the one before
 CYCLES = (
     5  # in a record, of its lowest line: below, wandering is as large as what polynomials leave
 )
-AT_ONCE = 4096  # lines whose products are formed together: 30 MB at 120 nodes
+AT_ONCE = 1024  # lines whose products are formed together: 4 MB at 120 nodes, what a cache holds
 
 Response = Callable[[Complex], Complex]
 """(n,) s -> (n, q) of the reference model, from input to sensors; (n, q m) of m inputs, all inputs
@@ -210,10 +210,11 @@ class Records:
 
     def seen(self, H: Complex, loop: Loops) -> list[Seen]:
         """Of each piece what H on `exact` leaves, and what else is in it."""
-        answers = Answers.of(H, self.exact(), loop, self.longest, self.pieces[0].inputs)
         rms = [np.sqrt(np.mean(by_input(p.r) ** 2, axis=1)) for p in self.pieces]
-        strength = np.max(rms, axis=0)
-        return [Seen.of(p, self.lines(p).k, answers, self.step, strength) for p in self.pieces]
+        answers = Answers.of(
+            H, self.exact(), loop, self.longest, np.max(rms, axis=0), self.pieces[0].inputs
+        )
+        return [Seen.of(p, self.lines(p).k, answers, self.step) for p in self.pieces]
 
 
 def _left_in_time(samples: Samples | Piece, H: Complex, contour: Contour) -> Float:
@@ -360,16 +361,17 @@ def formed(
 
     known = rounding.Added.of([s.rounding for s in seen])
 
-    def told(with_past: Records) -> tuple[Rows, Callable[[rounding.Added], Noise]]:
+    def told(with_past: Records) -> tuple[Rows, _Free, Callable[[rounding.Added], Noise]]:
         rows = _rows(records, _columns(with_past, smooth, nodes), seen)
-        left = _with_repeats(records, H, seen, rows, *_residual(rows, free))
-        return rows, lambda known: Noise.of(*left, disturbances=disturbances, known=known)
+        change = _Free.of(rows, free)
+        left = _with_repeats(records, H, seen, rows, *_residual(change))
+        return rows, change, lambda known: Noise.of(*left, disturbances=disturbances, known=known)
 
-    rows, noise = told(records)
+    rows, change, noise = told(records)
     power = noise(known)
-    with_past = _with_past(records, rows, seen, power, free)
+    with_past = _with_past(records, change, seen, power)
     if with_past is not None:
-        rows, noise = told(with_past)
+        rows, _, noise = told(with_past)
         power = noise(known)
     times = _as_changes(rows, seen, power)
     if np.any(times > 1):
@@ -393,19 +395,14 @@ def formed(
 
 
 def _with_past(
-    records: Records, rows: Rows, seen: Sequence[Seen], noise: Noise, spare: Float
+    records: Records, change: _Free, seen: Sequence[Seen], noise: Noise
 ) -> Records | None:
     """The same records, with what moved the rig before each piece as far as its lines show that,
-    whatever the change of the response is; None where nothing did.
-
-    spare : as of `_residual`.
-    """
-    W = _weights(rows, noise)
+    whatever the change of the response is; None where nothing did."""
+    W = _weights(change.rows, noise)
     pieces = list(records.pieces)
-    rows, groups = _grouped(rows, spare)
-    for on in groups:
-        one = rows.take(on)
-        Q = orthonormal(as_real(one.X))
+    for on, Q in change.groups:
+        one = change.rows.take(on)
         own = [(i, seen[i]) for i in np.unique(one.piece)]
         blocks = []
         for i, s in own:
@@ -555,12 +552,13 @@ def _rows(records: Records, changes: Sequence[Complex] | None, seen: Sequence[Se
     # Where each line of each piece stands.
     place = np.split(np.argsort(order), np.cumsum(size)[:-1])
     n, q, m = order.size, seen[0].e.shape[1], max(s.N.shape[2] for s in seen)
-    X = np.zeros((n, changes[0].shape[1] if changes else 0), complex)
+    X = np.empty((n, changes[0].shape[1] if changes else 0), complex)
     e, N, f = np.zeros((n, q), complex), np.zeros((n, q, m), complex), np.zeros(n)
     k, which = np.zeros(n, np.int64), np.zeros(n, np.int64)
     for i, (on, piece) in enumerate(zip(place, records.pieces, strict=True)):
         if changes:
-            X[on] = changes[i] * (1 / np.sqrt(len(piece.z)))
+            changes[i] *= 1 / np.sqrt(len(piece.z))
+            X[on] = changes[i]
         e[on], f[on], k[on], which[on] = seen[i].e, lines[i].frequency, lines[i].k, i
         N[on, :, : seen[i].N.shape[2]] = seen[i].N
     return Rows(X, e, N, f, k, which, order)
@@ -571,10 +569,10 @@ def _without(e: Complex, N: Complex) -> tuple[Complex, Float]:
     n, q = e.shape[:2]
     out, used = np.zeros_like(e), np.zeros(2 * n)
     for c in range(q):
-        Q = orthonormal(as_real(N[:, c][:, np.any(N[:, c] != 0, axis=0)]))
+        Q = _spanned(_nuisances_of(N[:, c]))
         goal = as_real(e[:, c])
         goal = goal - Q @ (Q.T @ goal)
-        used += np.sum(Q**2, axis=1)
+        used += _lengths(Q)
         out[:, c] = as_complex(goal)
     return out, np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
 
@@ -620,69 +618,94 @@ def _between(nodes: Int, few: Int) -> Float:
     return np.stack([np.interp(nodes, few, one) for one in np.eye(few.size)], axis=1)
 
 
-def _residual(rows: Rows, spare: Float) -> tuple[Complex, Float]:
-    """What the best change of each sensor in each piece leaves (n, q), and the freedom (n,) that
-    each line has left: pieces that differ by more than noise are not noise.
+@dataclass(frozen=True, slots=True)
+class _Free:
+    """A change that is free where noise is told, and the lines that show it together: each piece's
+    by themselves where they are enough.
 
-    spare : (b, m) the change that is free, on the nodes.
+    rows : of all lines; what the change does is in `groups`. groups : some lines (n,) and the
+    directions (2 n, p) of the change in them, of every sensor.
     """
-    rows, groups = _grouped(rows, spare)
-    n, q = rows.e.shape
+
+    rows: Rows
+    groups: list[tuple[Int, Float]]
+
+    @classmethod
+    def of(cls, rows: Rows, spare: Float) -> _Free:
+        """spare : (b, m) the change that is free, on the nodes."""
+        b, n = len(spare), len(rows.e)
+        real, parts = as_real(rows.X), range(0, rows.X.shape[1], len(spare))
+        X = np.concatenate([real[:, i : i + b] @ spare for i in parts], axis=1)
+        pieces = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
+        if len(parts) > 2:
+            X = _excited(X, pieces, len(parts) // 2)
+        rows = replace(rows, X=rows.X[:, :0])
+        each = [X[np.concatenate([on, n + on])] for on in pieces]
+        if any(len(on) < ENOUGH * _free(one) for on, one in zip(pieces, each, strict=True)):
+            return cls(rows, [(np.arange(n), orthonormal(X))])
+        return cls(rows, [(on, orthonormal(one)) for on, one in zip(pieces, each, strict=True)])
+
+
+def _residual(change: _Free) -> tuple[Complex, Float]:
+    """What the best change of each sensor in each piece leaves (n, q), and the freedom (n,) that
+    each line has left: pieces that differ by more than noise are not noise."""
+    n, q = change.rows.e.shape
     left, free = np.zeros((n, q), complex), np.zeros(n)
-    for on in groups:
-        left[on], free[on] = _of_pieces(rows.take(on))
+    for on, Q in change.groups:
+        left[on], free[on] = _of_pieces(change.rows.take(on), Q)
     return left, free
 
 
-def _grouped(rows: Rows, spare: Float) -> tuple[Rows, list[Int]]:
-    """Of a change that is free, and the lines that show it together: each piece's by themselves
-    where they are enough."""
-    b = len(spare)
-    parts = range(0, rows.X.shape[1], b)
-    rows = replace(rows, X=np.concatenate([rows.X[:, i : i + b] @ spare for i in parts], axis=1))
-    pieces = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
-    if len(parts) > 2:
-        rows = _excited(rows, pieces, len(parts) // 2)
-    if any(len(on) < ENOUGH * _free(rows.X[on]) for on in pieces):
-        return rows, [np.arange(len(rows.e))]
-    return rows, pieces
-
-
-def _excited(rows: Rows, pieces: Sequence[Int], inputs: int) -> Rows:
+def _excited(X: Float, pieces: Sequence[Int], inputs: int) -> Float:
     """The same, without what each of several inputs does in a piece in which it rests."""
-    X = rows.X.reshape(len(rows.X), inputs, -1).copy()
-    size = np.array([np.linalg.norm(X[on], axis=(0, 2)) / np.sqrt(len(on)) for on in pieces])
+    X = X.reshape(2, len(X) // 2, inputs, -1)
+    size = np.array([np.sqrt(np.sum(X[:, on] ** 2, axis=(0, 1, 3)) / len(on)) for on in pieces])
     for on, rests in zip(pieces, size < RESTS * size.max(axis=0), strict=True):
-        X[np.ix_(on, np.flatnonzero(rests))] = 0.0
-    return replace(rows, X=X.reshape(len(X), -1))
+        X[:, on[:, None], np.flatnonzero(rests)] = 0.0
+    return X.reshape(2 * X.shape[1], -1)
 
 
-def _free(X: Complex) -> int:
+def _free(X: Float) -> int:
     """Columns that do anything."""
     return int(np.count_nonzero(np.any(X != 0, axis=0)))
 
 
-def _of_pieces(rows: Rows) -> tuple[Complex, Float]:
-    """As `_residual`, of pieces that share one change. Nuisances are projected out piece by piece:
-    side by side those of many pieces would be many times as much as all lines."""
-    X, (n, q) = as_real(rows.X), rows.e.shape
-    size = np.linalg.norm(X, axis=0)
-    X /= np.where(size > 0, size, 1.0)
-    left, used = np.zeros((n, q), complex), np.zeros(2 * n)
+def _of_pieces(rows: Rows, Q: Float) -> tuple[Complex, Float]:
+    """As `_residual`, of pieces that share one change, of directions Q (2 n, p)."""
+    n, q = rows.e.shape
     each = [(np.concatenate([on, n + on]), on, m) for on, m in rows.each()]
-    for c in range(q):
-        change, goal = X.copy(), as_real(rows.e[:, c])
-        for at, on, m in each:
-            more = as_real(rows.N[on, c, :m])
-            Q = orthonormal(more[:, np.any(more != 0, axis=0)])
-            change[at] -= Q @ (Q.T @ change[at])
-            goal[at] -= Q @ (Q.T @ goal[at])
-            used[at] += np.sum(Q**2, axis=1)
-        Q = _spanned(change)
+    goal, used = as_real(rows.e), np.zeros(2 * n)
+    if len(each) == 1:
         goal -= Q @ (Q.T @ goal)
-        used += np.sum(Q**2, axis=1)
-        left[:, c] = as_complex(goal)
-    return left, np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
+        used += q * _lengths(Q)
+        for c in range(q):
+            N = _nuisances_of(rows.N[:, c])
+            N = _spanned(N - Q @ (Q.T @ N))
+            goal[:, c] -= N @ (N.T @ goal[:, c])
+            used += _lengths(N)
+    else:  # side by side the nuisances of many pieces would be many times as much as all lines
+        for c in range(q):
+            change = Q.copy()
+            for at, on, m in each:
+                N = _spanned(_nuisances_of(rows.N[on, c, :m]))
+                change[at] -= N @ (N.T @ change[at])
+                goal[at, c] -= N @ (N.T @ goal[at, c])
+                used[at] += _lengths(N)
+            change = _spanned(change)
+            goal[:, c] -= change @ (change.T @ goal[:, c])
+            used += _lengths(change)
+    return as_complex(goal), np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
+
+
+def _nuisances_of(N: Complex) -> Float:
+    """(2 n, m) those of (n, m_all) that there are in one sensor, of size 1."""
+    some = as_real(N[:, np.any(N != 0, axis=0)])
+    return np.asarray(some / np.linalg.norm(some, axis=0))
+
+
+def _lengths(Q: Float) -> Float:
+    """(n,) squares of the rows of Q (n, m)."""
+    return np.asarray(np.einsum("ij,ij->i", Q, Q))
 
 
 def orthonormal(X: Float) -> Float:
@@ -712,8 +735,7 @@ def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     b, q = reference.shape  # q : of each input by itself, where there are several
     W = _weights(rows, noise)
     We = (W @ rows.e[:, :, None])[:, :, 0]
-    M = _products(rows.X, W)
-    g = (rows.X.conj().T @ We).real.T.ravel()
+    M, g = _products(rows.X, W, We)
     cross, own_head = _nuisances(rows, W, We)
     # Where nothing was excited nothing is known: there the diagonal keeps the factor regular, and
     # takes the directions' place. What nuisances leave is as exact as what they were taken from.
@@ -763,25 +785,31 @@ def _nuisances(rows: Rows, W: Complex, We: Complex) -> tuple[Float, Float]:
     return np.concatenate(crosses, axis=1), np.concatenate(heads)
 
 
-def _products(X: Complex, W: Complex) -> Float:
-    """(q 2 b, q 2 b) real parts of X^H W_ij X of lines X (n, 2 b), sensor by sensor."""
+def _products(X: Complex, W: Complex, We: Complex) -> tuple[Float, Float]:
+    """(q 2 b, q 2 b) real parts of X^H W_ij X of lines X (n, 2 b), sensor by sensor, and (q 2 b,)
+    of X^H We of lines We (n, q)."""
     q, size = W.shape[1], X.shape[1]
-    M = np.zeros((q * size, q * size))
+    M, g = np.zeros((q * size, q * size)), np.zeros((q, size))
     for first in range(0, len(X), AT_ONCE):
-        x, w = X[first : first + AT_ONCE], W[first : first + AT_ONCE]
-        real = as_real(x)
+        some = slice(first, first + AT_ONCE)
+        # Real parts beside imaginary ones, as they stand in memory: real parts of products.
+        x = np.ascontiguousarray(X[some].T)
+        real, scaled = x.view(np.float64), np.empty_like(x)
+        w = np.ascontiguousarray(W[some].transpose(1, 2, 0))
+        g += np.ascontiguousarray(We[some].T).view(np.float64) @ real.T
         for i in range(q):
             own = slice(i * size, (i + 1) * size)
-            root = real * np.tile(np.sqrt(w[:, i, i].real), 2)[:, None]
-            M[own, own] += root.T @ root
+            root = np.multiply(x, np.sqrt(w[i, i].real), out=scaled).view(np.float64)
+            M[own, own] += root @ root.T
             for j in range(i + 1, q):
-                M[own, j * size : (j + 1) * size] += real.T @ as_real(w[:, i, j, None] * x)
+                other = np.multiply(x, w[i, j], out=scaled).view(np.float64)
+                M[own, j * size : (j + 1) * size] += real @ other.T
     # In place: with eight sensors and some hundred nodes M is the most that is kept of any record.
     for i in range(q):
         for j in range(i + 1, q):
             one, other = slice(i * size, (i + 1) * size), slice(j * size, (j + 1) * size)
             M[other, one] = M[one, other].T
-    return M
+    return M, g.ravel()
 
 
 def _factor(M: Float, ridge: Float) -> tuple[Float, Float]:

@@ -24,6 +24,8 @@ class Answers:
 
     H : (M//2 + 1, q), or (M//2 + 1, q inputs) of several, all inputs of the first sensor first.
     loops : that H has closed. impulse : (m, q) or (m, q inputs) its answer to an impulse.
+    strength : (inputs,) rms of what is known to act. What pieces of one length have in common is
+    kept: most are repeats and levels of one excitation.
     """
 
     H: Complex
@@ -31,23 +33,44 @@ class Answers:
     loops: Loops
     inputs: int
     impulse: Float
-    kept: dict[int, list[Float]] = field(default_factory=dict)
+    strength: Float
+    kept: dict[tuple[int, int, int, int], tuple[Past, Complex, Complex]] = field(
+        default_factory=dict
+    )
 
     @classmethod
-    def of(cls, H: Complex, exact: Contour, loops: Loops, longest: int, inputs: int = 1) -> Answers:
+    def of(
+        cls,
+        H: Complex,
+        exact: Contour,
+        loops: Loops,
+        longest: int,
+        strength: Float,
+        inputs: int = 1,
+    ) -> Answers:
         """longest : samples of any piece, input before it included."""
-        return cls(H, exact, loops, inputs, exact.record(H, min(2 * longest, exact.samples)))
+        impulse = exact.record(H, min(2 * longest, exact.samples))
+        return cls(H, exact, loops, inputs, impulse, strength)
 
-    def steps(self, n: int) -> list[Float]:
+    def alike(self, piece: Piece, k: Int) -> tuple[Past, Complex, Complex]:
+        """Of neighbouring lines k of a piece, whatever its input: its past, how sensors wander, and
+        what the offsets of inputs and loops' sensors make, of size 1."""
+        n, q = piece.z.shape
+        key = n, piece.history, int(k[0]), k.size
+        if key not in self.kept:
+            past = Past.of_piece(piece, k, self.impulse, self.exact, self.strength)
+            steps = nuisance.offsets(piece, k, self._steps(len(piece.r)))
+            self.kept[key] = past, nuisance.wander(n, k, q), _of_size_one(steps)
+        return self.kept[key]
+
+    def _steps(self, n: int) -> list[Float]:
         """(n, q) what the sensors show of a step of each input, and of each loop's sensor."""
-        if n not in self.kept:
-            each = [self.H[:, j :: self.inputs] for j in range(self.inputs)]
-            for kp, sensor, of in self.loops:
-                sensed = -kp * each[of]
-                sensed[:, sensor] += 1
-                each.append(sensed)
-            self.kept[n] = [self.exact.predicted(H, np.ones(n)) for H in each]
-        return self.kept[n]
+        each = [self.H[:, j :: self.inputs] for j in range(self.inputs)]
+        for kp, sensor, of in self.loops:
+            sensed = -kp * each[of]
+            sensed[:, sensor] += 1
+            each.append(sensed)
+        return [self.exact.predicted(H, np.ones(n)) for H in each]
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,23 +92,21 @@ class Seen:
     left: Float
 
     @classmethod
-    def of(cls, piece: Piece, k: Int, answers: Answers, step: Float, strength: Float) -> Seen:
-        """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known.
-        strength : (inputs,) rms of what is known to act."""
-        n, q = piece.z.shape
+    def of(cls, piece: Piece, k: Int, answers: Answers, step: Float) -> Seen:
+        """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known."""
+        n = len(piece.z)
         H, exact = answers.H, answers.exact
         y = exact.predicted(H, piece.r)[piece.history :]
         left_in_time = piece.z - y
         left = np.fft.rfft(left_in_time, axis=0)
-        past = Past.of_piece(piece, k, answers.impulse, exact, strength)
-        own = [nuisance.wander(n, k, q), nuisance.hum(left, k, exact.rate_hz, n)]
+        past, wander, steps = answers.alike(piece, k)
+        own = [wander, nuisance.hum(left, k, exact.rate_hz, n)]
         if np.any(step > 0):  # what a converter reads is the whole motion
-            y = y + _before(past, left[k], own[0], answers.impulse, piece)
+            y = y + _before(past, left[k], wander, answers.impulse, piece)
         rounding = Rounding.of_piece(piece, k, step, y, exact.rate_hz)
         own += [nuisance.unread(piece, k, rounding.factors, H, exact, answers.loops)]
         own += [nuisance.edges(piece, k, answers.impulse)]
-        steps = nuisance.offsets(piece, k, answers.steps(len(piece.r)))
-        beside, steps = _of_size_one(np.concatenate(own, axis=2)), _of_size_one(steps)
+        beside = _of_size_one(np.concatenate(own, axis=2))
         first = past.shapes.shape[2]
         return cls(
             np.asarray(left[k] / np.sqrt(n)),

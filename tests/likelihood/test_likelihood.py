@@ -23,6 +23,7 @@ from samii_rig.likelihood.reduce import (
     _past_of,
     as_real,
     left_by,
+    orthonormal,
     reduced,
 )
 from samii_rig.likelihood.rounding import Added, Rounding, repeating
@@ -177,22 +178,25 @@ def test_a_past_of_one_mode_has_its_two_states_however_long_it_rings(damping: fl
     assert found.shapes.shape[2] == 2
 
 
-def test_the_residual_of_pieces_that_share_a_change_is_what_no_change_and_nuisance_makes():
+@pytest.mark.parametrize("lines", [(27,), (12, 15)])
+def test_the_residual_of_pieces_that_share_a_change_is_what_no_change_and_nuisance_makes(
+    lines: tuple[int, ...],
+):
     """The projection with the nuisances of every piece in columns of their own, side by side."""
     rng = np.random.default_rng(3)
-    lines, q, b, m = (12, 15), 2, 3, 2
+    q, b, m = 2, 3, 2
     n = sum(lines)
 
     def drawn(*shape: int) -> Complex:
         return rng.normal(size=shape) + 1j * rng.normal(size=shape)
 
-    piece = np.repeat(np.arange(2), lines)
+    piece = np.repeat(np.arange(len(lines)), lines)
     k = np.arange(n)
     rows = Rows(drawn(n, b), drawn(n, q), drawn(n, q, m), k + 1.0, k, piece, k)
-    left, free = _of_pieces(rows)
+    left, free = _of_pieces(rows, orthonormal(as_real(rows.X)))
     freedom = 0.0
     for c in range(q):
-        own = [np.where((piece == i)[:, None], rows.N[:, c], 0) for i in range(2)]
+        own = [np.where((piece == i)[:, None], rows.N[:, c], 0) for i in range(len(lines))]
         A = as_real(np.concatenate([rows.X, *own], axis=1))
         Q = np.linalg.qr(A)[0]
         e = as_real(rows.e[:, c])

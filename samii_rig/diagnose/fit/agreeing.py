@@ -28,7 +28,7 @@ from samii_rig.errors import EstimateError, InputError
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.likelihood.reduce import Reduced, Response, orthonormal
 from samii_rig.rig.schema import Rig
-from samii_rig.signal.columns import aligned, proportional
+from samii_rig.signal.columns import proportional
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Complex, Finding, Float, FrequencyResponse, Recording
 
@@ -179,9 +179,9 @@ def _alone(given: Given) -> list[_Alone]:
     band = records.bands[0] if whole.asked else None
     response = kept(whole.response(given.fitted))
     out = []
-    for i, (run, _) in enumerate(aligned(given.runs)):
+    for i, run in enumerate(whole.runs):
         try:
-            own = Whole.of([run], whole.rig, band, sensors, _own(run, given.findings))
+            own = Whole.of_aligned([run], whole.rig, band, sensors, _own(run, given.findings))
             # On two states, those lines alone that both have.
             among = within(own.records, records.band)
         except EstimateError:

@@ -94,6 +94,7 @@ class Whole:
     apart: Records | None = None  # the same, every level by itself
     asked: bool = False  # whether somebody said which lines count
     live: bool = False  # whether every model folds back what is its own from above the rate
+    runs: tuple[Recording, ...] = field(default=(), repr=False, compare=False)  # as `aligned`
 
     @classmethod
     def of(
@@ -111,7 +112,19 @@ class Whole:
 
         Raises EstimateError where they hold nothing to compare.
         """
-        runs = [run for run, _ in aligned(runs)]
+        every = [run for run, _ in aligned(runs)]
+        return cls.of_aligned(every, rig, band, sensors, findings)
+
+    @classmethod
+    def of_aligned(
+        cls,
+        runs: Sequence[Recording],
+        rig: Rig,
+        band: tuple[float, float] | None = None,
+        sensors: Sequence[str] | None = None,
+        findings: Sequence[Finding] = (),
+    ) -> Whole:
+        """As `of`, of runs whose rows hold what was sent and measured at one time."""
         wired = wiring(runs, rig, sensors)
         bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
         without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
@@ -129,7 +142,8 @@ class Whole:
         )
         rests = tuple(j for j, x in enumerate(wired.inputs) if not x.driven)
         all_, apart = (replace(one, undriven=rests) for one in (all_, apart))
-        return cls(rig, all_, wired, tuple(without.items()), apart, band is not None)
+        left_out, asked = tuple(without.items()), band is not None
+        return cls(rig, all_, wired, left_out, apart, asked, runs=tuple(runs))
 
     @property
     def every(self) -> int:

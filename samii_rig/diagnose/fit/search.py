@@ -53,6 +53,8 @@ class Search(Explanations):
     """What is tried: effects added, taken away again and swapped."""
 
     usual = LINES
+    # The latest screen, and what it was about: single effects and pairs begin with the same one.
+    _screened: tuple[tuple[object, ...], list[tuple[float, Effect, list[Start]]]] | None = None
 
     def run(self, *, briefly: bool = False) -> list[Explanation]:
         """Grow, swap, prune; all explanations, the most probable first. briefly : single effects
@@ -251,9 +253,14 @@ class Search(Explanations):
     def screen(self, base: Explanation) -> list[tuple[float, Effect, list[Start]]]:
         """How far chi-square should fall with each further effect, and one or two starts for its
         refit; the largest first."""
-        look = Screen.of(self.problem, base.fitted)
-        every = self.each(self.table, lambda e: named([e]))
-        return ranking(look, every, base.effects, self.model)
+        about = self.problem, base.fitted, self.table
+        if self._screened is None or any(
+            a is not b for a, b in zip(self._screened[0], about, strict=True)
+        ):
+            look = Screen.of(self.problem, base.fitted)
+            every = self.each(self.table, lambda e: named([e]))
+            self._screened = about, ranking(look, every, base.effects, self.model)
+        return self._screened[1]
 
     def saturate(self, physics: str) -> None:
         """Every place of one physics at once, taken away again one by one while that is better.
