@@ -165,7 +165,7 @@ def _independent(shapes: Complex) -> tuple[Float, Float]:
     flat = (shapes / scale[:, None]).reshape(n * q, p)
     rows = np.concatenate([flat.real, flat.imag])
     size = np.linalg.norm(rows, axis=0)
-    _, values, turn = np.linalg.svd(rows / size, full_matrices=False)
+    _, values, turn = np.linalg.svd(np.linalg.qr(rows / size, mode="r"), full_matrices=False)
     return size, np.asarray(turn[values > NEW * values[0]])
 
 

@@ -296,6 +296,7 @@ class Rows:
     N : (n, q, m) nuisances of each line's own piece, columns of zeros behind them.
     f : (n,) Hz. k : (n,) numbers of the lines. piece : (n,) which.
     order : (n,) of the lines of all pieces, one after the other, which these are.
+    counts : (pieces,) of each its nuisances.
     """
 
     X: Complex
@@ -305,20 +306,19 @@ class Rows:
     k: Int
     piece: Int
     order: Int
+    counts: Int
 
     def take(self, which: Any) -> Rows:
         """Some of the lines."""
         return Rows(
             self.X[which], self.e[which], self.N[which], self.f[which], self.k[which],
-            self.piece[which], self.order[which],
+            self.piece[which], self.order[which], self.counts,
         )  # fmt: skip
 
     def each(self) -> list[tuple[Int, int]]:
         """Of each piece its lines, and how many nuisances they have."""
-        some = np.any(self.N != 0, axis=1)
-        lines = [np.flatnonzero(self.piece == i) for i in np.unique(self.piece)]
-        counts = [np.flatnonzero(np.any(some[on], axis=0)) for on in lines]
-        return [(on, int(c[-1]) + 1 if c.size else 0) for on, c in zip(lines, counts, strict=True)]
+        every = np.unique(self.piece)
+        return [(np.flatnonzero(self.piece == i), int(self.counts[i])) for i in every]
 
 
 def reduced(
@@ -362,9 +362,10 @@ def formed(
     known = rounding.Added.of([s.rounding for s in seen])
 
     def told(with_past: Records) -> tuple[Rows, _Free, Callable[[rounding.Added], Noise]]:
-        rows = _rows(records, _columns(with_past, smooth, nodes), seen)
-        change = _Free.of(rows, free)
-        left = _with_repeats(records, H, seen, rows, *_residual(change))
+        changes = _columns(with_past, smooth, nodes)
+        rows = _rows(records, changes, seen)
+        change = _Free.of(rows, changes, free)
+        left = _with_repeats(records, H, seen, rows, *_residual(change, seen))
         return rows, change, lambda known: Noise.of(*left, disturbances=disturbances, known=known)
 
     rows, change, noise = told(records)
@@ -401,14 +402,11 @@ def _with_past(
     whatever the change of the response is; None where nothing did."""
     W = _weights(change.rows, noise)
     pieces = list(records.pieces)
-    for on, Q in change.groups:
-        one = change.rows.take(on)
-        own = [(i, seen[i]) for i in np.unique(one.piece)]
-        blocks = []
-        for i, s in own:
-            at = np.flatnonzero(one.piece == i)
-            blocks.append((at, s.past.likely, one.N[at][:, :, s.beside]))
-        found = _past_of(Q, blocks, one.e, W[on])
+    for which, on, Q in change.groups:
+        own = [(i, seen[i]) for i in which]
+        group = change.rows.piece[on]
+        blocks = [(np.flatnonzero(group == i), s.past.likely, s.N[:, :, s.beside]) for i, s in own]
+        found = _past_of(Q, blocks, change.rows.e[on], W[on])
         if found is None:
             continue
         for i, s in own:
@@ -469,16 +467,15 @@ def _past_of(
     # Side by side the shapes of many pieces would be many times as much as all lines: of each its
     # products, and what all lose to the change by its p directions.
     n, q = e.shape
-    C, We = as_complex(Q), (W @ e[:, :, None])[:, :, 0]
-    K = np.array([[(C.conj().T @ (W[:, c, d, None] * C)).real for d in range(q)] for c in range(q)])
-    K = K.transpose(0, 2, 1, 3).reshape(q * Q.shape[1], -1)
+    We = (W @ e[:, :, None])[:, :, 0]
+    K, pull = _products(as_complex(Q), W, We)
 
     def along(at: Int, x: Complex) -> Float:
         """(q p, m) of lines x (k, q, m) along the change."""
         there = Q[np.concatenate([at, n + at])].T
         return np.concatenate([there @ as_real(x[:, c]) for c in range(q)])
 
-    every, last = np.arange(n), sum(before.shape[2] for _, before, _ in blocks)
+    last = sum(before.shape[2] for _, before, _ in blocks)
     m = last + sum(beside.shape[2] for _, _, beside in blocks)
     square, head, first = np.zeros((m, m)), np.zeros(m), 0
     B, T = np.zeros((len(K), m)), np.zeros((len(K), m))
@@ -491,7 +488,7 @@ def _past_of(
         head[place] = (flat @ We[at].ravel()).real
         B[:, place], T[:, place] = along(at, A), along(at, WA)
     square += B.T @ (K @ B) - T.T @ B - B.T @ T
-    own, pull = along(every, e[:, :, None])[:, 0], along(every, We[:, :, None])[:, 0]
+    own = along(np.arange(n), e[:, :, None])[:, 0]
     head += B.T @ (K @ own - pull) - T.T @ own
     return shown(square, head, sum(before.shape[2] for _, before, _ in blocks))
 
@@ -555,13 +552,12 @@ def _rows(records: Records, changes: Sequence[Complex] | None, seen: Sequence[Se
     X = np.empty((n, changes[0].shape[1] if changes else 0), complex)
     e, N, f = np.zeros((n, q), complex), np.zeros((n, q, m), complex), np.zeros(n)
     k, which = np.zeros(n, np.int64), np.zeros(n, np.int64)
-    for i, (on, piece) in enumerate(zip(place, records.pieces, strict=True)):
+    for i, on in enumerate(place):
         if changes:
-            changes[i] *= 1 / np.sqrt(len(piece.z))
             X[on] = changes[i]
         e[on], f[on], k[on], which[on] = seen[i].e, lines[i].frequency, lines[i].k, i
         N[on, :, : seen[i].N.shape[2]] = seen[i].N
-    return Rows(X, e, N, f, k, which, order)
+    return Rows(X, e, N, f, k, which, order, np.array([s.N.shape[2] for s in seen]))
 
 
 def _without(e: Complex, N: Complex) -> tuple[Complex, Float]:
@@ -589,8 +585,8 @@ def as_complex(x: Float) -> Complex:
 
 
 def _columns(records: Records, contour: Contour, nodes: Int) -> list[Complex]:
-    """Of each piece (n_lines, 2 n_nodes), of several inputs one beside the other; those of one
-    shape are computed together."""
+    """Of each piece (n_lines, 2 n_nodes), in units of the root of its record's power, of several
+    inputs one beside the other; those of one shape are computed together."""
     out: dict[int, Complex] = {}
     shapes = [
         (p.history, len(p.z), band) for p, band in zip(records.pieces, records.bands, strict=True)
@@ -603,6 +599,7 @@ def _columns(records: Records, contour: Contour, nodes: Int) -> list[Complex]:
         m = len(both) // len(own)
         for j in records.undriven:
             both[j::m] = 0.0
+        both *= 1 / np.sqrt(shape[1])
         for j, i in enumerate(own):
             out[i] = both[j] if m == 1 else np.concatenate(both[j * m : (j + 1) * m], axis=1)
     return [out[i] for i in range(len(records.pieces))]
@@ -623,46 +620,56 @@ class _Free:
     """A change that is free where noise is told, and the lines that show it together: each piece's
     by themselves where they are enough.
 
-    rows : of all lines; what the change does is in `groups`. groups : some lines (n,) and the
-    directions (2 n, p) of the change in them, of every sensor.
+    rows : of all lines. groups : pieces, their lines (n,), and the directions (2 n, p) of the
+    change in these, of every sensor.
     """
 
     rows: Rows
-    groups: list[tuple[Int, Float]]
+    groups: list[tuple[Sequence[int], Int, Float]]
 
     @classmethod
-    def of(cls, rows: Rows, spare: Float) -> _Free:
-        """spare : (b, m) the change that is free, on the nodes."""
+    def of(cls, rows: Rows, changes: Sequence[Complex], spare: Float) -> _Free:
+        """changes : of each piece, as `_columns`. spare : (b, m) the change that is free, on the
+        nodes."""
         b, n = len(spare), len(rows.e)
-        real, parts = as_real(rows.X), range(0, rows.X.shape[1], len(spare))
-        X = np.concatenate([real[:, i : i + b] @ spare for i in parts], axis=1)
-        pieces = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
+        parts = range(0, rows.X.shape[1], b)
+        each = []
+        for change in changes:
+            real = as_real(change)
+            each.append(np.concatenate([real[:, i : i + b] @ spare for i in parts], axis=1))
         if len(parts) > 2:
-            X = _excited(X, pieces, len(parts) // 2)
-        rows = replace(rows, X=rows.X[:, :0])
-        each = [X[np.concatenate([on, n + on])] for on in pieces]
-        if any(len(on) < ENOUGH * _free(one) for on, one in zip(pieces, each, strict=True)):
-            return cls(rows, [(np.arange(n), orthonormal(X))])
-        return cls(rows, [(on, orthonormal(one)) for on, one in zip(pieces, each, strict=True)])
+            _excited(each, len(parts) // 2)
+        pieces = [on for on, _ in rows.each()]
+        if all(len(on) >= ENOUGH * _free(X) for on, X in zip(pieces, each, strict=True)):
+            alone = zip(pieces, each, strict=True)
+            return cls(rows, [([i], on, orthonormal(X)) for i, (on, X) in enumerate(alone)])
+        X = np.empty((2 * n, each[0].shape[1]))
+        for on, own in zip(pieces, each, strict=True):
+            X[np.concatenate([on, n + on])] = own
+        return cls(rows, [(range(len(each)), np.arange(n), orthonormal(X))])
 
 
-def _residual(change: _Free) -> tuple[Complex, Float]:
+def _residual(change: _Free, seen: Sequence[Seen]) -> tuple[Complex, Float]:
     """What the best change of each sensor in each piece leaves (n, q), and the freedom (n,) that
     each line has left: pieces that differ by more than noise are not noise."""
     n, q = change.rows.e.shape
     left, free = np.zeros((n, q), complex), np.zeros(n)
-    for on, Q in change.groups:
-        left[on], free[on] = _of_pieces(change.rows.take(on), Q)
+    for which, on, Q in change.groups:
+        if len(which) == 1:
+            (s,) = (seen[i] for i in which)
+            left[on], free[on] = _of_piece(s.e, s.N, Q)
+        else:
+            left[on], free[on] = _of_pieces(change.rows, Q)
     return left, free
 
 
-def _excited(X: Float, pieces: Sequence[Int], inputs: int) -> Float:
-    """The same, without what each of several inputs does in a piece in which it rests."""
-    X = X.reshape(2, len(X) // 2, inputs, -1)
-    size = np.array([np.sqrt(np.sum(X[:, on] ** 2, axis=(0, 1, 3)) / len(on)) for on in pieces])
-    for on, rests in zip(pieces, size < RESTS * size.max(axis=0), strict=True):
-        X[:, on[:, None], np.flatnonzero(rests)] = 0.0
-    return X.reshape(2 * X.shape[1], -1)
+def _excited(each: Sequence[Float], inputs: int) -> None:
+    """Take out of what changes do in each piece (2 n, p) what those of an input do that rests in
+    it."""
+    parts = [X.reshape(len(X), inputs, -1) for X in each]
+    size = np.sqrt([np.mean(np.sum(X**2, axis=2), axis=0) for X in parts])
+    for X, rests in zip(parts, size < RESTS * size.max(axis=0), strict=True):
+        X[:, rests] = 0.0
 
 
 def _free(X: Float) -> int:
@@ -670,30 +677,36 @@ def _free(X: Float) -> int:
     return int(np.count_nonzero(np.any(X != 0, axis=0)))
 
 
+def _of_piece(e: Complex, N: Complex, Q: Float) -> tuple[Complex, Float]:
+    """As `_residual`, of one piece's lines e (n, q) and nuisances N (n, q, m), where the change has
+    directions Q (2 n, p)."""
+    n, q = e.shape
+    goal, used = as_real(e), q * _lengths(Q)
+    goal -= Q @ (Q.T @ goal)
+    for c in range(q):
+        own = _nuisances_of(N[:, c])
+        own = _spanned(own - Q @ (Q.T @ own))
+        goal[:, c] -= own @ (own.T @ goal[:, c])
+        used += _lengths(own)
+    return as_complex(goal), np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
+
+
 def _of_pieces(rows: Rows, Q: Float) -> tuple[Complex, Float]:
-    """As `_residual`, of pieces that share one change, of directions Q (2 n, p)."""
+    """As `_of_piece`, of pieces that share one change. Nuisances are projected out piece by piece:
+    side by side those of many pieces would be many times as much as all lines."""
     n, q = rows.e.shape
     each = [(np.concatenate([on, n + on]), on, m) for on, m in rows.each()]
     goal, used = as_real(rows.e), np.zeros(2 * n)
-    if len(each) == 1:
-        goal -= Q @ (Q.T @ goal)
-        used += q * _lengths(Q)
-        for c in range(q):
-            N = _nuisances_of(rows.N[:, c])
-            N = _spanned(N - Q @ (Q.T @ N))
-            goal[:, c] -= N @ (N.T @ goal[:, c])
-            used += _lengths(N)
-    else:  # side by side the nuisances of many pieces would be many times as much as all lines
-        for c in range(q):
-            change = Q.copy()
-            for at, on, m in each:
-                N = _spanned(_nuisances_of(rows.N[on, c, :m]))
-                change[at] -= N @ (N.T @ change[at])
-                goal[at, c] -= N @ (N.T @ goal[at, c])
-                used[at] += _lengths(N)
-            change = _spanned(change)
-            goal[:, c] -= change @ (change.T @ goal[:, c])
-            used += _lengths(change)
+    for c in range(q):
+        change = Q.copy()
+        for at, on, m in each:
+            own = _spanned(_nuisances_of(rows.N[on, c, :m]))
+            change[at] -= own @ (own.T @ change[at])
+            goal[at, c] -= own @ (own.T @ goal[at, c])
+            used[at] += _lengths(own)
+        change = _spanned(change)
+        goal[:, c] -= change @ (change.T @ goal[:, c])
+        used += _lengths(change)
     return as_complex(goal), np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
 
 

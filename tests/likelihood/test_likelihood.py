@@ -19,6 +19,7 @@ from samii_rig.likelihood.reduce import (
     Records,
     Rows,
     _beyond,
+    _of_piece,
     _of_pieces,
     _past_of,
     as_real,
@@ -192,8 +193,11 @@ def test_the_residual_of_pieces_that_share_a_change_is_what_no_change_and_nuisan
 
     piece = np.repeat(np.arange(len(lines)), lines)
     k = np.arange(n)
-    rows = Rows(drawn(n, b), drawn(n, q), drawn(n, q, m), k + 1.0, k, piece, k)
-    left, free = _of_pieces(rows, orthonormal(as_real(rows.X)))
+    counts = np.full(len(lines), m)
+    rows = Rows(drawn(n, b), drawn(n, q), drawn(n, q, m), k + 1.0, k, piece, k, counts)
+    Q = orthonormal(as_real(rows.X))
+    alone = len(lines) == 1
+    left, free = _of_piece(rows.e, rows.N, Q) if alone else _of_pieces(rows, Q)
     freedom = 0.0
     for c in range(q):
         own = [np.where((piece == i)[:, None], rows.N[:, c], 0) for i in range(len(lines))]

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -99,27 +99,38 @@ class Apart:
         return f"compare the states: samii-rig diagnose --before {before} --after {after}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Alone:
-    """A recording by itself. whole : its pieces, those of each level apart. form : its likelihood
-    about what all recordings led to."""
+    """A recording by itself. whole : its records. about : their likelihood about what all
+    recordings led to."""
 
     name: str
-    pieces: tuple[Piece, ...]
-    form: Reduced
+    whole: Whole
+    about: Callable[[Whole], Reduced]
+
+    @cached_property
+    def form(self) -> Reduced:
+        """Its likelihood, computed where the recording is compared."""
+        return self.about(self.whole)
+
+    @property
+    def pieces(self) -> tuple[Piece, ...]:
+        """Its pieces, those of each level apart."""
+        return self.whole.by_level().records.pieces
 
     @property
     def linear(self) -> bool:
         """Whether levels of its own show that it answers in proportion."""
+        if not any(p.contrasts for p in self.whole.records.pieces):
+            return False
         found, mean = self.form.differing
         return mean > 0 and found < DIFFER * mean
 
     def comparable(self, other: _Alone) -> bool:
         """Whether no force makes the two differ."""
-        if self.linear and other.linear:
-            return True
         ours, theirs = self.pieces, other.pieces
-        return _all_in(ours, theirs) and _all_in(theirs, ours)
+        alike = _all_in(ours, theirs) and _all_in(theirs, ours)
+        return alike or (self.linear and other.linear)
 
 
 def states_apart(every: Sequence[Given], left: float | None = None) -> list[Apart]:
@@ -178,6 +189,10 @@ def _alone(given: Given) -> list[_Alone]:
     records, sensors = whole.records, whole.wired.sensors
     band = records.bands[0] if whole.asked else None
     response = kept(whole.response(given.fitted))
+
+    def about(own: Whole) -> Reduced:
+        return own.about(given.fitted, given.frequency, response)
+
     out = []
     for i, run in enumerate(whole.runs):
         try:
@@ -188,9 +203,7 @@ def _alone(given: Given) -> list[_Alone]:
             continue
         if own.wired == whole.wired:
             long = replace(own, records=replace(among, least=records.longest))
-            form = long.about(given.fitted, given.frequency, response)
-            pieces = own.by_level().records.pieces
-            out.append(_Alone(run.source or f"recording {i + 1}", pieces, form))
+            out.append(_Alone(run.source or f"recording {i + 1}", long, about))
     return out
 
 
