@@ -50,6 +50,9 @@ Response = Callable[[Complex], Complex]
 """(n,) s -> (n, q) of the reference model, from input to sensors; (n, q m) of m inputs, all inputs
 of the first sensor first."""
 
+Part = Callable[[Int], NDArray[np.bool_]]
+"""Which lines of a piece, by their number."""
+
 
 @dataclass(frozen=True, slots=True)
 class Lines:
@@ -236,29 +239,28 @@ class Left:
 
 
 def left_by(
-    records: Records,
-    response: Response,
-    noise: Reduced,
-    loop: Loops = (),
-    part: Callable[[Int], NDArray[np.bool_]] | None = None,
-) -> Left:
-    """The lines of all pieces under one model, in units of the noise that `noise` has."""
+    records: Records, response: Response, noise: Reduced, loop: Loops = (), *parts: Part
+) -> list[Left]:
+    """The lines of all pieces under one model, in units of the noise that `noise` has: of each of
+    some parts, nuisances at their best there; of all lines where none is said."""
     H = response(records.exact().s)
     records = records.without_spikes(H)
-    rows = _rows(records, None, records.seen(H, loop))
-    if part is not None:
-        rows = rows.take(np.flatnonzero(part(rows.k)))
-    both = np.concatenate([rows.e[:, :, None], rows.N], axis=2)
-    both = np.sqrt(2) * noise.noise.whitened(rows.f, rows.piece, both)
-    white = both[:, :, 0]
-    for on, m in rows.each():
-        N = both[on][:, :, 1 : 1 + m].reshape(-1, m)
-        Q = orthonormal(as_real(N))
-        goal = as_real(white[on].ravel())
-        goal -= Q @ (Q.T @ goal)
-        white[on] = as_complex(goal).reshape(on.size, -1)
-    each = noise.noise.scaled(rows.f, rows.piece, white) / 2
-    return Left(rows.f, np.sum(np.abs(white) ** 2, axis=1), each)
+    every = _rows(records, None, records.seen(H, loop))
+    out = []
+    for part in parts or (lambda k: np.ones(k.size, bool),):
+        rows = every.take(np.flatnonzero(part(every.k)))
+        both = np.concatenate([rows.e[:, :, None], rows.N], axis=2)
+        both = np.sqrt(2) * noise.noise.whitened(rows.f, rows.piece, both)
+        white = both[:, :, 0]
+        for on, m in rows.each():
+            N = both[on][:, :, 1 : 1 + m].reshape(-1, m)
+            Q = orthonormal(as_real(N))
+            goal = as_real(white[on].ravel())
+            goal -= Q @ (Q.T @ goal)
+            white[on] = as_complex(goal).reshape(on.size, -1)
+        each = noise.noise.scaled(rows.f, rows.piece, white) / 2
+        out.append(Left(rows.f, np.sum(np.abs(white) ** 2, axis=1), each))
+    return out
 
 
 def nodes_of(
@@ -326,7 +328,7 @@ def reduced(
     response: Response,
     disturbances: Disturbances,
     loop: Loops = (),
-    part: Callable[[Int], NDArray[np.bool_]] | None = None,
+    part: Part | None = None,
     at: Float | None = None,
 ) -> Reduced:
     """The likelihood of all models near a reference.
@@ -343,7 +345,7 @@ def formed(
     response: Response,
     disturbances: Disturbances,
     loop: Loops = (),
-    part: Callable[[Int], NDArray[np.bool_]] | None = None,
+    part: Part | None = None,
     at: Float | None = None,
 ) -> tuple[Reduced, Rows]:
     """As `reduced`, and the lines that it was made of."""

@@ -31,7 +31,7 @@ from samii_rig.diagnose.physics.rows import RESONANT
 from samii_rig.diagnose.result import Band, Gap, Used
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
-from samii_rig.likelihood.noise import Disturbances
+from samii_rig.likelihood.noise import Disturbances, Noise
 from samii_rig.likelihood.pieces import Loops, Piece, Wiring, joined, pieces_of, wiring
 from samii_rig.likelihood.reduce import (
     CYCLES,
@@ -302,8 +302,17 @@ class Whole:
 
     def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
         """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
-        part = _shown if shown else fitted_lines
-        return left_by(self.records, self.response(fitted), noise, self._loop, part)
+        latest = self._latest
+        if not latest or latest[0][0] is not fitted or latest[0][1] is not noise.noise:
+            parts = fitted_lines, _shown
+            each = left_by(self.records, self.response(fitted), noise, self._loop, *parts)
+            latest[:] = [(fitted, noise.noise, each)]
+        return latest[0][2][shown]
+
+    @cached_property
+    def _latest(self) -> list[tuple[Fitted, Noise, list[Left]]]:
+        """What the latest fit leaves: both parts of the lines are asked for."""
+        return []
 
 
 def _records(
