@@ -37,7 +37,8 @@ from samii_rig.types import Complex, Float, Int
 class Complete:
     """Chi-square of all lines, split.
 
-    rows : the lines, without `X`. columns : (2 n, 2 b) real parts of that, then imaginary ones.
+    rows : the lines, without `X` and `N`. columns : (2 n, 2 b) real parts of `X`, then imaginary
+    ones.
     root : (n, q, q) so that root e has real and imaginary parts of variance 1. nuisances : of each
     piece its lines and orthonormal columns over their real, then imaginary parts. factor : (m, m)
     C.
@@ -62,10 +63,9 @@ class Complete:
         """As `reduced`."""
         found, rows = formed(records, response, disturbances, loop, part)
         root = np.sqrt(2) * np.linalg.inv(found.noise.root(rows.f, rows.piece))
-        each = [np.flatnonzero(rows.piece == i) for i in np.unique(rows.piece)]
-        nuisances = tuple((on, _columns(root[on] @ rows.N[on])) for on in each)
+        nuisances = tuple((on, _columns(root[on] @ N)) for on, N in rows.each())
         m = found.factor.shape[0]
-        columns, rows = as_real(rows.X), replace(rows, X=rows.X[:, :0].copy())
+        columns, rows = as_real(rows.X), replace(rows, X=rows.X[:, :0].copy(), N=())
         return cls(found, rows, columns, root, nuisances, found.factor.reshape(m, m))
 
     @property

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -248,14 +247,13 @@ def left_by(
     every = _rows(records, None, records.seen(H, loop))
     out = []
     for part in parts or (lambda k: np.ones(k.size, bool),):
-        rows = every.take(np.flatnonzero(part(every.k)))
-        both = np.concatenate([rows.e[:, :, None], rows.N], axis=2)
-        both = np.sqrt(2) * noise.noise.whitened(rows.f, rows.piece, both)
-        white = both[:, :, 0]
-        for on, m in rows.each():
-            N = both[on][:, :, 1 : 1 + m].reshape(-1, m)
-            Q = orthonormal(as_real(N))
-            goal = as_real(white[on].ravel())
+        rows = every.take(part(every.k))
+        white = np.empty_like(rows.e)
+        for on, N in rows.each():
+            both = np.concatenate([rows.e[on][:, :, None], N], axis=2)
+            both = np.sqrt(2) * noise.noise.whitened(rows.f[on], rows.piece[on], both)
+            Q = orthonormal(as_real(both[:, :, 1:].reshape(-1, N.shape[2])))
+            goal = as_real(both[:, :, 0].ravel())
             goal -= Q @ (Q.T @ goal)
             white[on] = as_complex(goal).reshape(on.size, -1)
         each = noise.noise.scaled(rows.f, rows.piece, white) / 2
@@ -295,32 +293,31 @@ class Rows:
 
     X : (n, 2 b) what a change on the nodes does, (n, 2 b m) of m inputs. e : (n, q) what the
     reference leaves.
-    N : (n, q, m) nuisances of each line's own piece, columns of zeros behind them.
+    N : of each piece (n_i, q, m_i) the nuisances of its lines.
     f : (n,) Hz. k : (n,) numbers of the lines. piece : (n,) which.
     order : (n,) of the lines of all pieces, one after the other, which these are.
-    counts : (pieces,) of each its nuisances.
     """
 
     X: Complex
     e: Complex
-    N: Complex
+    N: Sequence[Complex]
     f: Float
     k: Int
     piece: Int
     order: Int
-    counts: Int
 
-    def take(self, which: Any) -> Rows:
+    def take(self, which: NDArray[np.bool_]) -> Rows:
         """Some of the lines."""
+        N = [one[which[self.piece == i]] for i, one in enumerate(self.N)]
         return Rows(
-            self.X[which], self.e[which], self.N[which], self.f[which], self.k[which],
-            self.piece[which], self.order[which], self.counts,
+            self.X[which], self.e[which], N, self.f[which], self.k[which],
+            self.piece[which], self.order[which],
         )  # fmt: skip
 
-    def each(self) -> list[tuple[Int, int]]:
-        """Of each piece its lines, and how many nuisances they have."""
-        every = np.unique(self.piece)
-        return [(np.flatnonzero(self.piece == i), int(self.counts[i])) for i in every]
+    def each(self) -> list[tuple[Int, Complex]]:
+        """Of each piece its lines, and their nuisances."""
+        every = ((np.flatnonzero(self.piece == i), N) for i, N in enumerate(self.N))
+        return [(on, N) for on, N in every if on.size]
 
 
 def reduced(
@@ -380,7 +377,7 @@ def formed(
     if np.any(times > 1):
         power = noise(replace(known, times=times))
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
-    rows = rows.take(np.flatnonzero(counted))
+    rows = rows.take(counted)
     form = _quadratic(rows, power, S[nodes])
     count = 2.0 * rows.e.shape[1] * int(counted.sum()) - form.nuisances
     made = Reduced(
@@ -550,16 +547,15 @@ def _rows(records: Records, changes: Sequence[Complex] | None, seen: Sequence[Se
     order = np.argsort(np.concatenate([x.frequency for x in lines]), kind="stable")
     # Where each line of each piece stands.
     place = np.split(np.argsort(order), np.cumsum(size)[:-1])
-    n, q, m = order.size, seen[0].e.shape[1], max(s.N.shape[2] for s in seen)
+    n, q = order.size, seen[0].e.shape[1]
     X = np.empty((n, changes[0].shape[1] if changes else 0), complex)
-    e, N, f = np.zeros((n, q), complex), np.zeros((n, q, m), complex), np.zeros(n)
+    e, f = np.zeros((n, q), complex), np.zeros(n)
     k, which = np.zeros(n, np.int64), np.zeros(n, np.int64)
     for i, on in enumerate(place):
         if changes:
             X[on] = changes[i]
         e[on], f[on], k[on], which[on] = seen[i].e, lines[i].frequency, lines[i].k, i
-        N[on, :, : seen[i].N.shape[2]] = seen[i].N
-    return Rows(X, e, N, f, k, which, order, np.array([s.N.shape[2] for s in seen]))
+    return Rows(X, e, [s.N for s in seen], f, k, which, order)
 
 
 def _without(e: Complex, N: Complex) -> tuple[Complex, Float]:
@@ -697,12 +693,12 @@ def _of_pieces(rows: Rows, Q: Float) -> tuple[Complex, Float]:
     """As `_of_piece`, of pieces that share one change. Nuisances are projected out piece by piece:
     side by side those of many pieces would be many times as much as all lines."""
     n, q = rows.e.shape
-    each = [(np.concatenate([on, n + on]), on, m) for on, m in rows.each()]
+    each = [(np.concatenate([on, n + on]), N) for on, N in rows.each()]
     goal, used = as_real(rows.e), np.zeros(2 * n)
     for c in range(q):
         change = Q.copy()
-        for at, on, m in each:
-            own = _spanned(_nuisances_of(rows.N[on, c, :m]))
+        for at, N in each:
+            own = _spanned(_nuisances_of(N[:, c]))
             change[at] -= own @ (own.T @ change[at])
             goal[at, c] -= own @ (own.T @ goal[at, c])
             used[at] += _lengths(own)
@@ -780,9 +776,10 @@ def _nuisances(rows: Rows, W: Complex, We: Complex) -> tuple[Float, Float]:
     """The directions of all nuisances, of length 1: their products with the changes of all nodes
     (q 2 b, m), and with what the reference leaves (m,)."""
     found = []
-    for on, m in rows.each():
-        N, X = rows.N[on][:, :, :m], rows.X[on]
-        q, flat = N.shape[1], N.reshape(-1, m)
+    for on, N in rows.each():
+        X = rows.X[on]
+        q, m = N.shape[1:]
+        flat = N.reshape(-1, m)
         WN = W[on] @ N
         square = (flat.conj().T @ WN.reshape(-1, m)).real
         values, turn = directions(square)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import signal
+from scipy import linalg, signal
 
 from samii_rig.diagnose.fit.records import _shown, fitted_lines
 from samii_rig.likelihood import pieces
@@ -193,15 +193,15 @@ def test_the_residual_of_pieces_that_share_a_change_is_what_no_change_and_nuisan
 
     piece = np.repeat(np.arange(len(lines)), lines)
     k = np.arange(n)
-    counts = np.full(len(lines), m)
-    rows = Rows(drawn(n, b), drawn(n, q), drawn(n, q, m), k + 1.0, k, piece, k, counts)
+    N = [drawn(own, q, m) for own in lines]
+    rows = Rows(drawn(n, b), drawn(n, q), N, k + 1.0, k, piece, k)
     Q = orthonormal(as_real(rows.X))
     alone = len(lines) == 1
-    left, free = _of_piece(rows.e, rows.N, Q) if alone else _of_pieces(rows, Q)
+    left, free = _of_piece(rows.e, N[0], Q) if alone else _of_pieces(rows, Q)
     freedom = 0.0
     for c in range(q):
-        own = [np.where((piece == i)[:, None], rows.N[:, c], 0) for i in range(len(lines))]
-        A = as_real(np.concatenate([rows.X, *own], axis=1))
+        own = linalg.block_diag(*(one[:, c] for one in N))
+        A = as_real(np.concatenate([rows.X, own], axis=1))
         Q = np.linalg.qr(A)[0]
         e = as_real(rows.e[:, c])
         np.testing.assert_allclose(as_real(left[:, c]), e - Q @ (Q.T @ e), atol=1e-9)
