@@ -401,11 +401,11 @@ def _with_past(
     whatever the change of the response is; None where nothing did."""
     W = _weights(change.rows, noise)
     pieces = list(records.pieces)
-    for which, on, Q in change.groups:
+    for which, on, X in change.groups:
         own = [(i, seen[i]) for i in which]
         group = change.rows.piece[on]
         blocks = [(np.flatnonzero(group == i), s.past.likely, s.N[:, :, s.beside]) for i, s in own]
-        found = _past_of(Q, blocks, change.rows.e[on], W[on])
+        found = _past_of(orthonormal(X), blocks, change.rows.e[on], W[on])
         if found is None:
             continue
         for i, s in own:
@@ -618,8 +618,8 @@ class _Free:
     """A change that is free where noise is told, and the lines that show it together: each piece's
     by themselves where they are enough.
 
-    rows : of all lines. groups : pieces, their lines (n,), and the directions (2 n, p) of the
-    change in these, of every sensor.
+    rows : of all lines. groups : pieces, their lines (n,), and (2 n, p) what the change does in
+    these, of every sensor.
     """
 
     rows: Rows
@@ -640,11 +640,11 @@ class _Free:
         pieces = [on for on, _ in rows.each()]
         if all(len(on) >= ENOUGH * _free(X) for on, X in zip(pieces, each, strict=True)):
             alone = zip(pieces, each, strict=True)
-            return cls(rows, [([i], on, orthonormal(X)) for i, (on, X) in enumerate(alone)])
+            return cls(rows, [([i], on, X) for i, (on, X) in enumerate(alone)])
         X = np.empty((2 * n, each[0].shape[1]))
         for on, own in zip(pieces, each, strict=True):
             X[np.concatenate([on, n + on])] = own
-        return cls(rows, [(range(len(each)), np.arange(n), orthonormal(X))])
+        return cls(rows, [(range(len(each)), np.arange(n), X)])
 
 
 def _residual(change: _Free, seen: Sequence[Seen]) -> tuple[Complex, Float]:
@@ -652,12 +652,10 @@ def _residual(change: _Free, seen: Sequence[Seen]) -> tuple[Complex, Float]:
     each line has left: pieces that differ by more than noise are not noise."""
     n, q = change.rows.e.shape
     left, free = np.zeros((n, q), complex), np.zeros(n)
-    for which, on, Q in change.groups:
-        if len(which) == 1:
-            (s,) = (seen[i] for i in which)
-            left[on], free[on] = _of_piece(s.e, s.N, Q)
-        else:
-            left[on], free[on] = _of_pieces(change.rows, Q)
+    for which, on, X in change.groups:
+        piece = change.rows.piece[on]
+        each = [(np.flatnonzero(piece == i), seen[i].N) for i in which]
+        left[on], free[on] = _of_pieces(change.rows.e[on], each, X)
     return left, free
 
 
@@ -675,29 +673,20 @@ def _free(X: Float) -> int:
     return int(np.count_nonzero(np.any(X != 0, axis=0)))
 
 
-def _of_piece(e: Complex, N: Complex, Q: Float) -> tuple[Complex, Float]:
-    """As `_residual`, of one piece's lines e (n, q) and nuisances N (n, q, m), where the change has
-    directions Q (2 n, p)."""
+def _of_pieces(e: Complex, each: Sequence[tuple[Int, Complex]], X: Float) -> tuple[Complex, Float]:
+    """As `_residual`, of pieces that share one change X (2 n, p). Nuisances are projected out piece
+    by piece: side by side those of many pieces would be many times as much as all lines.
+
+    each : of every piece its lines, and their nuisances.
+    """
     n, q = e.shape
-    goal, used = as_real(e), q * _lengths(Q)
-    goal -= Q @ (Q.T @ goal)
+    goal, used = as_real(e), np.zeros(2 * n)
+    size = np.linalg.norm(X, axis=0)
+    X = X / np.where(size > 0, size, 1.0)
     for c in range(q):
-        own = _nuisances_of(N[:, c])
-        own = _spanned(own - Q @ (Q.T @ own))
-        goal[:, c] -= own @ (own.T @ goal[:, c])
-        used += _lengths(own)
-    return as_complex(goal), np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
-
-
-def _of_pieces(rows: Rows, Q: Float) -> tuple[Complex, Float]:
-    """As `_of_piece`, of pieces that share one change. Nuisances are projected out piece by piece:
-    side by side those of many pieces would be many times as much as all lines."""
-    n, q = rows.e.shape
-    each = [(np.concatenate([on, n + on]), N) for on, N in rows.each()]
-    goal, used = as_real(rows.e), np.zeros(2 * n)
-    for c in range(q):
-        change = Q.copy()
-        for at, N in each:
+        change = X.copy()
+        for on, N in each:
+            at = np.concatenate([on, n + on]) if len(each) > 1 else slice(None)
             own = _spanned(_nuisances_of(N[:, c]))
             change[at] -= own @ (own.T @ change[at])
             goal[at, c] -= own @ (own.T @ goal[at, c])

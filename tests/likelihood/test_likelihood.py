@@ -19,12 +19,10 @@ from samii_rig.likelihood.reduce import (
     Records,
     Rows,
     _beyond,
-    _of_piece,
     _of_pieces,
     _past_of,
     as_real,
     left_by,
-    orthonormal,
     reduced,
 )
 from samii_rig.likelihood.rounding import Added, Rounding, repeating
@@ -195,9 +193,7 @@ def test_the_residual_of_pieces_that_share_a_change_is_what_no_change_and_nuisan
     k = np.arange(n)
     N = [drawn(own, q, m) for own in lines]
     rows = Rows(drawn(n, b), drawn(n, q), N, k + 1.0, k, piece, k)
-    Q = orthonormal(as_real(rows.X))
-    alone = len(lines) == 1
-    left, free = _of_piece(rows.e, N[0], Q) if alone else _of_pieces(rows, Q)
+    left, free = _of_pieces(rows.e, rows.each(), as_real(rows.X))
     freedom = 0.0
     for c in range(q):
         own = linalg.block_diag(*(one[:, c] for one in N))
