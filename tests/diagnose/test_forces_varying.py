@@ -17,7 +17,7 @@ from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.variation import _less, variation
-from samii_rig.diagnose.forces.varying import Pulled, _between, pulled, pulls
+from samii_rig.diagnose.forces.varying import Pulled, Springs, Swing, _between, pulled, pulls
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.record.reader import read_recording
@@ -160,24 +160,28 @@ def test_what_a_swing_adds_in_time_is_what_it_adds_to_the_lines(nothing: ForceSe
     assert np.linalg.norm(lines - same) < 1e-6 * np.linalg.norm(same)
 
 
-def test_a_swing_that_is_put_into_the_records_is_taken_out_again(nothing: ForceSearch) -> None:
-    """By as much as it was put in, to first order in all else that is refitted."""
-    spring = next(
-        e.quasi for e in nothing.forces if e.quasi and e.quasi.law is HARDENING and "2" in e.site
-    )
-    k = nothing.reach.scale((spring.place.across[-1], "k"))
-    pieces = pulls(nothing, spring.place, nothing.unexplained(nothing.nominal.fitted))
-    hz, depth, made = 0.7, 0.02, []
+def swinging(nothing: ForceSearch, site: str, hz: float, depth: float) -> ForceSearch:
+    """The same on records of a rig in which a spring swings."""
+    place = next(
+        e.quasi.place for e in nothing.forces if e.quasi and e.quasi.law is HARDENING and
+        e.site == site
+    )  # fmt: skip
+    k, made = nothing.reach.scale((site, "k")), []
+    pieces = pulls(nothing, place, nothing.unexplained(nothing.nominal.fitted))
     for one, piece in zip(pieces, nothing.levels.records.pieces, strict=True):
         changes = np.zeros((one.times.size, 3))
         changes[0, 1] = -depth * k * one.times[0]
         made.append(_less(piece, -one.added(changes, [hz])))
     records = replace(nothing.levels.records, pieces=tuple(made))
-    fitted = nothing.nominal.fitted
-    other = nothing.on(replace(nothing.levels, records=records), fitted)
-    found = variation(other, replace(nothing.nominal, fitted=fitted), 3)
+    return nothing.on(replace(nothing.levels, records=records), nothing.nominal.fitted)
+
+
+def test_a_swing_that_is_put_into_the_records_is_taken_out_again(nothing: ForceSearch) -> None:
+    """By as much as it was put in, to first order in all else that is refitted."""
+    hz, depth = 0.7, 0.02
+    found = variation(swinging(nothing, "joint_2", hz, depth), replace(nothing.nominal), 3)
     assert found is not None
-    assert found.sites[0][0] == spring.place.across[-1]
+    assert found.sites[0][0] == "joint_2"
     told = found.parameters["depth"]
     assert told.low is not None
     assert told.high is not None
@@ -185,3 +189,25 @@ def test_a_swing_that_is_put_into_the_records_is_taken_out_again(nothing: ForceS
     assert found.parameters["f"].value == pytest.approx(hz, rel=0.02)
     assert found.inside
     assert found.after[0] < found.before[0]
+
+
+def test_which_spring_swings_is_decided_without_the_swing_in_the_noise(
+    nothing: ForceSearch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A neighbour that explains nearly as much while what varies stands in the noise, and is looked
+    at first, is not the one."""
+    strongest, seen = Springs.strongest, []
+
+    def neighbour_first(*args: Any) -> list[tuple[str, Swing]]:
+        found = strongest(*args)
+        seen.append([site for site, _ in found])
+        return [*found[1::-1], *found[2:]]
+
+    monkeypatch.setattr(Springs, "strongest", neighbour_first)
+    found = variation(swinging(nothing, "joint_2", 1.0, 0.0028), replace(nothing.nominal), 3)
+    assert seen[0][:2] == ["joint_2", "joint_1"]
+    assert found is not None
+    (site, sure), (other, _) = found.sites
+    assert (site, other) == ("joint_2", "joint_1")
+    assert sure > 0.99
+    assert found.parameters["f"].value == pytest.approx(1.0, rel=0.01)
