@@ -85,6 +85,17 @@ def hardening(rng: Rng, setup: Setup, swing: Swing) -> Draft:
     )  # fmt: skip
 
 
+def drag(rng: Rng, setup: Setup, swing: Swing) -> Draft:
+    """A damper that grows with the speed: c2 |x'| x', as of oil through an orifice."""
+    on, k, peak = joint(rng, setup, swing)
+    force, motion = units(setup, on)
+    return Draft(
+        "quadratic_damping", on, None, {"c2": f"{force} s^2/{motion}^2"}, lambda x: {"c2": x},
+        on_joint("quadratic_damping", on), 1e-6 * k / peak, k / peak,
+        also=_also("quadratic_damping", setup, on),
+    )  # fmt: skip
+
+
 def _of_drive(
     physics: str, drive: Drive, units: dict[str, str], values: Callable[[float], Numbers],
     start: float, most: float,
@@ -132,6 +143,7 @@ FORCES: dict[str, Callable[[Rng, Setup, Swing], Draft]] = {
     "coulomb_friction": friction,
     "backlash": play,
     "cubic_stiffness": hardening,
+    "quadratic_damping": drag,
     "valve_deadband": dead_zone,
     "output_saturation": clipping,
     "flow_saturation": orifice,

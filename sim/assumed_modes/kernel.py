@@ -16,7 +16,7 @@ from numba import njit
 from samii_rig.types import Float, Int
 
 # Laws by number, as the compiled loop knows them, with their numbers in order.
-CUBIC, BACKLASH, FRICTION, BOUC_WEN, PARAMETRIC, FLOW, DRAG = range(7)
+CUBIC, BACKLASH, FRICTION, BOUC_WEN, PARAMETRIC, FLOW, DRAG, ONE_SIDED = range(8)
 ITERATIONS = 6  # of a smooth law; each gains a factor k h^2/2m, about 1 %
 N_VALUES = 5
 
@@ -82,6 +82,8 @@ def smooth(law: int, p: Float, z: float, dz: float, t: float, memory: float, h: 
         return float(-p[0] * bouc_wen(p, dz, memory, h))
     if law == 6:  # a damper that grows with the speed, p = c2
         return float(-p[0] * abs(dz) * dz)
+    if law == 7:  # stiffer to one side, p = dk
+        return float(-p[0] * max(z, 0.0))
     # parametric, p = k, depth 1, w1, depth 2, w2
     return float(-p[0] * z * (p[1] * np.sin(p[2] * t) + p[3] * np.sin(p[4] * t)))
 

@@ -62,18 +62,18 @@ def fractional(rng: Rng, setup: Setup, swing: Swing) -> Draft:
     )  # fmt: skip
 
 
-def drag(rng: Rng, setup: Setup, swing: Swing) -> Draft:
-    """A joint with a damper that grows with the speed: c2 |x'| x', as of oil through an orifice."""
-    on, k, peak = joint(rng, setup, swing)
+def one_sided(rng: Rng, setup: Setup, swing: Swing) -> Draft:
+    """A joint that is stiffer by dk to one side, as where a crack closes."""
+    on, k, _ = joint(rng, setup, swing)
     force, motion = units(setup, on)
     return Draft(
-        "quadratic_damper", on, None, {"c2": f"{force} s^2/{motion}^2"}, lambda x: {"c2": x},
-        on_joint("drag", on), 1e-6 * k / peak, k / peak,
+        "one_sided_stiffness", on, None, {"dk": f"{force}/{motion}"}, lambda x: {"dk": x},
+        on_joint("one_sided", on), 1e-6 * k, k,
     )  # fmt: skip
 
 
 OUTSIDE: dict[str, Callable[[Rng, Setup, Swing], Draft]] = {
     "hysteresis": hysteresis,
     "fractional_damper": fractional,
-    "quadratic_damper": drag,
+    "one_sided_stiffness": one_sided,
 }

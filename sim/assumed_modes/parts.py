@@ -90,7 +90,7 @@ class Relaxation:
 @dataclass(frozen=True, slots=True)
 class Force:
     """A law that is not linear: `law` of `samii_rig`'s vocabulary or `bouc_wen`, `parametric` or
-    `drag`.
+    `one_sided`.
 
     on : the joint whose relative motion it opposes, or the actuator. values : its numbers.
     """

@@ -26,7 +26,8 @@ NUMBERS = {
     "coulomb_friction": (kernel.FRICTION, ("T_c",)),
     "bouc_wen": (kernel.BOUC_WEN, ("T_y", "z_y", "beta", "gamma", "n")),
     "parametric": (kernel.PARAMETRIC, ("k", "depth_1", "w_1", "depth_2", "w_2")),
-    "drag": (kernel.DRAG, ("c2",)),
+    "quadratic_damping": (kernel.DRAG, ("c2",)),
+    "one_sided": (kernel.ONE_SIDED, ("dk",)),
     "flow_saturation": (kernel.FLOW, ("M_stall",)),
 }
 STATIC = {"valve_deadband": "width", "output_saturation": "limit"}

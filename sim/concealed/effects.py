@@ -93,12 +93,14 @@ ROWS = (
     Row("valve_deadband", "source", nonlinear.overlap, linear=False, most=5.0),
     Row("backlash", "joint", nonlinear.play, linear=False, most=20.0),
     Row("cubic_stiffness", "joint", nonlinear.cubic, linear=False, most=100.0),
+    Row("quadratic_damping", "joint", nonlinear.drag, linear=False, most=20.0),
     Row("flow_saturation", "source", nonlinear.flow, linear=False, most=10.0),
     Row("output_saturation", "source", nonlinear.clipped, linear=False, most=20.0),
 )
 OUTSIDE = (
     Row("hysteresis", "joint", nonlinear.slip, linear=False, most=10.0, outside=True),
     Row("fractional_damper", "joint", linear.fractional, most=20.0, outside=True),
+    Row("one_sided_stiffness", "joint", nonlinear.one_sided, linear=False, most=20.0, outside=True),
 )
 VARYING = (Row("stiffness_variation", "joint", nonlinear.drift, linear=False, most=6.0),)
 TABLES = {"outside": OUTSIDE, "varying": VARYING}  # rows of a kind, where it has its own

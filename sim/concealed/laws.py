@@ -11,6 +11,8 @@ with the motion it causes (`solve`), so that stiff laws and dry friction need no
 | backlash | on a joint, in series with its spring; its damper stays | angle, rate | width, k |
 | drift | on a joint: stiffness k (1 + share (1 - exp(-t/tau))) | angle, rate | k, share, tau |
 | slip | on a joint: elements (k, T) that stick and slide | angle, rate | k1, T1, ... |
+| drag | on a joint: c2 abs(rate) rate | angle, rate | c2 |
+| one_sided | on a joint, stiffer where its angle is positive | angle, rate | k |
 | flow_saturation | on the source: v sqrt(1 + sign(v) M/T_s) | M, v | T_s |
 """
 
@@ -23,8 +25,11 @@ from numba import njit
 
 from samii_rig.types import Float
 
-KINDS = ("coulomb", "drive_friction", "cubic", "backlash", "drift", "slip", "flow_saturation")
-COULOMB, DRIVE_FRICTION, CUBIC, BACKLASH, DRIFT, SLIP, FLOW = range(len(KINDS))
+KINDS = (
+    "coulomb", "drive_friction", "cubic", "backlash", "drift", "slip", "flow_saturation", "drag",
+    "one_sided",
+)  # fmt: skip
+COULOMB, DRIVE_FRICTION, CUBIC, BACKLASH, DRIFT, SLIP, FLOW, DRAG, ONE_SIDED = range(len(KINDS))
 MOST_STEPS = 30  # Newton steps; three are usual
 WHOLE = 1e-10  # relative change of the force at which the solution stands
 VALUES = 16  # numbers a law may have
@@ -58,6 +63,10 @@ def force(kind: int, q: Float, memory: Float, t: float, a: float, b: float) -> f
                 stretch = memory[2 * i] + q[2 * i] * (a - memory[2 * i + 1])
                 total -= min(max(stretch, -limit), limit)
         return total
+    if kind == DRAG:
+        return float(-q[0] * abs(b) * b)
+    if kind == ONE_SIDED:
+        return float(-q[0] * max(a, 0.0))
     if kind == FLOW:
         side = 1.0 if b > 0.0 else -1.0
         return b * (math.sqrt(max(1.0 + side * a / q[0], 0.0)) - 1.0)

@@ -42,6 +42,21 @@ def cubic(plant: Description, site: str, dose: Dose) -> Concealed:
     return Concealed("cubic_stiffness", site, {"k3": k3})
 
 
+def drag(plant: Description, site: str, dose: Dose) -> Concealed:
+    """A damper that grows with the speed: c2 |speed| speed."""
+    # A joint's spring has as much at 1e-3 rad and 1 rad/s.
+    c2 = dose("c2", 1e-3 * dose.x * plant.part(site).values["k"])
+    plant.laws.append(Law("drag", site, (c2,)))
+    return Concealed("quadratic_damping", site, {"c2": c2})
+
+
+def one_sided(plant: Description, site: str, dose: Dose) -> Concealed:
+    """A joint that is stiffer to one side, as where a crack closes."""
+    k = dose("k", 0.01 * dose.x * plant.part(site).values["k"])
+    plant.laws.append(Law("one_sided", site, (k,)))
+    return Concealed("one_sided_stiffness", site, {"k": k})
+
+
 def flow(plant: Description, site: str, dose: Dose) -> Concealed:
     """Orifice flow: the speed falls with the root of the pressure that the load leaves."""
     T_s = dose("T_s", 0.01 * Scales.of(plant).k / dose.x)

@@ -212,6 +212,10 @@ def describing(law: Law, a: Float, v: Float, s: Complex) -> Complex:
         case "slip":
             pairs = zip(q[::2], q[1::2], strict=True)
             return np.asarray(-sum(k * _slip(a * k / T) for k, T in pairs))
+        case "drag":
+            return np.asarray(-8 / (3 * np.pi) * q[0] * a * np.abs(s) * s)
+        case "one_sided":
+            return np.asarray(np.full(a.shape, -q[0] / 2, complex))
         case "flow_saturation":
             return np.asarray(0.42 * v / q[0] + 0j)
     raise ValueError(law.kind)

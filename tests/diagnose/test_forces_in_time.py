@@ -39,6 +39,7 @@ CASES: dict[str, tuple[Force, tuple[float, ...]]] = {
     "uneven": (Force(JOINT_2, laws.UNEVEN), (0.3, 0.6)),
     "hardening": (Force(JOINT_1, laws.HARDENING), (1e8,)),
     "softening": (Force(JOINT_1, laws.SOFTENING), (2e7,)),
+    "quadratic": (Force(JOINT_1, laws.QUADRATIC), (2e4,)),
     "play": (Force(JOINT_1, laws.PLAY, K_1), (1e-4,)),
     "hysteresis": (Force(JOINT_1, laws.HYSTERESIS), (1.0, 3e3)),
     "orifice": (Force(FLOW, laws.ORIFICE), (500.0,)),
@@ -46,6 +47,7 @@ CASES: dict[str, tuple[Force, tuple[float, ...]]] = {
 PLANT = {
     "friction": PlantLaw("coulomb", "joint_2", (0.5,)),
     "hardening": PlantLaw("cubic", "joint_1", (1e8,)),
+    "quadratic": PlantLaw("drag", "joint_1", (2e4,)),
     "play": PlantLaw("backlash", "joint_1", (1e-4, 1.36e4)),
     "orifice": PlantLaw("flow_saturation", "joint_2_source", (500.0,)),
 }

@@ -116,6 +116,10 @@ SOFTENING = Law(
     "softening", "cubic_stiffness", "a spring that softens", BETWEEN, ("k3",), ONE,
     weak=HARDENING.weak, fixed=(0.0, 1.0), step=steps.cubic,
 )  # fmt: skip
+QUADRATIC = Law(
+    "quadratic", "quadratic_damping", "a damper that grows with the speed", BETWEEN, ("c2",), ONE,
+    weak=lambda y, _v, p: -p[0] * np.abs(y) * y, step=steps.quadratic, of_speed=True,
+)  # fmt: skip
 PLAY = Law(
     "play", "backlash", "play", BETWEEN, ("width",), ONE,
     weak=lambda y, _v, p: p[1] * np.clip(y, -p[0] / 2, p[0] / 2), step=steps.play, scaled=True,
@@ -138,7 +142,9 @@ CLIPPED = Law(
     "clipped", "output_saturation", "a clipped command", ("command",), ("limit",), ONE,
     told=_excess,
 )  # fmt: skip
-LAWS = (FRICTION, UNEVEN, HARDENING, SOFTENING, PLAY, HYSTERESIS, ORIFICE, OVERLAP, CLIPPED)
+LAWS = (
+    FRICTION, UNEVEN, HARDENING, SOFTENING, QUADRATIC, PLAY, HYSTERESIS, ORIFICE, OVERLAP, CLIPPED,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,20 @@ def cubic(
 
 
 @njit(SIGNATURE, cache=True)
+def quadratic(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """-p0 |y| y of a speed y."""
+    middle, share = 0.5 * (before + free), 0.5 * g * p[0]
+    # y = middle + g f/2, solved.
+    y = 2.0 * middle / (1.0 + np.sqrt(1.0 + 4.0 * share * abs(middle)))
+    held = 1.0 + 2.0 * share * abs(y)
+    out[0] = -p[0] * abs(y) * y
+    out[1] = out[2] = -p[0] * abs(y) / held
+    out[8] = -abs(y) * y / held
+
+
+@njit(SIGNATURE, cache=True)
 def play(
     before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
 ) -> None:

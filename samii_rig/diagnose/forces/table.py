@@ -14,6 +14,7 @@ from samii_rig.diagnose.forces.laws import (
     ORIFICE,
     OVERLAP,
     PLAY,
+    QUADRATIC,
     SOFTENING,
     UNEVEN,
     Force,
@@ -88,6 +89,10 @@ def _between(reach: Reach, place: Place, spring: Spring) -> Iterator[Effect]:
     moved = reach.ports(place, of_speed=False)
     if other or moved is None:
         return
+    # The sine in c2 |speed| speed is two thirds of that in friction of T_c = c2 speed^2.
+    c2 = 3 / 2 * force / speed**2
+    unknown = _log("c2", f"{of_force} s^2/{of_way}^2", RANGE[0] * c2, RANGE[1] * c2)
+    yield effect(QUADRATIC, place, name, "", (unknown,))
     top = _largest(reach, place, of_speed=False)
     doubles = 1 / float(np.median(moved.y1))  # force a way
     k3 = 4 / 3 * doubles / top**2

@@ -52,6 +52,7 @@ _ROWS = (
     Physics("gravity_cross_sensitivity", "an accelerometer that tilts"),
     Physics("noncollocated_encoder", "an encoder across other parts"),
     Physics("coulomb_friction", "dry friction"),
+    Physics("quadratic_damping", "a damper that grows with the speed"),
     Physics("valve_deadband", "a dead band of the valve"),
     Physics("backlash", "play"),
     Physics("cubic_stiffness", "a joint that stiffens or softens"),
