@@ -12,8 +12,9 @@ from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose, table
 from samii_rig.diagnose.fit.records import RecordSearch
 from samii_rig.diagnose.fit.refit import refit
-from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.fit.search import BENT, Search
 from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.verdict.judge import _is_thin
 from samii_rig.identify.bootstrap import redraw
 
 
@@ -46,6 +47,49 @@ def test_what_the_nominal_parameters_hide_is_found_from_the_files_own():
     assert straight.fitted.cost > search.nominal.fitted.cost
     search.grow(straight, 30, again=True)
     assert mass.name in search.ranked()[0].effects[0].names
+
+
+def test_they_are_tried_though_another_effect_seems_to_be_enough():
+    """About nominal parameters at unlikely values what is missing may not be among the first, and
+    what mimics it may leave no more than noise."""
+    mass = effect("added_mass", "link_2", "added")
+    search = search_of(concealing((mass, [1.17])), [mass])
+    assert search.nominal.fitted.penalty > BENT * search.nominal.fitted.model.n_nominal
+    search.keep((mass,), search.refitted((mass,), search.nominal, [np.log(1.17)]))
+    best = search.ranked()[0]
+    assert best.effects == (mass,)
+    assert search._enough(best)
+    assert search._bent(best)
+
+
+def test_a_mistake_of_the_data_is_no_effect_that_may_be_too_little_beside_another():
+    """Removed, it costs little chi-square but unlikely nominal parameters; the cause beside it is
+    the answer all the same, and no less probable one."""
+
+    def of(chi2, *effects):
+        return SimpleNamespace(
+            effects=effects,
+            key=frozenset(e.key for e in effects),
+            fitted=SimpleNamespace(chi2=chi2),
+        )
+
+    mistake, inertia, lag = (
+        SimpleNamespace(key=key, physical=key != "mistake", quasi=None, rough=0.0)
+        for key in ("mistake", "inertia", "lag")
+    )
+    nothing = of(2000.0)
+    fewer = [nothing, of(900.0, mistake), of(583.0, inertia), of(583.0, lag)]
+    search = SimpleNamespace(
+        found={e.key: e for e in fewer},
+        worth=28.0,
+        temperature=1.0,
+        nominal=nothing,
+        without=lambda e, i: search.found[e.key - {e.effects[i].key}],
+    )
+    assert not _is_thin(search, of(570.0, mistake, inertia))
+    assert _is_thin(search, of(570.0, lag, inertia))
+    fewer[1].fitted.chi2 = 590.0
+    assert _is_thin(search, of(570.0, mistake, inertia))
 
 
 def wandering(eta, by):

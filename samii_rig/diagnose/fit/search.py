@@ -143,8 +143,7 @@ class Search(Explanations):
     def _bent(self, best: Explanation) -> bool:
         """Whether nominal parameters at unlikely values may hide what is missing."""
         n = self.nominal.fitted.model.n_nominal
-        hidden = not self._enough(best) and self.nominal.fitted.penalty > BENT * n
-        return hidden or best.fitted.penalty > BENT * n
+        return max(self.nominal.fitted.penalty, best.fitted.penalty) > BENT * n
 
     def _straight(self) -> Explanation:
         """The rig as its file has it: where the refitted one took values that their tolerances make

@@ -326,6 +326,9 @@ def _is_thin(search: Search, e: Explanation) -> bool:
         return True
     fewer: list[Explanation | None] = []
     for i, effect in enumerate(e.effects):
+        if not effect.physical:
+            # What is wrong with the data is no answer. Of two causes beside it, evidence decides.
+            continue
         if all(x.quasi is None for x in e.effects):
             fewer.append(search.without(e, i))
         elif effect.quasi is None:
