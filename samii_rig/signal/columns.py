@@ -28,6 +28,7 @@ TAPS = 1  # rows to each side of which what a voltmeter shows of a command is ma
 # Rows of that filter's delay: a voltmeter between two commands has half a row, another shift one.
 CENTRED = 0.75
 ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same
+KNOWN = 0.5  # part of the rows of two recordings, of which fewer tell little of either
 LOOKED_AT = 1 << 14  # samples about the largest reference: thousands tell a shift, millions cost
 QUIETER = 0.5  # of a command's fourth differences, those without what a loop would have added
 SENT = ("reference", "command")  # roles of columns that are sent, not measured
@@ -204,9 +205,10 @@ def _alike(one: Recording, other: Recording) -> bool:
     names = _driving(one)
     if names != _driving(other) or not names:
         return False
-    a, b = _overlap(one, other)
-    v, w = one.columns(names)[a], other.columns(names)[b]
-    if len(v) <= 2 * FARTHEST or not np.all(np.isfinite(v) & np.isfinite(w)):
+    v, w = _overlap(one, other, names)
+    known = np.isfinite(v).all(axis=1) & np.isfinite(w).all(axis=1)
+    v, w = v[known], w[known]
+    if len(v) <= max(2 * FARTHEST, KNOWN * known.size):
         return False
     if len(names) > 1:  # each in units of its largest, by which they compare
         size = np.max(np.abs(np.concatenate([v, w])), axis=0)
@@ -220,55 +222,46 @@ def _driving(recording: Recording) -> list[str]:
     return references or list(recording.names("command"))
 
 
-def _overlap(one: Recording, other: Recording) -> tuple[slice, slice]:
-    """Rows of both that are as far from the start of their first segments; none where these are
-    not as long, but for the ends that a shift takes, or have gaps."""
-    a, b = _first(one), _first(other)
-    none = slice(0, 0), slice(0, 0)
-    if a is None or b is None:
-        return none
-    (rows_a, at_a, n_a), (rows_b, at_b, n_b) = a, b
-    if abs(n_a - n_b) > 2 * FARTHEST:
-        return none
-    low = max(at_a, at_b)
-    high = min(at_a + rows_a.stop - rows_a.start, at_b + rows_b.stop - rows_b.start)
-
-    def within(rows: slice, at: int) -> slice:
-        return slice(rows.start + low - at, rows.start + high - at)
-
-    return within(rows_a, at_a), within(rows_b, at_b)
+def _overlap(one: Recording, other: Recording, names: Sequence[str]) -> tuple[Float, Float]:
+    """(n, p) these columns in the first segments of both, row by row from their starts; no row
+    where these are not as long, but for the ends that a shift takes."""
+    a, b = _first(one, names), _first(other, names)
+    n = min(len(a), len(b)) if abs(len(a) - len(b)) <= 2 * FARTHEST else 0
+    return a[:n], b[:n]
 
 
-def _first(recording: Recording) -> tuple[slice, int, int] | None:
-    """The rows of the first segment, all where none is told, how far they begin behind its start,
-    and its length; None where a row is missing between them."""
+def _first(recording: Recording, names: Sequence[str]) -> Float:
+    """(n, p) these columns in the first segment, in the whole where none is told; NaN in rows that
+    are missing."""
     sequence = recording.sequence
     if not sequence.size:
-        return None
+        return np.zeros((0, len(names)))
     start, stop = int(sequence[0]), int(sequence[-1]) + 1
     if recording.segments:
         start, stop = recording.segments[0].start, recording.segments[0].stop
     a, b = (int(x) for x in np.searchsorted(sequence, [start, stop]))
-    if a == b or sequence[b - 1] - sequence[a] != b - 1 - a:
-        return None
-    return slice(a, b), int(sequence[a]) - start, stop - start
+    out = np.full((stop - start, len(names)), np.nan)
+    out[sequence[a:b] - start] = recording.columns(names)[a:b]
+    return out
 
 
 def _against(first: Recording, recording: Recording) -> int:
     """Samples by which the sensors of a recording stand behind those of another of the same input;
     0 where no shift makes them clearly more alike."""
-    a, b = _overlap(first, recording)
     driving = _driving(first)[0]
-    v, w = first.values_of(driving)[a], recording.values_of(driving)[b]
-    size = float(v @ w) / float(v @ v)
-    inside = slice(FARTHEST, v.size - FARTHEST)
     names = [n for n in first.names("sensor") if n in recording.names("sensor")]
-    off = np.zeros((len(names), 2 * FARTHEST + 1))
-    for row, name in zip(off, names, strict=True):
-        x, y = size * first.values_of(name)[a], recording.values_of(name)[b]
-        x, y = (np.nan_to_num(z - np.nanmean(z)) for z in (x, y))
-        for i, m in enumerate(range(-FARTHEST, FARTHEST + 1)):
-            row[i] = np.mean((np.roll(y, -m) - x)[inside] ** 2)
+    x, y = _overlap(first, recording, [driving, *names])
+    known = np.isfinite(x[:, 0]) & np.isfinite(y[:, 0])
+    size = float(x[known, 0] @ y[known, 0]) / float(x[known, 0] @ x[known, 0])
+    x, y = size * x[:, 1:], y[:, 1:]
+    x, y = (z - np.nanmean(z, axis=0) for z in (x, y))
+    inside = slice(FARTHEST, len(x) - FARTHEST)
+    off = np.array(
+        [
+            np.nanmean((np.roll(y, -m, axis=0) - x)[inside] ** 2, axis=0)
+            for m in range(-FARTHEST, FARTHEST + 1)
+        ]
+    ).T
     off = off[np.all(off > 0, axis=1)]
     if not len(off):
         return 0

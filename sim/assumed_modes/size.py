@@ -15,6 +15,8 @@ from sim.assumed_modes.simulate import Control, clean
 LEAST, MOST = 3.0, 300.0  # sigma of an effect, drawn evenly in the logarithm between them
 CLOSE = 1.25  # ratio to the drawn sigma that is near enough; the truth says what it is
 NEAR = 1.0  # tolerance; a refit that moves nothing by more has one minimum
+UNLIKELY = 3.0  # tolerances; a refit that moves one by more was led astray, or hides what is there
+GROWN = 16  # steps in which an effect grows; with 8 a joint six tolerances stiffer is not followed
 TRIES = 9  # strengths tried for one effect
 RAW = 3.0  # sigma before any refit at which the derivatives foretell what is left
 FIRST_JUMP = 0.01  # of RAW: what shows less than that grows by its inverse
@@ -41,6 +43,17 @@ def records(bench: Bench, control: Control, setup: Setup) -> Records:
         [clean(setup, control, level * w.r)[:: bench.every] for level in w.levels]
         for w in bench.waveforms
     ]
+
+
+def grown(refit: Refit, of: Callable[[float], Records], strength: float) -> Left:
+    """What a refit leaves of an effect that grows from nothing to `strength`, each refit from where
+    the last ended: a mode that moves by more than its width leads a refit astray, in any one step.
+    """
+    at = np.zeros(refit.n)
+    for k in range(1, GROWN + 1):
+        left = refit.left(of(strength * k / GROWN), at * k / max(k - 1, 1))
+        at = left.moved
+    return left
 
 
 def solve(
@@ -87,8 +100,10 @@ def solve(
             x = float(np.sqrt(low * high)) if low > 0 and np.isfinite(high) else draft.most
     if best is None or not LEAST * 0.8 <= best[1].sigma <= MOST * CLOSE:
         return None
-    if float(np.abs(best[1].moved).max(initial=0.0)) < NEAR:
+    moved = float(np.abs(best[1].moved).max(initial=0.0))
+    if moved < NEAR:
         return best
     # From the nominal parameters themselves there may be a lower minimum.
-    other = refit.left(of(best[0]))
-    return (best[0], min(best[1], other, key=lambda x: x.sigma))
+    other = grown(refit, of, best[0]) if moved > UNLIKELY else refit.left(of(best[0]))
+    least = min(best[1], other, key=lambda x: x.sigma)
+    return (best[0], least) if least.sigma >= LEAST * 0.8 else None

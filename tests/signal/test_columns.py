@@ -91,6 +91,25 @@ def test_recordings_of_one_input_are_set_beside_each_other_where_no_law_is_known
     np.testing.assert_array_equal(found.values, other.values[found.sequence])
 
 
+def test_they_are_though_each_lacks_rows_of_its_own():
+    first, other = loop(rig_toml=""), loop(seed=2, rig_toml="")
+    gaps = np.r_[0:700, 760:N], np.r_[0:2000, 2110 : N - 3]
+    (_, no), (found, finding) = aligned([rows(first, gaps[0]), rows(late(other, 3), gaps[1])])
+    assert no is None
+    assert finding is not None
+    assert "3 samples later" in finding.message
+    np.testing.assert_array_equal(found.values, other.values[found.sequence])
+
+
+def test_two_of_which_most_rows_are_missing_are_left_as_they_are():
+    first, other = loop(rig_toml=""), loop(seed=2, rig_toml="")
+    few = np.r_[0:900, 3000:N]
+    assert [said for _, said in aligned([first, rows(late(other, 3), few[few < N - 3])])] == [
+        None,
+        None,
+    ]
+
+
 def test_recordings_of_other_inputs_are_left_as_they_are():
     other = late(loop(rig_toml=""), 2)
     values = other.values.copy()

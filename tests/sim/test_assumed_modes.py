@@ -49,7 +49,7 @@ from sim.assumed_modes.parts import Attachment, Force, Part, Setup, nominal, set
 from sim.assumed_modes.plant import plant
 from sim.assumed_modes.ritz import Mechanism
 from sim.assumed_modes.sampled import Loop, closed, discrete, timeline
-from sim.assumed_modes.sigma import Bench, Waveform
+from sim.assumed_modes.sigma import Bench, Records, Waveform
 from sim.assumed_modes.simulate import Control, clean, recorded
 
 RIGS = (
@@ -472,6 +472,32 @@ def test_a_refit_absorbs_what_the_tolerances_allow_and_keeps_the_rest(scene: tri
     left = refit.left(records)
     assert 10.0 < left.sigma <= refit.raw(records)
     assert left.sigma**2 == pytest.approx(left.data**2 + left.moved @ left.moved)
+
+
+@pytest.mark.parametrize(
+    ("rig", "element", "far"),
+    [
+        ("three_masses", "spring_1", 6.0),
+        ("three_masses", "spring_3", -6.0),
+        ("samii", "clamp", 6.0),
+    ],
+)
+def test_what_a_stiffness_far_off_explains_costs_no_more_than_that(
+    rig: str, element: str, far: float
+) -> None:
+    rngs = [np.random.default_rng([7, k]) for k in range(2)]
+    made = trial.scene_of(rngs[0], rngs[1], parse(Rig, load_rig(rig)[1], rig), STYLE)
+    refit = trial.nominal_refit(made)
+    offsets = np.zeros(refit.n)
+    offsets[made.nominal.keys.index((element, "k"))] = far
+
+    def of(strength: float) -> Records:
+        unit = made.bench.linear(made.built(strength * offsets))
+        both = zip(made.bench.waveforms, unit, strict=True)
+        return [[level * y for level in w.levels] for w, y in both]
+
+    assert refit.left(of(1.0)).sigma > 10 * abs(far)  # another valley
+    assert size.grown(refit, of, 1.0).sigma <= abs(far) * 1.001
 
 
 def test_a_small_effect_s_sigma_is_that_of_the_linear_algebra(scene: trial.Scene) -> None:

@@ -61,12 +61,15 @@ class Search(Explanations):
         alone, and beside what is wrong with the data."""
         self.grow(self.nominal, FIRST, open_to_all=not briefly)
         if self._bent(self.ranked()[0]):
-            self.grow(self._straight(), STRAIGHT, again=True)
+            self.grow(self._straight(self.nominal), STRAIGHT, again=True)
         self.temper()
         best = self.ranked()[0]
         if briefly and mistaken(best.effects) and not self._enough(best):
             self.renew(best)
-            self.grow(self.ranked()[0], FIRST)
+            base = self.ranked()[0]
+            self.grow(base, FIRST)
+            if self._bent(base):
+                self.grow(self._straight(base), STRAIGHT, again=True)
             self.temper()
         if briefly:
             self._plainer()
@@ -145,12 +148,13 @@ class Search(Explanations):
         n = self.nominal.fitted.model.n_nominal
         return max(self.nominal.fitted.penalty, best.fitted.penalty) > BENT * n
 
-    def _straight(self) -> Explanation:
-        """The rig as its file has it: where the refitted one took values that their tolerances make
-        unlikely, it has done what is missing by them, and hides it."""
-        model = self.nominal.fitted.model
-        there = refit(model, self.problem, np.zeros(model.n), far=False, steps=0)
-        return Explanation((), there, 0.0)
+    def _straight(self, base: Explanation) -> Explanation:
+        """The same, the rig as its file has it: where the refitted one took values that their
+        tolerances make unlikely, it has done what is missing by them, and hides it."""
+        model, x = base.fitted.model, base.fitted.x.copy()
+        x[: model.n_nominal] = 0.0
+        there = refit(model, self.problem, x, far=False, steps=0)
+        return Explanation(base.effects, there, 0.0)
 
     def grow(
         self, base: Explanation, most: int, *, again: bool = False, open_to_all: bool = False
