@@ -579,7 +579,7 @@ class RecordSearch(Search):
         plain refit to the wrong one."""
         model = fitted.model
         x = np.zeros(model.n)
-        before = self.problem, self._between
+        before, was = (self.problem, self._between), self.deviance(fitted)
         self._about(self._there(model, x))
         cold = self.problem.expected / max(self._there(model, x).cost, 1.0)
         steps = int(np.ceil(-np.log(min(cold, 1.0)) / np.log(COOLER)))
@@ -593,10 +593,15 @@ class RecordSearch(Search):
             if self.ratio(now) > COOLER**k:  # less noise than what is left tells nothing more
                 break
         now = refit(model, self.problem, x)
-        if now.cost < self._there(model, fitted.x).cost:
+        if self.deviance(now) < was:
             return now
         self.problem, self._between = before
         return refit(model, self.problem, fitted.x)
+
+    def deviance(self, fitted: Fitted) -> float:
+        """Of a fit with the noise about which the likelihood stands: one that leaves much calls it
+        noise, and is right where its noise is weighed too."""
+        return fitted.cost + self.reduced.inside[0] + self.reduced.spread
 
     def _there(self, model: Model, x: Float) -> Fitted:
         return refit(model, self.problem, x, far=False, steps=0)
