@@ -29,6 +29,7 @@ ENOUGH = 0.01  # of sigma^2, by which a round must lower it to be followed by an
 FORETOLD = 0.02
 # Levenberg's and Marquardt's, relative to the diagonal, until one lowers the cost.
 DAMPINGS = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
+COOLER = 10**0.5  # times less power of the noise from one refit to the next; 10 misses some
 INSIDE = 0.9  # of the way to where an unknown ends
 # Records with an effect: of each waveform and each of its levels the samples (n, n_y).
 Records = Sequence[Sequence[Float]]
@@ -199,8 +200,18 @@ class Refit:
         less = float(g @ np.linalg.solve(2 * N + np.eye(self.n), g))
         return float(np.sqrt(max(total - less, 0.0)))
 
-    def left(self, records: Records, start: Float | None = None) -> Left:
-        """What a refit leaves, by Gauss-Newton from `start`.
+    def cooled(self, records: Records) -> Left:
+        """What a refit leaves, the noise first taken for so large that the nominal parameters as
+        they are leave no more, then for less and less. A mode that moves by more than its width
+        leads a refit in the least noise into valleys far from the tolerances."""
+        steps = np.ceil(np.log(max(self.raw(records) ** 2, 1.0)) / np.log(COOLER))
+        at = np.zeros(self.n)
+        for k in range(int(steps), 0, -1):
+            at = self.left(records, at, COOLER**k).moved
+        return self.left(records, at)
+
+    def left(self, records: Records, start: Float | None = None, times: float = 1.0) -> Left:
+        """What a refit leaves, by Gauss-Newton from `start`, in noise of `times` the power.
 
         Derivatives are kept as long as they lower the cost as they foretell.
         """
@@ -208,9 +219,9 @@ class Refit:
         y = self.bench.linear(self.build(at))
         fresh = not np.any(at)
         J = self.J
-        cost = self._cost(records, y) + float(at @ at)
+        cost = self._cost(records, y) / times + float(at @ at)
         for _ in range(ROUNDS):
-            N, g, _ = self._normal(records, y, J)
+            N, g = (x / times for x in self._normal(records, y, J)[:2])
             hoped = gained = 0.0
             for damping in DAMPINGS:
                 G = N + np.eye(self.n)
@@ -221,7 +232,7 @@ class Refit:
                     y1 = self.bench.linear(self.build(there))
                 except UnphysicalError:
                     continue
-                new = self._cost(records, y1) + float(there @ there)
+                new = self._cost(records, y1) / times + float(there @ there)
                 if new < cost:
                     whole = damping == 0.0 and bool(np.all(there == at + step))
                     step = there - at

@@ -15,7 +15,7 @@ from sim.assumed_modes.simulate import Control, clean
 LEAST, MOST = 3.0, 300.0  # sigma of an effect, drawn evenly in the logarithm between them
 CLOSE = 1.25  # ratio to the drawn sigma that is near enough; the truth says what it is
 NEAR = 1.0  # tolerance; a refit that moves nothing by more has one minimum
-UNLIKELY = 3.0  # tolerances; a refit that moves one by more was led astray, or hides what is there
+UNLIKELY = 3.0  # tolerances; a refit that moves one by more may have been led astray
 GROWN = 16  # steps in which an effect grows; with 8 a joint six tolerances stiffer is not followed
 TRIES = 9  # strengths tried for one effect
 RAW = 3.0  # sigma before any refit at which the derivatives foretell what is left
@@ -47,8 +47,7 @@ def records(bench: Bench, control: Control, setup: Setup) -> Records:
 
 def grown(refit: Refit, of: Callable[[float], Records], strength: float) -> Left:
     """What a refit leaves of an effect that grows from nothing to `strength`, each refit from where
-    the last ended: a mode that moves by more than its width leads a refit astray, in any one step.
-    """
+    the last ended."""
     at = np.zeros(refit.n)
     for k in range(1, GROWN + 1):
         left = refit.left(of(strength * k / GROWN), at * k / max(k - 1, 1))
@@ -100,10 +99,17 @@ def solve(
             x = float(np.sqrt(low * high)) if low > 0 and np.isfinite(high) else draft.most
     if best is None or not LEAST * 0.8 <= best[1].sigma <= MOST * CLOSE:
         return None
-    moved = float(np.abs(best[1].moved).max(initial=0.0))
-    if moved < NEAR:
-        return best
-    # From the nominal parameters themselves there may be a lower minimum.
-    other = grown(refit, of, best[0]) if moved > UNLIKELY else refit.left(of(best[0]))
-    least = min(best[1], other, key=lambda x: x.sigma)
-    return (best[0], least) if least.sigma >= LEAST * 0.8 else None
+    strength, left = best
+    if _farthest(left) >= NEAR:
+        # From the nominal parameters themselves there may be a lower minimum.
+        left = min(left, refit.left(of(strength)), key=lambda x: x.sigma)
+    if _farthest(left) > UNLIKELY:
+        left = min(left, refit.cooled(of(strength)), key=lambda x: x.sigma)
+    if _farthest(left) > UNLIKELY:
+        left = min(left, grown(refit, of, strength), key=lambda x: x.sigma)
+    return (strength, left) if left.sigma >= LEAST * 0.8 else None
+
+
+def _farthest(left: Left) -> float:
+    """Tolerances by which a refit moved an unknown at most."""
+    return float(np.abs(left.moved).max(initial=0.0))
