@@ -11,19 +11,30 @@ import numpy as np
 import pytest
 from concealed_kit import SAMII, SAMII_TOML
 from cut_kit import DESIGN, cut_sweeps
+from scipy import stats
 from table_kit import Effects, table_of
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.variation import _less, variation
-from samii_rig.diagnose.forces.varying import Pulled, Springs, Swing, _between, pulled, pulls
+from samii_rig.diagnose.forces.varying import (
+    Pulled,
+    Springs,
+    Swing,
+    _between,
+    pulled,
+    pulls,
+    uneven,
+)
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.record.reader import read_recording
+from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Recording
 from sim.assumed_modes import trial
+from sim.assumed_modes.outside import OUTSIDE
 from sim.assumed_modes.varying import VARYING
 
 FEW = Effects(lambda: table_of(SAMII, 0.5, 20.0, "actuator_lag", "added_mass"))
@@ -80,6 +91,24 @@ def test_a_joint_that_differs_from_run_to_run_is_named(
     assert not found.states
 
 
+def test_a_spring_that_is_stiffer_to_one_side_is_none_that_swings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It swings as the motion does, which of a multisine is a few lines: it was told as that."""
+    monkeypatch.setitem(
+        trial.POOLS, "outside", {"one_sided_stiffness": OUTSIDE["one_sided_stiffness"]}
+    )
+    rig, text = load_rig("two_masses")
+    folder = trial.make("outside", 4, tmp_path, text, ("multisine_once", "clean"))
+    (truth,) = json.loads((tmp_path / "truth" / "outside_4.json").read_text())["effects"]
+    runs = [read_recording(path) for path in sorted(folder.glob("*.mcap"))]
+    found = diagnose(estimate(runs), rig, runs=runs)
+    assert found.verdict == "unknown"
+    assert not found.causes
+    words = f"the spring of {truth['site']} is not the same to both sides"
+    assert any(words in said for said in found.not_physics)
+
+
 @pytest.fixture(scope="module")
 def nothing(tmp_path_factory: pytest.TempPathFactory) -> ForceSearch:
     runs = cut_sweeps(tmp_path_factory.mktemp("nothing"), design=DESIGN)
@@ -109,7 +138,7 @@ def test_under_noise_alone_every_frequency_has_chi_square_of_two_freedoms(
     """Noise that is white in the likelihood's own units, at the lines of real records."""
     rng, reach = np.random.default_rng(2), nothing.reach
     left = nothing.unexplained(nothing.nominal.fitted)
-    f, each = (0.05, 0.1, 0.4, 1.6, 6.4), []
+    f, each, sides = (0.05, 0.1, 0.4, 1.6, 6.4), [], []
     for spring in (e.quasi for e in nothing.forces if e.quasi and e.quasi.law is HARDENING):
         ports = reach.ports(spring.place, of_speed=False)
         assert ports is not None
@@ -126,6 +155,7 @@ def test_under_noise_alone_every_frequency_has_chi_square_of_two_freedoms(
             parts = zip(reach.spans, motion, ports.sensors, noise, strict=True)
             pieces = [Pulled.of(*one) for one in parts]
             apart = _between(pieces)
+            sides.append(uneven(pieces))
             swings = [np.sum([one.exact(hz) for one in pieces], axis=0) for hz in f]
             each += [[(apart.chi2, apart.free, 0.0), *swings]]
     chi2, free, _ = np.moveaxis(np.array(each), 2, 0)
@@ -135,6 +165,9 @@ def test_under_noise_alone_every_frequency_has_chi_square_of_two_freedoms(
     unit = (chi2 - free) / np.sqrt(2 * free)
     assert np.max(np.abs(np.mean(unit, axis=0))) < 0.3, np.mean(unit, axis=0)
     assert np.max(np.abs(np.var(unit, axis=0) - 1)) < 0.5, np.var(unit, axis=0)
+    # The larger of two that have one freedom each and are alike.
+    assert 0.8 < np.mean(sides) < 1.9
+    assert np.max(sides) < stats.chi2.isf(0.01 / len(sides), 1)
 
 
 def test_where_nothing_is_missing_every_stiffness_is_constant(nothing: ForceSearch) -> None:

@@ -14,6 +14,7 @@ from copy import copy
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy import stats
 
 from samii_rig.diagnose.fit.between_runs import STIFFNESS, spread_of
 from samii_rig.diagnose.fit.exact import NINETY
@@ -22,7 +23,15 @@ from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.records import Whole, fitted_lines
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.forces.search import ForceSearch
-from samii_rig.diagnose.forces.varying import Pulled, Springs, Swing, pulls
+from samii_rig.diagnose.forces.varying import (
+    ALARM,
+    SIDES,
+    Pulled,
+    Springs,
+    Swing,
+    pulls,
+    uneven,
+)
 from samii_rig.diagnose.result import Gap, Value
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.likelihood.unexplained import Unexplained
@@ -107,6 +116,38 @@ def variation(search: ForceSearch, best: Explanation, files: int) -> Variation |
         inside=bool(np.mean(after[0]) < threshold(taken.search.spread)),
         again=taken.again,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Uneven:
+    """A spring that is not the same to both sides. chi2 : what that explains, with one unknown."""
+
+    site: str
+    chi2: float
+
+    def told(self) -> str:
+        """In words."""
+        return (
+            f"the spring of {self.site} is not the same to both sides: that explains "
+            f"{math.sqrt(self.chi2):.3g} sigma, and has no row in the table (a crack, a stop or a "
+            "preload that ends would do it)"
+        )
+
+
+def uneven_spring(search: ForceSearch, best: Explanation) -> Uneven | None:
+    """The spring that is not the same to both sides, by what a linear explanation leaves of the
+    records: where it explains more than noise, and more than one that varies in time, which it
+    would pass for, as it swings with the motion."""
+    springs = Springs.of(search)
+    left = _some(search.unexplained(best.fitted))
+    each = [(site, pulls(search, place, left)) for site, place in springs.each]
+    found = [Uneven(site, uneven(pieces)) for site, pieces in each if pieces]
+    most = max(found, key=lambda one: one.chi2, default=None)
+    tries = len(SIDES) * len(found)
+    if most is None or tries * float(stats.chi2.sf(most.chi2, 1)) > ALARM:
+        return None
+    swings = springs.strongest(search, left)
+    return most if not swings or swings[0][1].gain < most.chi2 else None
 
 
 @dataclass

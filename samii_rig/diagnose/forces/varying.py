@@ -36,6 +36,9 @@ FINE = 4  # frequencies for each that the longest record tells apart
 ALARM = 2e-3  # chance that noise alone makes any stiffness vary
 ONE_PHASE = 1e-3  # of V: less variance is that of a phase which the motion does not show
 FLAT = 1e-2  # of the distance between frequencies that are tried: nearer, chi-square is flat
+# Powers of the motion that a spring's force has which is not the same to both sides: of one that is
+# stiffer to one side, and of the first that a curve has.
+SIDES = (1, 2)
 ROUNDED = 1e-6  # of the largest variance: less is rounding
 
 
@@ -152,6 +155,16 @@ class Pulled:
         one that is as large in each record as the motion is."""
         known = self._products([np.ones(self.phi.size)])[0, 0]
         return self.P[:, 0].real / self.times, np.full(self.times.size, known), self.times
+
+    def uneven(self, power: int) -> tuple[Float, Float]:
+        """Normal equations (2, 2) of a constant and of a stiffness that follows the sign of the
+        motion (its force has power 1) or the motion (2), and their right side (2,). What repeats
+        differ by has neither."""
+        shape = np.sign(self.phi) if power == 1 else self.phi
+        shapes = [np.ones(self.phi.size), shape]
+        size = np.array([self.times[0], self.times[0] ** power])
+        G = self._products(shapes) * np.outer(size, size)
+        return G, np.array(shapes) @ self.along[0] / self.times[0] * size
 
     def changes(self, each: Sequence[float]) -> Float:
         """(rows, 1 + 2 m) of a row that is once the motion: a constant, and the cosine and sine by
@@ -294,6 +307,18 @@ class Swing:
             return 0.0
         added = (self.gain - self.free * math.log(self.chi2 / self.free)) / 2
         return added - math.log(self.tries)
+
+
+def uneven(pieces: Sequence[Pulled]) -> float:
+    """Chi-square that a spring explains which is not the same to both sides, alike in all pieces,
+    beyond another constant stiffness: it swings as the motion does."""
+    found = []
+    for power in SIDES:
+        G, b = (sum(x) for x in zip(*(one.uneven(power) for one in pieces), strict=True))
+        share = G[0, 1] / G[0, 0] if G[0, 0] > 0 else 0.0
+        known = G[1, 1] - share * G[0, 1]
+        found.append((b[1] - share * b[0]) ** 2 / known if known > ROUNDED * G[1, 1] else 0.0)
+    return float(max(found))
 
 
 def _scan(pieces: Sequence[Pulled], f: Float) -> Float:

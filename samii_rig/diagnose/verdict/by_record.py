@@ -13,7 +13,7 @@ from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
-from samii_rig.diagnose.forces.variation import Variation, variation
+from samii_rig.diagnose.forces.variation import Variation, uneven_spring, variation
 from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
@@ -233,14 +233,20 @@ def _winning(forces: ForceSearch | None) -> ForceSearch | None:
 
 def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files: int) -> _Looked:
     """The same, but where a stiffness varies that is the answer: in the place of another that the
-    data make less likely, or in words beside it. search : what was looked at. files : recordings.
+    data make less likely, or in words beside it. What no row explains as well as a spring that is
+    not the same to both sides is unknown. search : what was looked at. files : recordings.
     """
     judged = looked.judged
     base = verdict.as_meant(forces, judged.best)
     own = verdict.as_meant(search, judged.best)
     # At the noise itself: while a mismatch is gross all weights are smaller, a variation's not.
     rival = max(judged.best.weight - own.weight, (own.fitted.cost - judged.best.fitted.cost) / 2)
-    found = None if _is_linear(judged) else variation(forces, base, files)
+    linear = _is_linear(judged)
+    sides = None if linear else uneven_spring(forces, base)
+    if sides is not None and sides.chi2 / 2 > rival:
+        unknown = replace(judged, verdict="unknown")
+        return replace(looked, judged=unknown, said=(*looked.said, sides.told()))
+    found = None if linear else variation(forces, base, files)
     if found is not None and found.evidence > rival:
         varies = verdict.varying(judged, own, found, max(rival, 0.0))
         return _Looked(varies, found.before[1], found.after[1], found.gap, looked.said)
