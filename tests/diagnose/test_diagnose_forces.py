@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,6 +22,7 @@ from samii_rig.diagnose.fit.records import RecordProblem, Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.fit.stated import IN_DATA
+from samii_rig.diagnose.forces.laws import CLIPPED
 from samii_rig.diagnose.forces.problem import ForceProblem
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.way import Ways
@@ -290,3 +292,16 @@ def test_a_force_is_held_against_what_is_wrong_with_the_data_alone():
     search.linear, search.table = linear, ()
     search.__post_init__()
     assert search.kept == [nominal, mistake, both]
+
+
+def test_a_force_that_changes_nothing_leaves_what_the_linear_rig_does(
+    nothing: list[Recording],
+) -> None:
+    """A limit that no command comes near."""
+    search = forces_of(nothing)
+    (clipped,) = (e for e in search.table if e.quasi is not None and e.quasi.law is CLIPPED)
+    end = search.refitted_from(
+        (clipped,), np.append(search.nominal.fitted.x, math.log(1e3 * clipped.unknowns[0].high))
+    )
+    assert end is not None
+    assert end.chi2 == pytest.approx(search.nominal.fitted.chi2, rel=1e-6)

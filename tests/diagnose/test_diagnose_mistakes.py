@@ -28,7 +28,7 @@ LINES = np.geomspace(0.5, 40.0, 120)
 SENSORS = np.arange(len(RIG.sensor))
 ALL = list(mistakes.effects(RIG, RIG.rate_hz))
 TWO, _ = load_rig("two_masses")
-LATE = "stands samples from the sensors' columns, which are 2 samples later"
+LATE = "is not of the sensors' sample: their columns stand 2 samples later"
 
 
 def response(rig, *effects, lines=LINES):

@@ -192,5 +192,6 @@ class ForceProblem(RecordProblem):
         if lines.size:
             lines = lines[:, : self.complete.rows.e.shape[1]]  # one row for all inputs
             moving = np.flatnonzero(np.any(lines != 0, axis=(0, 1)))
-            out[:, moving] += self.complete.split(lines[:, :, moving])
+            if moving.size:
+                out[:, moving] += self.complete.split(lines[:, :, moving])
         return out

@@ -30,7 +30,7 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
 from samii_rig.likelihood.reduce import Left
-from samii_rig.likelihood.unexplained import Unexplained, unexplained
+from samii_rig.likelihood.unexplained import Unexplained, evenly, unexplained
 from samii_rig.types import Float
 
 CLOSER = 2  # times that the best strength is looked at closer
@@ -50,6 +50,7 @@ AGAIN = 3  # times that the likelihood is made anew about the best explanation
 STILL = 0.5  # standard deviations, a move from one to the next that is none
 RENEWED = 6  # times that the chain through which a force acts is renewed in between
 RIVALS = 4  # linear explanations that forces are held against
+UNEVEN = 1e-4  # chance of a true force to explain lines as unevenly, below which it is none
 BESIDE = 6  # linear effects that are refitted beside the best force, and the other way round
 
 
@@ -153,7 +154,25 @@ class ForceSearch(RecordSearch):
         self._either_way(self.ranked()[0])
         self.pair()
         self._rivals()
+        self._forget_uneven()
         self.temper()
+
+    def _forget_uneven(self) -> None:
+        """Without explanations whose force does not explain at all lines what it says that it does:
+        what is left of an input's edges, say, is like dry friction at some and not at others."""
+        while isinstance(model := (best := self.ranked()[0]).fitted.model, ForceModel):
+            linear = tuple(e for e in best.effects if e.quasi is None)
+            x = np.delete(best.fitted.x, list(model.unknowns))
+            base = self.refitted_from(linear, x)
+            if base is None or self._even(base, best.fitted):
+                return
+            del self.found[best.key]
+
+    def _even(self, before: Fitted, after: Fitted) -> bool:
+        """Whether what one fit has more than another shows at all lines as it should."""
+        rates = [len(p.z) for p in self.levels.records.pieces]
+        a, b = self.unexplained(before), self.unexplained(after)
+        return evenly(a, b, rates, self.ratio(after)) > UNEVEN
 
     def _rivals(self) -> None:
         """The force of the best explanation beside what does as well as its linear effects do: what

@@ -99,7 +99,7 @@ def _shifts(physics: str, rate_hz: float) -> Iterator[Mistake]:
         many = f"{abs(n)} sample{'s' * (abs(n) > 1)} {'later' if n > 0 else 'earlier'}"
         said = f"stands {many} than the other columns: a logger's, or a delay of as much"
         if physics == "columns_shifted":
-            said = f"stands samples from the sensors' columns, which are {many}: a logger's"
+            said = f"is not of the sensors' sample: their columns stand {many} (a logger's shift)"
         law = partial(behind, seconds=n / rate_hz)
         yield Mistake(physics, said, law, 1 / (2 * MOST_SHIFTED))
 
