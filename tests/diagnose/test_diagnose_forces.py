@@ -23,6 +23,7 @@ from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.fit.stated import IN_DATA
 from samii_rig.diagnose.forces.laws import CLIPPED
+from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.problem import ForceProblem
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.way import Ways
@@ -305,3 +306,32 @@ def test_a_force_that_changes_nothing_leaves_what_the_linear_rig_does(
     )
     assert end is not None
     assert end.chi2 == pytest.approx(search.nominal.fitted.chi2, rel=1e-6)
+
+
+@pytest.mark.parametrize(("by_itself", "first"), [(-283_482.7, -4_433.8), (-4_430.0, -4_430.0)])
+def test_a_force_that_stopped_elsewhere_is_refitted_from_where_it_stands_beside_another(
+    by_itself: float, first: float
+) -> None:
+    """By itself it had ended far off, and so an oscillator beside it seemed to be needed. What had
+    ended better stays."""
+    force = Effect("cubic_stiffness", "spring", quasi=object())  # type: ignore[arg-type]
+    beside, model = Effect("attached_oscillator", "mass"), object.__new__(ForceModel)
+
+    def ended(weight: float, *effects: Effect) -> Explanation:
+        return Explanation(effects, SimpleNamespace(model=model, weight=weight), weight)  # type: ignore[arg-type]
+
+    class Kept(ForceSearch):
+        spent = False  # type: ignore[assignment]
+
+        def without(self, whole: Explanation, i: int) -> Explanation:
+            made = ended(-4_433.8, *(e for e in whole.effects if e is not whole.effects[i]))
+            return self.found.setdefault(made.key, made)
+
+        def weigh(self, effects: tuple[Effect, ...], fitted: Fitted) -> float:
+            return float(fitted.weight)  # type: ignore[attr-defined]
+
+    search = object.__new__(Kept)
+    both, alone = ended(-4_429.0, beside, force), ended(by_itself, force)
+    search.found = {e.key: e for e in (both, alone)}
+    search._alone()
+    assert search.found[alone.key].weight == first

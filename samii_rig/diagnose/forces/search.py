@@ -153,6 +153,7 @@ class ForceSearch(RecordSearch):
                 break
         self._either_way(self.ranked()[0])
         self.pair()
+        self._alone()
         self._rivals()
         self._forget_uneven()
         self.temper()
@@ -173,6 +174,20 @@ class ForceSearch(RecordSearch):
         rates = [len(p.z) for p in self.levels.records.pieces]
         a, b = self.unexplained(before), self.unexplained(after)
         return evenly(a, b, rates, self.ratio(after)) > UNEVEN
+
+    def _alone(self) -> None:
+        """The force of the best explanation without each linear effect beside it, from where both
+        ended: refitted by itself before it may have stopped elsewhere, and what stands beside it
+        would seem to be needed for that alone."""
+        best = self.ranked()[0]
+        if not isinstance(best.fitted.model, ForceModel):
+            return
+        for i, gone in enumerate(best.effects):
+            if gone.quasi is None and not self.spent:
+                old = self.found.pop(best.key - {gone.key}, None)
+                self.without(best, i)
+                if old is not None:
+                    self.keep(old.effects, old.fitted)
 
     def _rivals(self) -> None:
         """The force of the best explanation beside what does as well as its linear effects do: what
