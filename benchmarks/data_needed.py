@@ -208,7 +208,7 @@ CASES = (
     Case("repeats", "1", first(1)),
     Case(OUT, "the transient", whole=False),
     Case(OUT, "the discrepancy",
-         without=lambda: _replaced(RecordSearch, leftover=lambda _self, _fitted: 1.0)),
+         without=lambda: _replaced(RecordSearch, overdispersion_of=lambda _self, _fitted: 1.0)),
     Case(OUT, "the nominal refit", held=certain),
     Case(OUT, "the levels", without=lambda: _replaced(Whole, by_level=lambda self: self)),
     Case(OUT, "the noise model", without=lambda: _replaced(Whole, disturbed=_alone)),

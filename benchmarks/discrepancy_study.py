@@ -3,9 +3,9 @@
 python benchmarks/discrepancy_study.py --data FOLDER [nothing clamp tip spring lag motor]
 
 The whole robot without a part, among linear single effects: first where chi-square is divided by
-one factor (`Explanations.leftover`), then with a discrepancy beside the noise, as `diagnose` ends
-(`fit/discrepant.py`), and which explanations do not hold. Of the motor, forces, to first order
-about where each refit ended.
+one factor (`Explanations.overdispersion_of`), then with a discrepancy beside the noise, as
+`diagnose` ends (`fit/discrepant.py`), and which explanations do not hold. Of the motor, forces, to
+first order about where each refit ended.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MOVED = 3.0  # tolerances by which a nominal parameter is told to be moved
 def told(search: RecordSearch, e: Explanation) -> str:
     """An explanation with its values, and the nominal parameters that it moves far."""
     fit = e.fitted
-    sd = np.sqrt(np.diagonal(fit.covariance()) * search.temperature)
+    sd = np.sqrt(np.diagonal(fit.covariance()) * search.overdispersion)
     values = []
     for i, effect in enumerate(e.effects):
         for k, (u, at) in enumerate(zip(effect.unknowns, fit.model.own(i), strict=True)):
@@ -85,7 +85,7 @@ def whole(name: str, rig: Rig, runs: Sequence[Recording]) -> None:
         "|---|---|---|---|---|"
     )
     linear.run(briefly=True)
-    row(f"factor {linear.temperature:.0f}", linear)
+    row(f"factor {linear.overdispersion:.0f}", linear)
     search = DiscrepantSearch(linear)
     search.settle()
     row(f"discrepancy {search.discrepancy.scale:.1%}, {search.discrepancy.length:g}", search)
@@ -112,17 +112,17 @@ def motor(rig: Rig, data: Path) -> None:
         found = weighed(search.reduced, search.reduced.reference, fit, left)
         rows.append((found.evidence + search.log_prior(e.effects), e, found))
     best = max(weight for weight, _, _ in rows)
-    print(f"\nmotor: factor {search.temperature:.1f}\n")
+    print(f"\nmotor: factor {search.overdispersion:.1f}\n")
     print(
         "| explanation | chi-square per dof | behind, factor | behind, discrepancy | scale, length "
         f"| value, factor | value, discrepancy |\n{'|---' * 7}|"
     )
     for weight, e, found in sorted(rows, key=lambda r: -r[0]):
-        forced = (k for k, x in enumerate(e.effects) if x.quasi)
+        forced = (k for k, x in enumerate(e.effects) if x.force)
         at = [i for k in forced for i in e.fitted.model.own(k)][:1]
         values = []
         for x, C, times in (
-            (e.fitted.x, e.fitted.covariance(), search.temperature),
+            (e.fitted.x, e.fitted.covariance(), search.overdispersion),
             (found.x, np.linalg.inv(found.precision), 1.0),
         ):
             values.append(

@@ -192,12 +192,12 @@ def motor(data: Path, rig: Rig) -> None:
     print(f"\nmotor alone, chi-square per dof of the refitted model {left:.3g}")
     tried: set[str] = set()
     for e in search.ranked():
-        force = next((x for x in e.effects if x.quasi is not None), None)
+        force = next((x for x in e.effects if x.force is not None), None)
         if force is None or force.physics in tried:
             continue
         tried.add(force.physics)
         found, at = e.fitted, e.fitted.model.own(e.effects.index(force))[0]
-        sd = math.sqrt(found.covariance()[at, at] * search.temperature)
+        sd = math.sqrt(found.covariance()[at, at] * search.overdispersion)
         names = " and ".join(f"{x.physics} at {x.site}" for x in e.effects)
         print(f"{names}: {math.exp(found.x[at]):.3g} {force.unknowns[0].unit} (sd {sd:.0%}), "
               f"chi-square per dof {search.ratio(found):.3g}")  # fmt: skip

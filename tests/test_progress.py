@@ -170,7 +170,7 @@ def test_a_diagnosis_tells_its_end_from_its_first_stage_on(several: bool) -> Non
 def test_the_rest_of_a_diagnosis_is_known_at_its_stages() -> None:
     for usual in (RECORDS, LINES, STATES, POSES):
         assert usual[next(iter(usual))] == START
-        assert "what cannot be told apart" in usual
+        assert "what cannot be distinguished" in usual
         assert all(0 <= low <= high for low, high in usual.values())
 
 

@@ -120,7 +120,7 @@ class DiagnoseOptions:
 def diagnose(o: DiagnoseOptions) -> None:
     """Locate what differs between rig file and recordings, name it, model it, show the gain.
 
-    Says which explanations the data do not tell apart, and which experiment would. With --before
+    Says which explanations the data do not distinguish, and which experiment would. With --before
     and --after: what changed between two states of the rig. Recordings in several poses share one
     set of parameters.
 

@@ -116,7 +116,7 @@ def changed(
         (_named(before), _named(after)),
         explained(search.nominal.fitted),
     )
-    words = (beside.told(), answer.not_physics)
+    words = (beside.describe(), answer.not_physics)
     # That one side is of several states is said first.
     first_words, others = words[::-1] if answer.states else words
     return replace(answer, before=beside, not_physics=(*first_words, *others))

@@ -14,7 +14,7 @@ import numpy as np
 from samii_rig.diagnose.data import findings
 from samii_rig.diagnose.data.measured import measured, usable
 from samii_rig.diagnose.fit.agreeing import Saved
-from samii_rig.diagnose.fit.classes import without_twins
+from samii_rig.diagnose.fit.classes import merge_equivalent
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.usual import LINES_TAKE, RECORDS_TAKE, takes
 from samii_rig.diagnose.physics.effect import Effect
@@ -29,7 +29,7 @@ from samii_rig.progress import Begun, Progress
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
 
-TWIN_POINTS = 40
+EQUIVALENCE_POINTS = 40
 
 
 def table(
@@ -41,13 +41,13 @@ def table(
     poses: Sequence[Rig] = (),
     recorded_hz: float | None = None,
 ) -> list[Effect]:
-    """All effects that the table knows on this rig, structural twins as one. signed, recorded_hz :
-    as of `vocabulary.hypotheses`. poses : the rig in each of several; twins in all of them are
-    one."""
-    f = np.geomspace(low_hz, high_hz, TWIN_POINTS)
+    """All effects that the table knows on this rig, structurally equivalent ones as one. signed,
+    recorded_hz : as of `vocabulary.hypotheses`. poses : the rig in each of several; equivalent in
+    all of them are one."""
+    f = np.geomspace(low_hz, high_hz, EQUIVALENCE_POINTS)
     every = hypotheses(rig, low_hz, high_hz, signed=signed, recorded_hz=recorded_hz)
     every = weighty(every, rig, poses=bool(poses))
-    return without_twins(rig, every, f, poses)
+    return merge_equivalent(rig, every, f, poses)
 
 
 def diagnose(
@@ -96,14 +96,14 @@ def case_of(
 ) -> Case:
     """What is to be explained, the nominal model refitted; arguments as of `diagnose`, `signed` as
     of `table`."""
-    clean = findings.sound(responses, rig, band)
-    sound = usable(clean.responses)
-    lines = measured(sound, rig, band)
+    clean = findings.checked(responses, rig, band)
+    trusted = usable(clean.responses)
+    lines = measured(trusted, rig, band)
     seen, decide, show = lines.splits()
     at = grid(rig, lines.frequency, lines.sensor, lines.actuator)
     if effects is None:
         low, high = float(lines.frequency[0]), float(lines.frequency[-1])
-        effects = table(rig, low, high, signed=signed, recorded_hz=sound[0].rate_hz)
+        effects = table(rig, low, high, signed=signed, recorded_hz=trusted[0].rate_hz)
     by_line = Search(rig, seen, at, clean.competing(effects), progress=progress)
     runs = runs if clean.mend is None else [clean.mend(run) for run in runs]
-    return Case(clean, sound, runs, lines, by_line, decide, show)
+    return Case(clean, trusted, runs, lines, by_line, decide, show)

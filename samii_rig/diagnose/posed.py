@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from samii_rig.diagnose.data.findings import Sound
+from samii_rig.diagnose.data.findings import Checked
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
 from samii_rig.diagnose.fit.agreeing import Given
 from samii_rig.diagnose.fit.poses import InPoses, PosesSearch
@@ -25,7 +25,7 @@ from samii_rig.errors import EstimateError, InputError
 from samii_rig.identify.poses import at_pose, by_pose
 from samii_rig.progress import Begun, Progress
 from samii_rig.rig.load import parse
-from samii_rig.rig.pose import pose_of, told
+from samii_rig.rig.pose import in_words, pose_of
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
 from samii_rig.types import FrequencyResponse, Recording
@@ -46,9 +46,9 @@ class InPose:
     runs: Sequence[Recording]
 
     @property
-    def told(self) -> str:
+    def in_words(self) -> str:
         """The pose in words."""
-        return told(self.pose)
+        return in_words(self.pose)
 
 
 def sorted_by_pose(
@@ -65,7 +65,7 @@ def one_pose(poses: Sequence[Angle], option: str, expected: str) -> Angle:
     """The pose of recordings that have one; InputError of an option where they have several."""
     first, *others = dict.fromkeys(poses)
     if others:
-        raise InputError(option, "pose", ", ".join(told(p) for p in (first, *others)), expected)
+        raise InputError(option, "pose", ", ".join(in_words(p) for p in (first, *others)), expected)
     return first
 
 
@@ -128,15 +128,15 @@ def in_poses(
     search.run()
     whole = replace(first, clean=_of_all([case.clean for case in cases]))
     given = [
-        Given(case.runs, *of, case.clean.samples, f" in pose {one.told}")
+        Given(case.runs, *of, case.clean.samples, f" in pose {one.in_words}")
         for one, case, of in zip(each, cases, search.by_pose(), strict=True)
     ]
     found = by_samples(whole, search, at_first, bands, given)
-    poses = ", ".join(one.told for one in each)
-    said = f"one set of parameters in {len(each)} poses ({poses})"
+    poses = ", ".join(one.in_words for one in each)
+    remark = f"one set of parameters in {len(each)} poses ({poses})"
     if found.rig is not None or found.traces:
-        said += "; the curves and the new rig file are of the first"
-    words = (*found.not_physics, said) if found.states else (said, *found.not_physics)
+        remark += "; the curves and the new rig file are of the first"
+    words = (*found.not_physics, remark) if found.states else (remark, *found.not_physics)
     return replace(found, not_physics=(*words, FORCES))
 
 
@@ -162,7 +162,7 @@ def _together(
     ]
     wholes = []
     for one, case, rig in zip(each, cases, rigs, strict=True):
-        where = f"the recordings in pose {one.told}"
+        where = f"the recordings in pose {one.in_words}"
         if why := case.not_whole():
             raise EstimateError(f"{where} cannot be fitted with the others: {why}")
         try:
@@ -174,11 +174,11 @@ def _together(
     return InPoses(tuple(wholes))
 
 
-def _of_all(each: Sequence[Sound]) -> Sound:
+def _of_all(each: Sequence[Checked]) -> Checked:
     """What was found in the recordings of all poses."""
     return replace(
         each[0],
-        told=tuple(dict.fromkeys(words for one in each for words in one.told)),
+        remarks=tuple(dict.fromkeys(words for one in each for words in one.remarks)),
         lacks=tuple(dict.fromkeys(words for one in each for words in one.lacks)),
         of_lines=frozenset().union(*(one.of_lines for one in each)),
     )

@@ -133,7 +133,7 @@ class Exact:
     stated: float
     value: Value
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """In words."""
         v, unit = self.value, self.value.unit
         return (
@@ -211,7 +211,7 @@ class Before:
             "after": list(self.recordings[1]),
         }
 
-    def told(self) -> tuple[str, ...]:
+    def describe(self) -> tuple[str, ...]:
         """In words."""
         if self.discrepancy:
             return (
@@ -219,7 +219,7 @@ class Before:
                 "the same in both states, and only what their responses differ by is explained",
             )
         if self.causes:
-            named = " and ".join(_said(c) for c in self.causes)
+            named = " and ".join(_in_words(c) for c in self.causes)
             return (f"both states have, beside the rig file: {named}",)
         if self.verdict == "unknown":
             return (
@@ -260,7 +260,7 @@ class Diagnosis:
         whether they are told or not.
     before : of two states, what both have; the causes are then what changed between them.
     moved : the largest first. sigma : root of the chi-square that the causes explain. gain : noise
-        units by which the next experiment would tell the rivals apart; None where none was found.
+        units by which the next experiment would distinguish the rivals; None where none was found.
     states : the recordings of each state of the rig, where they are of more than one. exact : what
         is no missing physics, but one or two wrong numbers of the rig file. beyond : a
         stiffness that is not constant, where it is not sure enough for a cause, in words.
@@ -373,7 +373,7 @@ class Diagnosis:
         what, how_well, next_ = self.lines()
         sites = ", ".join(f"{s} {p:.0%}" for s, p in self.sites[:4])
         facts = {"found": what, "fit": how_well, "next": next_, "places": sites}
-        head = ("left out", "at", "probability", "parameters (90 %)", "not told apart from")
+        head = ("left out", "at", "probability", "parameters (90 %)", "not distinguished from")
         return card("Diagnosis", facts, head, rows)
 
     def _what(self) -> str:
@@ -402,8 +402,8 @@ class Diagnosis:
             case "unknown" if self.exact:
                 what = "A number" if len(self.exact) == 1 else "Two numbers"
                 are = "is" if len(self.exact) == 1 else "are"
-                said = " and ".join(one.told() for one in self.exact)
-                return f"{what} of the rig file {are} wrong: {said}."
+                words = " and ".join(one.describe() for one in self.exact)
+                return f"{what} of the rig file {are} wrong: {words}."
             case "unknown":
                 site, p = self.sites[0] if self.sites else ("", 0.0)
                 place = f" It is most likely at {site} ({percent(p)})." if p >= LIKELY else ""
@@ -411,7 +411,7 @@ class Diagnosis:
                 if self.beyond:
                     return f"{what} that is not named for sure: {self.beyond}."
                 return f"{what} that the table does not name for sure.{place}"
-        named = " and ".join(_said(c) for c in self.causes)
+        named = " and ".join(_in_words(c) for c in self.causes)
         what = "Changed" if two else "Left out"
         if self.verdict == "named":
             return f"{what}: {named}."
@@ -419,12 +419,14 @@ class Diagnosis:
 
     def _how_well(self) -> str:
         before, after = self.nominal[1], self.with_causes[1]
-        on = "on lines kept apart"
+        on = "on test lines"
         if self.before is not None:
             what = (
-                "that were fitted" if self.before.discrepancy else "of the state after kept apart"
+                "lines that were fitted"
+                if self.before.discrepancy
+                else "test lines of the state after"
             )
-            on = f"on lines {what}"
+            on = f"on {what}"
         if self.exact:
             return (
                 f"{sentence(on)[:-1]} chi-square per degree of freedom falls from {before:.3g} to "
@@ -441,7 +443,7 @@ class Diagnosis:
         )
 
     def _next(self) -> str:
-        parts = [sentence(told) for told in self.not_physics[:1]]
+        parts = [sentence(remark) for remark in self.not_physics[:1]]
         if self.experiment:
             parts.append(f"Next: {self.experiment} ({self.why}).")
         if not self.experiment and self.could_hide:
@@ -486,11 +488,11 @@ def percent(p: float) -> str:
     return f"{100 * p:.0f} %"
 
 
-def _said(cause: Cause) -> str:
+def _in_words(cause: Cause) -> str:
     every = cause.parameters.items()
     numbers = ", ".join(f"{k} = {v.value:.3g}{_unit(v)}" for k, v in every)
-    said = f"{cause.physics.replace('_', ' ')} at {cause.site}"
-    return f"{said} ({numbers})" if numbers else said
+    words = f"{cause.physics.replace('_', ' ')} at {cause.site}"
+    return f"{words} ({numbers})" if numbers else words
 
 
 def _unit(value: Value) -> str:

@@ -185,10 +185,10 @@ def pieces_of(
     wired: Wiring,
     without: Collection[str] = (),
     *,
-    apart: bool = False,
+    by_level: bool = False,
 ) -> list[Piece]:
     """Every segment as a piece, those with proportional inputs as one. without : places of
-    segments to leave out, as `Recording.place` gives them. apart : of one level only, for what
+    segments to leave out, as `Recording.place` gives them. by_level : of one level only, for what
     depends on the level.
 
     The input of the loop is v + kp theta as they were recorded: it holds the reference, the
@@ -213,7 +213,7 @@ def pieces_of(
                 continue
             found += _cut(recording, segment, v, r, values, whole, edges, step)
     repeats = _joined(found, levels=False)
-    return repeats if apart else joined(repeats)
+    return repeats if by_level else joined(repeats)
 
 
 def _driving(

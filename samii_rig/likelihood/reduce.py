@@ -109,7 +109,7 @@ class Reduced:
         """(b - 1,) Hz, in the middle between nodes."""
         return np.asarray((self.frequency[:-1] + self.frequency[1:]) / 2)
 
-    def bent(self, d: Complex, middle: Complex) -> float:
+    def interpolation_error(self, d: Complex, middle: Complex) -> float:
         """Noise units by which a change d (b, q) is off that is taken for linear between nodes, and
         is `middle` (b - 1, q) there."""
         off = middle - (d[:-1] + d[1:]) / 2
@@ -189,7 +189,7 @@ class Records:
         k = np.arange(max(CYCLES, int(np.ceil(low))), min(int(high), (n - 1) // 2) + 1)
         return Lines(k, np.asarray(k * (self.rate_hz / n), np.float64))
 
-    def left(self, samples: Samples | Piece, k: Int, H: Complex, contour: Contour) -> Complex:
+    def residual(self, samples: Samples | Piece, k: Int, H: Complex, contour: Contour) -> Complex:
         """(n, q) lines k of what H (M//2 + 1, q) on `exact` leaves of samples, a sample's power."""
         e = _left_in_time(samples, H, contour)
         return np.asarray(np.fft.rfft(e, axis=0)[k] / np.sqrt(len(e)))
@@ -199,16 +199,16 @@ class Records:
         cubic is blind to them where the motion is fast."""
         exact = self.exact()
 
-        def left(samples: Samples | Piece) -> Float:
+        def residual(samples: Samples | Piece) -> Float:
             e = _left_in_time(samples, H, exact)
             mended, count = spikes.mended(e, self.step)
             return samples.z + (mended - e) if count.any() else samples.z
 
         def each(found: tuple[Samples, ...]) -> tuple[Samples, ...]:
-            return tuple(replace(x, z=left(x)) for x in found)
+            return tuple(replace(x, z=residual(x)) for x in found)
 
         pieces = tuple(
-            replace(p, z=left(p), repeats=each(p.repeats), contrasts=each(p.contrasts))
+            replace(p, z=residual(p), repeats=each(p.repeats), contrasts=each(p.contrasts))
             for p in self.pieces
         )
         return replace(self, pieces=pieces)
@@ -228,7 +228,7 @@ def _left_in_time(samples: Samples | Piece, H: Complex, contour: Contour) -> Flo
 
 
 @dataclass(frozen=True, slots=True)
-class Left:
+class LineResiduals:
     """What a model leaves, line by line, nuisances at their best.
 
     frequency : (n,) Hz. chi2 : (n,) of all sensors together, 2 q in the mean.
@@ -240,9 +240,9 @@ class Left:
     each: Float
 
 
-def left_by(
+def residuals_by_line(
     records: Records, response: Response, noise: Reduced, loop: Loops = (), *parts: Part
-) -> list[Left]:
+) -> list[LineResiduals]:
     """The lines of all pieces under one model, in units of the noise that `noise` has: of each of
     some parts, nuisances at their best there; of all lines where none is said."""
     H = response(records.exact().s)
@@ -260,7 +260,7 @@ def left_by(
             goal -= Q @ (Q.T @ goal)
             white[on] = as_complex(goal).reshape(on.size, -1)
         each = noise.noise.scaled(rows.f, rows.piece, white) / 2
-        out.append(Left(rows.f, np.sum(np.abs(white) ** 2, axis=1), each))
+        out.append(LineResiduals(rows.f, np.sum(np.abs(white) ** 2, axis=1), each))
     return out
 
 
@@ -525,7 +525,7 @@ def _beside(
     if not others:
         return []
     lines, exact = records.lines(piece), records.exact()
-    left = np.stack([records.left(samples, lines.k, H, exact) for samples in others], axis=2)
+    left = np.stack([records.residual(samples, lines.k, H, exact) for samples in others], axis=2)
     left, free = _without(left, own.N)
     return [(lines.frequency, left[:, :, i], free) for i in range(len(others))]
 

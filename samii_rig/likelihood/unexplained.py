@@ -60,7 +60,7 @@ def unexplained(
         N = (root @ seen.N).reshape(-1, seen.N.shape[2])
         Q = orthonormal(as_real(N))
         white = []
-        for e in (seen.e, *(records.left(x, lines.k, H, exact) for x in piece.repeats)):
+        for e in (seen.e, *(records.residual(x, lines.k, H, exact) for x in piece.repeats)):
             goal = as_real((root @ e[:, :, None]).ravel())
             white.append(as_complex(goal - Q @ (Q.T @ goal)).reshape(e.shape))
         out.append(Unexplained(lines.k, root, np.stack(white)))

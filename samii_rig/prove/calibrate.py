@@ -46,7 +46,7 @@ def _asked(told: Mapping[str, Any]) -> bool:
 
 def places(truth: Truth, answer: Mapping[str, Any]) -> list[tuple[Evidence, bool]]:
     """Evidence of the most probable explanation, once for each of its causes, and whether
-    something is concealed at that cause's site, or at one it is not told apart from."""
+    something is concealed at that cause's site, or at one it is not distinguished from."""
     told = answer["evidence"]
     if not _asked(told):
         return []

@@ -50,8 +50,8 @@ def size_of(truth: Mapping[str, Any], arrays: Mapping[str, Any], rig: Rig) -> Si
         twins = {n for e in every if hidden & set(e.names) for n in e.names} - hidden
         return Sized(_away(search, search.nominal), tuple(sorted({site for _, site in twins})))
     if search.table:
-        search.grow(search.nominal, FIRST)
-        search.renew(min(search.found.values(), key=lambda e: e.fitted.cost))
+        search.forward(search.nominal, FIRST)
+        search.rebin_and_refit(min(search.found.values(), key=lambda e: e.fitted.cost))
     size = min(_away(search, e) for e in search.found.values())
     if truth["kind"] == "two" and "settled" in arrays:
         # The table that is refitted has no forces, so this is the force's. The other effect's is

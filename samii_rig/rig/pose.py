@@ -66,7 +66,7 @@ def _bent_by(rig: Rig, pose: Pose) -> Rig:
     return rig.model_copy(update={"element": tuple(turned)})
 
 
-def told(pose: Angle) -> str:
+def in_words(pose: Angle) -> str:
     """A pose in words."""
     angle = f"{math.degrees(pose.value):.4g} deg"
     if not isinstance(pose, Pose):

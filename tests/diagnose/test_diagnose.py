@@ -220,7 +220,7 @@ def test_a_rotational_spring_to_ground_and_the_pendulum_are_one(problem):
     lines = measured([concealing((pendulum, [3000.0]))], samii())
     at = grid(samii(), lines.frequency, lines.sensor, lines.actuator)
     search = Search(samii(), lines, at, [pendulum, brace])
-    search.grow(search.nominal, 5)
+    search.forward(search.nominal, 5)
     one, other = (e for e in search.ranked() if e.effects)
     assert distance(one, other, search.problem) < 1.0
 

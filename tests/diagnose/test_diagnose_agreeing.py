@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 from samii_rig.cli.app import app
 from samii_rig.diagnose.changed import State, changed
 from samii_rig.diagnose.diagnose import case_of, diagnose, table
-from samii_rig.diagnose.fit.agreeing import Apart, Given, states_apart
+from samii_rig.diagnose.fit.agreeing import Given, SeveralStates, several_states
 from samii_rig.diagnose.posed import in_poses
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import on_records
@@ -52,11 +52,11 @@ def runs() -> dict[str, Recording]:
     return {name: recorded(*how, name) for name, how in each.items()}
 
 
-def apart(*runs: Recording) -> Apart | None:
+def several(*runs: Recording) -> SeveralStates | None:
     case = case_of(estimate(runs), RIG, None, None, runs)
     search = on_records(case, None)
     assert search is not None
-    found = states_apart([Given.of(search, case.runs, case.clean.samples)])
+    found = several_states([Given.of(search, case.runs, case.clean.samples)])
     return found[0] if found else None
 
 
@@ -75,12 +75,12 @@ def test_a_spring_that_differs_between_two_recordings_is_told_at_its_place(runs)
 
 
 def test_recordings_of_one_rig_agree_as_well_as_their_own_noise_lets_them(runs):
-    assert apart(runs["one"], runs["again"]) is None
-    assert apart(runs["one"]) is None
+    assert several(runs["one"], runs["again"]) is None
+    assert several(runs["one"]) is None
 
 
 def test_the_odd_one_of_three_is_told_though_its_repeats_are_foreign_to_the_others(runs):
-    found = apart(*runs.values())
+    found = several(*runs.values())
     assert found is not None
     assert found.states == (("one.mcap", "again.mcap"), ("stiffer.mcap",))
     assert found.differing > 100

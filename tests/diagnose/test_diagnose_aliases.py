@@ -97,7 +97,7 @@ def test_a_model_of_other_parameters_folds_back_what_is_its_own():
     model = Model(rig)
     x = model.prior * np.random.default_rng(1).standard_normal(model.n)
     nominal = grid(rig, f, sensor, actuator, Chain(rig), 0.1)
-    live = grid(rig, f, sensor, actuator, Chain(rig), 0.1, live=True)
+    live = grid(rig, f, sensor, actuator, Chain(rig), 0.1, own_aliases=True)
     own = model.response(x, grid(rig, f, sensor, actuator, model.plain(x), 0.1))
 
     def off(h: Complex) -> float:

@@ -14,7 +14,7 @@ from samii_rig.diagnose.physics.poses import in_pose as in_the_pose
 from samii_rig.diagnose.posed import in_poses, same_rig
 from samii_rig.errors import InputError
 from samii_rig.identify.poses import at_pose, poses_of
-from samii_rig.rig.pose import read_whole_pose, told
+from samii_rig.rig.pose import in_words, read_whole_pose
 from samii_rig.rig.schema import Rig
 
 KINDS = ("added_mass", "gravity_stiffness", "rigid_ground_spring", "ground_spring")
@@ -103,7 +103,7 @@ def test_a_recording_tells_the_pose_of_its_bend_too() -> None:
     turned = at_pose(RIG, read_whole_pose("75 deg, bent 10 deg", RIG))
     run = replace(in_pose(RIG, "20 deg", 1, repeats=1).runs[0], rig_toml=toml(turned))
     (pose,) = poses_of([run], RIG, ())
-    assert told(pose) == "75 deg, bent 10 deg"
+    assert in_words(pose) == "75 deg, bent 10 deg"
     assert at_pose(RIG, pose) == turned
     assert same_rig(run.rig_toml, RIG)
     with pytest.raises(InputError, match="a bend: one of none"):

@@ -75,8 +75,8 @@ def best_two(response):
     lines = measured([response], samii())
     at = grid(samii(), lines.frequency, lines.sensor, lines.actuator)
     search = Search(samii(), lines, at, TABLE)
-    search.grow(search.nominal, 8)
-    search.grow(search.ranked()[0], 8)
+    search.forward(search.nominal, 8)
+    search.forward(search.ranked()[0], 8)
     return search, next(e for e in search.ranked() if len(e.effects) == 2)
 
 
@@ -95,7 +95,7 @@ def test_damping_with_a_power_of_frequency_is_named_with_its_power():
     lines = measured([response], rig)
     some = [*TABLE, *(e for e in ALL if e.physics == "fractional_damping")]
     search = Search(rig, lines, grid(rig, lines.frequency, lines.sensor, lines.actuator), some)
-    search.grow(search.nominal, 8)
+    search.forward(search.nominal, 8)
     best = search.ranked()[0]
     assert [e.name for e in best.effects] == [("fractional_damping", "joint_1")]
     c, alpha = best.effects[0].report(best.fitted.model.parts(best.fitted.x)[0])
@@ -108,9 +108,9 @@ def test_an_effect_that_only_spares_the_tolerances_is_not_told_beside_another():
     lines = measured([concealing((spring, [1e6, 0.05]))], samii())
     at = grid(samii(), lines.frequency, lines.sensor, lines.actuator)
     search = Search(samii(), lines, at, [spring, damper])
-    search.grow(search.nominal, 2)
+    search.forward(search.nominal, 2)
     both = (spring, damper)
-    search.grow(search.found[frozenset({spring.key})], 2)
+    search.forward(search.found[frozenset({spring.key})], 2)
     end = search.refitted(both, search.found[frozenset({spring.key})], [0.0])
     assert end is not None
     # However much more likely its nominal parameters: the data do not show the damper.
@@ -133,7 +133,7 @@ def test_a_name_is_one_that_the_data_leave_as_probable(behind, told):
     lines = measured([concealing((pendulum, [3000.0]))], samii())
     at = grid(samii(), lines.frequency, lines.sensor, lines.actuator)
     search = Search(samii(), lines, at, [pendulum, brace])
-    search.grow(search.nominal, 5)
+    search.forward(search.nominal, 5)
     one, other = (search.found[frozenset({e.key})] for e in (pendulum, brace))
     both = Class((one, replace(other, weight=one.weight - behind)), (0.0, 0.0), 1.0)
     parts = both.parts()

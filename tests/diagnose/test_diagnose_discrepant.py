@@ -148,7 +148,7 @@ def test_an_oscillator_that_one_sensor_alone_asks_for_is_refused(nothing, seen_b
     h[:, on] = by[:, on]
     search = DiscrepantSearch(drawn(nothing, rng, h))
     search.discrepancy = TRUE
-    search._beside()
+    search._with_discrepancy()
     worse = search.worse(with_oscillator(search))
     assert set(worse) == {s.name for s in RIG.sensor} - set(seen_by)
 
@@ -162,7 +162,7 @@ def test_an_oscillator_at_one_of_two_levels_is_refused_and_one_at_both_is_not():
     for other, worse in ((RIG, ["0.5 V alone"]), (rig, [])):
         search = DiscrepantSearch(of(sweep(rig, 1.0, 1), sweep(other, 0.5, 2)))
         search.discrepancy = TRUE
-        search._beside()
+        search._with_discrepancy()
         assert search.worse(with_oscillator(search)) == worse
 
 

@@ -275,9 +275,9 @@ def test_a_line_that_holds_no_number_is_left_out(rivals):
 def test_a_level_that_does_not_fit_between_two_that_agree_is_left_out():
     other = drawn(2, H=drawn(2).H * np.linspace(0.9, 1.1, LINES.size)[:, None, None])
     levels = [replace(r, level=x) for x, r in ((0.2, drawn(1)), (0.4, other), (0.8, drawn(3)))]
-    clean = findings.sound(levels, samii())
+    clean = findings.checked(levels, samii())
     assert [r.level for r in clean.responses] == [0.2, 0.8]
-    assert any("the runs at 0.4 V do not fit between" in text for text in clean.told)
+    assert any("the runs at 0.4 V do not fit between" in text for text in clean.remarks)
 
 
 def test_levels_that_a_nonlinear_rig_would_have_are_all_kept():
@@ -285,7 +285,7 @@ def test_levels_that_a_nonlinear_rig_would_have_are_all_kept():
     levels = [
         replace(drawn(i, H=drawn(i).H * (1 + 0.03 * i * bend)), level=float(i)) for i in (1, 2, 3)
     ]
-    assert len(findings.sound(levels, samii()).responses) == 3
+    assert len(findings.checked(levels, samii()).responses) == 3
 
 
 @pytest.mark.parametrize(

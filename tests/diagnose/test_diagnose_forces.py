@@ -33,7 +33,7 @@ from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict import by_line
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.diagnose.verdict.force_words import distorted
-from samii_rig.diagnose.verdict.judge import _is_thin
+from samii_rig.diagnose.verdict.judge import _is_insignificant
 from samii_rig.record.importer import import_file
 from samii_rig.record.maps import load_map
 from samii_rig.rig.load import load_rig
@@ -113,7 +113,7 @@ def test_both_parts_of_the_lines_are_joined_again(nothing: list[Recording]) -> N
     search = forces_of(nothing)
     complete, screen = search.problem.complete, Screen.of(search.problem, search.nominal.fitted)
     rows = complete.rows.e.size * 2 + len(complete.factor)
-    parts = np.column_stack([screen.left_by(), screen.directions])[:rows]
+    parts = np.column_stack([screen.residual(), screen.directions])[:rows]
     rng = np.random.default_rng(4)
     e = rng.normal(size=(2, *complete.rows.e.shape)) * np.abs(complete.rows.e)
     lines = e[0] + 1j * e[1]
@@ -187,13 +187,13 @@ def test_levels_that_differ_are_told_without_a_model(nothing: list[Recording]) -
     alike = measured([one, lower], SAMII)
     other = measured([one, replace(lower, H=lower.H * 1.2)], SAMII)
     assert alike.differing() < 1e-6
-    assert other.torn()
+    assert other.depends_on_level()
     assert np.isnan(alike.take(alike.level == 0).differing())
 
 
 @pytest.mark.parametrize(("gained", "told"), [(14.0, False), (60.0, True)])
 def test_a_linear_effect_beside_a_force_must_show_in_the_data(gained: float, told: bool) -> None:
-    force = Effect("coulomb_friction", "joint_2", quasi=object())  # type: ignore[arg-type]
+    force = Effect("coulomb_friction", "joint_2", force=object())  # type: ignore[arg-type]
     beside = Effect("added_mass", "beam")
     one = SimpleNamespace(key=frozenset({force.key}), effects=(force,), fitted=fit_of(1000.0))
     both = SimpleNamespace(
@@ -203,11 +203,11 @@ def test_a_linear_effect_beside_a_force_must_show_in_the_data(gained: float, tol
     )
     search = SimpleNamespace(
         found={one.key: one},
-        temperature=1.0,
-        worth=IN_DATA,
+        overdispersion=1.0,
+        critical_value=IN_DATA,
         nominal=SimpleNamespace(fitted=fit_of(5000.0)),
     )
-    assert _is_thin(search, both) is not told
+    assert _is_insignificant(search, both) is not told
 
 
 @pytest.mark.parametrize(
@@ -226,12 +226,12 @@ def test_several_effects_must_outdo_a_law_by_more_than_it_is_off(
     without = SimpleNamespace(effects=(a,), fitted=fit_of(1e5))
     search = SimpleNamespace(
         found={one.key: one},
-        temperature=1.0,
-        worth=IN_DATA,
+        overdispersion=1.0,
+        critical_value=IN_DATA,
         nominal=SimpleNamespace(fitted=fit_of(1.6e6)),
         without=lambda _e, _i: without,
     )
-    assert _is_thin(search, both) is not told
+    assert _is_insignificant(search, both) is not told
 
 
 def fit_of(chi2: float) -> SimpleNamespace:
@@ -261,7 +261,7 @@ def test_the_real_motor_has_dry_friction(recordings: Path) -> None:
     search = compete_on_records(linear)
     assert search is not None
     best = search.ranked()[0]
-    force = next(e for e in best.effects if e.quasi is not None)
+    force = next(e for e in best.effects if e.force is not None)
     assert force.physics == "coulomb_friction"
     # Two fifths and more of what the nominal model leaves over the noise.
     assert search.ratio(best.fitted) - 1 < 0.6 * (search.ratio(search.nominal.fitted) - 1)
@@ -300,7 +300,7 @@ def test_a_force_that_changes_nothing_leaves_what_the_linear_rig_does(
 ) -> None:
     """A limit that no command comes near."""
     search = forces_of(nothing)
-    (clipped,) = (e for e in search.table if e.quasi is not None and e.quasi.law is CLIPPED)
+    (clipped,) = (e for e in search.table if e.force is not None and e.force.law is CLIPPED)
     end = search.refitted_from(
         (clipped,), np.append(search.nominal.fitted.x, math.log(1e3 * clipped.unknowns[0].high))
     )
@@ -314,14 +314,14 @@ def test_a_force_that_stopped_elsewhere_is_refitted_from_where_it_stands_beside_
 ) -> None:
     """By itself it had ended far off, and so an oscillator beside it seemed to be needed. What had
     ended better stays."""
-    force = Effect("cubic_stiffness", "spring", quasi=object())  # type: ignore[arg-type]
+    force = Effect("cubic_stiffness", "spring", force=object())  # type: ignore[arg-type]
     beside, model = Effect("attached_oscillator", "mass"), object.__new__(ForceModel)
 
     def ended(weight: float, *effects: Effect) -> Explanation:
         return Explanation(effects, SimpleNamespace(model=model, weight=weight), weight)  # type: ignore[arg-type]
 
     class Kept(ForceSearch):
-        spent = False  # type: ignore[assignment]
+        exhausted = False  # type: ignore[assignment]
 
         def without(self, whole: Explanation, i: int) -> Explanation:
             made = ended(-4_433.8, *(e for e in whole.effects if e is not whole.effects[i]))

@@ -80,7 +80,7 @@ def test_beside_a_force_the_chain_is_that_without_both() -> None:
     damper = next(e for e in every if e.fractional is not None and e.site == "joint_2")
     strength = Unknown("T_c", "N m", 1e-3, 1e3, (1.0,))
     force = Force(Place("joint", ("joint_1",)), FRICTION)
-    rubbed = Effect("coulomb_friction", "joint_1", (strength,), quasi=force)
+    rubbed = Effect("coulomb_friction", "joint_1", (strength,), force=force)
     both, alone = model_of(samii(), (rubbed, damper)), Model(samii(), (damper,))
     x = np.zeros(both.n)
     chain = both.plain(x)

@@ -15,7 +15,7 @@ from identify_kit import noiseless, samii
 from samii_rig.diagnose.data.pace import paced
 from samii_rig.diagnose.data.wiring import outputs_of, scaled, wired
 from samii_rig.diagnose.diagnose import diagnose
-from samii_rig.diagnose.physics import insert, mistakes
+from samii_rig.diagnose.physics import faults, insert
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw
@@ -26,7 +26,7 @@ from samii_rig.types import Channel, Recording
 RIG = samii()
 LINES = np.geomspace(0.5, 40.0, 120)
 SENSORS = np.arange(len(RIG.sensor))
-ALL = list(mistakes.effects(RIG, RIG.rate_hz))
+ALL = list(faults.effects(RIG, RIG.rate_hz))
 TWO, _ = load_rig("two_masses")
 LATE = "is not of the sensors' sample: their columns stand 2 samples later"
 
@@ -80,7 +80,7 @@ def test_a_mistake_is_a_factor_that_is_exactly_known(physics, site, said, factor
 
 
 def test_a_logger_shifts_by_rows_of_the_recording_not_of_the_loop():
-    (late,) = (e for e in mistakes.effects(RIG, RIG.rate_hz / 4) if e.variant.startswith(LATE))
+    (late,) = (e for e in faults.effects(RIG, RIG.rate_hz / 4) if e.variant.startswith(LATE))
     s = 2j * np.pi * LINES
     assert late.factor.value(s, np.zeros(0))[0] == pytest.approx(np.exp(-s * 8 / RIG.rate_hz))
 
@@ -142,7 +142,7 @@ def test_a_rig_a_quarter_stiffer_than_its_file_is_no_wrong_rate(rig):
     ],
 )
 def test_it_is_told_and_no_physics_is_named(physics, site, said):
-    effect = one(physics, site, said, list(mistakes.effects(TWO, TWO.rate_hz)))
+    effect = one(physics, site, said, list(faults.effects(TWO, TWO.rate_hz)))
     found = diagnose([measured(TWO, response(TWO, effect))], TWO)
     assert found.verdict == "no_mismatch"
     assert not found.causes

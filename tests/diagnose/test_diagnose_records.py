@@ -63,7 +63,7 @@ def test_who_waits_is_told_what_is_tried_in_every_stage(answer):
     fits = stages.index("nominal model of whole records, fit 1 of at most 6")
     assert fits < stages.index("what is missing")
     assert stages[-3:] == [
-        "what cannot be told apart",
+        "what cannot be distinguished",
         "whether stiffnesses are constant",
         "whether the recordings agree",
     ]

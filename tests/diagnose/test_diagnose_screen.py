@@ -75,13 +75,13 @@ def test_two_evaluations_of_the_chain_stand_for_every_strength_of_a_part(part, p
 @pytest.mark.parametrize("physics", sorted({e.physics for e in PARTS}))
 def test_the_screen_of_a_part_says_what_the_chain_says(physics, nominal, problem):
     part = next(e for e in PARTS if e.physics == physics and not e.jump.fixed)
-    look = Screen.of(problem, nominal)
+    screen = Screen.of(problem, nominal)
     trial = Model(samii(), (part,))
-    place = place_of(trial, nominal.x, part, problem.at, look.response)
-    drop, starts = look.through(place, part)
+    place = place_of(trial, nominal.x, part, problem.at, screen.response)
+    drop, starts = screen.through(place, part)
     h = trial.response(np.append(nominal.x, np.log(starts[0])), problem.at)
-    r = np.concatenate([problem.residual(h), look.tail])
-    left = r - look.directions @ (look.directions.T @ r)
+    r = np.concatenate([problem.residual(h), screen.tail])
+    left = r - screen.directions @ (screen.directions.T @ r)
     assert nominal.cost - drop == pytest.approx(left @ left, rel=1e-7)
 
 

@@ -12,9 +12,9 @@ from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose, table
 from samii_rig.diagnose.fit.records import RecordSearch
 from samii_rig.diagnose.fit.refit import refit
-from samii_rig.diagnose.fit.search import BENT, Search
+from samii_rig.diagnose.fit.search import PENALISED, Search
 from samii_rig.diagnose.physics.model import Model, grid
-from samii_rig.diagnose.verdict.judge import _is_thin
+from samii_rig.diagnose.verdict.judge import _is_insignificant
 from samii_rig.identify.bootstrap import redraw
 
 
@@ -35,17 +35,17 @@ def test_an_oscillator_is_tried_elsewhere_from_the_values_that_it_has_here():
     before = search.found[frozenset({there.key})].fitted.cost
     here = search.found[frozenset({near.key})]
     assert before > here.fitted.cost + 1000
-    search.swap(here)
+    search.exchange(here)
     assert search.found[frozenset({there.key})].fitted.cost < here.fitted.cost + 25
 
 
 def test_what_the_nominal_parameters_hide_is_found_from_the_files_own():
     mass = effect("added_mass", "link_2", "added")
     search = search_of(concealing((mass, [1.17])), [e for e in ALL if e.physics == "added_mass"])
-    straight = search._straight()
+    straight = search._straight(search.nominal)
     assert straight.fitted.penalty == 0
     assert straight.fitted.cost > search.nominal.fitted.cost
-    search.grow(straight, 30, again=True)
+    search.forward(straight, 30, again=True)
     assert mass.name in search.ranked()[0].effects[0].names
 
 
@@ -54,7 +54,7 @@ def test_they_are_tried_though_another_effect_seems_to_be_enough():
     what mimics it may leave no more than noise."""
     mass = effect("added_mass", "link_2", "added")
     search = search_of(concealing((mass, [1.17])), [mass])
-    assert search.nominal.fitted.penalty > BENT * search.nominal.fitted.model.n_nominal
+    assert search.nominal.fitted.penalty > PENALISED * search.nominal.fitted.model.n_nominal
     search.keep((mass,), search.refitted((mass,), search.nominal, [np.log(1.17)]))
     best = search.ranked()[0]
     assert best.effects == (mass,)
@@ -74,22 +74,22 @@ def test_a_mistake_of_the_data_is_no_effect_that_may_be_too_little_beside_anothe
         )
 
     mistake, inertia, lag = (
-        SimpleNamespace(key=key, physical=key != "mistake", quasi=None, rough=0.0)
+        SimpleNamespace(key=key, physical=key != "mistake", force=None, rough=0.0)
         for key in ("mistake", "inertia", "lag")
     )
     nothing = of(2000.0)
     fewer = [nothing, of(900.0, mistake), of(583.0, inertia), of(583.0, lag)]
     search = SimpleNamespace(
         found={e.key: e for e in fewer},
-        worth=28.0,
-        temperature=1.0,
+        critical_value=28.0,
+        overdispersion=1.0,
         nominal=nothing,
         without=lambda e, i: search.found[e.key - {e.effects[i].key}],
     )
-    assert not _is_thin(search, of(570.0, mistake, inertia))
-    assert _is_thin(search, of(570.0, lag, inertia))
+    assert not _is_insignificant(search, of(570.0, mistake, inertia))
+    assert _is_insignificant(search, of(570.0, lag, inertia))
     fewer[1].fitted.chi2 = 590.0
-    assert _is_thin(search, of(570.0, mistake, inertia))
+    assert _is_insignificant(search, of(570.0, mistake, inertia))
 
 
 def wandering(eta, by):
@@ -125,11 +125,11 @@ def test_a_strength_is_known_no_better_than_its_law():
     end = refit(
         Model(samii(), [loss]), search.problem, np.append(search.nominal.fitted.x, np.log(0.04))
     )
-    rough = end.roughly()
+    rough = end.with_model_error()
     assert rough.covariance()[-1, -1] == pytest.approx(end.covariance()[-1, -1] + loss.rough**2)
     assert np.allclose(rough.covariance()[:-1, :-1], end.covariance()[:-1, :-1], rtol=1e-4)
     sure = refit(Model(samii(), [replace(loss, rough=0.0)]), search.problem, end.x, steps=0)
-    assert sure.roughly() is sure
+    assert sure.with_model_error() is sure
 
 
 def test_of_two_effects_the_one_behind_what_mimics_both_is_grown():

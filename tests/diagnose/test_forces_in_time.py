@@ -60,7 +60,7 @@ def chirp(n: int = 3000) -> Float:
 
 def model_of(force: Force, strengths: tuple[float, ...]) -> tuple[ForceModel, Float]:
     unknowns = tuple(Unknown(f"p{i}", "1", p / 10, 10 * p, (p,)) for i, p in enumerate(strengths))
-    model = ForceModel(SAMII, (Effect("force", "here", unknowns, quasi=force),))
+    model = ForceModel(SAMII, (Effect("force", "here", unknowns, force=force),))
     return model, np.append(np.zeros(model.n - len(strengths)), np.log(strengths))
 
 
@@ -213,10 +213,10 @@ def test_half_the_step_leaves_a_quarter_of_the_error(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("law", [laws.OVERLAP, laws.CLIPPED])
 def test_slopes_of_what_the_command_drives_are_its_differences(law: Law) -> None:
     v, p = np.linspace(-1.5, 1.5, 300), np.array([0.8, 0.0])
-    assert law.told is not None
+    assert law.of_command is not None
     d = np.array([1e-6, 0.0])
-    want = (law.told(v, p + d)[0] - law.told(v, p - d)[0]) / 2e-6
-    np.testing.assert_allclose(law.told(v, p)[1][:, 0], want, atol=1e-6)
+    want = (law.of_command(v, p + d)[0] - law.of_command(v, p - d)[0]) / 2e-6
+    np.testing.assert_allclose(law.of_command(v, p)[1][:, 0], want, atol=1e-6)
 
 
 def test_a_law_that_is_not_known_is_an_error_and_never_another() -> None:
@@ -235,7 +235,7 @@ def test_a_law_that_is_not_known_is_an_error_and_never_another() -> None:
 
 def test_one_model_has_one_force() -> None:
     effects = tuple(
-        Effect("force", "here", (Unknown("p", "1", 0.1, 10.0, (1.0,)),), quasi=force, variant=name)
+        Effect("force", "here", (Unknown("p", "1", 0.1, 10.0, (1.0,)),), force=force, variant=name)
         for name, (force, p) in CASES.items()
         if len(p) == 1
     )

@@ -14,7 +14,7 @@ def test_a_load_cell_behind_a_joint_reads_the_friction_beside_the_spring_too() -
     """What it reads is what moves the link, J theta'' + m g r theta, and nothing else does."""
     rig = load_rig("samii_torque_vertical")[0]
     angle = AbsoluteAngle(kind="absolute_angle", name="theta", after="gravity", unit="rad")
-    wide = Place("joint", ("joint_2",)).widened(rig)
+    wide = Place("joint", ("joint_2",)).augmented(rig)
     wide = wide.model_copy(update={"sensor": (*wide.sensor, angle)})
     s = 2j * np.pi * np.geomspace(0.3, 60, 40)
     names, inputs = [x.name for x in wide.sensor], [a.name for a in wide.actuator]

@@ -6,8 +6,8 @@ from typing import Any, cast
 
 import pytest
 
+from samii_rig.diagnose.forces.paths import TransferPaths
 from samii_rig.diagnose.forces.place import Place
-from samii_rig.diagnose.forces.reach import Reach
 from samii_rig.diagnose.forces.table import _drive
 from samii_rig.rig.schema import ActuatorSpec
 
@@ -28,5 +28,5 @@ class Moved:
 )
 def test_a_coarse_converter_hides_a_dead_band_and_no_limit(step: float, known: set[str]) -> None:
     valve = ActuatorSpec(name="v", unit="V", low=-10.0, high=10.0, resolution=step)
-    found = _drive(cast(Reach, Moved()), "motor", valve, turns=False)
+    found = _drive(cast(TransferPaths, Moved()), "motor", valve, turns=False)
     assert {e.physics for e in found} == known

@@ -38,7 +38,7 @@ def command() -> Float:
 def moved(rig: Rig, force: Force, strengths: tuple[float, ...]) -> Float:
     """(N,) mm that a force adds to x."""
     unknowns = tuple(Unknown(f"p{i}", "1", p / 10, 10 * p, (p,)) for i, p in enumerate(strengths))
-    model = ForceModel(rig, (Effect("force", "here", unknowns, quasi=force),))
+    model = ForceModel(rig, (Effect("force", "here", unknowns, force=force),))
     x = np.append(np.zeros(model.n - len(strengths)), np.log(strengths))
     way = Way.of(model, x)
     e = way.force(model, command(), model.numbers(x), model.seeds(x, ()))[0]

@@ -60,7 +60,7 @@ def sensors(rig: Rig, v: Float, **settings: object) -> Float:
 def added(rig: Rig, force: Force, strengths: tuple[float, ...], v: Float) -> Float:
     """(n, q) what a force adds to the sensors, no loop closed."""
     unknowns = tuple(Unknown(f"p{i}", "1", p / 10, 10 * p, (p,)) for i, p in enumerate(strengths))
-    model = ForceModel(rig, (Effect("force", "here", unknowns, quasi=force),))
+    model = ForceModel(rig, (Effect("force", "here", unknowns, force=force),))
     x = np.append(np.zeros(model.n - len(strengths)), np.log(strengths))
     way = Way.of(model, x, acting=(0, 1))
     return way.sensed.of(way.force(model, v, model.numbers(x), model.seeds(x, ()))[0])

@@ -19,12 +19,12 @@ from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.variation import _less, variation
 from samii_rig.diagnose.forces.varying import (
-    Pulled,
+    Modulation,
+    PieceModulation,
     Springs,
-    Swing,
     _between,
-    pulled,
-    pulls,
+    piece_modulations,
+    projected_back,
     uneven,
 )
 from samii_rig.diagnose.result import Diagnosis
@@ -118,17 +118,17 @@ def nothing(tmp_path_factory: pytest.TempPathFactory) -> ForceSearch:
 
 
 def test_what_a_force_adds_to_the_lines_is_turned_round_exactly(nothing: ForceSearch) -> None:
-    rng, reach = np.random.default_rng(1), nothing.reach
-    span, piece = reach.spans[0], nothing.levels.records.pieces[0]
+    rng, paths = np.random.default_rng(1), nothing.paths
+    span, piece = paths.spans[0], nothing.levels.records.pieces[0]
     k = nothing.levels.records.lines(piece).k
-    spring = next(e.quasi for e in nothing.forces if e.quasi and e.quasi.law is HARDENING)
-    ports = reach.ports(spring.place, of_speed=False)
+    spring = next(e.force for e in nothing.forces if e.force and e.force.law is HARDENING)
+    ports = paths.ports(spring.place, of_speed=False)
     assert ports is not None
     force = rng.standard_normal(span.decay.size) * span.alive
     some = rng.standard_normal((2, k.size, ports.sensors[0].shape[1]))
     lines = some[0] + 1j * some[1]
     added = span.lines(span.damped(force), ports.sensors[0], k)
-    back = pulled(span, ports.sensors[0], k, lines, span.times)
+    back = projected_back(span, ports.sensors[0], k, lines, span.times)
     assert force @ back == pytest.approx(float(np.sum(lines.conj() * added).real), rel=1e-9)
 
 
@@ -136,13 +136,13 @@ def test_under_noise_alone_every_frequency_has_chi_square_of_two_freedoms(
     nothing: ForceSearch,
 ) -> None:
     """Noise that is white in the likelihood's own units, at the lines of real records."""
-    rng, reach = np.random.default_rng(2), nothing.reach
+    rng, paths = np.random.default_rng(2), nothing.paths
     left = nothing.unexplained(nothing.nominal.fitted)
     f, each, sides = (0.05, 0.1, 0.4, 1.6, 6.4), [], []
-    for spring in (e.quasi for e in nothing.forces if e.quasi and e.quasi.law is HARDENING):
-        ports = reach.ports(spring.place, of_speed=False)
+    for spring in (e.force for e in nothing.forces if e.force and e.force.law is HARDENING):
+        ports = paths.ports(spring.place, of_speed=False)
         assert ports is not None
-        motion = reach.motion(spring.place, of_speed=False)
+        motion = paths.motion(spring.place, of_speed=False)
         for _ in range(40):
             noise = [
                 replace(
@@ -152,12 +152,12 @@ def test_under_noise_alone_every_frequency_has_chi_square_of_two_freedoms(
                 )
                 for x in left
             ]
-            parts = zip(reach.spans, motion, ports.sensors, noise, strict=True)
-            pieces = [Pulled.of(*one) for one in parts]
-            apart = _between(pieces)
+            parts = zip(paths.spans, motion, ports.sensors, noise, strict=True)
+            pieces = [PieceModulation.of(*one) for one in parts]
+            between = _between(pieces)
             sides.append(uneven(pieces))
-            swings = [np.sum([one.exact(hz) for one in pieces], axis=0) for hz in f]
-            each += [[(apart.chi2, apart.free, 0.0), *swings]]
+            modulations = [np.sum([one.exact(hz) for one in pieces], axis=0) for hz in f]
+            each += [[(between.chi2, between.free, 0.0), *modulations]]
     chi2, free, _ = np.moveaxis(np.array(each), 2, 0)
     rows = sum(len(x.white) for x in left)
     assert set(free[:, 0]) == {rows - 1}
@@ -175,13 +175,13 @@ def test_where_nothing_is_missing_every_stiffness_is_constant(nothing: ForceSear
 
 
 def test_what_a_swing_adds_in_time_is_what_it_adds_to_the_lines(nothing: ForceSearch) -> None:
-    reach, span = nothing.reach, nothing.reach.spans[0]
+    paths, span = nothing.paths, nothing.paths.spans[0]
     left = nothing.unexplained(nothing.nominal.fitted)[0]
-    spring = next(e.quasi for e in nothing.forces if e.quasi and e.quasi.law is HARDENING)
-    ports = reach.ports(spring.place, of_speed=False)
+    spring = next(e.force for e in nothing.forces if e.force and e.force.law is HARDENING)
+    ports = paths.ports(spring.place, of_speed=False)
     assert ports is not None
-    phi = reach.motion(spring.place, of_speed=False)[0]
-    piece = Pulled.of(span, phi, ports.sensors[0], left)
+    phi = paths.motion(spring.place, of_speed=False)[0]
+    piece = PieceModulation.of(span, phi, ports.sensors[0], left)
     changes = np.zeros((len(left.white), 3))
     changes[0] = 0.0, 3.0, 4.0
     added = piece.added(changes, [0.4])
@@ -196,11 +196,11 @@ def test_what_a_swing_adds_in_time_is_what_it_adds_to_the_lines(nothing: ForceSe
 def swinging(nothing: ForceSearch, site: str, hz: float, depth: float) -> ForceSearch:
     """The same on records of a rig in which a spring swings."""
     place = next(
-        e.quasi.place for e in nothing.forces if e.quasi and e.quasi.law is HARDENING and
+        e.force.place for e in nothing.forces if e.force and e.force.law is HARDENING and
         e.site == site
     )  # fmt: skip
-    k, made = nothing.reach.scale((site, "k")), []
-    pieces = pulls(nothing, place, nothing.unexplained(nothing.nominal.fitted))
+    k, made = nothing.paths.scale((site, "k")), []
+    pieces = piece_modulations(nothing, place, nothing.unexplained(nothing.nominal.fitted))
     for one, piece in zip(pieces, nothing.levels.records.pieces, strict=True):
         changes = np.zeros((one.times.size, 3))
         changes[0, 1] = -depth * k * one.times[0]
@@ -231,7 +231,7 @@ def test_which_spring_swings_is_decided_without_the_swing_in_the_noise(
     at first, is not the one."""
     strongest, seen = Springs.strongest, []
 
-    def neighbour_first(*args: Any) -> list[tuple[str, Swing]]:
+    def neighbour_first(*args: Any) -> list[tuple[str, Modulation]]:
         found = strongest(*args)
         seen.append([site for site, _ in found])
         return [*found[1::-1], *found[2:]]

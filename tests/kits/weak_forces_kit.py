@@ -10,7 +10,7 @@ from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS, PLAY, Law
 from samii_rig.diagnose.forces.model import ForceModel
-from samii_rig.diagnose.forces.screen import Looks, scaled, weakly
+from samii_rig.diagnose.forces.screen import ForceScreen, first_order, scaled
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.types import Float
 
@@ -18,25 +18,25 @@ from samii_rig.types import Float
 def weak_ones(search: ForceSearch) -> Iterator[tuple[Law, str, float, float]]:
     """Of each force its law and site, and the power of what it adds, to first order and in time."""
     nominal = search.nominal.fitted
-    looks = Looks(search.problem, (Screen.of(search.problem, nominal),))
-    hopes = weakly(search.forces, search.reach, looks)
-    assert {h.effect.key for h in hopes} == {e.key for e in search.forces}
-    for hope in hopes:
-        law = hope.effect.quasi.law
+    screen = ForceScreen(search.problem, (Screen.of(search.problem, nominal),))
+    scores = first_order(search.forces, search.paths, screen)
+    assert {h.effect.key for h in scores} == {e.key for e in search.forces}
+    for score in scores:
+        law = score.effect.force.law
         if law in (
             PLAY,
             HYSTERESIS,
             FRICTION,
         ):  # whose shape depends on the strength, or that stick
             continue
-        share = 0.02 if law.told is None else 1.0
-        largest = search.reach.largest(hope.effect.quasi.place)
-        strengths = scaled(law, hope.strengths, share, largest)
-        model = search.model((hope.effect,))
+        share = 0.02 if law.of_command is None else 1.0
+        largest = search.paths.largest(score.effect.force.place)
+        strengths = scaled(law, score.strengths, share, largest)
+        model = search.model((score.effect,))
         assert isinstance(model, ForceModel)
         x = np.append(moved(nominal.model, nominal.x, model), np.log(strengths))
-        in_time = _power(*looks.gains(search.problem.change(model, x))) / share**2
-        yield law, hope.effect.site, _power(hope.own, hope.may, hope.times), in_time
+        in_time = _power(*screen.gains(search.problem.change(model, x))) / share**2
+        yield law, score.effect.site, _power(score.own, score.may, score.times), in_time
 
 
 def _power(own: Float, _may: Float, times: Float | float) -> float:

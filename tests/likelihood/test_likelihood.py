@@ -22,8 +22,8 @@ from samii_rig.likelihood.reduce import (
     _of_pieces,
     _past_of,
     as_real,
-    left_by,
     reduced,
+    residuals_by_line,
 )
 from samii_rig.likelihood.rounding import Added, Rounding, repeating
 from samii_rig.likelihood.spikes import mended
@@ -278,7 +278,7 @@ def test_an_offset_and_a_slow_wander_of_a_sensor_are_no_mismatch():
     u, z = noisy(3)
     t = np.linspace(-1, 1, len(z))
     records, found = likelihood(u, z + np.column_stack([0.5 + 0.3 * t**2, -2.0 * t**3]), poles())
-    (left,) = left_by(records, lambda s: response(s, poles()), found)
+    (left,) = residuals_by_line(records, lambda s: response(s, poles()), found)
     assert float(np.mean(left.chi2)) == pytest.approx(4.0, rel=0.15)
 
 
@@ -504,7 +504,7 @@ def test_bursts_in_a_row_are_predicted_however_long_the_rig_rings():
     records = Records(tuple(found), RATE, ((0.8, 15.0),) * 3)
     form = reduced(records, lambda s: response(s, mode), own_alone)
     assert float(form.target @ form.target) / form.known == pytest.approx(1.0, abs=0.25)
-    (left,) = left_by(records, lambda s: response(s, mode), form)
+    (left,) = residuals_by_line(records, lambda s: response(s, mode), form)
     assert float(np.mean(left.chi2)) == pytest.approx(4.0, rel=0.15)
     f = np.arange(2.0, 13.0)
     power = np.trace(form.noise.covariance(f, one_piece(f)), axis1=1, axis2=2).real
@@ -547,7 +547,7 @@ def test_the_mains_are_no_mismatch_between_lines_too():
     )
     records = [Records((piece(u, x),), RATE, ((0.8, 70.0),)) for x in (z, z + hum)]
     plain, humming = (
-        left_by(
+        residuals_by_line(
             r, lambda s: response(s, poles()),
             reduced(records[0], lambda s: response(s, poles()), own_alone),
         )[0]

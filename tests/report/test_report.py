@@ -390,11 +390,11 @@ def test_who_waits_sees_what_is_tried_and_that_kernels_are_compiled():
             say(Counted("what is missing", tried, 50, within="round 1"))  # each soon after
         assert kernels.__doc__  # it hears the compiler from then on
         numba.njit(lambda x: x + 1)(1)
-        say("what cannot be told apart")
+        say("what cannot be distinguished")
     stages = [line.partition(" (after")[0] for line in said.file.getvalue().splitlines()]
     assert stages == [
         "diagnosis ...",
         "diagnosis: what is missing ...",
         "diagnosis: compiling the model's kernels, once a machine ...",
-        "diagnosis: what cannot be told apart ...",
+        "diagnosis: what cannot be distinguished ...",
     ]

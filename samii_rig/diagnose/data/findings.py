@@ -38,22 +38,22 @@ NO_REPEATS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Sound:
-    """responses : as they may be trusted. told : what was found, in words; lacks : what these
-    recordings cannot tell, in words. doubt : why nothing may be named, or None; guessed : the same
-    of responses line by line, whole records have it not.
+class Checked:
+    """responses : as they may be trusted. remarks : what was found, in words; lacks : what these
+    recordings cannot tell, in words. refusal : why nothing may be named, or None; guessed : the
+    same of responses line by line, whole records have it not.
     units : channels whose unit was mended. mended : whether anything was, in the responses alone;
     mend : of all recordings' columns, the same as in the responses.
-    of_lines : of `told`, what concerns responses alone. samples : why segments or channels were
+    of_lines : of `remarks`, what concerns responses alone. samples : why segments or channels were
     left out for what their samples are."""
 
     responses: tuple[FrequencyResponse, ...]
-    told: tuple[str, ...]
+    remarks: tuple[str, ...]
     lacks: tuple[str, ...]
-    doubt: Doubt | None
+    refusal: Refusal | None
     units: frozenset[str]
     mended: bool = False
-    guessed: Doubt | None = None
+    guessed: Refusal | None = None
     of_lines: frozenset[str] = frozenset()
     samples: tuple[Finding, ...] = ()
     mend: Mend | None = None
@@ -76,7 +76,7 @@ class Sound:
 
 
 @dataclass(frozen=True, slots=True)
-class Doubt:
+class Refusal:
     """Something wrong with all of the recordings that may pass for physics: why, what to do,
     and the most that may be said all the same."""
 
@@ -85,36 +85,36 @@ class Doubt:
     most: Verdict
 
 
-def sound(
+def checked(
     responses: Sequence[FrequencyResponse], rig: Rig, band: tuple[float, float] | None = None
-) -> Sound:
+) -> Checked:
     """The responses without what is no physics, and what that was.
 
     Raises InputError where recordings, rig and band (Hz) do not belong together, EstimateError
     where nothing is left.
     """
-    told = estimated(responses)
+    remarks = estimated(responses)
     for r in responses:
         _belongs(r, rig)
     if responses:
         _covered(responses, band)
     given = responses
-    responses, doubt = _timed(given, told)
-    finite, said = _finite(_fine(responses))
+    responses, refusal = _timed(given, remarks)
+    finite, lost = _finite(_fine(responses))
     paced(finite, rig)
     found = wired(finite, rig)
     steady, changed = _steady(found.responses)
     guessed = None
     if not any(repeated(r) for r in steady):
-        guessed = Doubt(NO_REPEATS, "repeat each run three times, each from rest", "ambiguous")
-    return Sound(
+        guessed = Refusal(NO_REPEATS, "repeat each run three times, each from rest", "ambiguous")
+    return Checked(
         tuple(steady),
-        tuple(told + said + found.told + changed),
+        tuple(remarks + lost + found.remarks + changed),
         lacks(steady, rig),
-        doubt,
+        refusal,
         found.units,
-        mended=bool(said or changed or (found.told and found.mend is None)),
-        mend=found.mend if found.told else None,
+        mended=bool(lost or changed or (found.remarks and found.mend is None)),
+        mend=found.mend if found.remarks else None,
         guessed=guessed,
         of_lines=frozenset(estimated(responses, OF_LINES)),
         samples=tuple(
@@ -195,8 +195,8 @@ def _covered(responses: Sequence[FrequencyResponse], band: tuple[float, float] |
 
 
 def _timed(
-    responses: Sequence[FrequencyResponse], told: list[str]
-) -> tuple[list[FrequencyResponse], Doubt | None]:
+    responses: Sequence[FrequencyResponse], remarks: list[str]
+) -> tuple[list[FrequencyResponse], Refusal | None]:
     """Without responses whose clock and rate disagree, as long as there are others."""
     doubtful = [
         any(f.kind == "clock" and f.severity != "note" for f in r.findings) for r in responses
@@ -206,9 +206,9 @@ def _timed(
     if not all(doubtful):
         out = [r for r, bad in zip(responses, doubtful, strict=True) if not bad]
         names = [named(r) for r, bad in zip(responses, doubtful, strict=True) if bad]
-        told.append(f"the runs {', '.join(dict.fromkeys(names))} are left out for their clock")
+        remarks.append(f"the runs {', '.join(dict.fromkeys(names))} are left out for their clock")
         return out, None
-    return list(responses), Doubt(
+    return list(responses), Refusal(
         "every frequency is off by as much as the clock is, which looks like other stiffnesses",
         "set rate_hz to what the clock says, or mend the clock, and estimate again",
         "unknown",
@@ -233,18 +233,20 @@ def _fine(responses: Sequence[FrequencyResponse]) -> list[FrequencyResponse]:
 def _finite(
     responses: Sequence[FrequencyResponse],
 ) -> tuple[list[FrequencyResponse], list[str]]:
-    out, said = [], []
+    out, remarks = [], []
     for r in responses:
         p = r.H.shape[1] * r.H.shape[2]
         entries = np.concatenate([r.H.reshape(-1, p), r.covariance.reshape(-1, p * p)], axis=1)
         good = np.asarray(np.isfinite(entries).all(axis=1))
         if not good.all():
-            said.append(f"{named(r)}: {int((~good).sum())} lines hold no number and are left out")
+            remarks.append(
+                f"{named(r)}: {int((~good).sum())} lines hold no number and are left out"
+            )
         if good.sum() >= FEW_LINES or good.all():
             out.append(r if good.all() else lines_of(r, good))
     if not out and responses:
         raise EstimateError("no response has lines that hold numbers")
-    return out, said
+    return out, remarks
 
 
 # Levels
@@ -255,7 +257,7 @@ def _steady(
 ) -> tuple[list[FrequencyResponse], list[str]]:
     """Without channels whose gain was changed between levels, and without a level between two
     that agree and that it does not agree with."""
-    out, said = list(responses), []
+    out, remarks = list(responses), []
     families: dict[tuple[object, ...], list[int]] = {}
     for i, r in enumerate(out):
         names = tuple(c.name for c in (*r.inputs, *r.outputs))
@@ -265,19 +267,19 @@ def _steady(
     for members in families.values():
         members.sort(key=lambda i: out[i].level)
         for k, words in _changed([out[i] for i in members]):
-            said.append(words)
+            remarks.append(words)
             keep = [j for j in range(len(out[members[0]].outputs)) if j != k]
             for i in members:
                 out[i] = outputs_of(out[i], keep)
         odd = _foreign([out[i] for i in members])
         if odd is not None:
             r = out[members[odd]]
-            said.append(
+            remarks.append(
                 f"the runs {named(r)} do not fit between the lower and the higher level, which "
                 "agree with each other: another state of the rig; left out"
             )
             dropped.add(members[odd])
-    return [r for i, r in enumerate(out) if i not in dropped], said
+    return [r for i, r in enumerate(out) if i not in dropped], remarks
 
 
 def _changed(levels: Sequence[FrequencyResponse]) -> list[tuple[int, str]]:
@@ -311,8 +313,8 @@ def _change(a: FrequencyResponse, b: FrequencyResponse, k: int) -> tuple[float, 
     weight = np.where(var > 0, 1 / np.where(var > 0, var, 1.0), 0.0)
     gain = float(np.sum(weight * (x.conj() * y).real) / np.sum(weight * np.abs(x) ** 2))
     # The noise of what is multiplied grows with it.
-    grown = (a.covariance[:, at, at] * gain**2 + b.covariance[:, at, at]).real
-    flat = float(np.mean(np.abs(y - gain * x) ** 2 / np.where(grown > 0, grown, np.inf)))
+    variance = (a.covariance[:, at, at] * gain**2 + b.covariance[:, at, at]).real
+    flat = float(np.mean(np.abs(y - gain * x) ** 2 / np.where(variance > 0, variance, np.inf)))
     return gain, flat, float(np.mean(weight * np.abs(y - x) ** 2))
 
 
@@ -321,13 +323,13 @@ def _foreign(levels: Sequence[FrequencyResponse]) -> int | None:
     if len(levels) < 3:
         return None
     n = len(levels)
-    apart = np.zeros((n, n))
+    distance = np.zeros((n, n))
     for i, j in combinations(range(n), 2):
         worst = max(_change(levels[i], levels[j], k)[2] for k in range(len(levels[i].outputs)))
-        apart[i, j] = apart[j, i] = worst
+        distance[i, j] = distance[j, i] = worst
     for i in range(1, n - 1):
         rest = [j for j in range(n) if j != i]
-        agree = max(apart[j, k] for j, k in combinations(rest, 2))
-        if agree < FLAT and min(apart[i, j] for j in rest) > ELSE:
+        agree = max(distance[j, k] for j, k in combinations(rest, 2))
+        if agree < FLAT and min(distance[i, j] for j in rest) > ELSE:
             return i
     return None

@@ -24,7 +24,7 @@ MOST_BINS = 400
 SPLIT = 6.0  # standard deviations of chi-square inside a bin above which it is divided
 COARSE = 0.01  # of a model's misfit, over noise, that may be lost in a bin
 SHAPE = 0.6  # weight of the response's own arc (logarithm, radians) against log frequency
-SHOW, TURN = 4, 5  # one line in five is kept apart, to show on what was found
+SHOW, TURN = 4, 5  # one line in five is a test line
 PERIODIC = ("periodic", "stepped")  # methods of excitations that repeat themselves
 # Methods of which a line is a whole number of cycles a record (or a period).
 WHOLE = ("burst", "settled", "periodic")
@@ -102,7 +102,7 @@ class Measured:
         left, mean = self.disagreeing()
         return left / mean if mean > 0 else math.nan
 
-    def torn(self) -> bool:
+    def depends_on_level(self) -> bool:
         """Whether levels differ by far more than noise makes them."""
         return self.differing() > DIFFER
 
@@ -183,8 +183,8 @@ def usable(responses: Sequence[FrequencyResponse]) -> list[FrequencyResponse]:
     what the local models leave of the transient is not in their covariance. They are used only
     where there is nothing else.
     """
-    sound = [r for r in responses if repeated(r)]
-    return sound or list(responses)
+    trusted = [r for r in responses if repeated(r)]
+    return trusted or list(responses)
 
 
 def measured(
@@ -293,7 +293,7 @@ def binned(
     shape : (n, q) a model at the lines. In a bin the truth is taken for the model times one
     complex factor for each entry; chi-square about that is kept in `inside`, and a bin in
     which it is too large is divided, up to `most` bins. misfit : chi-square over its mean that
-    the model has anyhow; where it is gross, bins need not be fine.
+    the model has anyhow; where it is large, bins need not be fine.
     """
     split = SPLIT * max(1.0, COARSE * misfit)
     size = np.abs(shape)
@@ -303,19 +303,19 @@ def binned(
     metric = step + SHAPE * arc.sum(axis=1) / max(float(arc.sum()), 1e-12)
     place = np.concatenate([[0.0], np.cumsum(metric)])
     at = np.searchsorted(place, np.linspace(0, place[-1], min(bins, lines.n) + 1)[:-1])
-    starts = np.unique(_apart(lines.frequency, at))
+    starts = np.unique(_edges(lines.frequency, at))
     while True:
         found, chi, mean = combined(lines, smooth, starts)
         counts = np.diff(np.append(starts, lines.n))
         bad = (chi - mean > split * np.sqrt(2 * np.maximum(mean, 1.0))) & (counts > 1)
-        more = _apart(lines.frequency, (starts + counts // 2)[bad])
+        more = _edges(lines.frequency, (starts + counts // 2)[bad])
         new = np.unique(np.concatenate([starts, more]))
         if new.size == starts.size or new.size > most:
             return found
         starts = new
 
 
-def _apart(f: Float, at: Int) -> Int:
+def _edges(f: Float, at: Int) -> Int:
     """The same places, moved back to the first line of that frequency (another level's)."""
     return np.asarray(np.searchsorted(f, f[at]), dtype=np.int64)
 

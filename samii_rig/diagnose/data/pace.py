@@ -31,15 +31,15 @@ def _pace(r: FrequencyResponse, rig: Rig) -> float:
     on = [[s.name for s in rig.sensor].index(c.name) for c in r.outputs]
     by = [[a.name for a in rig.actuator].index(c.name) for c in r.inputs]
 
-    def left(k: float) -> float:
+    def misfit_at(k: float) -> float:
         f = r.frequency[pick] / k
         inside = f < rig.rate_hz / 2
         model = sampled_response(rig, f[inside])[:, on][:, :, by]
         return misfit(r.H[pick][inside], model)
 
-    as_it_is = left(1.0)
+    as_it_is = misfit_at(1.0)
     if as_it_is < MISFIT:
         return 1.0
-    each = {k: left(k) for pace in PACES for k in (pace, 1 / pace)}
+    each = {k: misfit_at(k) for pace in PACES for k in (pace, 1 / pace)}
     best = min(each, key=lambda k: each[k])
     return best if each[best] < SWAPPED * as_it_is else 1.0

@@ -52,12 +52,12 @@ class Mend:
 class Wired:
     """Responses with channels in the rig file's order, units and signs.
 
-    told : what was changed, once for all that share it. units : channels whose unit was.
+    remarks : what was changed, once for all that share it. units : channels whose unit was.
     mend : the same for their recordings; None where it differs from one response to another.
     """
 
     responses: list[FrequencyResponse]
-    told: list[str]
+    remarks: list[str]
     units: frozenset[str]
     mend: Mend | None
 
@@ -67,18 +67,18 @@ def wired(responses: Sequence[FrequencyResponse], rig: Rig) -> Wired:
     where: dict[str, list[FrequencyResponse]] = {}
     out, units, mends = [], set(), []
     for r in responses:
-        mended, said, order, gains = _mended(r, rig)
+        mended, remarks, order, gains = _mended(r, rig)
         out.append(mended)
         units |= {c.name for c, g in zip(r.outputs, gains, strict=True) if abs(g) != 1}
         mends.append(_columns(r, order, gains))
-        for text in said:
+        for text in remarks:
             where.setdefault(text, []).append(r)
-    told = []
+    remarks = []
     for text, those in where.items():
         some = f" ({', '.join(dict.fromkeys(named(r) for r in those))})"
-        told.append(text + ("" if len(those) == len(responses) else some))
+        remarks.append(text + ("" if len(those) == len(responses) else some))
     alike = all(m == mends[0] for m in mends)
-    return Wired(out, told, frozenset(units), Mend(mends[0]) if mends and alike else None)
+    return Wired(out, remarks, frozenset(units), Mend(mends[0]) if mends and alike else None)
 
 
 def _columns(
@@ -104,19 +104,19 @@ def _mended(
     acting = [a.name for a in rig.actuator]
     model = sampled_response(rig, r.frequency[pick])[:, on]
     model = as_measured(lines_of(r, pick), model, acting)
-    H, said = r.H[pick], []
+    H, remarks = r.H[pick], []
     order = list(range(len(on)))
     for a, b in _swaps(H, model):
         order[a], order[b] = order[b], order[a]
-        said.append(
+        remarks.append(
             f"{r.outputs[a].name} and {r.outputs[b].name} are swapped; taken for each other"
         )
-    if said:
+    if remarks:
         labels = r.outputs
         r = replace(outputs_of(r, order), outputs=labels)
         H = H[:, order]
-    gains, words = _gains(H, model, r, _loose(rig))
-    return scaled(r, gains) if words else r, said + words, order, gains
+    gains, words = _gains(H, model, r, _tolerance(rig))
+    return scaled(r, gains) if words else r, remarks + words, order, gains
 
 
 def _ratio(H: Complex, model: Complex) -> Complex:
@@ -146,19 +146,19 @@ def _swaps(H: Complex, model: Complex) -> list[tuple[int, int]]:
     return out
 
 
-def _loose(rig: Rig) -> float:
+def _tolerance(rig: Rig) -> float:
     """By what part the gain of a source may be off, by its tolerance."""
     sources = [e for e in rig.element if isinstance(e, SOURCES)]
     return max((parameters(e)["K"].tolerance for e in sources), default=0.0)
 
 
 def _gains(
-    H: Complex, model: Complex, r: FrequencyResponse, loose: float
+    H: Complex, model: Complex, r: FrequencyResponse, tolerance: float
 ) -> tuple[Float, list[str]]:
     """Factors (n_out,) that bring every output to the rig file's unit and sign, and words."""
     log = _ratio(H, model)
     n = log.shape[1]
-    unit = [_unit(log[:, k], loose) for k in range(n)]
+    unit = [_unit(log[:, k], tolerance) for k in range(n)]
     turned = [_opposite(log[:, k]) for k in range(n)]
     gains, words = np.ones(n), []
     inputs = ", ".join(c.name for c in r.inputs)
@@ -179,9 +179,9 @@ def _gains(
     return gains, words
 
 
-def _unit(log: Complex, loose: float) -> float:
+def _unit(log: Complex, tolerance: float) -> float:
     """The factor between units that all lines of an output share; 1 for none, or where two are as
-    near as a drive's gain may be off: these are told apart by the fit."""
+    near as a drive's gain may be off: these are distinguished by the fit."""
     size = log.real[np.isfinite(log)]
     if size.size < FEW_LINES:
         return 1.0
@@ -189,9 +189,9 @@ def _unit(log: Complex, loose: float) -> float:
     if high - low > 2 * math.log(ALIKE):
         return 1.0
     _, best = nearest(math.exp(float(middle)))
-    reach = math.log(UNIT_WITHIN) + 2 * loose
+    within = math.log(UNIT_WITHIN) + 2 * tolerance
     others = [f for u in UNITS for f in (u.factor, 1 / u.factor, 1.0) if f != best]
-    if any(abs(float(middle) - math.log(f)) < reach for f in others):
+    if any(abs(float(middle) - math.log(f)) < within for f in others):
         return 1.0
     return best if abs(float(middle) - math.log(best)) < math.log(UNIT_WITHIN) else 1.0
 

@@ -66,7 +66,7 @@ class Given:
 
 
 @dataclass(frozen=True, slots=True)
-class Apart:
+class SeveralStates:
     """Recordings of more than one state.
 
     states : the recordings of each, the first one's first. differing : chi-square per degree of
@@ -81,7 +81,7 @@ class Apart:
     where: str = ""
     samples: bool = True
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """In words."""
         first, *others = (", ".join(names) for names in self.states)
         return (
@@ -133,7 +133,7 @@ class _Alone:
         return alike or (self.linear and other.linear)
 
 
-def states_apart(every: Sequence[Given], left: float | None = None) -> list[Apart]:
+def several_states(every: Sequence[Given], left: float | None = None) -> list[SeveralStates]:
     """The states that recordings are of, for each of several that are given as of one and are of
     more; those that differ most come first. left : chi-square over its mean that is to be explained
     of all; None for what the models leave of each recording."""
@@ -144,12 +144,12 @@ def states_apart(every: Sequence[Given], left: float | None = None) -> list[Apar
     if left is None:
         alone = [one or _alone(given) for given, one in zip(every, each, strict=True)]
         left = sum(_left(given, one) for given, one in zip(every, alone, strict=True))
-    apart = [
-        replace(one.apart([alone.name for alone in own], left), where=given.where)
+    several = [
+        replace(one.several_states([alone.name for alone in own], left), where=given.where)
         for given, own, one in zip(every, each, found, strict=True)
         if len(one.groups) > 1
     ]
-    return sorted(apart, key=lambda one: -one.differing)
+    return sorted(several, key=lambda one: -one.differing)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,10 +161,10 @@ class _Grouped:
     worst: float
     excess: float
 
-    def apart(self, names: Sequence[str], left: float) -> Apart:
+    def several_states(self, names: Sequence[str], left: float) -> SeveralStates:
         """What they differ by, of so much that is to be explained."""
         states = tuple(tuple(names[i] for i in group) for group in self.groups)
-        return Apart(states, self.worst, min(self.excess / left, 1.0) if left > 0 else 1.0)
+        return SeveralStates(states, self.worst, min(self.excess / left, 1.0) if left > 0 else 1.0)
 
 
 def _grouped(n: int, difference: Callable[[int, int], tuple[float, float, float]]) -> _Grouped:
@@ -262,8 +262,10 @@ def _left(given: Given, each: Sequence[_Alone]) -> float:
     return total
 
 
-def lines_apart(files: Sequence[Saved], lines: Measured, left: float, rig: Rig) -> Apart | None:
-    """As `states_apart`, of responses that were kept without their samples.
+def several_states_of_lines(
+    files: Sequence[Saved], lines: Measured, left: float, rig: Rig
+) -> SeveralStates | None:
+    """As `several_states`, of responses that were kept without their samples.
 
     lines : of all that take part; left : chi-square over its mean that the nominal model leaves of
     them.
@@ -272,7 +274,7 @@ def lines_apart(files: Sequence[Saved], lines: Measured, left: float, rig: Rig) 
     found = _lines_grouped(files, rig, band)
     if len(found.groups) < 2:
         return None
-    return replace(found.apart([name for name, _ in files], left), samples=False)
+    return replace(found.several_states([name for name, _ in files], left), samples=False)
 
 
 def states_of(files: Sequence[Saved], rig: Rig) -> tuple[tuple[str, ...], ...]:
@@ -280,7 +282,7 @@ def states_of(files: Sequence[Saved], rig: Rig) -> tuple[tuple[str, ...], ...]:
     agree."""
     every = [f for _, own in files for r in own for f in r.frequency]
     found = _lines_grouped(files, rig, (float(min(every)), float(max(every))))
-    return found.apart([name for name, _ in files], 0.0).states
+    return found.several_states([name for name, _ in files], 0.0).states
 
 
 def _lines_grouped(files: Sequence[Saved], rig: Rig, band: Band) -> _Grouped:

@@ -55,7 +55,7 @@ class Changing:
         free = self.change.size - 1
         return {"spread": spread_of(float(np.sum(self.change**2)) / free, free)}
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """In words."""
         each = ", ".join(
             f"{100 * d:+.2g} % (+/- {100 * s:.1g}) in "
@@ -90,13 +90,13 @@ def between_runs(search: Search, base: Fitted, decide: Measured) -> Changing | N
     order = np.argsort(cost)
     names = [base.model.keys[known[k][1]][0] for k in order]
     (_, change, cov), _ = known[int(order[0])]
-    apart = np.eye(change.size) - 1 / change.size  # the mean is the rig file's own parameter
+    centred = np.eye(change.size) - 1 / change.size  # the mean is the rig file's own parameter
     explained = gain / max(none[0] - expected, gain)
     return Changing(
         sites=tuple(zip(names, (explained * p / p.sum())[order].tolist(), strict=True)),
         series=tuple((*search.lines.levels[k], search.lines.periodic[k]) for k, _ in series),
-        change=np.expm1(apart @ change),
-        sd=np.sqrt(np.diag(apart @ cov @ apart)),
+        change=np.expm1(centred @ change),
+        sd=np.sqrt(np.diag(centred @ cov @ centred)),
     )
 
 
@@ -111,12 +111,12 @@ def _every_joint(search: Search, base: Fitted) -> Fitted:
     """The same with every stiffness among the model's parameters, also one without a tolerance: it
     is known, but need not stay."""
 
-    def loose(p: Parameter) -> Parameter:
+    def freed(p: Parameter) -> Parameter:
         known = p.tolerance > 0 or p.value == 0
         return p if known else p.model_copy(update={"tolerance": KNOWN})
 
     elements = tuple(
-        e.model_copy(update={STIFFNESS: loose(parameters(e)[STIFFNESS])})
+        e.model_copy(update={STIFFNESS: freed(parameters(e)[STIFFNESS])})
         if STIFFNESS in parameters(e)
         else e
         for e in search.rig.element
@@ -126,7 +126,7 @@ def _every_joint(search: Search, base: Fitted) -> Fitted:
 
 
 def _series(search: Search, base: Fitted, decide: Measured) -> list[tuple[int, Problem]]:
-    """Index of its level, and lines, of each series of runs that keeps its level apart."""
+    """Index of its level, and lines, of each series of runs that keeps its level to itself."""
     out = []
     for lines in (search.lines, decide):
         for level in np.unique(lines.level[lines.level >= 0]):

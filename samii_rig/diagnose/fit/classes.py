@@ -1,4 +1,4 @@
-"""What cannot be told apart: distances between explanations, in noise units on these data."""
+"""What cannot be distinguished: distances between explanations, in noise units on these data."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ TRUSTED = 0.5  # of the logarithm of evidence between members
 AS_PROBABLE = 2.0  # of the logarithm of evidence: a member with less freedom goes first
 LEAST = 1e-3  # probability of an explanation that may begin a class of its own
 LOOKED_AT = 24  # explanations for which distances are computed
-TWIN = 1e-7  # relative difference of responses below which two effects are one by structure
+EQUIVALENT = 1e-7  # relative difference of responses below which two effects are one by structure
 
 
 @dataclass(frozen=True, slots=True)
 class Class:
-    """Explanations that these data do not tell apart, the most probable first.
+    """Explanations that these data do not distinguish, the most probable first.
 
     distance : of each from the first, in noise units after its refit to the first's response.
     probability : of the class.
@@ -100,7 +100,7 @@ def distance(a: Explanation, b: Explanation, problem: Problem) -> float:
     return math.sqrt(max(end.cost - a.fitted.penalty, 0.0))
 
 
-def apart(a: Explanation, b: Explanation, problem: Problem, unit: float = 1.0) -> float:
+def separation(a: Explanation, b: Explanation, problem: Problem, unit: float = 1.0) -> float:
     """`distance` in noise units of which each is `unit`; inf where b fits worse than a by more
     than a class is wide, so that it cannot be near."""
     if b.fitted.cost - a.fitted.cost > (unit * (SAME + 2.5)) ** 2:
@@ -112,13 +112,13 @@ def classes(
     ranked: Sequence[Explanation],
     probability: Sequence[float],
     problem: Problem,
-    temperature: float = 1.0,
+    overdispersion: float = 1.0,
 ) -> list[Class]:
     """Explanations in classes, the most probable class first.
 
-    temperature : of `search.Search`; a noise unit is its root where more than noise is left.
+    overdispersion : of `search.Search`; a noise unit is its root where more than noise is left.
     """
-    unit = math.sqrt(temperature)
+    unit = math.sqrt(overdispersion)
     left = list(zip(ranked, probability, strict=True))
     out: list[Class] = []
     while left and len(out) < LOOKED_AT:
@@ -128,7 +128,7 @@ def classes(
         members, far, total, rest = [first], [0.0], p, []
         for other, q in left[:LOOKED_AT]:
             alike = bool(other.effects) == bool(first.effects)
-            d = apart(first, other, problem, unit) if alike else math.inf
+            d = separation(first, other, problem, unit) if alike else math.inf
             if d < SAME:
                 members.append(other)
                 far.append(d)
@@ -151,7 +151,7 @@ def _plainest_first(members: Sequence[Explanation]) -> list[int]:
     return [first, *(i for i in range(len(members)) if i != first)]
 
 
-def without_twins(
+def merge_equivalent(
     rig: Rig, table: Sequence[Effect], frequency: np.ndarray, poses: Sequence[Rig] = ()
 ) -> list[Effect]:
     """The table with effects that are the same by structure as one, its names as aliases. poses :
@@ -163,7 +163,7 @@ def without_twins(
             h = np.stack([_at_start(at, own, frequency) for at, own in each])
         except SamiiRigError:
             # What it begins with is no rig, as a link with more mass taken off than it has about
-            # its middle: the refit goes elsewhere, and it is nobody's twin.
+            # its middle: the refit goes elsewhere, and it is equivalent to none.
             h = np.array(np.nan)
         for i, (other, response) in enumerate(kept):
             if len(other.unknowns) == len(effect.unknowns) and _same(h, response):
@@ -195,4 +195,4 @@ def _at_start(rig: Rig, effect: Effect, frequency: np.ndarray) -> np.ndarray:
 
 def _same(a: np.ndarray, b: np.ndarray) -> bool:
     size = np.abs(a) + np.abs(b)
-    return bool(np.all(np.abs(a - b) <= TWIN * size + 1e-300))
+    return bool(np.all(np.abs(a - b) <= EQUIVALENT * size + 1e-300))

@@ -32,7 +32,7 @@ class Discrepancy:
     scale: float
     length: float
 
-    def beside(self, form: Reduced, M: Complex) -> Reduced:
+    def added_to(self, form: Reduced, M: Complex) -> Reduced:
         """The same likelihood with it beside the noise. M : (b, q) as of the module."""
         G = _directions(form, M, self.length)
         m = len(G)

@@ -84,7 +84,7 @@ class DiscrepantSearch(RecordSearch):
         new = weighed(self.plain.reduced, h, there, self.plain.residual(h)).discrepancy
         still = new.length == old.length and abs(math.log(new.scale / (old.scale or 1.0))) < STILL
         self.discrepancy = new
-        self._beside()
+        self._with_discrepancy()
         ranked = self.ranked()
         self.found = {}
         some = [*ranked[:KEPT], *(e for e in ranked[KEPT:] if not e.effects)]
@@ -100,14 +100,14 @@ class DiscrepantSearch(RecordSearch):
         self.plain = self.problem
         self._shape = self.plain.reduced.reference
         self.__dict__.pop("_levels", None)
-        self._beside()
+        self._with_discrepancy()
 
-    def _beside(self) -> None:
-        form = self.discrepancy.beside(self.plain.reduced, self._shape)
+    def _with_discrepancy(self) -> None:
+        form = self.discrepancy.added_to(self.plain.reduced, self._shape)
         self.problem = replace(self.plain, reduced=form)
         self.__dict__.pop("_parts", None)
 
-    def leftover(self, fitted: Fitted) -> float:
+    def overdispersion_of(self, fitted: Fitted) -> float:
         """As of `Explanations`: nothing but noise and discrepancy is left."""
         return 1.0
 
@@ -152,9 +152,9 @@ class DiscrepantSearch(RecordSearch):
         if less is None:
             return []
         own = [k for i, e in enumerate(explanation.effects) if e.physical for k in fit.model.own(i)]
-        bare = moved(fit.model, np.delete(fit.x, own), less)
+        x_without = moved(fit.model, np.delete(fit.x, own), less)
         h, dh = fit.model.gradient(fit.x, self.problem.at)
-        change = h - less.response(bare, self.problem.at)
+        change = h - less.response(x_without, self.problem.at)
         sd = fit.model.prior[:n]
         out = []
         for part in self._parts:
@@ -179,7 +179,7 @@ class DiscrepantSearch(RecordSearch):
             each = np.split(every, len(sensors))
             found += [_Part(n, on, _alone(form, on)) for n, on in zip(sensors, each, strict=True)]
         shape = self._shape
-        return [replace(p, form=self.discrepancy.beside(p.form, shape[:, p.on])) for p in found]
+        return [replace(p, form=self.discrepancy.added_to(p.form, shape[:, p.on])) for p in found]
 
     @cached_property
     def _levels(self) -> list[tuple[str, Reduced]]:
@@ -201,8 +201,8 @@ class DiscrepantSearch(RecordSearch):
                 bands=tuple(records.bands[i] for i in of),
                 least=records.longest,
             )
-            said = " and ".join(f"{value:g} {unit}" for value, unit in level)
-            out.append((said, replace(whole, records=some).about(fitted, at, response)))
+            words = " and ".join(f"{value:g} {unit}" for value, unit in level)
+            out.append((words, replace(whole, records=some).about(fitted, at, response)))
         return out
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import RecordSearch, Whole
 from samii_rig.diagnose.fit.refit import Fitted
-from samii_rig.diagnose.fit.search import GROSS, Search
+from samii_rig.diagnose.fit.search import LARGE_MISMATCH, Search
 from samii_rig.diagnose.result import Exact, Value
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig, parameters
@@ -47,20 +47,25 @@ def wrong_lengths(search: RecordSearch) -> tuple[tuple[Exact, ...], RecordSearch
     """
     whole, by_line = search.whole, search.by_line
     best = search.ranked()[0].fitted
-    gross = by_line.ratio(by_line.nominal.fitted)
+    mismatch = by_line.ratio(by_line.nominal.fitted)
     close = search.ratio(best) <= threshold(search.spread)
-    if close or gross < GROSS or by_line.lines.torn() or not isinstance(whole, Whole):
+    if (
+        close
+        or mismatch < LARGE_MISMATCH
+        or by_line.lines.depends_on_level()
+        or not isinstance(whole, Whole)
+    ):
         return None
     names = list(_exact(by_line.rig))
     alone = _freed_each(search, [(name,) for name in names])
-    if found := _explaining(search, whole, alone[:1], LEAVES * gross):
+    if found := _explaining(search, whole, alone[:1], LEAVES * mismatch):
         return found
     helping = [one for (one,), _ in alone[:HELPING]]
     pairs = [pair for pair in combinations(names, 2) if set(pair) & set(helping)]
     together = _freed_each(search, pairs)
     if len(together) > 1 and _left(together[1]) < CLEARLY * _left(together[0]):
         return None  # another pair does as well: which are wrong is not known
-    return _explaining(search, whole, together[:1], LEAVES * gross)
+    return _explaining(search, whole, together[:1], LEAVES * mismatch)
 
 
 Freed = tuple[tuple[str, ...], Search]
@@ -98,7 +103,7 @@ def _explaining(
             continue
         fitted = found.nominal.fitted
         if found.ratio(fitted) <= threshold(found.spread):
-            return tuple(_told(search.by_line.rig, name, fitted) for name in names), found
+            return tuple(_exact_of(search.by_line.rig, name, fitted) for name in names), found
     return None
 
 
@@ -132,7 +137,7 @@ def _freed(rig: Rig, names: Collection[str]) -> Rig:
     return rig.model_copy(update={"element": tuple(map(element, rig.element))})
 
 
-def _told(rig: Rig, name: str, fitted: Fitted) -> Exact:
+def _exact_of(rig: Rig, name: str, fitted: Fitted) -> Exact:
     key = (name, LENGTH)
     at = fitted.model.keys.index(key)
     sd = float(np.sqrt(fitted.covariance()[at, at]))

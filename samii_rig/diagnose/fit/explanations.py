@@ -1,7 +1,7 @@
 """Explanations of one set of lines: refitted jointly with the rig's own parameters, and weighed.
 
 What is the same for all of them is here: the bins in which lines are looked at, the prior and the
-temperature. Which are tried is the search's (`search`).
+overdispersion. Which are tried is the search's (`search`).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from samii_rig.progress import Begun, Progress, counted
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Float
 
-CHANCE = (0.5, 0.4, 0.02)  # before the data: of nothing, one, two effects missing
+PRIOR = (0.5, 0.4, 0.02)  # before the data: of nothing, one, two effects missing
 FEWER = 0.05  # of each further effect
-MISTAKE = 0.4  # before the data, of each that is in how the records were made
+FAULTY = 0.4  # before the data, of each that is in how the records were made
 NEAR = 25.0  # of the logarithm of evidence: explanations further below the best are let go
 FIVE = 5.0  # standard deviations of chi-square beyond which what is left is more than noise
 ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and bins over which it is looked for
@@ -80,13 +80,13 @@ class Explanations:
     table: Sequence[Effect]
     found: dict[frozenset[str], Explanation] = field(default_factory=dict)
     problem: Problem = field(init=False)
-    temperature: float = 1.0
+    overdispersion: float = 1.0
     progress: Progress = lambda _stage: None
     stage: str = "nominal model"
     partial: ClassVar[bool] = False  # whether all that can be told leaves much of the mismatch
     usual: ClassVar[Usual] = {}  # how long the rest takes, by where it is
     _round: int = 0
-    _gross: float = 0.0  # chi-square that the nominal model leaves
+    _nominal_chi2: float = 0.0  # chi-square that the nominal model leaves
     _rows: Counter[str] = field(init=False)
     _total: dict[str, float] = field(init=False)
     _models: dict[tuple[str, ...], Model | None] = field(default_factory=dict)
@@ -135,44 +135,44 @@ class Explanations:
 
     def weigh(self, effects: Iterable[Effect], fitted: Fitted) -> float:
         """Logarithm of evidence times prior, less what effects beside the first must be worth
-        where the mismatch is gross: they may not live on what models are not exact to."""
+        where the mismatch is large: they may not live on what models are not exact to."""
         effects = tuple(effects)
-        beside = self.inexact(effects, self._gross)
+        beside = self.model_error_penalty(effects, self._nominal_chi2)
         small = sum(
             unknown.small(float(fitted.x[at]))
             for i, e in enumerate(effects)
             for unknown, at in zip(e.unknowns, fitted.model.own(i), strict=True)
         )
-        return fitted.evidence(self.temperature) + small + self.log_prior(effects) - beside
+        return fitted.evidence(self.overdispersion) + small + self.log_prior(effects) - beside
 
-    def inexact(self, effects: Sequence[Effect], gross: float) -> float:
+    def model_error_penalty(self, effects: Sequence[Effect], nominal_chi2: float) -> float:
         """Logarithm of evidence that effects beside the first must be worth on lines where the
-        nominal model leaves `gross` of chi-square."""
-        return 0.5 * EXACT**2 * gross / self.temperature * max(len(effects) - 1, 0)
+        nominal model leaves `nominal_chi2` of chi-square."""
+        return 0.5 * EXACT**2 * nominal_chi2 / self.overdispersion * max(len(effects) - 1, 0)
 
     def log_prior(self, effects: Iterable[Effect]) -> float:
         """Before the data: of how many, which rows, which sites of a row. What is no physics has
         nothing to do with how much is missing of the rig."""
         effects = tuple(effects)
         n = sum(e.physical for e in effects)
-        chance = CHANCE[n] if n < len(CHANCE) else CHANCE[-1] * FEWER ** (n - len(CHANCE) + 1)
+        prior = PRIOR[n] if n < len(PRIOR) else PRIOR[-1] * FEWER ** (n - len(PRIOR) + 1)
         each = (math.log(e.weight / self._total[e.physics] / len(self._rows)) for e in effects)
-        mistakes = (len(effects) - n) * math.log(MISTAKE)
-        return math.log(chance) + mistakes + math.lgamma(n + 1) + sum(each)
+        faults = (len(effects) - n) * math.log(FAULTY)
+        return math.log(prior) + faults + math.lgamma(n + 1) + sum(each)
 
-    def temper(self) -> None:
-        """Take the temperature of the explanation that fits best, and weigh all anew.
+    def take_overdispersion(self) -> None:
+        """Take the overdispersion of the explanation that fits best, and weigh all anew.
 
         What even that leaves is a part of the truth that is not in the table, and has structure
         along frequency: lines count by how much they and their neighbours say that is new.
         """
         best = min(self.found.values(), key=lambda e: e.fitted.cost)
-        self.temperature = self.leftover(best.fitted)
+        self.overdispersion = self.overdispersion_of(best.fitted)
         for key, e in self.found.items():
             self.found[key] = replace(e, weight=self.weigh(e.effects, e.fitted))
 
     @property
-    def worth(self) -> float:
+    def critical_value(self) -> float:
         """Chi-square that an effect must explain of the data to be called missing."""
         return IN_DATA
 
@@ -181,7 +181,7 @@ class Explanations:
         """Relative variance of chi-square over all lines."""
         return self.lines.spread
 
-    def leftover(self, fitted: Fitted) -> float:
+    def overdispersion_of(self, fitted: Fitted) -> float:
         """Chi-square per degree of freedom times the bins over which what is left is alike; 1
         where noise would leave as much."""
         left = self.ratio(fitted)
@@ -265,7 +265,7 @@ class Explanations:
     def keep(self, effects: tuple[Effect, ...], fitted: Fitted) -> None:
         """Weigh it, and keep it unless the same effects were refitted to more weight."""
         if not effects:
-            self._gross = fitted.chi2
+            self._nominal_chi2 = fitted.chi2
         made = Explanation(effects, fitted, self.weigh(effects, fitted))
         old = self.found.get(made.key)
         if old is None or made.weight > old.weight:
@@ -285,7 +285,7 @@ class Explanations:
             self.keep(effects, end)
         return self.found[key]
 
-    def bare(self, whole: Explanation, i: int) -> Explanation | None:
+    def without_refit(self, whole: Explanation, i: int) -> Explanation | None:
         """`whole` less its effect i, not refitted."""
         effects = whole.effects[:i] + whole.effects[i + 1 :]
         less = self.model(effects)
@@ -298,7 +298,7 @@ class Explanations:
         fitted = Fitted(less, x, float(r @ r), whole.fitted.penalty, J, J.T @ J)
         return Explanation(effects, fitted, 0.0)
 
-    def beside(self, best: Explanation) -> tuple[Explanations, Explanation]:
+    def linear_part(self, best: Explanation) -> tuple[Explanations, Explanation]:
         """Where linear effects can be weighed beside `best`, and the linear part of it there."""
         return self, best
 

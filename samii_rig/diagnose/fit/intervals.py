@@ -57,12 +57,13 @@ class Drawn:
         )
 
 
-def values_of(chosen: Class, inflation: float) -> list[dict[str, Value]]:
-    """Parameters of every effect of a class's first member. inflation : factor on covariances."""
+def values_of(chosen: Class, overdispersion: float) -> list[dict[str, Value]]:
+    """Parameters of every effect of a class's first member. overdispersion : factor on
+    covariances."""
     (first, left), *rivals = chosen.parts()
-    out = [dict(found) for found in drawn(first, inflation)]
+    out = [dict(found) for found in drawn(first, overdispersion)]
     for rival, share in rivals:
-        for i, found in _alike(first, rival, drawn(rival, inflation)):
+        for i, found in _alike(first, rival, drawn(rival, overdispersion)):
             out[i] = {
                 symbol: own.mixed(found[symbol], share / (left + share)) if symbol in found else own
                 for symbol, own in out[i].items()
@@ -93,12 +94,12 @@ def _same(a: Effect, b: Effect) -> bool:
     return bool(set(a.names) & set(b.names))
 
 
-def drawn(explanation: Explanation, inflation: float) -> list[dict[str, Drawn]]:
+def drawn(explanation: Explanation, overdispersion: float) -> list[dict[str, Drawn]]:
     """Draws of the parameters of every effect, as they are reported, by symbol."""
     fitted = explanation.fitted
     model, x = fitted.model, fitted.x
     n = model.n_nominal
-    cov = fitted.covariance()[n:, n:] * inflation
+    cov = fitted.covariance()[n:, n:] * overdispersion
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(x[n:], cov, DRAWS, method="eigh") if x.size > n else None
     out = []

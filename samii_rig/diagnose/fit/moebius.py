@@ -17,7 +17,7 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.types import Complex, Float
 
-APART = 10.0  # between the two strengths at which the chain is evaluated
+STRENGTH_RATIO = 10.0  # between the two strengths at which the chain is evaluated
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ def place_of(
     s = at.s
     middle = np.sqrt(first.low * first.high)
     xs, g = [], []
-    for strength in (middle / np.sqrt(APART), middle * np.sqrt(APART)):
+    for strength in (middle / np.sqrt(STRENGTH_RATIO), middle * np.sqrt(STRENGTH_RATIO)):
         values = np.array([strength, *(u.starts[0] for u in between), *fixed])
         x = effect.jump.x(s, values[None])[0]
         xs.append(x)

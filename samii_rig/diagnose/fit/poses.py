@@ -20,7 +20,7 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.physics.poses import in_pose
 from samii_rig.likelihood.pieces import Wiring
-from samii_rig.likelihood.reduce import Left, Reduced
+from samii_rig.likelihood.reduce import LineResiduals, Reduced
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, Int
 
@@ -98,13 +98,13 @@ class InPoses:
         return tuple(one for whole in self.each for one in whole.left_out)
 
     @property
-    def live(self) -> bool:
+    def own_aliases(self) -> bool:
         """As of `Recorded`."""
-        return self.each[0].live
+        return self.each[0].own_aliases
 
-    def lively(self) -> InPoses:
+    def with_own_aliases(self) -> InPoses:
         """As of `Recorded`."""
-        return replace(self, each=tuple(w.lively() for w in self.each))
+        return replace(self, each=tuple(w.with_own_aliases() for w in self.each))
 
     def about(self, fitted: Fitted) -> Summed:
         """As of `Recorded`."""
@@ -121,14 +121,16 @@ class InPoses:
         each = zip(self.each, parts_of(found), _each(fitted), strict=True)
         return Stacked.of([whole.between(part, own) for whole, part, own in each])
 
-    def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
+    def residuals(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> LineResiduals:
         """As of `Recorded`, of all poses, by frequency."""
         each = zip(self.each, parts_of(noise), _each(fitted), strict=True)
-        found = [whole.left(own, part, shown=shown) for whole, part, own in each]
+        found = [whole.residuals(own, part, shown=shown) for whole, part, own in each]
         f = np.concatenate([one.frequency for one in found])
         order = np.argsort(f, kind="stable")
         chi2 = np.concatenate([one.chi2 for one in found])
-        return Left(f[order], chi2[order], np.concatenate([one.each for one in found])[order])
+        return LineResiduals(
+            f[order], chi2[order], np.concatenate([one.each for one in found])[order]
+        )
 
 
 class PosesSearch(RecordSearch):

@@ -18,7 +18,7 @@ ModelOf = Callable[[tuple[Effect, ...]], Model | None]
 
 
 def ranking(
-    look: Screen, table: Iterable[Effect], base: tuple[Effect, ...], model_of: ModelOf
+    screen: Screen, table: Iterable[Effect], base: tuple[Effect, ...], model_of: ModelOf
 ) -> list[tuple[float, Effect, list[Start]]]:
     """How far chi-square should fall with each effect of `table` beside those of `base`, and one
     or two starts for its refit; the largest first.
@@ -26,7 +26,7 @@ def ranking(
     model_of : the model with some effects, None if the rig does not allow them together.
     """
     names = {e.key for e in base}
-    linear = all(e.quasi is None for e in base)
+    linear = all(e.force is None for e in base)
     places: dict[tuple[str, Start], Place | None] = {}
     out = []
     for effect in table:
@@ -34,13 +34,13 @@ def ranking(
             continue
         found: Found | None = None
         if linear and effect.jump is not None:
-            found = _at_place(look, base, effect, model_of, places)
+            found = _at_place(screen, base, effect, model_of, places)
         elif linear and effect.factor is not None:
-            found = look.channel(effect)
+            found = screen.channel(effect)
         else:
             model = model_of((*base, effect))
             if model is not None:
-                found = look.look(model, moved(look.base.model, look.base.x, model), effect)
+                found = screen.tried(model, moved(screen.base.model, screen.base.x, model), effect)
         if found is not None:
             out.append((found[0], effect, found[1]))
     out.sort(key=lambda item: -item[0])
@@ -48,7 +48,7 @@ def ranking(
 
 
 def _at_place(
-    look: Screen,
+    screen: Screen,
     base: tuple[Effect, ...],
     effect: Effect,
     model_of: ModelOf,
@@ -61,24 +61,24 @@ def _at_place(
     for fixed in product(*(u.starts for u in own)):
         key = (effect.jump.place, fixed)
         if key not in places:
-            places[key] = place_at(look, base, effect, model_of, fixed)
+            places[key] = place_at(screen, base, effect, model_of, fixed)
         place = places[key]
-        found = look.through(place, effect, fixed) if place else None
+        found = screen.through(place, effect, fixed) if place else None
         if found is not None and (best is None or found[0] > best[0]):
             best = found
     return best
 
 
 def place_at(
-    look: Screen, base: tuple[Effect, ...], effect: Effect, model_of: ModelOf, fixed: Start
+    screen: Screen, base: tuple[Effect, ...], effect: Effect, model_of: ModelOf, fixed: Start
 ) -> Place | None:
     """The place of a part beside those of `base`, with the unknowns that belong to it."""
     model = model_of((*base, effect))
     if model is None:
         return None
-    known = moved(look.base.model, look.base.x, model)
+    known = moved(screen.base.model, screen.base.x, model)
     try:
-        return place_of(model, known, effect, look.problem.at, look.response, fixed)
+        return place_of(model, known, effect, screen.problem.at, screen.response, fixed)
     except SamiiRigError:
         return None
 

@@ -35,13 +35,13 @@ from samii_rig.likelihood.noise import Disturbances, Noise
 from samii_rig.likelihood.pieces import Loops, Piece, Wiring, joined, pieces_of, wiring
 from samii_rig.likelihood.reduce import (
     CYCLES,
-    Left,
+    LineResiduals,
     Records,
     Reduced,
     Response,
     by_input,
-    left_by,
     reduced,
+    residuals_by_line,
 )
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
@@ -50,9 +50,9 @@ from samii_rig.signal.groups import segments_of
 from samii_rig.signal.statistics import octaves
 from samii_rig.types import Complex, Finding, Float, Int, Recording
 
-TURN = 10  # one line in so many is kept apart, to show on what was found
-# Lines kept apart: by turns of this part, so that of every second, fifth or tenth line, where a
-# multisine has its own, one in ten is kept apart too (Weyl 1916, Math. Ann. 77).
+TURN = 10  # one line in so many is a test line
+# Test lines: by turns of this part, so that of every second, fifth or tenth line, where a
+# multisine has its own, one in ten is a test line too (Weyl 1916, Math. Ann. 77).
 GOLDEN = (5**0.5 - 1) / 2
 # Of the largest, an input's energy in a third of an octave that excites: steps through frequencies,
 # of as many periods each, and steps of the input have that over 2.5 decades.
@@ -79,7 +79,7 @@ MOST_MADE = 6  # times that the likelihood is made about the nominal model
 # linear, for the likelihood to stand: less than noise makes of one unknown.
 BETWEEN = 0.5
 ALARM = 2e-3  # chance that noise alone makes the best of all effects look missing
-HIGHEST_WORTH = 1e3  # of chi-square, beyond what any table asks for
+HIGHEST_CRITICAL = 1e3  # of chi-square, beyond what any table asks for
 ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and octaves' parts over which it is sought
 
 
@@ -91,9 +91,9 @@ class Whole:
     records: Records
     wired: Wiring
     left_out: tuple[tuple[str, str], ...] = ()
-    apart: Records | None = None  # the same, every level by itself
+    of_levels: Records | None = None  # the same, every level by itself
     asked: bool = False  # whether somebody said which lines count
-    live: bool = False  # whether every model folds back what is its own from above the rate
+    own_aliases: bool = False  # whether every model folds back what is its own from above the rate
     runs: tuple[Recording, ...] = field(default=(), repr=False, compare=False)  # as `aligned`
 
     @classmethod
@@ -128,7 +128,7 @@ class Whole:
         wired = wiring(runs, rig, sensors)
         bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
         without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
-        levels = pieces_of(runs, rig, wired, without, apart=True)
+        levels = pieces_of(runs, rig, wired, without, by_level=True)
         if not levels:
             raise EstimateError("no segment is sound")
         steps = {s.name: s.resolution for s in rig.sensor}
@@ -137,13 +137,13 @@ class Whole:
         finest = {a.name: a.resolution for a in rig.actuator}
         rounding = np.array([finest[x.command] ** 2 / 12 for x in wired.inputs])
         slower = round(rig.rate_hz / rate) > 1
-        all_, apart = (
+        all_, of_levels = (
             _records(p, rate, band, step, rounding, slower=slower) for p in (joined(levels), levels)
         )
         rests = tuple(j for j, x in enumerate(wired.inputs) if not x.driven)
-        all_, apart = (replace(one, undriven=rests) for one in (all_, apart))
+        all_, of_levels = (replace(one, undriven=rests) for one in (all_, of_levels))
         left_out, asked = tuple(without.items()), band is not None
-        return cls(rig, all_, wired, left_out, apart, asked, runs=tuple(runs))
+        return cls(rig, all_, wired, left_out, of_levels, asked, runs=tuple(runs))
 
     @property
     def every(self) -> int:
@@ -152,7 +152,7 @@ class Whole:
 
     def by_level(self) -> Whole:
         """The same records, the levels not summed up: for what depends on amplitude."""
-        return self if self.apart is None else replace(self, records=self.apart)
+        return self if self.of_levels is None else replace(self, records=self.of_levels)
 
     def with_harmonics(self) -> Whole:
         """The same records, with the lines at which a force shows that depends on the level: up to
@@ -210,12 +210,20 @@ class Whole:
 
         chain = model.plain(fitted.x)
         return grid(
-            self.rig, frequency, sensor, actuator, chain, sigma, self.loop, aliases, self.live
+            self.rig,
+            frequency,
+            sensor,
+            actuator,
+            chain,
+            sigma,
+            self.loop,
+            aliases,
+            self.own_aliases,
         )
 
-    def lively(self) -> Whole:
+    def with_own_aliases(self) -> Whole:
         """As of `Recorded`."""
-        return replace(self, live=True)
+        return replace(self, own_aliases=True)
 
     @cached_property
     def _aliases(self) -> dict[tuple[int, bytes, bytes], tuple[Model, Aliases]]:
@@ -300,17 +308,17 @@ class Whole:
             self.records, self.response(fitted), disturbed, self._loop, fitted_lines
         )
 
-    def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
+    def residuals(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> LineResiduals:
         """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
         latest = self._latest
         if not latest or latest[0][0] is not fitted or latest[0][1] is not noise.noise:
             parts = fitted_lines, _shown
-            each = left_by(self.records, self.response(fitted), noise, self._loop, *parts)
+            each = residuals_by_line(self.records, self.response(fitted), noise, self._loop, *parts)
             latest[:] = [(fitted, noise.noise, each)]
         return latest[0][2][shown]
 
     @cached_property
-    def _latest(self) -> list[tuple[Fitted, Noise, list[Left]]]:
+    def _latest(self) -> list[tuple[Fitted, Noise, list[LineResiduals]]]:
         """What the latest fit leaves: both parts of the lines are asked for."""
         return []
 
@@ -451,16 +459,16 @@ class Recorded(Protocol):
         """What is between them."""
         ...
 
-    def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
+    def residuals(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> LineResiduals:
         """What a fit leaves, line by line."""
         ...
 
     @property
-    def live(self) -> bool:
+    def own_aliases(self) -> bool:
         """Whether every model folds back what is its own from above the rate."""
         ...
 
-    def lively(self) -> Recorded:
+    def with_own_aliases(self) -> Recorded:
         """The same, where it does."""
         ...
 
@@ -500,7 +508,7 @@ class RecordProblem(Problem):
         """As of `Problem`."""
         return self.reduced.slopes(dh)
 
-    def warmed(self, times: float) -> RecordProblem:
+    def with_noise_times(self, times: float) -> RecordProblem:
         """The same with noise of so many times the power."""
         root, form = math.sqrt(times), self.reduced
         warm = replace(form, factor=form.factor / root, target=form.target / root)
@@ -567,7 +575,7 @@ class RecordSearch(Search):
             if self._stands(fitted):
                 break
             self._about(fitted)
-        else:  # a gross mismatch: the nominal model is weighed where the likelihood stands now
+        else:  # a large mismatch: the nominal model is weighed where the likelihood stands now
             fitted = refit(fitted.model, self.problem, fitted.x)
         if self.ratio(fitted) > threshold(self.spread):
             fitted = self._cooled(fitted)
@@ -586,7 +594,7 @@ class RecordSearch(Search):
         warm = range(steps, -1, -1)
         for k in self.each(warm, lambda _: "less noise each time"):
             assert isinstance(self.problem, RecordProblem)
-            x = refit(model, self.problem.warmed(COOLER**k), x).x
+            x = refit(model, self.problem.with_noise_times(COOLER**k), x).x
             now = self._there(model, x)
             if not self._stands(now, COOLER**k):
                 self._about(now)
@@ -625,15 +633,15 @@ class RecordSearch(Search):
         there = fitted.model.response(fitted.x, self.problem.at)
         middle = fitted.model.response(fitted.x, between) - reference
         most = BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
-        if self.reduced.bent(there - self.reduced.reference, middle) > most:
+        if self.reduced.interpolation_error(there - self.reduced.reference, middle) > most:
             return False
         # What folds back from above is that of the fit about which the likelihood was made, or of
         # each model itself once that shows.
         own = fitted.model.response(fitted.x, self.whole.nodes(self.reduced, fitted))
         if float(np.linalg.norm(self.reduced.slopes((own - there)[:, :, None]))) < most:
             return True
-        if not self.whole.live:
-            self.whole = self.whole.lively()
+        if not self.whole.own_aliases:
+            self.whole = self.whole.with_own_aliases()
         return False
 
     @property
@@ -649,20 +657,20 @@ class RecordSearch(Search):
         return 2.0 / self.problem.expected + 2.0 / free  # the noise is known to so much
 
     @property
-    def worth(self) -> float:
+    def critical_value(self) -> float:
         """As of `Explanations`: with `ALARM`, noise reaches it in the best of the whole table."""
         unknowns = np.array([max(len(e.unknowns), 1) for e in self.table])
-        tries = np.ones(unknowns.size)
-        # What resonates is looked for at every line: as many tries of its mass and phase, alike at
+        trials = np.ones(unknowns.size)
+        # What resonates is looked for at every line: as many trials of its mass and phase, alike at
         # neighbouring places (a bound of the maximum of a scan; Davies 1987, Biometrika 74).
         resonant = np.array([e.physics in RESONANT for e in self.table], bool)
         unknowns[resonant] = 2
-        tries[resonant] = 2 * self.whole.lines / max(int(np.count_nonzero(resonant)), 1)
+        trials[resonant] = 2 * self.whole.lines / max(int(np.count_nonzero(resonant)), 1)
 
-        def chance(t: float) -> float:
-            return float(tries @ stats.chi2.sf(t, unknowns)) - ALARM
+        def false_alarm(t: float) -> float:
+            return float(trials @ stats.chi2.sf(t, unknowns)) - ALARM
 
-        return float(optimize.brentq(chance, 1.0, HIGHEST_WORTH))
+        return float(optimize.brentq(false_alarm, 1.0, HIGHEST_CRITICAL))
 
     def ratio(self, fitted: Fitted) -> float:
         """Chi-square per degree of freedom of what a change of the response explains."""
@@ -679,7 +687,7 @@ class RecordSearch(Search):
         found = ((x / mean, math.sqrt(2 / mean + 2 * of)) for (x, mean), of in each)
         return max(found, key=lambda one: (one[0] - 1) / one[1])
 
-    def leftover(self, fitted: Fitted) -> float:
+    def overdispersion_of(self, fitted: Fitted) -> float:
         """As of `Explanations`."""
         left = self.ratio(fitted)
         if left <= 1 + FIVE * math.sqrt(self.spread):
@@ -707,13 +715,13 @@ class RecordSearch(Search):
     def _nearest(self) -> Explanation:
         return self.ranked()[0]
 
-    def left(self, fitted: Fitted, *, shown: bool = False) -> Left:
+    def residuals(self, fitted: Fitted, *, shown: bool = False) -> LineResiduals:
         """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""
-        return self.whole.left(fitted, self.reduced, shown=shown)
+        return self.whole.residuals(fitted, self.reduced, shown=shown)
 
     def bands(self, fitted: Fitted) -> tuple[Band, ...]:
         """Chi-square per degree of freedom of each sensor in each octave."""
-        left = self.left(fitted)
+        left = self.residuals(fitted)
         out = []
         for low, high in octaves(left.frequency):
             inside = (left.frequency >= low) & (left.frequency < high)
@@ -725,13 +733,13 @@ class RecordSearch(Search):
         return tuple(out)
 
     def used(self) -> Used:
-        """Lines of the whole records, those kept apart too; all that were excited take part."""
+        """Lines of the whole records, test lines too; all that were excited take part."""
         return Used(self.whole.lines, self.whole.lines, self.whole.left_out)
 
     def shown(self, before: Fitted, after: Fitted) -> tuple[float, float, Gap]:
-        """On the lines kept apart: chi-square per degree of freedom of both, and the gap closed."""
-        a = self.left(before, shown=True).chi2
-        b = a if after is before else self.left(after, shown=True).chi2
+        """On the test lines: chi-square per degree of freedom of both, and the gap closed."""
+        a = self.residuals(before, shown=True).chi2
+        b = a if after is before else self.residuals(after, shown=True).chi2
         floor = np.full(a.size, 2.0 * self.whole.sensor.size)
         mean = float(np.sum(floor))
         return float(np.sum(a)) / mean, float(np.sum(b)) / mean, gap_of(a, b, floor)

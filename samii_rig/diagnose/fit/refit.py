@@ -77,8 +77,8 @@ class Problem:
     def forms(self, left: Float, directions: Float) -> Callable[[Complex], Form]:
         """Chi-square when a part moves the prediction by b phi, of any b (n, q).
 
-        left : residuals of data and priors. directions : orthonormal, that are projected out; rows
-        of zeros in them do not count.
+        residual : residuals of data and priors. directions : orthonormal, that are projected out;
+        rows of zeros in them do not count.
         """
         directions = counted(directions)
         half = self.data.H.size
@@ -141,17 +141,17 @@ class Fitted:
         """(n_x, n_x) information of data and priors."""
         return np.asarray(self.information + np.diag(_prior_precision(self.model)))
 
-    def evidence(self, temperature: float = 1.0) -> float:
+    def evidence(self, overdispersion: float = 1.0) -> float:
         """Logarithm, up to a constant of the data: -cost/2 less what the freedom of the unknowns
         costs (Laplace's approximation, each unknown no wider than its bounds allow).
 
-        temperature : how many times a data point counts less than its noise says, because a
+        overdispersion : how many times a data point counts less than its noise says, because a
         model leaves more than noise.
         """
         prior = _prior_precision(self.model)
-        A = self.information / temperature / np.sqrt(np.outer(prior, prior))
+        A = self.information / overdispersion / np.sqrt(np.outer(prior, prior))
         log_det = float(np.linalg.slogdet(A + np.eye(self.model.n))[1])
-        return -0.5 * self.chi2 / temperature - 0.5 * self.penalty - 0.5 * log_det
+        return -0.5 * self.chi2 / overdispersion - 0.5 * self.penalty - 0.5 * log_det
 
     def away(self, other: Fitted) -> float:
         """How far another refit of the same model ended, in standard deviations of this one."""
@@ -162,7 +162,7 @@ class Fitted:
         """(n_x, n_x) of the logarithms."""
         return np.asarray(np.linalg.inv(self.precision()))
 
-    def roughly(self) -> Fitted:
+    def with_model_error(self) -> Fitted:
         """The same, the first unknown of each effect known no better than its law holds."""
         rough = np.zeros(self.x.size)
         for i, effect in enumerate(self.model.effects):
@@ -320,7 +320,7 @@ def move(model: Model, x: Float, by: Normal, damping: float) -> Float | None:
         return None
     limit = np.where(on < model.n_nominal, 4 * np.minimum(model.prior[on], 1e3), LONGEST)
     # Damped by what a parameter may move, not by what the data say of it: parameters that
-    # the data hardly tell apart would otherwise creep along their common valley.
+    # the data hardly distinguish would otherwise creep along their ill-conditioned direction.
     try:
         d = step(by.A[np.ix_(on, on)], by.g[on], damping / limit**2 + floor[on])
     except np.linalg.LinAlgError:
@@ -336,19 +336,19 @@ def _logarithm(model: Model, problem: Problem, first: _Point) -> _Point:
     lines = problem.lines
     same, best = lines is problem, first
 
-    def left(h: Complex) -> Float:
-        r = _left_of_logarithms(lines, h)
+    def residual(h: Complex) -> Float:
+        r = _residual_of_logarithms(lines, h)
         return np.concatenate([r.real.ravel(), r.imag.ravel()])
 
     def point(x: Float, h: Complex, dh: Complex | None) -> _Point:
-        r = left(h)
+        r = residual(h)
         return _Point(x, float(r @ r) + _penalty(model, x), h, dh)
 
     def normal(now: _Point) -> _Normal:
         dh = model.gradient(now.x, lines.at)[1] if now.dh is None else now.dh
         slope = (lines.log_weight / now.h)[:, :, None] * dh
         J = np.concatenate([slope.real.reshape(-1, model.n), slope.imag.reshape(-1, model.n)])
-        return _Normal.of(model, now.x, J, left(now.h))
+        return _Normal.of(model, now.x, J, residual(now.h))
 
     def trial(now: _Point, by: _Normal, damping: float) -> _Point | None:
         nonlocal best
@@ -384,11 +384,11 @@ def far_off(model: Model, problem: Problem, x: Float) -> float:
         h = model.response(x, lines.at)
     except SamiiRigError:
         return math.inf
-    off = float(np.sum(np.abs(_left_of_logarithms(lines, h)) ** 2))
+    off = float(np.sum(np.abs(_residual_of_logarithms(lines, h)) ** 2))
     return off if math.isfinite(off) else math.inf
 
 
-def _left_of_logarithms(lines: Problem, h: Complex) -> Complex:
+def _residual_of_logarithms(lines: Problem, h: Complex) -> Complex:
     """(n, q) what a response leaves of the logarithms."""
     d = lines.data.H
     return np.asarray(lines.log_weight * np.log(h / np.where(d == 0, h, d)))

@@ -32,12 +32,12 @@ def explained(fitted: Fitted) -> Rig:
     )
     for effect, theta in zip(model.effects, model.parts(x), strict=True):
         rig = effect.write(rig, theta)
-        if effect.quasi is not None:
+        if effect.force is not None:
             symbol, unit = effect.unknowns[0].symbol, effect.unknowns[0].unit
             found = f"{effect.physics.replace('_', ' ')} at {effect.site}"
             value = f"{symbol} = {effect.report(theta)[0]:.4g} {unit}"
-            told = f"Found beside this linear rig: {found}, {value}."
-            rig = rig.model_copy(update={"description": f"{rig.description} {told}".strip()})
+            remark = f"Found beside this linear rig: {found}, {value}."
+            rig = rig.model_copy(update={"description": f"{rig.description} {remark}".strip()})
     return rig
 
 

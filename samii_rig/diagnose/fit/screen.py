@@ -3,7 +3,7 @@
 The uncertain parameters and the effects of the model so far are projected out of what it
 leaves. A part that acts through one complex number at each frequency, or a factor on a channel,
 is tried over its whole range without a further response of the chain (`moebius`), and its best
-tries are brought to their optimum. Any other effect is tried at its starts, and from its best
+trials are brought to their optimum. Any other effect is tried at its starts, and from its best
 and its weakest try one step further along its own derivative: so one that matters only in a
 narrow range, or hardly at all, is not passed over.
 """
@@ -29,14 +29,14 @@ from samii_rig.errors import SamiiRigError
 from samii_rig.levenberg import Normal, Progress, descend
 from samii_rig.types import Complex, Float
 
-APART = 2.5  # of logarithms: two starts from which different optima may be reached
+DISTINCT_STARTS = 2.5  # of logarithms: two starts from which different optima may be reached
 LOOSE = 1e-3  # precision of an unknown without a prior, which keeps the projection regular
 OTHERS = 10  # starts behind the best among which a second is looked for
-FINER = 4  # times as many tries as starts where they cost next to nothing
-WIDER = (1 / 12, 1.0, 8.0)  # tries about an only start
+FINER = 4  # times as many trials as starts where they cost next to nothing
+WIDER = (1 / 12, 1.0, 8.0)  # trials about an only start
 MANY = 20  # starts that are already fine
-VALLEYS = 2  # tries that are brought to their optimum
-VALLEY = 0.7  # of a logarithm: tries in different valleys
+MINIMA = 2  # trials that are brought to their optimum
+DISTINCT_MINIMA = 0.7  # of a logarithm: trials near different minima
 SECOND = 0.6  # of the best try's gain: less is no start of its own
 
 Start = tuple[float, ...]
@@ -79,7 +79,7 @@ class Screen:
         problem = self.problem.toward(self.response)
         return Screen(problem, self.base, directions, np.zeros_like(self.tail))
 
-    def bare(self) -> Screen:
+    def unprojected(self) -> Screen:
         """With no direction projected out."""
         return replace(self, directions=self.directions[:, :0])
 
@@ -93,17 +93,17 @@ class Screen:
         """(n,) rad/s."""
         return self.problem.at.s
 
-    def left_by(self) -> Float:
+    def residual(self) -> Float:
         """What the fit leaves of data and priors, with the directions projected out."""
-        return self._left(self._left_by)
+        return self._projected(self._whole_residual)
 
-    def left(self) -> float:
+    def chi_square(self) -> float:
         """Chi-square of what the fit leaves, with the directions projected out."""
-        left = self._left(self._left_by)
+        left = self._projected(self._whole_residual)
         return float(left @ left)
 
     def through(self, place: Place, effect: Effect, fixed: Start = ()) -> Found | None:
-        """`look` for a part at a place. fixed : unknowns that belong to the place."""
+        """`tried` for a part at a place. fixed : unknowns that belong to the place."""
         assert effect.jump is not None
         x_of = effect.jump.x
         own = np.array(fixed)
@@ -116,7 +116,7 @@ class Screen:
         return found and (found[0], [(*start, *fixed) for start in found[1]])
 
     def channel(self, effect: Effect) -> Found | None:
-        """`look` for a factor on a channel."""
+        """`tried` for a factor on a channel."""
         return self._over(*self.factor(effect), effect.unknowns)
 
     def factor(self, effect: Effect) -> tuple[Complex, Callable[[Float], Complex]]:
@@ -145,20 +145,20 @@ class Screen:
         """All of a fine grid over the unknowns, and the optima that its best lead to."""
         form = self.form(b)
         finer = FINER if len(unknowns) < 3 else 1
-        tries = np.array(list(product(*(_fine(u, finer) for u in unknowns))))
+        trials = np.array(list(product(*(_fine(u, finer) for u in unknowns))))
         with np.errstate(all="ignore"):
-            cost = form.cost(phi(tries))
+            cost = form.cost(phi(trials))
         order = np.argsort(cost)
         if not math.isfinite(cost[order[0]]):
             return None
         if not unknowns:
             return self.base.cost - float(cost[0]), [()]
-        y = np.log(tries)
+        y = np.log(trials)
         chosen = [int(order[0])]
         for i in order[1:]:
-            if len(chosen) == VALLEYS or not math.isfinite(cost[i]):
+            if len(chosen) == MINIMA or not math.isfinite(cost[i]):
                 break
-            if all(np.max(np.abs(y[i] - y[j])) > VALLEY for j in chosen):
+            if all(np.max(np.abs(y[i] - y[j])) > DISTINCT_MINIMA for j in chosen):
                 chosen.append(int(i))
         with np.errstate(all="ignore"):
             end, at = forms.descend(form, phi, y[chosen], cost[chosen], unknowns)
@@ -166,8 +166,8 @@ class Screen:
         gain = self.base.cost - end
         starts = [at[best[0]]]
         for i in best[1:]:
-            apart = np.max(np.abs(at[i] - starts[0])) > VALLEY
-            if apart and gain[i] > SECOND * gain[best[0]] and len(starts) < 2:
+            distinct = np.max(np.abs(at[i] - starts[0])) > DISTINCT_MINIMA
+            if distinct and gain[i] > SECOND * gain[best[0]] and len(starts) < 2:
                 starts.append(at[i])
         return float(gain[best[0]]), [tuple(np.exp(y).tolist()) for y in starts]
 
@@ -180,7 +180,7 @@ class Screen:
 
     @cached_property
     def _forms(self) -> Callable[[Complex], Form]:
-        return self.problem.forms(self._left_by, self.directions)
+        return self.problem.forms(self._whole_residual, self.directions)
 
     @cached_property
     def _made(self) -> dict[bytes, Form]:
@@ -188,11 +188,11 @@ class Screen:
         return {}
 
     @cached_property
-    def _left_by(self) -> Float:
+    def _whole_residual(self) -> Float:
         """What the fit leaves of the data and of the priors, in noise units."""
         return np.concatenate([self._base_residual(), self.tail])
 
-    def look(self, model: Model, known: Float, effect: Effect) -> Found | None:
+    def tried(self, model: Model, known: Float, effect: Effect) -> Found | None:
         """How far chi-square falls with `effect`, the last of `model`, and where to start.
 
         known : the model's vector but for that effect's unknowns. None if nothing can be had.
@@ -206,7 +206,7 @@ class Screen:
             return None
         gain = 0.0
         if effect.unknowns:
-            nothing = self._left(self._left_by)
+            nothing = self._projected(self._whole_residual)
             best = min(tried, key=lambda t: t[0])
             weak = min(tried, key=lambda t: float(np.sum((t[2] - nothing) ** 2)))
             for cost, start, left in {best[1]: best, weak[1]: weak}.values():
@@ -217,7 +217,7 @@ class Screen:
         if len(effect.unknowns) > 1:
             tried.insert(0, self._descended(model, known, effect, tried[0]))
         starts = [tried[0][1]]
-        other = next((t[1] for t in tried[1:OTHERS] if _apart(t[1], starts[0])), None)
+        other = next((t[1] for t in tried[1:OTHERS] if _distinct(t[1], starts[0])), None)
         if other is not None:
             starts.append(other)
         return max(gain, self.base.cost - tried[0][0]), starts
@@ -225,21 +225,21 @@ class Screen:
     def _base_residual(self) -> Float:
         return self.problem.residual(self.response)
 
-    def _left(self, whole: Float) -> Float:
+    def _projected(self, whole: Float) -> Float:
         return np.asarray(whole - self.directions @ (self.directions.T @ whole))
 
     def _cost(self, model: Model, known: Float, start: Start) -> Tried | None:
         """Chi-square with the effect at `start`, and what is left."""
         try:
-            left = self.left_with(model, np.append(known, np.log(start)))
+            left = self.residual_with(model, np.append(known, np.log(start)))
         except SamiiRigError:
             return None
         return (float(left @ left), start, left) if np.all(np.isfinite(left)) else None
 
-    def left_with(self, model: Model, x: Float) -> Float:
+    def residual_with(self, model: Model, x: Float) -> Float:
         """What a model with another effect leaves, with the directions projected out."""
         r = self.problem.residual(model.response(x, self.problem.at))
-        return self._left(np.concatenate([r, self.tail]))
+        return self._projected(np.concatenate([r, self.tail]))
 
     def _descended(self, model: Model, known: Float, effect: Effect, best: Tried) -> Tried:
         """The best try after a few damped Gauss-Newton steps in all of the effect's unknowns."""
@@ -249,7 +249,7 @@ class Screen:
         def normal(now: _Point) -> Normal:
             _, dh = model.gradient(np.append(known, now.x), self.problem.at)
             slopes = self.problem.whiten(dh[:, :, first:])
-            J = self._left(np.concatenate([slopes, np.zeros((self.tail.size, now.x.size))]))
+            J = self._projected(np.concatenate([slopes, np.zeros((self.tail.size, now.x.size))]))
             return Normal(J.T @ J, J.T @ now.left)
 
         def trial(now: _Point, by: Normal, damping: float) -> _Point | None:
@@ -281,7 +281,7 @@ class Screen:
             return [], 0.0
         j = model.n - len(effect.unknowns)
         slope = self.problem.whiten(dh[:, :, j : j + 1])[:, 0]
-        slope = self._left(np.concatenate([slope, np.zeros(self.tail.size)]))
+        slope = self._projected(np.concatenate([slope, np.zeros(self.tail.size)]))
         power = float(slope @ slope)
         if not power > 0 or not math.isfinite(power):
             return [], 0.0
@@ -306,5 +306,5 @@ def _fine(unknown: Unknown, finer: int) -> Float:
     return np.append(np.geomspace(unknown.low, unknown.high, finer * starts.size), starts[-1])
 
 
-def _apart(a: Start, b: Start) -> bool:
-    return any(abs(math.log(x / y)) > APART for x, y in zip(a, b, strict=True))
+def _distinct(a: Start, b: Start) -> bool:
+    return any(abs(math.log(x / y)) > DISTINCT_STARTS for x, y in zip(a, b, strict=True))

@@ -32,19 +32,21 @@ SATURATED = "torsional_compliance"  # joints that give: what is missing in many 
 MOST_SATURATED = 12  # of these places
 TENTHS = (2, 5, 8)  # tenths of their range at which several unknowns start together
 WEAK = (4, 5, 6)  # tenths of the range at which they start
-BEAM = 2  # explanations that are grown further
+BEAM = 2  # explanations to which further effects are added
 HOPELESS = 20.0  # times the best chi-square, above which an explanation is let go
 AGAIN, STILL = 4, 0.3  # times that bins are made anew at most, and a move that is none
 SWAPS = 2  # rounds of them, the second about what won the first
 ANYHOW = 2  # of the most promising in another's place are refitted whatever the screen says
 SHARE = 0.3  # of the best candidate's gain: one that promises less is not refitted
-BENT = 3.0  # of the penalty of a nominal parameter above which the refit hides what is missing
-GROSS = 8.0  # chi-square over its mean above which candidates race before they are refitted
-AHEAD, FINALISTS = 5, 5  # steps of a leg of that race, and how many go on after it
+PENALISED = 3.0  # of a nominal parameter's penalty, above which the refit hides what is missing
+LARGE_MISMATCH = (
+    8.0  # chi-square over its mean, above which candidates compete by halving before a refit
+)
+AHEAD, FINALISTS = 5, 5  # steps of a round of that, and how many go on after it
 FALLING = 0.5  # of its cost, after a leg, below which one is still on its way and runs another
 OTHERS = 3  # of other physics than theirs, that go on too
-SWITCHED = 12  # effects without unknowns that race: the nearest as the rig file has the rest
-BROAD = 4  # single effects of different physics that are grown where none is enough
+SWITCHED = 12  # effects without unknowns that compete so: the nearest as the rig file has the rest
+BROAD = 4  # single effects of different physics that are extended where none is enough
 
 Candidate = tuple[float, tuple[Effect, ...], list[Float]]  # chi-square hoped for, and starts
 
@@ -57,20 +59,20 @@ class Search(Explanations):
     _screened: tuple[tuple[object, ...], list[tuple[float, Effect, list[Start]]]] | None = None
 
     def run(self, *, briefly: bool = False) -> list[Explanation]:
-        """Grow, swap, prune; all explanations, the most probable first. briefly : single effects
-        alone, and beside what is wrong with the data."""
-        self.grow(self.nominal, FIRST, open_to_all=not briefly)
+        """Forward, exchange, backward; all explanations, the most probable first. briefly : single
+        effects alone, and beside what is wrong with the data."""
+        self.forward(self.nominal, FIRST, open_to_all=not briefly)
         if self._bent(self.ranked()[0]):
-            self.grow(self._straight(self.nominal), STRAIGHT, again=True)
-        self.temper()
+            self.forward(self._straight(self.nominal), STRAIGHT, again=True)
+        self.take_overdispersion()
         best = self.ranked()[0]
-        if briefly and mistaken(best.effects) and not self._enough(best):
-            self.renew(best)
+        if briefly and faulty(best.effects) and not self._enough(best):
+            self.rebin_and_refit(best)
             base = self.ranked()[0]
-            self.grow(base, FIRST)
+            self.forward(base, FIRST)
             if self._bent(base):
-                self.grow(self._straight(base), STRAIGHT, again=True)
-            self.temper()
+                self.forward(self._straight(base), STRAIGHT, again=True)
+            self.take_overdispersion()
         if briefly:
             self._plainer()
             return self.ranked()
@@ -79,31 +81,31 @@ class Search(Explanations):
             before = self._nearest() if turn == 0 else self.ranked()[0]
             if not before.effects:
                 break
-            self.renew(before)
+            self.rebin_and_refit(before)
             about = before.key
             if turn == 0 and not self._enough(self.ranked()[0]):
                 # What is one of two often stands behind what mimics both.
                 for base in list(_each_physics(self.ranked()))[:BROAD]:
-                    self.grow(base, LATER)
+                    self.forward(base, LATER)
                 self.saturate(SATURATED)
             for base in self._beam():
-                self.grow(base, LATER)
-            self.temper()
-            self.prune()
+                self.forward(base, LATER)
+            self.take_overdispersion()
+            self.backward()
             if self.ranked()[0].key == before.key:
                 break
         for _ in range(SWAPS):
             best = self.ranked()[0]
             if not best.effects:
                 break
-            self.swap(best)
-            self.temper()
-            self.prune()
+            self.exchange(best)
+            self.take_overdispersion()
+            self.backward()
             if self.ranked()[0].key == best.key:
                 break
         if (best := self.ranked()[0]).key != about and best.effects:
-            self.renew(best)
-            self.temper()
+            self.rebin_and_refit(best)
+            self.take_overdispersion()
         self._from_everywhere()
         self._plainer()
         return self.ranked()
@@ -115,22 +117,22 @@ class Search(Explanations):
         for _ in range(SWAPS):
             best = self.ranked()[0]
             for i, gone in enumerate(best.effects):
-                base, some = self.bare(best, i), [e for e in self.table if e.within(gone)]
+                base, some = self.without_refit(best, i), [e for e in self.table if e.within(gone)]
                 if base is None or not some:
                     continue
-                look = Screen.of(self.problem, base.fitted)
-                for _drop, effect, starts in ranking(look, some, base.effects, self.model):
+                screen = Screen.of(self.problem, base.fitted)
+                for _drop, effect, starts in ranking(screen, some, base.effects, self.model):
                     effects = (*base.effects, effect)
                     end = self.refitted(effects, base, np.log(starts[0]).tolist())
                     if end is not None:
                         self.keep(effects, end)
-            self.temper()
+            self.take_overdispersion()
             if self.ranked()[0].key == best.key:
                 return
 
     def _from_everywhere(self) -> None:
         """Single effects of several unknowns that may still compete, refitted from weak to strong:
-        one that stopped in a valley beside its own loses to others by that alone."""
+        one that stopped in a local minimum beside its own loses to others by that alone."""
         best = self.ranked()[0]
         near = [e for e in self.ranked() if best.effects and e.weight > best.weight - NEAR]
         several = [e for e in near if len(e.effects) == 1 and len(e.effects[0].unknowns) > 1]
@@ -141,12 +143,12 @@ class Search(Explanations):
                 end = self.refitted(e.effects, self.nominal, start, e.fitted.cost)
                 if end is not None:
                     self.keep(e.effects, end)
-        self.temper()
+        self.take_overdispersion()
 
     def _bent(self, best: Explanation) -> bool:
         """Whether nominal parameters at unlikely values may hide what is missing."""
         n = self.nominal.fitted.model.n_nominal
-        return max(self.nominal.fitted.penalty, best.fitted.penalty) > BENT * n
+        return max(self.nominal.fitted.penalty, best.fitted.penalty) > PENALISED * n
 
     def _straight(self, base: Explanation) -> Explanation:
         """The same, the rig as its file has it: where the refitted one took values that their
@@ -156,16 +158,16 @@ class Search(Explanations):
         there = refit(model, self.problem, x, far=False, steps=0)
         return Explanation(base.effects, there, 0.0)
 
-    def grow(
+    def forward(
         self, base: Explanation, most: int, *, again: bool = False, open_to_all: bool = False
     ) -> None:
         """Refit `base` with each of the most promising further effects; again : those too that
-        were refitted from elsewhere. open_to_all : where a race decides, not of those alone."""
+        were refitted from elsewhere. open_to_all : where halving decides, not of those alone."""
         if len(base.effects) >= MOST:
             return
         tried: list[Candidate] = []
-        gross = base.fitted.cost > GROSS * self.problem.expected
-        entered = None if gross and open_to_all else most
+        large_mismatch = base.fitted.cost > LARGE_MISMATCH * self.problem.expected
+        entered = None if large_mismatch and open_to_all else most
         for drop, effect, starts in self.screen(base)[:entered]:
             effects = (*base.effects, effect)
             model = self.model(effects)
@@ -175,7 +177,7 @@ class Search(Explanations):
             known = moved(base.fitted.model, base.fitted.x, model)
             whole = [np.append(known, np.log(start)) for start in starts]
             tried.append((base.fitted.cost - drop, effects, whole))
-        if gross:
+        if large_mismatch:
             tried = self._ahead([*tried, *self._switches(base)])
         best = min((e.fitted.cost for e in self.found.values()), default=math.inf)
         reached = base.fitted.cost
@@ -196,7 +198,8 @@ class Search(Explanations):
 
     def _switches(self, base: Explanation) -> list[Candidate]:
         """Effects that are there or not, from the nominal parameters as the rig file has them:
-        where a gross mismatch has bent these, no step along them shows what such an effect does."""
+        where a large mismatch has moved these, no step along them shows what such an effect
+        does."""
         nearest: dict[tuple[str, str], tuple[float, tuple[Effect, ...], Float]] = {}
         for effect in self.table:
             effects = (*base.effects, effect)
@@ -260,9 +263,9 @@ class Search(Explanations):
         if self._screened is None or any(
             a is not b for a, b in zip(self._screened[0], about, strict=True)
         ):
-            look = Screen.of(self.problem, base.fitted)
+            screen = Screen.of(self.problem, base.fitted)
             every = self.each(self.table, lambda e: named([e]))
-            self._screened = about, ranking(look, every, base.effects, self.model)
+            self._screened = about, ranking(screen, every, base.effects, self.model)
         return self._screened[1]
 
     def saturate(self, physics: str) -> None:
@@ -295,11 +298,11 @@ class Search(Explanations):
 
     def _least(self, whole: Explanation) -> list[int]:
         """Its effects, first the one without which chi-square should rise least."""
-        bare = [self.bare(whole, i) for i in range(len(whole.effects))]
-        left = [Screen.of(self.problem, e.fitted).left() if e else math.inf for e in bare]
+        each = [self.without_refit(whole, i) for i in range(len(whole.effects))]
+        left = [Screen.of(self.problem, e.fitted).chi_square() if e else math.inf for e in each]
         return [int(i) for i in np.argsort(left)]
 
-    def prune(self) -> None:
+    def backward(self) -> None:
         """Try the best explanation without each of its effects, until none can go."""
         while True:
             best = self.ranked()[0]
@@ -310,13 +313,13 @@ class Search(Explanations):
             if self.ranked()[0].key == best.key:
                 return
 
-    def swap(self, whole: Explanation) -> None:
+    def exchange(self, whole: Explanation) -> None:
         """Every effect of `whole` taken out, and every other tried in its place, about where
         `whole` left the rest."""
-        enough = whole.fitted.cost + 4 * NEAR * self.temperature
+        enough = whole.fitted.cost + 4 * NEAR * self.overdispersion
         for i in self.each(range(len(whole.effects)), _without(whole)):
             gone = whole.effects[i]
-            base = self.bare(whole, i)
+            base = self.without_refit(whole, i)
             if base is None:
                 continue
             if len(gone.unknowns) > 2:
@@ -352,33 +355,33 @@ class Search(Explanations):
 
     def _nearest(self) -> Explanation:
         """The most probable explanation; where even that leaves much, the one nearest to the lines
-        themselves: bins about a gross mismatch hide how well another would do."""
+        themselves: bins about a large mismatch hide how well another would do."""
         ranked = self.ranked()
         if self._enough(ranked[0]):
             return ranked[0]
         at = self.grid.at(self.lines.frequency, self.lines.level)
 
-        def left(e: Explanation) -> float:
+        def cost_there(e: Explanation) -> float:
             return float(np.sum(self.lines.chi_square(e.fitted.model.response(e.fitted.x, at))))
 
-        return min(ranked[:FINALISTS], key=left)
+        return min(ranked[:FINALISTS], key=cost_there)
 
     def _beam(self) -> list[Explanation]:
         ranked = self.ranked()
         best = ranked[0]
         size = len(best.effects)
         near = [e for e in ranked if len(e.effects) == size]
-        grown = near[:1] if self._enough(best) else near[:BEAM]
+        kept = near[:1] if self._enough(best) else near[:BEAM]
         if size > MIXED:  # many places of one physics may stand for two of different physics
             one = [e for e in ranked if len(e.effects) == 1]
-            grown += [e for e in one if e.weight > best.weight - 4 * NEAR][:1]
-        return grown
+            kept += [e for e in one if e.weight > best.weight - 4 * NEAR][:1]
+        return kept
 
     def _enough(self, explanation: Explanation) -> bool:
         """Whether what an explanation leaves is near what noise would."""
         return explanation.fitted.chi2 < ENOUGH * self.problem.expected
 
-    def renew(self, best: Explanation) -> None:
+    def rebin_and_refit(self, best: Explanation) -> None:
         """Bins anew about the best explanation until it stands still, for bins about a model that
         is off lead to one that is; and what may still compete refitted on them."""
         near = [e for e in self.ranked()[:FIRST] if e.weight > best.weight - 4 * NEAR]
@@ -402,7 +405,7 @@ class Search(Explanations):
                 self.keep(e.effects, end)
 
 
-def mistaken(effects: Sequence[Effect]) -> bool:
+def faulty(effects: Sequence[Effect]) -> bool:
     """Whether these are of the data alone, not of the rig."""
     return bool(effects) and not any(e.physical for e in effects)
 

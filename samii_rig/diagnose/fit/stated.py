@@ -32,7 +32,7 @@ class Evidence:
     odds : logarithm of its class's odds among all explanations that were looked at.
     left, held : chi-square per degree of freedom that it leaves on lines that were fitted, and on
         lines that were kept to decide (1 where there are none).
-    effects : how many of physics; a mistake of the recording is no cause. forced : whether one is a
+    effects : how many of physics; a fault of the recording is no cause. forced : whether one is a
         nonlinear force; confirmed : in time.
     gain : logarithm of evidence over that nothing is missing. drop : of chi-square, what it
         explains. names : how many names its class has. pair : whether it is two of one physics,

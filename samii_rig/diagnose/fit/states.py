@@ -20,7 +20,7 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.result import Gap
 from samii_rig.likelihood.pieces import Wiring
-from samii_rig.likelihood.reduce import Left, Reduced
+from samii_rig.likelihood.reduce import LineResiduals, Reduced
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, Int
 
@@ -151,13 +151,15 @@ class Both:
         return self.after.left_out + self.before.left_out
 
     @property
-    def live(self) -> bool:
+    def own_aliases(self) -> bool:
         """As of `Recorded`."""
-        return self.after.live
+        return self.after.own_aliases
 
-    def lively(self) -> Both:
+    def with_own_aliases(self) -> Both:
         """As of `Recorded`."""
-        return replace(self, after=self.after.lively(), before=self.before.lively())
+        return replace(
+            self, after=self.after.with_own_aliases(), before=self.before.with_own_aliases()
+        )
 
     def about(self, fitted: Fitted) -> Summed:
         """As of `Recorded`."""
@@ -181,9 +183,9 @@ class Both:
         )
         return BothGrid.of(each)
 
-    def left(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> Left:
+    def residuals(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> LineResiduals:
         """As of `Recorded`, of the state after: there a change shows."""
-        return self.after.left(_after(fitted), parts_of(noise)[0], shown=shown)
+        return self.after.residuals(_after(fitted), parts_of(noise)[0], shown=shown)
 
 
 class StatesSearch(RecordSearch):

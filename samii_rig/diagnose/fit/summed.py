@@ -38,7 +38,7 @@ class Stacked(Grid):
             sigma=np.concatenate([np.full(g.frequency.size, g.sigma) for g in each]),
             loop=first.loop,
             far=first.far,  # hardly differs: far above what a pose or a part moves
-            live=_joined([g.live for g in each]),
+            own_aliases=_joined([g.own_aliases for g in each]),
             sizes=tuple(g.frequency.size for g in each),
         )
 
@@ -49,7 +49,8 @@ class Stacked(Grid):
             Grid(
                 self.frequency[own], self.factor[own], self.aliases[own], self.folded[:, own],
                 self.rate_hz, self.sensor, self.actuator, sigma=sigma[own], loop=self.loop,
-                far=self.far, live=None if self.live is None else self.live[:, own],
+                far=self.far,
+                own_aliases=None if self.own_aliases is None else self.own_aliases[:, own],
             )
             for own in runs(self.sizes)
         )  # fmt: skip
@@ -88,7 +89,7 @@ class Summed(Reduced):
         known = sum(one.known for one in each)
         if alike:
             common = sum(factor[..., node] for node in nodes)
-            rest, rank = _beside(np.asarray(common).reshape(len(factor), -1))
+            rest, rank = _null_space(np.asarray(common).reshape(len(factor), -1))
             factor = (rest.T @ factor.reshape(len(factor), -1)).reshape(-1, *factor.shape[1:])
             target, known = rest.T @ target, known - rank
         return cls(
@@ -110,12 +111,12 @@ class Summed(Reduced):
         flat = by_sensor(dh)
         return np.asarray(self.factor.reshape(-1, len(flat)) @ flat)
 
-    def bent(self, d: Complex, middle: Complex) -> float:
+    def interpolation_error(self, d: Complex, middle: Complex) -> float:
         """As of `Reduced`."""
         sizes = [one.frequency.size for one in self.each]
         between = runs([n - 1 for n in sizes])
         each = zip(self.each, runs(sizes), between, strict=True)
-        return math.hypot(*(one.bent(d[own], middle[gap]) for one, own, gap in each))
+        return math.hypot(*(one.interpolation_error(d[own], middle[gap]) for one, own, gap in each))
 
 
 def parts_of(found: Reduced) -> tuple[Reduced, ...]:
@@ -128,7 +129,7 @@ def _added(pairs: Sequence[tuple[float, float]]) -> tuple[float, float]:
     return sum(a for a, _ in pairs), sum(b for _, b in pairs)
 
 
-def _beside(columns: Float) -> tuple[Float, int]:
+def _null_space(columns: Float) -> tuple[Float, int]:
     """Orthonormal directions (m, m - rank) that no column (m, n) has, and the rank."""
     scale = np.linalg.norm(columns, axis=0)
     Q, R, _ = linalg.qr(columns / np.where(scale > 0, scale, 1.0), pivoting=True)

@@ -38,7 +38,7 @@ RECORDS: Usual = {
     "what is missing, in pairs": (0.21, 2.0),
     "what is missing, in pairs, round 4": (0.23, 1.1),
     "amplitude levels, beside pairs": (0.1, 0.93),
-    "what cannot be told apart": (0.07, 0.69),
+    "what cannot be distinguished": (0.07, 0.69),
     "whether the recordings agree": (0.13, 0.85),
 }
 # Of the responses of 39 such trials alone, 7 s in the median.
@@ -48,7 +48,7 @@ LINES: Usual = {
     "what is missing, round 4": (0.84, 6.7),
     "what is missing, round 8": (0.42, 2.5),
     "what is missing, round 16": (0.06, 0.54),
-    "what cannot be told apart": (0.02, 0.46),
+    "what cannot be distinguished": (0.02, 0.46),
 }
 # Of 18 trials of two states on four rigs, from the state before on: 9 s in the median.
 STATES: Usual = {
@@ -58,18 +58,18 @@ STATES: Usual = {
     "before: amplitude levels, round 1": (3.6, 8.7),
     "before: what is missing, in pairs": (3.0, 6.2),
     "before: what is missing, in pairs, round 4": (2.4, 3.4),
-    "before: what cannot be told apart": (1.7, 4.4),
+    "before: what cannot be distinguished": (1.7, 4.4),
     "both states": (1.3, 3.5),
     "what changed": (0.39, 1.0),
     "what changed, round 2": (0.34, 0.69),
     "what changed, round 4": (0.28, 0.53),
-    "what cannot be told apart": (0.07, 0.15),
+    "what cannot be distinguished": (0.07, 0.15),
 }
 # Of 12 arms of two links in two poses, 7 s in the median.
 POSES: Usual = {
     "what is missing": START,
     "what is missing, round 2": (1.6, 7.3),
     "what is missing, round 4": (0.45, 1.1),
-    "what cannot be told apart": (0.09, 1.3),
+    "what cannot be distinguished": (0.09, 1.3),
     "whether the recordings agree": (0.08, 1.2),
 }

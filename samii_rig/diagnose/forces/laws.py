@@ -30,12 +30,13 @@ class Law:
 
     tag : its own. physics : its name in the table. unknowns : their symbols; how they enter the
         law's numbers (n_unknown, 2), each number a sum of unknowns, or `fixed` where none does.
-    step : in time, driven by a motion. told : (command (n,), numbers) -> force (n,) and its slopes
+    step : in time, driven by a motion. of_command : (command (n,), numbers) -> force (n,) and its
+    slopes
         (n, 2), of a law that the command alone drives.
     weak : (motion (n,), command (n,), numbers) -> force (n,) of a motion that it does not change,
         of a law that has a step.
     of_speed : whether it is driven by the speed of what is read. scaled : whether the last number
-        is a parameter of the rig. rough : part of what it does by which it is known to be off.
+        is a parameter of the rig. rough : relative model error.
         words : what it is.
     """
 
@@ -48,13 +49,13 @@ class Law:
     weak: Callable[[Float, Float, Float], Float] | None = None
     fixed: tuple[float, float] = (0.0, 0.0)
     step: Step | None = None
-    told: Callable[[Float, Float], tuple[Float, Float]] | None = None
+    of_command: Callable[[Float, Float], tuple[Float, Float]] | None = None
     of_speed: bool = False
     scaled: bool = False
     rough: float = COMPUTED
 
     def __post_init__(self) -> None:
-        if {self.step is None, self.weak is None} != {self.told is not None}:
+        if {self.step is None, self.weak is None} != {self.of_command is not None}:
             raise ValueError(f"{self.tag}: a law is driven by a motion or by the command")
 
     def numbers(self, strengths: Float, scale: float = 1.0) -> Float:
@@ -136,11 +137,11 @@ ORIFICE = Law(
 )  # fmt: skip
 OVERLAP = Law(
     "overlap", "valve_deadband", "a dead band of the valve", ("command",), ("width",), ONE,
-    told=_overlap,
+    of_command=_overlap,
 )  # fmt: skip
 CLIPPED = Law(
     "clipped", "output_saturation", "a clipped command", ("command",), ("limit",), ONE,
-    told=_excess,
+    of_command=_excess,
 )  # fmt: skip
 LAWS = (
     FRICTION, UNEVEN, HARDENING, SOFTENING, QUADRATIC, PLAY, HYSTERESIS, ORIFICE, OVERLAP, CLIPPED,

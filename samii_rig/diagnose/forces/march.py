@@ -22,7 +22,7 @@ _FAST = {"reassoc", "contract", "nsz"}
       fastmath=_FAST)  # fmt: skip
 def march(
     law: Step,
-    grow: Float,
+    transition: Float,
     by_v: Float,
     by_e: Float,
     direct: float,
@@ -37,12 +37,12 @@ def march(
     """(1 + m, n inner) the force under a command v (n,) from rest, and its slopes along m changes
     of its numbers.
 
-    grow, by_v, by_e : (2, n_pole) real and imaginary parts. What drives the force is the sum of
-    all real parts, and direct and g per unit of command and of force. others : (n inner,) what
+    transition, by_v, by_e : (2, n_pole) real and imaginary parts. What drives the force is the sum
+    of all real parts, and direct and g per unit of command and of force. others : (n inner,) what
     other commands do to it, as `moved`, or none. late : steps of dead time.
     seeds : (m, 2) each change of the numbers p (2,).
     """
-    m, n_pole = seeds.shape[0], grow.shape[1]
+    m, n_pole = seeds.shape[0], transition.shape[1]
     wr, wi = np.zeros((1 + m, n_pole)), np.zeros((1 + m, n_pole))
     f = np.zeros((1 + m, v.size * inner))
     out = np.zeros(OUT)
@@ -54,8 +54,8 @@ def march(
             given = u if i == 0 else 0.0
             for k in range(n_pole):
                 real, imag = wr[i, k] + by_e[0, k] * e, wi[i, k] + by_e[1, k] * e
-                wr[i, k] = grow[0, k] * real - grow[1, k] * imag + by_v[0, k] * given
-                wi[i, k] = grow[0, k] * imag + grow[1, k] * real + by_v[1, k] * given
+                wr[i, k] = transition[0, k] * real - transition[1, k] * imag + by_v[0, k] * given
+                wi[i, k] = transition[0, k] * imag + transition[1, k] * real + by_v[1, k] * given
                 total += wr[i, k]
             y[i] = total + direct * given
         out[:] = 0.0
@@ -76,17 +76,17 @@ def march(
 
 
 @njit(cache=True, fastmath=_FAST)
-def moved(v: Float, grow: Float, by_v: Float, direct: float, late: int, inner: int) -> Float:
+def moved(v: Float, transition: Float, by_v: Float, direct: float, late: int, inner: int) -> Float:
     """(n inner,) what a command v (n,) alone does from rest; as `march` has it."""
-    n_pole = grow.shape[1]
+    n_pole = transition.shape[1]
     wr, wi = np.zeros(n_pole), np.zeros(n_pole)
     out = np.zeros(v.size * inner)
     for step in range(v.size * inner):
         u = v[(step - late) // inner] if step >= late else 0.0
         total = direct * u
         for k in range(n_pole):
-            real = grow[0, k] * wr[k] - grow[1, k] * wi[k] + by_v[0, k] * u
-            wi[k] = grow[0, k] * wi[k] + grow[1, k] * wr[k] + by_v[1, k] * u
+            real = transition[0, k] * wr[k] - transition[1, k] * wi[k] + by_v[0, k] * u
+            wi[k] = transition[0, k] * wi[k] + transition[1, k] * wr[k] + by_v[1, k] * u
             wr[k] = real
             total += real
         out[step] = total
@@ -94,11 +94,11 @@ def moved(v: Float, grow: Float, by_v: Float, direct: float, late: int, inner: i
 
 
 @njit(cache=True, fastmath=_FAST)
-def read(e: Float, grow: Float, by_e: Float, direct: Float, inner: int, late: Int) -> Float:
+def read(e: Float, transition: Float, by_e: Float, direct: Float, inner: int, late: Int) -> Float:
     """(n, q) what sensors show of a force e (n inner,), before each sample's steps.
 
-    grow : (2, n_pole); by_e : (2, q, n_pole) what a force held over a step makes of each sensor's
-    state. late : (q,) steps of each sensor's delay.
+    transition : (2, n_pole); by_e : (2, q, n_pole) what a force held over a step makes of each
+    sensor's state. late : (q,) steps of each sensor's delay.
     """
     q, n_pole = by_e.shape[1], by_e.shape[2]
     n = e.size // inner
@@ -114,7 +114,7 @@ def read(e: Float, grow: Float, by_e: Float, direct: Float, inner: int, late: In
                 out[(step + late[i]) // inner, i] = y
         before = e[step]
         for k in range(n_pole):
-            real = grow[0, k] * wr[k] - grow[1, k] * wi[k] + before
-            wi[k] = grow[0, k] * wi[k] + grow[1, k] * wr[k]
+            real = transition[0, k] * wr[k] - transition[1, k] * wi[k] + before
+            wi[k] = transition[0, k] * wi[k] + transition[1, k] * wr[k]
             wr[k] = real
     return out

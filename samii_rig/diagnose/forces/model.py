@@ -37,13 +37,13 @@ class ForceModel(Model):
 
     def __init__(self, rig: Rig, effects: Sequence[Effect]) -> None:
         super().__init__(rig, effects)
-        forced = [(i, e) for i, e in enumerate(effects) if e.quasi is not None]
+        forced = [(i, e) for i, e in enumerate(effects) if e.force is not None]
         if len(forced) != 1:
             raise InputError(rig.name, "effects", len(forced), "one force at a time")
         which, effect = forced[0]
-        assert effect.quasi is not None
-        self.force: Force = effect.quasi
-        self.chain = self.chain_of(self.force.place.widened(self.built))
+        assert effect.force is not None
+        self.force: Force = effect.force
+        self.chain = self.chain_of(self.force.place.augmented(self.built))
         self.unknowns = tuple(self.own(which))
         scale = self.force.scale
         self.moving = (*self.unknowns, *((self.keys.index(scale),) if scale in self.keys else ()))
@@ -115,5 +115,5 @@ def _wide(lines: Complex, width: int) -> Complex:
 
 def model_of(rig: Rig, effects: Sequence[Effect]) -> Model:
     """The model that the effects need."""
-    forced = any(e.quasi is not None for e in effects)
+    forced = any(e.force is not None for e in effects)
     return ForceModel(rig, effects) if forced else Model(rig, effects)

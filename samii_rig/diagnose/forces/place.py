@@ -71,7 +71,7 @@ class Place:
         """Different for different places."""
         return " ".join((self.kind, *self.across))
 
-    def widened(self, rig: Rig, name: str = EXTRA) -> Rig:
+    def augmented(self, rig: Rig, name: str = EXTRA) -> Rig:
         """The rig with the force's input behind its own and its sensor behind its own; `name` of
         both."""
         names = [e.name for e in rig.element]

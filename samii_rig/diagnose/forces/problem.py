@@ -42,10 +42,12 @@ class Moved:
         the slopes of both by the entries `moving` of x."""
         p, seeds = model.numbers(x), model.seeds(x, moving)
         wired = self.whole.wired
-        if model.force.law.told is not None:
+        if model.force.law.of_command is not None:
             pieces = self.whole.records.pieces
             on = wired.column(model.force.place.command(model.built))
-            return [_told(piece, model, p, seeds, self.whole.every, on) for piece in pieces]
+            return [
+                _lines_of_command(piece, model, p, seeds, self.whole.every, on) for piece in pieces
+            ]
         way = self.ways.at(model, x)
         contour = self.whole.records.exact()
         channels = model.channels(x, contour.s)
@@ -82,16 +84,16 @@ class Moved:
         return replace(self.whole, records=replace(records, pieces=pieces))
 
 
-def _told(
+def _lines_of_command(
     piece: Piece, model: ForceModel, p: Float, seeds: Float, every: int, on: int
 ) -> list[Samples]:
     """A force on the command of input `on` alone, of every record by itself: a converter's steps
     fall differently each time."""
-    told = model.force.law.told
-    assert told is not None
+    of_command = model.force.law.of_command
+    assert of_command is not None
     r = np.zeros((1 + len(seeds), *piece.r.shape))
     for command in piece.commands:
-        e, slopes = told(between(by_input(command.v)[on], every), p)
+        e, slopes = of_command(between(by_input(command.v)[on], every), p)
         all_ = np.concatenate([e[None], (slopes @ seeds.T).T])
         r.reshape(*r.shape[:2], -1)[:, :, on] += command.part * (
             all_ if every == 1 else signal.resample_poly(all_, 1, every, axis=1)
@@ -135,7 +137,7 @@ class ForceProblem(RecordProblem):
 
         def added(model: ForceModel, x: Float, moving: Sequence[int]) -> Complex:
             each = [
-                np.stack([-records.left(Samples(m.r, -m.z), k_, S, exact) for m in own], axis=2)
+                np.stack([-records.residual(Samples(m.r, -m.z), k_, S, exact) for m in own], axis=2)
                 for own, k_ in zip(moved.of(model, x, moving), k, strict=True)
             ]
             return np.asarray(np.concatenate(each)[order])

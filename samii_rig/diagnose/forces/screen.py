@@ -24,8 +24,8 @@ from samii_rig.diagnose.forces.laws import (
     Force,
     Law,
 )
+from samii_rig.diagnose.forces.paths import Span, TransferPaths
 from samii_rig.diagnose.forces.problem import ForceProblem
-from samii_rig.diagnose.forces.reach import Reach, Span
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.likelihood.reduce import by_input
 from samii_rig.types import Complex, Float
@@ -43,7 +43,7 @@ STRONG = 0.03  # of the motion that drives it, that a force may change to count 
 
 
 @dataclass(frozen=True, slots=True)
-class Hope:
+class Score:
     """What a force should gain of chi-square beside each base, and at which strengths.
 
     own : (n_look,) gain at `strengths`. may : (n_look,) the gain of its best multiple, `times` as
@@ -59,7 +59,7 @@ class Hope:
 
 
 @dataclass(frozen=True)
-class Looks:
+class ForceScreen:
     """Fits, and what they leave, against which changes of the lines are held."""
 
     problem: ForceProblem
@@ -69,15 +69,15 @@ class Looks:
         """(n_look,) of a change g of what is predicted: fall of chi-square with it, with its best
         multiple, and how many times it is that."""
         found = []
-        for look in self.screens:
-            through = look.directions[: g.size].T @ g
-            found.append((-float(g @ look.left_by()[: g.size]), float(g @ g - through @ through)))
+        for base in self.screens:
+            through = base.directions[: g.size].T @ g
+            found.append((-float(g @ base.residual()[: g.size]), float(g @ g - through @ through)))
         return _gains(*np.array(found).T)
 
-    def weakly(self, changes: Sequence[Complex]) -> list[tuple[Float, Float, Float]]:
+    def first_order(self, changes: Sequence[Complex]) -> list[tuple[Float, Float, Float]]:
         """`gains` of each of many changes of the lines (n, q)."""
         rows = self.problem.complete.rows.e.size * 2 + len(self.problem.complete.factor)
-        sides = [np.column_stack([s.left_by(), s.directions])[:rows] for s in self.screens]
+        sides = [np.column_stack([s.residual(), s.directions])[:rows] for s in self.screens]
         joined = self.problem.complete.joined(np.concatenate(sides, axis=1))
         flat = _real(joined.reshape(-1, joined.shape[2]))
         out, ends = [], np.cumsum([side.shape[1] for side in sides])
@@ -103,10 +103,10 @@ def _gains(along: Float, power: Float) -> tuple[Float, Float, Float]:
     return own, np.maximum(along, 0.0) * np.maximum(times, 0.0) * known, times
 
 
-def tries(effect: Effect, reach: Reach) -> list[Float]:
+def trial_strengths(effect: Effect, paths: TransferPaths) -> list[Float]:
     """Strengths at which the shape of a force differs."""
-    assert effect.quasi is not None
-    law, high = effect.quasi.law, effect.unknowns[0].high
+    assert effect.force is not None
+    law, high = effect.force.law, effect.unknowns[0].high
     if law is CLIPPED:
         return [np.array([high * x]) for x in LIMITS]
     if law in (OVERLAP, PLAY):
@@ -114,7 +114,7 @@ def tries(effect: Effect, reach: Reach) -> list[Float]:
     if law is ORIFICE:
         return [np.array([high * WEAK])]
     if law is HYSTERESIS:
-        motion = reach.motion(effect.quasi.place, of_speed=False)
+        motion = paths.motion(effect.force.place, of_speed=False)
         top = max(float(np.max(np.abs(y))) for y in motion)
         k = effect.unknowns[1].high * WEAK
         return [np.array([k * top * x, k]) for x in SLIPS]
@@ -129,33 +129,35 @@ def scaled(law: Law, strengths: Float, times: float, largest: float) -> Float:
     return np.asarray(strengths / times if law is ORIFICE else strengths * times)
 
 
-def weakly(effects: Sequence[Effect], reach: Reach, looks: Looks) -> list[Hope]:
+def first_order(
+    effects: Sequence[Effect], paths: TransferPaths, screen: ForceScreen
+) -> list[Score]:
     """Of each force its best try, to first order."""
-    records, order = reach.whole.records, looks.problem.complete.rows.order
+    records, order = paths.whole.records, screen.problem.complete.rows.order
     k = [records.lines(p).k for p in records.pieces]
     which, shapes, changed = [], [], []
     for effect in effects:
-        force = effect.quasi
+        force = effect.force
         assert force is not None
-        ports = reach.ports(force.place, of_speed=force.law.of_speed)
+        ports = paths.ports(force.place, of_speed=force.law.of_speed)
         if ports is None:
             continue
-        for strengths in tries(effect, reach):
-            p = force.law.numbers(strengths, reach.scale(force.scale))
-            spectra, share = _forces(force, p, reach)
-            lines = map(Span.lines, reach.spans, spectra, ports.sensors, k)
+        for strengths in trial_strengths(effect, paths):
+            p = force.law.numbers(strengths, paths.scale(force.scale))
+            spectra, share = _forces(force, p, paths)
+            lines = map(Span.lines, paths.spans, spectra, ports.sensors, k)
             shapes.append(np.concatenate(list(lines))[order])
             which.append((effect, strengths))
             changed.append(share)
-    best: dict[str, Hope] = {}
-    gains = looks.weakly(shapes)
+    best: dict[str, Score] = {}
+    gains = screen.first_order(shapes)
     for (effect, strengths), share, (own, may, times) in zip(which, changed, gains, strict=True):
         at = int(np.argmax(may))
         weak = share * max(float(times[at]), 0.0) < STRONG
-        hope = Hope(effect, strengths, own, may, float(times[at]), weak)
+        score = Score(effect, strengths, own, may, float(times[at]), weak)
         old = best.get(effect.key)
         if old is None or may[at] > np.max(old.may):
-            best[effect.key] = hope
+            best[effect.key] = score
     return sorted(best.values(), key=lambda h: -float(np.max(h.may)))
 
 
@@ -163,23 +165,25 @@ def _summed(each: Sequence[Float]) -> Float:
     return np.asarray(np.sum(each, axis=0))
 
 
-def _forces(force: Force, p: Float, reach: Reach) -> tuple[list[Complex], float]:
+def _forces(force: Force, p: Float, paths: TransferPaths) -> tuple[list[Complex], float]:
     """Of each piece the damped spectrum of a force under the motion that it does not change, and
     the share by which it would change that, at the worst lines."""
-    if force.law.told is not None:
-        told, on = force.law.told, reach.column(force.place)
+    if force.law.of_command is not None:
+        of_command, on = force.law.of_command, paths.column(force.place)
         each = [
-            s.spectrum(_summed([c.part * told(by_input(c.v)[on], p)[0] for c in piece.commands]))
+            s.spectrum(
+                _summed([c.part * of_command(by_input(c.v)[on], p)[0] for c in piece.commands])
+            )
             / s.times
-            for s, piece in zip(reach.spans, reach.whole.records.pieces, strict=True)
+            for s, piece in zip(paths.spans, paths.whole.records.pieces, strict=True)
         ]
         return each, 0.0
     assert force.law.weak is not None
-    motion = reach.motion(force.place, of_speed=force.law.of_speed)
-    commands = reach.commands(force.place)
+    motion = paths.motion(force.place, of_speed=force.law.of_speed)
+    commands = paths.commands(force.place)
     e = [force.law.weak(y, v, p) for y, v in zip(motion, commands, strict=True)]
-    ports = reach.ports(force.place, of_speed=force.law.of_speed)
+    ports = paths.ports(force.place, of_speed=force.law.of_speed)
     assert ports is not None
     moved = max(float(np.sqrt(np.mean(x**2))) for x in e) * math.sqrt(np.mean(ports.y1**2))
     moves = max(float(np.sqrt(np.mean(y**2))) for y in motion)
-    return [s.damped(x) for s, x in zip(reach.spans, e, strict=True)], float(moved / moves)
+    return [s.damped(x) for s, x in zip(paths.spans, e, strict=True)], float(moved / moves)

@@ -21,15 +21,15 @@ from samii_rig.diagnose.fit.refit import STEPS, Fitted
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.laws import FRICTION
 from samii_rig.diagnose.forces.model import ForceModel, model_of
+from samii_rig.diagnose.forces.paths import TransferPaths
 from samii_rig.diagnose.forces.problem import ForceProblem, Moved
-from samii_rig.diagnose.forces.reach import Reach
-from samii_rig.diagnose.forces.screen import Hope, Looks, scaled, weakly
+from samii_rig.diagnose.forces.screen import ForceScreen, Score, first_order, scaled
 from samii_rig.diagnose.forces.table import forces, uneven
 from samii_rig.diagnose.forces.way import Ways
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
-from samii_rig.likelihood.reduce import Left
+from samii_rig.likelihood.reduce import LineResiduals
 from samii_rig.likelihood.unexplained import Unexplained, evenly, unexplained
 from samii_rig.types import Float
 
@@ -63,8 +63,8 @@ class ForceSearch(RecordSearch):
         self._ways = Ways(acting=tuple(whole.acting.tolist()))
         self.linear = linear
         moved = _of_data(linear).fitted
-        self.reach = Reach(whole, moved.model, moved.x)
-        self.forces = tuple(forces(whole.rig, self.reach))
+        self.paths = TransferPaths(whole, moved.model, moved.x)
+        self.forces = tuple(forces(whole.rig, self.paths))
         super().__init__(whole, linear.by_line)
         self.use((*linear.table, *self.forces))
 
@@ -87,7 +87,7 @@ class ForceSearch(RecordSearch):
                 self.keep(e.effects, end)
 
     def _about(self, fitted: Fitted) -> None:
-        self._ways.renew()
+        self._ways.clear()
         self.problem = ForceProblem.near(self.levels, fitted, self.by_line.problem, self._ways)
         between = self.levels.between(self.reduced, fitted)
         self._between = between, fitted.model.response(fitted.x, between)
@@ -129,16 +129,16 @@ class ForceSearch(RecordSearch):
         that stands still."""
         base = _of_data(self)
         # Without what is wrong with the data itself nothing can be seen of a force beside it.
-        mistaken = bool(base.effects)
+        faulty = bool(base.effects)
         single = (e for e in self.ranked() if len(e.effects) == 1)
-        first = base if mistaken else next(single, None)
+        first = base if faulty else next(single, None)
         ahead = 0.0 if first is None else self.nominal.fitted.cost - first.fitted.cost
-        both = [self.nominal] if first is None or mistaken else [self.nominal, first]
-        hopes = self.hopes(both)
-        self._try([h for h in hopes if h.own[0] >= STRONG * ahead], self.nominal, 0)
+        both = [self.nominal] if first is None or faulty else [self.nominal, first]
+        scores = self.scores(both)
+        self._try([h for h in scores if h.own[0] >= STRONG * ahead], self.nominal, 0)
         if first is not None:
-            self._try(self.hopes([first]) if mistaken else hopes, first, -1)
-        self.temper()
+            self._try(self.scores([first]) if faulty else scores, first, -1)
+        self.take_overdispersion()
         for _ in range(AGAIN):
             best = self.ranked()[0]
             if not isinstance(best.fitted.model, ForceModel):
@@ -147,22 +147,22 @@ class ForceSearch(RecordSearch):
             near = [e for e in self.ranked() if e.weight > best.weight - NEAR]
             self._only((*near, self.nominal))
             self._through(self.ranked()[0])
-            self.temper()
+            self.take_overdispersion()
             after = self.ranked()[0]
-            if self.spent or (after.key == best.key and after.fitted.away(best.fitted) < STILL):
+            if self.exhausted or (after.key == best.key and after.fitted.away(best.fitted) < STILL):
                 break
         self._either_way(self.ranked()[0])
         self.pair()
         self._alone()
         self._rivals()
         self._forget_uneven()
-        self.temper()
+        self.take_overdispersion()
 
     def _forget_uneven(self) -> None:
         """Without explanations whose force does not explain at all lines what it says that it does:
         what is left of an input's edges, say, is like dry friction at some and not at others."""
         while isinstance(model := (best := self.ranked()[0]).fitted.model, ForceModel):
-            linear = tuple(e for e in best.effects if e.quasi is None)
+            linear = tuple(e for e in best.effects if e.force is None)
             x = np.delete(best.fitted.x, list(model.unknowns))
             base = self.refitted_from(linear, x)
             if base is None or self._even(base, best.fitted):
@@ -183,7 +183,7 @@ class ForceSearch(RecordSearch):
         if not isinstance(best.fitted.model, ForceModel):
             return
         for i, gone in enumerate(best.effects):
-            if gone.quasi is None and not self.spent:
+            if gone.force is None and not self.exhausted:
                 old = self.found.pop(best.key - {gone.key}, None)
                 self.without(best, i)
                 if old is not None:
@@ -191,10 +191,10 @@ class ForceSearch(RecordSearch):
 
     def _rivals(self) -> None:
         """The force of the best explanation beside what does as well as its linear effects do: what
-        the linear search cannot tell apart, a force beside it does not either."""
+        the linear search cannot distinguish, a force beside it does not either."""
         best = self.ranked()[0]
-        force = [i for i, e in enumerate(best.effects) if e.quasi is not None]
-        beside = frozenset(e.key for e in best.effects if e.quasi is None)
+        force = [i for i, e in enumerate(best.effects) if e.force is not None]
+        beside = frozenset(e.key for e in best.effects if e.force is None)
         own = self.linear.found.get(beside)
         if not force or not beside or own is None:
             return
@@ -202,24 +202,24 @@ class ForceSearch(RecordSearch):
         ranked = self.linear.ranked()
         near = [e for e in ranked if e.key != beside and e.weight > own.weight - NEAR]
         for rival in self.each(near[:RIVALS], lambda e: named(e.effects)):
-            if self.spent:
+            if self.exhausted:
                 return
             effects = (*rival.effects, *(best.effects[i] for i in force))
             end = self.refitted(effects, rival, strengths) if self.model(effects) else None
             if end is not None:
                 self.keep(effects, end)
 
-    def _try(self, hopes: Sequence[Hope], base: Explanation, look: int) -> None:
-        """Refit the forces that may be the best beside `base`, by the gains of that look."""
-        some = _worth_while(hopes, self.worth, look)
-        for hope in self.each(some, lambda h: named([h.effect])):
-            if self.spent:
+    def _try(self, scores: Sequence[Score], base: Explanation, at: int) -> None:
+        """Refit the forces that may be the best beside `base`, by its gains there."""
+        some = _promising(scores, self.critical_value, at)
+        for score in self.each(some, lambda h: named([h.effect])):
+            if self.exhausted:
                 return
-            effects = (*base.effects, hope.effect)
+            effects = (*base.effects, score.effect)
             best = min(e.fitted.cost for e in self.found.values())
-            end = self.refitted(effects, base, np.log(hope.strengths).tolist(), best)
+            end = self.refitted(effects, base, np.log(score.strengths).tolist(), best)
             if end is not None and base.fitted.chi2 - end.chi2 > (
-                self.worth if base.effects else 0
+                self.critical_value if base.effects else 0
             ):
                 self.keep(effects, end)
 
@@ -227,9 +227,9 @@ class ForceSearch(RecordSearch):
         """Refit it with the chain through which its force acts renewed where each refit ended,
         until that stands still."""
         for _ in range(RENEWED):
-            if self.spent or not isinstance(best.fitted.model, ForceModel):
+            if self.exhausted or not isinstance(best.fitted.model, ForceModel):
                 return
-            self._ways.renew()
+            self._ways.clear()
             end = self.refitted(best.effects, best)
             if end is None:
                 return
@@ -241,8 +241,8 @@ class ForceSearch(RecordSearch):
 
     def _either_way(self, best: Explanation) -> None:
         """Dry friction that may differ by direction, from where it did not."""
-        forced = next((e for e in best.effects if e.quasi is not None), None)
-        if forced is None or forced.quasi is None or forced.quasi.law is not FRICTION:
+        forced = next((e for e in best.effects if e.force is not None), None)
+        if forced is None or forced.force is None or forced.force.law is not FRICTION:
             return
         other = uneven(forced)
         at = best.effects.index(forced)
@@ -252,7 +252,7 @@ class ForceSearch(RecordSearch):
         if other.key not in {e.key for e in self.table}:
             self.use((*self.table, other))
         end = self.refitted_from(effects, start)
-        if end is not None and best.fitted.chi2 - end.chi2 > self.worth:
+        if end is not None and best.fitted.chi2 - end.chi2 > self.critical_value:
             self.keep(effects, end)
 
     def pair(self) -> None:
@@ -262,23 +262,23 @@ class ForceSearch(RecordSearch):
         single = len(real) == 1 and isinstance(best.fitted.model, ForceModel)
         if not single:
             return
-        plain, rest = self.beside(best)
+        plain, rest = self.linear_part(best)
         assert isinstance(plain, RecordSearch)
         for drop, effect, starts in ranking(
             Screen.of(plain.problem, rest.fitted), self.linear.table, (), plain.model
         )[:BESIDE]:
             effects = (*best.effects, effect)
-            if drop < self.worth / 2 or self.model(effects) is None:
+            if drop < self.critical_value / 2 or self.model(effects) is None:
                 continue
             end = self.refitted(effects, best, np.log(starts[0]).tolist())
             alone = [best, self.found.get(frozenset({effect.key}))]
             if end is not None and all(
-                e is None or e.fitted.chi2 - end.chi2 > self.worth for e in alone
+                e is None or e.fitted.chi2 - end.chi2 > self.critical_value for e in alone
             ):
                 self.keep(effects, end)
 
     @property
-    def spent(self) -> bool:
+    def exhausted(self) -> bool:
         """Whether as many forces were computed as a person waits for."""
         return self._ways.marched > MOST_MARCHED
 
@@ -286,45 +286,46 @@ class ForceSearch(RecordSearch):
         """Whether the best explanation leaves no more than noise."""
         return self.ratio(self.ranked()[0].fitted) < threshold(self.spread)
 
-    def hopes(self, bases: Sequence[Explanation]) -> list[Hope]:
+    def scores(self, bases: Sequence[Explanation]) -> list[Score]:
         """Every force that may explain as much as an effect must beside the first of some
         explanations, or beside the last, with what it gains beside each."""
         screens = tuple(Screen.of(self._force_problem, e.fitted) for e in bases)
-        looks = Looks(self._force_problem, screens)
-        hopes = weakly(self.forces, self.reach, looks)
-        most = max((float(np.max(h.may)) for h in hopes), default=0.0)
-        some = [h for h in hopes if self._matters(h, most)][:MARCHED]
+        screen = ForceScreen(self._force_problem, screens)
+        scores = first_order(self.forces, self.paths, screen)
+        most = max((float(np.max(h.may)) for h in scores), default=0.0)
+        some = [h for h in scores if self._matters(h, most)][:MARCHED]
         each = self.each(some, lambda h: named([h.effect]))
-        found = [self._closer(h, looks, bases[0]) for h in each]
+        found = [self._closer(h, screen, bases[0]) for h in each]
         # Beside the first it must do as much as what the last has more did.
-        ahead = screens[0].base.cost - min(look.base.cost for look in screens)
+        ahead = screens[0].base.cost - min(one.base.cost for one in screens)
         return [
             h
             for h in found
-            if h is not None and (h.own[0] >= STRONG * ahead or h.own[-1] >= self.worth / 2)
+            if h is not None
+            and (h.own[0] >= STRONG * ahead or h.own[-1] >= self.critical_value / 2)
         ]
 
-    def _matters(self, hope: Hope, most: float) -> bool:
-        may = float(np.max(hope.may))
-        return may > max((WEAK if hope.weak else STRONG) * self.worth, LESS * most)
+    def _matters(self, score: Score, most: float) -> bool:
+        may = float(np.max(score.may))
+        return may > max((WEAK if score.weak else STRONG) * self.critical_value, LESS * most)
 
-    def _closer(self, hope: Hope, looks: Looks, base: Explanation) -> Hope | None:
+    def _closer(self, score: Score, screen: ForceScreen, base: Explanation) -> Score | None:
         """The same, computed in time where the first order leads, and closer to its best."""
-        effect, old = hope.effect, base.fitted
+        effect, old = score.effect, base.fitted
         model = self.model((*base.effects, effect))
-        assert effect.quasi is not None
+        assert effect.force is not None
         if not isinstance(model, ForceModel):
             return None
         known = moved(old.model, old.x, model)
         low, high = np.array([(u.low, u.high) for u in effect.unknowns]).T
-        strengths, times, best = hope.strengths, hope.times, None
-        if effect.quasi.law.told is not None:
-            best = hope  # such a force does not depend on what it does: the first order is all
+        strengths, times, best = score.strengths, score.times, None
+        if effect.force.law.of_command is not None:
+            best = score  # such a force does not depend on what it does: the first order is all
         for _ in range(1 + CLOSER):
             if not times > 0:
                 break
             times = min(max(times, TIMES[0]), TIMES[1]) if best else times
-            law, largest = effect.quasi.law, self.reach.largest(effect.quasi.place)
+            law, largest = effect.force.law, self.paths.largest(effect.force.place)
             there = np.clip(scaled(law, strengths, times, largest), low, high)
             try:
                 g = self._force_problem.change(model, np.append(known, np.log(there)))
@@ -332,16 +333,16 @@ class ForceSearch(RecordSearch):
                 times = math.sqrt(times)
                 continue
             strengths = there
-            own, may, each = looks.gains(g)
+            own, may, each = screen.gains(g)
             at = int(np.argmax(own))
             times = float(each[at])
             if best is None or own[at] > np.max(best.own):
-                best = Hope(effect, strengths, own, may, times, weak=False)
+                best = Score(effect, strengths, own, may, times, weak=False)
         return best
 
-    def left(self, fitted: Fitted, *, shown: bool = False) -> Left:
+    def residuals(self, fitted: Fitted, *, shown: bool = False) -> LineResiduals:
         """As of `RecordSearch`."""
-        return self._rest(fitted).left(fitted, self.reduced, shown=shown)
+        return self._rest(fitted).residuals(fitted, self.reduced, shown=shown)
 
     def unexplained(self, fitted: Fitted) -> list[Unexplained]:
         """What a fit leaves of each piece."""
@@ -354,10 +355,10 @@ class ForceSearch(RecordSearch):
             return self.levels
         return Moved(self.levels, self._ways).without(fitted)
 
-    def beside(self, best: Explanation) -> tuple[Explanations, Explanation]:
+    def linear_part(self, best: Explanation) -> tuple[Explanations, Explanation]:
         """As of `Explanations`: the records without the force of `best`, about which the likelihood
         stands."""
-        linear = tuple(e for e in best.effects if e.quasi is None)
+        linear = tuple(e for e in best.effects if e.force is None)
         model = Model(self.rig, linear)
         plain = copy(self)
         plain.problem = self._force_problem.without_force()
@@ -389,16 +390,16 @@ def _of_data(search: Explanations) -> Explanation:
     """What is wrong with the data by the most probable explanation, without what is missing of the
     rig: the nominal model where that is nothing."""
     best = search.ranked()[0].effects
-    mistakes = frozenset(e.key for e in best if not e.physical)
-    return search.found.get(mistakes, search.nominal)
+    faults = frozenset(e.key for e in best if not e.physical)
+    return search.found.get(faults, search.nominal)
 
 
-def _worth_while(hopes: Sequence[Hope], worth: float, look: int) -> list[Hope]:
+def _promising(scores: Sequence[Score], critical_value: float, at: int) -> list[Score]:
     """Those that may be the best: of each physics the first, and the first's at other places."""
-    if not hopes:
+    if not scores:
         return []
-    ranked = sorted(hopes, key=lambda h: -float(h.own[look]))
-    some = [h for h in ranked if h.own[look] > max(worth / 2, PROMISING * ranked[0].own[look])]
+    ranked = sorted(scores, key=lambda h: -float(h.own[at]))
+    some = [h for h in ranked if h.own[at] > max(critical_value / 2, PROMISING * ranked[0].own[at])]
     if not some:
         return []
     first = list({h.effect.physics: h for h in reversed(some)}.values())[::-1]

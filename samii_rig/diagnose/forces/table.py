@@ -20,8 +20,8 @@ from samii_rig.diagnose.forces.laws import (
     Force,
     Law,
 )
+from samii_rig.diagnose.forces.paths import TransferPaths
 from samii_rig.diagnose.forces.place import Place
-from samii_rig.diagnose.forces.reach import Reach
 from samii_rig.diagnose.physics.effect import Effect, Unknown
 from samii_rig.diagnose.physics.scales import spread
 from samii_rig.rig.schema import (
@@ -45,16 +45,16 @@ LEAST_LIMIT = 0.02  # of the largest command
 WEAKEST_SUPPLY = 1e4  # of the largest moment: the loss of flow is 1e-4/2 of the flow
 
 
-def forces(rig: Rig, reach: Reach) -> Iterator[Effect]:
+def forces(rig: Rig, paths: TransferPaths) -> Iterator[Effect]:
     """Every force that the table knows on this rig; ranges are those of the data."""
     order = [e.name for e in rig.element]
     kinds = {e.name: e for e in rig.element}
     for e in rig.element:
         slides = isinstance(e, TranslationalSpring | TranslationalGroundSpring)
         if isinstance(e, TorsionalGroundSpring | TranslationalGroundSpring):
-            yield from _between(reach, Place("ground", (e.name,), slides), e)
+            yield from _between(paths, Place("ground", (e.name,), slides), e)
         if isinstance(e, TranslationalSpring):
-            yield from _between(reach, Place("joint", (e.name,), slides), e)
+            yield from _between(paths, Place("joint", (e.name,), slides), e)
         if isinstance(e, TorsionalSpring):
             at = order.index(e.name)
             near: list[tuple[str, ...]] = [
@@ -63,8 +63,8 @@ def forces(rig: Rig, reach: Reach) -> Iterator[Effect]:
                 if 0 <= i < len(order) and isinstance(kinds[order[i]], ANGLE_SOURCES)
             ]
             for across in ((e.name,), *near):
-                yield from _between(reach, Place("joint", across), e)
-    for index in reach.whole.acting:
+                yield from _between(paths, Place("joint", across), e)
+    for index in paths.whole.acting:
         actuator = rig.actuator[index]
         source = next(
             (e for e in rig.element if isinstance(e, SOURCES) and e.input == actuator.name), None
@@ -72,28 +72,28 @@ def forces(rig: Rig, reach: Reach) -> Iterator[Effect]:
         if source is None:
             continue
         turns = isinstance(source, ANGLE_SOURCES)
-        yield from _drive(reach, source.name, actuator, turns=turns)
+        yield from _drive(paths, source.name, actuator, turns=turns)
 
 
-def _between(reach: Reach, place: Place, spring: Spring) -> Iterator[Effect]:
+def _between(paths: TransferPaths, place: Place, spring: Spring) -> Iterator[Effect]:
     """Forces between both sides of a joint, of its spring alone or of spring and source; or between
     a part and the ground."""
     name, (of_force, of_way) = spring.name, place.units
     other = next((n for n in place.across if n != name), "")
-    speed, ports = _largest(reach, place, of_speed=True), reach.ports(place, of_speed=True)
+    speed, ports = _largest(paths, place, of_speed=True), paths.ports(place, of_speed=True)
     if speed <= 0 or ports is None:
         return
     force = np.pi / 4 * speed / float(np.median(ports.y1))
     T_c = _log("T_c", of_force, RANGE[0] * force, RANGE[1] * force)
     yield effect(FRICTION, place, name, other, (T_c,))
-    moved = reach.ports(place, of_speed=False)
+    moved = paths.ports(place, of_speed=False)
     if other or moved is None:
         return
     # The sine in c2 |speed| speed is two thirds of that in friction of T_c = c2 speed^2.
     c2 = 3 / 2 * force / speed**2
     unknown = _log("c2", f"{of_force} s^2/{of_way}^2", RANGE[0] * c2, RANGE[1] * c2)
     yield effect(QUADRATIC, place, name, "", (unknown,))
-    top = _largest(reach, place, of_speed=False)
+    top = _largest(paths, place, of_speed=False)
     doubles = 1 / float(np.median(moved.y1))  # force a way
     k3 = 4 / 3 * doubles / top**2
     for law, most in ((HARDENING, RANGE[1]), (SOFTENING, SOFTEST)):
@@ -107,38 +107,40 @@ def _between(reach: Reach, place: Place, spring: Spring) -> Iterator[Effect]:
     yield effect(HYSTERESIS, place, name, "", (T_y, k))
 
 
-def _drive(reach: Reach, source: str, actuator: ActuatorSpec, *, turns: bool) -> Iterator[Effect]:
+def _drive(
+    paths: TransferPaths, source: str, actuator: ActuatorSpec, *, turns: bool
+) -> Iterator[Effect]:
     """Forces on the command. turns : whether the source gives an angle."""
     alias, unit, across = actuator.name, actuator.unit, (source,)
     drive, flow = Place("drive", across), Place("flow", across)
-    largest = reach.largest(drive)
+    largest = paths.largest(drive)
     # What is narrower than a step of the command's converter is that converter's rounding.
     low, high = max(WIDTHS[0] * largest, actuator.resolution), WIDTHS[1] * largest
     wide = low < high
-    if wide and turns and reach.ports(drive, of_speed=True) is not None:
+    if wide and turns and paths.ports(drive, of_speed=True) is not None:
         yield effect(FRICTION, drive, source, alias, (_log("T_c", unit, low, high),))
-    top = _largest(reach, flow, of_speed=False) if turns else 0.0
+    top = _largest(paths, flow, of_speed=False) if turns else 0.0
     if top > 0:
         yield effect(ORIFICE, flow, source, alias, (_log("T_s", "N m", top, WEAKEST_SUPPLY * top),))
-    told = Place("command", across)
+    on_command = Place("command", across)
     if wide:
-        yield effect(OVERLAP, told, source, alias, (_log("width", unit, low, high),))
+        yield effect(OVERLAP, on_command, source, alias, (_log("width", unit, low, high),))
     limit = _log("limit", unit, LEAST_LIMIT * largest, largest)
-    yield effect(CLIPPED, told, source, alias, (limit,))
+    yield effect(CLIPPED, on_command, source, alias, (limit,))
 
 
 def uneven(even: Effect) -> Effect:
     """Dry friction that may differ by direction in the place of one that does not."""
-    assert even.quasi is not None
+    assert even.force is not None
     (T_c,) = even.unknowns
     unknowns = tuple(_log(symbol, T_c.unit, T_c.low, T_c.high) for symbol in UNEVEN.symbols)
     alias = even.aliases[0][1] if even.aliases else ""
-    return effect(UNEVEN, even.quasi.place, even.site, alias, unknowns)
+    return effect(UNEVEN, even.force.place, even.site, alias, unknowns)
 
 
-def _largest(reach: Reach, place: Place, *, of_speed: bool) -> float:
+def _largest(paths: TransferPaths, place: Place, *, of_speed: bool) -> float:
     return max(
-        (float(np.max(np.abs(y))) for y in reach.motion(place, of_speed=of_speed)), default=0
+        (float(np.max(np.abs(y))) for y in paths.motion(place, of_speed=of_speed)), default=0
     )
 
 
@@ -160,7 +162,7 @@ def effect(
         physics=law.physics,
         site=site,
         unknowns=unknowns,
-        quasi=Force(place, law, scale),
+        force=Force(place, law, scale),
         aliases=((law.physics, alias),) if alias else (),
         rough=0.0 if place.kind == "command" else law.rough,
         variant=f"{law.tag} {place.name}",

@@ -3,7 +3,7 @@
 What varies passes for noise, so the noise that is told with it in the records is too much. So, as
 with every force, what it adds to the sensors is computed in time, the records less that are those
 of a linear rig, and the likelihood is made anew about them: its noise, its parameters, and what
-varies still. A swing is linear in its two phases (Born's approximation, `varying`).
+varies still. A modulation is linear in its two phases (Born's approximation, `varying`).
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.varying import (
     ALARM,
     SIDES,
-    Pulled,
+    Modulation,
+    PieceModulation,
     Springs,
-    Swing,
-    pulls,
+    piece_modulations,
     uneven,
 )
 from samii_rig.diagnose.result import Gap, Value
@@ -72,7 +72,7 @@ class Variation:
         gap = self.before[0] - 1
         return (self.before[0] - self.after[0]) / gap if gap > 0 else 0.0
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """In words."""
         if "depth" in self.parameters:
             depth, f = self.parameters["depth"].times(100.0), self.parameters["f"]
@@ -91,23 +91,23 @@ def variation(search: ForceSearch, best: Explanation, files: int) -> Variation |
     if not found:
         return None
     tried = []
-    for site, swing in found:
-        k = search.reach.scale((site, STIFFNESS))
+    for site, modulation in found:
+        k = search.paths.scale((site, STIFFNESS))
         # None varies by more than all of it: something else does.
-        if RIVAL * found[0][1].gain < swing.gain < swing.known * k**2:
+        if RIVAL * found[0][1].gain < modulation.gain < modulation.known * k**2:
             tried.append(_Taken(search, best.fitted, springs, site).settled(best))
     if not tried:
         return None
     tried.sort(key=lambda one: -one.evidence)
     taken, first = tried[0], dict(found)[tried[0].site]
-    before = taken.left(search.levels, best.fitted)
-    after = taken.left(taken.search.levels, taken.fitted)
+    before = taken.residuals(search.levels, best.fitted)
+    after = taken.residuals(taken.search.levels, taken.fitted)
     each = 2.0 * search.levels.sensor.size
     p = np.exp([one.evidence - taken.evidence for one in tried])
     names = [one.site for one in tried]
     return Variation(
         sites=tuple(zip(names, (p / p.sum()).tolist(), strict=True)),
-        parameters=taken.parameters(search.reach.scale((taken.site, STIFFNESS)), files),
+        parameters=taken.parameters(search.paths.scale((taken.site, STIFFNESS)), files),
         evidence=first.evidence - math.log(len(springs.each)),
         gain=float(np.sum(before[0] - after[0])) * each,
         before=(float(np.mean(before[0])), float(np.mean(before[1]))),
@@ -125,7 +125,7 @@ class Uneven:
     site: str
     chi2: float
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """In words."""
         return (
             f"the spring of {self.site} is not the same to both sides: that explains "
@@ -140,36 +140,36 @@ def uneven_spring(search: ForceSearch, best: Explanation) -> Uneven | None:
     would pass for, as it swings with the motion."""
     springs = Springs.of(search)
     left = _some(search.unexplained(best.fitted))
-    each = [(site, pulls(search, place, left)) for site, place in springs.each]
+    each = [(site, piece_modulations(search, place, left)) for site, place in springs.each]
     found = [Uneven(site, uneven(pieces)) for site, pieces in each if pieces]
     most = max(found, key=lambda one: one.chi2, default=None)
     tries = len(SIDES) * len(found)
     if most is None or tries * float(stats.chi2.sf(most.chi2, 1)) > ALARM:
         return None
-    swings = springs.strongest(search, left)
-    return most if not swings or swings[0][1].gain < most.chi2 else None
+    modulations = springs.strongest(search, left)
+    return most if not modulations or modulations[0][1].gain < most.chi2 else None
 
 
 @dataclass
 class _Taken:
     """The records less what the variation of one spring adds to them.
 
-    search, fitted : of these, and a model of them. swings : what varies. changes : of each piece,
-    as `Pulled.changes` has them, with none at first.
+    search, fitted : of these, and a model of them. modulations : what varies. changes : of each
+    piece, as `PieceModulation.changes` has them, with none at first.
     """
 
     search: ForceSearch
     fitted: Fitted
     springs: Springs
     site: str
-    swings: list[Swing] = field(default_factory=list)
+    modulations: list[Modulation] = field(default_factory=list)
     changes: list[Float] = field(default_factory=list)
-    pieces: list[Pulled] = field(default_factory=list)
+    pieces: list[PieceModulation] = field(default_factory=list)
 
     @property
     def hz(self) -> list[float]:
         """Frequencies at which it swings."""
-        return [one.hz for one in self.swings if one.hz > 0]
+        return [one.hz for one in self.modulations if one.hz > 0]
 
     def settled(self, best: Explanation) -> _Taken:
         """The same, once nothing is left that varies."""
@@ -188,17 +188,17 @@ class _Taken:
             - float(np.sum(np.abs(x.white) ** 2)) / 2
             for x in each
         )
-        sought = sum(one.chi2 / 2 - one.evidence for one in self.swings)
+        sought = sum(one.chi2 / 2 - one.evidence for one in self.modulations)
         return found - self.fitted.penalty / 2 - sought
 
     def closer(self, best: Explanation) -> bool:
         """Take out what varies still, and make the likelihood anew. False if noise could do it."""
         place, step = dict(self.springs.each)[self.site], 1 / self.springs.longest
         left = _some(self.search.unexplained(self.fitted))
-        self.pieces = pulls(self.search, place, left)
+        self.pieces = piece_modulations(self.search, place, left)
         more = self.springs.strongest(self.search, left, self.site)
-        if more and all(abs(more[0][1].hz - one.hz) > step for one in self.swings):
-            self.swings.append(more[0][1].closer(self.pieces, step))
+        if more and all(abs(more[0][1].hz - one.hz) > step for one in self.modulations):
+            self.modulations.append(more[0][1].closer(self.pieces, step))
         found = self._changes()
         levels = self.search.levels
         taken = tuple(
@@ -217,7 +217,7 @@ class _Taken:
         """Of each piece what the records still vary by. A constant counts where it is not the same
         in all records."""
         found = [one.changes(self.hz) for one in self.pieces]
-        if any(one.hz == 0 for one in self.swings):
+        if any(one.hz == 0 for one in self.modulations):
             known = [one.constants()[1][0] for one in self.pieces]
             times = [one.times[0] for one in self.pieces]
             mean = sum(g * t * x[0, 0] for g, t, x in zip(known, times, found, strict=True))
@@ -237,22 +237,22 @@ class _Taken:
         return more or len(set(levels)) < len(levels) or any(self.hz)
 
     def parameters(self, k: float, files: int) -> dict[str, Value]:
-        """Of the deepest swing, with intervals of 90 %, or of what records differ by where that is
-        more. k : the stiffness."""
-        swings = [self._depth(one, k) for one in self.swings if one.hz > 0]
-        apart = [self._spread(k, files) for one in self.swings if one.hz == 0]
-        return max((*swings, *apart), key=lambda found: next(iter(found.values())).value)
+        """Of the deepest modulation, with intervals of 90 %, or of what records differ by where
+        that is more. k : the stiffness."""
+        modulations = [self._depth(one, k) for one in self.modulations if one.hz > 0]
+        differing = [self._spread(k, files) for one in self.modulations if one.hz == 0]
+        return max((*modulations, *differing), key=lambda found: next(iter(found.values())).value)
 
-    def _depth(self, swing: Swing, k: float) -> dict[str, Value]:
+    def _depth(self, modulation: Modulation, k: float) -> dict[str, Value]:
         """Of phases that are random in each record."""
-        at = 1 + 2 * self.hz.index(swing.hz)
-        power = [one.exact(swing.hz)[2] for one in self.pieces]
+        at = 1 + 2 * self.hz.index(modulation.hz)
+        power = [one.exact(modulation.hz)[2] for one in self.pieces]
         size = [float(np.sum(x[:, at : at + 2] ** 2)) / one.times[0] ** 2
                 for x, one in zip(self.changes, self.pieces, strict=True)]  # fmt: skip
         depth = math.sqrt(float(np.average(size, weights=power)))
-        sd = math.sqrt(2 / sum(power) * swing.louder)
+        sd = math.sqrt(2 / sum(power) * modulation.louder)
         low, high = max(depth - NINETY * sd, 0.0), depth + NINETY * sd
-        f, off = swing.hz, NINETY * swing.off
+        f, off = modulation.hz, NINETY * modulation.off
         return {
             "depth": Value(depth / k, "1", low / k, high / k),
             "f": Value(f, "Hz", f - off, f + off),
@@ -268,7 +268,7 @@ class _Taken:
         own = min(free, files - 1) if files > 1 else free
         return {"spread": spread_of(square / free / k**2, own)}
 
-    def left(self, levels: Whole, fitted: Fitted) -> tuple[Float, Float]:
+    def residuals(self, levels: Whole, fitted: Fitted) -> tuple[Float, Float]:
         """Of the lines fitted (n,) and of those shown (m,), what a fit leaves of records, 1 in the
         mean; what repeats differ by, too."""
         other = copy(self.search)

@@ -10,7 +10,8 @@ explain it, how far a change cos(Omega t) lies along that is the Fourier coeffic
 under noise alone, which knows nothing of phi: R_phi the products of the motion with itself, R_pull
 the covariance of the pull, of the noise's own spectrum. So 2 |P|^2/V is chi-square with two degrees
 of freedom at every Omega, summed over the records with two for each. Where it is largest both
-phases are computed exactly: ends and all, and as one where the motion is short for a slow swing.
+phases are computed exactly: ends and all, and as one where the motion is short for a slow
+modulation.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ from scipy import optimize, stats
 
 from samii_rig.diagnose.fit.between_runs import STIFFNESS
 from samii_rig.diagnose.forces.laws import HARDENING
+from samii_rig.diagnose.forces.paths import Span
 from samii_rig.diagnose.forces.place import Place
-from samii_rig.diagnose.forces.reach import Span
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.likelihood.reduce import CYCLES
 from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.types import Complex, Float, Int
 
 FASTEST = 0.2  # of the highest frequency in the records: what varies faster is no stiffness
-FINE = 4  # frequencies for each that the longest record tells apart
+FINE = 4  # frequencies for each that the longest record resolves
 ALARM = 2e-3  # chance that noise alone makes any stiffness vary
 ONE_PHASE = 1e-3  # of V: less variance is that of a phase which the motion does not show
 FLAT = 1e-2  # of the distance between frequencies that are tried: nearer, chi-square is flat
@@ -46,7 +47,7 @@ ROUNDED = 1e-6  # of the largest variance: less is rounding
 class Springs:
     """The springs of a rig, and what noise may make of their search.
 
-    each : (site, its place). f : (m,) Hz, at which a swing is looked for. longest : s, record.
+    each : (site, its place). f : (m,) Hz, at which a modulation is looked for. longest : s, record.
     """
 
     each: tuple[tuple[str, Place], ...]
@@ -56,47 +57,49 @@ class Springs:
     @classmethod
     def of(cls, search: ForceSearch) -> Springs:
         """Of a rig that moves."""
-        records, reach = search.levels.records, search.reach
+        records, paths = search.levels.records, search.paths
         longest = max(len(p.z) for p in records.pieces) / records.rate_hz
         # What is slower than the lines that count is as a sensor that wanders.
         f = np.arange(CYCLES / longest, FASTEST * records.band[1], 1 / (FINE * longest))
-        laws = [e for e in search.forces if e.quasi is not None and e.quasi.law is HARDENING]
-        each = ((e.site, e.quasi.place) for e in laws if e.quasi is not None)
+        laws = [e for e in search.forces if e.force is not None and e.force.law is HARDENING]
+        each = ((e.site, e.force.place) for e in laws if e.force is not None)
         return cls(
-            tuple(one for one in each if f.size and reach.scale((one[0], STIFFNESS)) > 0),
+            tuple(one for one in each if f.size and paths.scale((one[0], STIFFNESS)) > 0),
             f,
             longest,
         )
 
     def strongest(
         self, search: ForceSearch, left: Sequence[Unexplained], only: str = ""
-    ) -> list[tuple[str, Swing]]:
+    ) -> list[tuple[str, Modulation]]:
         """Of each spring what explains most of what is `left` of all pieces, the best first; none
         where noise could do as much. only : the spring that is looked at, of all if none."""
         found = [
-            (site, Swing.of(pieces, self.f, 2 * self.longest * float(self.f[-1])))
+            (site, Modulation.of(pieces, self.f, 2 * self.longest * float(self.f[-1])))
             for site, place in self.each
-            if only in ("", site) and (pieces := pulls(search, place, left))
+            if only in ("", site) and (pieces := piece_modulations(search, place, left))
         ]
         found.sort(key=lambda one: -one[1].gain)
-        if not found or len(found) * found[0][1].chance > ALARM:
+        if not found or len(found) * found[0][1].false_alarm > ALARM:
             return []
         return found
 
 
-def pulls(search: ForceSearch, place: Place, left: Sequence[Unexplained]) -> list[Pulled]:
+def piece_modulations(
+    search: ForceSearch, place: Place, left: Sequence[Unexplained]
+) -> list[PieceModulation]:
     """What is left of all pieces, taken back to a place; none where no force acts there."""
-    reach = search.reach
-    ports = reach.ports(place, of_speed=False)
+    paths = search.paths
+    ports = paths.ports(place, of_speed=False)
     if ports is None:
         return []
-    motion = reach.motion(place, of_speed=False)
-    each = zip(reach.spans, motion, ports.sensors, left, strict=True)
-    return [Pulled.of(*one) for one in each]
+    motion = paths.motion(place, of_speed=False)
+    each = zip(paths.spans, motion, ports.sensors, left, strict=True)
+    return [PieceModulation.of(*one) for one in each]
 
 
 @dataclass(frozen=True, slots=True)
-class Pulled:
+class PieceModulation:
     """Of one piece and its repeats.
 
     span, left : of the piece. phi : (M,) the way over the spring. sensors : (M//2 + 1, q) lines of
@@ -115,12 +118,15 @@ class Pulled:
     V: Float
 
     @classmethod
-    def of(cls, span: Span, phi: Float, sensors: Complex, left: Unexplained) -> Pulled:
+    def of(cls, span: Span, phi: Float, sensors: Complex, left: Unexplained) -> PieceModulation:
         """As above."""
         times = np.ones(len(left.white))
         times[0] = span.times  # a piece is so many times the motion, its repeats differ
         pull = np.stack(
-            [pulled(span, sensors, left.k, a, t) for a, t in zip(left.pull, times, strict=True)]
+            [
+                projected_back(span, sensors, left.k, a, t)
+                for a, t in zip(left.pull, times, strict=True)
+            ]
         )
         size = 2 * phi.size  # nothing wraps around
         phi = phi * span.alive
@@ -137,7 +143,7 @@ class Pulled:
 
     def exact(self, hz: float) -> tuple[float, int, float]:
         """Chi-square of all rows at a frequency, beyond what another constant stiffness of each
-        does, its degrees of freedom, and what is known of both phases of a swing."""
+        does, its degrees of freedom, and what is known of both phases of a modulation."""
         G, pull = self._normal([hz])
         if not G[0, 0] > ROUNDED * self.V.max():
             return 0.0, 0, 0.0
@@ -172,13 +178,13 @@ class Pulled:
         G, pull = self._normal(each)
         return np.asarray(np.linalg.lstsq(G, pull, rcond=ONE_PHASE**2)[0].T)
 
-    def without(self, hz: float) -> Pulled:
-        """The same less what a constant and a swing do at their best."""
+    def without(self, hz: float) -> PieceModulation:
+        """The same less what a constant and a modulation do at their best."""
         span, left = self.span, self.left
         forces = self.phi * (self.changes([hz]) @ np.array(self._waves([hz])))
         lines = [span.lines(span.damped(e), self.sensors, left.k) / span.times for e in forces]
         white = left.white - np.einsum("nij,rnj->rni", left.root, np.stack(lines))
-        return Pulled.of(span, self.phi, self.sensors, replace(left, white=white))
+        return PieceModulation.of(span, self.phi, self.sensors, replace(left, white=white))
 
     def added(self, changes: Float, each: Sequence[float]) -> Float:
         """(rows, samples, q) what sensors show of these, at the record's rate."""
@@ -209,7 +215,7 @@ class Pulled:
         return np.asarray((white.conj().T @ white).real)
 
 
-def pulled(span: Span, sensors: Complex, k: Int, lines: Complex, times: float) -> Float:
+def projected_back(span: Span, sensors: Complex, k: Int, lines: Complex, times: float) -> Float:
     """(M,) so that its product with a force (M,), summed up, is that of `lines` (n, q) with what
     the force adds to the lines k: `Span.lines` and `Span.damped` turned round."""
     spectrum = np.zeros((span.n // 2 + 1, lines.shape[1]), complex)
@@ -236,43 +242,48 @@ def _variance(span: Span, phi: Float, sensors: Complex, left: Unexplained) -> Fl
 
 
 @dataclass(frozen=True, slots=True)
-class Swing:
+class Modulation:
     """At one spring, where most is explained. hz : 0 for what differs from record to record. chi2,
     with `free` degrees of freedom. known : of its amplitude's square, or of its mean square. off :
-    Hz, standard deviation of its frequency. tries : independent ones at this spring, of which it
-    is the best: half the chance is that of a swing at any frequency. louder : the noise there
-    than it is told."""
+    Hz, standard deviation of its frequency. trials : independent ones at this spring, of which it
+    is the best: half the probability of a false alarm is that of a modulation at any frequency.
+    louder : the noise there than it is told."""
 
     hz: float
     chi2: float
     free: int
     known: float
-    tries: float = 2.0
+    trials: float = 2.0
     off: float = 0.0
     louder: float = 1.0
 
     @classmethod
-    def of(cls, pieces: Sequence[Pulled], f: Float, many: float) -> Swing:
+    def of(cls, pieces: Sequence[PieceModulation], f: Float, many: float) -> Modulation:
         """Of all pieces, at one frequency of f (m,) Hz, of which so many are independent, or from
         record to record."""
         hz = float(f[np.argmax(_scan(pieces, f))])
         # Where noise is louder than it is told, at the lowest lines say, it is so beside too, also
-        # without the swing, which is as wide as the motion is short.
+        # without the modulation, which is as wide as the motion is short.
         near = _scan([one.without(hz) for one in pieces], f)[(f > hz / 2) & (f < 2 * hz)]
         usual = stats.chi2.median(2 * sum(one.times.size for one in pieces))
         louder = max(float(np.median(near)) / float(usual), 1.0)
         return min(
-            cls._at(pieces, hz, 2 * many, louder), _between(pieces), key=lambda one: one.chance
+            cls._at(pieces, hz, 2 * many, louder), _between(pieces), key=lambda one: one.false_alarm
         )
 
     @classmethod
     def _at(
-        cls, pieces: Sequence[Pulled], hz: float, tries: float, louder: float, off: float = 0.0
-    ) -> Swing:
+        cls,
+        pieces: Sequence[PieceModulation],
+        hz: float,
+        trials: float,
+        louder: float,
+        off: float = 0.0,
+    ) -> Modulation:
         chi2, free, known = zip(*(one.exact(hz) for one in pieces), strict=True)
-        return cls(hz, sum(chi2) / louder, sum(free), sum(known) / 2 / louder, tries, off, louder)
+        return cls(hz, sum(chi2) / louder, sum(free), sum(known) / 2 / louder, trials, off, louder)
 
-    def closer(self, pieces: Sequence[Pulled], step: float) -> Swing:
+    def closer(self, pieces: Sequence[PieceModulation], step: float) -> Modulation:
         """The same at the best frequency within a step (Hz) of its own."""
         if not self.hz > 0:
             return self
@@ -287,7 +298,7 @@ class Swing:
         hz, half = float(found.x), step / 2
         fall = (lost(hz - half) + lost(hz + half)) / 2 - float(found.fun)
         off = half / math.sqrt(max(fall / self.louder, 1.0))
-        return self._at(pieces, hz, self.tries, self.louder, off)
+        return self._at(pieces, hz, self.trials, self.louder, off)
 
     @property
     def gain(self) -> float:
@@ -295,9 +306,9 @@ class Swing:
         return self.chi2 - self.free
 
     @property
-    def chance(self) -> float:
+    def false_alarm(self) -> float:
         """That noise makes as much at this spring."""
-        return self.tries * float(stats.chi2.sf(self.chi2, self.free)) if self.free else 1.0
+        return self.trials * float(stats.chi2.sf(self.chi2, self.free)) if self.free else 1.0
 
     @property
     def evidence(self) -> float:
@@ -306,10 +317,10 @@ class Swing:
         if not 0 < self.free < self.chi2:
             return 0.0
         added = (self.gain - self.free * math.log(self.chi2 / self.free)) / 2
-        return added - math.log(self.tries)
+        return added - math.log(self.trials)
 
 
-def uneven(pieces: Sequence[Pulled]) -> float:
+def uneven(pieces: Sequence[PieceModulation]) -> float:
     """Chi-square that a spring explains which is not the same to both sides, alike in all pieces,
     beyond another constant stiffness: it swings as the motion does."""
     found = []
@@ -321,12 +332,12 @@ def uneven(pieces: Sequence[Pulled]) -> float:
     return float(max(found))
 
 
-def _scan(pieces: Sequence[Pulled], f: Float) -> Float:
+def _scan(pieces: Sequence[PieceModulation], f: Float) -> Float:
     """Chi-square (m,) of all pieces at f (m,) Hz."""
     return np.asarray(np.sum([np.interp(f, one.f, one.chi_square()) for one in pieces], axis=0))
 
 
-def _between(pieces: Sequence[Pulled]) -> Swing:
+def _between(pieces: Sequence[PieceModulation]) -> Modulation:
     """What differs from record to record: a constant of each, but for what all have in common.
     Repeats differ by what they do not have in common."""
     P, known, times = (np.concatenate(x) for x in zip(*(one.constants() for one in pieces),
@@ -336,9 +347,9 @@ def _between(pieces: Sequence[Pulled]) -> Swing:
     common = first[seen[first]]
     free = int(np.count_nonzero(seen)) - min(len(common), 1)
     if free <= 0:
-        return Swing(0.0, 0.0, 0, 1.0)
+        return Modulation(0.0, 0.0, 0, 1.0)
     chi2 = float(np.sum(P[seen] ** 2 / known[seen]))
     if len(common):
         t = times[common]
         chi2 -= float(t @ P[common]) ** 2 / float(t**2 @ known[common])
-    return Swing(0.0, chi2, free, float(np.mean(known[seen])) * free)
+    return Modulation(0.0, chi2, free, float(np.mean(known[seen])) * free)

@@ -22,27 +22,27 @@ INNER = 8  # steps a sample: 3 % of what a force adds, halved steps a quarter of
 class Sensed:
     """A rig's partial fractions from a force to its sensors, no loop closed; as `read` has it."""
 
-    grow: Float
+    transition: Float
     by_e: Float
     direct: Float
     late: Int
 
     def of(self, e: Float) -> Float:
         """(n, q) of a force e (n INNER,) from rest."""
-        return read(e, self.grow, self.by_e, self.direct, INNER, self.late)
+        return read(e, self.transition, self.by_e, self.direct, INNER, self.late)
 
 
 @dataclass(frozen=True, slots=True)
 class Way:
     """A rig's partial fractions from commands and force to what drives the force, by exact steps.
 
-    grow, by_e : (2, n_pole) what a step makes of a state and of a force held over it, real and
-    imaginary parts; by_v (m, 2, n_pole) of each command. direct (m,), g : as `march` has them.
+    transition, by_e : (2, n_pole) what a step makes of a state and of a force held over it, real
+    and imaginary parts; by_v (m, 2, n_pole) of each command. direct (m,), g : as `march` has them.
     late : (m,) steps of dead time. own : the command in whose drive the force acts, 0 for none.
     structure : the chain's own poles.
     """
 
-    grow: Float
+    transition: Float
     by_v: Float
     by_e: Float
     direct: Float
@@ -65,17 +65,17 @@ class Way:
 
         Raises InputError as that does.
         """
-        made = realise(_widened(model, x), near=near)
+        made = realise(_augmented(model, x), near=near)
         rig = model.built
         n = len(rig.sensor)
         h = 1 / (rig.rate_hz * INNER)
-        grow, push = _steps(made.poles, h)
+        transition, push = _steps(made.poles, h)
         pairs = np.where(made.poles.imag > 0, 2.0, 1.0)
         at = model.force.place.acts_on(rig)
         by_e = made.residues[:, :n, at].T * (pairs * push)
         late = np.array([round(s.delay / h) for s in rig.sensor], np.int64)
         parts = np.ascontiguousarray(_parts(by_e))
-        sensed = Sensed(_parts(grow), parts, np.ascontiguousarray(made.direct[:n, at]), late)
+        sensed = Sensed(_parts(transition), parts, np.ascontiguousarray(made.direct[:n, at]), late)
         return cls._made(model, made, sensed, list(acting))
 
     @classmethod
@@ -88,7 +88,7 @@ class Way:
         at = place.acts_on(rig)
         on = np.any(made.residues[:, -1] != 0, axis=1)  # the others are of sensors' filters
         poles = made.poles[on]
-        grow, push = _steps(poles, h)
+        transition, push = _steps(poles, h)
         R = made.residues[on, -1] * np.where(poles.imag > 0, 2.0, 1.0)[:, None]
         D = made.direct[-1]
         if model.force.law.of_speed:  # and at once by what changes it
@@ -97,7 +97,7 @@ class Way:
         both = push[:, None] * R
         g = float(D[at] + both[:, at].real.sum())
         return cls(
-            _parts(grow), np.stack([_parts(both[:, a]) for a in acting]), _parts(both[:, at]),
+            _parts(transition), np.stack([_parts(both[:, a]) for a in acting]), _parts(both[:, at]),
             D[acting], g, late, 0 if place.own_input else acting.index(at), made.structure.poles,
             sensed,
         )  # fmt: skip
@@ -118,10 +118,10 @@ class Way:
         for j, command in enumerate(each):
             if j != self.own and command.any():
                 by_v, late = self.by_v[j], int(self.late[j])
-                others += moved(command, self.grow, by_v, float(self.direct[j]), late, INNER)
+                others += moved(command, self.transition, by_v, float(self.direct[j]), late, INNER)
         e = march(
             step,
-            self.grow,
+            self.transition,
             self.by_v[self.own],
             self.by_e,
             float(self.direct[self.own]),
@@ -141,7 +141,7 @@ class Way:
 @dataclass
 class Ways:
     """The partial fractions through which forces act, kept where each was computed first: what the
-    chain's parameters change of a force is of second order, until `renew` asks for it."""
+    chain's parameters change of a force is of second order, until `clear` asks for it."""
 
     kept: dict[str, Way] = field(default_factory=dict)
     marched: int = 0  # samples, under which forces were computed through any of them
@@ -154,33 +154,33 @@ class Ways:
         Raises SamiiRigError where it has none.
         """
         speed = str(model.force.law.of_speed)
-        key = " ".join((model.force.place.name, speed, *_beside(model)))
+        key = " ".join((model.force.place.name, speed, *_linear_keys(model)))
         if key not in self.kept:
             self.kept[key] = Way.of(model, x, self.near, self.acting)
             self.near = self.kept[key].structure
         return self.kept[key]
 
-    def renew(self) -> None:
+    def clear(self) -> None:
         """Compute all anew, where they are asked for next."""
         self.kept.clear()
 
 
-def _beside(model: ForceModel) -> list[str]:
-    return [e.key for e in model.effects if e.quasi is None]
+def _linear_keys(model: ForceModel) -> list[str]:
+    return [e.key for e in model.effects if e.force is None]
 
 
-def _widened(model: ForceModel, x: Float) -> Rig:
+def _augmented(model: ForceModel, x: Float) -> Rig:
     """The rig at x with what its force needs more."""
     values = model.values(x)
     element = tuple(valued(e, values, {}) for e in model.built.element)
-    return model.force.place.widened(model.built.model_copy(update={"element": element}))
+    return model.force.place.augmented(model.built.model_copy(update={"element": element}))
 
 
 def _steps(poles: Complex, h: float) -> tuple[Complex, Complex]:
     """What a step h makes of the state of each pole, and of an input held over it."""
-    grow = np.exp(poles * h)
+    transition = np.exp(poles * h)
     still = np.abs(poles) * h < 1e-12
-    return grow, np.where(still, h, (grow - 1) / np.where(still, 1.0, poles))
+    return transition, np.where(still, h, (transition - 1) / np.where(still, 1.0, poles))
 
 
 def _parts(x: Complex) -> Float:

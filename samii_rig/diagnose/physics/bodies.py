@@ -13,7 +13,7 @@ from samii_rig.diagnose.physics.along import Along, stretches
 from samii_rig.diagnose.physics.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.physics.fractional import Joint
 from samii_rig.diagnose.physics.points import ON_LINK
-from samii_rig.diagnose.physics.scales import PAIRS, REACH, Places, middle, spread
+from samii_rig.diagnose.physics.scales import PAIRS, RANGE, Places, middle, spread
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     BEAMS,
@@ -80,24 +80,24 @@ def _fractional(
     spring: TorsionalSpring | TranslationalSpring, forces: tuple[float, ...], w: float
 ) -> Effect:
     """A damper c s^alpha beside a spring. Its unknowns are its force over motion at w rad/s, in
-    the bounds of `forces`, and alpha: with c itself the two would hardly be told apart."""
+    the bounds of `forces`, and alpha: with c itself the two would hardly be distinguished."""
     low, high = forces
     joint = Joint(spring.name, math.sqrt(low * high) / w)
     unit = spring.k.unit.replace("/", " s^alpha/")
 
-    def told(x: Float) -> Float:
+    def reported(x: Float) -> Float:
         return np.array([x[0] / w ** x[1], x[1]])
 
     def values(x: Float, _: Values) -> dict[Key, float]:
-        return dict(zip(joint.keys, told(x).tolist(), strict=True))
+        return dict(zip(joint.keys, reported(x).tolist(), strict=True))
 
     def write(rig: Rig, x: Float) -> Rig:
-        c, alpha = told(x)
-        said = (
+        c, alpha = reported(x)
+        remark = (
             f"Found beside this rig, which has no element for it: a fractional damper at "
             f"{spring.name}, {c:.4g} {unit} with alpha = {alpha:.3g}."
         )
-        return rig.model_copy(update={"description": f"{rig.description} {said}".strip()})
+        return rig.model_copy(update={"description": f"{rig.description} {remark}".strip()})
 
     return Effect(
         physics="fractional_damping",
@@ -111,7 +111,7 @@ def _fractional(
         jump=Jump(
             f"beside {spring.name}", lambda s, x: np.asarray(x[:, :1] * (s / w) ** x[:, 1:2])
         ),
-        report=told,
+        report=reported,
         write=write,
     )
 
@@ -130,7 +130,7 @@ def _lines(rig: Rig, where: Places) -> Iterator[Effect]:
             continue
         name = f"{insert.PREFIX}line_{port}"
         scale = insert.DISPLACEMENT**2 * x  # C_h/D^2 is the compliance
-        bounds = scale / REACH[1], scale / REACH[0]
+        bounds = scale / RANGE[1], scale / RANGE[0]
 
         def values(x: Float, _: Values, name: str = name) -> dict[Key, float]:
             C_h, omega, zeta = (float(v) for v in x)
@@ -177,7 +177,7 @@ def _links(rig: Rig, where: Places) -> Iterator[Effect]:
             return np.array([x[0], stretch.position(float(x[1]))])
 
         scale = x / w**2
-        bounds = scale / REACH[1], scale / REACH[0]
+        bounds = scale / RANGE[1], scale / RANGE[0]
         yield Effect(
             physics="added_mass",
             site=e.name,

@@ -11,7 +11,7 @@ import numpy as np
 
 from samii_rig.diagnose.physics import insert
 from samii_rig.diagnose.physics.effect import Effect, Factor, Key, Unknown, Values
-from samii_rig.diagnose.physics.less import FASTER
+from samii_rig.diagnose.physics.reduced import FASTER
 from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.diagnose.physics.scales import SMALLEST
 from samii_rig.rig.schema import (
@@ -28,7 +28,7 @@ from samii_rig.types import Complex, Float
 
 Law = Callable[[Complex, Float], tuple[Complex, list[Complex]]]
 
-# Not physics: wiring, units and signs. They compete with physics and are reported apart.
+# Not physics: wiring, units and signs. They compete with physics and are reported separately.
 # Of a period at the top of the band, a delay that no bench shows; a lag of as much looks the same.
 INVISIBLE = 1e-6
 NOT_PHYSICS = tuple(row.name for row in PHYSICS.values() if not row.physical)
@@ -255,12 +255,12 @@ def _tilted(name: str) -> Iterator[Effect]:
 def _encoders(rig: Rig, sensor: RelativeAngle) -> Iterator[Effect]:
     """The encoder across other neighbours of the same source and springs."""
     order = [e.name for e in rig.element]
-    thin = [isinstance(e, (TorsionalSpring, *ANGLE_SOURCES)) for e in rig.element]
+    lengthless = [isinstance(e, (TorsionalSpring, *ANGLE_SOURCES)) for e in rig.element]
     first, last = order.index(sensor.across[0]), order.index(sensor.across[-1])
     low, high = first, last
-    while low > 0 and thin[low - 1]:
+    while low > 0 and lengthless[low - 1]:
         low -= 1
-    while high + 1 < len(order) and thin[high + 1]:
+    while high + 1 < len(order) and lengthless[high + 1]:
         high += 1
     spans = [
         tuple(order[i : j + 1])

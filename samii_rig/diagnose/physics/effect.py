@@ -95,12 +95,12 @@ class Effect:
     causal : (beam, Hz) whose loss factor it brings, and where the stiffness is as in the file.
     jump : its place and x(s), if it acts through one number; as `build` and `parameters` do.
     fractional : the damper c s^alpha that it is; `parameters` sets its two.
-    quasi : the nonlinear force that it is, if it is one; the first unknown is its strength.
+    force : the nonlinear force that it is, if it is one; the first unknown is its strength.
     write : the rig as a file would have it, from the built rig and the unknowns.
     weight : prior weight against the other hypotheses.
     report : physical quantities to be reported, from the unknowns.
-    rough : part of what it does by which its law is known to be off; 0 for one that holds.
-    variant : tells effects with one name and different changes apart.
+    rough : relative model error, the part of what it does by which its law is known to be off; 0
+    for one that holds. variant : distinguishes effects with one name and different changes.
     position : m from the site's upstream end, if it stands at one place along it; that of an
         effect with a position among its unknowns is None.
     pieces : names of what it cuts its site into, beside the one that keeps the name. They are the
@@ -117,7 +117,7 @@ class Effect:
     jump: Jump | None = None
     causal: tuple[str, float] | None = None
     fractional: Joint | None = None
-    quasi: Force | None = None
+    force: Force | None = None
     write: Callable[[Rig, Float], Rig] = lambda rig, _x: rig
     weight: float = 1.0
     aliases: tuple[tuple[str, str], ...] = field(default=())

@@ -20,7 +20,7 @@ from samii_rig.diagnose.physics.effect import Key
 from samii_rig.model.tmm import Chain
 from samii_rig.types import Complex, Float
 
-APART = 10.0  # between the two dashpots: far enough for R, near enough for both to be seen
+DASHPOT_RATIO = 10.0  # between the two dashpots: far enough for R, near enough for both to be seen
 
 
 class ChainLike(Protocol):
@@ -119,7 +119,7 @@ class FractionalChain:
         inner = [k for k in wrt if k not in self._joint.keys]
         a, da = self._at(0.0, s, inner)
         g, dg, xs = [], [], []
-        for share in (APART**-0.5, APART**0.5):
+        for share in (DASHPOT_RATIO**-0.5, DASHPOT_RATIO**0.5):
             more = share * self._joint.dashpot
             H, dH = self._at(more, s, inner)
             x = (more * s)[:, None, None]

@@ -22,7 +22,7 @@ ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smoo
 # Aliases that are computed at every frequency, as a mode in one may be sharp, and that a factor on
 # a channel changes.
 NEAR = (-1, 1, -2, 2)
-LIVE = 2  # of them, those of each model itself where that shows: modes are seldom above 1.5 rates
+OWN = 2  # of them, those of each model itself where that shows: modes are seldom above 1.5 rates
 # Aliases beyond those, each by itself at a few frequencies, as a factor changes each otherwise:
 # what it leaves of them is smooth between. Behind the last of `FAR` every term falls as the one
 # before it did; up to the last of all a delay is 7e-5 of the largest off, and 2e-3 without any.
@@ -72,7 +72,7 @@ class JointLoops:
 
     gain: Float
 
-    def _apart(self, H: Complex) -> Complex:
+    def _by_input(self, H: Complex) -> Complex:
         """(n, q, m, ...) of entries (n, q m, ...)."""
         m, q = self.gain.shape
         return H.reshape(len(H), q, m, *H.shape[2:])
@@ -84,7 +84,7 @@ class JointLoops:
     def part(self, H: Complex, b: Complex) -> tuple[Complex, Complex]:
         """As of `Loop`. A part is of rank one, B = u w^T. By Sherman and Morrison H + B x becomes,
         closed, H S + (I - H S K) B S x/(1 + tr(S K B) x)."""
-        G, B = self._apart(H), self._apart(b)
+        G, B = self._by_input(H), self._by_input(b)
         S = self._sensitivity(G)
         BS = B @ S
         turned = BS - G @ S @ (self.gain @ BS)
@@ -93,20 +93,20 @@ class JointLoops:
 
     def closed(self, H: Complex) -> Complex:
         """(n, q m) to the references from those to the commands."""
-        G = self._apart(H)
+        G = self._by_input(H)
         return np.asarray((G @ self._sensitivity(G)).reshape(H.shape))
 
     def slopes(self, H: Complex, dH: Complex) -> Complex:
         """(n, q m, k) derivatives of `closed`: (I - H S K) dH S."""
-        G = self._apart(H)
+        G = self._by_input(H)
         S = self._sensitivity(G)
-        own = np.moveaxis(self._apart(dH), 3, 1) @ S[:, None]
+        own = np.moveaxis(self._by_input(dH), 3, 1) @ S[:, None]
         out = own - (G @ S)[:, None] @ (self.gain @ own)
         return np.asarray(np.moveaxis(out, 1, 3).reshape(dH.shape))
 
     def around(self, H: Complex, every: Complex) -> Complex:
         """As of `Loop`: (I + H K)^-1 = I - H S K."""
-        return np.asarray(every - self._apart(H) @ (self.gain @ every))
+        return np.asarray(every - self._by_input(H) @ (self.gain @ every))
 
 
 Closed = Loop | JointLoops
@@ -164,7 +164,8 @@ class Grid:
 
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
     folded : (order, n, q) of these the ones of `NEAR`, or none. far : of these those beyond.
-    live : (`LIVE`, n, q) hold, filters and delays of the first of `folded`, if every model has its
+    own_aliases : (`OWN`, n, q) hold, filters and delays of the first of `folded`, if every model
+    has its
         own there; None where those of one chain are near enough.
     rate_hz : of the samples.
     sensor, actuator : (q,) entries. loop : closed around them, if responses are to the references.
@@ -181,7 +182,7 @@ class Grid:
     sigma: float | Float = field(default=0.0, kw_only=True)
     loop: Closed | None = field(default=None, kw_only=True)
     far: Far | None = field(default=None, kw_only=True)
-    live: Complex | None = field(default=None, kw_only=True)
+    own_aliases: Complex | None = field(default=None, kw_only=True)
 
     @property
     def changed(self) -> slice:
@@ -200,32 +201,32 @@ class Grid:
         return Grid(
             frequency, self.factor[i], self.aliases[i], self.folded[:, i], self.rate_hz,
             self.sensor, self.actuator, sigma=self.sigma, loop=self.loop, far=self.far,
-            live=None if self.live is None else self.live[:, i],
+            own_aliases=None if self.own_aliases is None else self.own_aliases[:, i],
         )  # fmt: skip
 
     def without_aliases(self) -> Grid:
         """The same of the rig before it is sampled, no loop closed."""
         none = np.zeros((0, *self.factor.shape), complex)
-        bare = np.zeros_like(self.factor)
-        return replace(self, aliases=bare, folded=none, far=None, live=None, loop=None)
+        nothing = np.zeros_like(self.factor)
+        return replace(self, aliases=nothing, folded=none, far=None, own_aliases=None, loop=None)
 
     def asked(self) -> Complex:
         """s at which a model's chain is asked: of the grid, and of its own aliases behind."""
-        own = () if self.live is None else NEAR[:LIVE]
+        own = () if self.own_aliases is None else NEAR[:OWN]
         return np.concatenate([self.s, *(_upper(self.s, k, self.rate_hz) for k in own)])
 
-    def apart(self, answers: Complex) -> list[Complex]:
+    def by_alias(self, answers: Complex) -> list[Complex]:
         """Answers there, as rows, of the grid and of each of these aliases."""
-        return np.split(answers, 1 if self.live is None else 1 + LIVE)
+        return np.split(answers, 1 if self.own_aliases is None else 1 + OWN)
 
-    def told(self, answers: Complex) -> tuple[Complex, Complex]:
+    def response_and_folded(self, answers: Complex) -> tuple[Complex, Complex]:
         """Answers (n ..., q) there as those of the grid (n, q), and what folds back
         (order, n, q): of the chain itself where it was asked."""
-        G, *terms = self.apart(answers)
-        if self.live is None:
+        G, *terms = self.by_alias(answers)
+        if self.own_aliases is None:
             return G, self.folded
-        own = [_lower(t, k) * f for t, k, f in zip(terms, NEAR, self.live, strict=False)]
-        return G, np.concatenate([np.stack(own), self.folded[LIVE:]])
+        own = [_lower(t, k) * f for t, k, f in zip(terms, NEAR, self.own_aliases, strict=False)]
+        return G, np.concatenate([np.stack(own), self.folded[OWN:]])
 
     def orders(self) -> list[Complex]:
         """s (n,) of each order of `folded`."""
@@ -300,12 +301,12 @@ def grid(
     sigma: float = 0.0,
     loop: Closed | None = None,
     aliases: Callable[[Chain, Float], Aliases] | None = None,
-    live: bool = False,
+    own_aliases: bool = False,
 ) -> Grid:
     """The grid of a rig at sorted frequencies, Hz. chain : whose aliases these are, if they are
     not the rig's own. sigma : 1/s, how far beside the imaginary axis.
     loop : closed around the entries. aliases : of a chain at a few frequencies, where they may be
-    known from before. live : whether every model folds back what is its own."""
+    known from before. own_aliases : whether every model folds back what is its own."""
     f = np.unique(frequency)
     few = np.geomspace(f[f > 0][0], f[-1], min(ALIAS_POINTS, f.size))
     few[-1] = f[-1]
@@ -316,12 +317,12 @@ def grid(
     every = made.spread(s, rig.rate_hz) + folded.sum(axis=0)
     factor = _around(rig, s, sensor, actuator)
     own: Complex | None = None
-    if live:
-        upper = [(_upper(s, k, rig.rate_hz), k) for k in NEAR[:LIVE]]
+    if own_aliases:
+        upper = [(_upper(s, k, rig.rate_hz), k) for k in NEAR[:OWN]]
         own = np.stack([_lower(_around(rig, u, sensor, actuator), k) for u, k in upper])
     return Grid(
         f, factor, every, folded, rig.rate_hz, sensor, actuator,
-        sigma=sigma, loop=loop, far=made.far, live=own,
+        sigma=sigma, loop=loop, far=made.far, own_aliases=own,
     )  # fmt: skip
 
 
@@ -445,7 +446,7 @@ class Model:
     def response(self, x: Float, at: Grid) -> Complex:
         """(n, q) at the grid's frequencies."""
         chain = self.chain.with_values(self.values(x))
-        G, folded = at.told(chain.evaluate(at.asked())[:, at.sensor, at.actuator])
+        G, folded = at.response_and_folded(chain.evaluate(at.asked())[:, at.sensor, at.actuator])
         factor, aliases = _through(at, folded, *self._passed(x, at))
         H = np.asarray(G * factor + aliases)
         return H if at.loop is None else at.loop.closed(H)
@@ -456,14 +457,14 @@ class Model:
         keys = tuple(values)
         chain = self.chain.with_values(values)
         every, slopes = chain.gradient_at(at.asked(), keys)
-        G, folded = at.told(every[:, at.sensor, at.actuator])
+        G, folded = at.response_and_folded(every[:, at.sensor, at.actuator])
         near, beyond = self._passed(x, at)
         factor, aliases = _through(at, folded, near, beyond)
-        own, *folds = at.apart(slopes[:, at.sensor, at.actuator])
+        own, *folds = at.by_alias(slopes[:, at.sensor, at.actuator])
         dG = own * factor[:, :, None]
         for i, (k, d) in enumerate(zip(NEAR, folds, strict=False)):
-            assert at.live is not None
-            passed = at.live[i] if near is None else at.live[i] * near.F[1 + i]
+            assert at.own_aliases is not None
+            passed = at.own_aliases[i] if near is None else at.own_aliases[i] * near.F[1 + i]
             dG += _lower(d, k) * passed[:, :, None]
         dH = np.zeros((*G.shape, self.n), complex)
         n = self.n_nominal

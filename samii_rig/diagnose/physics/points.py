@@ -19,7 +19,7 @@ from samii_rig.diagnose.physics import insert
 from samii_rig.diagnose.physics.along import Along, stretches
 from samii_rig.diagnose.physics.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.physics.insert import DISPLACEMENT, VOLUME
-from samii_rig.diagnose.physics.scales import PAIRS, REACH, SMALLEST, Places, middle, spread
+from samii_rig.diagnose.physics.scales import PAIRS, RANGE, SMALLEST, Places, middle, spread
 from samii_rig.model.tmm import State
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
@@ -94,13 +94,13 @@ class Point:
         match self.law:
             case "softness" | "column" | "slip":
                 scale = 1 / x if self.law != "slip" else 1 / (x * w)
-                low, high = (scale * r for r in REACH)
+                low, high = (scale * r for r in RANGE)
                 if self.law == "column":  # C_h/D^2 is the compliance
                     return DISPLACEMENT**2 / high, DISPLACEMENT**2 / low
                 return low, high
             case "spring" | "damper" | "mass":
                 scale = x / w ** ("spring", "damper", "mass").index(self.law)
-                return scale / REACH[1], scale / REACH[0]
+                return scale / RANGE[1], scale / RANGE[0]
 
     def unknowns(self, x: float, w: float) -> tuple[Unknown, ...]:
         """The strong one, and the loss over it."""

@@ -11,7 +11,7 @@ class Physics:
 
     name : in the contract. words : for a person. hidden : what a person asks for first, where any
     of it could hide, (a part, a part under a size); () for what nobody asks. soft : the larger its
-    number, the less of it. physical : not wiring, units or signs, which are told apart.
+    number, the less of it. physical : not wiring, units or signs, which are reported separately.
     resonant : it acts in a narrow band that may be anywhere.
     """
 

@@ -19,7 +19,7 @@ from samii_rig.types import Complex, Float
 PAIRS: tuple[tuple[State, State], ...] = (("theta", "M"), ("w", "V"), ("V", "w"), ("M", "theta"))
 STATES: tuple[State, ...] = ("w", "theta", "M", "V")
 POINTS = 60
-REACH = (1e-3, 1e5)  # of a stiffness or damping over the chain's own, from gross to invisible
+RANGE = (1e-3, 1e5)  # of a stiffness or damping over the chain's own, from gross to invisible
 SMALLEST = 1e-5  # part of what is there; the data of no bench show less
 
 

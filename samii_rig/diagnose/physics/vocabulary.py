@@ -1,7 +1,7 @@
 """The table of physics: what may have been left out of a rig file, as data.
 
 Parts at a point are rows of `points`, changes of what the chain is made of are in `bodies`, what a
-rig has less of in `less`, factors in `channels`, what is no physics in `mistakes`. A lab adds
+rig has less of in `reduced`, factors in `channels`, what is no physics in `faults`. A lab adds
 effects by the entry point `samii_rig.effects`.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from importlib.metadata import entry_points
 
 from samii_rig.devices.plugins import asked, named, wrong
-from samii_rig.diagnose.physics import bodies, channels, less, mistakes, points
+from samii_rig.diagnose.physics import bodies, channels, faults, points, reduced
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.scales import places
 from samii_rig.rig.schema import Rig
@@ -36,9 +36,9 @@ def hypotheses(
     return [
         *points.effects(rig, where),
         *bodies.effects(rig, where),
-        *less.effects(rig, between=signed),
+        *reduced.effects(rig, between=signed),
         *channels.effects(rig, low_hz, high_hz),
-        *mistakes.effects(rig, recorded_hz or rig.rate_hz),
+        *faults.effects(rig, recorded_hz or rig.rate_hz),
         *plugged(rig, low_hz, high_hz),
     ]
 

@@ -30,7 +30,7 @@ def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> t
     """The physics of a class's first member. Each has its own marginal probability, or that of
     the whole class where it is given."""
     first = chosen.first
-    values = values_of(chosen, judged.inflation)
+    values = values_of(chosen, judged.overdispersion)
     out = []
     for effect, found in zip(first.effects, values, strict=True):
         if not effect.physical or unit_of(effect, found):
@@ -40,7 +40,7 @@ def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> t
         if p is None:
             p = sum(
                 q
-                for c, q in zip(judged.classes, judged.shares, strict=True)
+                for c, q in zip(judged.classes, judged.probabilities, strict=True)
                 if any(n in same for e in c.first.effects for n in e.names)
             )
         equivalents = tuple(n for n in chosen.equivalents(effect))
@@ -78,11 +78,11 @@ def moved(fitted: Fitted) -> tuple[Moved, ...]:
     return tuple(sorted(out, key=lambda m: -abs(m.sigmas)))
 
 
-def told(judged: Judgement) -> list[str]:
+def not_physics_of(judged: Judgement) -> list[str]:
     """Findings of the chosen explanation that are not physics, in words."""
     out = []
     best = judged.best
-    values = values_of(judged.classes[0], judged.inflation)
+    values = values_of(judged.classes[0], judged.overdispersion)
     for effect, found in zip(best.effects, values, strict=True):
         unit = unit_of(effect, found)
         match effect.physics:
@@ -119,7 +119,7 @@ def told(judged: Judgement) -> list[str]:
 
 
 def sites(judged: Judgement) -> list[tuple[str, float]]:
-    """Probability of each site over all explanations and what they are not told apart from, the
+    """Probability of each site over all explanations and what they are not distinguished from, the
     most probable first. Sites of what was chosen are there however improbable."""
     if judged.varies is not None:
         return [(s, p) for s, p in judged.varies.sites if p >= SHOWN]

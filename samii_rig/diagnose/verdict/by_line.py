@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from samii_rig.diagnose.fit.agreeing import Apart, lines_apart
+from samii_rig.diagnose.fit.agreeing import SeveralStates, several_states_of_lines
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.usual import LINES_TAKE, takes
 from samii_rig.diagnose.result import Diagnosis, Used
 from samii_rig.diagnose.verdict import answer
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.force_words import distorted
-from samii_rig.diagnose.verdict.stages import Case, Shown, of_states, told
+from samii_rig.diagnose.verdict.stages import Case, Shown, diagnosis_of, of_states
 
 DIFFER = (
     "levels differ; give the recordings: friction, play, hardening and the like are told from "
@@ -27,20 +27,20 @@ def by_lines(case: Case) -> Diagnosis:
     search, show = case.search, case.show
     nominal = search.nominal.fitted
     first, bands = search.ratio(nominal), answer.bands(search, nominal)
-    torn = search.lines.torn()
+    level_dependent = search.lines.depends_on_level()
     search.begin("what is missing", takes(LINES_TAKE, case.lines.n) if case.runs else None)
-    search.run(briefly=torn)
-    search.begin("what cannot be told apart")
+    search.run(briefly=level_dependent)
+    search.begin("what cannot be distinguished")
     judged = verdict.judge(search, case.decide)
     nominal, best = search.nominal.fitted, judged.best
     there = search.grid.at(show.frequency, show.level)
     plain, after = (f.model.response(f.x, there) for f in (nominal, best.fitted))
     gap, due = answer.gap(show, plain, after), answer.due_there(show, plain, after)
     judged = verdict.shown(judged, gap, due)
-    if torn:
+    if level_dependent:
         judged = replace(judged, verdict="unknown")
-    apart = _states(case)
-    for one in apart:
+    several = _states(case)
+    for one in several:
         judged = verdict.of_several_states(judged, one.part)
     shown = Shown(
         first=first,
@@ -52,15 +52,17 @@ def by_lines(case: Case) -> Diagnosis:
         used=Used(case.lines.n, sum(r.frequency.size for r in case.responses)),
     )
     clean = case.clean
-    said = (DIFFER, *distorted(case.responses)) if torn else ()
-    if clean.doubt is None and clean.guessed is not None:
-        found = told(case, search, judged, shown, (*said, clean.guessed.why), clean.guessed)
+    remarks = (DIFFER, *distorted(case.responses)) if level_dependent else ()
+    if clean.refusal is None and clean.guessed is not None:
+        found = diagnosis_of(
+            case, search, judged, shown, (*remarks, clean.guessed.why), clean.guessed
+        )
     else:
-        found = told(case, search, judged, shown, said, clean.doubt)
-    return of_states(found, apart)
+        found = diagnosis_of(case, search, judged, shown, remarks, clean.refusal)
+    return of_states(found, several)
 
 
-def _states(case: Case) -> list[Apart]:
+def _states(case: Case) -> list[SeveralStates]:
     """The states that files of responses are of, where they are of more than one."""
     if len(case.files) < 2:
         return []
@@ -70,5 +72,5 @@ def _states(case: Case) -> list[Apart]:
     at = search.grid.at(lines.frequency, lines.level)
     chi2 = float(np.sum(lines.chi_square(fitted.model.response(fitted.x, at))))
     left = chi2 - float(np.sum(lines.expected))
-    apart = lines_apart(case.files, lines, left, search.rig)
-    return [] if apart is None else [apart]
+    several = several_states_of_lines(case.files, lines, left, search.rig)
+    return [] if several is None else [several]

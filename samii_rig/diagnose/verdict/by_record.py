@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.measured import DIFFER
-from samii_rig.diagnose.fit.agreeing import Given, states_apart
+from samii_rig.diagnose.fit.agreeing import Given, several_states
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
 from samii_rig.diagnose.fit.explanations import threshold
@@ -17,10 +17,10 @@ from samii_rig.diagnose.forces.variation import Variation, uneven_spring, variat
 from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
-from samii_rig.diagnose.verdict.stages import Case, Shown, of_states, told
+from samii_rig.diagnose.verdict.stages import Case, Shown, diagnosis_of, of_states
 from samii_rig.errors import EstimateError, SamiiRigError
 
-SPENT = (
+EXHAUSTED = (
     "not every force that may act was computed to the end, as the records are long; fewer of them "
     "or a narrower band would let it"
 )
@@ -30,7 +30,7 @@ MORE = 5.0  # standard deviations of chi-square beyond which it is more than noi
 def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | None:
     """The search on whole records, where they can be used as they are."""
     clean = case.clean
-    if not case.runs or clean.mended or clean.doubt:
+    if not case.runs or clean.mended or clean.refusal:
         return None
     try:
         whole = Whole.of(case.runs, case.search.rig, band, clean.sensors, clean.samples)
@@ -50,7 +50,9 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     search.begin("amplitude levels")
     forces = forces_on(search)
     forced = _winning(forces)
-    if forced is None or _may_be_linear(forced, torn=case.search.lines.torn()):
+    if forced is None or _may_be_linear(
+        forced, level_dependent=case.search.lines.depends_on_level()
+    ):
         search.begin("what is missing, in pairs")
         single = search.ranked()[0].key
         search.run()
@@ -58,14 +60,14 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         if forced is not None and search.ranked()[0].key != single:
             forces = forces_on(search)
             forced = _winning(forces)
-    search.begin("what cannot be told apart")
+    search.begin("what cannot be distinguished")
     if forced is None:
         looked = _consistent(search, _looked(search))
     else:
         first, bands = _at_first(forced)
         looked = _looked(forced)
-        if forced.spent:
-            looked = replace(looked, said=(*looked.said, SPENT))
+        if forced.exhausted:
+            looked = replace(looked, remarks=(*looked.remarks, EXHAUSTED))
     if forces is not None:
         search.begin("whether stiffnesses are constant")
         looked = _constant(forces, forced or search, looked, len(case.runs))
@@ -83,8 +85,8 @@ def _not_explained(judged: Judgement, forced: ForceSearch | None) -> bool:
     """Whether all that was tried leaves much of the mismatch, and more than noise. A force that is
     told all the same keeps its answer: it is told by how levels differ, and no response that is
     the same at all of them does that."""
-    told = forced is not None and judged.verdict in verdict.SAID
-    return judged.partly and judged.varies is None and not told
+    by_force = forced is not None and judged.verdict in verdict.WITH_CAUSES
+    return judged.partly and judged.varies is None and not by_force
 
 
 def by_samples(
@@ -97,8 +99,8 @@ def by_samples(
 ) -> Diagnosis:
     """The answer, once all linear explanations of the records were tried. first, bands : what the
     refitted nominal model left before, in all and by band. given : the recordings that are taken
-    for those of one state, for each; left : as of `states_apart`."""
-    search.begin("what cannot be told apart")
+    for those of one state, for each; left : as of `several_states`."""
+    search.begin("what cannot be distinguished")
     looked = _consistent(search, _looked(search))
     return _agreeing(case, search, first, bands, looked, given, left)
 
@@ -114,31 +116,31 @@ def _agreeing(
 ) -> Diagnosis:
     """The answer, with what the recordings of one state differ by, where they are of several."""
     # What was found to differ from record to record is what they do not agree in.
-    between = looked.judged.verdict in verdict.SAID and looked.judged.between
+    between = looked.judged.verdict in verdict.WITH_CAUSES and looked.judged.between
     if not between and any(len(one.runs) > 1 for one in given):
         search.begin("whether the recordings agree")
-    apart = [] if between else states_apart(given, left)
-    for one in apart:
+    several = [] if between else several_states(given, left)
+    for one in several:
         looked = replace(looked, judged=verdict.of_several_states(looked.judged, one.part))
-    return of_states(_answer(case, search, first, bands, looked), apart)
+    return of_states(_answer(case, search, first, bands, looked), several)
 
 
 @dataclass(frozen=True, slots=True)
 class _Looked:
-    """What was judged, with chi-square per degree of freedom on the lines kept apart by the nominal
+    """What was judged, with chi-square per degree of freedom on the test lines by the nominal
     model and with the causes, the gap closed there, and what else there is to say."""
 
     judged: Judgement
     plain: float
     after: float
     gap: Gap
-    said: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
 
 def _looked(search: RecordSearch) -> _Looked:
     judged = verdict.judge(search)
     plain, after, gap = search.shown(search.nominal.fitted, judged.best.fitted)
-    if any(e.quasi is not None for e in judged.best.effects) and gap.low > 0:
+    if any(e.force is not None for e in judged.best.effects) and gap.low > 0:
         # Computed in time, and seen on lines that it was not fitted to.
         judged = verdict.confirmed(judged)
     judged = verdict.shown(judged, gap, judged.evidence.drop / (TURN - 1))
@@ -170,8 +172,8 @@ def _answer(
     if isinstance(varies := looked.judged.varies, Variation):
         shown = replace(shown, with_causes=varies.after)
     of_lines = case.clean.of_lines
-    clean = replace(case.clean, told=tuple(w for w in case.clean.told if w not in of_lines))
-    return told(replace(case, clean=clean), search, looked.judged, shown, looked.said)
+    clean = replace(case.clean, remarks=tuple(w for w in case.clean.remarks if w not in of_lines))
+    return diagnosis_of(replace(case, clean=clean), search, looked.judged, shown, looked.remarks)
 
 
 def _of_lengths(
@@ -195,7 +197,7 @@ def _of_lengths(
         used=search.used(),
     )
     looked = _Looked(verdict.judge(freed), plain, after, gap)
-    found = told(case, freed, looked.judged, shown)
+    found = diagnosis_of(case, freed, looked.judged, shown)
     measured = " and ".join(one.parameter for one in wrong)
     which = "this number does" if len(wrong) == 1 else "these numbers do"
     return replace(
@@ -219,11 +221,12 @@ def forces_on(search: RecordSearch) -> ForceSearch | None:
         return None
 
 
-def _may_be_linear(forced: ForceSearch, *, torn: bool) -> bool:
+def _may_be_linear(forced: ForceSearch, *, level_dependent: bool) -> bool:
     """Whether pairs of linear effects may do what the best explanation with a force does: beside a
-    linear effect a part that never slips is a spring. torn : no linear response explains all."""
+    linear effect a part that never slips is a spring. level_dependent : no linear response explains
+    all."""
     real = [e for e in forced.ranked()[0].effects if e.physical]
-    return len(real) > 1 or not (torn or forced.is_enough())
+    return len(real) > 1 or not (level_dependent or forced.is_enough())
 
 
 def _winning(forces: ForceSearch | None) -> ForceSearch | None:
@@ -239,29 +242,29 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
     judged = looked.judged
     base = verdict.as_meant(forces, judged.best)
     own = verdict.as_meant(search, judged.best)
-    # At the noise itself: while a mismatch is gross all weights are smaller, a variation's not.
+    # At the noise itself: while a mismatch is large all weights are smaller, a variation's not.
     rival = max(judged.best.weight - own.weight, (own.fitted.cost - judged.best.fitted.cost) / 2)
     linear = _is_linear(judged)
     sides = None if linear else uneven_spring(forces, base)
     if sides is not None and sides.chi2 / 2 > rival:
         unknown = replace(judged, verdict="unknown")
-        return replace(looked, judged=unknown, said=(*looked.said, sides.told()))
+        return replace(looked, judged=unknown, remarks=(*looked.remarks, sides.describe()))
     found = None if linear else variation(forces, base, files)
     if found is not None and found.evidence > rival:
         varies = verdict.varying(judged, own, found, max(rival, 0.0))
-        return _Looked(varies, found.before[1], found.after[1], found.gap, looked.said)
+        return _Looked(varies, found.before[1], found.after[1], found.gap, looked.remarks)
     if judged.best.effects and judged.best.key != base.key:
         beside = variation(forces, judged.best, files)
         if beside is not None and beside.closed >= verdict.PARTLY:
-            return replace(looked, said=(*looked.said, beside.told()))
+            return replace(looked, remarks=(*looked.remarks, beside.describe()))
     return looked
 
 
 def _is_linear(judged: Judgement) -> bool:
     """Whether a linear response is told and leaves no more than noise: what varies is then beside
-    it. Swings of any phase in every record would do the work of such a response, too."""
-    linear = all(e.quasi is None for e in judged.best.effects)
-    return linear and judged.verdict in verdict.SAID and not judged.partly
+    it. Modulations of any phase in every record would do the work of such a response, too."""
+    linear = all(e.force is None for e in judged.best.effects)
+    return linear and judged.verdict in verdict.WITH_CAUSES and not judged.partly
 
 
 def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
@@ -270,11 +273,11 @@ def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
     left, sd = search.inconsistent()
     if left < 1 + MORE * sd:
         return looked
-    said = (
+    remarks = (
         f"the records disagree: chi-square per degree of freedom {left:.3g} of what no linear "
         "model can explain, so something depends on amplitude or changed between runs",
     )
     judged = looked.judged
     if judged.verdict == "no_mismatch" or left > DIFFER:
         judged = replace(judged, verdict="unknown")
-    return replace(looked, judged=judged, said=said)
+    return replace(looked, judged=judged, remarks=remarks)

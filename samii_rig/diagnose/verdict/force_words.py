@@ -23,7 +23,7 @@ def distorted(responses: Sequence[FrequencyResponse]) -> list[str]:
 
 def next_levels(judged: Judgement) -> tuple[str, str, None] | None:
     """(why, experiment), of unknown gain, where a force is among the leading explanations."""
-    leading = [e for c in judged.classes[:2] for e in c.first.effects if e.quasi is not None]
+    leading = [e for c in judged.classes[:2] for e in c.first.effects if e.force is not None]
     if judged.verdict == "no_mismatch" or not leading:
         return None
     if judged.verdict == "named":

@@ -19,28 +19,28 @@ from samii_rig.errors import SamiiRigError
 from samii_rig.types import Float
 
 FOUND = 0.9  # probability with which an effect of the size that is told would have been found
-Looks = tuple[Screen, Screen]  # without directions projected out, and with
+Screens = tuple[Screen, Screen]  # without directions projected out, and with
 TRIES = 16  # strengths over the range of an effect, log-spaced, for one that is weak
 
 
 def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
     """Of each physics and site, beside what was found, the smallest that would have been seen."""
-    look = Screen.of(search.problem, best.fitted).of_data()
-    looks = look.bare(), look
-    needed = math.sqrt(search.worth * search.temperature) + float(stats.norm.ppf(FOUND))
+    screen = Screen.of(search.problem, best.fitted).of_data()
+    screens = screen.unprojected(), screen
+    needed = math.sqrt(search.critical_value * search.overdispersion) + float(stats.norm.ppf(FOUND))
     found: dict[tuple[str, str], Hiding] = {}
     taken = {e.key for e in best.effects}
     for effect in search.table:
-        plain = effect.unknowns and effect.quasi is None and effect.physical
+        plain = effect.unknowns and effect.force is None and effect.physical
         if plain and effect.key not in taken and effect.name not in found:
-            seen = _smallest(search, best, looks, effect, needed)
+            seen = _smallest(search, best, screens, effect, needed)
             if seen is not None:
                 found[effect.name] = seen
     return tuple(found.values())
 
 
 def _smallest(
-    search: Explanations, best: Explanation, looks: Looks, effect: Effect, needed: float
+    search: Explanations, best: Explanation, screens: Screens, effect: Effect, needed: float
 ) -> Hiding | None:
     """Where noise units reach what is needed. What a refit leaves grows with a weak strength, or
     with its inverse, in proportion: so far as a refit bends, this is exact for what is weak."""
@@ -49,7 +49,7 @@ def _smallest(
     middle = [u.starts[len(u.starts) // 2] for u in others]
     values = np.column_stack([strength, np.tile(middle, (TRIES, 1))])
     with np.errstate(all="ignore"):
-        changed = _changed(search, best, looks, effect, values)
+        changed = _changed(search, best, screens, effect, values)
     if changed is None:
         return None
     before, left = (np.sqrt(np.maximum(x, 0.0)) for x in changed)
@@ -64,29 +64,29 @@ def _smallest(
 
 
 def _changed(
-    search: Explanations, best: Explanation, looks: Looks, effect: Effect, values: Float
+    search: Explanations, best: Explanation, screens: Screens, effect: Effect, values: Float
 ) -> tuple[Float, Float] | None:
     """Chi-square (m,) of what an effect with unknowns (m, k) changes: all of it, and what a refit
     leaves; None where the rig does not allow it."""
-    bare, look = looks
-    linear = all(e.quasi is None for e in best.effects)
+    unprojected, screen = screens
+    linear = all(e.force is None for e in best.effects)
     if linear and effect.jump is not None:
         k = values.shape[1] - effect.jump.fixed
         fixed = tuple(values[0, k:].tolist())
-        place = place_at(look, best.effects, effect, search.model, fixed)
+        place = place_at(screen, best.effects, effect, search.model, fixed)
         if place is None:
             return None
-        b, phi = place.b, place.phi(effect.jump.x(look.s, values))
+        b, phi = place.b, place.phi(effect.jump.x(screen.s, values))
     elif linear and effect.factor is not None:
-        b, law = look.factor(effect)
+        b, law = screen.factor(effect)
         phi = law(values)
     else:
-        return _with_model(search, best, looks, effect, values)
-    return bare.form(b).cost(phi), look.form(b).cost(phi)
+        return _with_model(search, best, screens, effect, values)
+    return unprojected.form(b).cost(phi), screen.form(b).cost(phi)
 
 
 def _with_model(
-    search: Explanations, best: Explanation, looks: Looks, effect: Effect, values: Float
+    search: Explanations, best: Explanation, screens: Screens, effect: Effect, values: Float
 ) -> tuple[Float, Float] | None:
     model = search.model((*best.effects, effect))
     if model is None:
@@ -96,7 +96,7 @@ def _with_model(
     for i, value in enumerate(values):
         x = np.append(known, np.log(value))
         try:
-            out[:, i] = [float(np.sum(at.left_with(model, x) ** 2)) for at in looks]
+            out[:, i] = [float(np.sum(at.residual_with(model, x) ** 2)) for at in screens]
         except SamiiRigError:
             continue
     return None if np.all(np.isnan(out)) else (out[0], out[1])

@@ -26,7 +26,7 @@ MOSTLY = 0.5  # of the mismatch; one cause that explains it is told whatever els
 MOST_NAMES = 4  # of a class; more is no answer
 MUST_SHOW = 900.0  # of chi-square, that an effect explains of the data: 30 noise units
 PARTLY = 0.9  # of the mismatch: effects that leave more of it, and more than noise, are not named
-SAID = ("named", "ambiguous")  # verdicts that come with causes
+WITH_CAUSES = ("named", "ambiguous")  # verdicts that come with causes
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class Judgement:
         probabilities are among what was looked at.
 
     nothing : probability of nothing missing. right : that the chosen explanation is right, up to
-        its class, by its evidence. inflation : factor on covariances for what it leaves.
+        its class, by its evidence. overdispersion : factor on covariances for what it leaves.
     varies : a stiffness that is not constant, where that explains the data better than all classes;
     the place is then its own.
     partly : whether the effects leave much of the mismatch, and more than noise.
@@ -46,7 +46,7 @@ class Judgement:
     nothing: float
     right: float
     evidence: Evidence
-    inflation: float
+    overdispersion: float
     varies: Variation | Changing | None = None
     partly: bool = False
 
@@ -61,11 +61,11 @@ class Judgement:
         return self.varies is not None and "spread" in self.varies.parameters
 
     @property
-    def shares(self) -> tuple[float, ...]:
+    def probabilities(self) -> tuple[float, ...]:
         """Probability of each class; what is left to one is of what was not looked at."""
-        return self._shared(self.right)
+        return self._probabilities(self.right)
 
-    def _shared(self, first: float) -> tuple[float, ...]:
+    def _probabilities(self, first: float) -> tuple[float, ...]:
         """Of each class, where that of the first is known."""
         if self.varies is not None:
             total = sum(c.probability for c in self.classes)
@@ -78,13 +78,13 @@ class Judgement:
 
     @property
     def placed(self) -> tuple[float, ...]:
-        """As `shares`, that each class's sites are right, whatever the physics there."""
-        return self._shared(probability(self.evidence, PLACE))
+        """As `probabilities`, that each class's sites are right, whatever the physics there."""
+        return self._probabilities(probability(self.evidence, PLACE))
 
     @property
     def outside(self) -> float:
         """Probability of something that was not looked at."""
-        return max(0.0, 1 - sum(self.shares))
+        return max(0.0, 1 - sum(self.probabilities))
 
 
 def judge(search: Search, decide: Measured | None = None) -> Judgement:
@@ -92,34 +92,34 @@ def judge(search: Search, decide: Measured | None = None) -> Judgement:
 
     decide : lines that took no part in the fit, on which the best explanation must hold too.
     """
-    thin = _thin(search)
+    insignificant = _insignificant(search)
     for key, e in search.found.items():
-        search.found[key] = replace(e, fitted=e.fitted.roughly())
-    kept = [e for e in search.ranked() if e.key not in thin and search.holds(e)]
+        search.found[key] = replace(e, fitted=e.fitted.with_model_error())
+    kept = [e for e in search.ranked() if e.key not in insignificant and search.holds(e)]
     ranked = _decided(search, decide, kept) if decide is not None else kept
     weights = np.array([e.weight for e in ranked])
     p = np.exp(weights - np.max(weights))
-    grouped = classes(ranked, (p / p.sum()).tolist(), search.problem, search.temperature)
+    grouped = classes(ranked, (p / p.sum()).tolist(), search.problem, search.overdispersion)
     nothing = sum(c.probability for c in grouped if not c.first.effects)
     ordered = tuple(_chosen_first(grouped, nothing))
     evidence = _evidence(search, ordered, ranked, decide)
-    said = _verdict(ordered[0], evidence, search, decide)
+    verdict = _verdict(ordered[0], evidence, search, decide)
     varies = (
-        _changing(search, ordered[0].first, evidence, decide) if said != "no_mismatch" else None
+        _changing(search, ordered[0].first, evidence, decide) if verdict != "no_mismatch" else None
     )
     # Beside more than noise that nothing explains, an effect is believed for the part that is its.
     much = search.partial or evidence.closed < PARTLY
     partly = much and _unexplained(evidence, search, decide)
     if partly:
-        said = _most(said, evidence)
+        verdict = _most(verdict, evidence)
     return Judgement(
-        # No lines are kept apart on which it could show.
-        verdict="unknown" if varies else said,
+        # There are no test lines on which it could show.
+        verdict="unknown" if varies else verdict,
         classes=ordered,
         nothing=nothing,
         right=max(p for _, p in varies.sites) if varies else probability(evidence),
         evidence=evidence,
-        inflation=search.temperature,
+        overdispersion=search.overdispersion,
         varies=varies,
         partly=partly,
     )
@@ -129,10 +129,10 @@ def _changing(
     search: Search, best: Explanation, evidence: Evidence, decide: Measured | None
 ) -> Changing | None:
     """A joint that changes from run to run, where that explains the data better."""
-    if any(e.quasi is not None for e in best.effects):
+    if any(e.force is not None for e in best.effects):
         return None
     if decide is not None and evidence.held > threshold(decide.spread):
-        absorbed = evidence.drop <= search.worth
+        absorbed = evidence.drop <= search.critical_value
         base = search.nominal if absorbed else best
         return between_runs(search, base.fitted, decide)
     return None
@@ -158,15 +158,15 @@ def varying(judged: Judgement, base: Explanation, found: Variation, rival: float
         closed=found.closed,
         worth=judged.evidence.worth,
     )
-    said = _said(evidence)
-    if said == "named" and not (evidence.confirmed and found.again):
-        said = "ambiguous"
+    verdict = _by_probability(evidence)
+    if verdict == "named" and not (evidence.confirmed and found.again):
+        verdict = "ambiguous"
     partly = evidence.closed < PARTLY and not found.inside
     if partly:
-        said = _most(said, evidence)
+        verdict = _most(verdict, evidence)
     made = replace(
         judged,
-        verdict=said,
+        verdict=verdict,
         classes=(Class((base,), (0.0,), 0.0), *judged.classes),
         right=probability(evidence),
         evidence=evidence,
@@ -194,14 +194,14 @@ def _evidence(
         left=search.ratio(first.fitted),
         held=_held(search, decide, first.fitted) if decide is not None else 1.0,
         effects=len(physics),
-        forced=any(e.quasi is not None for e in first.effects),
+        forced=any(e.force is not None for e in first.effects),
         confirmed=False,
         gain=min(first.weight - empty, 1e6),
-        drop=(base.chi2 - first.fitted.chi2) / search.temperature,
+        drop=(base.chi2 - first.fitted.chi2) / search.overdispersion,
         names=chosen.names(),
         pair=len(physics) == 2 and physics[0] == physics[1],
         closed=search.closed(base, first.fitted),
-        worth=search.worth,
+        worth=search.critical_value,
     )
 
 
@@ -221,10 +221,10 @@ def as_meant(search: Explanations, best: Explanation) -> Explanation:
 def confirmed(judged: Judgement) -> Judgement:
     """The same once a nonlinear force was confirmed in time."""
     evidence = replace(judged.evidence, confirmed=True)
-    said = "unknown" if evidence.names > MOST_NAMES else _said(evidence)
+    verdict = "unknown" if evidence.names > MOST_NAMES else _by_probability(evidence)
     if judged.partly:
-        said = _most(said, evidence)
-    return replace(judged, verdict=said, right=probability(evidence), evidence=evidence)
+        verdict = _most(verdict, evidence)
+    return replace(judged, verdict=verdict, right=probability(evidence), evidence=evidence)
 
 
 def _verdict(
@@ -236,13 +236,13 @@ def _verdict(
     # What a refit of the nominal parameters absorbs, at the cost of values that their tolerances
     # make unlikely, is not in the data; what is no physics is told beside the verdict.
     physics = [e for e in chosen.first.effects if e.physical]
-    if not physics or evidence.drop <= search.worth:
+    if not physics or evidence.drop <= search.critical_value:
         return "unknown" if _unexplained(evidence, search, decide) else "no_mismatch"
     if evidence.names > MOST_NAMES:
         return "unknown"
-    said = _said(evidence)
+    verdict = _by_probability(evidence)
     # A nonlinear force is named once it was confirmed in time: see `confirmed`.
-    return "ambiguous" if said == "named" and evidence.forced else said
+    return "ambiguous" if verdict == "named" and evidence.forced else verdict
 
 
 def _unexplained(evidence: Evidence, search: Search, decide: Measured | None) -> bool:
@@ -252,7 +252,7 @@ def _unexplained(evidence: Evidence, search: Search, decide: Measured | None) ->
     return held or evidence.left > threshold(search.spread)
 
 
-def _said(evidence: Evidence) -> Verdict:
+def _by_probability(evidence: Evidence) -> Verdict:
     right = probability(evidence)
     if right >= DOUBT:
         return "named" if right >= SURE else "ambiguous"
@@ -260,24 +260,24 @@ def _said(evidence: Evidence) -> Verdict:
     return "ambiguous" if one else "unknown"
 
 
-def _most(said: Verdict, evidence: Evidence) -> Verdict:
+def _most(verdict: Verdict, evidence: Evidence) -> Verdict:
     """What may be said of effects that leave much: one cause of most of it may be told. Sums of
     two mimic what is in no table."""
-    if said not in SAID:
-        return said
+    if verdict not in WITH_CAUSES:
+        return verdict
     return "ambiguous" if evidence.effects == 1 and evidence.closed > MOSTLY else "unknown"
 
 
-def doubted(judged: Judgement, most: Verdict) -> Judgement:
+def limited(judged: Judgement, most: Verdict) -> Judgement:
     """The same where something is wrong with the recordings that could pass for physics: no more
     is said than `most`."""
-    return replace(judged, verdict=most) if judged.verdict in SAID else judged
+    return replace(judged, verdict=most) if judged.verdict in WITH_CAUSES else judged
 
 
 def without_causes(judged: Judgement) -> Judgement:
     """The same where all that is said is no physics: a sensor's gain that is a unit."""
-    said: dict[Verdict, Verdict] = {"named": "no_mismatch", "ambiguous": "unknown"}
-    return replace(judged, verdict=said.get(judged.verdict, judged.verdict))
+    without: dict[Verdict, Verdict] = {"named": "no_mismatch", "ambiguous": "unknown"}
+    return replace(judged, verdict=without.get(judged.verdict, judged.verdict))
 
 
 def of_several_states(judged: Judgement, part: float) -> Judgement:
@@ -300,24 +300,24 @@ def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
     """
     must = judged.evidence.drop > MUST_SHOW and due > IN_DATA
     worse = gap.high < 0 or (gap.value < 0 and must)
-    if judged.verdict in SAID and worse:
+    if judged.verdict in WITH_CAUSES and worse:
         return replace(judged, verdict="unknown")
     return judged
 
 
-def _thin(search: Search) -> set[frozenset[str]]:
+def _insignificant(search: Search) -> set[frozenset[str]]:
     """Explanations of which one linear effect, beside the others, is not in the data: it spares
     the nominal parameters values that their tolerances make unlikely, and no more."""
     out: set[frozenset[str]] = set()
     while True:
         ranked = [e for e in search.ranked() if e.key not in out]
         near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
-        if not (thin := {e.key for e in near if _is_thin(search, e)}):
+        if not (insignificant := {e.key for e in near if _is_insignificant(search, e)}):
             return out
-        out |= thin
+        out |= insignificant
 
 
-def _is_thin(search: Search, e: Explanation) -> bool:
+def _is_insignificant(search: Search, e: Explanation) -> bool:
     if len(e.effects) < 2:
         return False
     single = [s for s in search.found.values() if len(s.effects) == 1 and not s.key <= e.key]
@@ -329,21 +329,21 @@ def _is_thin(search: Search, e: Explanation) -> bool:
         if not effect.physical:
             # What is wrong with the data is no answer. Of two causes beside it, evidence decides.
             continue
-        if all(x.quasi is None for x in e.effects):
+        if all(x.force is None for x in e.effects):
             fewer.append(search.without(e, i))
-        elif effect.quasi is None:
+        elif effect.force is None:
             # A force is not refitted here: without this one it was fitted to itself, or not at all.
             fewer.append(search.found.get(e.key - {effect.key}))
     return any(
-        less is not None and less.fitted.chi2 - e.fitted.chi2 < _worth(search, less)
+        less is not None and less.fitted.chi2 - e.fitted.chi2 < _critical_value(search, less)
         for less in fewer
     )
 
 
-def _worth(search: Search, less: Explanation) -> float:
+def _critical_value(search: Search, less: Explanation) -> float:
     """Chi-square that an effect beside those of `less` must explain: more than chance does, and
     more than their own laws are off by."""
-    return max(search.worth * search.temperature, _off(search, less))
+    return max(search.critical_value * search.overdispersion, _off(search, less))
 
 
 def _off(search: Search, e: Explanation) -> float:
@@ -357,13 +357,15 @@ def _decided(search: Search, lines: Measured, ranked: list[Explanation]) -> list
     likely each makes lines that were not fitted; the most probable first."""
     rivals = [e for e in ranked if e.weight > ranked[0].weight - NEAR or not e.effects]
     predicted = {e.key: _predicted(search, lines, e.fitted) for e in rivals}
-    gross, _ = predicted[search.nominal.key]
-    heard = []
+    nominal_chi2, _ = predicted[search.nominal.key]
+    reweighted = []
     for e in rivals:
         chi2, spread = predicted[e.key]
-        lost = 0.5 * (chi2 / search.temperature + spread) + search.inexact(e.effects, gross)
-        heard.append(replace(e, weight=e.weight - lost))
-    return sorted(heard, key=lambda e: -e.weight)
+        lost = 0.5 * (chi2 / search.overdispersion + spread) + search.model_error_penalty(
+            e.effects, nominal_chi2
+        )
+        reweighted.append(replace(e, weight=e.weight - lost))
+    return sorted(reweighted, key=lambda e: -e.weight)
 
 
 def _held(search: Search, lines: Measured, fitted: Fitted) -> float:

@@ -152,8 +152,8 @@ def at_lines(fitted: Fitted, search: Search) -> Fitted:
 
 def _without(search: Search, best: Explanation, i: int) -> Explanation | None:
     """The explanation without one effect; None where a force of its own is left in it."""
-    base = search.bare(best, i)
-    return None if base is None or any(e.quasi for e in base.effects) else base
+    base = search.without_refit(best, i)
+    return None if base is None or any(e.force for e in base.effects) else base
 
 
 def _trace(item: Located, search: Search) -> Trace:

@@ -1,4 +1,4 @@
-"""Which experiment would tell the leading explanations apart."""
+"""Which experiment would distinguish the leading explanations."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ POINTS = 80
 WIDER = 2.0  # how far a band is widened at either end
 STIFF = 1e9  # N m/rad and N/m: a brace that does not give
 KNOWN = 0.1  # of the chain's own mass, a mass that is added
-LIKELY = 0.05  # probability from which another class is to be told apart
+LIKELY = 0.05  # probability from which another class is to be distinguished
 
 
 def next_experiment(search: Search, judged: Judgement) -> tuple[str, str, float | None]:
-    """(why, experiment) in words, both empty where nothing is to be told apart; and by how many
+    """(why, experiment) in words, both empty where nothing is to be distinguished; and by how many
     noise units the experiment would tell, if that is known."""
     rivals = _rivals(judged)
     if not rivals and judged.verdict != "no_mismatch" and (alone := _alone(search)):
@@ -54,7 +54,7 @@ def next_experiment(search: Search, judged: Judgement) -> tuple[str, str, float 
     first, other = rivals
     if not first.effects and not other.effects:
         return "", "", None
-    what = f"{_said(first)} and {_said(other)} are not told apart"
+    what = f"{_in_words(first)} and {_in_words(other)} are not distinguished"
     best = ("", 0.0)
     for words, rig_of, f in _experiments(search):
         d = _separation(first, other, rig_of, f, search)
@@ -99,7 +99,7 @@ def _rivals(judged: Judgement) -> tuple[Explanation, Explanation] | None:
     return None
 
 
-def _said(explanation: Explanation) -> str:
+def _in_words(explanation: Explanation) -> str:
     if not explanation.effects:
         return "nothing missing"
     return " and ".join(f"{e.physics.replace('_', ' ')} at {e.site}" for e in explanation.effects)

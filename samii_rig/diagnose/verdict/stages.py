@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from samii_rig.diagnose.data.findings import Doubt, Sound
+from samii_rig.diagnose.data.findings import Checked, Refusal
 from samii_rig.diagnose.data.measured import Measured
-from samii_rig.diagnose.fit.agreeing import Apart, Saved
+from samii_rig.diagnose.fit.agreeing import Saved, SeveralStates
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.result import Band, Diagnosis, Gap, Used
@@ -23,7 +23,7 @@ from samii_rig.types import FrequencyResponse, Recording
 
 ALTERNATIVES = 6
 REPEAT = (
-    "a stiffness that changes is told apart from a force by when it does",
+    "a stiffness that changes is distinguished from a force by when it does",
     "repeat one recording at once, and again after a pause",
 )
 
@@ -38,7 +38,7 @@ class Case:
     file, where they were kept without their recordings.
     """
 
-    clean: Sound
+    clean: Checked
     responses: Sequence[FrequencyResponse]
     runs: Sequence[Recording]
     lines: Measured
@@ -51,9 +51,9 @@ class Case:
         """Why these records cannot be held sample by sample against others of one linear rig; ""
         where they can."""
         clean = self.clean
-        if not (self.search.lines.torn() or clean.mended or clean.doubt):
+        if not (self.search.lines.depends_on_level() or clean.mended or clean.refusal):
             return ""
-        return (*clean.told, "they depend on the level as no linear rig does")[0]
+        return (*clean.remarks, "they depend on the level as no linear rig does")[0]
 
 
 @dataclass(frozen=True)
@@ -70,54 +70,54 @@ class Shown:
     used: Used
 
 
-def of_states(found: Diagnosis, apart: Sequence[Apart]) -> Diagnosis:
+def of_states(found: Diagnosis, several: Sequence[SeveralStates]) -> Diagnosis:
     """The same, with what recordings of one state differ by, if they do; where that leaves no
     answer, what to do."""
-    if not apart:
+    if not several:
         return found
-    words = (*(one.told() for one in apart), *found.not_physics)
-    found = replace(found, states=apart[0].states, not_physics=words)
+    words = (*(one.describe() for one in several), *found.not_physics)
+    found = replace(found, states=several[0].states, not_physics=words)
     if found.verdict != "unknown":
         return found
     why = "what one model makes of several states is of none of them"
-    return replace(found, sites=(), why=why, experiment=apart[0].experiment(), gain=None)
+    return replace(found, sites=(), why=why, experiment=several[0].experiment(), gain=None)
 
 
-def told(
+def diagnosis_of(
     case: Case,
     search: Search,
     judged: Judgement,
     shown: Shown,
-    said: Sequence[str] = (),
-    doubt: Doubt | None = None,
+    remarks: Sequence[str] = (),
+    refusal: Refusal | None = None,
 ) -> Diagnosis:
-    """The answer. said : what else there is to say, in words. doubt : why less may be said."""
+    """The answer. remarks : what else there is to say, in words. refusal : why less may be said."""
     clean, best = case.clean, judged.best
-    if doubt:
-        judged = verdict.doubted(judged, doubt.most)
+    if refusal:
+        judged = verdict.limited(judged, refusal.most)
     if len(set(case.lines.outputs)) == 1 and len(best.effects) > 1:
-        # Trials of four channels say nothing of how often one curve tells several places apart.
-        judged = verdict.doubted(judged, "ambiguous")
+        # Trials of four channels say nothing of how often one curve distinguishes several places.
+        judged = verdict.limited(judged, "ambiguous")
     own = answer.varying(judged) or answer.causes_of(judged.classes[0], judged)
-    causes = own if judged.verdict in verdict.SAID else ()
+    causes = own if judged.verdict in verdict.WITH_CAUSES else ()
     if not causes:
         judged = verdict.without_causes(judged)
     missing = judged.verdict != "no_mismatch"
     if not missing and best.effects and not own:
         # The model is held against what was meant to be recorded.
         shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
-    words = list(clean.told)
+    words = list(clean.remarks)
     if missing or best.effects:
-        words += answer.told(judged)
-    words += (*said, *clean.lacks)
+        words += answer.not_physics_of(judged)
+    words += (*remarks, *clean.lacks)
     why, experiment, gain = next_levels(judged) or next_experiment(search, judged)
     if judged.varies is not None:
         named = judged.verdict == "named"
         why, experiment, gain = ("", "", None) if named else (*REPEAT, None)
-    if doubt and missing:
-        why, experiment, gain = doubt.why, doubt.experiment, None
-    ranked = list(zip(judged.classes, judged.shares, strict=True))[len(causes) > 0 :]
-    untold = judged.varies.told() if judged.varies is not None and not causes else ""
+    if refusal and missing:
+        why, experiment, gain = refusal.why, refusal.experiment, None
+    ranked = list(zip(judged.classes, judged.probabilities, strict=True))[len(causes) > 0 :]
+    untold = judged.varies.describe() if judged.varies is not None and not causes else ""
     alternatives = tuple(
         (answer.causes_of(c, judged, share), share)
         for c, share in ranked[:ALTERNATIVES]
@@ -142,7 +142,7 @@ def told(
         rig=explained(best.fitted) if best.effects else None,
         traces=traces(search, judged) if missing and judged.varies is None else (),
         moved=answer.moved(best.fitted),
-        could_hide=could_hide(*search.beside(best)),
+        could_hide=could_hide(*search.linear_part(best)),
         used=shown.used,
         sigma=math.sqrt(max(judged.evidence.drop, 0.0)) if best.effects or judged.varies else 0.0,
         gain=gain,

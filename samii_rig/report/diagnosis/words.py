@@ -194,7 +194,7 @@ def _verdict(found: Diagnosis) -> tuple[Mark, str, str]:
         title = "A number of the rig file is wrong"
         if len(found.exact) > 1:
             title = "Two numbers of the rig file are wrong"
-        return "bad", title, f"{' and '.join(one.told() for one in found.exact)}."
+        return "bad", title, f"{' and '.join(one.describe() for one in found.exact)}."
     if found.beyond:
         return "bad", "Something is missing that is not named for sure", sentence(found.beyond)
     places = suspects(found)
@@ -264,7 +264,7 @@ def _facts(found: Diagnosis) -> list[tuple[str, str, str]]:
         (
             "Gap closed",
             value,
-            f"{between}on lines kept apart",
+            f"{between}on test lines",
         ),
         (
             "Chi-square per degree of freedom",
@@ -286,7 +286,7 @@ def _mended(found: Diagnosis) -> bool:
 
 
 def fit_rows(found: Diagnosis) -> list[tuple[str, str, str]]:
-    """(model, on lines fitted, on lines kept apart): chi-square per degree of freedom."""
+    """(model, on lines fitted, on test lines): chi-square per degree of freedom."""
     plain, caused = models(found)
     rows = [(plain, found.nominal)]
     if answer(found):

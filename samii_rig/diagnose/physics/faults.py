@@ -1,4 +1,4 @@
-"""Mistakes of those who record, as hypotheses: no unknown, no physics, told apart from it.
+"""Faults of measurement, as hypotheses: no unknown, no physics, distinguished from it.
 
 One table. Each row is a factor on a column that is exactly known, or a sensor that is another. They
 compete with physics in the same search, at the price of what has no unknown.
@@ -36,11 +36,12 @@ ORDER = {AbsoluteAngle: 0, RelativeAngle: 0, Displacement: 0, Velocity: 1, Accel
 
 
 @dataclass(frozen=True, slots=True)
-class Mistake:
-    """A column that is F(s) times what it is said to be. said : in words, behind its name."""
+class Fault:
+    """A column that is F(s) times what it is said to be. description : in words, behind its
+    name."""
 
     physics: str
-    said: str
+    description: str
     factor: Callable[[Complex], Complex]
     weight: float = 1.0
 
@@ -61,7 +62,7 @@ def derived(s: Complex, times: int) -> Complex:
 
 
 def effects(rig: Rig, recorded_hz: float) -> Iterator[Effect]:
-    """Every mistake that this rig's columns allow, of so many rows a second."""
+    """Every fault that this rig's columns allow, of so many rows a second."""
     for actuator in rig.actuator:
         shifts = list(_shifts("columns_shifted", recorded_hz))
         for m in (*_of_any(), *shifts, *_measured_too(shifts, rig.rate_hz)):
@@ -84,27 +85,29 @@ def effects(rig: Rig, recorded_hz: float) -> Iterator[Effect]:
         )
 
 
-def _of_any() -> Iterator[Mistake]:
+def _of_any() -> Iterator[Fault]:
     """Of a column of any kind."""
-    yield Mistake("sign_error", "has the wrong sign", partial(scaled, by=-1.0))
+    yield Fault("sign_error", "has the wrong sign", partial(scaled, by=-1.0))
     for unit in UNITS:
         for by in (unit.factor, 1 / unit.factor):
-            said = f"is {by:.4g} times what it should be: {unit.name}"
-            yield Mistake("unit_error", said, partial(scaled, by=by), 1 / (2 * len(UNITS)))
+            description = f"is {by:.4g} times what it should be: {unit.name}"
+            yield Fault("unit_error", description, partial(scaled, by=by), 1 / (2 * len(UNITS)))
 
 
-def _shifts(physics: str, rate_hz: float) -> Iterator[Mistake]:
+def _shifts(physics: str, rate_hz: float) -> Iterator[Fault]:
     """Of a logger: a dead time is no whole number of samples but by chance."""
     for n in (n for n in range(-MOST_SHIFTED, MOST_SHIFTED + 1) if n != 0):
         many = f"{abs(n)} sample{'s' * (abs(n) > 1)} {'later' if n > 0 else 'earlier'}"
-        said = f"stands {many} than the other columns: a logger's, or a delay of as much"
+        description = f"stands {many} than the other columns: a logger's, or a delay of as much"
         if physics == "columns_shifted":
-            said = f"is not of the sensors' sample: their columns stand {many} (a logger's shift)"
+            description = (
+                f"is not of the sensors' sample: their columns stand {many} (a logger's shift)"
+            )
         law = partial(behind, seconds=n / rate_hz)
-        yield Mistake(physics, said, law, 1 / (2 * MOST_SHIFTED))
+        yield Fault(physics, description, law, 1 / (2 * MOST_SHIFTED))
 
 
-def _measured_too(shifts: Iterable[Mistake], rate_hz: float) -> Iterator[Mistake]:
+def _measured_too(shifts: Iterable[Fault], rate_hz: float) -> Iterator[Fault]:
     """Each of them where what stands apart was measured, not sent: both at once look like one dead
     time or lag, and explain none of it alone."""
 
@@ -112,27 +115,27 @@ def _measured_too(shifts: Iterable[Mistake], rate_hz: float) -> Iterator[Mistake
         return factor(s) * not_held(s, np.zeros(0), rate_hz)[0]
 
     for m in shifts:
-        said = f"was measured, not held, and {m.said}"
-        yield Mistake(m.physics, said, partial(both, factor=m.factor), MEASURED * m.weight)
+        description = f"was measured, not held, and {m.description}"
+        yield Fault(m.physics, description, partial(both, factor=m.factor), MEASURED * m.weight)
 
 
-def _of_kind(sensor: Sensor) -> Iterator[Mistake]:
+def _of_kind(sensor: Sensor) -> Iterator[Fault]:
     """Of a sensor that measures another derivative of the same motion."""
     own = ORDER.get(type(sensor))
     for order, kind in enumerate(ORDERS):
         if own is not None and order != own:
-            said = f"reads as {kind}, not as {ORDERS[own]}"
+            description = f"reads as {kind}, not as {ORDERS[own]}"
             if not isinstance(sensor, Displacement | Velocity | Acceleration):
-                said = f"reads as {kind} of the angle, not as the angle"
-            yield Mistake("kind_error", said, partial(derived, times=order - own), 0.5)
+                description = f"reads as {kind} of the angle, not as the angle"
+            yield Fault("kind_error", description, partial(derived, times=order - own), 0.5)
 
 
-def _on(kind: Any, name: str, m: Mistake) -> Effect:
+def _on(kind: Any, name: str, m: Fault) -> Effect:
     def value(s: Complex, _: Float) -> tuple[Complex, list[Complex]]:
         return m.factor(s), []
 
     factor = Factor(kind, name, value)
-    return Effect(m.physics, name, factor=factor, weight=m.weight, variant=m.said)
+    return Effect(m.physics, name, factor=factor, weight=m.weight, variant=m.description)
 
 
 def _angles(rig: Rig, sensor: Sensor) -> Iterator[Effect]:
@@ -141,7 +144,7 @@ def _angles(rig: Rig, sensor: Sensor) -> Iterator[Effect]:
     fields = {k: getattr(sensor, k) for k in sensor.model_fields_set - {"kind", "across", "after"}}
     if isinstance(sensor, RelativeAngle):
         made = AbsoluteAngle(kind="absolute_angle", after=sensor.across[-1], **fields)
-        said = f"reads as an angle against the ground, not as one across {sensor.across[0]}"
+        description = f"reads as an angle against the ground, not as one across {sensor.across[0]}"
     elif isinstance(sensor, AbsoluteAngle):
         order = [e.name for e in rig.element]
         acting = [e.name for e in rig.element if getattr(e, "input", None)]
@@ -150,7 +153,7 @@ def _angles(rig: Rig, sensor: Sensor) -> Iterator[Effect]:
         if starts and starts[-1] > 0:
             across = tuple(span[starts[-1] :])
             made = RelativeAngle(kind="relative_angle", across=across, **fields)
-            said = f"reads as an angle across {across[0]}, not as one against the ground"
+            description = f"reads as an angle across {across[0]}, not as one against the ground"
     if made is not None:
         build = partial(insert.replaced, sensor=made)
-        yield Effect("kind_error", sensor.name, build=build, weight=0.5, variant=said)
+        yield Effect("kind_error", sensor.name, build=build, weight=0.5, variant=description)

@@ -120,7 +120,7 @@ class Ports:
 
 
 @dataclass
-class Reach:
+class TransferPaths:
     """The linear motion of a rig under all commands."""
 
     whole: Whole
@@ -200,8 +200,8 @@ class Reach:
 
     def _made(self, place: Place, *, of_speed: bool) -> Ports | None:
         rig, records = self.model.built, self.whole.records
-        told = place.kind == "command"
-        chain = self.model.chain_of(rig if told else place.widened(rig))
+        of_command = place.kind == "command"
+        chain = self.model.chain_of(rig if of_command else place.augmented(rig))
         chain = chain.with_values(self.model.values(self.x))
         n, on, acting, loop = len(rig.sensor), self.whole.sensor, self.whole.acting, self.whole.loop
         at = place.acts_on(rig)
@@ -212,11 +212,11 @@ class Reach:
             hold = self._held(s)
             seen = sensors_at(rig.sensor, s)[:, on]
             H = G[:, on[:, None], acting] * seen[:, :, None] * hold[:, None]
-            by_force = H[:, :, self.column(place)] if told else G[:, on, at] * seen
+            by_force = H[:, :, self.column(place)] if of_command else G[:, on, at] * seen
             if loop is not None:
                 closed = loop.closed(H.reshape(len(H), -1))
                 by_force = loop.around(closed, by_force[:, :, None])[:, :, 0]
-            if told:
+            if of_command:
                 return np.zeros(0, complex), by_force, np.zeros(0)
             rate = s if of_speed else np.ones_like(s)
             return rate[:, None] * G[:, n, acting] * hold, by_force, np.abs(rate * G[:, n, at])
@@ -231,11 +231,11 @@ class Reach:
                 found[key] = of(s)
             read, seen, size = found[key]
             sensors.append(seen)
-            if not told:
+            if not of_command:
                 reading.append(read)
                 inside = (s.imag >= 2 * np.pi * band[0]) & (s.imag <= 2 * np.pi * band[1])
                 y1.append(size[inside])
-        if told:
+        if of_command:
             return Ports([], sensors, np.zeros(0))
         moved = np.concatenate(y1)
         drives = max(float(np.max(np.abs(r))) for r in reading) > 0
