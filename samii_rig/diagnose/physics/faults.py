@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from samii_rig.diagnose.physics import insert
-from samii_rig.diagnose.physics.channels import not_held
+from samii_rig.diagnose.physics.channels import METERED, not_held
 from samii_rig.diagnose.physics.confusions import UNITS
 from samii_rig.diagnose.physics.effect import Effect, Factor
 from samii_rig.rig.schema import (
@@ -38,12 +38,13 @@ ORDER = {AbsoluteAngle: 0, RelativeAngle: 0, Displacement: 0, Velocity: 1, Accel
 @dataclass(frozen=True, slots=True)
 class Fault:
     """A column that is F(s) times what it is said to be. description : in words, behind its
-    name."""
+    name. rough : part of what it does by which F is off, 0 where that is exactly known."""
 
     physics: str
     description: str
     factor: Callable[[Complex], Complex]
     weight: float = 1.0
+    rough: float = 0.0
 
 
 def scaled(s: Complex, by: float) -> Complex:
@@ -116,7 +117,8 @@ def _measured_too(shifts: Iterable[Fault], rate_hz: float) -> Iterator[Fault]:
 
     for m in shifts:
         description = f"was measured, not held, and {m.description}"
-        yield Fault(m.physics, description, partial(both, factor=m.factor), MEASURED * m.weight)
+        law, weight = partial(both, factor=m.factor), MEASURED * m.weight
+        yield Fault(m.physics, description, law, weight, METERED)
 
 
 def _of_kind(sensor: Sensor) -> Iterator[Fault]:
@@ -135,7 +137,9 @@ def _on(kind: Any, name: str, m: Fault) -> Effect:
         return m.factor(s), []
 
     factor = Factor(kind, name, value)
-    return Effect(m.physics, name, factor=factor, weight=m.weight, variant=m.description)
+    return Effect(
+        m.physics, name, factor=factor, weight=m.weight, variant=m.description, rough=m.rough
+    )
 
 
 def _angles(rig: Rig, sensor: Sensor) -> Iterator[Effect]:
