@@ -17,7 +17,7 @@ from table_kit import Effects, table_of
 from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.search import ForceSearch
-from samii_rig.diagnose.forces.variation import _less, variation
+from samii_rig.diagnose.forces.variation import _less, _repeats_differ, variation
 from samii_rig.diagnose.forces.varying import (
     Modulation,
     PieceModulation,
@@ -244,3 +244,29 @@ def test_which_spring_swings_is_decided_without_the_swing_in_the_noise(
     assert (site, other) == ("joint_2", "joint_1")
     assert sure > 0.99
     assert found.parameters["f"].value == pytest.approx(1.0, rel=0.01)
+
+
+@pytest.mark.parametrize("in_time", [True, False])
+def test_repeats_of_one_input_differ_by_what_swings_and_not_by_a_law_of_the_motion(
+    nothing: ForceSearch, in_time: bool
+) -> None:
+    """Of both the sum of all repeats holds as much."""
+    rng, paths, hz = np.random.default_rng(9), nothing.paths, 0.4
+    left = nothing.unexplained(nothing.nominal.fitted)
+    spring = next(e.force for e in nothing.forces if e.force and e.force.law is HARDENING)
+    ports = paths.ports(spring.place, of_speed=False)
+    assert ports is not None
+    motion = paths.motion(spring.place, of_speed=False)
+    pieces = []
+    for span, phi, sensors, x in zip(paths.spans, motion, ports.sensors, left, strict=True):
+        t = np.arange(phi.size) * (span.samples / span.n / span.rate_hz)
+        force = phi * np.cos(2 * np.pi * hz * t)
+        added = span.lines(span.damped(force), sensors, x.k)
+        added *= 12 / np.linalg.norm(np.einsum("nij,nj->ni", x.root, added))
+        noise = rng.standard_normal((2, 3, *x.white.shape[1:]))  # a sum of three, and differences
+        white = noise[0] + 1j * noise[1]
+        rows = range(len(white)) if in_time else range(1)
+        for row in rows:
+            white[row] += np.einsum("nij,nj->ni", x.root, added)
+        pieces.append(PieceModulation.of(span, phi, sensors, replace(x, white=white)))
+    assert _repeats_differ(pieces, hz) is in_time

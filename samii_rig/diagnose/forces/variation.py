@@ -41,6 +41,7 @@ ROUNDS = 6  # times that the likelihood is made anew at most: 2 to 4 were usual
 # Of what the first explains, from which on another spring may be the one: as long as what varies
 # stands in the noise, neighbours gain nearly as much as the spring that does.
 RIVAL = 0.5
+AGAIN = 1e-3  # chance of noise to make repeats differ as much, below which they do
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,8 +155,9 @@ def uneven_spring(search: ForceSearch, best: Explanation) -> Uneven | None:
 class _Taken:
     """The records less what the variation of one spring adds to them.
 
-    search, fitted : of these, and a model of them. modulations : what varies. changes : of each
-    piece, as `PieceModulation.changes` has them, with none at first.
+    search, fitted : of these, and a model of them. modulations : what varies. repeats : of each,
+    whether repeats of one input differ by it, None where there are none. changes : of each piece,
+    as `PieceModulation.changes` has them, with none at first.
     """
 
     search: ForceSearch
@@ -163,6 +165,7 @@ class _Taken:
     springs: Springs
     site: str
     modulations: list[Modulation] = field(default_factory=list)
+    repeats: list[bool | None] = field(default_factory=list)
     changes: list[Float] = field(default_factory=list)
     pieces: list[PieceModulation] = field(default_factory=list)
 
@@ -199,6 +202,7 @@ class _Taken:
         more = self.springs.strongest(self.search, left, self.site)
         if more and all(abs(more[0][1].hz - one.hz) > step for one in self.modulations):
             self.modulations.append(more[0][1].closer(self.pieces, step))
+            self.repeats.append(_repeats_differ(self.pieces, self.modulations[-1].hz))
         found = self._changes()
         levels = self.search.levels
         taken = tuple(
@@ -231,10 +235,12 @@ class _Taken:
 
     @property
     def again(self) -> bool:
-        """Whether records of one level are held against each other."""
+        """Whether what varies is no law of the amplitude: repeats of one input differ by it, or,
+        where nothing was repeated, records of one level do, or one in itself."""
         levels = [p.levels for p in self.search.levels.records.pieces]
-        more = any(one.times.size > 1 for one in self.pieces)
-        return more or len(set(levels)) < len(levels) or any(self.hz)
+        if all(one is None for one in self.repeats):
+            return len(set(levels)) < len(levels) or any(self.hz)
+        return any(self.repeats)
 
     def parameters(self, k: float, files: int) -> dict[str, Value]:
         """Of the deepest modulation, with intervals of 90 %, or of what records differ by where
@@ -279,6 +285,13 @@ class _Taken:
         seen = [x[:, m].ravel() for x, m in zip(own, on, strict=True)]
         kept = [x[:, ~m].ravel() for x, m in zip(own, on, strict=True)]
         return np.concatenate(seen), np.concatenate(kept)
+
+
+def _repeats_differ(pieces: Sequence[PieceModulation], hz: float) -> bool | None:
+    """Whether repeats of one input differ by a modulation, whose phase is another in each, more
+    than noise does; None where nothing was repeated."""
+    chi2, free = (sum(x) for x in zip(*(one.differing(hz) for one in pieces), strict=True))
+    return bool(stats.chi2.sf(chi2, free) < AGAIN) if free else None
 
 
 def _summed(before: Float, more: Float) -> Float:

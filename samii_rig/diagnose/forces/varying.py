@@ -144,17 +144,33 @@ class PieceModulation:
     def exact(self, hz: float) -> tuple[float, int, float]:
         """Chi-square of all rows at a frequency, beyond what another constant stiffness of each
         does, its degrees of freedom, and what is known of both phases of a modulation."""
+        chi2, free, known = self._rows(hz)
+        return float(np.sum(chi2)), free * self.times.size, known
+
+    def differing(self, hz: float) -> tuple[float, int]:
+        """Chi-square of what repeats differ by, of them alone, and its degrees of freedom. hz : 0
+        for what differs from record to record."""
+        if hz > 0:
+            chi2, free, _ = self._rows(hz)
+        else:
+            P, known, _ = self.constants()
+            shown = bool(known[0] > ROUNDED * self.V.max())
+            chi2, free = (P**2 / known, 1) if shown else (0 * P, 0)
+        return float(np.sum(chi2[1:])), free * (self.times.size - 1)
+
+    def _rows(self, hz: float) -> tuple[Float, int, float]:
+        """Chi-square of each row, its degrees of freedom, and what all tell of both phases."""
         G, pull = self._normal([hz])
         if not G[0, 0] > ROUNDED * self.V.max():
-            return 0.0, 0, 0.0
+            return np.zeros(self.times.size), 0, 0.0
         share = G[1:, :1] / G[0, 0]
         power, phases = np.linalg.eigh(G[1:, 1:] - share * G[:1, 1:])
         shown = power > ONE_PHASE * np.trace(G[1:, 1:])
         along = phases.T @ (pull[1:] - share * pull[:1])
-        chi2 = np.sum(along[shown] ** 2 / power[shown, None])
+        chi2 = np.sum(along[shown] ** 2 / power[shown, None], axis=0)
         # Records that repeat each other are turned, by which their sum of squares stays.
         known = float(np.sum(power[shown])) * float(self.times[0] ** 2)
-        return float(chi2), int(np.count_nonzero(shown)) * self.times.size, known
+        return chi2, int(np.count_nonzero(shown)), known
 
     def constants(self) -> tuple[Float, Float, Float]:
         """(rows,) how far a constant change lies along what is left, what is known of it, and of

@@ -144,6 +144,8 @@ def varying(judged: Judgement, base: Explanation, found: Variation, rival: float
     was judged, over that."""
     ahead = found.evidence - rival
     others = sum(p for _, p in found.sites[1:])
+    if not found.again:  # as likely a law of the amplitude that no row has
+        others += 1.0
     evidence = Evidence(
         odds=-math.log(max(others + math.exp(-max(ahead, 0.0)), TINY)),
         left=found.after[0],
