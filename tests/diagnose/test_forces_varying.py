@@ -37,11 +37,12 @@ from sim.assumed_modes import trial
 from sim.assumed_modes.outside import OUTSIDE
 from sim.assumed_modes.varying import VARYING
 
-FEW = Effects(lambda: table_of(SAMII, 0.5, 20.0, "actuator_lag", "added_mass"))
+BAND = (0.5, 12.0)  # Hz, with the first two modes: what a diagnosis takes grows with its lines
+FEW = Effects(lambda: table_of(SAMII, *BAND, "actuator_lag", "added_mass"))
 
 
 def found_in(runs: list[Recording]) -> Diagnosis:
-    return diagnose(estimate(runs), SAMII, runs=runs, effects=FEW)
+    return diagnose(estimate(runs, band=BAND), SAMII, band=BAND, runs=runs, effects=FEW)
 
 
 def concealed(
@@ -109,12 +110,22 @@ def test_a_spring_that_is_stiffer_to_one_side_is_none_that_swings(
     assert any(words in said for said in found.not_physics)
 
 
-@pytest.fixture(scope="module")
-def nothing(tmp_path_factory: pytest.TempPathFactory) -> ForceSearch:
-    runs = cut_sweeps(tmp_path_factory.mktemp("nothing"), design=DESIGN)
-    linear = on_records(case_of(estimate(runs), SAMII, None, FEW, runs), None)
+def search_in(folder: Path, band: tuple[float, float] | None) -> ForceSearch:
+    runs = cut_sweeps(folder, design=DESIGN)
+    linear = on_records(case_of(estimate(runs, band=band), SAMII, band, FEW, runs), band)
     assert linear is not None
     return ForceSearch(linear)
+
+
+@pytest.fixture(scope="module")
+def nothing(tmp_path_factory: pytest.TempPathFactory) -> ForceSearch:
+    """In the band of the sweep: in a narrower one motion above it is left out."""
+    return search_in(tmp_path_factory.mktemp("nothing"), None)
+
+
+@pytest.fixture(scope="module")
+def narrow(tmp_path_factory: pytest.TempPathFactory) -> ForceSearch:
+    return search_in(tmp_path_factory.mktemp("narrow"), BAND)
 
 
 def test_what_a_force_adds_to_the_lines_is_turned_round_exactly(nothing: ForceSearch) -> None:
@@ -133,13 +144,13 @@ def test_what_a_force_adds_to_the_lines_is_turned_round_exactly(nothing: ForceSe
 
 
 def test_under_noise_alone_every_frequency_has_chi_square_of_two_freedoms(
-    nothing: ForceSearch,
+    narrow: ForceSearch,
 ) -> None:
     """Noise that is white in the likelihood's own units, at the lines of real records."""
-    rng, paths = np.random.default_rng(2), nothing.paths
-    left = nothing.unexplained(nothing.nominal.fitted)
+    rng, paths = np.random.default_rng(2), narrow.paths
+    left = narrow.unexplained(narrow.nominal.fitted)
     f, each, sides = (0.05, 0.1, 0.4, 1.6, 6.4), [], []
-    for spring in (e.force for e in nothing.forces if e.force and e.force.law is HARDENING):
+    for spring in (e.force for e in narrow.forces if e.force and e.force.law is HARDENING):
         ports = paths.ports(spring.place, of_speed=False)
         assert ports is not None
         motion = paths.motion(spring.place, of_speed=False)
