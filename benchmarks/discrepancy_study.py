@@ -18,18 +18,21 @@ from pathlib import Path
 
 import numpy as np
 import sflr_diagnosis as sflr
+from scipy import linalg
 
 from samii_rig.diagnose.diagnose import case_of, table
-from samii_rig.diagnose.fit.discrepancy import weighed
+from samii_rig.diagnose.fit.discrepancy import Discrepancy, _directions, weighed
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.explanations import Explanation, named
 from samii_rig.diagnose.fit.records import RecordSearch
+from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.verdict.by_record import on_records
+from samii_rig.likelihood.reduce import Reduced
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Recording
+from samii_rig.types import Float, Recording
 
 SHOWN = 6  # explanations that are told
 WIDE = 1.645  # standard deviations of a 90 % interval
@@ -110,20 +113,20 @@ def motor(rig: Rig, data: Path) -> None:
         fit = e.fitted
         left = search.problem.residual(fit.model.response(fit.x, search.problem.at))
         found = weighed(search.reduced, search.reduced.reference, fit, left)
-        rows.append((found.evidence + search.log_prior(e.effects), e, found))
-    best = max(weight for weight, _, _ in rows)
+        rows.append((found.evidence + search.log_prior(e.effects), e, found, left))
+    best = max(weight for weight, _, _, _ in rows)
     print(f"\nmotor: factor {search.overdispersion:.1f}\n")
     print(
         "| explanation | chi-square per dof | behind, factor | behind, discrepancy | scale, length "
         f"| value, factor | value, discrepancy |\n{'|---' * 7}|"
     )
-    for weight, e, found in sorted(rows, key=lambda r: -r[0]):
+    for weight, e, found, left in sorted(rows, key=lambda r: -r[0]):
         forced = (k for k, x in enumerate(e.effects) if x.force)
         at = [i for k in forced for i in e.fitted.model.own(k)][:1]
         values = []
         for x, C, times in (
             (e.fitted.x, e.fitted.covariance(), search.overdispersion),
-            (found.x, np.linalg.inv(found.precision), 1.0),
+            (*moved(search.reduced, found.discrepancy, e.fitted, left), 1.0),
         ):
             values.append(
                 ", ".join(f"{math.exp(x[i]):.3g} ({math.sqrt(C[i, i] * times):.0%})" for i in at)
@@ -134,6 +137,23 @@ def motor(rig: Rig, data: Path) -> None:
             f"{best - weight:.1f} | {found.discrepancy.scale:.2%}, "
             f"{found.discrepancy.length:g} | {' | '.join(values)} |"
         )
+
+
+def moved(form: Reduced, beside: Discrepancy, fit: Fitted, left: Float) -> tuple[Float, Float]:
+    """The vector of a fit (n,), moved to first order by a discrepancy beside the noise, and its
+    covariance (n, n). left : residual (m + r,) of the noise alone, in whose units the fit is."""
+    m, n = len(form.factor), fit.model.n_nominal
+    G = _directions(form, form.reference, beside.length)
+    root = np.linalg.cholesky(np.eye(m) + beside.scale**2 / 2 * G @ G.T)
+    J, r = (
+        np.concatenate([linalg.solve_triangular(root, rows[:m], lower=True), rows[m:]])
+        for rows in (fit.jacobian, left)
+    )
+    prior = fit.precision() - fit.information
+    pull = np.zeros(fit.x.size)
+    pull[:n] = (prior @ fit.x)[:n]
+    covariance = np.linalg.inv(J.T @ J + prior)
+    return fit.x - covariance @ (J.T @ r + pull), covariance
 
 
 def main() -> None:

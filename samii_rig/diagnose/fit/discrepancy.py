@@ -47,12 +47,10 @@ class Discrepancy:
 @dataclass(frozen=True, slots=True)
 class Weighed:
     """A fit beside its most likely discrepancy. evidence : its logarithm, up to a constant of the
-    data. x : (n,) the vector, moved to first order; precision : (n, n)."""
+    data."""
 
     evidence: float
     discrepancy: Discrepancy
-    x: Float
-    precision: Float
 
 
 def weighed(form: Reduced, M: Complex, fit: Fitted, left: Float) -> Weighed:
@@ -96,7 +94,7 @@ def _of_length(form: Reduced, M: Complex, fit: Fitted, left: Float, length: floa
         cost = float(r @ (counts * r) + left[m:] @ left[m:] + fit.penalty + g @ d)
         free = float(np.linalg.slogdet(A / np.outer(size, size))[1])
         evidence = -0.5 * (cost - float(np.sum(np.log(counts))) + free)
-        found.append(Weighed(evidence, Discrepancy(float(scale), length), fit.x + d, A))
+        found.append(Weighed(evidence, Discrepancy(float(scale), length)))
     return max(found, key=lambda w: w.evidence)
 
 
