@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from poses_kit import BAND, in_pose, loaded, two_links
+from poses_kit import BAND, in_pose, loaded, named_mass, two_links
 from table_kit import Effects, table_of
 
 from samii_rig.diagnose.fit.rigfile import toml
@@ -36,11 +36,7 @@ FEW = Effects(lambda: table_of(RIG, *BAND, *KINDS))
 def test_a_mass_beyond_a_bend_has_its_place_and_size() -> None:
     """The bend carries it along, which a mass at its place alone would not tell."""
     found = in_poses([in_pose(RIG, "20 deg", 1, loaded(0.1))], RIG, effects=FEW)
-    assert found.verdict == "named"
-    (cause,) = found.causes
-    assert (cause.physics, cause.site) == ("added_mass", "fore")
-    assert cause.parameters["m"].value == pytest.approx(0.1, rel=0.05)
-    assert found.with_causes[0] < found.threshold < found.chi2_per_dof
+    named_mass(found, 0.1)
     whole = in_poses([in_pose(RIG, "20 deg", 2)], RIG, effects=FEW)
     assert whole.verdict == "no_mismatch"
 
@@ -62,11 +58,7 @@ POSES = ("20 deg, bent 60 deg", "80 deg, bent -30 deg")
 def test_a_mass_beyond_a_bend_is_found_over_poses_in_which_both_joints_turn() -> None:
     each = [in_pose(RIG, pose, i, loaded(0.1)) for i, pose in enumerate(POSES, 1)]
     found = in_poses(each, RIG, effects=FEW)
-    assert found.verdict == "named"
-    (cause,) = found.causes
-    assert (cause.physics, cause.site) == ("added_mass", "fore")
-    assert cause.parameters["m"].value == pytest.approx(0.1, rel=0.05)
-    assert found.with_causes[0] < found.threshold < found.chi2_per_dof
+    named_mass(found, 0.1)
     assert found.not_physics[0].startswith(
         "one set of parameters in 2 poses (20 deg, bent 60 deg, 80 deg, bent -30 deg)"
     )

@@ -6,12 +6,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import pytest
 from elements_kit import part
 from gravity_kit import hanging
 
 from samii_rig.devices.protocols import CommandBlock, DeviceLoop
 from samii_rig.diagnose.physics.insert import element_of, inserted
 from samii_rig.diagnose.posed import InPose
+from samii_rig.diagnose.result import Cause, Diagnosis
 from samii_rig.identify.poses import at_pose
 from samii_rig.rig.pose import read_whole_pose
 from samii_rig.rig.schema import GravityStiffness, LumpedMass, Rig, TorsionalGroundSpring
@@ -105,6 +107,16 @@ def _hidden(kind: type[Any], **values: float) -> Change:
 def loaded(mass: float) -> Change:
     """A mass (kg) at the tip."""
     return _hidden(LumpedMass, m=mass)
+
+
+def named_mass(found: Diagnosis, mass: float) -> Cause:
+    """The one cause, which must be a mass (kg) at the tip that explains all but the noise."""
+    assert found.verdict == "named"
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("added_mass", "fore")
+    assert cause.parameters["m"].value == pytest.approx(mass, rel=0.05)
+    assert found.with_causes[0] < found.threshold < found.chi2_per_dof
+    return cause
 
 
 def held(k: float) -> Change:
