@@ -71,8 +71,8 @@ class Reduced:
     known : directions of d that the records tell anything of, the mean of chi-square.
     inside : chi-square that no d explains, and its mean.
     noise : of a sample. differing : chi-square of levels against each other, and its mean.
-    spread : twice the sum over the lines of the logarithm of the determinant of the noise, which
-    with chi-square is the deviance of a model with this noise.
+    log_determinant : twice the sum over the lines of the logarithm of the determinant of the noise,
+    which with chi-square is the deviance of a model with this noise.
     """
 
     frequency: Float
@@ -84,7 +84,7 @@ class Reduced:
     inside: tuple[float, float]
     noise: Noise
     differing: tuple[float, float]
-    spread: float
+    log_determinant: float
 
     def residual(self, h: Complex) -> Float:
         """(m,) in noise units, of a response (b, q)."""
@@ -393,7 +393,7 @@ def formed(
         inside=(form.total - float(form.target @ form.target), count - form.known),
         noise=power,
         differing=_differing(records, H, seen, power),
-        spread=form.spread,
+        log_determinant=form.log_determinant,
     )
     return made, rows
 
@@ -732,7 +732,7 @@ class _Form:
     target: Float
     total: float
     nuisances: int
-    spread: float
+    log_determinant: float
 
 
 def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
@@ -757,7 +757,8 @@ def _quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
         target=linalg.solve_triangular(C, g, trans="T", check_finite=False),
         total=float(np.sum(rows.e.conj() * We).real) - float(own_head @ own_head),
         nuisances=own_head.size,
-        spread=-2 * float(np.sum(np.linalg.slogdet(W)[1])),  # but for a constant of the lines
+        log_determinant=-2
+        * float(np.sum(np.linalg.slogdet(W)[1])),  # but for a constant of the lines
     )
 
 

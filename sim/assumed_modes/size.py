@@ -100,11 +100,13 @@ def solve(
     if best is None or not LEAST * 0.8 <= best[1].sigma <= MOST * CLOSE:
         return None
     strength, left = best
-    if _farthest(left) >= NEAR:
-        # From the nominal parameters themselves there may be a lower minimum.
-        left = min(left, refit.left(of(strength)), key=lambda x: x.sigma)
+    if _farthest(left) < NEAR:
+        return best
+    # From the nominal parameters themselves there may be a lower minimum.
+    rows = of(strength)
+    left = min(left, refit.left(rows), key=lambda x: x.sigma)
     if _farthest(left) > UNLIKELY:
-        left = min(left, refit.cooled(of(strength)), key=lambda x: x.sigma)
+        left = min(left, refit.cooled(rows), key=lambda x: x.sigma)
     if _farthest(left) > UNLIKELY:
         left = min(left, grown(refit, of, strength), key=lambda x: x.sigma)
     return (strength, left) if left.sigma >= LEAST * 0.8 else None

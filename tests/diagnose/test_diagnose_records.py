@@ -13,11 +13,9 @@ from table_kit import Effects, table_of
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose
-from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.records import RecordProblem, Whole, _unfolded
 from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
-from samii_rig.diagnose.forces.search import ForceSearch
-from samii_rig.diagnose.forces.variation import Variation
+from samii_rig.diagnose.forces.variation import BySpring, Variation
 from samii_rig.diagnose.physics.model import Model, grid
 from samii_rig.diagnose.result import Diagnosis, Gap, Value
 from samii_rig.diagnose.verdict import by_record
@@ -107,9 +105,9 @@ def test_a_segment_in_which_a_sensor_freezes_is_left_out_and_told(nothing: list[
     assert every.verdict == "no_mismatch"
 
 
-def anything(_search: ForceSearch, best: Explanation, _files: int) -> Variation | None:
+def anything(seen: BySpring, _files: int) -> Variation | None:
     """A joint that swings in any phase, which does the work of every linear effect."""
-    if best.effects:
+    if seen.best.effects:
         return None
     return Variation(
         sites=(("joint_1", 1.0),),

@@ -64,30 +64,37 @@ def test_they_are_tried_though_another_effect_seems_to_be_enough():
     assert search._bent(best)
 
 
+def of(chi2, *effects):
+    """An explanation that leaves so much."""
+    return SimpleNamespace(
+        effects=effects,
+        key=frozenset(e.key for e in effects),
+        fitted=SimpleNamespace(chi2=chi2),
+    )
+
+
+def searched(found):
+    """A search that found these, the first with nothing missing."""
+    search = SimpleNamespace(
+        found={e.key: e for e in found},
+        critical_value=28.0,
+        overdispersion=1.0,
+        nominal=found[0],
+        without=lambda e, i: search.found[e.key - {e.effects[i].key}],
+    )
+    return search
+
+
 def test_a_mistake_of_the_data_is_no_effect_that_may_be_too_little_beside_another():
     """Removed, it costs little chi-square but unlikely nominal parameters; the cause beside it is
     the answer all the same, and no less probable one."""
-
-    def of(chi2, *effects):
-        return SimpleNamespace(
-            effects=effects,
-            key=frozenset(e.key for e in effects),
-            fitted=SimpleNamespace(chi2=chi2),
-        )
 
     mistake, inertia, lag = (
         SimpleNamespace(key=key, physical=key != "mistake", force=None, rough=0.0)
         for key in ("mistake", "inertia", "lag")
     )
-    nothing = of(2000.0)
-    fewer = [nothing, of(900.0, mistake), of(583.0, inertia), of(583.0, lag)]
-    search = SimpleNamespace(
-        found={e.key: e for e in fewer},
-        critical_value=28.0,
-        overdispersion=1.0,
-        nominal=nothing,
-        without=lambda e, i: search.found[e.key - {e.effects[i].key}],
-    )
+    fewer = [of(2000.0), of(900.0, mistake), of(583.0, inertia), of(583.0, lag)]
+    search = searched(fewer)
     assert not _is_insignificant(search, of(570.0, mistake, inertia))
     assert _is_insignificant(search, of(570.0, lag, inertia))
     fewer[1].fitted.chi2 = 590.0
@@ -227,23 +234,10 @@ def test_what_a_meter_may_be_off_by_is_no_dead_time(rough: float, insignificant:
     """Of 712,000 of chi-square that a meter explains, 47 more by a dead time of a hundredth of a
     sample."""
 
-    def of(chi2, *effects):
-        return SimpleNamespace(
-            effects=effects,
-            key=frozenset(e.key for e in effects),
-            fitted=SimpleNamespace(chi2=chi2),
-        )
-
     meter = SimpleNamespace(key="meter", physical=False, force=None, rough=rough)
     late = SimpleNamespace(key="late", physical=True, force=None, rough=0.0)
-    fewer = [nothing := of(712_000.0), of(550.0, meter), of(30_000.0, late)]
-    search = SimpleNamespace(
-        found={e.key: e for e in fewer},
-        critical_value=28.0,
-        overdispersion=1.0,
-        nominal=nothing,
-        without=lambda e, i: search.found[e.key - {e.effects[i].key}],
-    )
+    fewer = [of(712_000.0), of(550.0, meter), of(30_000.0, late)]
+    search = searched(fewer)
     assert _is_insignificant(search, of(503.0, meter, late)) is insignificant
     table = channels.effects(samii(), 0.5, 40.0)
     meters = [e for e in table if e.physics == "input_not_held"]

@@ -17,7 +17,7 @@ from table_kit import Effects, table_of
 from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.search import ForceSearch
-from samii_rig.diagnose.forces.variation import _less, _repeats_differ, variation
+from samii_rig.diagnose.forces.variation import BySpring, _less, _repeats_differ, variation
 from samii_rig.diagnose.forces.varying import (
     Modulation,
     PieceModulation,
@@ -182,7 +182,7 @@ def test_under_noise_alone_every_frequency_has_chi_square_of_two_freedoms(
 
 
 def test_where_nothing_is_missing_every_stiffness_is_constant(nothing: ForceSearch) -> None:
-    assert variation(nothing, nothing.nominal, 3) is None
+    assert variation(BySpring.of(nothing, nothing.nominal), 3) is None
 
 
 def test_what_a_swing_adds_in_time_is_what_it_adds_to_the_lines(nothing: ForceSearch) -> None:
@@ -223,7 +223,9 @@ def swinging(nothing: ForceSearch, site: str, hz: float, depth: float) -> ForceS
 def test_a_swing_that_is_put_into_the_records_is_taken_out_again(nothing: ForceSearch) -> None:
     """By as much as it was put in, to first order in all else that is refitted."""
     hz, depth = 0.7, 0.02
-    found = variation(swinging(nothing, "joint_2", hz, depth), replace(nothing.nominal), 3)
+    found = variation(
+        BySpring.of(swinging(nothing, "joint_2", hz, depth), replace(nothing.nominal)), 3
+    )
     assert found is not None
     assert found.sites[0][0] == "joint_2"
     told = found.parameters["depth"]
@@ -248,7 +250,9 @@ def test_which_spring_swings_is_decided_without_the_swing_in_the_noise(
         return [*found[1::-1], *found[2:]]
 
     monkeypatch.setattr(Springs, "strongest", neighbour_first)
-    found = variation(swinging(nothing, "joint_2", 1.0, 0.0028), replace(nothing.nominal), 3)
+    found = variation(
+        BySpring.of(swinging(nothing, "joint_2", 1.0, 0.0028), replace(nothing.nominal)), 3
+    )
     assert seen[0][:2] == ["joint_2", "joint_1"]
     assert found is not None
     (site, sure), (other, _) = found.sites

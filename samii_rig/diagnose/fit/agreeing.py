@@ -196,7 +196,8 @@ def _alone(given: Given) -> list[_Alone]:
     out = []
     for i, run in enumerate(whole.runs):
         try:
-            own = Whole.of_aligned([run], whole.rig, band, sensors, _own(run, given.findings))
+            findings = _own(run, given.findings)
+            own = Whole.of([run], whole.rig, band, sensors, findings, in_order=True)
             # On two states, those lines alone that both have.
             among = within(own.records, records.band)
         except EstimateError:

@@ -104,27 +104,19 @@ class Whole:
         band: tuple[float, float] | None = None,
         sensors: Sequence[str] | None = None,
         findings: Sequence[Finding] = (),
+        *,
+        in_order: bool = False,
     ) -> Whole:
         """All runs of one rig.
 
         sensors : those that are sound, all that were recorded if None. findings : of the samples;
         segments that they are about are left out, but not for a sensor that is left out itself.
+        in_order : whether their rows hold what was sent and measured at one time, as `runs` do.
 
         Raises EstimateError where they hold nothing to compare.
         """
-        every = [run for run, _ in aligned(runs)]
-        return cls.of_aligned(every, rig, band, sensors, findings)
-
-    @classmethod
-    def of_aligned(
-        cls,
-        runs: Sequence[Recording],
-        rig: Rig,
-        band: tuple[float, float] | None = None,
-        sensors: Sequence[str] | None = None,
-        findings: Sequence[Finding] = (),
-    ) -> Whole:
-        """As `of`, of runs whose rows hold what was sent and measured at one time."""
+        if not in_order:
+            runs = [run for run, _ in aligned(runs)]
         wired = wiring(runs, rig, sensors)
         bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
         without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
@@ -609,7 +601,7 @@ class RecordSearch(Search):
     def deviance(self, fitted: Fitted) -> float:
         """Of a fit with the noise about which the likelihood stands: one that leaves much calls it
         noise, and is right where its noise is weighed too."""
-        return fitted.cost + self.reduced.inside[0] + self.reduced.spread
+        return fitted.cost + self.reduced.inside[0] + self.reduced.log_determinant
 
     def _there(self, model: Model, x: Float) -> Fitted:
         return refit(model, self.problem, x, far=False, steps=0)

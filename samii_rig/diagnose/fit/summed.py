@@ -102,7 +102,7 @@ class Summed(Reduced):
             inside=_added([one.inside for one in each]),
             noise=each[0].noise,
             differing=_added([one.differing for one in each]),
-            spread=sum(one.spread for one in each),
+            log_determinant=sum(one.log_determinant for one in each),
             each=tuple(each),
         )
 

@@ -50,7 +50,7 @@ AGAIN = 3  # times that the likelihood is made anew about the best explanation
 STILL = 0.5  # standard deviations, a move from one to the next that is none
 RENEWED = 6  # times that the chain through which a force acts is renewed in between
 RIVALS = 4  # linear explanations that forces are held against
-UNEVEN = 1e-4  # chance of a true force to explain lines as unevenly, below which it is none
+INCONSISTENT = 1e-4  # chance of a true force to explain lines as unevenly, below which it is none
 BESIDE = 6  # linear effects that are refitted beside the best force, and the other way round
 
 
@@ -155,25 +155,25 @@ class ForceSearch(RecordSearch):
         self.pair()
         self._alone()
         self._rivals()
-        self._forget_uneven()
+        self._forget_inconsistent()
         self.take_overdispersion()
 
-    def _forget_uneven(self) -> None:
+    def _forget_inconsistent(self) -> None:
         """Without explanations whose force does not explain at all lines what it says that it does:
         what is left of an input's edges, say, is like dry friction at some and not at others."""
         while isinstance(model := (best := self.ranked()[0]).fitted.model, ForceModel):
             linear = tuple(e for e in best.effects if e.force is None)
             x = np.delete(best.fitted.x, list(model.unknowns))
             base = self.refitted_from(linear, x)
-            if base is None or self._even(base, best.fitted):
+            if base is None or self._consistent(base, best.fitted):
                 return
             del self.found[best.key]
 
-    def _even(self, before: Fitted, after: Fitted) -> bool:
+    def _consistent(self, before: Fitted, after: Fitted) -> bool:
         """Whether what one fit has more than another shows at all lines as it should."""
-        rates = [len(p.z) for p in self.levels.records.pieces]
+        samples = [len(p.z) for p in self.levels.records.pieces]
         a, b = self.unexplained(before), self.unexplained(after)
-        return evenly(a, b, rates, self.ratio(after)) > UNEVEN
+        return evenly(a, b, samples, self.ratio(after)) > INCONSISTENT
 
     def _alone(self) -> None:
         """The force of the best explanation without each linear effect beside it, from where both

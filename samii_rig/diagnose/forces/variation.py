@@ -12,6 +12,7 @@ import math
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import stats
@@ -29,7 +30,6 @@ from samii_rig.diagnose.forces.varying import (
     Modulation,
     PieceModulation,
     Springs,
-    piece_modulations,
     uneven,
 )
 from samii_rig.diagnose.result import Gap, Value
@@ -84,11 +84,32 @@ class Variation:
         return f"the stiffness of {self.sites[0][0]} is not constant: it {how}"
 
 
-def variation(search: ForceSearch, best: Explanation, files: int) -> Variation | None:
-    """The stiffness that varies, by what a linear explanation leaves of the records; None where
-    noise could do that. files : recordings, each of which may have a stiffness of its own."""
-    springs = Springs.of(search)
-    found = springs.strongest(search, _some(search.unexplained(best.fitted)))
+@dataclass(frozen=True)
+class BySpring:
+    """What a linear explanation `best` leaves of the records, taken back to each spring."""
+
+    search: ForceSearch
+    best: Explanation
+    springs: Springs
+    pieces: dict[str, list[PieceModulation]]
+
+    @classmethod
+    def of(cls, search: ForceSearch, best: Explanation) -> BySpring:
+        """Of an explanation of these records."""
+        springs = Springs.of(search)
+        left = _some(search.unexplained(best.fitted))
+        return cls(search, best, springs, springs.pieces(search, left))
+
+    @cached_property
+    def strongest(self) -> list[tuple[str, Modulation]]:
+        """As of `Springs`."""
+        return self.springs.strongest(self.pieces)
+
+
+def variation(seen: BySpring, files: int) -> Variation | None:
+    """The stiffness that varies; None where noise could do that. files : recordings, each of which
+    may have a stiffness of its own."""
+    search, best, springs, found = seen.search, seen.best, seen.springs, seen.strongest
     if not found:
         return None
     tried = []
@@ -135,20 +156,15 @@ class Uneven:
         )
 
 
-def uneven_spring(search: ForceSearch, best: Explanation) -> Uneven | None:
-    """The spring that is not the same to both sides, by what a linear explanation leaves of the
-    records: where it explains more than noise, and more than one that varies in time, which it
-    would pass for, as it swings with the motion."""
-    springs = Springs.of(search)
-    left = _some(search.unexplained(best.fitted))
-    each = [(site, piece_modulations(search, place, left)) for site, place in springs.each]
-    found = [Uneven(site, uneven(pieces)) for site, pieces in each if pieces]
+def uneven_spring(seen: BySpring) -> Uneven | None:
+    """The spring that is not the same to both sides: where it explains more than noise, and more
+    than one that varies in time, which it would pass for, as it swings with the motion."""
+    found = [Uneven(site, uneven(pieces)) for site, pieces in seen.pieces.items()]
     most = max(found, key=lambda one: one.chi2, default=None)
     tries = len(SIDES) * len(found)
     if most is None or tries * float(stats.chi2.sf(most.chi2, 1)) > ALARM:
         return None
-    modulations = springs.strongest(search, left)
-    return most if not modulations or modulations[0][1].gain < most.chi2 else None
+    return most if not seen.strongest or seen.strongest[0][1].gain < most.chi2 else None
 
 
 @dataclass
@@ -196,10 +212,10 @@ class _Taken:
 
     def closer(self, best: Explanation) -> bool:
         """Take out what varies still, and make the likelihood anew. False if noise could do it."""
-        place, step = dict(self.springs.each)[self.site], 1 / self.springs.longest
+        step = 1 / self.springs.longest
         left = _some(self.search.unexplained(self.fitted))
-        self.pieces = piece_modulations(self.search, place, left)
-        more = self.springs.strongest(self.search, left, self.site)
+        here = self.springs.pieces(self.search, left, self.site)
+        self.pieces, more = here[self.site], self.springs.strongest(here)
         if more and all(abs(more[0][1].hz - one.hz) > step for one in self.modulations):
             self.modulations.append(more[0][1].closer(self.pieces, step))
             self.repeats.append(_repeats_differ(self.pieces, self.modulations[-1].hz))

@@ -17,7 +17,7 @@ modulation.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -69,15 +69,25 @@ class Springs:
             longest,
         )
 
-    def strongest(
+    def pieces(
         self, search: ForceSearch, left: Sequence[Unexplained], only: str = ""
+    ) -> dict[str, list[PieceModulation]]:
+        """What is `left` of all pieces, taken back to each spring at which a force acts. only : the
+        spring that is looked at, all if none."""
+        each = (
+            (site, piece_modulations(search, place, left))
+            for site, place in self.each
+            if only in ("", site)
+        )
+        return {site: pieces for site, pieces in each if pieces}
+
+    def strongest(
+        self, by_site: Mapping[str, Sequence[PieceModulation]]
     ) -> list[tuple[str, Modulation]]:
-        """Of each spring what explains most of what is `left` of all pieces, the best first; none
-        where noise could do as much. only : the spring that is looked at, of all if none."""
+        """Of each spring what explains most, the best first; none where noise could do as much."""
         found = [
             (site, Modulation.of(pieces, self.f, 2 * self.longest * float(self.f[-1])))
-            for site, place in self.each
-            if only in ("", site) and (pieces := piece_modulations(search, place, left))
+            for site, pieces in by_site.items()
         ]
         found.sort(key=lambda one: -one[1].gain)
         if not found or len(found) * found[0][1].false_alarm > ALARM:

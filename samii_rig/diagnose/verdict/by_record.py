@@ -13,7 +13,7 @@ from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
-from samii_rig.diagnose.forces.variation import Variation, uneven_spring, variation
+from samii_rig.diagnose.forces.variation import BySpring, Variation, uneven_spring, variation
 from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
@@ -244,17 +244,17 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
     own = verdict.as_meant(search, judged.best)
     # At the noise itself: while a mismatch is large all weights are smaller, a variation's not.
     rival = max(judged.best.weight - own.weight, (own.fitted.cost - judged.best.fitted.cost) / 2)
-    linear = _is_linear(judged)
-    sides = None if linear else uneven_spring(forces, base)
+    seen = None if _is_linear(judged) else BySpring.of(forces, base)
+    sides = uneven_spring(seen) if seen else None
     if sides is not None and sides.chi2 / 2 > rival:
         unknown = replace(judged, verdict="unknown")
         return replace(looked, judged=unknown, remarks=(*looked.remarks, sides.describe()))
-    found = None if linear else variation(forces, base, files)
+    found = variation(seen, files) if seen else None
     if found is not None and found.evidence > rival:
         varies = verdict.varying(judged, own, found, max(rival, 0.0))
         return _Looked(varies, found.before[1], found.after[1], found.gap, looked.remarks)
     if judged.best.effects and judged.best.key != base.key:
-        beside = variation(forces, judged.best, files)
+        beside = variation(BySpring.of(forces, judged.best), files)
         if beside is not None and beside.closed >= verdict.PARTLY:
             return replace(looked, remarks=(*looked.remarks, beside.describe()))
     return looked
