@@ -85,9 +85,10 @@ def test_a_logger_shifts_by_rows_of_the_recording_not_of_the_loop():
     assert late.factor.value(s, np.zeros(0))[0] == pytest.approx(np.exp(-s * 8 / RIG.rate_hz))
 
 
-def measured(rig, H, lines=LINES, seed=3):
-    """A response with noise in it, of H (n, n_sensor)."""
-    return redraw(noiseless(rig, lines), H[:, :, None], np.random.default_rng(seed), 10)
+def measured(rig, H, lines=LINES, seed=3, noise=0.01):
+    """A response with noise in it, a part of its size, of H (n, n_sensor)."""
+    like = noiseless(rig, lines, relative=noise)
+    return redraw(like, H[:, :, None], np.random.default_rng(seed), 10)
 
 
 @pytest.mark.parametrize(
@@ -147,3 +148,13 @@ def test_it_is_told_and_no_physics_is_named(physics, site, said):
     assert found.verdict == "no_mismatch"
     assert not found.causes
     assert any(site in words for words in found.not_physics)
+
+
+def test_a_shift_stays_a_shift_where_a_dead_time_fits_by_less_than_models_are_exact_to():
+    """2 us beside 4 ms are 7 noise units, and 5e-4 of what is wrong."""
+    table = list(faults.effects(TWO, TWO.rate_hz))
+    (effect,) = (e for e in table if e.variant.startswith(LATE) and e.site == "v")
+    off = np.exp(-2j * np.pi * LINES * 2e-6)[:, None]
+    found = diagnose([measured(TWO, response(TWO, effect) * off, noise=1e-4)], TWO)
+    assert any("2 samples later" in words for words in found.not_physics)
+    assert all(c.parameters["tau"].value < 3e-6 for c in found.causes)

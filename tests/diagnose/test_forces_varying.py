@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -259,6 +260,27 @@ def test_which_spring_swings_is_decided_without_the_swing_in_the_noise(
     assert (site, other) == ("joint_2", "joint_1")
     assert sure > 0.99
     assert found.parameters["f"].value == pytest.approx(1.0, rel=0.01)
+
+
+def shown_by(each: list[tuple[float, float]]) -> Modulation:
+    """A modulation of two phases in each of some records. each : chi-square, known."""
+    rows = np.array([(chi2, 2.0, known) for chi2, known in each])
+    return Modulation(3.0, float(rows[:, 0].sum()), 2 * len(rows), 1.0, each=rows)
+
+
+def test_records_that_show_a_swing_alike_weigh_it_as_a_whole() -> None:
+    alike = shown_by([(12.0, 0.3), (9.0, 0.3), (15.0, 0.3)])
+    chi2, n = 36.0, 6
+    closed = (chi2 - n - n * math.log(chi2 / n)) / 2 - math.log(alike.trials)
+    assert alike.evidence == pytest.approx(closed, abs=0.01)
+
+
+def test_what_only_records_have_that_hardly_show_it_is_no_swing() -> None:
+    shown, hardly = 1e-3, 1e-5
+    swing = shown_by([(20.0, shown), (25.0, shown), (2.0, hardly), (3.0, hardly)])
+    other = shown_by([(2.0, shown), (3.0, shown), (20.0, hardly), (25.0, hardly)])
+    assert other.chi2 == swing.chi2
+    assert swing.evidence > 10 > other.evidence
 
 
 @pytest.mark.parametrize("in_time", [True, False])

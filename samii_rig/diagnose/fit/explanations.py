@@ -137,7 +137,12 @@ class Explanations:
         """Logarithm of evidence times prior, less what effects beside the first must be worth
         where the mismatch is large: they may not live on what models are not exact to."""
         effects = tuple(effects)
-        beside = self.model_error_penalty(effects, self._nominal_chi2)
+        # What is wrong with the data is mended exactly: beside it the rest is what counts.
+        faults = frozenset(e.key for e in effects if not e.physical)
+        meant = self.found.get(faults) if faults else None
+        beside = self.model_error_penalty(
+            effects, meant.fitted.chi2 if meant else self._nominal_chi2
+        )
         small = sum(
             unknown.small(float(fitted.x[at]))
             for i, e in enumerate(effects)
@@ -147,8 +152,13 @@ class Explanations:
 
     def model_error_penalty(self, effects: Sequence[Effect], nominal_chi2: float) -> float:
         """Logarithm of evidence that effects beside the first must be worth on lines where the
-        nominal model leaves `nominal_chi2` of chi-square."""
-        return 0.5 * EXACT**2 * nominal_chi2 / self.overdispersion * max(len(effects) - 1, 0)
+        nominal model of what was meant to be recorded leaves `nominal_chi2`; and the first, in the
+        place of what is wrong with the data. Two explanations that differ by d sigma differ by d^2
+        of chi-square, and a model's error of e sigma moves that by 2 d e at most: by less than d^2
+        where d is more than 2 e."""
+        beside = max(len(effects) - 1, 0)
+        instead = 4 if effects and all(e.physical for e in effects) else 0
+        return 0.5 * EXACT**2 * nominal_chi2 / self.overdispersion * (beside + instead)
 
     def log_prior(self, effects: Iterable[Effect]) -> float:
         """Before the data: of how many, which rows, which sites of a row. What is no physics has

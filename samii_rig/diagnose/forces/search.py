@@ -292,12 +292,11 @@ class ForceSearch(RecordSearch):
         screens = tuple(Screen.of(self._force_problem, e.fitted) for e in bases)
         screen = ForceScreen(self._force_problem, screens)
         scores = first_order(self.forces, self.paths, screen)
-        most = max((float(np.max(h.may)) for h in scores), default=0.0)
-        some = [h for h in scores if self._matters(h, most)][:MARCHED]
-        each = self.each(some, lambda h: named([h.effect]))
-        found = [self._closer(h, screen, bases[0]) for h in each]
         # Beside the first it must do as much as what the last has more did.
         ahead = screens[0].base.cost - min(one.base.cost for one in screens)
+        some = self._matter(scores, ahead)[:MARCHED]
+        each = self.each(some, lambda h: named([h.effect]))
+        found = [self._closer(h, screen, bases[0]) for h in each]
         return [
             h
             for h in found
@@ -305,9 +304,17 @@ class ForceSearch(RecordSearch):
             and (h.own[0] >= STRONG * ahead or h.own[-1] >= self.critical_value / 2)
         ]
 
-    def _matters(self, score: Score, most: float) -> bool:
-        may = float(np.max(score.may))
-        return may > max((WEAK if score.weak else STRONG) * self.critical_value, LESS * most)
+    def _matter(self, scores: Sequence[Score], ahead: float) -> list[Score]:
+        """Those that to first order may do enough beside one of the bases. ahead : of chi-square,
+        what it has to do as well beside the first."""
+        if not scores:
+            return []
+        may = np.array([h.may for h in scores])
+        share = np.array([WEAK if h.weak else STRONG for h in scores])
+        least = np.maximum(share[:, None] * self.critical_value, LESS * np.max(may, axis=0))
+        least[:, 0] = np.maximum(least[:, 0], STRONG**2 * ahead)
+        enough = np.any(may > least, axis=1)
+        return [h for h, on in zip(scores, enough, strict=True) if on]
 
     def _closer(self, score: Score, screen: ForceScreen, base: Explanation) -> Score | None:
         """The same, computed in time where the first order leads, and closer to its best."""

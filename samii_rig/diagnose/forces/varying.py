@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import optimize, stats
@@ -41,6 +41,7 @@ FLAT = 1e-2  # of the distance between frequencies that are tried: nearer, chi-s
 # stiffer to one side, and of the first that a curve has.
 SIDES = (1, 2)
 ROUNDED = 1e-6  # of the largest variance: less is rounding
+VARIANCES = 400  # that are tried: a decade of them has 40 or more, and likelihoods are flat there
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,6 +157,13 @@ class PieceModulation:
         does, its degrees of freedom, and what is known of both phases of a modulation."""
         chi2, free, known = self._rows(hz)
         return float(np.sum(chi2)), free * self.times.size, known
+
+    def each(self, hz: float) -> Float:
+        """(rows, 3) chi-square of each row, its degrees of freedom, and what is known, as of
+        `exact`: repeats show a modulation alike, as its phase is another in each."""
+        chi2, free, known = self._rows(hz)
+        rows = chi2.size
+        return np.column_stack([chi2, np.full(rows, free), np.full(rows, known / rows)])
 
     def differing(self, hz: float) -> tuple[float, int]:
         """Chi-square of what repeats differ by, of them alone, and its degrees of freedom. hz : 0
@@ -273,7 +281,8 @@ class Modulation:
     with `free` degrees of freedom. known : of its amplitude's square, or of its mean square. off :
     Hz, standard deviation of its frequency. trials : independent ones at this spring, of which it
     is the best: half the probability of a false alarm is that of a modulation at any frequency.
-    louder : the noise there than it is told."""
+    louder : the noise there than it is told. each : (m, 3) chi-square, degrees of freedom and what
+    is known, of records that do not show it alike; none where they do."""
 
     hz: float
     chi2: float
@@ -282,6 +291,7 @@ class Modulation:
     trials: float = 2.0
     off: float = 0.0
     louder: float = 1.0
+    each: Float = field(default_factory=lambda: np.empty((0, 3)))
 
     @classmethod
     def of(cls, pieces: Sequence[PieceModulation], f: Float, many: float) -> Modulation:
@@ -306,8 +316,9 @@ class Modulation:
         louder: float,
         off: float = 0.0,
     ) -> Modulation:
-        chi2, free, known = zip(*(one.exact(hz) for one in pieces), strict=True)
-        return cls(hz, sum(chi2) / louder, sum(free), sum(known) / 2 / louder, trials, off, louder)
+        each = np.concatenate([one.each(hz) for one in pieces]) / [louder, 1.0, louder]
+        chi2, free, known = (float(x) for x in np.sum(each, axis=0))
+        return cls(hz, chi2, round(free), known / 2, trials, off, louder, each)
 
     def closer(self, pieces: Sequence[PieceModulation], step: float) -> Modulation:
         """The same at the best frequency within a step (Hz) of its own."""
@@ -339,11 +350,23 @@ class Modulation:
     @property
     def evidence(self) -> float:
         """Logarithm of the likelihood that it adds, of random phases whose variance is the most
-        likely one: (chi2 - free - free log(chi2/free))/2, less that of all that was tried."""
+        likely one and the same in all records, less that of all that was tried: (chi2 - free -
+        free log(chi2/free))/2 where all show it alike. A record that hardly shows it cannot have
+        more of it than the others."""
         if not 0 < self.free < self.chi2:
             return 0.0
-        added = (self.gain - self.free * math.log(self.chi2 / self.free)) / 2
-        return added - math.log(self.trials)
+        alike = np.array([[self.chi2, self.free, 1.0]])
+        return _likeliest(self.each if len(self.each) else alike) - math.log(self.trials)
+
+
+def _likeliest(each: Float) -> float:
+    """Logarithm of the likelihood that phases of one variance add to noise alone, at the most
+    likely variance: with v = 1 + variance x known of a record, the sum of (chi2 (1 - 1/v) - free
+    log v)/2 over the records. each : (m, 3) chi-square, degrees of freedom and known of them."""
+    chi2, free, known = each[(each[:, 1] > 0) & (each[:, 2] > 0)].T
+    variance = np.geomspace(1 / known.max(), chi2.max() / known.min(), VARIANCES)
+    v = 1 + variance[:, None] * known
+    return float(np.max(np.sum(chi2 * (1 - 1 / v) - free * np.log(v), axis=1), initial=0.0)) / 2
 
 
 def uneven(pieces: Sequence[PieceModulation]) -> float:
