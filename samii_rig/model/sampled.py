@@ -22,6 +22,7 @@ from samii_rig.types import Complex, Float
 
 ALIAS_TOLERANCE = 1e-5  # of each response, change by the last doubling of the aliases
 FIRST_ALIASES = 16  # aliases on each side to begin with
+SETTLED = 0.7  # ratio of a doubling's sum to the last, below which the rest is told: 1/f^2 has 0.5
 BLOCK = 128  # frequencies at once, so that memory stays bounded
 MAX_ALIASES = 4096  # on each side; the terms fall at least as 1/f^2 from there
 
@@ -153,15 +154,30 @@ def sampled_response(rig: Rig, frequency_hz: Float, chain: Chain | None = None) 
 
 
 def _aliased(rig: Rig, chain: Chain, f: Float) -> Complex:
-    """Sum over as many aliases as the slowest of these frequencies needs."""
+    """Sum over as many aliases as the slowest of these frequencies needs.
+
+    Far up, terms are smooth in k: their sum to k = K, the last one halved, is an integral but for
+    the third order of 1/K (Euler and Maclaurin). What twice as many add falls by a ratio that
+    settles, and the rest is a geometric series (Aitken): it is taken once two estimates agree.
+    """
+
+    def both(k: np.ndarray) -> Complex:
+        return _terms(rig, chain, f, k) + _terms(rig, chain, f, -k)
+
     total = _terms(rig, chain, f, np.zeros(1, dtype=np.int64))
+    last, end = np.zeros_like(total), np.zeros_like(total)
+    estimate = np.full_like(total, np.inf)
     reached, upto = 0, FIRST_ALIASES
     while True:
-        k = np.arange(reached + 1, upto + 1)
-        part = _terms(rig, chain, f, k) + _terms(rig, chain, f, -k)
+        half = both(np.array([upto])) / 2
+        part = end + both(np.arange(reached + 1, upto)) + half
         total += part
-        if upto >= MAX_ALIASES or np.all(np.abs(part) <= ALIAS_TOLERANCE * np.abs(total)):
-            return total
+        ratio = np.divide(part, last, out=np.zeros_like(part), where=np.abs(part) < np.abs(last))
+        rest = np.where(np.abs(ratio) < SETTLED, part * ratio / (1 - ratio), half)
+        off = np.minimum(np.abs(part), np.abs(total + rest - estimate))
+        estimate, last, end = total + rest, part, half
+        if upto >= MAX_ALIASES or np.all(off <= ALIAS_TOLERANCE * np.abs(total)):
+            return estimate
         reached, upto = upto, 2 * upto
 
 
