@@ -84,8 +84,9 @@ def place_at(
 
 
 def moved(old: Model, x: Float, model: Model) -> Float:
-    """x of `old` for a model of more effects: some nominal parameters may be gone or back."""
+    """x of `old`, copied, for a model of more effects: some nominal parameters may be gone or
+    back."""
     if model.keys == old.keys:
-        return x
+        return x.copy()
     held = dict(zip(old.keys, x[: old.n_nominal].tolist(), strict=True))
     return np.array([held.get(k, 0.0) for k in model.keys] + x[old.n_nominal :].tolist())

@@ -132,6 +132,9 @@ class Fitted:
     jacobian: Float
     information: Float
 
+    def __post_init__(self) -> None:
+        self.x.setflags(write=False)  # what is kept of a fit belongs to it
+
     @property
     def cost(self) -> float:
         """Chi-square and penalty."""

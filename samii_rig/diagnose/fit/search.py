@@ -57,13 +57,16 @@ class Search(Explanations):
     usual = LINES
     # The latest screen, and what it was about: single effects and pairs begin with the same one.
     _screened: tuple[tuple[object, ...], list[tuple[float, Effect, list[Start]]]] | None = None
+    # The lines, and the effects, from which the rig as its file has it was extended.
+    _straightened: tuple[object, frozenset[str]] = None, frozenset()
 
     def run(self, *, briefly: bool = False) -> list[Explanation]:
         """Forward, exchange, backward; all explanations, the most probable first. briefly : single
         effects alone, and beside what is wrong with the data."""
-        self.forward(self.nominal, FIRST, open_to_all=not briefly)
+        base = self.nominal if briefly else self._meant()
+        self.forward(base, FIRST, open_to_all=not briefly)
         if self._bent(self.ranked()[0]):
-            self.forward(self._straight(self.nominal), STRAIGHT, again=True)
+            self._forward_straight(base)
         self.take_overdispersion()
         best = self.ranked()[0]
         if briefly and faulty(best.effects) and not self._enough(best):
@@ -71,7 +74,7 @@ class Search(Explanations):
             base = self.ranked()[0]
             self.forward(base, FIRST)
             if self._bent(base):
-                self.forward(self._straight(base), STRAIGHT, again=True)
+                self._forward_straight(base)
             self.take_overdispersion()
         if briefly:
             self._plainer()
@@ -149,6 +152,22 @@ class Search(Explanations):
         """Whether nominal parameters at unlikely values may hide what is missing."""
         n = self.nominal.fitted.model.n_nominal
         return max(self.nominal.fitted.penalty, best.fitted.penalty) > PENALISED * n
+
+    def _meant(self) -> Explanation:
+        """The nominal model of what was meant to be recorded: with what is wrong with the data,
+        where nothing without that comes near."""
+        best = self.ranked()[0]
+        faults = frozenset(e.key for e in best.effects if not e.physical)
+        rival = next((e for e in self.ranked() if not faults <= e.key), None)
+        sure = rival is None or rival.weight < best.weight - 4 * NEAR
+        return self.found.get(faults, self.nominal) if sure else self.nominal
+
+    def _forward_straight(self, base: Explanation) -> None:
+        """Forward from the rig as its file has it, once on the same lines."""
+        problem, key = self._straightened
+        if problem is not self.problem or key != base.key:
+            self._straightened = self.problem, base.key
+            self.forward(self._straight(base), STRAIGHT, again=True)
 
     def _straight(self, base: Explanation) -> Explanation:
         """The same, the rig as its file has it: where the refitted one took values that their
@@ -250,7 +269,8 @@ class Search(Explanations):
     def _run(self, effects: tuple[Effect, ...], x: Float) -> Fitted | None:
         """A refit for as long as it falls fast: who starts far away is not behind for that."""
         end = self.refitted_from(effects, x, steps=AHEAD)
-        cost = math.inf
+        begun = self.refitted_from(effects, x, steps=0, far=False)
+        cost = math.inf if begun is None else begun.cost
         while end is not None and end.cost < FALLING * cost:
             cost = end.cost
             end = self.refitted_from(effects, end.x, steps=AHEAD, far=False) or end
