@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from samii_rig.likelihood.pieces import Loops
@@ -17,7 +18,7 @@ from samii_rig.likelihood.reduce import (
     as_real,
     orthonormal,
 )
-from samii_rig.types import Complex, Int
+from samii_rig.types import Complex, Float, Int
 
 # Parts of the lines in each of which what is added does as much, and what it may be off by in one:
 # the laws of both plants are by less than this part of what they do.
@@ -31,11 +32,19 @@ class Unexplained:
     k : (n,) its lines. root : (n, q, q) what whitens them: real and imaginary parts of variance 1.
     white : (1 + repeats, n, q) what the model leaves of the piece, and what its repeats differ by,
         nuisances at their best.
+    rounded : (offsets, n, q) of each sensor that nothing dithers the same of its rounding, wherever
+        it stands in its step.
     """
 
     k: Int
     root: Complex
     white: Complex
+    rounded: Mapping[int, Complex] = field(default_factory=dict)
+
+    def at(self, on: NDArray[np.bool_]) -> Unexplained:
+        """Of some of the lines."""
+        rounded = {c: x[:, on] for c, x in self.rounded.items()}
+        return Unexplained(self.k[on], self.root[on], self.white[:, on], rounded)
 
     @property
     def pull(self) -> Complex:
@@ -59,12 +68,37 @@ def unexplained(
         )
         N = (root @ seen.N).reshape(-1, seen.N.shape[2])
         Q = orthonormal(as_real(N))
-        white = []
-        for e in (seen.e, *(records.residual(x, lines.k, H, exact) for x in piece.repeats)):
-            goal = as_real((root @ e[:, :, None]).ravel())
-            white.append(as_complex(goal - Q @ (Q.T @ goal)).reshape(e.shape))
-        out.append(Unexplained(lines.k, root, np.stack(white)))
+
+        def white(e: Complex, root: Complex = root, Q: Float = Q) -> Complex:
+            """(m, n, q) whitened, nuisances at their best."""
+            goal = as_real((root @ e[..., None]).reshape(len(e), -1).T)
+            return as_complex(goal - Q @ (Q.T @ goal)).T.reshape(e.shape)
+
+        repeats = (records.residual(x, lines.k, H, exact) for x in piece.repeats)
+        rounded = {}
+        for c, draws in seen.rounding.draws.items():
+            rounded[c] = np.zeros((*draws.shape, seen.e.shape[1]), complex)
+            rounded[c][:, :, c] = draws
+            rounded[c] = white(rounded[c])
+        out.append(Unexplained(lines.k, root, white(np.stack([seen.e, *repeats])), rounded))
     return out
+
+
+def as_rounding(before: Sequence[Unexplained], after: Sequence[Unexplained]) -> float:
+    """Power of the noise along what one model has that another lacks, in units of what it is told,
+    1 at least: the rounding of a motion of few steps repeats as the motion does, and has more there
+    than noise that is independent from line to line."""
+    along: dict[int, Float] = {}
+    independent = size = 0.0
+    for a, b in zip(before, after, strict=True):
+        d = a.white[0] - b.white[0]
+        size += float(np.sum(np.abs(d) ** 2))
+        for c, draws in a.rounded.items():
+            each = np.sum(d.conj() * draws, axis=2)
+            along[c] = along.get(c, 0.0) + np.sum(each.real, axis=1)
+            independent += float(np.sum(np.abs(each) ** 2)) / (2 * len(each))
+    shows = sum(float(np.mean(x**2)) for x in along.values())
+    return 1 + max(shows - independent, 0.0) / size if size > 0 else 1.0
 
 
 def evenly(

@@ -30,7 +30,7 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
 from samii_rig.likelihood.reduce import LineResiduals
-from samii_rig.likelihood.unexplained import Unexplained, evenly, unexplained
+from samii_rig.likelihood.unexplained import Unexplained, as_rounding, evenly, unexplained
 from samii_rig.types import Float
 
 CLOSER = 2  # times that the best strength is looked at closer
@@ -170,10 +170,13 @@ class ForceSearch(RecordSearch):
             del self.found[best.key]
 
     def _consistent(self, before: Fitted, after: Fitted) -> bool:
-        """Whether what one fit has more than another shows at all lines as it should."""
+        """Whether what one fit has more than another shows at all lines as it should, and is more
+        than rounding may do along it."""
         samples = [len(p.z) for p in self.levels.records.pieces]
         a, b = self.unexplained(before), self.unexplained(after)
-        return evenly(a, b, samples, self.ratio(after)) > INCONSISTENT
+        fall = (before.chi2 - after.chi2) / as_rounding(a, b)
+        even = evenly(a, b, samples, self.ratio(after)) > INCONSISTENT
+        return even and fall > self.critical_value
 
     def _alone(self) -> None:
         """The force of the best explanation without each linear effect beside it, from where both

@@ -320,7 +320,7 @@ def _summed(before: Float, more: Float) -> Float:
 def _some(left: Sequence[Unexplained]) -> list[Unexplained]:
     """On the lines that are fitted."""
     each = [(x, fitted_lines(x.k)) for x in left]
-    return [replace(x, k=x.k[on], root=x.root[on], white=x.white[:, on]) for x, on in each]
+    return [x.at(on) for x, on in each]
 
 
 def _less(piece: Piece, added: Float) -> Piece:
