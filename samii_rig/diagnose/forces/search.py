@@ -160,9 +160,7 @@ class ForceSearch(RecordSearch):
 
     def _forget_inconsistent(self) -> None:
         """Without explanations whose force does not explain at all lines what it says that it does:
-        what is left of an input's edges, say, is like dry friction at some and not at others. But
-        one that leaves noise where there was more may stay: of a motion that began in a gap of the
-        recording a force is off, and nothing else is there for what it explains."""
+        what is left of an input's edges, say, is like dry friction at some and not at others."""
         while isinstance(model := (best := self.ranked()[0]).fitted.model, ForceModel):
             linear = tuple(e for e in best.effects if e.force is None)
             x = np.delete(best.fitted.x, list(model.unknowns))
@@ -174,8 +172,10 @@ class ForceSearch(RecordSearch):
             del self.found[best.key]
 
     def _to_noise(self, before: Fitted, after: Fitted) -> bool:
-        """Whether one fit leaves no more than noise where another leaves more."""
-        return self.ratio(after) < threshold(self.spread) < self.ratio(before)
+        """Whether a force may be off for its motion, as it began in a gap, and leaves no more than
+        noise where another fit leaves more."""
+        moving = any(piece.moving for piece in self.levels.records.pieces)
+        return moving and self.ratio(after) < threshold(self.spread) < self.ratio(before)
 
     def _consistent(self, before: Fitted, after: Fitted) -> bool:
         """Whether what one fit has more than another shows at all lines as it should, and is more

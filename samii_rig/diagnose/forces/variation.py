@@ -105,6 +105,12 @@ class BySpring:
         """As of `Springs`."""
         return self.springs.strongest(self.pieces)
 
+    @property
+    def evidence(self) -> float:
+        """Logarithm of the evidence of the spring that most speaks for, of all of them."""
+        most = max((one.evidence for _, one in self.strongest), default=-math.inf)
+        return most - math.log(max(len(self.springs.each), 1))
+
 
 def variation(seen: BySpring, files: int) -> Variation | None:
     """The stiffness that varies; None where noise could do that. files : recordings, each of which

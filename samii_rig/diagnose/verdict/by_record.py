@@ -249,11 +249,12 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
     if sides is not None and sides.chi2 / 2 > rival:
         unknown = replace(judged, verdict="unknown")
         return replace(looked, judged=unknown, remarks=(*looked.remarks, sides.describe()))
-    found = variation(seen, files) if seen else None
+    found = variation(seen, files) if seen and seen.evidence > rival else None
     if found is not None and found.evidence > rival:
         varies = verdict.varying(judged, own, found, max(rival, 0.0))
         return _Looked(varies, found.before[1], found.after[1], found.gap, looked.remarks)
-    if judged.best.effects and judged.best.key != base.key:
+    more = judged.evidence.left > threshold(forces.spread)
+    if more and judged.best.effects and judged.best.key != base.key:
         beside = variation(BySpring.of(forces, judged.best), files)
         if beside is not None and beside.closed >= verdict.PARTLY:
             return replace(looked, remarks=(*looked.remarks, beside.describe()))
