@@ -57,7 +57,9 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         single = search.ranked()[0].key
         search.run()
         search.begin("amplitude levels, beside pairs")
-        if forced is not None and search.ranked()[0].key != single:
+        best = search.ranked()[0]
+        more = search.ratio(best.fitted) > threshold(search.spread)
+        if best.key != single and (forced is not None or more):
             forces = forces_on(search)
             forced = _winning(forces)
     search.begin("what cannot be distinguished")
