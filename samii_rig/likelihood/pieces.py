@@ -331,12 +331,18 @@ def _proportional(one: Piece, other: Piece, scale: Float | None, *, levels: bool
     return proportional(_flat(one.r, scale), _flat(other.r, scale))
 
 
-def _turned(group: list[Piece], scale: Float | None, *, levels: bool) -> Piece:
-    first = group[0]
-    c = np.array([_flat(p.r, scale) @ _flat(first.r, scale) for p in group])
+def turn_to(c: Float) -> Float:
+    """(n, n) orthonormal rows, the first along c (n,), by which records c_i r are turned."""
     # The first row of U^T of a Householder reflection that sends c to its own axis.
     U = np.linalg.qr(np.column_stack([c, np.eye(c.size)[:, 1:]]))[0].T
     U[0] *= np.sign(U[0] @ c)
+    return np.asarray(U)
+
+
+def _turned(group: list[Piece], scale: Float | None, *, levels: bool) -> Piece:
+    first = group[0]
+    c = np.array([_flat(p.r, scale) @ _flat(first.r, scale) for p in group])
+    U = turn_to(c)
     r = (U @ np.stack([p.r.ravel() for p in group])).reshape(len(group), *first.r.shape)
     z = np.tensordot(U, np.stack([p.z for p in group]), axes=1)
     others = tuple(Samples(r[i], z[i]) for i in range(1, len(group)))

@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 from concealed_kit import SAMII, SAMII_TOML
 from cut_kit import DESIGN, cut_sweeps
-from scipy import stats
+from scipy import integrate, stats
 from table_kit import Effects, table_of
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
+from samii_rig.diagnose.fit.exact import NINETY
 from samii_rig.diagnose.forces.laws import HARDENING
+from samii_rig.diagnose.forces.paths import Span
 from samii_rig.diagnose.forces.search import ForceSearch
+from samii_rig.diagnose.forces.swings import Swings
 from samii_rig.diagnose.forces.variation import BySpring, _less, _repeats_differ, variation
 from samii_rig.diagnose.forces.varying import (
     Modulation,
@@ -30,10 +33,12 @@ from samii_rig.diagnose.forces.varying import (
 )
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import on_records
+from samii_rig.likelihood.pieces import Command, Piece
+from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Recording
+from samii_rig.types import Float, Recording
 from sim.assumed_modes import trial
 from sim.assumed_modes.outside import OUTSIDE
 from sim.assumed_modes.varying import VARYING
@@ -196,13 +201,113 @@ def test_what_a_swing_adds_in_time_is_what_it_adds_to_the_lines(nothing: ForceSe
     piece = PieceModulation.of(span, phi, ports.sensors[0], left)
     changes = np.zeros((len(left.white), 3))
     changes[0] = 0.0, 3.0, 4.0
-    added = piece.added(changes, [0.4])
+    still = np.zeros_like(ports.back[0])  # a motion that the change does not change
+    added = piece.added(changes, [0.4], still, [1.0] * len(left.white))
     assert added.shape == (len(left.white), span.samples, ports.sensors[0].shape[1])
     assert not added[1:].any()
     lines = np.fft.rfft(added[0], axis=0)[left.k] / np.sqrt(span.samples)
     force = phi * (changes[0] @ np.array(piece._waves([0.4])))
     same = span.lines(span.damped(force), ports.sensors[0], left.k) / span.times
     assert np.linalg.norm(lines - same) < 1e-6 * np.linalg.norm(same)
+
+
+def test_the_motion_that_a_swing_changes_is_that_of_a_spring_that_swings() -> None:
+    """A mass on a spring that swings by a tenth, 1.5 times as much as its damping lets be small,
+    against an integration in time of m x'' + c x' + (k - dk(t)) x = v, its input held."""
+    m, c, k, rate, hz, depth = 1.0, 4.0, 900.0, 100.0, 0.7, 0.1
+    rng = np.random.default_rng(3)
+    v = rng.standard_normal(1000)
+    piece = Piece("held", v, np.zeros((v.size, 1)), 0, (), commands=(Command(v, 1.0),))
+    span = Span.of(piece, rate, rate / 4)
+
+    def moved(soft: float) -> Float:
+        def motion(t: float, y: Float) -> list[float]:
+            dk = soft * k * np.cos(2 * np.pi * hz * t)
+            force = v[min(int(t * rate + 1e-9), v.size - 1)]
+            return [y[1], (force - c * y[1] - (k - dk) * y[0]) / m]
+
+        y, out = np.zeros(2), []
+        for i in range(v.size):  # from one edge of the input to the next
+            out.append(y[0])
+            ends = (i / rate, (i + 1 - 1e-6) / rate)
+            y = integrate.solve_ivp(motion, ends, y, rtol=1e-9, atol=1e-12).y[:, -1]
+        return np.array(out)
+
+    back = 1 / (m * span.s**2 + c * span.s + k)
+    held = (1 - np.exp(-span.s / rate)) / (span.s / rate)
+    phi = span.motion((back * held)[:, None])
+    n_line = 40
+    left = Unexplained(
+        np.arange(5, 5 + n_line), np.ones((n_line, 1, 1)), np.zeros((1, n_line, 1), complex)
+    )
+    one = PieceModulation.of(span, phi, back[:, None], left)
+    changes = np.array([[0.0, depth * k, 0.0]])
+    added = one.added(changes, [hz], back, [1.0])[0, :, 0]
+    born = one.added(changes, [hz], np.zeros_like(back), [1.0])[0, :, 0]
+    true = moved(depth) - moved(0.0)
+    assert np.linalg.norm(added - true) < 0.02 * np.linalg.norm(true)
+    assert np.linalg.norm(born - true) > 0.2 * np.linalg.norm(true)
+
+
+def test_intervals_of_two_swings_hold_in_nine_of_ten(narrow: ForceSearch) -> None:
+    """Frequencies and depths of two swings as far apart as a record resolves twice, one of them of
+    two periods a record, each of another phase in every record, under noise that is white in the
+    likelihood's own units."""
+    rng, paths, covered = np.random.default_rng(11), narrow.paths, []
+    left = narrow.unexplained(narrow.nominal.fitted)
+    spring = next(e.force for e in narrow.forces if e.force and e.force.law is HARDENING)
+    ports = paths.ports(spring.place, of_speed=False)
+    assert ports is not None
+    motion = paths.motion(spring.place, of_speed=False)
+    parts = list(zip(paths.spans, motion, ports.sensors, strict=True))
+    longest = max(span.samples / span.rate_hz for span in paths.spans)
+    hz = np.array([2.1, 4.2]) / longest
+    noise = [np.zeros(x.white.shape, complex) for x in left]
+    plain = [
+        PieceModulation.of(*one, replace(x, white=z))
+        for one, x, z in zip(parts, left, noise, strict=True)
+    ]
+    known = [[one.exact(f)[2] for one in plain] for f in hz]
+    depths = np.array([14.0, 9.0]) / np.sqrt([sum(x) for x in known])  # noise units
+
+    def less(one: PieceModulation, x: Float, at: list[float]) -> PieceModulation:
+        lines = [
+            one.span.lines(one.span.damped(e), one.sensors, one.left.k) / one.span.times
+            for e in one.phi * (x @ np.array(one._waves(at)))
+        ]
+        white = one.left.white - np.einsum("nij,rnj->rni", one.left.root, np.stack(lines))
+        return PieceModulation.of(one.span, one.phi, one.sensors, replace(one.left, white=white))
+
+    records = [[c.part for c in piece.commands] for piece in narrow.levels.records.pieces]
+    for _ in range(40):
+        pieces = []
+        for one in plain:
+            shape = one.left.white.shape
+            white = rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
+            true = np.zeros((len(white), 5))
+            turned = rng.uniform(0, 2 * np.pi, 2)
+            true[0, 1::2] = depths * np.cos(turned) * one.times[0]
+            true[0, 2::2] = depths * np.sin(turned) * one.times[0]
+            noisy = replace(one, left=replace(one.left, white=white))
+            pieces.append(less(noisy, -true, hz.tolist()))
+        swings = Swings.none([one.times.size for one in plain])
+        for f in hz:
+            swings = swings.beside(f + rng.uniform(-0.2, 0.2) / longest)
+        here = pieces
+        for _ in range(4):
+            swings = swings.closer(here, 1 / longest)
+            here = [
+                less(one, x, swings.hz.tolist())
+                for one, x in zip(pieces, swings.changes, strict=True)
+            ]
+        for j in range(2):
+            _, low, high = swings.depth(j, here, records)
+            covered += [
+                low < depths[j] < high,
+                abs(swings.hz[j] - hz[j]) < NINETY * math.sqrt(swings.off[j, j]),
+            ]
+    low, high = stats.binom.ppf([0.005, 0.995], len(covered), 0.9)
+    assert low <= np.sum(covered) <= high, np.sum(covered)
 
 
 def swinging(nothing: ForceSearch, site: str, hz: float, depth: float) -> ForceSearch:
@@ -213,10 +318,13 @@ def swinging(nothing: ForceSearch, site: str, hz: float, depth: float) -> ForceS
     )  # fmt: skip
     k, made = nothing.paths.scale((site, "k")), []
     pieces = piece_modulations(nothing, place, nothing.unexplained(nothing.nominal.fitted))
-    for one, piece in zip(pieces, nothing.levels.records.pieces, strict=True):
+    ports = nothing.paths.ports(place, of_speed=False)
+    assert ports is not None
+    for one, piece, back in zip(pieces, nothing.levels.records.pieces, ports.back, strict=True):
         changes = np.zeros((one.times.size, 3))
         changes[0, 1] = -depth * k * one.times[0]
-        made.append(_less(piece, -one.added(changes, [hz])))
+        parts = [c.part for c in piece.commands]
+        made.append(_less(piece, -one.added(changes, [hz], back, parts)))
     records = replace(nothing.levels.records, pieces=tuple(made))
     return nothing.on(replace(nothing.levels, records=records), nothing.nominal.fitted)
 

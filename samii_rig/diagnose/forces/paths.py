@@ -110,12 +110,14 @@ class Span:
 
 @dataclass(frozen=True)
 class Ports:
-    """One place: (M//2 + 1, m) of each piece what drives a force there, per command; and the
-    recorded lines per unit force, the loop's answer in them. y1 : (n,) of all lines in the band,
-    how much a unit force moves what drives it."""
+    """One place: (M//2 + 1, m) of each piece what drives a force there, per command; the
+    recorded lines per unit force, the loop's answer in them; and (M//2 + 1,) `back`, what a unit
+    force moves what drives it under the commands as recorded. y1 : (n,) its size, of all lines in
+    the band."""
 
     reading: list[Complex]
     sensors: list[Complex]
+    back: list[Complex]
     y1: Float
 
 
@@ -206,8 +208,8 @@ class TransferPaths:
         n, on, acting, loop = len(rig.sensor), self.whole.sensor, self.whole.acting, self.whole.loop
         at = place.acts_on(rig)
 
-        def of(s: Complex) -> tuple[Complex, Complex, Float]:
-            """Reading, lines and size of what a unit force moves there, on one contour."""
+        def of(s: Complex) -> tuple[Complex, Complex, Complex]:
+            """Reading, lines and what a unit force moves there, on one contour."""
             G = chain.evaluate(s)
             hold = self._held(s)
             seen = sensors_at(rig.sensor, s)[:, on]
@@ -217,27 +219,28 @@ class TransferPaths:
                 closed = loop.closed(H.reshape(len(H), -1))
                 by_force = loop.around(closed, by_force[:, :, None])[:, :, 0]
             if of_command:
-                return np.zeros(0, complex), by_force, np.zeros(0)
+                return np.zeros(0, complex), by_force, np.zeros(0, complex)
             rate = s if of_speed else np.ones_like(s)
-            return rate[:, None] * G[:, n, acting] * hold, by_force, np.abs(rate * G[:, n, at])
+            return rate[:, None] * G[:, n, acting] * hold, by_force, rate * G[:, n, at]
 
         # Most pieces are as long as others, on the same contour.
-        found: dict[tuple[int, complex], tuple[Complex, Complex, Float]] = {}
-        reading, sensors, y1 = [], [], []
+        found: dict[tuple[int, complex], tuple[Complex, Complex, Complex]] = {}
+        reading, sensors, back, y1 = [], [], [], []
         for span, band in zip(self.spans, records.bands, strict=True):
             s = span.s
             key = s.size, complex(s[-1])
             if key not in found:
                 found[key] = of(s)
-            read, seen, size = found[key]
+            read, seen, moves = found[key]
             sensors.append(seen)
             if not of_command:
                 reading.append(read)
+                back.append(moves)
                 inside = (s.imag >= 2 * np.pi * band[0]) & (s.imag <= 2 * np.pi * band[1])
-                y1.append(size[inside])
+                y1.append(np.abs(moves[inside]))
         if of_command:
-            return Ports([], sensors, np.zeros(0))
+            return Ports([], sensors, [], np.zeros(0))
         moved = np.concatenate(y1)
         drives = max(float(np.max(np.abs(r))) for r in reading) > 0
         useful = drives and bool(np.all(moved > 0) and np.all(np.isfinite(moved)))
-        return Ports(reading, sensors, moved) if useful else None
+        return Ports(reading, sensors, back, moved) if useful else None

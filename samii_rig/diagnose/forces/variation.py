@@ -3,7 +3,7 @@
 What varies passes for noise, so the noise that is told with it in the records is too much. So, as
 with every force, what it adds to the sensors is computed in time, the records less that are those
 of a linear rig, and the likelihood is made anew about them: its noise, its parameters, and what
-varies still. A modulation is linear in its two phases (Born's approximation, `varying`).
+varies still. All that varies is fitted together (`swings`), with the motion that it changes.
 """
 
 from __future__ import annotations
@@ -23,13 +23,17 @@ from samii_rig.diagnose.fit.explanations import Explanation, threshold
 from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.records import Whole, fitted_lines
 from samii_rig.diagnose.fit.refit import Fitted
+from samii_rig.diagnose.forces.model import ForceModel
+from samii_rig.diagnose.forces.paths import TransferPaths
 from samii_rig.diagnose.forces.search import ForceSearch
+from samii_rig.diagnose.forces.swings import Swings
 from samii_rig.diagnose.forces.varying import (
     ALARM,
     SIDES,
     Modulation,
     PieceModulation,
     Springs,
+    louder_beside,
     uneven,
 )
 from samii_rig.diagnose.result import Gap, Value
@@ -37,7 +41,8 @@ from samii_rig.likelihood.pieces import Piece
 from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.types import Float
 
-ROUNDS = 6  # times that the likelihood is made anew at most: 2 to 4 were usual
+STILL = 0.25  # of chi-square of each number that a step promises: half its standard deviation
+ROUNDS = 8  # times that the likelihood is made anew at most: 3 or 4 were usual
 # Of what the first explains, from which on another spring may be the one: as long as what varies
 # stands in the noise, neighbours gain nearly as much as the spring that does.
 RIVAL = 0.5
@@ -123,7 +128,7 @@ def variation(seen: BySpring, files: int) -> Variation | None:
         k = search.paths.scale((site, STIFFNESS))
         # None varies by more than all of it: something else does.
         if RIVAL * found[0][1].gain < modulation.gain < modulation.known * k**2:
-            tried.append(_Taken(search, best.fitted, springs, site).settled(best))
+            tried.append(_Taken.of(seen, site).settled(best))
     if not tried:
         return None
     tried.sort(key=lambda one: -one.evidence)
@@ -177,31 +182,39 @@ def uneven_spring(seen: BySpring) -> Uneven | None:
 class _Taken:
     """The records less what the variation of one spring adds to them.
 
-    search, fitted : of these, and a model of them. modulations : what varies. repeats : of each,
-    whether repeats of one input differ by it, None where there are none. changes : of each piece,
-    as `PieceModulation.changes` has them, with none at first.
+    search, fitted : of these, and a model of them. levels : the records with it. modulations : what
+    varies, as it was found. repeats : of each, whether repeats of one input differ by it, None
+    where there are none. swings : of all of them, what is taken out.
     """
 
     search: ForceSearch
     fitted: Fitted
     springs: Springs
     site: str
+    levels: Whole
+    swings: Swings
     modulations: list[Modulation] = field(default_factory=list)
     repeats: list[bool | None] = field(default_factory=list)
-    changes: list[Float] = field(default_factory=list)
     pieces: list[PieceModulation] = field(default_factory=list)
 
-    @property
-    def hz(self) -> list[float]:
-        """Frequencies at which it swings."""
-        return [one.hz for one in self.modulations if one.hz > 0]
+    @classmethod
+    def of(cls, seen: BySpring, site: str) -> _Taken:
+        """Nothing taken out yet of the spring of a site."""
+        search, pieces = seen.search, seen.pieces[site]
+        none = Swings.none([one.times.size for one in pieces])
+        return cls(search, seen.best.fitted, seen.springs, site, search.levels, none)
 
     def settled(self, best: Explanation) -> _Taken:
-        """The same, once nothing is left that varies."""
+        """The same, once nothing is left that varies and what was found stands still."""
         for _ in range(ROUNDS):
-            if not self.closer(best):
+            if not self.closer(best) and self.swings.left < STILL:
                 break
         return self
+
+    @property
+    def parts(self) -> list[list[float]]:
+        """Of each piece, of its records."""
+        return [[c.part for c in piece.commands] for piece in self.levels.records.pieces]
 
     @property
     def evidence(self) -> float:
@@ -222,38 +235,52 @@ class _Taken:
         left = _some(self.search.unexplained(self.fitted))
         here = self.springs.pieces(self.search, left, self.site)
         self.pieces, more = here[self.site], self.springs.strongest(here)
-        if more and all(abs(more[0][1].hz - one.hz) > step for one in self.modulations):
-            self.modulations.append(more[0][1].closer(self.pieces, step))
-            self.repeats.append(_repeats_differ(self.pieces, self.modulations[-1].hz))
-        found = self._changes()
-        levels = self.search.levels
-        taken = tuple(
-            _less(piece, one.added(x, self.hz))
-            for piece, one, x in zip(levels.records.pieces, self.pieces, found, strict=True)
-        )
-        levels = replace(levels, records=replace(levels.records, pieces=taken))
+        known = [*self.swings.hz, *(0.0 for one in self.modulations if one.hz == 0)]
+        if more and all(abs(more[0][1].hz - hz) > step for hz in known):
+            one = more[0][1].closer(self.pieces, step)
+            self.modulations.append(one)
+            self.repeats.append(_repeats_differ(self.pieces, one.hz))
+            if one.hz > 0:
+                self.swings = self.swings.beside(one.hz)
+        self.swings = self._level(self.swings.closer(self.pieces, step))
+        ports = self.search.paths.ports(dict(self.springs.each)[self.site], of_speed=False)
+        assert ports is not None
+        each = zip(self.pieces, self.swings.changes, ports.back, self.parts, strict=True)
+        hz = self.swings.hz.tolist()
+        added = [one.added(x, hz, back, part) for one, x, back, part in each]
+        taken = tuple(map(_less, self.levels.records.pieces, added))
+        levels = replace(self.levels, records=replace(self.levels.records, pieces=taken))
         self.search = self.search.on(levels, self.fitted)
         again = self.search.refitted(best.effects, replace(best, fitted=self.fitted))
         self.fitted = again or self.fitted
-        before = self.changes or [np.zeros((len(x), 0)) for x in found]
-        self.changes = [_summed(x, y) for x, y in zip(before, found, strict=True)]
+        self._move()
         return bool(more)
 
-    def _changes(self) -> list[Float]:
-        """Of each piece what the records still vary by. A constant counts where it is not the same
-        in all records."""
-        found = [one.changes(self.hz) for one in self.pieces]
+    def _move(self) -> None:
+        """Let the rig move as it is fitted without what varies: the first motion is that of a rig
+        that had to make up for it."""
+        model, x = self.fitted.model, self.fitted.x
+        if isinstance(model, ForceModel):
+            return
+        paths = TransferPaths(self.search.levels, model, x)
+        if paths.ports(dict(self.springs.each)[self.site], of_speed=False) is not None:
+            self.search.paths = paths
+
+    def _level(self, found: Swings) -> Swings:
+        """The same, but a constant counts where it is not the same in all records: that is the rig
+        file's own."""
+        changes = [x.copy() for x in found.changes]
         if any(one.hz == 0 for one in self.modulations):
             known = [one.constants()[1][0] for one in self.pieces]
             times = [one.times[0] for one in self.pieces]
-            mean = sum(g * t * x[0, 0] for g, t, x in zip(known, times, found, strict=True))
+            mean = sum(g * t * x[0, 0] for g, t, x in zip(known, times, changes, strict=True))
             mean /= sum(g * t**2 for g, t in zip(known, times, strict=True))
-            for x, t in zip(found, times, strict=True):
+            for x, t in zip(changes, times, strict=True):
                 x[0, 0] -= t * mean
         else:
-            for x in found:
+            for x in changes:
                 x[:, 0] = 0.0
-        return found
+        return replace(found, changes=tuple(changes))
 
     @property
     def again(self) -> bool:
@@ -261,26 +288,22 @@ class _Taken:
         where nothing was repeated, records of one level do, or one in itself."""
         levels = [p.levels for p in self.search.levels.records.pieces]
         if all(one is None for one in self.repeats):
-            return len(set(levels)) < len(levels) or any(self.hz)
+            return len(set(levels)) < len(levels) or bool(self.swings.hz.size)
         return any(self.repeats)
 
     def parameters(self, k: float, files: int) -> dict[str, Value]:
         """Of the deepest modulation, with intervals of 90 %, or of what records differ by where
         that is more. k : the stiffness."""
-        modulations = [self._depth(one, k) for one in self.modulations if one.hz > 0]
+        modulations = [self._depth(j, k) for j in range(self.swings.hz.size)]
         differing = [self._spread(k, files) for one in self.modulations if one.hz == 0]
         return max((*modulations, *differing), key=lambda found: next(iter(found.values())).value)
 
-    def _depth(self, modulation: Modulation, k: float) -> dict[str, Value]:
-        """Of phases that are random in each record."""
-        at = 1 + 2 * self.hz.index(modulation.hz)
-        power = [one.exact(modulation.hz)[2] for one in self.pieces]
-        size = [float(np.sum(x[:, at : at + 2] ** 2)) / one.times[0] ** 2
-                for x, one in zip(self.changes, self.pieces, strict=True)]  # fmt: skip
-        depth = math.sqrt(float(np.average(size, weights=power)))
-        sd = math.sqrt(2 / sum(power) * modulation.louder)
-        low, high = max(depth - NINETY * sd, 0.0), depth + NINETY * sd
-        f, off = modulation.hz, NINETY * modulation.off
+    def _depth(self, j: int, k: float) -> dict[str, Value]:
+        """Of the j-th frequency, phases that are random in each record."""
+        f = float(self.swings.hz[j])
+        louder = louder_beside(self.pieces, f, self.springs.f)
+        depth, low, high = self.swings.depth(j, self.pieces, self.parts, louder)
+        off = NINETY * math.sqrt(louder * self.swings.off[j, j])
         return {
             "depth": Value(depth / k, "1", low / k, high / k),
             "f": Value(f, "Hz", f - off, f + off),
@@ -288,7 +311,7 @@ class _Taken:
 
     def _spread(self, k: float, files: int) -> dict[str, Value]:
         """Of normal stiffnesses, as many as there are recordings; chi-square."""
-        x = np.concatenate([x[:, 0] for x in self.changes])
+        x = np.concatenate([x[:, 0] for x in self.swings.changes])
         known = np.concatenate([one.constants()[1] for one in self.pieces])
         free = x.size - 1
         square = max(float(known @ x**2) - free, 0.0) / float(np.mean(known))
@@ -314,13 +337,6 @@ def _repeats_differ(pieces: Sequence[PieceModulation], hz: float) -> bool | None
     than noise does; None where nothing was repeated."""
     chi2, free = (sum(x) for x in zip(*(one.differing(hz) for one in pieces), strict=True))
     return bool(stats.chi2.sf(chi2, free) < AGAIN) if free else None
-
-
-def _summed(before: Float, more: Float) -> Float:
-    """Changes (rows, m), and those (rows, m or more) that come to them."""
-    out = more.copy()
-    out[:, : before.shape[1]] += before
-    return out
 
 
 def _some(left: Sequence[Unexplained]) -> list[Unexplained]:

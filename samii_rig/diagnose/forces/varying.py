@@ -22,16 +22,19 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import optimize, stats
+from scipy.sparse import linalg
 
 from samii_rig.diagnose.fit.between_runs import STIFFNESS
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.paths import Span
 from samii_rig.diagnose.forces.place import Place
 from samii_rig.diagnose.forces.search import ForceSearch
-from samii_rig.likelihood.reduce import CYCLES
+from samii_rig.likelihood.pieces import turn_to
 from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.types import Complex, Float, Int
 
+# Periods in the longest record: a slower swing moves no line beside another, and is a constant.
+SLOWEST = 1.0
 FASTEST = 0.2  # of the highest frequency in the records: what varies faster is no stiffness
 FINE = 4  # frequencies for each that the longest record resolves
 ALARM = 2e-3  # chance that noise alone makes any stiffness vary
@@ -40,6 +43,7 @@ FLAT = 1e-2  # of the distance between frequencies that are tried: nearer, chi-s
 # Powers of the motion that a spring's force has which is not the same to both sides: of one that is
 # stiffer to one side, and of the first that a curve has.
 SIDES = (1, 2)
+OWN = 1e-3  # of a force, to which what it does to itself is solved
 ROUNDED = 1e-6  # of the largest variance: less is rounding
 VARIANCES = 400  # that are tried: a decade of them has 40 or more, and likelihoods are flat there
 
@@ -60,8 +64,7 @@ class Springs:
         """Of a rig that moves."""
         records, paths = search.levels.records, search.paths
         longest = max(len(p.z) for p in records.pieces) / records.rate_hz
-        # What is slower than the lines that count is as a sensor that wanders.
-        f = np.arange(CYCLES / longest, FASTEST * records.band[1], 1 / (FINE * longest))
+        f = np.arange(SLOWEST / longest, FASTEST * records.band[1], 1 / (FINE * longest))
         laws = [e for e in search.forces if e.force is not None and e.force.law is HARDENING]
         each = ((e.site, e.force.place) for e in laws if e.force is not None)
         return cls(
@@ -178,7 +181,7 @@ class PieceModulation:
 
     def _rows(self, hz: float) -> tuple[Float, int, float]:
         """Chi-square of each row, its degrees of freedom, and what all tell of both phases."""
-        G, pull = self._normal([hz])
+        G, pull = self.normal([hz])
         if not G[0, 0] > ROUNDED * self.V.max():
             return np.zeros(self.times.size), 0, 0.0
         share = G[1:, :1] / G[0, 0]
@@ -209,7 +212,7 @@ class PieceModulation:
     def changes(self, each: Sequence[float]) -> Float:
         """(rows, 1 + 2 m) of a row that is once the motion: a constant, and the cosine and sine by
         which a stiffness swings at m frequencies."""
-        G, pull = self._normal(each)
+        G, pull = self.normal(each)
         return np.asarray(np.linalg.lstsq(G, pull, rcond=ONE_PHASE**2)[0].T)
 
     def without(self, hz: float) -> PieceModulation:
@@ -220,25 +223,59 @@ class PieceModulation:
         white = left.white - np.einsum("nij,rnj->rni", left.root, np.stack(lines))
         return PieceModulation.of(span, self.phi, self.sensors, replace(left, white=white))
 
-    def added(self, changes: Float, each: Sequence[float]) -> Float:
-        """(rows, samples, q) what sensors show of these, at the record's rate."""
-        forces = self.phi * (changes @ np.array(self._waves(each)))
+    def added(
+        self, changes: Float, each: Sequence[float], back: Complex, parts: Sequence[float]
+    ) -> Float:
+        """(rows, samples, q) what sensors show of these, at the record's rate. back : as `Ports`
+        has it. parts : of the records, of which the first row is the sum."""
+        forces = self.forces(changes, each, back, parts)
         return np.stack([self.span.sampled(self.span.damped(e), self.sensors) for e in forces])
 
-    def _waves(self, each: Sequence[float]) -> list[Float]:
-        """(M,) a constant, then cosine and sine of each frequency. Time runs from the record's
-        first sample; the input before it stands at the end."""
+    def of_records(self, parts: Sequence[float]) -> tuple[Float, Float]:
+        """(rows, records) by which records are turned to rows, and (records,) how many times the
+        motion each has. parts : of the records, of which the first row is the sum."""
+        turn = turn_to(np.array(parts))
+        return turn, self.times[0] * turn[0]
+
+    def forces(
+        self, changes: Float, each: Sequence[float], back: Complex, parts: Sequence[float]
+    ) -> Float:
+        """(rows, M) the force of each row, e = dk (motion + back e) of each record by itself: what
+        the change adds to the motion it changes too."""
+        turn, size = self.of_records(parts)
+        dk = (turn.T @ changes / size[:, None]) @ np.array(self._waves(each))
+        each_record = zip(dk, size, strict=True)
+        return np.asarray(turn @ np.stack([self._force(x, n, back) for x, n in each_record]))
+
+    def _force(self, dk: Float, size: float, back: Complex) -> Float:
+        """(M,) e = dk (size phi + back e)."""
+        span, M = self.span, self.phi.size
+
+        def rest(e: Float) -> Float:
+            moved = np.fft.irfft(back * span.damped(e), M) / span.decay * span.alive
+            return np.asarray(e - dk * moved)
+
+        first = dk * (size * self.phi)
+        if not first.any():
+            return first
+        whole = linalg.LinearOperator((M, M), matvec=rest, dtype=first.dtype)
+        return np.asarray(linalg.gmres(whole, first, rtol=OWN, maxiter=1)[0])
+
+    def _waves(self, each: Sequence[float], *, slopes: bool = False) -> list[Float]:
+        """(M,) a constant, then cosine and sine of each frequency; then both times t (s). Time runs
+        from the record's first sample; the input before it stands at the end."""
         M, span = self.phi.size, self.span
         t = np.arange(M, dtype=float)
         t[M - span.before :] -= M
-        turn = 2 * np.pi * t * (span.samples / span.n / span.rate_hz)
-        both = (wave(hz * turn) for hz in each for wave in (np.cos, np.sin))
-        return [np.ones(M), *both]
+        t *= span.samples / span.n / span.rate_hz
+        both = [wave(2 * np.pi * hz * t) for hz in each for wave in (np.cos, np.sin)]
+        return [np.ones(M), *both, *(t * x for x in both if slopes)]
 
-    def _normal(self, each: Sequence[float]) -> tuple[Float, Float]:
-        """Normal equations (1 + 2 m, 1 + 2 m) of a constant and both phases of each frequency, of
-        a row that is once the motion, and their right sides (1 + 2 m, rows)."""
-        shapes = self._waves(each)
+    def normal(self, each: Sequence[float], *, slopes: bool = False) -> tuple[Float, Float]:
+        """Normal equations (n, n) of a constant and both phases of each frequency, n = 1 + 2 m, or
+        of those times t too, n = 1 + 4 m, of a row that is once the motion; and their right sides
+        (n, rows)."""
+        shapes = self._waves(each, slopes=slopes)
         return self._products(shapes), np.array(shapes) @ self.along.T / self.times
 
     def _products(self, shapes: Sequence[Float]) -> Float:
@@ -278,18 +315,17 @@ def _variance(span: Span, phi: Float, sensors: Complex, left: Unexplained) -> Fl
 @dataclass(frozen=True, slots=True)
 class Modulation:
     """At one spring, where most is explained. hz : 0 for what differs from record to record. chi2,
-    with `free` degrees of freedom. known : of its amplitude's square, or of its mean square. off :
-    Hz, standard deviation of its frequency. trials : independent ones at this spring, of which it
-    is the best: half the probability of a false alarm is that of a modulation at any frequency.
-    louder : the noise there than it is told. each : (m, 3) chi-square, degrees of freedom and what
-    is known, of records that do not show it alike; none where they do."""
+    with `free` degrees of freedom. known : of its amplitude's square, or of its mean square.
+    trials : independent ones at this spring, of which it is the best: half the probability of a
+    false alarm is that of a modulation at any frequency.
+    louder : the noise there than it is told, in its power. each : (m, 3) chi-square, degrees of
+    freedom and what is known, of records that do not show it alike; none where they do."""
 
     hz: float
     chi2: float
     free: int
     known: float
     trials: float = 2.0
-    off: float = 0.0
     louder: float = 1.0
     each: Float = field(default_factory=lambda: np.empty((0, 3)))
 
@@ -298,11 +334,8 @@ class Modulation:
         """Of all pieces, at one frequency of f (m,) Hz, of which so many are independent, or from
         record to record."""
         hz = float(f[np.argmax(_scan(pieces, f))])
-        # Where noise is louder than it is told, at the lowest lines say, it is so beside too, also
-        # without the modulation, which is as wide as the motion is short.
-        near = _scan([one.without(hz) for one in pieces], f)[(f > hz / 2) & (f < 2 * hz)]
-        usual = stats.chi2.median(2 * sum(one.times.size for one in pieces))
-        louder = max(float(np.median(near)) / float(usual), 1.0)
+        # Without the modulation, which is as wide as the motion is short.
+        louder = louder_beside([one.without(hz) for one in pieces], hz, f)
         return min(
             cls._at(pieces, hz, 2 * many, louder), _between(pieces), key=lambda one: one.false_alarm
         )
@@ -314,11 +347,10 @@ class Modulation:
         hz: float,
         trials: float,
         louder: float,
-        off: float = 0.0,
     ) -> Modulation:
         each = np.concatenate([one.each(hz) for one in pieces]) / [louder, 1.0, louder]
         chi2, free, known = (float(x) for x in np.sum(each, axis=0))
-        return cls(hz, chi2, round(free), known / 2, trials, off, louder, each)
+        return cls(hz, chi2, round(free), known / 2, trials, louder, each)
 
     def closer(self, pieces: Sequence[PieceModulation], step: float) -> Modulation:
         """The same at the best frequency within a step (Hz) of its own."""
@@ -332,10 +364,7 @@ class Modulation:
         found = optimize.minimize_scalar(
             lost, bounds=ends, method="bounded", options={"xatol": FLAT * step}
         )
-        hz, half = float(found.x), step / 2
-        fall = (lost(hz - half) + lost(hz + half)) / 2 - float(found.fun)
-        off = half / math.sqrt(max(fall / self.louder, 1.0))
-        return self._at(pieces, hz, self.trials, self.louder, off)
+        return self._at(pieces, float(found.x), self.trials, self.louder)
 
     @property
     def gain(self) -> float:
@@ -379,6 +408,14 @@ def uneven(pieces: Sequence[PieceModulation]) -> float:
         known = G[1, 1] - share * G[0, 1]
         found.append((b[1] - share * b[0]) ** 2 / known if known > ROUNDED * G[1, 1] else 0.0)
     return float(max(found))
+
+
+def louder_beside(pieces: Sequence[PieceModulation], hz: float, f: Float) -> float:
+    """How much louder than it is told the noise is around a frequency, of its power: where it is,
+    at the lowest lines say, it is so beside too. f : (m,) Hz at which that is looked at."""
+    near = _scan(pieces, f[(f > hz / 2) & (f < 2 * hz)])
+    usual = stats.chi2.median(2 * sum(one.times.size for one in pieces))
+    return max(float(np.median(near)) / float(usual), 1.0) if near.size else 1.0
 
 
 def _scan(pieces: Sequence[PieceModulation], f: Float) -> Float:
