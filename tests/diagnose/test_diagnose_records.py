@@ -121,7 +121,9 @@ def test_a_valve_that_lags_is_named_though_every_sweep_ends_with_its_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(by_record, "variation", anything)
-    runs = cut_sweeps(tmp_path, SLOW_VALVE, design=replace(DESIGN, levels=(1.0,)))
+    runs = cut_sweeps(
+        tmp_path, SLOW_VALVE, design=replace(DESIGN, levels=(1.0,), burst=20.0, high_hz=20.0)
+    )
     found = diagnose(estimate(runs), SAMII, runs=runs, effects=FEW)
     names = {(c.physics, c.site) for c in found.causes}
     names |= {n for c in found.causes for n in c.equivalents}

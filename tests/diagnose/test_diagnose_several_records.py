@@ -14,7 +14,15 @@ from samii_rig.errors import EstimateError
 from samii_rig.likelihood.pieces import wiring
 from samii_rig.signal.estimate import estimate
 
-FEW = Effects(lambda: table_of(RIG, *BAND, "transport_delay", "torsional_compliance"))
+# A dead time of either input, and a joint that gives there: what takes the time are the refits.
+INPUTS = ("joint_2_source", "joint_3_source")
+FEW = Effects(
+    lambda: [
+        e
+        for e in table_of(RIG, *BAND, "transport_delay", "torsional_compliance")
+        if e.site in INPUTS
+    ]
+)
 HOW = {"in turn": in_turn, "together": together}
 
 
@@ -30,7 +38,7 @@ def test_where_nothing_is_missing_two_inputs_say_so(how):
     found = found_in(recorded(RIG, HOW[how]()))
     assert found.verdict == "no_mismatch"
     assert 0.8 < found.chi2_per_dof < found.threshold < 1.2
-    assert found.used.lines == found.used.of > 1000
+    assert found.used.lines == found.used.of > 500
     assert found.causes == ()  # of forces neither
 
 
@@ -76,6 +84,7 @@ def test_of_one_joint_driven_nothing_is_missing_where_nothing_is():
     assert 0.8 < found.chi2_per_dof < found.threshold < 1.2
 
 
+@pytest.mark.slow  # half a minute; what names it is that of both inputs, above
 def test_of_one_joint_driven_a_dead_time_of_it_is_named():
     found = found_in(one_joint(late("v_2", 1e-3)))
     assert found.verdict == "named"
