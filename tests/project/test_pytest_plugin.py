@@ -150,11 +150,10 @@ def test_a_rig_file_that_leaves_something_out_fails_with_the_lines_of_the_page(r
 
 def test_recordings_are_held_one_by_one_and_all_that_fail_are_named(run, few, tmp_path):
     shutil.copy(run, tmp_path / "a.mcap")
-    shutil.copy(run, tmp_path / "b.mcap")
-    (tmp_path / "c.mcap").write_bytes(run.read_bytes()[:2000])
-    with pytest.raises(AssertionError, match=r"1 of 3 recordings .*\s+c\.mcap: "):
+    (tmp_path / "b.mcap").write_bytes(run.read_bytes()[:2000])
+    with pytest.raises(AssertionError, match=r"1 of 2 recordings .*\s+b\.mcap: "):
         assert_still_explained("samii", tmp_path)
-    with pytest.raises(AssertionError, match=r"(?s)3 of 3 .*\na\.mcap: .*\nb\.mcap: "):
+    with pytest.raises(AssertionError, match=r"(?s)2 of 2 .*\na\.mcap: .*\nb\.mcap: "):
         assert_still_explained(rigid(), tmp_path)
 
 

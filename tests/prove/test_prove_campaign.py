@@ -137,8 +137,9 @@ def test_an_unknown_plant_costs_one_line() -> None:
         jobs.plant("no_such_plant")
 
 
-def test_a_scheduler_that_does_not_answer_costs_one_line() -> None:
+def test_a_scheduler_that_does_not_answer_costs_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
+    monkeypatch.setattr("samii_rig.workers.ANSWERS_WITHIN", "1s")
     with (
         pytest.raises(InputError, match="--scheduler"),
         workers(scheduler="tcp://127.0.0.1:9"),
