@@ -32,8 +32,9 @@ from samii_rig.serve import runner
 from samii_rig.serve.job import Job, JobState, Request
 from samii_rig.serve.supervisor import Supervisor
 
-PACE = "20"  # times real time: minutes of a rig in seconds
-LONG = sweep(duration=60.0, repeats=20)  # a minute at that pace, never waited for
+PACE = "4"  # times real time: what is waited for takes seconds
+SWEEPS = 5
+LONG = sweep(duration=60.0, repeats=SWEEPS)  # a minute and more at that pace, never waited for
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -50,13 +51,14 @@ def service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
 
 
 def ended(service: Service, id_: str) -> dict:
-    def over() -> dict | None:
-        job = service.job(id_)
-        # In the state too: the service has taken note of it.
-        last = service.state()["last"]
-        return job if last and last["id"] == id_ else None
+    """The job, asked for after the service has put its recording in the list."""
 
-    return service.until(over)
+    def over() -> bool:
+        last = service.state()["last"]
+        return bool(last) and last["id"] == id_
+
+    service.until(over)
+    return service.job(id_)
 
 
 def recording_of(service: Service, job: dict) -> Path:
@@ -71,7 +73,7 @@ def test_a_lab_s_afternoon(service: Service, capsys: pytest.CaptureFixture[str])
         third = service.start(lease, sweep())
         service.until(service.progressing)
         state = service.state()
-        assert state["running"]["progress"]["n_segments"] == 20
+        assert state["running"]["progress"]["n_segments"] == SWEEPS
         assert [j["id"] for j in state["queue"]] == [second, third]
         left = [
             state["running"]["progress"]["time_left"],
@@ -184,7 +186,7 @@ def test_after_a_stop_all_that_was_recorded_is_estimated(service: Service) -> No
         # No diagnosis was asked for, and none is there to be asked for.
         assert (job["estimated"], job["diagnosed"]) == (True, False)
         told = service.http.get(f"/api/jobs/{id_}/responses").json()
-        assert (told["final"], told["done"], told["of"]) == (True, 0, 20)
+        assert (told["final"], told["done"], told["of"]) == (True, 0, SWEEPS)
         (response,) = told["responses"]
         assert response["going_on"]
         assert response["high_hz"] > 4.0
@@ -346,11 +348,11 @@ def test_a_runner_that_is_killed_leaves_what_it_recorded(service: Service) -> No
         assert len(read_recording(back)) > 0
 
 
-KILLS = 3
+KILLS = 2  # the second service of a run that another had found going on
 
 
 def test_a_service_that_is_killed_loses_nothing(tmp_path: Path) -> None:
-    """Killed three times during a run, and started again: the run goes on as if nothing were."""
+    """Killed twice during a run, and started again: the run goes on as if nothing were."""
     with Service(tmp_path, "--pace", "4") as service:
         with service.lease() as lease:
             id_ = service.start(lease, sweep(repeats=10))
