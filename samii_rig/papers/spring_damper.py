@@ -7,8 +7,10 @@ theta_2 spans the source and the joint's spring (paper 2, eq. 6 and 11).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 
 from samii_rig.identify.actuator import actuated_joint, fit_actuator
@@ -160,60 +162,53 @@ def _missed(name: str, f: Float, ratio: Complex, said: str) -> Iterator[Number]:
     yield between(what, below, "deg", 0.0, 10.0, "fairly accurate", 3)
 
 
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """Fig. 12 of the models on `GRID`, rad/V: the source alone (`nominal`), with its
+    spring-damper and theta_2 across `both` or `at_source`, and the velocity `feedback`."""
+
+    nominal: Complex
+    both: Complex
+    at_source: Complex
+    feedback: Complex
+
+
+def source_alone(f: Float) -> Complex:
+    """theta/v of the rig's angular velocity source without a structure (eq. 1), rad/V."""
+    source = next(e for e in samii().element if e.kind == "angular_velocity_source")
+    return first_order(laplace(f), source.K.value, source.p.value)
+
+
+def curves() -> Curves:
+    """The models that Fig. 12 draws."""
+    rigs = samii(), collocated(samii()), in_series(rayleigh(samii(), ALPHA), G_V)
+    return Curves(source_alone(GRID), *(Chain(rig).response(GRID)[:, 0, 0] for rig in rigs))
+
+
 def figure_12() -> Result:
     """Source with spring-damper, theta_2 across both or at the source; velocity feedback."""
-    f = GRID
-    s = laplace(f)
-    source = next(e for e in samii().element if e.kind == "angular_velocity_source")
-    nominal = first_order(s, source.K.value, source.p.value)
-    both = Chain(samii()).response(f)[:, 0, 0]
-    at_source = Chain(collocated(samii())).response(f)[:, 0, 0]
-    feedback = Chain(in_series(rayleigh(samii(), ALPHA), G_V)).response(f)[:, 0, 0]
-    inside = (f > AROUND[0]) & (f < AROUND[1])
-    dip, dip_hz, rise, _ = dip_and_rise(f[inside], both[inside], nominal[inside])
-    after = f[inside] > dip_hz
-    over = np.degrees(np.angle((both / nominal)[inside][after]))
-    flat, _, up, _ = dip_and_rise(f[inside], at_source[inside], nominal[inside])
-    m_f, m_H, m_sd = measured_theta()
-    near = (m_f > AROUND[0]) & (m_f < AROUND[1])
-    m_nominal = first_order(laplace(m_f), source.K.value, source.p.value)
-    m_dip, m_hz, m_rise, _ = dip_and_rise(m_f[near], m_H[near], m_nominal[near])
-    found: Agreement = "found again"
-    numbers: tuple[Number, ...] = (
-        between(
-            "phase dip, theta_2 across both",
-            -dip,
-            "deg",
-            85.0,
-            120.0,
-            "about 90 deg",
-            3,
-            "calibrated",
-        ),
-        between("at", dip_hz, "Hz", 7.0, 8.5, "about 8 Hz", 3),
-        between("phase above nominal, theta_2 across both", rise, "deg", -np.inf, 1.0, "none", 2),
-        between("left of the dip at 12.5 Hz", -over[-1], "deg", -np.inf, RECOVERED, "recovery", 2),
-        between("phase dip in the recording", -m_dip, "deg", 85.0, 120.0, "about 90 deg", 3, found),
-        between("at, in the recording", m_hz, "Hz", 7.0, 8.5, "about 8 Hz", 3, found),
-        between(
-            "phase above nominal in the recording", m_rise, "deg", -np.inf, 1.0, "none", 2, found
-        ),
-        between(
-            "same model, encoder at the source: largest change of phase",
-            max(-flat, up),
-            "deg",
-            0.0,
-            1e-6,
-            digits=1,
-        ),
+    model, (f, H, sd) = curves(), measured_theta()
+    inside = _around(GRID)
+    numbers = (
+        *_dips(model),
+        *_measured_dip(f, H),
+        _collocated(model),
+        *_fitted(),
+        *both_figures(GRID[inside], model.nominal[inside]),
     )
-    numbers = (*numbers, *_fitted(), *both_figures(f[inside], nominal[inside]))
+    across, at_source = model.both, model.at_source
     panels = bode_panels(
         (
-            Bode("measured (simulated rig, 1 V)", m_f, m_H, "points", 0, m_sd),
-            Bode("source with spring-damper, theta_2 across both (eq. 6)", f, both, "line", 1),
-            Bode("velocity feedback, encoder at the actuator (eq. 3)", f, feedback, "dashed", 2),
-            Bode("source with spring-damper, encoder at the source", f, at_source, "dashed", 3),
+            Bode("measured (simulated rig, 1 V)", f, H, "points", 0, sd),
+            Bode("source with spring-damper, theta_2 across both (eq. 6)", GRID, across, "line", 1),
+            Bode(
+                "velocity feedback, encoder at the actuator (eq. 3)",
+                GRID,
+                model.feedback,
+                "dashed",
+                2,
+            ),
+            Bode("source with spring-damper, encoder at the source", GRID, at_source, "dashed", 3),
         ),
         "rad/V",
         (Mark("7.2 to 8 Hz", *INTERACTION),),
@@ -237,6 +232,45 @@ def figure_12() -> Result:
             ),
         ),
     )
+
+
+def _around(f: Float) -> NDArray[np.bool_]:
+    """Which of the frequencies lie around mode 2."""
+    return (f > AROUND[0]) & (f < AROUND[1])
+
+
+def _dips(model: Curves) -> Iterator[Number]:
+    """The phase over the source's own with the encoder across source and spring: dip, recovery."""
+    inside = _around(GRID)
+    f, both, nominal = GRID[inside], model.both[inside], model.nominal[inside]
+    dip, dip_hz, rise, _ = dip_and_rise(f, both, nominal)
+    end = np.degrees(np.angle((both / nominal)[f > dip_hz]))[-1]
+    what, said = "phase dip, theta_2 across both", "about 90 deg"
+    yield between(what, -dip, "deg", 85.0, 120.0, said, 3, "calibrated")
+    yield between("at", dip_hz, "Hz", 7.0, 8.5, "about 8 Hz", 3)
+    what = "phase above nominal, theta_2 across both"
+    yield between(what, rise, "deg", -np.inf, 1.0, "none", 2)
+    yield between("left of the dip at 12.5 Hz", -end, "deg", -np.inf, RECOVERED, "recovery", 2)
+
+
+def _measured_dip(f: Float, H: Complex) -> Iterator[Number]:
+    """The same dip in the recording."""
+    near = _around(f)
+    dip, dip_hz, rise, _ = dip_and_rise(f[near], H[near], source_alone(f)[near])
+    found: Agreement = "found again"
+    said = "about 90 deg"
+    yield between("phase dip in the recording", -dip, "deg", 85.0, 120.0, said, 3, found)
+    yield between("at, in the recording", dip_hz, "Hz", 7.0, 8.5, "about 8 Hz", 3, found)
+    what = "phase above nominal in the recording"
+    yield between(what, rise, "deg", -np.inf, 1.0, "none", 2, found)
+
+
+def _collocated(model: Curves) -> Number:
+    """With the encoder at the source nothing of the structure is seen."""
+    inside = _around(GRID)
+    dip, _, rise, _ = dip_and_rise(GRID[inside], model.at_source[inside], model.nominal[inside])
+    what = "same model, encoder at the source: largest change of phase"
+    return between(what, max(-dip, rise), "deg", 0.0, 1e-6, digits=1)
 
 
 def both_figures(f: Float, nominal: Complex) -> tuple[Number, ...]:

@@ -137,47 +137,15 @@ def _angles() -> tuple[Number, ...]:
 def figures_8_9_10() -> Result:
     """theta/M, M/v and theta/v in both configurations, model over recording."""
     both = [measured(name) for name in CONFIGURATIONS]
-    numbers = list(slopes())
-    for s in both:
-        inside = (s.f > 5 * LOW[1]) & (s.f < HIGH[1])
-        model_M = np.interp(s.f[inside], GRID, s.M.real) + 1j * np.interp(
-            s.f[inside], GRID, s.M.imag
-        )
-        off = np.abs(s.M_measured[inside] / model_M - 1)
-        numbers.append(
-            between(
-                f"{s.name}: measured M/v against the model, 0.5 to 12 Hz, median",
-                100 * float(np.median(off)),
-                "%",
-                0.0,
-                5.0,
-                "agree closely",
-                2,
-                "found again",
-            )
-        )
-    k = closed_form(both[0].rig)
-    turn = float(np.sqrt(k[1] / k[0]) / (2 * np.pi))
-    numbers.append(shown("vertical: natural frequency of the pendulum", turn, "Hz", "", 3))
-    gains: list[Panel] = []
-    phases: list[Panel] = []
-    for figure, what, unit, near in (
-        (8, "theta/M", "rad/(N m)", 0.0),
-        (9, "M/v", "N m/V", -90.0),
-        (10, "theta/v", "rad/V", -90.0),
-    ):
-        marks = (Mark("pendulum", turn),) if figure < 10 else ()
-        gain, phase = _together(
-            [
-                bode_panels(_curves(s, i, what), unit, marks, f"Fig. {figure}: {what}", near)
-                for i, s in enumerate(both)
-            ]
-        )
-        gains.append(gain if figure == 8 else replace(gain, legend=None))
-        phases.append(replace(phase, y_step=90.0, y_range=(-200.0, 110.0)))
-    gains[1] = replace(gains[1], labels=_slope_labels(both))
+    J, mgr = closed_form(both[0].rig)
+    pendulum = float(np.sqrt(mgr / J) / (2 * np.pi))
+    numbers = (
+        *slopes(),
+        *(_moment_measured(s) for s in both),
+        shown("vertical: natural frequency of the pendulum", pendulum, "Hz", "", 3),
+    )
     return Result(
-        tuple(numbers),
+        numbers,
         (
             "theta/M and M/v change with gravity, theta/v does not: the clearest relation of the "
             "three, and why gravity needs no place in the actuator's model.",
@@ -188,13 +156,44 @@ def figures_8_9_10() -> Result:
             Picture(
                 "p2-fig-8-9-10",
                 "Paper 2, Fig. 8 to 10: the torque test, vertical and horizontal",
-                (*gains, *phases),
+                _panels(both, pendulum),
                 columns=3,
                 width=11.0,
                 height=5.0,
             ),
         ),
     )
+
+
+def _moment_measured(s: Setup) -> Number:
+    """M/v of the recording over that of the model, median of the gain from 0.5 to 12 Hz."""
+    inside = (s.f > 5 * LOW[1]) & (s.f < HIGH[1])
+    f = s.f[inside]
+    model_M = np.interp(f, GRID, s.M.real) + 1j * np.interp(f, GRID, s.M.imag)
+    off = 100 * float(np.median(np.abs(s.M_measured[inside] / model_M - 1)))
+    what = f"{s.name}: measured M/v against the model, 0.5 to 12 Hz, median"
+    return between(what, off, "%", 0.0, 5.0, "agree closely", 2, "found again")
+
+
+def _panels(both: list[Setup], pendulum: float) -> tuple[Panel, ...]:
+    """The three gains above the three phases; pendulum : its natural frequency, Hz, marked where
+    the moment shows it."""
+    gains: list[Panel] = []
+    phases: list[Panel] = []
+    for figure, what, unit, near in (
+        (8, "theta/M", "rad/(N m)", 0.0),
+        (9, "M/v", "N m/V", -90.0),
+        (10, "theta/v", "rad/V", -90.0),
+    ):
+        marks = (Mark("pendulum", pendulum),) if figure < 10 else ()
+        title = f"Fig. {figure}: {what}"
+        gain, phase = _together(
+            [bode_panels(_curves(s, i, what), unit, marks, title, near) for i, s in enumerate(both)]
+        )
+        gains.append(gain if figure == 8 else replace(gain, legend=None))
+        phases.append(replace(phase, y_step=90.0, y_range=(-200.0, 110.0)))
+    gains[1] = replace(gains[1], labels=_slope_labels(both))
+    return (*gains, *phases)
 
 
 def _together(pairs: list[tuple[Panel, Panel]]) -> tuple[Panel, Panel]:
