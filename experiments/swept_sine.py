@@ -11,7 +11,7 @@ from experiments.inputs import Inputs
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import NonNegative, Positive, Rig
 from samii_rig.run.plan import Plan, PlannedSegment
-from samii_rig.signal.excitation import Sweep, swept_sine
+from samii_rig.signal.excitation import Profile, Sweep, swept_sine
 
 
 class SweptSine(Inputs):
@@ -78,12 +78,10 @@ class SweptSine(Inputs):
             self.start_hz,
             self.stop_hz,
             self.duration,
-            sweep=self.sweep,
             ramp=self.ramp,
             lead_in=self.lead_in,
             ring_down=self.ring_down,
-            schedule=self.schedule,
-            interpolation=self.interpolation,
+            profile=Profile(self.sweep, self.schedule, self.interpolation),
         )
         band = (min(self.start_hz, self.stop_hz), max(self.start_hz, self.stop_hz))
         levels = {level: level * shape for level in self.amplitudes}

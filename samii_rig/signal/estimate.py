@@ -54,7 +54,6 @@ def estimate(
     method: Method = "auto",
     gaps: Gaps = "refuse",
     band: tuple[float, float] | None = None,
-    pooling: int | None = None,
     nperseg: int = 2048,
 ) -> tuple[FrequencyResponse, ...]:
     """Frequency responses from the inputs to all outputs, one for each level and experiment.
@@ -73,7 +72,6 @@ def estimate(
     gaps : what to do with a segment that misses samples: `refuse`, `exclude` it, or `model`
         what follows a gap as a new transient (local models). Nothing is made up.
     band : Hz; without it, where the reference has energy.
-    pooling : neighbouring lines that share one noise covariance (burst, periodic).
     nperseg : samples per window (Welch).
 
     Returns
@@ -89,22 +87,15 @@ def estimate(
     EstimateError : the data do not allow it; the message says what would. Where other
         groups can be estimated, a group that cannot be becomes a finding of the first.
     """
-    if method not in get_args(Method):
-        raise InputError("estimate", "method", method, one_of(method, get_args(Method)))
-    if gaps not in get_args(Gaps):
-        raise InputError("estimate", "gaps", gaps, one_of(gaps, get_args(Gaps)))
-    if band is not None and not 0 <= band[0] < band[1]:
-        raise InputError(
-            "estimate", "band", band, "two frequencies in Hz, 0 or more, low below high"
-        )
+    how = How(outputs, method, gaps, band, nperseg)
+    _check(how)
     skews = skews_of(recordings)
     moved = aligned(recordings)
     recordings = [r for r, _ in moved]
     inputs, undriven = inputs_of(recordings, input)
     if undriven:
         sensors = [n for n in recordings[0].names("sensor") if n not in inputs]
-        outputs = [*(sensors if outputs is None else outputs), *undriven]
-    how = How(outputs, method, gaps, band, pooling, nperseg)
+        how = replace(how, outputs=[*(sensors if outputs is None else outputs), *undriven])
     if len(inputs) > 1:
         references = [reference] if isinstance(reference, str) else reference
         out = _several(recordings, inputs, references, how)
@@ -115,6 +106,17 @@ def estimate(
     shifted = tuple(finding for _, finding in moved if finding)
     out[0] = replace(out[0], findings=(*out[0].findings, *shifted))
     return tuple(apart(with_skew(response, skews), undriven) for response in out)
+
+
+def _check(how: How) -> None:
+    """InputError for a method, a way with gaps or a band that does not exist."""
+    if how.method not in get_args(Method):
+        raise InputError("estimate", "method", how.method, one_of(how.method, get_args(Method)))
+    if how.gaps not in get_args(Gaps):
+        raise InputError("estimate", "gaps", how.gaps, one_of(how.gaps, get_args(Gaps)))
+    if how.band is not None and not 0 <= how.band[0] < how.band[1]:
+        expected = "two frequencies in Hz, 0 or more, low below high"
+        raise InputError("estimate", "band", how.band, expected)
 
 
 def _several(
@@ -176,7 +178,7 @@ def _one(
             if choice == "local":
                 out.append(_local(group, why, band))
             else:
-                out.append(_repeats(group, choice, why, band, how.pooling))
+                out.append(_repeats(group, choice, why, band))
         except EstimateError as error:
             failed.append(error)
     if not out:
@@ -237,7 +239,6 @@ def _repeats(
     method: Literal["burst", "settled", "periodic"],
     why: str,
     band: tuple[float, float] | None,
-    pooling: int | None,
 ) -> FrequencyResponse:
     taken = _spectra(group, method)
     pieces, spectra, periods = taken.pieces, taken.each, taken.periods
@@ -246,7 +247,7 @@ def _repeats(
     lines = comb(spectra, band) if method == "periodic" else excited(spectra, band)
     lines = _driven(group, pieces, spectra, lines)
     n, p = len(spectra), len(group.selection.outputs)
-    wanted = pooling or repeats.pooling_lines(n, p)
+    wanted = repeats.pooling_lines(n, p)
     if min(wanted, lines.size) * (n - 1) <= p:
         raise EstimateError(
             f"{n} repeats of {lines.size} lines do not give a covariance of {p} outputs; "
@@ -275,18 +276,16 @@ def _repeats(
         if method == "periodic"
         else np.abs(result.gain) * _peak(pieces) / np.sqrt(2)
     )
-    response = _response(
-        group,
+    found = _ByLine(
         frequency=spectra[0].frequency[lines],
         H=result.H,
         covariance=result.covariance,
         dof=result.dof,
         coherence=_coherence(result.H, result.gain, np.mean(np.abs(R) ** 2, axis=0), result.noise),
         input_rms=amplitude,
-        n=averages,
-        method=f"{method} (over {over}, through {group.through})",
-        why=f"{why}; {result.remark}",
     )
+    done = f"{method} (over {over}, through {group.through})"
+    response = _response(group, found, averages, done, f"{why}; {result.remark}")
     return replace(response, even=seen.even, odd=seen.odd)
 
 
@@ -374,19 +373,18 @@ def _local(group: Group, why: str, band: tuple[float, float] | None) -> Frequenc
         raise EstimateError(f"{dof.min():.2g} degrees of freedom for {p} outputs; more data would")
     # Of the piece in which the sweep passes the frequency.
     power = np.max([np.interp(f0, s.frequency, np.abs(s.R) ** 2) for s in spectra], axis=0)
-    return _response(
-        group,
+    found = _ByLine(
         frequency=f0,
         H=pick("H"),
         covariance=pick("covariance"),
         dof=dof,
         coherence=_coherence(pick("H"), pick("gain"), power, pick("noise")),
         input_rms=np.abs(pick("gain")) * _peak(group.pieces) / np.sqrt(2),
-        n=len(group.pieces),
-        method=f"local (LPM, LRM at {rational:.0%} of the lines, through {group.through})",
-        why=f"{why}; windows of {width:.3g} Hz, "
-        + (f"{len(transients)} transients" if transients else "at rest at both ends: no transient"),
     )
+    done = f"local (LPM, LRM at {rational:.0%} of the lines, through {group.through})"
+    ends = f"{len(transients)} transients" if transients else "at rest at both ends: no transient"
+    why = f"{why}; windows of {width:.3g} Hz, {ends}"
+    return _response(group, found, len(group.pieces), done, why)
 
 
 def _unclear(f0: Float, clear: NDArray[np.bool_]) -> Finding:
@@ -435,18 +433,16 @@ def _welch(
         "leakage and what a loop feeds back bias it, and its covariance does not know",
     )
     group.findings.append(warning)
-    return _response(
-        group,
+    found = _ByLine(
         frequency=f[keep],
         H=result.H[inside][keep],
         covariance=result.covariance[inside][keep],
         dof=np.full(int(keep.sum()), result.dof),
         coherence=result.coherence[inside][keep],
         input_rms=np.full(int(keep.sum()), np.nan),
-        n=result.n_frames,
-        method=f"{method} (Welch, {nperseg} samples, Hann)",
-        why="asked for",
     )
+    done = f"{method} (Welch, {nperseg} samples, Hann)"
+    return _response(group, found, result.n_frames, done, "asked for")
 
 
 def _coherence(H: Complex, gain: Complex, power: Float, noise: Complex) -> Float:
@@ -461,30 +457,32 @@ def _peak(pieces: Sequence[Piece]) -> float:
     return max(float(np.abs(p.r).max(initial=0.0)) for p in pieces)
 
 
-def _response(
-    group: Group,
-    *,
-    frequency: Float,
-    H: Complex,
-    covariance: Complex,
-    dof: Float,
-    coherence: Float,
-    input_rms: Float,
-    n: int,
-    method: str,
-    why: str,
-) -> FrequencyResponse:
+@dataclass(frozen=True, slots=True)
+class _ByLine:
+    """What an estimate of one input has for each line: frequency, dof, input_rms (n,), H and
+    coherence (n, p), covariance (n, p, p), as in `FrequencyResponse`."""
+
+    frequency: Float
+    H: Complex
+    covariance: Complex
+    dof: Float
+    coherence: Float
+    input_rms: Float
+
+
+def _response(group: Group, found: _ByLine, n: int, method: str, why: str) -> FrequencyResponse:
+    """The response of a group over n averages, with what the group knows of it."""
     return FrequencyResponse(
-        frequency=frequency,
-        H=H[:, :, None],
-        covariance=covariance,
-        dof=dof,
-        coherence=coherence,
+        frequency=found.frequency,
+        H=found.H[:, :, None],
+        covariance=found.covariance,
+        dof=found.dof,
+        coherence=found.coherence,
         inputs=(group.selection.input,),
         outputs=group.selection.outputs,
         level=group.level,
         level_unit=group.unit,
-        input_rms=input_rms[:, None],
+        input_rms=found.input_rms[:, None],
         rate_hz=group.rate_hz,
         n_averages=n,
         method=method,

@@ -7,6 +7,7 @@ silence again while the rig rings down.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -73,18 +74,29 @@ def schedule_factor(
     return np.asarray(np.exp(np.interp(np.log(frequency), np.log(hz), np.log(factor))))
 
 
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """How frequency and amplitude run along a sweep: `sweep` as in `sweep_frequency`, `schedule`
+    and `interpolation` as in `schedule_factor`."""
+
+    sweep: Sweep = "logarithmic"
+    schedule: Sequence[tuple[float, float]] = ()
+    interpolation: Interpolation = "logarithmic"
+
+
+EVEN = Profile()  # logarithmic, of one amplitude
+
+
 def swept_sine(
     rate_hz: float,
     start_hz: float,
     stop_hz: float,
     duration: float,
     *,
-    sweep: Sweep = "logarithmic",
     ramp: float = 0.0,
     lead_in: float = 0.0,
     ring_down: float = 0.0,
-    schedule: Sequence[tuple[float, float]] = (),
-    interpolation: Interpolation = "logarithmic",
+    profile: Profile = EVEN,
 ) -> tuple[Float, Float]:
     """A burst of unit level and its instantaneous frequency.
 
@@ -93,6 +105,7 @@ def swept_sine(
     duration : s of the sweep, both ramps inside it.
     ramp : s of the cosine ramp at its start and at its stop.
     lead_in, ring_down : s of silence before and after it.
+    profile : of frequency and amplitude over the sweep.
 
     Returns
     -------
@@ -102,10 +115,11 @@ def swept_sine(
     before, n, after = (round(x * rate_hz) for x in (lead_in, duration, ring_down))
     t = np.arange(n) / rate_hz
     T = n / rate_hz
-    f = sweep_frequency(t, start_hz, stop_hz, T, sweep)
-    envelope = schedule_factor(f, schedule, interpolation) * cosine_ramp(n, rate_hz, ramp)
+    f = sweep_frequency(t, start_hz, stop_hz, T, profile.sweep)
+    factor = schedule_factor(f, profile.schedule, profile.interpolation)
+    envelope = factor * cosine_ramp(n, rate_hz, ramp)
     u = np.zeros(before + n + after)
     frequency = np.full(u.shape, np.nan)
-    u[before : before + n] = envelope * np.sin(sweep_phase(t, start_hz, stop_hz, T, sweep))
+    u[before : before + n] = envelope * np.sin(sweep_phase(t, start_hz, stop_hz, T, profile.sweep))
     frequency[before : before + n] = f
     return u, frequency

@@ -140,7 +140,7 @@ def hotelling_distribution(p: int, dof: Float) -> tuple[Float, Float, Float]:
     if np.any(dof < p):
         raise EstimateError(
             f"{float(dof.min()):.3g} degrees of freedom do not give a covariance of {p} outputs; "
-            "more repeats, a wider pooling or fewer outputs would"
+            "more repeats or fewer outputs would"
         )
     rest = dof - p + 1
     return dof * p / rest, np.full(dof.shape, 2.0 * p), 2.0 * rest

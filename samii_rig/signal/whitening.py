@@ -79,7 +79,7 @@ def factor(dof: Float, p: int) -> Float:
     if np.any(dof <= p + 1):
         raise EstimateError(
             f"{float(np.min(dof)):.3g} degrees of freedom are too few to weigh {p} outputs; "
-            "more repeats, a wider pooling or fewer outputs would do"
+            "more repeats or fewer outputs would do"
         )
     with np.errstate(invalid="ignore"):
         return np.where(np.isinf(dof), 1.0, ((dof - p) ** 2 - 1) / dof**2)

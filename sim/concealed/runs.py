@@ -14,7 +14,7 @@ from scipy.linalg import hadamard
 
 from samii_rig.devices.channels import centring_name
 from samii_rig.rig.schema import Rig
-from samii_rig.signal.excitation import cosine_ramp, schedule_factor, swept_sine
+from samii_rig.signal.excitation import Profile, cosine_ramp, schedule_factor, swept_sine
 from samii_rig.signal.multisine import odd_lines, realisations
 from samii_rig.types import Float, Segment
 
@@ -77,7 +77,7 @@ def burst(design: Design, rate_hz: float) -> Float:
         ramp=0.5,
         lead_in=design.lead_in,
         ring_down=design.ring_down,
-        schedule=SCHEDULE,
+        profile=Profile(schedule=SCHEDULE),
     )
     return wave
 

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from samii_rig.signal.excitation import (
     Interpolation,
+    Profile,
     Sweep,
     cosine_ramp,
     schedule_factor,
@@ -41,7 +42,7 @@ def test_a_logarithmic_sweep_of_almost_no_width_keeps_its_digits(start, ratio, T
 
 
 def test_one_frequency_is_a_plain_sine():
-    u, f = swept_sine(100.0, 5.0, 5.0, 2.0, sweep="logarithmic")
+    u, f = swept_sine(100.0, 5.0, 5.0, 2.0)
     np.testing.assert_allclose(u, np.sin(2 * np.pi * 5.0 * np.arange(200) / 100), atol=1e-12)
     assert np.all(f == 5.0)
 
@@ -65,8 +66,8 @@ def test_a_burst_is_silent_before_and_after_and_its_frequency_unknown_there():
 
 @given(ramp=st.floats(0.05, 1.0), sweep=SWEEPS)
 def test_a_ramp_never_raises_the_level_nor_jumps_at_its_ends(ramp, sweep):
-    hard, _ = swept_sine(500.0, 1.0, 30.0, 3.0, sweep=sweep)
-    soft, _ = swept_sine(500.0, 1.0, 30.0, 3.0, sweep=sweep, ramp=ramp)
+    hard, _ = swept_sine(500.0, 1.0, 30.0, 3.0, profile=Profile(sweep))
+    soft, _ = swept_sine(500.0, 1.0, 30.0, 3.0, ramp=ramp, profile=Profile(sweep))
     assert np.all(np.abs(soft) <= np.abs(hard) + 1e-15)
     # One sample from rest the ramp is at most (pi/2 dt/ramp)^2.
     assert abs(soft[-1]) <= (np.pi / 2 / 500.0 / ramp) ** 2
@@ -94,7 +95,7 @@ def test_a_schedule_is_interpolated_and_constant_outside(
 
 
 def test_the_schedule_is_the_envelope_of_the_burst():
-    u, f = swept_sine(2000.0, 2.0, 50.0, 20.0, schedule=[(2.0, 1.0), (50.0, 0.1)])
+    u, f = swept_sine(2000.0, 2.0, 50.0, 20.0, profile=Profile(schedule=[(2.0, 1.0), (50.0, 0.1)]))
     late = np.abs(u[f > 45.0]).max()
     assert late == pytest.approx(0.1, rel=0.1)
     assert np.abs(u[f < 3.0]).max() == pytest.approx(0.8, rel=0.3)

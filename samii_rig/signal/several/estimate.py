@@ -39,7 +39,6 @@ class How:
     method: Method
     gaps: Gaps
     band: tuple[float, float] | None
-    pooling: int | None
     nperseg: int
 
 
@@ -169,9 +168,7 @@ def _lines(
     at = _band(mean, parts, how.band, periodic=periodic)
     R = _references(mean[at], own, columns) if recorded else None
     realised = periodic and _realised(own, len(columns.inputs))
-    found = lines.estimate(
-        parts, columns, at, R, own.classes, realised=realised, pooling=how.pooling
-    )
+    found = lines.estimate(parts, columns, at, R, own.classes, realised=realised)
     if periodic:
         amplitude = np.sqrt(2 * found.input / parts[0].n_samples)
     else:

@@ -113,14 +113,12 @@ def estimate(
     classes: Sequence[Sequence[int]],
     *,
     realised: bool,
-    pooling: int | None,
 ) -> Lines:
     """H on the lines `at` from all experiments.
 
     R : (n_freq, n_ref, E) references there, None without any. classes : experiments whose noise
         is alike, such as those that drive one input.
     realised : whether the covariance is taken over experiments, so that it holds distortion.
-    pooling : neighbouring lines that share one covariance.
     """
     inputs, outputs = columns.part("inputs"), columns.part("outputs")
     count = np.array([len(m.Z) for m in parts])
@@ -138,9 +136,9 @@ def estimate(
     of_means: list[_Noise] = []
     for own in classes:
         if any(count[k] > 1 for k in own):
-            of_repeats.append(_over_repeats([parts[k] for k in own], columns, at, H, pooling))
+            of_repeats.append(_over_repeats([parts[k] for k in own], columns, at, H))
         if realised:
-            of_means.append(_over_means(rest[:, :, own], free[:, own], H, pooling))
+            of_means.append(_over_means(rest[:, :, own], free[:, own], H))
         used = (of_means if realised else of_repeats)[-1:]
         if not used:
             raise EstimateError("one repeat of an experiment shows no noise; two or more would")
@@ -165,9 +163,7 @@ def estimate(
     )
 
 
-def _over_repeats(
-    parts: Sequence[Measured], columns: Columns, at: Int, H: Complex, pooling: int | None
-) -> _Noise:
+def _over_repeats(parts: Sequence[Measured], columns: Columns, at: Int, H: Complex) -> _Noise:
     """From the scatter of e about its mean in each experiment, as `repeats.over_repeats`."""
     e = []
     for m in parts:
@@ -178,7 +174,7 @@ def _over_repeats(
     count = [len(m.Z) for m in parts]
     n, nu, p = float(np.mean(count)), float(sum(count) - len(count)), H.shape[1]
     correlation = max(m.correlation for m in parts)
-    found = noise.pooled(np.concatenate(e), nu, _width(pooling, nu, p, len(at)), H)
+    found = noise.pooled(np.concatenate(e), nu, _width(nu, p, len(at)), H)
     each = found.covariance / (1 - 2 * correlation / n)
     scatter = np.diagonal(each, axis1=1, axis2=2).real
     more = 1 + 2 * correlation * (n - 1) / n
@@ -189,7 +185,7 @@ def _over_repeats(
     return _Noise(N, found.dof / max(m.shared for m in parts), nu, found.remark)
 
 
-def _over_means(rest: Complex, free: Float, H: Complex, pooling: int | None) -> _Noise:
+def _over_means(rest: Complex, free: Float, H: Complex) -> _Noise:
     """From the residuals (n_freq, n_out, n) of the means of experiments, of which each leaves
     the part `free` (n_freq, n)."""
     share = float(np.mean(np.sum(free, axis=1)))
@@ -198,15 +194,15 @@ def _over_means(rest: Complex, free: Float, H: Complex, pooling: int | None) -> 
             "too few experiments drive each input to tell distortion from noise; "
             "another realisation would do"
         )
-    width = _width(pooling, share, H.shape[1], len(H))
+    width = _width(share, H.shape[1], len(H))
     found = noise.pooled(rest.transpose(2, 0, 1), share, width, H)
     return _Noise([found.covariance] * free.shape[1], found.dof, share, found.remark)
 
 
-def _width(pooling: int | None, nu: float, p: int, n_lines: int) -> int:
+def _width(nu: float, p: int, n_lines: int) -> int:
     """How many lines to pool, as `repeats.pooling_lines`, with nu degrees of freedom a line."""
-    width = pooling or -(-repeats.wanted_dof(p) // max(nu, 1e-9))
-    width = int(width) + 1 - int(width) % 2
+    width = int(-(-repeats.wanted_dof(p) // max(nu, 1e-9)))
+    width += 1 - width % 2
     if min(width, n_lines) * nu <= p:
         raise EstimateError(
             f"{nu:g} degrees of freedom at each of {n_lines} lines do not give a covariance of "
