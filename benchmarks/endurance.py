@@ -45,6 +45,7 @@ from samii_rig.record.writer import PARTIAL, RunWriter
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.run import campaign
+from samii_rig.run.client import Client
 from samii_rig.run.dryrun import DryRun, predict
 from samii_rig.run.order import RunOrder
 from samii_rig.run.outcome import Outcome
@@ -282,7 +283,7 @@ class Endured:
         Appender.add_chunk, campaign.RunWriter = add_chunk, opening
         try:
             outcome = campaign.carry_out(
-                RunOrder(self.wire.rig, "", "", self.plan, self.predicted), path, progress=progress
+                RunOrder(self.wire.rig, "", "", self.plan, self.predicted), path, Client(progress)
             )
             return outcome.stop.status, outcome.stop.reason
         except SamiiRigError as error:

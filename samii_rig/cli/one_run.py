@@ -103,6 +103,7 @@ def _driven(order: RunOrder, path: Path, said: Said) -> Outcome:
     """The run itself, with its progress on the console."""
     from samii_rig.report.summary import LiveProgress
     from samii_rig.run.campaign import carry_out
+    from samii_rig.run.client import Client
     from samii_rig.run.heartbeat import Pipe
     from samii_rig.run.pace import LoopSettings
 
@@ -114,8 +115,10 @@ def _driven(order: RunOrder, path: Path, said: Said) -> Outcome:
         return carry_out(
             order,
             path,
-            progress=None if said.json else live,
-            alive=Pipe(sys.stdin.fileno()) if heartbeat else None,
+            Client(
+                progress=None if said.json else live,
+                alive=Pipe(sys.stdin.fileno()) if heartbeat else None,
+            ),
             loop=LoopSettings(heartbeat_age=heartbeat) if heartbeat else None,
         )
 

@@ -12,13 +12,13 @@ from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from threading import Event
 
 from samii_rig.devices.opening import close_device, open_device
 from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import NO_MEMORY, RecordedError, RecordingError, SamiiRigError
 from samii_rig.record.reader import read_frequency_responses, read_recording
 from samii_rig.record.writer import RunWriter
+from samii_rig.run.client import NOBODY, Client
 from samii_rig.run.dryrun import DryRun
 from samii_rig.run.ending import finish
 from samii_rig.run.interrupts import Interrupts
@@ -27,8 +27,7 @@ from samii_rig.run.order import RunOrder
 from samii_rig.run.outcome import Outcome
 from samii_rig.run.pace import LoopSettings
 from samii_rig.run.priority import prioritised
-from samii_rig.run.progress import Progress
-from samii_rig.run.sink import Watched, recorded_channels
+from samii_rig.run.sink import Sink, Watched, recorded_channels
 from samii_rig.safety.latch import Cleared, Latch
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import SampleBlock, StopRecord
@@ -40,10 +39,8 @@ VERSIONS_OF = ("samii-rig", "numpy", "scipy", "numba", "mcap")
 def carry_out(
     order: RunOrder,
     path: Path,
+    client: Client = NOBODY,
     *,
-    progress: Callable[[Progress], None] | None = None,
-    stop: Event | None = None,
-    alive: Callable[[], bool] | None = None,
     loop: LoopSettings | None = None,
     watch: Callable[[SampleBlock], None] | None = None,
     at_rest: Callable[[StopRecord], None] | None = None,
@@ -53,7 +50,7 @@ def carry_out(
 
     However the run ends, the recording is whole and says how; what was measured until then
     is estimated where it suffices. A FAULT on a real rig is latched (`samii_rig.safety.latch`), and
-    while one is, nothing is opened. progress, stop, alive, loop : see `samii_rig.run.loop.run`.
+    while one is, nothing is opened. client, loop : see `samii_rig.run.loop.run`.
     watch : gets every block after it was recorded, for a display; it must neither wait nor raise.
     why : is asked for the reason of an end, where it may be known better than here: a signal does
     not say who sent it. at_rest : is told how the run ended once nothing moves, before the estimate
@@ -72,37 +69,23 @@ def carry_out(
     # may stay for a hundred runs.
     gc.collect()
     device = open_device(rig, order.settings)
-    real = device.metadata.get("clock") != "simulated"
     try:
-        notes = _notes(order, device, latch.cleared if real else None)
-        if real and (tripped := device.metadata.get("tripped")):
-            latch.set(tripped)
-            latch.refuse()
+        real_latch = _real_latch(device, latch)
+        notes = _notes(order, device, real_latch.cleared if real_latch else None)
         with (
             latch.held(device),
             Interrupts() as interrupts,
             _writer(order, path, device, notes) as writer,
         ):
-            with _refusal_recorded(writer, interrupts), prioritised() if real else nullcontext():
-                ended = run(
-                    order.plan,
-                    rig,
-                    device,
-                    writer if watch is None else Watched(writer, watch),
-                    progress,
-                    stop,
-                    alive=alive,
-                    settings=loop,
-                    interrupts=interrupts,
-                    latch=latch.set if real else None,
-                )
+            sink = writer if watch is None else Watched(writer, watch)
+            with _refusal_recorded(writer, interrupts):
+                ended = _drive(order, device, sink, client, loop, interrupts, real_latch)
             if why is not None:
                 ended = replace(ended, reason=why(ended))
             if at_rest is not None:
                 at_rest(ended)
             # What the device has learnt meanwhile, as how well its clocks are known.
-            told = {f"device_{key}": value for key, value in device.metadata.items()}
-            if news := dict(told.items() - notes.items()):
+            if news := dict(_of_device(device).items() - notes.items()):
                 writer.note(news)
             trouble = _estimate_into(writer, interrupts)
             finish(writer, ended)
@@ -111,6 +94,40 @@ def carry_out(
     with _recorded(path, ended):
         responses = tuple(read_frequency_responses(path))
         return Outcome(path, read_recording(path), responses, ended, trouble, interrupts.came)
+
+
+def _real_latch(device: OpenRig, latch: Latch) -> Latch | None:
+    """The latch that holds for this device, None for a simulated one; GateError where the device
+    itself says that it tripped."""
+    if device.metadata.get("clock") == "simulated":
+        return None
+    if tripped := device.metadata.get("tripped"):
+        latch.set(tripped)
+        latch.refuse()
+    return latch
+
+
+def _drive(
+    order: RunOrder,
+    device: OpenRig,
+    sink: Sink,
+    client: Client,
+    loop: LoopSettings | None,
+    interrupts: Interrupts,
+    latch: Latch | None,
+) -> StopRecord:
+    """The loop itself: with a latch, which a real rig has, at the priority of real time."""
+    with nullcontext() if latch is None else prioritised():
+        return run(
+            order.plan,
+            order.rig,
+            device,
+            sink,
+            client,
+            settings=loop,
+            interrupts=interrupts,
+            latch=None if latch is None else latch.set,
+        )
 
 
 @contextmanager
@@ -134,10 +151,15 @@ def _notes(order: RunOrder, device: OpenRig, cleared: Cleared | None) -> dict[st
         "device": device.description,
         "centring": "; ".join(f"{o.centring_sensor} {o.kp!r}" for o in order.plan.outputs),
         "predicted_peaks": json.dumps(_peaks(order.predicted)),
-        **{f"device_{key}": value for key, value in device.metadata.items()},
+        **_of_device(device),
         **({f"fault_cleared_{k}": v for k, v in asdict(cleared).items()} if cleared else {}),
         **versions(),
     }
+
+
+def _of_device(device: OpenRig) -> dict[str, str]:
+    """What the device says of itself now, by the names of the recording."""
+    return {f"device_{key}": value for key, value in device.metadata.items()}
 
 
 def _writer(order: RunOrder, path: Path, device: OpenRig, notes: dict[str, str]) -> RunWriter:

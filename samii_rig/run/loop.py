@@ -19,6 +19,7 @@ import numpy as np
 from samii_rig.devices.protocols import CommandBlock, OpenRig, Reports
 from samii_rig.errors import DeviceError, GateError, RecordingError, SamiiRigError
 from samii_rig.rig.schema import Rig
+from samii_rig.run.client import NOBODY, Client
 from samii_rig.run.dwell import Reference, Watch
 from samii_rig.run.ending import Status, Zero, attempt, with_troubles
 from samii_rig.run.interrupts import Interrupts
@@ -44,10 +45,8 @@ def run(
     rig: Rig,
     device: OpenRig,
     sink: Sink,
-    progress: Callable[[Progress], None] | None = None,
-    stop: Event | None = None,
+    client: Client = NOBODY,
     *,
-    alive: Callable[[], bool] | None = None,
     settings: LoopSettings | None = None,
     interrupts: Interrupts | None = None,
     latch: Callable[[str], None] | None = None,
@@ -61,10 +60,9 @@ def run(
     ----------
     sink : the recorder. On real time it works in a thread of its own; on simulated time
         (`device.metadata["clock"] == "simulated"`) it is called directly.
-    stop : when set, the run ends in good order (status `stopped`), as it does on Ctrl-C.
+    client : of the operator.
     interrupts : signals that end the run, if the caller handles them already; they are left
         with `ending` set.
-    alive : asked each tick whether the operator's client gave a sign of life since.
     latch : gets the reason when the gate has ended in FAULT, with the output at zero.
 
     Returns
@@ -77,9 +75,9 @@ def run(
     InputError if the settings do not fit the device, GateError if the device lacks a channel
     that the limits need: both before anything moves.
     """
-    job = _Run(plan, rig, device, sink, progress, alive, settings or LoopSettings())
+    job = _Run(plan, rig, device, sink, client, settings or LoopSettings())
     with nullcontext(interrupts) if interrupts else Interrupts() as signals:
-        status, reason = job.until_the_end(stop or Event(), signals)
+        status, reason = job.until_the_end(client.stop or Event(), signals)
         signals.ending = True
         if latch is not None and job.gate.state is State.FAULT:
             fault = job.gate.fault
@@ -96,13 +94,12 @@ class _Run:
         rig: Rig,
         device: OpenRig,
         sink: Sink,
-        progress: Callable[[Progress], None] | None,
-        alive: Callable[[], bool] | None,
+        client: Client,
         settings: LoopSettings,
     ) -> None:
         plan = completed(plan, rig)
         self.plan, self.rig, self.device, self.settings = plan, rig, device, settings
-        self.progress, self.alive = progress, alive
+        self.progress, self.alive = client.progress, client.alive
         self.clock, self.sensor = device.clock, device.sensor
         simulated = device.metadata.get("clock") == "simulated"
         self.tick = choose_tick(settings, device, plan.rate_hz, simulated)

@@ -28,6 +28,7 @@ from samii_rig.progress import telling
 from samii_rig.record.reader import read_events
 from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
+from samii_rig.run.client import Client
 from samii_rig.run.order import PlannedRun, RunOrder
 from samii_rig.run.outcome import Outcome
 from samii_rig.run.outputs import plan_limits
@@ -94,9 +95,11 @@ class Runner:
         return carry_out(
             order,
             self.path,
-            progress=lambda now: self._progress(order.plan, now),
-            stop=self.stop,
-            alive=lambda: self._alive(order.rig),
+            Client(
+                progress=lambda now: self._progress(order.plan, now),
+                stop=self.stop,
+                alive=lambda: self._alive(order.rig),
+            ),
             watch=lambda block: self._watch(order.plan, live, block),
             at_rest=lambda ended: self._at_rest(order, ended),
             why=self._reason,

@@ -100,9 +100,8 @@ def estimate(
         references = [reference] if isinstance(reference, str) else reference
         out = _several(recordings, inputs, references, how)
     else:
-        named = inputs[0] if inputs else None
         single = reference if isinstance(reference, str) else next(iter(reference or ()), None)
-        out = _one(recordings, named, single, how)
+        out = _one(recordings, next(iter(inputs), None), single, how)
     shifted = tuple(finding for _, finding in moved if finding)
     out[0] = replace(out[0], findings=(*out[0].findings, *shifted))
     return tuple(apart(with_skew(response, skews), undriven) for response in out)

@@ -8,6 +8,7 @@ from loop_kit import Memory, after
 
 from samii_rig.devices.opening import open_device
 from samii_rig.rig.load import load_rig
+from samii_rig.run.client import Client
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
 from samii_rig.run.loop import run
@@ -52,7 +53,7 @@ def test_the_shipped_plan_keeps_every_limit(planned):
 
 
 def test_stopped_in_the_middle_it_ends_at_zero(planned):
-    stop, _ = go(planned, {}, stop=after(4.0))
+    stop, _ = go(planned, {}, client=Client(stop=after(4.0)))
     assert (stop.status, stop.reason) == ("stopped", "stopped on request")
 
 

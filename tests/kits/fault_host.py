@@ -19,6 +19,7 @@ import numpy as np
 from samii_rig.devices.opening import open_device
 from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
+from samii_rig.run.client import NOBODY, Client
 from samii_rig.run.dryrun import DryRun, predict
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import _Run
@@ -53,7 +54,7 @@ class Nowhere:
 def rest(rig: Rig, state: str) -> int:
     """SAFE or ARMED, until a signal or a fault."""
     device = open_device(rig, {})
-    job = _Run(plan_of(rig, 1.0), rig, device, Nowhere(), None, None, LoopSettings())
+    job = _Run(plan_of(rig, 1.0), rig, device, Nowhere(), NOBODY, LoopSettings())
     with Interrupts() as interrupts:
         try:
             while job.newest < 0:
@@ -85,7 +86,7 @@ def driven(rig: Rig, path: Path, predicted: DryRun) -> int:
     plan = plan_of(rig, 30.0)
     loop = LoopSettings(report=0.02)
     order = RunOrder(rig, "", "", plan, predicted)
-    outcome = carry_out(order, path, progress=progress, loop=loop)
+    outcome = carry_out(order, path, Client(progress), loop=loop)
     return EXIT[outcome.stop.status]
 
 

@@ -14,6 +14,7 @@ from threading import Event
 from fault_host import Nowhere, plan_of
 from wire_kit import Wire
 
+from samii_rig.run.client import NOBODY
 from samii_rig.run.ending import attempt
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import _Run
@@ -32,7 +33,7 @@ class Held:
         self.wire, self.device = wire, wire.open(**settings)
         self.sink = Memory()
         plan = plan or plan_of(wire.rig, 20.0)
-        self.job = _Run(plan, wire.rig, self.device, self.sink, None, None, LoopSettings())
+        self.job = _Run(plan, wire.rig, self.device, self.sink, NOBODY, LoopSettings())
         self.stop, self.signals = Event(), Interrupts()
         self.state = "safe"
         self.ended: tuple[str, str] | None = None

@@ -17,6 +17,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from samii_rig.devices.protocols import CommandBlock
 from samii_rig.errors import DeviceError, GateError, RecordingError
 from samii_rig.rig.schema import Rig
+from samii_rig.run.client import Client
 from samii_rig.run.interrupts import Interrupts
 from samii_rig.run.loop import _Run
 from samii_rig.run.pace import LoopSettings
@@ -106,8 +107,7 @@ class GateAndLoop(RuleBasedStateMachine):
             rig,
             self.device.open(),
             self.sink,
-            None,
-            self.alive,
+            Client(alive=self.alive),
             LoopSettings(tick=TICK, heartbeat_age=HEARTBEAT),
         )
         self.begun = False

@@ -88,7 +88,7 @@ def test_a_run_that_was_never_armed_has_nothing_to_latch(endured, monkeypatch):
         return replace(outcome, stop=replace(outcome.stop, status="failed", reason="stale"))
 
     carry_out = campaign.carry_out
-    monkeypatch.setattr(campaign, "carry_out", lambda *g, progress, **n: stale(*g, **n))
+    monkeypatch.setattr(campaign, "carry_out", lambda order, path, client: stale(order, path))
     monkeypatch.setattr(endured.wire, "rig", load_rig("samii")[0])
     endured.one(2)
     assert endured.wrong == []

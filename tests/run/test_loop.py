@@ -15,6 +15,7 @@ from fake_device import RATE, FakeDevice, fake_rig
 from loop_kit import Broken, Memory, RealTime, after, patient_rig, plan
 
 from samii_rig.errors import DeviceError, GateError, InputError
+from samii_rig.run.client import Client
 from samii_rig.run.dwell import Reference
 from samii_rig.run.interrupts import PAUSE, Interrupts
 from samii_rig.run.loop import run
@@ -73,14 +74,14 @@ def test_the_reference_stays_ahead_and_never_breaks_off():
 
 
 def test_the_tail_shows_the_output_at_zero():
-    _, _, sink = go(FakeDevice(), stop=after(0.5))
+    _, _, sink = go(FakeDevice(), client=Client(stop=after(0.5)))
     assert sink.column("v")[-1] == 0.0
     assert np.abs(sink.column("v")).max() > 0.1
 
 
 def test_progress_tells_the_segment_the_frequency_and_the_margin():
     seen = []
-    stop, _, _ = go(progress=seen.append, settings=LoopSettings(report=0.1))
+    stop, _, _ = go(client=Client(seen.append), settings=LoopSettings(report=0.1))
     assert stop.status == "completed"
     assert [p.segment for p in seen] == sorted(p.segment for p in seen)
     assert {p.n_segments for p in seen} == {2}
@@ -99,7 +100,7 @@ def test_progress_tells_the_segment_the_frequency_and_the_margin():
 
 
 def test_a_stop_event_ends_at_zero():
-    stop, _, sink = go(stop=after(0.5))
+    stop, _, sink = go(client=Client(stop=after(0.5)))
     assert (stop.status, stop.reason) == ("stopped", "stopped on request")
     assert sink.segments == []
     assert sink.events[-1][1]["status"] == "stopped"
@@ -112,7 +113,7 @@ def test_a_segment_whose_last_sample_is_there_is_recorded_however_soon_the_stop_
         if now.segment == 2:
             asked.set()
 
-    stop, _, sink = go(stop=asked, progress=enough, settings=LoopSettings(report=0.0))
+    stop, _, sink = go(client=Client(enough, asked), settings=LoopSettings(report=0.0))
     assert (stop.status, stop.reason) == ("stopped", "stopped on request")
     assert [s.name for s in sink.segments] == ["burst_0"]
     assert sink.column("sequence")[-1] >= sink.segments[0].stop
@@ -245,10 +246,10 @@ def test_a_client_that_falls_silent_trips_the_run():
         asked.append(1)
         return len(asked) < 12
 
-    stop, _, _ = go(alive=alive, settings=LoopSettings(heartbeat_age=0.2))
+    stop, _, _ = go(client=Client(alive=alive), settings=LoopSettings(heartbeat_age=0.2))
     assert stop.status == "tripped"
     assert "operator's client" in stop.reason
-    stop, _, _ = go(alive=lambda: True, settings=LoopSettings(heartbeat_age=0.2))
+    stop, _, _ = go(client=Client(alive=lambda: True), settings=LoopSettings(heartbeat_age=0.2))
     assert stop.status == "completed"
 
 
@@ -267,7 +268,7 @@ def test_a_recorder_that_fails_at_the_very_end_does_not_hide_why_the_run_ended()
 
 
 def test_a_display_that_fails_ends_at_zero():
-    stop, _, _ = go(progress=raising(RuntimeError("no terminal")))
+    stop, _, _ = go(client=Client(raising(RuntimeError("no terminal"))))
     assert (stop.status, stop.reason) == ("failed", "RuntimeError: no terminal")
 
 
@@ -494,7 +495,7 @@ def test_a_recorder_that_lost_samples_makes_a_stopped_run_a_failed_one():
         patient_rig(),
         RealTime().open(),
         Broken("stop", OSError("disk full")),
-        stop=after(0.3),
+        Client(stop=after(0.3)),
     )
     assert stop.status == "failed"
     assert stop.reason == "stopped on request; then OSError: disk full"

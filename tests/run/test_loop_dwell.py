@@ -15,6 +15,7 @@ from loop_kit import Memory, after
 from experiments.stepped_sine import SteppedSine
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.rig.load import load_rig
+from samii_rig.run.client import Client
 from samii_rig.run.dryrun import predict
 from samii_rig.run.dwell import MIXED, Reference, Watch, check_segments, ways
 from samii_rig.run.loop import run
@@ -320,7 +321,9 @@ def test_every_way_out_right_after_a_dwell_was_left_ends_at_zero(how):
 
     device.spoil = spoil if how in ("nan", "angle") else quiet
     sink = Leaving(raises if how == "recorder" else flag.set)
-    stop = run(plan_of(), RIG, device.open(), sink, stop=flag if how == "stop" else after(100.0))
+    stop = run(
+        plan_of(), RIG, device.open(), sink, Client(stop=flag if how == "stop" else after(100.0))
+    )
     wanted = {"stop": "stopped", "recorder": "failed"}.get(how, "tripped")
     assert stop.status == wanted, stop
     assert [name for name, _ in sink.events].count("dwell") == 1

@@ -16,6 +16,7 @@ from scipy.signal import cont2discrete
 
 from samii_rig.errors import DeviceError, GateError, InputError, LimitError
 from samii_rig.rig.load import load_rig
+from samii_rig.run.client import Client
 from samii_rig.run.dryrun import predict
 from samii_rig.run.loop import run
 from samii_rig.run.plan import Output, Plan, PlannedSegment
@@ -92,12 +93,14 @@ def test_both_references_stay_ahead_together_and_never_break_off():
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_both_at_zero(number):
-    stop, _, _ = go(progress=lambda p: os.kill(os.getpid(), number) if p.segment == 3 else None)
+    stop, _, _ = go(
+        client=Client(lambda p: os.kill(os.getpid(), number) if p.segment == 3 else None)
+    )
     assert stop.status == "stopped"
 
 
 def test_a_stop_event_ends_both_at_zero():
-    stop, _, _ = go(stop=after(0.8))
+    stop, _, _ = go(client=Client(stop=after(0.8)))
     assert stop.status == "stopped"
 
 
@@ -208,7 +211,9 @@ def test_a_client_that_falls_silent_trips_the_run():
     from samii_rig.run.pace import LoopSettings
 
     beats = iter([True] * 30)
-    stop, _, _ = go(alive=lambda: next(beats, False), settings=LoopSettings(heartbeat_age=0.3))
+    stop, _, _ = go(
+        client=Client(alive=lambda: next(beats, False)), settings=LoopSettings(heartbeat_age=0.3)
+    )
     assert stop.status == "tripped"
     assert "no sign of the operator's client" in stop.reason
 

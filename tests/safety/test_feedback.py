@@ -35,6 +35,7 @@ from samii_rig.errors import DeviceError, InputError, LimitError
 from samii_rig.model.feedback import analogue, digital, reach, sections, state_space
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.schema import Feedback
+from samii_rig.run.client import Client
 from samii_rig.run.dryrun import predict
 from samii_rig.run.loop import run
 from samii_rig.safety.judgement import command_violation
@@ -223,7 +224,7 @@ def test_a_stop_and_a_broken_recorder_end_at_zero_too():
                 event.set()
 
         sink.write = write
-        stop = run(plan_for(), rig, device, sink, stop=event)
+        stop = run(plan_for(), rig, device, sink, Client(stop=event))
         assert stop.status == {"stop": "stopped", "exception": "failed"}[kind]
         assert np.abs(sink.values()[:, V]).max() > 0.0
         device.clock.sleep(1.0)

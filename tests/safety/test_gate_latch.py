@@ -16,6 +16,7 @@ from loop_kit import Memory, RealTime, patient_rig, plan
 
 from samii_rig.errors import DeviceError, GateError, InputError
 from samii_rig.run import campaign
+from samii_rig.run.client import Client
 from samii_rig.run.dryrun import predict
 from samii_rig.run.heartbeat import Pipe
 from samii_rig.run.loop import run
@@ -222,7 +223,9 @@ def test_a_run_that_was_stopped_or_whose_disk_was_full_is_no_fault():
     from samii_rig.errors import RecordingError
 
     told = []
-    assert run(plan(), RIG, FakeDevice().open(), Memory(), stop=after(0.3), latch=told.append)
+    assert run(
+        plan(), RIG, FakeDevice().open(), Memory(), Client(stop=after(0.3)), latch=told.append
+    )
     full = Broken("segment", RecordingError("recording failed: no space left"))
     stop = run(plan(), RIG, FakeDevice().open(), full, latch=told.append)
     assert (stop.status, stop.reason) == ("failed", "recording failed: no space left")
@@ -254,7 +257,7 @@ def test_a_client_that_dies_ends_the_run(tmp_path, monkeypatch):
         tmp_path,
         monkeypatch,
         FakeDevice(),
-        alive=Pipe(ours),
+        client=Client(alive=Pipe(ours)),
         loop=LoopSettings(heartbeat_age=0.1),
     )
     os.close(ours)

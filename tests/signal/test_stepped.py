@@ -19,6 +19,7 @@ from pydantic import ValidationError
 
 from experiments.stepped_sine import SteppedSine, whole_periods
 from samii_rig.errors import InputError
+from samii_rig.run.client import Client
 from samii_rig.run.dryrun import predict
 from samii_rig.run.loop import run
 from samii_rig.signal.estimate import estimate
@@ -198,7 +199,7 @@ def test_levels_stay_apart_and_repeats_of_a_frequency_are_joined():
 def test_progress_tells_the_points_done_and_the_longest_time_left():
     seen = []
     plan = steps().plan(RIG)
-    recorded(plan, noisy(1e-5), progress=seen.append)
+    recorded(plan, noisy(1e-5), client=Client(seen.append))
     assert {p.segment for p in seen} == {1, 2, 3}
     assert {p.n_segments for p in seen} == {3}
     left = [p.time_left for p in seen]
@@ -210,7 +211,7 @@ def test_progress_tells_the_points_done_and_the_longest_time_left():
 
 
 def test_stopped_in_a_dwell_it_ends_at_zero_with_the_points_that_are_done():
-    stop, recording, _ = recorded(steps().plan(RIG), noisy(1e-5), stop=after(5.0))
+    stop, recording, _ = recorded(steps().plan(RIG), noisy(1e-5), client=Client(stop=after(5.0)))
     assert stop.status == "stopped"
     assert 0 < len(recording.segments) < 3
 
