@@ -98,7 +98,7 @@ def _designed(o: ControlOptions, rig: Rig, text: str) -> tuple[str, Design, list
     shows of it."""
     from rich.console import Console
 
-    from samii_rig.control.design import Goals, design
+    from samii_rig.control.design import Draws, Goals, design
     from samii_rig.control.identified import identified as take_in
     from samii_rig.control.settle import settling
     from samii_rig.files import make_folder
@@ -121,9 +121,7 @@ def _designed(o: ControlOptions, rig: Rig, text: str) -> tuple[str, Design, list
             sensor=o.sensor,
             poles=o.poles,
             goals=Goals(spread=o.spread),
-            draws=o.draws,
-            seed=o.seed,
-            known=known,
+            draws=Draws(o.draws, o.seed, known),
             progress=say,
         )
         shown = [settling(r, made.feedback.sensor) for r in recordings]

@@ -169,7 +169,7 @@ def _by_likelihood(
 ) -> Identified:
     from rich.console import Console
 
-    from samii_rig.identify.maximum_likelihood import identify as maximum_likelihood
+    from samii_rig.identify.maximum_likelihood import problem, solve
     from samii_rig.identify.parameters import uncertain
     from samii_rig.identify.poses import by_pose
     from samii_rig.identify.table import summary_table
@@ -179,11 +179,11 @@ def _by_likelihood(
     estimating = Estimating(output=o.output, gaps=o.gaps, band=o.band)
     in_pose = [(r, pose) for pose, alike in by_pose(recordings, at) for r in estimating.of(alike)]
     with working(Console(highlight=False), "identifying", quiet=o.json) as say:
-        found = maximum_likelihood(
+        posed = problem(
             [response for response, _ in in_pose], rig, o.free or uncertain(rig),
             prior=not o.free, band=o.band, poses=[one for _, one in in_pose],
-            progress=say,
         )  # fmt: skip
+        found = solve(posed, progress=say)
     return found, summary_table
 
 

@@ -66,6 +66,20 @@ class Goals:
 
 
 @dataclass(frozen=True, slots=True)
+class Draws:
+    """The rigs that a controller is judged on beside those that it was found for: n within the
+    spread of the goals, and n as uncertain as the parameters are.
+
+    seed : of them, and of corners that are too many to take all. known : the covariance of an
+    identification, for the parameters that it holds instead of their tolerances.
+    """
+
+    n: int = 50
+    seed: int = 0
+    known: Known | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Trial:
     """The best controller of one number of poles: reserve and judgement on the worst corner."""
 
@@ -120,21 +134,18 @@ def design(
     actuator: str | None = None,
     poles: int | None = None,
     goals: Goals | None = None,
-    draws: int = 50,
-    seed: int = 0,
-    known: Known | None = None,
+    draws: Draws | None = None,
     progress: Progress | None = None,
 ) -> Design:
     """The controller with the largest reserve, and its judgement.
 
     sensor : the accelerometer (the first by default). poles : of the low-pass; without it as
-    few as reach the goals, at most MOST_POLES. draws : rigs drawn of each kind. known : the
-    covariance of an identification, for the parameters that it holds instead of tolerances.
+    few as reach the goals, at most MOST_POLES. draws : of rigs that the design did not see.
 
     A rig that has a feedback on this actuator already is judged with it as it is.
     InputError for an unknown sensor or actuator, or one that the rig cannot damp.
     """
-    goals = goals or Goals()
+    goals, draws = goals or Goals(), draws or Draws()
     say = progress or (lambda _stage: None)
     first = rig.actuator[0].name if actuator is None else actuator
     find_actuator(rig, first, rig.name)
@@ -145,7 +156,7 @@ def design(
     chosen = own[0].sensor if own else _accelerometer(bare, sensor)
     loops = loops_of(bare, first)
     nominal = plant("nominal", bare, loops)
-    values = corners_of(bare, goals.spread, seed)
+    values = corners_of(bare, goals.spread, draws.seed)
     at_corners = _plants(bare, values, loops, say, "rigs at the ends of their stiffness")
     trials: list[Trial] = []
     if not own:
@@ -158,8 +169,8 @@ def design(
         own = [lowpass(bare, chosen, first, best.poles, best.corner_hz, best.gain)]
     whole = rig.model_copy(update={"feedback": (*bare.feedback, *own)})
     closed = loops_of(whole, first)
-    inside = draws_inside(bare, goals.spread, draws, seed + 1)
-    drawn = draws_uncertain(bare, draws, seed + 2, known)
+    inside = draws_inside(bare, goals.spread, draws.n, draws.seed + 1)
+    drawn = draws_uncertain(bare, draws.n, draws.seed + 2, draws.known)
     return Design(
         whole,
         own[0],

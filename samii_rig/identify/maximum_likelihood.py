@@ -110,10 +110,7 @@ def identify(
     band: tuple[float, float] | None = None,
     outputs: Sequence[str] | None = None,
     starts: int = STARTS,
-    spread: float = SPREAD,
-    seed: int = 1,
     poses: Sequence[Angle | None] = (),
-    progress: Progress = lambda _stage: None,
 ) -> Identification:
     """Maximum likelihood, or maximum posterior, estimate of `free` from `responses`.
 
@@ -124,8 +121,7 @@ def identify(
     prior : use the rig file's tolerances as Gaussian priors on the logarithms.
     band : Hz. outputs : the channels to use, default all that were measured.
     poses : of the rig in each response, if they differ: one set of parameters for all.
-    starts : the first is the rig file's values, the others are drawn within `spread` of them.
-    progress : is told how many of them are done.
+    starts : of the search, as in `solve`.
 
     Raises
     ------
@@ -133,17 +129,8 @@ def identify(
         not have, a band without lines, fewer data than parameters.
     EstimateError : covariances of too few degrees of freedom, or singular.
     """
-    if starts < 1:
-        raise InputError("identify", "starts", starts, "1 or more")
-    if not 0 <= spread < 1:
-        raise InputError("identify", "spread", spread, "0 or more and below 1")
-    return solve(
-        problem(responses, rig, free, prior=prior, band=band, outputs=outputs, poses=poses),
-        starts=starts,
-        spread=spread,
-        seed=seed,
-        progress=progress,
-    )
+    posed = problem(responses, rig, free, prior=prior, band=band, outputs=outputs, poses=poses)
+    return solve(posed, starts=starts)
 
 
 def solve(
@@ -154,7 +141,17 @@ def solve(
     seed: int = 1,
     progress: Progress = lambda _stage: None,
 ) -> Identification:
-    """`identify` for a problem that is already set up."""
+    """`identify` for a problem that is already set up.
+
+    starts : the first is the rig file's values, the others are drawn within `spread` of them
+        (relative) by the generator of `seed`. progress : is called with how many are done.
+
+    InputError for no start, or a spread outside 0 to 1.
+    """
+    if starts < 1:
+        raise InputError("identify", "starts", starts, "1 or more")
+    if not 0 <= spread < 1:
+        raise InputError("identify", "spread", spread, "0 or more and below 1")
     rng = np.random.default_rng(seed)
     n = posed.space.start.size
     ends = []

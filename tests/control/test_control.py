@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
-from samii_rig.control.design import Goals, design, lowpass
+from samii_rig.control.design import Draws, Goals, design, lowpass
 from samii_rig.control.identified import identified
 from samii_rig.control.margins import margins
 from samii_rig.control.plants import corners, judge, plant, stiffnesses, uncertain, with_values
@@ -36,7 +36,7 @@ SAMII, TEXT = load_rig("samii")
 
 @pytest.fixture(scope="module")
 def made():
-    return design(SAMII, poles=3, draws=4, seed=1)
+    return design(SAMII, poles=3, draws=Draws(4, seed=1))
 
 
 def test_the_goals_are_reached_with_every_stiffness_off_by_a_fifth(made):
@@ -141,10 +141,10 @@ def test_what_is_no_identification_is_one_line(tmp_path, text):
 
 def test_bad_questions_are_one_line():
     with pytest.raises(InputError, match="expected an accelerometer: a_0, a_1, a_2"):
-        design(SAMII, sensor="theta_2", draws=2)
+        design(SAMII, sensor="theta_2", draws=Draws(2))
     blind = SAMII.model_copy(update={"sensor": SAMII.sensor[:1], "limit": ()})
     with pytest.raises(InputError, match="expected an accelerometer to feed back"):
-        design(blind, draws=2)
+        design(blind, draws=Draws(2))
 
 
 def test_settle_time_is_that_of_a_decay():

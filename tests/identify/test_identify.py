@@ -272,13 +272,18 @@ def renamed(**channels):
         ({"outputs": ["a_9"]}, "a_9.*outputs measured"),
         ({"band": (100.0, 200.0)}, "a band that meets 0.5 to 40 Hz"),
         ({"starts": 0}, "1 or more"),
-        ({"spread": 1.0}, "below 1"),
     ],
 )  # fmt: skip
 def test_what_is_asked_wrongly_is_said_in_one_line(changes, words):
     with pytest.raises(InputError, match=words) as error:
         identify(**bad(**changes))
     assert "\n" not in str(error.value)
+
+
+def test_starts_lie_within_a_range_of_the_rig_file_s():
+    posed = problem([drawn(samii(), n=30)], samii(), STIFFNESSES)
+    with pytest.raises(InputError, match=r"spread is 1\.0; expected 0 or more and below 1"):
+        solve(posed, spread=1.0)
 
 
 def test_too_few_degrees_of_freedom_are_refused():
