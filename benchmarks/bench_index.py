@@ -20,7 +20,7 @@ from samii_rig.index.query import Query
 from samii_rig.index.remarks import add_note, set_tags
 from samii_rig.index.store import Index
 from samii_rig.record.reader import read_notes
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.types import Channel, SampleBlock, StopRecord
 
 KINDS = 200  # recordings that differ; the others are copies of them
@@ -54,7 +54,7 @@ def make(folder: Path, count: int) -> None:
             "seed": str(i),
         }
         rig = f'name = "{RIGS[int(rng.integers(4))]}"\n'
-        with RunWriter(path, CHANNELS, 500.0, rig_toml=rig, metadata=notes) as writer:
+        with RunWriter(path, CHANNELS, 500.0, Origin(rig, metadata=notes)) as writer:
             n = np.arange(50)
             values = rng.standard_normal((50, 2))
             quality = np.zeros((50, 2), np.uint8)

@@ -28,7 +28,7 @@ from samii_rig.record.contents import read_contents
 from samii_rig.record.reader import read_recording
 from samii_rig.record.recover import recover
 from samii_rig.record.verify import verify
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.types import Channel, SampleBlock, StopRecord
 
 CHANNELS = tuple(Channel(f"c{i}", "V") for i in range(8))
@@ -89,7 +89,7 @@ def kills(folder: Path, count: int, rng: np.random.Generator) -> bool:
 
 
 def small_recording(path: Path) -> bytes:
-    with RunWriter(path, CHANNELS, 500.0, rig_toml="name = 'rig'\n") as writer:
+    with RunWriter(path, CHANNELS, 500.0, Origin("name = 'rig'\n")) as writer:
         for start in range(0, 100, 25):
             writer.write(block(start, 25))
             writer.flush()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from samii_rig.errors import RecordingError
 from samii_rig.files import open_file, reason
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.types import FrequencyResponse, StopRecord
 
 _PREFIX = "source."  # metadata key `source.NAME` holds the SHA-256 of the recording NAME
@@ -44,8 +44,7 @@ def save_frequency_responses(
         path,
         (),
         responses[0].rate_hz,
-        metadata={**(metadata or {}), **hashes},
-        rig_toml=rig_toml,
+        Origin(rig_toml, metadata={**(metadata or {}), **hashes}),
         keep_partial=False,
     ) as writer:
         for item in responses:

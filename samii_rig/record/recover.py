@@ -26,8 +26,8 @@ from samii_rig.record.contents import (
 )
 from samii_rig.record.layout import SampleLayout
 from samii_rig.record.reader import sample_channel, sample_records
-from samii_rig.record.writer import PARTIAL, RunWriter
-from samii_rig.types import Channel, SampleBlock, StopRecord
+from samii_rig.record.writer import PARTIAL, Origin, RunWriter
+from samii_rig.types import Channel, SampleBlock, Segment, StopRecord
 
 Item = TypeVar("Item")
 _BEFORE_ALL = -1 << 63  # a sequence number before every other
@@ -89,50 +89,43 @@ def recover(path: Path, output: Path | None = None) -> Recovered:
         raise NothingError(f"{path}: nothing can be recovered: {error}") from error
     row = SampleLayout(channels, rate_hz).record if sample_id is not None else None
     good = _whole(data, contents, sample_id, row, problems)
-    notes = {k: v for m in _maps(contents, layout.NOTES, problems) for k, v in m.items()}
-    segments = [layout.segment_from_map(item) for item in _maps(contents, layout.SEGMENT, problems)]
-    stops = [layout.stop_from_map(item) for item in _maps(contents, layout.STOP, problems)]
-    clocks = [layout.clock_from_map(item) for item in _maps(contents, layout.CLOCK, problems)]
-    offset = clocks[0] if clocks else 0
-    notes["recovered_from"] = path.name
-    notes["recovered_from_sha256"] = hashlib.sha256(data).hexdigest()
-    if problems:
-        notes["recovered_problems"] = "; ".join(problems[:20])
+    said = _metadata(contents, problems)
+    notes = {**said.notes, **_source(path, data, problems)}
     if not (good.samples or good.others):
         raise NothingError(f"{path}: nothing can be recovered: no whole chunk is in it")
+    files = layout.RIG_FILE, layout.EXPERIMENT_FILE
+    rig, experiment = (_text(data, contents, name) for name in files)
     target = output or default_output(path)
     with RunWriter(
         target,
         channels,
         rate_hz,
-        rig_toml=_text(data, contents, layout.RIG_FILE),
-        experiment_toml=_text(data, contents, layout.EXPERIMENT_FILE),
-        metadata=notes,
-        clock_offset=offset,
+        Origin(rig, experiment, notes),
+        clock_offset=said.offset,
         keep_partial=False,
     ) as writer:
         samples = 0
         if sample_id is not None and row is not None:
-            samples = _copy(data, good.samples, sample_id, row, offset, writer, problems)
+            samples = _copy(data, good.samples, sample_id, row, said.offset, writer, problems)
         happened = _decoded(data, contents, good.others, layout.EVENTS, events.decode)
         happened.sort(key=lambda event: event.time)
         for event in happened:
-            writer.event(event.time - offset, event.name, event.payload)
-        for segment in segments:
+            writer.event(event.time - said.offset, event.name, event.payload)
+        for segment in said.segments:
             writer.segment(segment)
         results = _decoded(data, contents, good.others, layout.RESPONSES, response.decode)
         for result in results:
             writer.frequency_response(result)
-        lost = max(0, stops[0][1] - samples) if stops else 0
+        lost = max(0, said.stops[0][1] - samples) if said.stops else 0
         if lost:
             problems.append(f"{lost} samples of the run are lost")
-        writer.close(_stop(stops, lost))
+        writer.close(_stop(said.stops, lost))
     return Recovered(
         path=target,
         samples=samples,
         events=len(happened),
         responses=len(results),
-        segments=len(segments),
+        segments=len(said.segments),
         problems=tuple(problems),
         cut=len(problems) == 1 and _cut(data, contents),
     )
@@ -169,6 +162,36 @@ def _samples_of(contents: Contents) -> tuple[tuple[Channel, ...], float, int | N
         return (), 1.0, None
     sample_id, sample_layout = sample_channel(contents)
     return sample_layout.channels, sample_layout.rate_hz, sample_id
+
+
+@dataclass(frozen=True, slots=True)
+class _Metadata:
+    """What the metadata records say: notes by name, segments, stop records each with the samples
+    that the run had, ns by which the wall clock was ahead."""
+
+    notes: dict[str, str]
+    segments: list[Segment]
+    stops: list[tuple[StopRecord, int]]
+    offset: int
+
+
+def _source(path: Path, data: memoryview, problems: list[str]) -> dict[str, str]:
+    """What the new file says of the one that it comes from."""
+    notes = {
+        "recovered_from": path.name,
+        "recovered_from_sha256": hashlib.sha256(data).hexdigest(),
+    }
+    if problems:
+        notes["recovered_problems"] = "; ".join(problems[:20])
+    return notes
+
+
+def _metadata(contents: Contents, problems: list[str]) -> _Metadata:
+    notes = {k: v for m in _maps(contents, layout.NOTES, problems) for k, v in m.items()}
+    segments = [layout.segment_from_map(item) for item in _maps(contents, layout.SEGMENT, problems)]
+    stops = [layout.stop_from_map(item) for item in _maps(contents, layout.STOP, problems)]
+    clocks = [layout.clock_from_map(item) for item in _maps(contents, layout.CLOCK, problems)]
+    return _Metadata(notes, segments, stops, clocks[0] if clocks else 0)
 
 
 @dataclass(frozen=True, slots=True)

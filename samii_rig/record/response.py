@@ -7,6 +7,7 @@ gets them; the words and the channels are strings (JSON where they have structur
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from samii_rig.errors import RecordingError
 from samii_rig.record import cdr
 from samii_rig.record.layout import MAX_CHANNELS, channel_from_json, channel_to_json
-from samii_rig.types import Complex, Finding, Float, FrequencyResponse
+from samii_rig.types import Channel, Complex, Finding, Float, FrequencyResponse
 
 SCHEMA = "samii_rig/msg/FrequencyResponse"
 
@@ -123,22 +124,8 @@ def encode(response: FrequencyResponse) -> bytes:
 def decode(data: bytes) -> FrequencyResponse:
     """The response in a message; RecordingError if it is not one."""
     values = _values(data)
-    try:
-        inputs, outputs, findings, sources = (
-            json.loads(cast(str, values[key]))
-            for key in ("inputs", "outputs", "findings", "sources")
-        )
-        channels_in = tuple(channel_from_json(item) for item in inputs)
-        channels_out = tuple(channel_from_json(item) for item in outputs)
-        told = json.loads(cast(str, values.get("followers", "[]")))
-        followers = tuple(channel_from_json(item) for item in told)
-        noticed = tuple(_finding_from_json(item) for item in findings)
-        named = tuple(str(item) for item in sources)
-    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise RecordingError("a frequency response's description cannot be read") from error
-    n, n_in, n_out = np.size(values["frequency"]), len(channels_in), len(channels_out)
-    if not (0 < n_in <= MAX_CHANNELS and 0 < n_out <= MAX_CHANNELS):
-        raise RecordingError("a frequency response names no inputs or no outputs")
+    said = _description(values)
+    n, n_in, n_out = np.size(values["frequency"]), len(said.inputs), len(said.outputs)
     p = n_in * n_out
 
     def array(name: str, *shape: int) -> Float:
@@ -164,8 +151,8 @@ def decode(data: bytes) -> FrequencyResponse:
         covariance=both("covariance", n, p, p),
         dof=array("dof", n),
         coherence=array("coherence", n, n_out),
-        inputs=channels_in,
-        outputs=channels_out,
+        inputs=said.inputs,
+        outputs=said.outputs,
         level=cast(float, values["level"]),
         level_unit=cast(str, values["level_unit"]),
         input_rms=array("input_rms", n, n_in),
@@ -177,11 +164,44 @@ def decode(data: bytes) -> FrequencyResponse:
         odd=known("odd"),
         noise=known("noise"),
         distortion=known("distortion"),
-        findings=noticed,
-        sources=named,
-        followers=followers,
-        follow=both("follow", n, len(followers), n_in) if followers else None,
+        findings=said.findings,
+        sources=said.sources,
+        followers=said.followers,
+        follow=both("follow", n, len(said.followers), n_in) if said.followers else None,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _Description:
+    """What a message says in JSON: the columns of its arrays, findings and sources."""
+
+    inputs: tuple[Channel, ...]
+    outputs: tuple[Channel, ...]
+    followers: tuple[Channel, ...]
+    findings: tuple[Finding, ...]
+    sources: tuple[str, ...]
+
+
+def _description(values: dict[str, cdr.Value]) -> _Description:
+    """RecordingError where it cannot be read, or names no inputs, no outputs or too many."""
+    values = {"followers": "[]", **values}
+
+    def items(key: str) -> list[Any]:
+        return list(json.loads(cast(str, values[key])))
+
+    try:
+        said = _Description(
+            inputs=tuple(channel_from_json(item) for item in items("inputs")),
+            outputs=tuple(channel_from_json(item) for item in items("outputs")),
+            followers=tuple(channel_from_json(item) for item in items("followers")),
+            findings=tuple(_finding_from_json(item) for item in items("findings")),
+            sources=tuple(str(item) for item in items("sources")),
+        )
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise RecordingError("a frequency response's description cannot be read") from error
+    if not (0 < len(said.inputs) <= MAX_CHANNELS and 0 < len(said.outputs) <= MAX_CHANNELS):
+        raise RecordingError("a frequency response names no inputs or no outputs")
+    return said
 
 
 def _values(data: bytes) -> dict[str, cdr.Value]:

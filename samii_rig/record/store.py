@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.types import Recording, SampleBlock
 
 
@@ -14,9 +14,7 @@ def write_recording(path: Path, recording: Recording) -> None:
         path,
         recording.channels,
         recording.rate_hz,
-        rig_toml=recording.rig_toml,
-        experiment_toml=recording.experiment_toml,
-        metadata=recording.metadata,
+        Origin(recording.rig_toml, recording.experiment_toml, recording.metadata),
         clock_offset=recording.clock_offset,
         keep_partial=False,
     ) as writer:

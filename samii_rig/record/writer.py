@@ -7,7 +7,9 @@ import os
 import queue
 import threading
 import time
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -35,6 +37,22 @@ _Bytes = np.ndarray[Any, Any]
 Times = TypeVar("Times", int, Int)  # ns
 
 
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """What a run was made from, and what repeats it.
+
+    rig_toml, experiment_toml : the files' text, kept as attachments; "" for none.
+    metadata : seed, versions, operator, calibration, limits, start, by name.
+    """
+
+    rig_toml: str = ""
+    experiment_toml: str = ""
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+UNKNOWN = Origin()
+
+
 class RunWriter:
     """Records a run.
 
@@ -48,8 +66,7 @@ class RunWriter:
     path : the final name; neither it nor its `.partial` may exist.
     channels : the columns of every block; empty for a file of results only.
     rate_hz : nominal samples/s of the device.
-    rig_toml, experiment_toml : the files' text, kept as attachments.
-    metadata : seed, versions, operator, calibration, limits, start: all that repeats the run.
+    origin : what the run was made from.
     compression : "lz4", "zstd" (smaller, slower) or "" for none.
     clock_offset : ns by which the wall clock, which stamps the messages, is ahead of the
         device's; 0 where nothing is known of it. By default the first call of `clocks` says it,
@@ -60,7 +77,7 @@ class RunWriter:
     calls raise DiskError too once the disk refused something, or the file was moved or removed
     by somebody, so that a full disk ends the run.
 
-    >>> with RunWriter(Path("run.mcap"), channels, 500.0, metadata={"seed": "7"}) as writer:
+    >>> with RunWriter(Path("run.mcap"), channels, 500.0, Origin(text)) as writer:
     ...     writer.write(block)
     ...     writer.close(StopRecord("completed", "all segments done"))
     """
@@ -70,10 +87,8 @@ class RunWriter:
         path: Path,
         channels: tuple[Channel, ...],
         rate_hz: float,
+        origin: Origin = UNKNOWN,
         *,
-        rig_toml: str = "",
-        experiment_toml: str = "",
-        metadata: dict[str, str] | None = None,
         compression: Compression = "lz4",
         clock_offset: int | None = None,
         keep_partial: bool = True,
@@ -103,10 +118,10 @@ class RunWriter:
             raise _refused(path, error) from error
         try:
             appender = Appender(self._file, layout.PROFILE)
-            self._describe(appender, rate_hz, metadata or {})
+            self._describe(appender, rate_hz, origin.metadata)
             for name, text in (
-                (layout.RIG_FILE, rig_toml),
-                (layout.EXPERIMENT_FILE, experiment_toml),
+                (layout.RIG_FILE, origin.rig_toml),
+                (layout.EXPERIMENT_FILE, origin.experiment_toml),
             ):
                 if text:
                     data = text.encode()
@@ -127,10 +142,10 @@ class RunWriter:
             self.clocks(0, clock_offset)
 
     @staticmethod
-    def _describe(appender: Appender, rate_hz: float, metadata: dict[str, str]) -> None:
+    def _describe(appender: Appender, rate_hz: float, metadata: Mapping[str, str]) -> None:
         run = {"format": layout.FORMAT, "rate_hz": repr(float(rate_hz))}
         appender.add_metadata(layout.RUN, layout.sealed(run))
-        appender.add_metadata(layout.NOTES, layout.sealed(metadata))
+        appender.add_metadata(layout.NOTES, layout.sealed(dict(metadata)))
 
     def _register(self, appender: Appender, rate_hz: float) -> None:
         def add(topic: str, name: str, text: str, metadata: dict[str, str]) -> int:

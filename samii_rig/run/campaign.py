@@ -17,7 +17,7 @@ from samii_rig.devices.opening import close_device, open_device
 from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import NO_MEMORY, RecordedError, RecordingError, SamiiRigError
 from samii_rig.record.reader import read_frequency_responses, read_recording
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.run.client import NOBODY, Client
 from samii_rig.run.dryrun import DryRun
 from samii_rig.run.ending import finish
@@ -167,9 +167,7 @@ def _writer(order: RunOrder, path: Path, device: OpenRig, notes: dict[str, str])
         path,
         recorded_channels(order.rig, order.plan, device.sensor.channels),
         order.plan.rate_hz,
-        rig_toml=order.rig_toml,
-        experiment_toml=order.experiment_toml,
-        metadata=notes,
+        Origin(order.rig_toml, order.experiment_toml, notes),
     )
 
 

@@ -21,7 +21,7 @@ from samii_rig.devices.opening import close_device, open_device
 from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, InputError
 from samii_rig.files import make_folder
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.rig.schema import Rig
 from samii_rig.run.ending import finish
 from samii_rig.run.loop import run
@@ -190,16 +190,16 @@ def _moved(
     make_folder("--out", folder)
     path = folder / f"{datetime.now(UTC):%Y-%m-%dT%H-%M-%S-%f}_jog.mcap"
     real = device.metadata.get("clock") != "simulated"
+    notes = {
+        "experiment": "jog",
+        "device": device.description,
+        **{f"device_{key}": value for key, value in device.metadata.items()},
+    }
     with RunWriter(
         path,
         recorded_channels(rig, plan, device.sensor.channels),
         rig.rate_hz,
-        rig_toml=rig_toml,
-        metadata={
-            "experiment": "jog",
-            "device": device.description,
-            **{f"device_{key}": value for key, value in device.metadata.items()},
-        },
+        Origin(rig_toml, metadata=notes),
     ) as writer:
         with prioritised() if real else contextlib.nullcontext():
             stop = run(

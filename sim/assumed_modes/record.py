@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from samii_rig.devices.channels import command_channel, reference_channels
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.rig.schema import ActuatorSpec, Rig
 from samii_rig.types import Channel, Flags, Float, Quality, SampleBlock, Segment, StopRecord
 from sim.assumed_modes.styles import Piece, Style
@@ -150,7 +150,7 @@ def write(
     notes = {"experiment": style.excitation, "operator": "", "started": STARTED, **log.notes}
     if loops:
         notes["centring"] = "; ".join(f"{sensor} {kp}" for sensor, kp in loops)
-    with RunWriter(path, channels, rate, rig_toml=rig_toml, metadata=notes) as writer:
+    with RunWriter(path, channels, rate, Origin(rig_toml, metadata=notes)) as writer:
         writer.write(block)
         unit = rig.actuator[0].unit
         for s in segments:

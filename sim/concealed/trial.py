@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from samii_rig.devices.channels import command_channel, reference_channels
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Float, Quality, SampleBlock, StopRecord
@@ -271,8 +271,7 @@ def _record(
         path,
         columns,
         rig.rate_hz,
-        rig_toml=drawn.nominal_toml,
-        metadata=metadata,
+        Origin(drawn.nominal_toml, metadata=metadata),
         compression="zstd",
     ) as writer:
         writer.write(block)

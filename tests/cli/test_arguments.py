@@ -24,7 +24,7 @@ from samii_rig.cli.papers import FORMATS
 from samii_rig.errors import InputError, SamiiRigError, one_of
 from samii_rig.record.export_samples import WRITERS
 from samii_rig.record.reader import read_rig_toml
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.report.figures import SUFFIXES
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import Rig
@@ -186,7 +186,7 @@ def test_a_name_to_free_is_held_against_the_rig_at_hand_before_samples_are_read(
     assert refused(*words, "spring_1.q").startswith("--free is 'spring_1.q'")
     run = tmp_path / "run.mcap"
     toml = load_rig("two_masses")[1]
-    with RunWriter(run, (), 500.0, rig_toml=toml) as writer:
+    with RunWriter(run, (), 500.0, Origin(toml)) as writer:
         writer.close(StopRecord("completed", "all segments done"))
     assert read_rig_toml(run) == toml
     assert "an element of Two masses" in refused("identify", str(run), "--free", "joint_1.k")

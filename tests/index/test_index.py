@@ -24,7 +24,7 @@ from samii_rig.index.query import Query
 from samii_rig.index.remarks import add_note, read_remarks, remarks_path, set_diagnosis, set_tags
 from samii_rig.index.store import FILE, PRIVATE, Index, index_for_reading
 from samii_rig.record import scan
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 
 
 def names(index: Index, **asked: str) -> list[str]:
@@ -144,7 +144,7 @@ def test_damaged_remarks_are_said_and_never_overwritten(index: Index) -> None:
 
 
 def test_what_is_cut_off_or_foreign_is_listed_with_its_problem(index: Index) -> None:
-    cut = RunWriter(index.folder / "cut.mcap", CHANNELS, RATE, rig_toml='name = "SAMII"\n')
+    cut = RunWriter(index.folder / "cut.mcap", CHANNELS, RATE, Origin('name = "SAMII"\n'))
     cut.write(block(0, 30))
     cut.abort()
     (index.folder / "foreign.mcap").write_bytes(b"not one of ours")

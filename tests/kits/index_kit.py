@@ -6,14 +6,14 @@ from pathlib import Path
 
 from record_kit import CHANNELS, RATE, STOP, block
 
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.types import StopRecord
 
 
 def write_small(path: Path, *, stop: StopRecord = STOP, rig: str = "SAMII", **notes: str) -> Path:
     """A recording of thirty samples with these notes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    with RunWriter(path, CHANNELS, RATE, rig_toml=f'name = "{rig}"\n', metadata=notes) as writer:
+    with RunWriter(path, CHANNELS, RATE, Origin(f'name = "{rig}"\n', metadata=notes)) as writer:
         writer.write(block(0, 30))
         writer.close(stop)
     return path

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.types import (
     Channel,
     Finding,
@@ -87,9 +87,7 @@ def write_run(path: Path, parts: list[SampleBlock], *, compression: str = "lz4")
         path,
         parts[0].channels if parts else CHANNELS,
         RATE,
-        rig_toml=RIG,
-        experiment_toml=EXPERIMENT,
-        metadata=NOTES,
+        Origin(RIG, EXPERIMENT, NOTES),
         clock_offset=WALL,
         compression=compression,  # type: ignore[arg-type]  # parametrised with its values
     )

@@ -31,7 +31,7 @@ from samii_rig.record import scan
 from samii_rig.record.reader import read_recording
 from samii_rig.record.recover import recover
 from samii_rig.record.verify import verify
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.run.experiments import shipped
 from samii_rig.serve.job import JOBS, Job, JobState, Request, ask_all_to_stop
 from samii_rig.serve.live import PAGE, LiveReader, LiveWriter
@@ -55,7 +55,7 @@ def measured(path: Path) -> Path:
     theta += 1e-3 * np.random.default_rng(1).standard_normal(len(n))
     quality = np.full((len(n), 2), Quality.GOOD, np.uint8)
     block = SampleBlock(CHANNELS, n * round(1e9 / RATE), n, np.stack([v, theta], 1), quality)
-    with RunWriter(path, CHANNELS, RATE, rig_toml='name = "red"\n') as writer:
+    with RunWriter(path, CHANNELS, RATE, Origin('name = "red"\n')) as writer:
         writer.write(block)
         for i in range(REPEATS):
             begin = i * N

@@ -35,7 +35,7 @@ from samii_rig.record.reader import (
     read_recording,
 )
 from samii_rig.record.verify import verify
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.types import Channel, FrequencyResponse, Recording, SampleBlock, StopRecord
 
 
@@ -124,7 +124,7 @@ def test_any_blocks_come_back(
 
 def test_a_run_can_be_read_before_it_is_closed(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with RunWriter(path, CHANNELS, RATE, rig_toml=RIG) as writer:
+    with RunWriter(path, CHANNELS, RATE, Origin(RIG)) as writer:
         writer.write(block(0, 50))
         assert writer.flush() == 50
         so_far = read_recording(writer.partial_path, partial=True)

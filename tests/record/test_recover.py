@@ -31,7 +31,7 @@ from samii_rig.record.contents import read_contents, read_tail
 from samii_rig.record.reader import read_events, read_frequency_responses, read_recording
 from samii_rig.record.recover import NothingError, default_output, recover
 from samii_rig.record.verify import verify
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.types import SampleBlock
 
 
@@ -250,7 +250,7 @@ def assert_continuous(path: Path) -> None:
 
 def test_what_was_noted_later_stands_in_place_of_what_was_before(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    writer = RunWriter(path, CHANNELS, RATE, metadata={"seed": "7", "clock": "1 ms"})
+    writer = RunWriter(path, CHANNELS, RATE, Origin(metadata={"seed": "7", "clock": "1 ms"}))
     writer.write(block(0, 10))
     writer.flush()
     writer.note({"clock": "2 ms"})

@@ -13,7 +13,7 @@ from experiments.multisine import Multisine
 from samii_rig.errors import InputError
 from samii_rig.model.sampled import sampled_response
 from samii_rig.record.reader import read_recording
-from samii_rig.record.writer import RunWriter
+from samii_rig.record.writer import Origin, RunWriter
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.run.dryrun import predict
 from samii_rig.run.experiments import load_experiment
@@ -218,7 +218,7 @@ def measured(tmp_path, seed, changes, **device):
     opened = open_rig(rig, {"seed": seed, **device})
     path = tmp_path / "run.mcap"
     channels = recorded_channels(rig, plan, opened.sensor.channels)
-    with RunWriter(path, channels, plan.rate_hz, rig_toml=text) as writer:
+    with RunWriter(path, channels, plan.rate_hz, Origin(text)) as writer:
         stopped = run(plan, rig, opened, writer)
         writer.close(stopped)
     recording = read_recording(path)
