@@ -316,21 +316,23 @@ def _written(o: ReportOptions, shown: _Shown, say: Progress) -> list[Path]:
     """Page and figures."""
     from samii_rig.record.reader import read_events
     from samii_rig.report.figures import bode_figure, save_figure
-    from samii_rig.report.page import write_report
+    from samii_rig.report.page import Subject, write_report
 
     written = []
     if o.page is not None:
         say("the page")
         write_report(
             o.page,
-            shown.recordings,
-            shown.responses,
-            rig=shown.rig,
-            model=shown.curve,
-            band_hz=o.band or ALL,
-            events=[event for path in o.logs for event in read_events(path)],
+            Subject(
+                shown.recordings,
+                shown.responses,
+                shown.rig,
+                shown.curve,
+                band_hz=o.band or ALL,
+                events=[event for path in o.logs for event in read_events(path)],
+                modes=shown.modes,
+            ),
             diagnosis=shown.diagnosis,
-            modes=shown.modes,
         )
         written.append(o.page)
     for path in o.figure or ():

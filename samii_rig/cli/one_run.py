@@ -149,18 +149,20 @@ def _page(
 ) -> Path | None:
     """The run's page, beside its recording; None where it cannot be written, which is said."""
     from samii_rig.record.reader import read_events
-    from samii_rig.report.page import write_report
+    from samii_rig.report.page import Subject, write_report
 
     try:
         return write_report(
             outcome.path.with_suffix(".html"),
-            outcome.recording,
-            outcome.responses,
-            rig=rig,
-            model=curve,
-            events=read_events(outcome.path),
+            Subject(
+                [outcome.recording],
+                outcome.responses,
+                rig,
+                curve,
+                events=read_events(outcome.path),
+                modes=modes,
+            ),
             diagnosis=found,
-            modes=modes,
         )
     except (InputError, OSError) as error:
         # The run is over and its recording whole: what is known of it is still to be told.

@@ -15,6 +15,8 @@ import numpy as np
 from samii_rig.types import Float
 
 Figure = dict[str, Any]
+Stroke = dict[str, Any]  # width in pixels, colour and dash, as plotly has them
+MODEL: Stroke = {"width": 2.2, "color": "@ink", "dash": "dash"}
 N_COLOURS = 6
 _STEPS, _MISSING = 65534, 65535  # of uint16
 _DECADES = 50.0  # largest over smallest, from which an array is stored by its logarithm
@@ -180,17 +182,16 @@ def line(
     values: Float,
     name: str,
     axis: str,
-    level: int | None,
+    of: int | Stroke,
     *,
     hover: str,
     legend: bool = True,
-    style: dict[str, Any] | None = None,
 ) -> None:
-    """Add a curve: of the measurement at the `level`-th amplitude, dashed of the model (None)
-    unless `style` says otherwise."""
-    style = style or {"width": 2.2, "color": "@ink", "dash": "dash"}
-    if level is not None:
-        style = {"width": 1.4, "color": f"@level{level % N_COLOURS}"}
+    """Add a curve: of the measurement at the `of`-th amplitude, or of a model in its stroke."""
+    if isinstance(of, int):
+        group, stroke = f"level{of}", {"width": 1.4, "color": f"@level{of % N_COLOURS}"}
+    else:
+        group, stroke = name, of
     figure["data"].append(
         {
             "type": "scatter",
@@ -199,8 +200,8 @@ def line(
             "x": packed(f),
             "y": packed(values),
             "yaxis": axis,
-            "line": style,
-            "legendgroup": name if level is None else f"level{level}",
+            "line": stroke,
+            "legendgroup": group,
             "showlegend": legend,
             "hovertemplate": hover,
         }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,63 +28,23 @@ if TYPE_CHECKING:
     from samii_rig.report.diagnosis.page import Section
 
 
-def write_report(
-    path: Path | str,
-    recordings: Recording | Sequence[Recording],
-    responses: Sequence[FrequencyResponse],
-    *,
-    rig: Rig | None = None,
-    model: ModelCurve | None = None,
-    title: str = "",
-    spectrogram_channel: str = "",
-    band_hz: tuple[float, float] = (0.0, np.inf),
-    events: Sequence[Event] = (),
-    diagnosis: Diagnosis | None = None,
-    modes: Sequence[Modes] | None = None,
-) -> Path:
-    """Write the page about `recordings` and what was estimated from them to `path`.
-
-    responses : one for each amplitude level, all with the same inputs and outputs.
-    model : laid over every response. band_hz : where it is compared in numbers.
-    spectrogram_channel : "" takes the last sensor. events : of the gate and the loop.
-    diagnosis : of `rig` by `responses`, shown first. modes : of `responses`; None to find them.
-
-    Raises
-    ------
-    InputError : a name that does not end in .html, responses of different channels, an unknown
-        channel, a diagnosis without its rig, a place that cannot be written to; nothing
-        half-written is left.
-    """
-    path = Path(path)
-    check_suffix(path)
-    recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
-    responses = sorted(responses, key=lambda r: (not np.isfinite(r.level), r.level))
-    _check(recordings, responses, spectrogram_channel)
-    found: Section | None = None
-    if diagnosis is not None:
-        if rig is None or not responses:
-            raise InputError("report", "diagnosis", "without its data", "its rig and responses")
-        from samii_rig.report.diagnosis.page import section  # loads the model and its compiler
-
-        found = section(diagnosis, responses, rig, band_hz)
-    if modes is None:
-        modes = modes_of_all(responses, rig)
-    about = _About(recordings, responses, rig, model, band_hz, events, modes)
-    return put(path, _text(about, found, title, spectrogram_channel))
-
-
 @dataclass(frozen=True, slots=True)
-class _About:
+class Subject:
     """What a page is about: recordings, what was estimated from them, and what they are held to.
-    Responses in the order in which they are drawn; the rest as of `write_report`."""
+
+    responses : one for each amplitude level, all with the same inputs and outputs; they are drawn
+        in the order of their levels.
+    model : laid over every response. band_hz : where it is compared in numbers.
+    events : of the gate and the loop. modes : of `responses`; None to find them.
+    """
 
     recordings: Sequence[Recording]
     responses: Sequence[FrequencyResponse]
-    rig: Rig | None
-    model: ModelCurve | None
-    band_hz: tuple[float, float]
-    events: Sequence[Event]
-    modes: Sequence[Modes]
+    rig: Rig | None = None
+    model: ModelCurve | None = None
+    band_hz: tuple[float, float] = (0.0, np.inf)
+    events: Sequence[Event] = ()
+    modes: Sequence[Modes] | None = None
 
     def comparisons(self) -> list[Comparison]:
         """Of the model with every response; none without a model."""
@@ -94,11 +54,53 @@ class _About:
         return [c for r in self.responses for c in compare(r, self.model, self.band_hz, among)]
 
 
-def _text(about: _About, diagnosis: Section | None, title: str, spectrogram_channel: str) -> str:
+def write_report(
+    path: Path | str,
+    subject: Subject,
+    *,
+    diagnosis: Diagnosis | None = None,
+    title: str = "",
+    spectrogram_channel: str = "",
+) -> Path:
+    """Write the page about `subject` to `path`.
+
+    diagnosis : of the subject's rig by its responses, shown first.
+    spectrogram_channel : "" takes the last sensor.
+
+    Raises
+    ------
+    InputError : a name that does not end in .html, responses of different channels, an unknown
+        channel, a diagnosis without its rig, a place that cannot be written to; nothing
+        half-written is left.
+    """
+    path = Path(path)
+    check_suffix(path)
+    responses = sorted(subject.responses, key=lambda r: (not np.isfinite(r.level), r.level))
+    _check(subject.recordings, responses, spectrogram_channel)
+    rig, modes = subject.rig, subject.modes
+    found: Section | None = None
+    if diagnosis is not None:
+        if rig is None or not responses:
+            raise InputError("report", "diagnosis", "without its data", "its rig and responses")
+        from samii_rig.report.diagnosis.page import section  # loads the model and its compiler
+
+        found = section(diagnosis, responses, rig, subject.band_hz)
+    modes = modes_of_all(responses, rig) if modes is None else modes
+    subject = replace(subject, responses=responses)
+    return put(path, _text(subject, modes, found, title, spectrogram_channel))
+
+
+def _text(
+    subject: Subject,
+    modes: Sequence[Modes],
+    diagnosis: Section | None,
+    title: str,
+    spectrogram_channel: str,
+) -> str:
     """The page as text."""
-    recordings, responses, rig, modes = about.recordings, about.responses, about.rig, about.modes
-    comparisons = about.comparisons()
-    bode = _bode(responses, about.model, comparisons, modes)
+    recordings, responses, rig = subject.recordings, subject.responses, subject.rig
+    comparisons = subject.comparisons()
+    bode = _bode(responses, subject.model, comparisons, modes)
     time, spectrum = _recorded(recordings, spectrogram_channel)
     plots_ = [p for p in (bode, time, spectrum) if p]
     return page_text(
@@ -118,7 +120,7 @@ def _text(about: _About, diagnosis: Section | None, title: str, spectrogram_chan
         series=time,
         spectrogram=spectrum,
         done=facts.done(recordings, rig),
-        events=facts.event_rows(about.events, recordings),
+        events=facts.event_rows(subject.events, recordings),
         chain=Markup(draw(rig)) if rig else "",
         chain_caption=rig.description if rig else "",
         limits=facts.limit_rows(recordings, rig) if rig else [],

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from samii_rig.report.canvas import (
+    MODEL,
     Figure,
     band,
     level_line,
@@ -122,7 +123,7 @@ def bode(
         f = common(responses, model)
         angle = same_turn(f, np.rad2deg(unwrapped(model.at(f, y.name, u.name))), anchor)
         name = f"model {model.name}"
-        line(figure, f, angle, name, "y2", None, legend=False, hover=DEGREES)
+        line(figure, f, angle, name, "y2", MODEL, legend=False, hover=DEGREES)
     frame(figure, responses)
     fit_gain(figure, responses, output, input, curve)
     fit_phase(figure)
@@ -304,7 +305,7 @@ def model_gain(
     """Add a model's gain to the first panel; returns it."""
     f = common(responses, model)
     gain = np.abs(model.at(f, y, u))
-    line(figure, f, gain, f"model {model.name}", "y", None, hover="%{y:.4g}")
+    line(figure, f, gain, f"model {model.name}", "y", MODEL, hover="%{y:.4g}")
     return gain
 
 

@@ -195,7 +195,7 @@ def report(path: str, diagnosed: bool) -> dict[str, Any]:
     from samii_rig.errors import InputError
     from samii_rig.record.reader import read_events, read_frequency_responses, read_recording
     from samii_rig.report.compare import model_curve
-    from samii_rig.report.page import write_report
+    from samii_rig.report.page import Subject, write_report
     from samii_rig.rig.load import parse
     from samii_rig.rig.schema import Rig
 
@@ -212,11 +212,13 @@ def report(path: str, diagnosed: bool) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         page = write_report(
             Path(folder) / "report.html",
-            recording,
-            responses,
-            rig=the_rig,
-            model=model_curve(the_rig, responses) if the_rig else None,
-            events=read_events(Path(path)),
+            Subject(
+                [recording],
+                responses,
+                the_rig,
+                model_curve(the_rig, responses) if the_rig else None,
+                events=read_events(Path(path)),
+            ),
             diagnosis=found,
         )
         return {"page": page.read_text(encoding="utf-8")}

@@ -10,7 +10,7 @@ from report_kit import measured
 
 from samii_rig.errors import InputError
 from samii_rig.record.export import export_response, replacing
-from samii_rig.report.page import write_report
+from samii_rig.report.page import Subject, write_report
 
 
 def test_npz_holds_everything_without_pickle(tmp_path):
@@ -124,5 +124,5 @@ def test_a_folder_is_not_replaced(tmp_path):
 
 def test_a_page_is_written_to_no_name_but_a_pages(tmp_path):
     with pytest.raises(InputError, match=r"suffix is '\.mcap'; expected \.html"):
-        write_report(tmp_path / "run.mcap", [], [measured()])
+        write_report(tmp_path / "run.mcap", Subject([], [measured()]))
     assert list(tmp_path.iterdir()) == []

@@ -28,7 +28,7 @@ from samii_rig.report.drawing import draw
 from samii_rig.report.facts import names
 from samii_rig.report.figures import bode_figure, save_figure
 from samii_rig.report.modes import modes_of_all, rows, sentences
-from samii_rig.report.page import write_report
+from samii_rig.report.page import Subject, write_report
 from samii_rig.report.summary import LiveProgress, dry_run_summary, progress_line, summary, working
 from samii_rig.report.verdicts import verdicts
 from samii_rig.rig.load import load_rig
@@ -44,10 +44,7 @@ def page(tmp_path_factory):
     rig, _ = load_rig("samii")
     path = write_report(
         folder / "r.html",
-        recorded(lost=3),
-        [measured(2.0, seed=1), measured(1.0)],
-        rig=rig,
-        model=model(0.6),
+        Subject([recorded(lost=3)], [measured(2.0, seed=1), measured(1.0)], rig, model(0.6)),
     )
     assert list(folder.iterdir()) == [path]
     text = path.read_text(encoding="utf-8")
@@ -108,7 +105,7 @@ def test_a_mismatch_of_a_recording_ends_with_the_command_that_diagnoses_it(page,
     _, parsed = page
     said = parsed.text.split("The figures need JavaScript")[0].rstrip()
     assert said.endswith("samii-rig diagnose run_1.mcap")
-    path = write_report(tmp_path / "r.html", recorded(), [measured()], model=model())
+    path = write_report(tmp_path / "r.html", Subject([recorded()], [measured()], model=model()))
     assert "samii-rig diagnose" not in Page(path.read_text(encoding="utf-8")).text
 
 
@@ -134,16 +131,18 @@ def test_text_from_files_cannot_become_markup(tmp_path):
     response = measured(n=60, findings=(Finding("gap", "warning", evil, evil, evil),))
     rig, _ = load_rig("sflr")
     rig = rig.model_copy(update={"name": evil, "description": evil})
-    path = write_report(tmp_path / "r.html", recording, [response], rig=rig, model=model())
+    path = write_report(tmp_path / "r.html", Subject([recording], [response], rig, model()))
     parsed = Page(path.read_text(encoding="utf-8"))
     assert all(address.startswith("#") for address in parsed.addresses)
     assert "alert(1)" in parsed.text
 
 
 def test_a_report_of_a_recording_alone_and_of_a_response_alone(tmp_path):
-    alone = write_report(tmp_path / "a.html", recorded(), []).read_text(encoding="utf-8")
+    alone = write_report(tmp_path / "a.html", Subject([recorded()], [])).read_text(encoding="utf-8")
     assert "No response was estimated" in alone
-    response = write_report(tmp_path / "b.html", [], [measured()]).read_text(encoding="utf-8")
+    response = write_report(tmp_path / "b.html", Subject([], [measured()])).read_text(
+        encoding="utf-8"
+    )
     assert "The response is measured" in response
 
 
@@ -160,7 +159,7 @@ ODD = {
 @pytest.mark.parametrize("case", ODD)
 def test_odd_responses_are_shown_all_the_same(tmp_path, case):
     response = replace(measured(n=50), **ODD[case])
-    write_report(tmp_path / "r.html", [], [response], model=model())
+    write_report(tmp_path / "r.html", Subject([], [response], model=model()))
     assert case
     printed(summary([], [response], model()))
     bode_figure([response], model())
@@ -169,12 +168,12 @@ def test_odd_responses_are_shown_all_the_same(tmp_path, case):
 def test_what_cannot_be_reported(tmp_path):
     path = tmp_path / "r.html"
     with pytest.raises(InputError, match="expected a recording or a response"):
-        write_report(path, [], [])
+        write_report(path, Subject([], []))
     with pytest.raises(InputError, match="spectrogram channel is 'x'"):
-        write_report(path, recorded(), [], spectrogram_channel="x")
+        write_report(path, Subject([recorded()], []), spectrogram_channel="x")
     other = replace(measured(), outputs=measured().outputs[::-1])
     with pytest.raises(InputError, match="the same in all responses"):
-        write_report(path, [], [measured(), other])
+        write_report(path, Subject([], [measured(), other]))
     with pytest.raises(InputError, match="expected the shape"):
         ModelCurve("m", np.arange(3.0), np.ones((3, 2), complex), ("a", "b"), ("u",))
     assert not list(tmp_path.iterdir())

@@ -14,7 +14,7 @@ import pytest
 from browser_kit import Browser, violations
 from report_kit import measured, model, recorded
 
-from samii_rig.report.page import write_report
+from samii_rig.report.page import Subject, write_report
 
 STAMP = 1_790_000_000_250  # ms since 1970: when the first sample was taken
 # A file whose first picture was taken seconds later, in whole seconds since 1904 as MP4 has it.
@@ -46,9 +46,11 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     offset = STAMP * 1_000_000 - int(recording.time[0])
     page = write_report(
         folder / "r.html",
-        replace(recording, clock_offset=offset),
-        [measured(2.0, seed=1), measured(1.0)],
-        model=model(0.6),
+        Subject(
+            [replace(recording, clock_offset=offset)],
+            [measured(2.0, seed=1), measured(1.0)],
+            model=model(0.6),
+        ),
     )
     with Browser(folder / "browser") as made:
         made.go(page.as_uri())

@@ -26,7 +26,7 @@ from samii_rig.report.diagnosis.models import strengths
 from samii_rig.report.diagnosis.page import write_diagnosis
 from samii_rig.report.diagnosis.plots import distance
 from samii_rig.report.drawing import Suspect, draw
-from samii_rig.report.page import write_report
+from samii_rig.report.page import Subject, write_report
 
 F = np.geomspace(0.5, 40.0, 120)
 EVERY = (0.0, np.inf)
@@ -307,7 +307,7 @@ def test_a_body_has_no_response_of_one_part(tmp_path):
 
 def test_it_is_a_section_of_the_report(tmp_path):
     response = noiseless(samii(), F)
-    path = write_report(tmp_path / "r.html", [], [response], rig=samii(), diagnosis=made())
+    path = write_report(tmp_path / "r.html", Subject([], [response], samii()), diagnosis=made())
     said = Page(path.read_text(encoding="utf-8")).text
     order = [
         "Diagnosis: ambiguous",
@@ -317,7 +317,7 @@ def test_it_is_a_section_of_the_report(tmp_path):
     ]
     assert [said.index(x) for x in order] == sorted(said.index(x) for x in order)
     with pytest.raises(InputError, match="its rig and responses"):
-        write_report(tmp_path / "s.html", [], [response], diagnosis=made())
+        write_report(tmp_path / "s.html", Subject([], [response]), diagnosis=made())
 
 
 def test_what_cannot_be_shown(tmp_path):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from samii_rig.report.canvas import (
+    MODEL,
     N_COLOURS,
     Figure,
+    Stroke,
     band,
     level_line,
     line,
@@ -34,8 +35,8 @@ from samii_rig.report.plots import (
 )
 from samii_rig.types import Complex, Float, FrequencyResponse
 
-BEFORE: dict[str, Any] = {"width": 2.2, "color": "@bad", "dash": "dot"}
-AFTER: dict[str, Any] = {"width": 2.2, "color": "@ink", "dash": "dash"}
+BEFORE: Stroke = {"width": 2.2, "color": "@bad", "dash": "dot"}
+AFTER = MODEL
 _KNOWN = 0.5  # of |x|, a standard deviation from which x says nothing
 _CUTS = (-180.0, -90.0, 0.0, -270.0)  # degrees
 _NEAR_CUT = 40.0
@@ -54,8 +55,8 @@ def strength(found: Sequence[Strength], quantity: str, unit_: str) -> Figure:
         _dots(figure, s.frequency, s.x, s.sd, law, s.level, k)
     first = found[0]
     f = first.frequency
-    line(figure, f, np.abs(first.law), "law of the named cause", "y", None, hover="%{y:.4g}")
-    line(figure, f, turn, "law of the named cause", "y2", None, legend=False, hover=DEGREES)
+    line(figure, f, np.abs(first.law), "law of the named cause", "y", MODEL, hover="%{y:.4g}")
+    line(figure, f, turn, "law of the named cause", "y2", MODEL, legend=False, hover=DEGREES)
     _fit(figure, [(s.x, s.sd) for s in found], np.abs(first.law), [s.frequency for s in found])
     return figure
 
@@ -158,16 +159,16 @@ def before_after(
         anchor = phase_curve(figure, c, k, i, j, anchor)
     models = [(before, BEFORE), *([(after, AFTER)] if after else [])]
     shown, distances = [np.empty(0)], [np.array([1.0])]
-    for model, style in models:
+    for model, stroke in models:
         f = model.frequency
         H = model.at(f, y.name, u.name)
         name = model.name
-        line(figure, f, np.abs(H), name, "y", None, hover="%{y:.4g}", style=style)
+        line(figure, f, np.abs(H), name, "y", stroke, hover="%{y:.4g}")
         assert anchor is not None
         angle = same_turn(f, np.rad2deg(unwrapped(H)), anchor)
-        line(figure, f, angle, name, "y2", None, legend=False, hover=DEGREES, style=style)
+        line(figure, f, angle, name, "y2", stroke, legend=False, hover=DEGREES)
         at, far = distance(responses, model, i, j)
-        line(figure, at, far, name, "y3", None, legend=False, hover="%{y:.2g}", style=style)
+        line(figure, at, far, name, "y3", stroke, legend=False, hover="%{y:.2g}")
         shown.append(np.abs(H))
         distances.append(far)
     frame(figure, responses)
