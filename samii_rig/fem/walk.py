@@ -133,6 +133,15 @@ class Walk:
         """Add one element and go on to its other end."""
         before = self.theta
         self._beyond -= _mass(e)
+        self._add(e, rigid, (feedback or {}).get(e.name))
+        self._waiting.append(e.name)
+        self._pulling.append(e.name)
+        self._span[e.name] = before, self.theta
+        self._moved[e.name] = self.w
+        self._place(e.name)
+
+    def _add(self, e: Element, rigid: Collection[str], loop: tuple[float, float] | None) -> None:
+        """Stiffness, damping, mass and coordinates of one element; loop : of a source."""
         match e:
             case Beam() | TimoshenkoBeam():
                 self._beam(e)
@@ -176,7 +185,7 @@ class Walk:
             case TranslationalGroundSpring():
                 self._spring(self._point(e.name), e.k.value, e.c.value)
             case AngularVelocitySource() | AngularVelocitySource2():
-                self._source(e, (feedback or {}).get(e.name))
+                self._source(e, loop)
             case DisplacementSource() | VelocitySource() | AccelerationSource():
                 self._motion_source(e)
             case TorqueSource():
@@ -188,11 +197,6 @@ class Walk:
             case _:
                 expected = "an element with a finite number of coordinates"
                 raise InputError(self._rig.name, e.name, e.kind, expected)
-        self._waiting.append(e.name)
-        self._pulling.append(e.name)
-        self._span[e.name] = before, self.theta
-        self._moved[e.name] = self.w
-        self._place(e.name)
 
     def _beam(self, e: Beam | TimoshenkoBeam) -> None:
         n, h = self._n_beam, e.L.value / self._n_beam

@@ -114,6 +114,13 @@ class Realisation:
         return A, B, C, self.direct
 
 
+def _relaxations(region: Region) -> Complex:
+    """Poles on the real axis for what lies in the region's holes and left of it, rad/s."""
+    # Two in each hole: the poles gathered there lie left of where the modulus vanishes.
+    holes = [x for low, high in region.holes for x in (low, (low + high) / 2)]
+    return np.array([*holes, *(region.left * x for x in BEYOND)], dtype=np.complex128)
+
+
 def realise(rig: Rig, band_hz: float | None = None, near: Complex | None = None) -> Realisation:
     """The chain of `rig` as partial fractions, all poles up to `band_hz` kept.
 
@@ -143,9 +150,7 @@ def realise(rig: Rig, band_hz: float | None = None, near: Complex | None = None)
     f = np.union1d(f, _near(found.poles, f[0], f[-1]))
     s = np.asarray(2j * np.pi * f, dtype=np.complex128)
     G = chain.evaluate(s)
-    # Two in each hole: the poles gathered there lie left of where the modulus vanishes.
-    holes = [x for low, high in found.region.holes for x in (low, (low + high) / 2)]
-    relaxations = np.array([*holes, *(found.region.left * x for x in BEYOND)], dtype=np.complex128)
+    relaxations = _relaxations(found.region)
     blocks: list[tuple[Complex, Complex]] = []
     direct = np.zeros((len(rig.sensor), len(rig.actuator)))
     error = np.zeros(len(rig.sensor))
