@@ -145,22 +145,7 @@ def _one_line(
     found = error.errors(include_url=False)
     # A name that is mistyped leaves the right one missing: the mistake is the former.
     first = next((e for e in found if e["type"] == "extra_forbidden"), found[0])
-    field = ""
-    node: object = data
-    last = len(first["loc"]) - 1
-    for i, key in enumerate(first["loc"]):
-        if isinstance(key, int) and isinstance(node, list) and key < len(node):
-            node = node[key]
-            named = node.get("name") if isinstance(node, dict) else None
-            field += f"[{named or key}]"
-        elif isinstance(node, dict) and key in node:
-            node = node[key]
-            field += f".{key}"
-        elif first["type"] == "missing" and i == last:
-            field += f".{key}"
-        # Otherwise the key is the tag of a union, which the file does not show.
-    # Names and keys are the file's: a line break in one must not make two lines of this.
-    field = "".join(c if c.isprintable() else "?" for c in field.lstrip("."))
+    field = _field(first["loc"], data, missing=first["type"] == "missing")
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     match first["type"]:
         case "value_error":
@@ -200,6 +185,29 @@ def _one_line(
             if choices:
                 return InputError(where, field, first["input"], one_of(first["input"], choices))
     return InputError(where, field, first.get("input"), message)
+
+
+def _field(loc: tuple[int | str, ...], data: dict[str, object], *, missing: bool) -> str:
+    """The field at `loc` as a person finds it in the file, such as `element[joint_1].k.unit`.
+
+    missing : it is not in the file itself, but where it would stand is.
+    """
+    field = ""
+    node: object = data
+    last = len(loc) - 1
+    for i, key in enumerate(loc):
+        if isinstance(key, int) and isinstance(node, list) and key < len(node):
+            node = node[key]
+            named = node.get("name") if isinstance(node, dict) else None
+            field += f"[{named or key}]"
+        elif isinstance(node, dict) and key in node:
+            node = node[key]
+            field += f".{key}"
+        elif missing and i == last:
+            field += f".{key}"
+        # Otherwise the key is the tag of a union, which the file does not show.
+    # Names and keys are the file's: a line break in one must not make two lines of this.
+    return "".join(c if c.isprintable() else "?" for c in field.lstrip("."))
 
 
 def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:

@@ -273,18 +273,9 @@ def _standstill(c: ChannelLimit, latest: Latest, i: int) -> Decision | None:
     return None
 
 
-def command_violation(
-    block: CommandBlock, latest: Latest, limits: GateLimits, sent: Sent
-) -> Decision | None:
-    """What is wrong with a reference before it reaches the wire, as a FAULT.
-
-    The device adds kp (theta_ref - theta) and its feedback, so the output is bounded by
-    |u| + kp (|theta_ref| + |theta|) + sum max with the largest |theta| of the newest block,
-    and its slew likewise, over the border to the last block too; a feedback's slew is bounded
-    by the largest value of its sensor in the newest block. A set point must lie inside the
-    limit of its sensor, and so must, with some room, the angle to which an angular velocity
-    source will have turned the joint, see `readback.travel`.
-    """
+def _misplaced(block: CommandBlock, latest: Latest, limits: GateLimits) -> Decision | None:
+    """A FAULT where a reference is not one number a sample, does not continue what was sent, or
+    comes too late or too far ahead of the samples."""
     n = len(block)
     if n == 0 or block.u.shape != (n,) or block.theta_ref.shape != (n,):
         return _fault("shape", "u and theta_ref must be one value a sample, at least one")
@@ -313,6 +304,24 @@ def command_violation(
             limits.max_ahead,
             "s",
         )
+    return None
+
+
+def command_violation(
+    block: CommandBlock, latest: Latest, limits: GateLimits, sent: Sent
+) -> Decision | None:
+    """What is wrong with a reference before it reaches the wire, as a FAULT.
+
+    The device adds kp (theta_ref - theta) and its feedback, so the output is bounded by
+    |u| + kp (|theta_ref| + |theta|) + sum max with the largest |theta| of the newest block,
+    and its slew likewise, over the border to the last block too; a feedback's slew is bounded
+    by the largest value of its sensor in the newest block. A set point must lie inside the
+    limit of its sensor, and so must, with some room, the angle to which an angular velocity
+    source will have turned the joint, see `readback.travel`.
+    """
+    misplaced = _misplaced(block, latest, limits)
+    if misplaced is not None:
+        return misplaced
     kp, output = abs(limits.kp), limits.output
     angle = angle_rate = 0.0
     for i, c in enumerate(limits.channels):
@@ -331,7 +340,7 @@ def command_violation(
     step = abs(float(block.u[0]) - latest.u) + kp * abs(
         float(block.theta_ref[0]) - latest.theta_ref
     )
-    if n > 1:
+    if len(block) > 1:
         u, theta_ref = block.u, block.theta_ref
         steps = np.abs(u[1:] - u[:-1]) + kp * np.abs(theta_ref[1:] - theta_ref[:-1])
         step = max(step, float(steps.max()))

@@ -123,8 +123,6 @@ def observe(
     for i in rates:
         rate[i] = _steepest(latest.last[i], latest.good[i], values[seen[i], i], time[seen[i]])
     since, travel, effort = _standstill(latest, values, time, seen)
-    order = time[0] > latest.time and sequence[0] > latest.sequence
-    order = order and (time[1:] > time[:-1]).all() and (sequence[1:] > sequence[:-1]).all()
     drifted = latest.offset + round(CLOCK_DRIFT * (now - latest.offset_at))
     return replace(
         latest,
@@ -138,12 +136,19 @@ def observe(
         effort=effort,
         clipped=clipped,
         limited=limited,
-        disorder=latest.disorder or not order,
+        disorder=latest.disorder or not _in_order(latest, block),
         sequence=int(sequence[-1]),
         time=int(time[-1]),
         offset=min(drifted, now - int(time[-1])),
         offset_at=now,
     )
+
+
+def _in_order(latest: Latest, block: SampleBlock) -> bool:
+    """Whether times and sequence numbers rise, from the last block on and within this one."""
+    time, sequence = block.time, block.sequence
+    rises = bool(time[0] > latest.time and sequence[0] > latest.sequence)
+    return rises and bool((time[1:] > time[:-1]).all() and (sequence[1:] > sequence[:-1]).all())
 
 
 def _standstill(
