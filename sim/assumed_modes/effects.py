@@ -170,8 +170,9 @@ def sideways(rng: Rng, setup: Setup) -> Draft:
 
 def _attached(
     physics: str, kind: str, rng: Rng, setup: Setup, units: dict[str, str],
-    values: Callable[[float], Numbers], start: float, most: float, *, turns: bool = False,
+    values: Callable[[float], Numbers], span: tuple[float, float], *, turns: bool = False,
 ) -> Draft:  # fmt: skip
+    """A part somewhere on the chain. span : its strength at the start and at most."""
     on, x = _place(rng, setup, setup.turning() if turns else setup.shifting())
     if turns and setup.part(on).kind == "beam":
         x = setup.part(on).values["L"]  # the moment that it makes jumps there: see ritz.ORDER
@@ -180,14 +181,14 @@ def _attached(
         return s.attached(Attachment(kind, on, x, v))  # type: ignore[arg-type]
 
     also = tuple((physics, n) for n in _at_end(setup, on, x) if n != on)
-    return Draft(physics, on, x, units, values, apply, start, most, also=also)
+    return Draft(physics, on, x, units, values, apply, *span, also=also)
 
 
 def mass(rng: Rng, setup: Setup) -> Draft:
     """A mass somewhere, or too much of it in the rig file."""
     moving = [p.values["m"] for p in setup.parts if p.kind in ("rigid_link", "lumped_mass")]
     draft = _attached(
-        "added_mass", "mass", rng, setup, {"m": "kg"}, lambda x: {"m": x}, 1e-7, 0.5 * max(moving)
+        "added_mass", "mass", rng, setup, {"m": "kg"}, lambda x: {"m": x}, (1e-7, 0.5 * max(moving))
     )
     host = setup.part(draft.site)
     if host.kind != "rigid_link" or rng.random() < 0.75:
@@ -205,8 +206,7 @@ def inertia(rng: Rng, setup: Setup) -> Draft:
         setup,
         {"J": "kg m^2"},
         lambda x: {"m": 0.0, "J": x},
-        1e-9,
-        10.0,
+        (1e-9, 10.0),
         turns=True,
     )
 
@@ -219,7 +219,7 @@ def brace(rng: Rng, setup: Setup) -> Draft:
     units = {"k": "N m/rad", "c": "N m s/rad"} if turn else {"k": "N/m", "c": "N s/m"}
     kind = "ground_torsion" if turn else "ground"
     return _attached(
-        "ground_spring", kind, rng, setup, units, lambda x: {"k": x, "c": loss * x}, 1e-5, 1e7,
+        "ground_spring", kind, rng, setup, units, lambda x: {"k": x, "c": loss * x}, (1e-5, 1e7),
         turns=turn,
     )  # fmt: skip
 
@@ -250,7 +250,7 @@ def damping(rng: Rng, setup: Setup) -> Draft:
     if rng.random() < 0.5 and setup.shifting():
         return _attached(
             "viscous_damping", "ground", rng, setup, {"c": "N s/m"},
-            lambda x: {"k": 0.0, "c": x}, 1e-5, 1e5,
+            lambda x: {"k": 0.0, "c": x}, (1e-5, 1e5),
         )  # fmt: skip
     on = str(rng.choice(joints))
 
@@ -304,7 +304,7 @@ def oscillator(rng: Rng, setup: Setup) -> Draft:
     zeta = float(rng.uniform(0.005, 0.05))
     return _attached(
         "attached_oscillator", "oscillator", rng, setup, {"m": "kg", "k": "N/m", "c": "N s/m"},
-        lambda x: {"m": x, "k": x * omega**2, "c": 2 * zeta * omega * x}, 1e-7, 2.0,
+        lambda x: {"m": x, "k": x * omega**2, "c": 2 * zeta * omega * x}, (1e-7, 2.0),
     )  # fmt: skip
 
 

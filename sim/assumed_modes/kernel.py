@@ -104,6 +104,26 @@ def bouc_wen(p: Float, dz: float, x: float, h: float) -> float:
 
 
 @njit(cache=True)
+def _converted(converters: Converters, i: int, value: float) -> float:
+    """What the converter of sensor i shows of a value."""
+    value += converters.offset[i]
+    if converters.step[i] > 0.0:
+        value = np.rint(value / converters.step[i]) * converters.step[i]
+    return float(min(max(value, converters.low[i]), converters.high[i]))
+
+
+@njit(cache=True)
+def _at_source(control: Controller, i: int, out: float) -> float:
+    """What of the command i reaches its source, through dead zone and limit."""
+    if control.dead[i] > 0.0:
+        half = 0.5 * control.dead[i]
+        out = out - min(max(out, -half), half)
+    if control.clip[i] > 0.0:
+        out = min(max(out, -control.clip[i]), control.clip[i])
+    return out
+
+
+@njit(cache=True)
 def run(
     pieces: Pieces,
     laws: Laws,
@@ -132,10 +152,7 @@ def run(
     z = np.zeros(2 * n_law)
     for k in range(n):
         for i in range(n_y):
-            value = line[0, i] + noise[k, i] + converters.offset[i]
-            if converters.step[i] > 0.0:
-                value = np.rint(value / converters.step[i]) * converters.step[i]
-            y[k, i] = min(max(value, converters.low[i]), converters.high[i])
+            y[k, i] = _converted(converters, i, line[0, i] + noise[k, i])
         for i in range(n_in):
             out = r[k, i]
             for j in range(n_y):
@@ -144,14 +161,9 @@ def run(
                 out = np.rint(out / control.step[i]) * control.step[i]
             out = min(max(out, control.low[i]), control.high[i])
             v[k, i] = out
-            if control.dead[i] > 0.0:
-                half = 0.5 * control.dead[i]
-                out = out - min(max(out, -half), half)
-            if control.clip[i] > 0.0:
-                out = min(max(out, -control.clip[i]), control.clip[i])
             for j in range(old.shape[1] - 1, 0, -1):
                 old[i, j] = old[i, j - 1]
-            old[i, 0] = out
+            old[i, 0] = _at_source(control, i, out)
         for j in range(deep):
             line[j] = line[j + 1]
         for j in range(push.shape[1]):

@@ -163,6 +163,20 @@ def _solution(A: Float, b: Float) -> Float:
         raise UnphysicalError("a motion that nothing resists") from error
 
 
+def _relaxations(sig: _Signals, mech: Mechanism, Q: Float, load: Float) -> dict[int, Float]:
+    """The Maxwell branches in states and loads: t s' = q - s pulls with k (q - s); the slip s of
+    each branch's dashpot, by its coordinate."""
+    slipped: dict[int, Float] = {}
+    for branch in mech.maxwell:
+        own = sig.states(1)
+        slipped[branch.at] = sig.unit(own.start)
+        sig.rate[own] += Q[branch.at] / branch.t
+        sig.rate[own, own] -= 1.0 / branch.t
+        load[branch.at] -= branch.k * Q[branch.at]
+        load[branch.at, own] += branch.k
+    return slipped
+
+
 def plant(setup: Setup, pushes: tuple[Push, ...] = ()) -> Plant:
     """The continuous plant of `setup`, with inputs for its laws and for the disturbances."""
     mech = Mechanism(setup)
@@ -199,14 +213,7 @@ def plant(setup: Setup, pushes: tuple[Push, ...] = ()) -> Plant:
         if force.on in mech.joints:
             load[mech.joints[force.on], first_law + i] += 1.0
     _pushes(mech, pushes, first_push, load, ddQ)
-    slipped: dict[int, Float] = {}  # what a branch's dashpot has given, by its coordinate
-    for branch in mech.maxwell:
-        own = sig.states(1)
-        slipped[branch.at] = sig.unit(own.start)
-        sig.rate[own] += Q[branch.at] / branch.t
-        sig.rate[own, own] -= 1.0 / branch.t
-        load[branch.at] -= branch.k * Q[branch.at]
-        load[branch.at, own] += branch.k
+    slipped = _relaxations(sig, mech, Q, load)
     if n_r:
         # Without mass the forces balance at once: C r' = ... gives the rate of what lies between.
         balance = _solution(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.errors import InputError
-from samii_rig.types import Complex, Float
+from samii_rig.types import Complex, Float, Int
 from sim.concealed.assemble import Structure, assemble
 from sim.concealed.parts import GRAVITY, Description, Drive, Law, SensorPath
 
@@ -127,19 +127,7 @@ def state_space(plant: Description, structure: Structure | None = None) -> State
     for j, law in enumerate(plant.laws):
         if law.kind not in DRIVE_LAWS:
             force[s.joints[law.site][-1], push + 1 + j] += 1.0
-    seen_by: dict[str, _Source] = {}
-    for k, (drive, at_phi) in enumerate(zip(plant.drives, phis.tolist(), strict=True)):
-        command = _command(drive, k, at_phi + 2, A, B)
-        x_row, u_row = command[0], command[1].copy()
-        for j, law in enumerate(plant.laws):
-            if law.kind in DRIVE_LAWS and law.site == drive.element:
-                u_row[push + 1 + j] += 1.0
-        at_speed = at_phi + 1
-        A[at_phi, at_speed] = 1.0
-        A[at_speed] = drive.K * drive.p * x_row
-        A[at_speed, at_speed] -= drive.p
-        B[at_speed] = drive.K * drive.p * u_row
-        seen_by[drive.element] = _Source(at_speed, command)
+    seen_by = _sources(plant, phis, A, B)
     speeds = phis + 1
 
     # Elastic forces, then the accelerations they leave.
@@ -183,6 +171,26 @@ class _Source:
 
     at_speed: int
     command: tuple[Float, Float]
+
+
+def _sources(plant: Description, phis: Int, A: Float, B: Float) -> dict[str, _Source]:
+    """Put phi'' = p (K v - phi') of every drive into A and B, with its filters behind `phis`; by
+    the element that it drives."""
+    push = len(plant.drives)
+    seen_by: dict[str, _Source] = {}
+    for k, (drive, at_phi) in enumerate(zip(plant.drives, phis.tolist(), strict=True)):
+        command = _command(drive, k, at_phi + 2, A, B)
+        x_row, u_row = command[0], command[1].copy()
+        for j, law in enumerate(plant.laws):
+            if law.kind in DRIVE_LAWS and law.site == drive.element:
+                u_row[push + 1 + j] += 1.0
+        at_speed = at_phi + 1
+        A[at_phi, at_speed] = 1.0
+        A[at_speed] = drive.K * drive.p * x_row
+        A[at_speed, at_speed] -= drive.p
+        B[at_speed] = drive.K * drive.p * u_row
+        seen_by[drive.element] = _Source(at_speed, command)
+    return seen_by
 
 
 def _command(drive: Drive, k: int, at: int, A: Float, B: Float) -> tuple[Float, Float]:

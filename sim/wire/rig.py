@@ -259,6 +259,17 @@ class WireRig:
 
     # Commands
 
+    def _rest(self) -> None:
+        """Plant, wires and history as at the start, no fault anywhere."""
+        self._emergency, self._jump, self._rails = False, 0, set()
+        self._offset, self._drift, self._frozen = {}, {}, {}
+        self._stray, self._relay = {}, True
+        self._plant.rest()
+        self._history.clear()
+        self._late, self._stalled = 0, 0.0
+        for line in self._lines.values():
+            line.drop()
+
     def obey(self, line: str) -> bool:
         """Carry out one command; False for quit. InputError for what is none."""
         words = line.split()
@@ -284,14 +295,7 @@ class WireRig:
                     self._node = self._booted(self._node.boot % 0xFFFF + 1, sample)
                     self._taken = 0
                     if what == "rest":
-                        self._emergency, self._jump, self._rails = False, 0, set()
-                        self._offset, self._drift, self._frozen = {}, {}, {}
-                        self._stray, self._relay = {}, True
-                        self._plant.rest()
-                        self._history.clear()
-                        self._late, self._stalled = 0, 0.0
-                        for line_of in self._lines.values():
-                            line_of.drop()
+                        self._rest()
                 case ["clock", change]:
                     self._clock += int(change)
                 case ["emergency", level]:
