@@ -73,28 +73,21 @@ def changed(
     first_rig = with_known(rig, known_before or {}, "--known-before")
     n = sum(map(len, [*before.runs, *after.runs]))
     progress(Begun("two states", takes=takes(STATES_TAKE, n)))
+
+    def say(stage: str) -> None:
+        progress(ahead("before: ", stage, usual=STATES))
+
     found = diagnose(
-        before.responses,
-        first_rig,
-        band=band,
-        effects=effects,
-        runs=before.runs,
-        progress=lambda stage: progress(ahead("before: ", stage, usual=STATES)),
+        before.responses, first_rig, band=band, effects=effects, runs=before.runs, progress=say
     )
     put_in = found.verdict != "no_mismatch" and found.rig is not None
     common = common_rig(first_rig, found.rig) if put_in and found.rig else first_rig
     progress(Begun("both states", STATES["both states"]))
     first = case_of(before.responses, common, band, effects, before.runs, progress=progress)
     # What is known of the state before alone is as the rig file has it after.
-    own = _as_in(common, rig, known_before or {})
+    own = with_known(_as_in(common, rig, known_before or {}), known or {})
     second = case_of(
-        after.responses,
-        with_known(own, known or {}),
-        band,
-        effects,
-        after.runs,
-        signed=True,
-        progress=progress,
+        after.responses, own, band, effects, after.runs, signed=True, progress=progress
     )
     both, start = _both(first, second, band)
     search = StatesSearch(both, second.search, start.nominal.fitted)
@@ -102,24 +95,30 @@ def changed(
     at_first, bands = search.ratio(nominal), search.bands(nominal)
     search.begin("what changed")
     search.run()
-    given = [
+    # What both have and no model explains is no part of what changed.
+    left = max(nominal.chi2 - search.problem.expected, 0.0) if both.alike else None
+    given = _given(search, second, first)
+    answer = by_samples(second, search, at_first, bands, given, left)
+    causes = found.causes if put_in else ()
+    names = _named(before), _named(after)
+    rig_of_both = explained(search.nominal.fitted)
+    return _beside(answer, Before(found.verdict, causes, both.alike, names, rig_of_both))
+
+
+def _given(search: StatesSearch, second: Case, first: Case) -> list[Given]:
+    """The recordings of each state, with what explains them."""
+    return [
         Given(case.runs, *of, case.clean.samples, where)
         for case, of, where in zip((second, first), search.by_state(), WHERE, strict=True)
     ]
-    # What both have and no model explains is no part of what changed.
-    left = max(nominal.chi2 - search.problem.expected, 0.0) if both.alike else None
-    answer = by_samples(second, search, at_first, bands, given, left)
-    beside = Before(
-        found.verdict,
-        found.causes if put_in else (),
-        both.alike,
-        (_named(before), _named(after)),
-        explained(search.nominal.fitted),
-    )
-    words = (beside.describe(), answer.not_physics)
+
+
+def _beside(answer: Diagnosis, before: Before) -> Diagnosis:
+    """The answer, with what was found before."""
+    words = (before.describe(), answer.not_physics)
     # That one side is of several states is said first.
     first_words, others = words[::-1] if answer.states else words
-    return replace(answer, before=beside, not_physics=(*first_words, *others))
+    return replace(answer, before=before, not_physics=(*first_words, *others))
 
 
 def _as_in(common: Rig, rig: Rig, names: Mapping[str, float]) -> Rig:

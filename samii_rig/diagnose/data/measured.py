@@ -198,13 +198,9 @@ def measured(
     rate = data.lines[0].response.rate_hz
     whole_part(rate, rig)
     columns = [[d.actuator, *(np.full(d.p, a) for a, _ in d.follow)] for d in data.lines]
+    by_column = [(d, own) for d, each in zip(data.lines, columns, strict=True) for own in each]
     pairs = sorted(
-        {
-            (int(s), int(a))
-            for d, each in zip(data.lines, columns, strict=True)
-            for own in each
-            for s, a in zip(d.sensor, own, strict=True)
-        }
+        {(int(s), int(a)) for d, own in by_column for s, a in zip(d.sensor, own, strict=True)}
     )
     levels = tuple(dict.fromkeys(_level(d.response) for d in data.lines))
     ringing = {_level(d.response) for d in data.lines if d.response.estimator == TRANSIENTS}

@@ -11,7 +11,7 @@ from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.agreeing import Saved, SeveralStates
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.search import Search
-from samii_rig.diagnose.result import Band, Diagnosis, Gap, Used
+from samii_rig.diagnose.result import Band, Cause, Diagnosis, Gap, Used
 from samii_rig.diagnose.verdict import answer
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.force_words import next_levels
@@ -83,6 +83,29 @@ def of_states(found: Diagnosis, several: Sequence[SeveralStates]) -> Diagnosis:
     return replace(found, sites=(), why=why, experiment=several[0].experiment(), gain=None)
 
 
+def _next(
+    search: Search, judged: Judgement, refusal: Refusal | None
+) -> tuple[str, str, float | None]:
+    """Why no more may be said, the experiment that would tell, and what it would gain."""
+    if refusal:
+        return refusal.why, refusal.experiment, None
+    if judged.varies is not None:
+        return ("", "", None) if judged.verdict == "named" else (*REPEAT, None)
+    return next_levels(judged) or next_experiment(search, judged)
+
+
+def _alternatives(
+    judged: Judgement, causes: Sequence[Cause]
+) -> tuple[tuple[tuple[Cause, ...], float], ...]:
+    """What else is probable beside the causes, with its probability."""
+    ranked = list(zip(judged.classes, judged.probabilities, strict=True))[len(causes) > 0 :]
+    return tuple(
+        (answer.causes_of(c, judged, share), share)
+        for c, share in ranked[:ALTERNATIVES]
+        if share >= answer.SHOWN
+    )
+
+
 def diagnosis_of(
     case: Case,
     search: Search,
@@ -110,19 +133,8 @@ def diagnosis_of(
     if missing or best.effects:
         words += answer.not_physics_of(judged)
     words += (*remarks, *clean.lacks)
-    why, experiment, gain = next_levels(judged) or next_experiment(search, judged)
-    if judged.varies is not None:
-        named = judged.verdict == "named"
-        why, experiment, gain = ("", "", None) if named else (*REPEAT, None)
-    if refusal and missing:
-        why, experiment, gain = refusal.why, refusal.experiment, None
-    ranked = list(zip(judged.classes, judged.probabilities, strict=True))[len(causes) > 0 :]
+    why, experiment, gain = _next(search, judged, refusal if missing else None)
     untold = judged.varies.describe() if judged.varies is not None and not causes else ""
-    alternatives = tuple(
-        (answer.causes_of(c, judged, share), share)
-        for c, share in ranked[:ALTERNATIVES]
-        if share >= answer.SHOWN and missing
-    )
     return Diagnosis(
         verdict=judged.verdict,
         chi2_per_dof=shown.first,
@@ -130,7 +142,7 @@ def diagnosis_of(
         bands=shown.bands,
         sites=tuple(answer.sites(judged)) if missing else (),
         causes=causes,
-        alternatives=alternatives,
+        alternatives=_alternatives(judged, causes) if missing else (),
         nominal=shown.nominal,
         with_causes=shown.with_causes,
         noise_floor=1.0,
