@@ -230,13 +230,16 @@ def test_the_noise_of_records_is_told_anew_by_the_rig_that_was_found():
     assert told == [(late,)]
 
 
+@pytest.mark.parametrize("force", [None, object()], ids=["a dead time", "friction"])
 @pytest.mark.parametrize(("rough", "insignificant"), [(METERED, True), (0.0, False)])
-def test_what_a_meter_may_be_off_by_is_no_dead_time(rough: float, insignificant: bool) -> None:
+def test_what_a_meter_may_be_off_by_is_no_physics(
+    rough: float, insignificant: bool, force: object
+) -> None:
     """Of 712,000 of chi-square that a meter explains, 47 more by a dead time of a hundredth of a
-    sample."""
+    sample, or by a force."""
 
     meter = SimpleNamespace(key="meter", physical=False, force=None, rough=rough)
-    late = SimpleNamespace(key="late", physical=True, force=None, rough=0.0)
+    late = SimpleNamespace(key="late", physical=True, force=force, rough=0.0)
     fewer = [of(712_000.0), of(550.0, meter), of(30_000.0, late)]
     search = searched(fewer)
     assert _is_insignificant(search, of(503.0, meter, late)) is insignificant

@@ -333,8 +333,9 @@ def _is_insignificant(search: Search, e: Explanation) -> bool:
             continue
         if all(x.force is None for x in e.effects):
             fewer.append(search.without(e, i))
-        elif effect.force is None:
-            # A force is not refitted here: without this one it was fitted to itself, or not at all.
+        else:
+            # A force is not refitted here: what is left without one of both was fitted to itself,
+            # or not at all.
             fewer.append(search.found.get(e.key - {effect.key}))
     return any(
         less is not None and less.fitted.chi2 - e.fitted.chi2 < _critical_value(search, less)
