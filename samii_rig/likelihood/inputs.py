@@ -74,20 +74,29 @@ def calibrated(r: Float, step: float) -> Float:
 
     step : of the command's converter, whose rounding is the input's own.
     """
-    if not np.isfinite(r).all():
+    floor = meter_noise(r, step) ** 2
+    if floor == 0:
         return r
     spectrum = np.fft.rfft(r - np.mean(r))
     power = np.abs(spectrum) ** 2 / r.size
+    part = np.maximum(1 - floor / np.maximum(power, floor), 0.0)
+    return np.asarray(np.fft.irfft(part * spectrum, r.size) + np.mean(r))
+
+
+def meter_noise(r: Float, step: float) -> float:
+    """Standard deviation of a meter's white noise on r (n,); 0 where the meter shows none, or the
+    input is as wide as what was recorded. step : as of `calibrated`."""
+    if not np.isfinite(r).all():
+        return 0.0
+    power = np.abs(np.fft.rfft(r - np.mean(r))) ** 2 / r.size
     # Under a window: a record that is cut ends with an edge, whose lines are no noise.
     window = signal.windows.hann(r.size, sym=False)
     apart = np.abs(np.fft.rfft(window * (r - np.mean(r)))) ** 2 / float(window @ window)
     upper = apart[int((1 - UPPER) * power.size) :]
     floor = float(np.median(upper)) / np.log(2)
     white = float(np.mean(upper)) < LOUDER * floor
-    if not white or floor < METER * step**2 / 12 or floor > QUIET * np.max(power):
-        return r
-    part = np.maximum(1 - floor / np.maximum(power, floor), 0.0)
-    return np.asarray(np.fft.irfft(part * spectrum, r.size) + np.mean(r))
+    shown = white and METER * step**2 / 12 <= floor <= QUIET * np.max(power)
+    return float(np.sqrt(floor)) if shown else 0.0
 
 
 def jumps(recording: Recording, command: int, kp: float, theta: Float | None) -> NDArray[np.bool_]:

@@ -18,12 +18,17 @@ from samii_rig.diagnose.forces.problem import mean_command
 from samii_rig.diagnose.physics.effect import Key
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
+from samii_rig.likelihood.inputs import meter_noise
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.likelihood.reduce import by_input
 from samii_rig.model.sampled import dead_time, hold_at, sensors_at
 from samii_rig.types import Complex, Float, Int
 
 OVER = 4.0  # rate over the highest line: third harmonics fold beside the band, not into it
+METERS = (
+    "input_not_held",
+    "columns_shifted",
+)  # what says that a command was measured, if not exact
 DAMPING = 5.0  # of the contour: 0.7 % wraps around, what is cut above the rate grows 12 times
 
 
@@ -145,6 +150,15 @@ class TransferPaths:
         on, pieces = self.column(place), self.whole.records.pieces
         each = [by_input(c.v)[on] for p in pieces for c in p.commands[:1]]
         return max(float(np.max(np.abs(v))) for v in each)
+
+    def meter_noise(self, place: Place, step: float) -> float:
+        """Standard deviation of the noise that a meter has put on that command, 0 where it was
+        recorded as it was sent: then its noise drives the rig. step : of the command's converter.
+        """
+        if not any(e.physics in METERS and e.rough for e in self.model.effects):
+            return 0.0
+        on, pieces = self.column(place), self.whole.records.pieces
+        return max(meter_noise(by_input(c.v)[on], step) for p in pieces for c in p.commands[:1])
 
     def column(self, place: Place) -> int:
         """Which input a force is on; the first where it has one of its own."""

@@ -38,6 +38,7 @@ from samii_rig.diagnose.forces.varying import (
 )
 from samii_rig.diagnose.result import Gap, Value
 from samii_rig.likelihood.pieces import Piece
+from samii_rig.likelihood.reduce import CYCLES
 from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.types import Float
 
@@ -59,7 +60,8 @@ class Variation:
     noise with it. gain : of chi-square on the lines fitted. before, after : chi-square per degree
     of freedom without it and with it, on the lines fitted and on those shown. gap : on those shown.
     inside : whether what it leaves of the lines fitted is no more than noise. again : whether
-    records of one level differ, or one in itself, so that it is no law of the amplitude.
+    records of one level differ, or one in itself, so that it is no law of the amplitude, and that
+    faster than what wanders.
     """
 
     sites: tuple[tuple[str, float], ...]
@@ -138,16 +140,20 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     each = 2.0 * search.levels.sensor.size
     p = np.exp([one.evidence - taken.evidence for one in tried])
     names = [one.site for one in tried]
+    parameters = taken.parameters(search.paths.scale((taken.site, STIFFNESS)), files)
+    f = parameters.get("f")
+    # As slow as what the lines leave out, it goes with what wanders, and its place with that.
+    slow = f is not None and f.value * springs.longest < CYCLES
     return Variation(
         sites=tuple(zip(names, (p / p.sum()).tolist(), strict=True)),
-        parameters=taken.parameters(search.paths.scale((taken.site, STIFFNESS)), files),
+        parameters=parameters,
         evidence=first.evidence - math.log(len(springs.each)),
         gain=float(np.sum(before[0] - after[0])) * each,
         before=(float(np.mean(before[0])), float(np.mean(before[1]))),
         after=(float(np.mean(after[0])), float(np.mean(after[1]))),
         gap=gap_of(before[1], after[1], np.ones(after[1].size)),
         inside=bool(np.mean(after[0]) < threshold(taken.search.spread)),
-        again=taken.again,
+        again=taken.again and not slow,
     )
 
 

@@ -75,7 +75,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         looked = _constant(forces, forced or search, looked, len(case.runs))
     given = Given.of(search, case.runs, case.clean.samples)
     last = forced or search
-    if _not_explained(looked.judged, forced):
+    if _not_explained(looked.judged, forced, search):
         search.begin("what is missing, beside a discrepancy")
         last = discrepant = DiscrepantSearch(search)
         discrepant.settle()
@@ -83,12 +83,15 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     return _agreeing(case, last, first, bands, looked, [given])
 
 
-def _not_explained(judged: Judgement, forced: ForceSearch | None) -> bool:
+def _not_explained(judged: Judgement, forced: ForceSearch | None, search: RecordSearch) -> bool:
     """Whether all that was tried leaves much of the mismatch, and more than noise. A force that is
     told all the same keeps its answer: it is told by how levels differ, and no response that is
-    the same at all of them does that."""
-    by_force = forced is not None and judged.verdict in verdict.WITH_CAUSES
-    return judged.partly and judged.varies is None and not by_force
+    the same at all of them does that. So does one beside which only what no response explains is
+    left: of that a discrepancy of the response knows nothing."""
+    if not judged.partly or judged.varies is not None:
+        return False
+    linear = search.ratio(search.ranked()[0].fitted) > threshold(search.spread)
+    return forced is None or (linear and judged.verdict not in verdict.WITH_CAUSES)
 
 
 def by_samples(
