@@ -13,10 +13,16 @@ from samii_rig.rig.schema import ActuatorSpec
 
 
 class Moved:
-    """Under a command of 1 V that turns nothing."""
+    """Under a command of 1 V that turns nothing, recorded as it was sent or by a meter."""
+
+    def __init__(self, noise: float = 0.0) -> None:
+        self.noise = noise
 
     def largest(self, place: Place) -> float:
         return 1.0
+
+    def meter_noise(self, place: Place, step: float) -> float:
+        return self.noise
 
     def ports(self, place: Place, *, of_speed: bool) -> Any:
         return None
@@ -30,3 +36,16 @@ def test_a_coarse_converter_hides_a_dead_band_and_no_limit(step: float, known: s
     valve = ActuatorSpec(name="v", unit="V", low=-10.0, high=10.0, resolution=step)
     found = _drive(cast(TransferPaths, Moved()), "motor", valve, turns=False)
     assert {e.physics for e in found} == known
+
+
+def test_what_is_as_narrow_as_a_meters_noise_is_none_of_the_rig() -> None:
+    """A dead band takes the noise out where the command rests, a limit at its top."""
+    valve = ActuatorSpec(name="v", unit="V", low=-10.0, high=10.0, resolution=1e-3)
+    ends = {}
+    for noise in (0.0, 0.01):
+        found = _drive(cast(TransferPaths, Moved(noise)), "motor", valve, turns=False)
+        ends[noise] = {e.physics: (e.unknowns[0].low, e.unknowns[0].high) for e in found}
+    assert ends[0.0]["valve_deadband"][0] == pytest.approx(1e-3)
+    assert ends[0.01]["valve_deadband"][0] == pytest.approx(0.03)
+    assert ends[0.0]["output_saturation"][1] == pytest.approx(1.0)
+    assert ends[0.01]["output_saturation"][1] == pytest.approx(0.94)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from samii_rig.likelihood.inputs import calibrated, jumps, sent
+from samii_rig.likelihood.inputs import calibrated, jumps, meter_noise, sent
 from samii_rig.types import Channel, Float, Recording
 
 RATE, N, KP, STEP = 500.0, 6000, 3.0, 3e-4
@@ -137,6 +137,7 @@ def test_of_a_meters_noise_lines_lose_the_part_that_is_none_of_the_input() -> No
     shown = r + meter * rng.standard_normal(n)
     made = calibrated(shown, STEP)
     assert np.std(made - r) < 0.6 * meter
+    assert meter_noise(shown, STEP) == pytest.approx(meter, rel=0.05)
     power = [np.abs(np.fft.rfft(x)) ** 2 for x in (r, shown, made)]
     silent = power[0] < 1e-6 * np.max(power[0])
     assert np.sum(power[2][silent]) < 0.4 * np.sum(power[1][silent])
@@ -146,6 +147,7 @@ def test_of_a_meters_noise_lines_lose_the_part_that_is_none_of_the_input() -> No
     np.testing.assert_array_equal(calibrated(held, STEP), held)
     wide = rng.standard_normal(n)
     np.testing.assert_array_equal(calibrated(wide, STEP), wide)
+    assert meter_noise(held, STEP) == meter_noise(wide, STEP) == 0.0
 
 
 def test_jumps_beside_a_rest_are_edges_and_a_sweep_has_none() -> None:
