@@ -38,7 +38,7 @@ def test_where_nothing_is_missing_two_inputs_say_so(how):
     found = found_in(recorded(RIG, HOW[how]()))
     assert found.verdict == "no_mismatch"
     assert 0.8 < found.chi2_per_dof < found.threshold < 1.2
-    assert found.used.lines == found.used.of > 500
+    assert found.used.lines == found.used.of > 1000
     assert found.causes == ()  # of forces neither
 
 

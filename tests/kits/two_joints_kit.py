@@ -16,7 +16,7 @@ from sim.rig import open_rig
 
 RIG = load_rig("samii_two_joints")[0]
 INPUTS = tuple(a.name for a in RIG.actuator)
-BAND = (0.5, 12.0)  # Hz: most of what a diagnosis takes grows with the square of its lines
+BAND = (0.5, 20.0)  # Hz: most of what a diagnosis takes grows with the square of its lines
 SWEEP = 24.0  # s: 40 lines to the first octave
 LEVEL = 0.4  # V, far from every limit
 
