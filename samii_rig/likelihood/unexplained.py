@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from samii_rig.likelihood.pieces import Loops
@@ -33,18 +32,13 @@ class Unexplained:
     white : (1 + repeats, n, q) what the model leaves of the piece, and what its repeats differ by,
         nuisances at their best.
     rounded : (offsets, n, q) of each sensor that nothing dithers the same of its rounding, wherever
-        it stands in its step.
+        it stands in its step; of none where that was not asked for.
     """
 
     k: Int
     root: Complex
     white: Complex
     rounded: Mapping[int, Complex] = field(default_factory=dict)
-
-    def at(self, on: NDArray[np.bool_]) -> Unexplained:
-        """Of some of the lines."""
-        rounded = {c: x[:, on] for c, x in self.rounded.items()}
-        return Unexplained(self.k[on], self.root[on], self.white[:, on], rounded)
 
     @property
     def pull(self) -> Complex:
@@ -54,9 +48,15 @@ class Unexplained:
 
 
 def unexplained(
-    records: Records, response: Response, noise: Reduced, loop: Loops = ()
+    records: Records,
+    response: Response,
+    noise: Reduced,
+    loop: Loops = (),
+    *,
+    rounded: bool = False,
 ) -> list[Unexplained]:
-    """Of every piece. noise : as of these records."""
+    """Of every piece. noise : as of these records. rounded : whether what rounding may do is asked
+    for too."""
     exact = records.exact()
     H = response(exact.s)
     records = records.without_spikes(H)
@@ -75,12 +75,12 @@ def unexplained(
             return as_complex(goal - Q @ (Q.T @ goal)).T.reshape(e.shape)
 
         repeats = (records.residual(x, lines.k, H, exact) for x in piece.repeats)
-        rounded = {}
-        for c, draws in seen.rounding.draws.items():
-            rounded[c] = np.zeros((*draws.shape, seen.e.shape[1]), complex)
-            rounded[c][:, :, c] = draws
-            rounded[c] = white(rounded[c])
-        out.append(Unexplained(lines.k, root, white(np.stack([seen.e, *repeats])), rounded))
+        own = {}
+        for c, draws in seen.rounding.draws.items() if rounded else ():
+            own[c] = np.zeros((*draws.shape, seen.e.shape[1]), complex)
+            own[c][:, :, c] = draws
+            own[c] = white(own[c])
+        out.append(Unexplained(lines.k, root, white(np.stack([seen.e, *repeats])), own))
     return out
 
 

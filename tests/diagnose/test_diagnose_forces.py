@@ -17,7 +17,7 @@ from weak_forces_kit import weak_ones
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import case_of, diagnose
-from samii_rig.diagnose.fit.explanations import Explanation
+from samii_rig.diagnose.fit.explanations import Explanation, Explanations
 from samii_rig.diagnose.fit.records import RecordProblem, Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.screen import Screen
@@ -275,9 +275,8 @@ def test_a_force_is_held_against_what_is_wrong_with_the_data_alone():
         Explanation(some, fitted, weight)
         for some, weight in (((), -1e6), ((unheld,), -500.0), ((unheld, slip), -200.0))
     )
-    found = {e.key: e for e in (nominal, mistake, both)}
-    ranked = [both, mistake, nominal]
-    linear = SimpleNamespace(stage="", nominal=nominal, found=found, ranked=lambda: ranked)
+    linear = object.__new__(Explanations)
+    linear.found = {e.key: e for e in (nominal, mistake, both)}
 
     class Kept(ForceSearch):
         def use(self, table):

@@ -129,6 +129,11 @@ class Explanations:
         """Nothing is missing."""
         return self.found[frozenset()]
 
+    def meant(self, effects: Iterable[Effect]) -> Explanation | None:
+        """The nominal model of what was meant to be recorded: with what is no physics of some
+        effects; None where that was not refitted."""
+        return self.found.get(frozenset(e.key for e in effects if not e.physical))
+
     def ranked(self) -> list[Explanation]:
         """All explanations, the most probable first."""
         return sorted(self.found.values(), key=lambda e: -e.weight)
@@ -138,11 +143,9 @@ class Explanations:
         where the mismatch is large: they may not live on what models are not exact to."""
         effects = tuple(effects)
         # What is wrong with the data is mended exactly: beside it the rest is what counts.
-        faults = frozenset(e.key for e in effects if not e.physical)
-        meant = self.found.get(faults) if faults else None
-        beside = self.model_error_penalty(
-            effects, meant.fitted.chi2 if meant else self._nominal_chi2
-        )
+        meant = self.meant(effects)
+        left = meant.fitted.chi2 if meant and meant.effects else self._nominal_chi2
+        beside = self.model_error_penalty(effects, left)
         small = sum(
             unknown.small(float(fitted.x[at]))
             for i, e in enumerate(effects)

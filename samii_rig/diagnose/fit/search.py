@@ -63,7 +63,7 @@ class Search(Explanations):
     def run(self, *, briefly: bool = False) -> list[Explanation]:
         """Forward, exchange, backward; all explanations, the most probable first. briefly : single
         effects alone, and beside what is wrong with the data."""
-        base = self.nominal if briefly else self._meant()
+        base = self.nominal if briefly else self._surely_meant()
         self.forward(base, FIRST, open_to_all=not briefly)
         if self._bent(self.ranked()[0]):
             self._forward_straight(base)
@@ -153,14 +153,14 @@ class Search(Explanations):
         n = self.nominal.fitted.model.n_nominal
         return max(self.nominal.fitted.penalty, best.fitted.penalty) > PENALISED * n
 
-    def _meant(self) -> Explanation:
-        """The nominal model of what was meant to be recorded: with what is wrong with the data,
-        where nothing without that comes near."""
+    def _surely_meant(self) -> Explanation:
+        """As of `meant` of the most probable, where nothing without what is wrong with the data
+        comes near."""
         best = self.ranked()[0]
-        faults = frozenset(e.key for e in best.effects if not e.physical)
-        rival = next((e for e in self.ranked() if not faults <= e.key), None)
+        meant = self.meant(best.effects) or self.nominal
+        rival = next((e for e in self.ranked() if not meant.key <= e.key), None)
         sure = rival is None or rival.weight < best.weight - 4 * NEAR
-        return self.found.get(faults, self.nominal) if sure else self.nominal
+        return meant if sure else self.nominal
 
     def _forward_straight(self, base: Explanation) -> None:
         """Forward from the rig as its file has it, once on the same lines."""

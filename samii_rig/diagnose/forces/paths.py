@@ -25,10 +25,6 @@ from samii_rig.model.sampled import dead_time, hold_at, sensors_at
 from samii_rig.types import Complex, Float, Int
 
 OVER = 4.0  # rate over the highest line: third harmonics fold beside the band, not into it
-METERS = (
-    "input_not_held",
-    "columns_shifted",
-)  # what says that a command was measured, if not exact
 DAMPING = 5.0  # of the contour: 0.7 % wraps around, what is cut above the rate grows 12 times
 
 
@@ -155,7 +151,8 @@ class TransferPaths:
         """Standard deviation of the noise that a meter has put on that command, 0 where it was
         recorded as it was sent: then its noise drives the rig. step : of the command's converter.
         """
-        if not any(e.physics in METERS and e.rough for e in self.model.effects):
+        # Of what is wrong with the data a meter alone is not exactly known.
+        if not any(e.rough and not e.physical for e in self.model.effects):
             return 0.0
         on, pieces = self.column(place), self.whole.records.pieces
         return max(meter_noise(by_input(c.v)[on], step) for p in pieces for c in p.commands[:1])

@@ -165,9 +165,9 @@ class ForceSearch(RecordSearch):
             linear = tuple(e for e in best.effects if e.force is None)
             x = np.delete(best.fitted.x, list(model.unknowns))
             base = self.refitted_from(linear, x)
-            if base is None or self._to_noise(base, best.fitted):
+            if base is None:
                 return
-            if self._consistent(base, best.fitted):
+            if self._to_noise(base, best.fitted) or self._consistent(base, best.fitted):
                 return
             del self.found[best.key]
 
@@ -181,7 +181,7 @@ class ForceSearch(RecordSearch):
         """Whether what one fit has more than another shows at all lines as it should, and is more
         than rounding may do along it."""
         samples = [len(p.z) for p in self.levels.records.pieces]
-        a, b = self.unexplained(before), self.unexplained(after)
+        a, b = self.unexplained(before, rounded=True), self.unexplained(after)
         fall = (before.chi2 - after.chi2) / as_rounding(a, b)
         even = evenly(a, b, samples, self.ratio(after)) > INCONSISTENT
         return even and fall > self.critical_value
@@ -362,10 +362,12 @@ class ForceSearch(RecordSearch):
         """As of `RecordSearch`."""
         return self._rest(fitted).residuals(fitted, self.reduced, shown=shown)
 
-    def unexplained(self, fitted: Fitted) -> list[Unexplained]:
-        """What a fit leaves of each piece."""
-        rest = self._rest(fitted)
-        return unexplained(rest.records, rest.response(fitted), self.reduced, rest.wired.loops)
+    def unexplained(self, fitted: Fitted, *, rounded: bool = False) -> list[Unexplained]:
+        """What a fit leaves of each piece. rounded : as of `unexplained`."""
+        rest, loops = self._rest(fitted), self.levels.wired.loops
+        return unexplained(
+            rest.records, rest.response(fitted), self.reduced, loops, rounded=rounded
+        )
 
     def _rest(self, fitted: Fitted) -> Whole:
         """The records as those of the linear part of a fit."""
@@ -407,9 +409,7 @@ def compete_on_records(linear: RecordSearch) -> ForceSearch:
 def _of_data(search: Explanations) -> Explanation:
     """What is wrong with the data by the most probable explanation, without what is missing of the
     rig: the nominal model where that is nothing."""
-    best = search.ranked()[0].effects
-    faults = frozenset(e.key for e in best if not e.physical)
-    return search.found.get(faults, search.nominal)
+    return search.meant(search.ranked()[0].effects) or search.nominal
 
 
 def _promising(scores: Sequence[Score], critical_value: float, at: int) -> list[Score]:

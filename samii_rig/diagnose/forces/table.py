@@ -41,7 +41,7 @@ STARTS = 14  # of a strength over its range
 RANGE = (1e-9, 30.0)  # of a strength over the one that doubles or halves the motion at its place
 SOFTEST = 1.0  # the same of a stiffness that falls: beyond, a spring would push
 WIDTHS = (1e-6, 2.0)  # of a gap or limit over the largest amplitude that meets it
-METERED = 3.0  # standard deviations of a meter's noise, which is beyond in 0.3 % of the samples
+BEYOND = 3.0  # standard deviations of a meter's noise, which is beyond in 0.3 % of the samples
 LEAST_LIMIT = 0.02  # of the largest command
 WEAKEST_SUPPLY = 1e4  # of the largest moment: the loss of flow is 1e-4/2 of the flow
 
@@ -117,7 +117,7 @@ def _drive(
     largest = paths.largest(drive)
     # What is narrower than a step of the command's converter is that converter's rounding; what is
     # as narrow as the noise of a meter takes that out where the command rests.
-    noise = METERED * paths.meter_noise(drive, actuator.resolution)
+    noise = BEYOND * paths.meter_noise(drive, actuator.resolution)
     low, high = max(WIDTHS[0] * largest, actuator.resolution, noise), WIDTHS[1] * largest
     wide = low < high
     if wide and turns and paths.ports(drive, of_speed=True) is not None:

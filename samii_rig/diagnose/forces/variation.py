@@ -115,8 +115,11 @@ class BySpring:
     @property
     def evidence(self) -> float:
         """Logarithm of the evidence of the spring that most speaks for, of all of them."""
-        most = max((one.evidence for _, one in self.strongest), default=-math.inf)
-        return most - math.log(max(len(self.springs.each), 1))
+        return max((self.evidence_of(one) for _, one in self.strongest), default=-math.inf)
+
+    def evidence_of(self, modulation: Modulation) -> float:
+        """Logarithm of the evidence of one spring's, as any other could have been the one."""
+        return modulation.evidence - math.log(len(self.springs.each))
 
 
 def variation(seen: BySpring, files: int) -> Variation | None:
@@ -147,7 +150,7 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     return Variation(
         sites=tuple(zip(names, (p / p.sum()).tolist(), strict=True)),
         parameters=parameters,
-        evidence=first.evidence - math.log(len(springs.each)),
+        evidence=seen.evidence_of(first),
         gain=float(np.sum(before[0] - after[0])) * each,
         before=(float(np.mean(before[0])), float(np.mean(before[1]))),
         after=(float(np.mean(after[0])), float(np.mean(after[1]))),
@@ -348,7 +351,7 @@ def _repeats_differ(pieces: Sequence[PieceModulation], hz: float) -> bool | None
 def _some(left: Sequence[Unexplained]) -> list[Unexplained]:
     """On the lines that are fitted."""
     each = [(x, fitted_lines(x.k)) for x in left]
-    return [x.at(on) for x, on in each]
+    return [replace(x, k=x.k[on], root=x.root[on], white=x.white[:, on]) for x, on in each]
 
 
 def _less(piece: Piece, added: Float) -> Piece:

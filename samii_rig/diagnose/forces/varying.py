@@ -45,7 +45,9 @@ FLAT = 1e-2  # of the distance between frequencies that are tried: nearer, chi-s
 SIDES = (1, 2)
 OWN = 1e-3  # of a force, to which what it does to itself is solved
 ROUNDED = 1e-6  # of the largest variance: less is rounding
-VARIANCES = 400  # that are tried: a decade of them has 40 or more, and likelihoods are flat there
+VARIANCES = (
+    400  # that are tried: 40 to a decade where records differ by ten, as likelihoods are flat there
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +160,8 @@ class PieceModulation:
     def exact(self, hz: float) -> tuple[float, int, float]:
         """Chi-square of all rows at a frequency, beyond what another constant stiffness of each
         does, its degrees of freedom, and what is known of both phases of a modulation."""
-        chi2, free, known = self._rows(hz)
-        return float(np.sum(chi2)), free * self.times.size, known
+        chi2, free, known = (float(x) for x in np.sum(self.each(hz), axis=0))
+        return chi2, round(free), known
 
     def each(self, hz: float) -> Float:
         """(rows, 3) chi-square of each row, its degrees of freedom, and what is known, as of
