@@ -7,7 +7,7 @@ optimum the logarithm of the response is fitted first, which has fewer wrong min
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -224,6 +224,44 @@ def refit(
     return Fitted(model, x, end.at.cost - penalty, penalty, J, J.T @ J)
 
 
+def profiled(
+    model: Model, problem: Problem, base: Fitted, starts: Iterable[Float]
+) -> list[Profiled]:
+    """Of vectors of `model`, which is that of `base` and more: each with the nominal parameters
+    brought to where they do best beside its other entries, by the derivatives at `base` alone.
+
+    That follows a curved valley as no step of both together does. Vectors that are no rig are left
+    out.
+    """
+    n, more = model.n_nominal, model.n - base.model.n
+    J = np.concatenate([base.jacobian, np.zeros((len(base.jacobian), more))], axis=1)
+    by = _Normal.of(model, np.zeros(model.n), J, np.zeros(len(J)))
+    out = []
+    for x in starts:
+        try:
+            h = model.response(x, problem.at)
+        except SamiiRigError:
+            continue
+        at = _Point(x, _cost(model, problem, x, h), h)
+        for _ in range(CORRECTIONS if n else 0):
+            g = _gradient(model, at.x, J, problem.residual(at.h))
+            new = _moved(model, problem, at.x, replace(by, g=g), DAMPING.least, nominal=True)
+            if new is None or not new.cost < at.cost:
+                break
+            at = new
+        if math.isfinite(at.cost):
+            out.append(Profiled(at.x, at.cost))
+    return sorted(out, key=lambda p: p.cost)
+
+
+@dataclass(frozen=True, slots=True)
+class Profiled:
+    """A vector, and the cost there."""
+
+    x: Float
+    cost: float
+
+
 @dataclass(frozen=True, slots=True)
 class _Point:
     """x, the cost there, the response h and its derivative dh, where both were computed."""
@@ -284,12 +322,13 @@ def _trial(
     new = _moved(model, problem, at.x, by, damping)
     if new is None:
         return None
+    nominal = 0 < model.n_nominal < model.n
     for _ in range(CORRECTIONS):
         if new.cost < at.cost:
             return new
         # Back into the curved valley along which the step went, by the same derivatives.
         g = _gradient(model, new.x, by.J, problem.residual(new.h))
-        back = _moved(model, problem, new.x, replace(by, g=g), damping)
+        back = _moved(model, problem, new.x, replace(by, g=g), DAMPING.least, nominal=nominal)
         if back is None:
             break
         new, before = back, new.cost
@@ -299,9 +338,12 @@ def _trial(
     return at if nothing else new
 
 
-def _moved(model: Model, problem: Problem, x: Float, by: Normal, damping: float) -> _Point | None:
-    """The point after a damped step from x; None where there is none, or no model there."""
-    new = move(model, x, by, damping)
+def _moved(
+    model: Model, problem: Problem, x: Float, by: Normal, damping: float, *, nominal: bool = False
+) -> _Point | None:
+    """The point after a damped step from x; None where there is none, or no model there. nominal :
+    whether the nominal parameters alone move."""
+    new = move(model, x, by, damping, nominal=nominal)
     if new is None:
         return None
     try:
@@ -311,14 +353,18 @@ def _moved(model: Model, problem: Problem, x: Float, by: Normal, damping: float)
     return _Point(new, _cost(model, problem, new, h), h)
 
 
-def move(model: Model, x: Float, by: Normal, damping: float) -> Float | None:
-    """x after a damped step within the bounds; unknowns held at a bound do not take part.
+def move(
+    model: Model, x: Float, by: Normal, damping: float, *, nominal: bool = False
+) -> Float | None:
+    """x after a damped step within the bounds; unknowns held at a bound do not take part. nominal :
+    whether the nominal parameters alone do.
 
     None where there is no step.
     """
     diagonal = np.diag(by.A)
     floor = 1e-12 * np.maximum(diagonal, 1e-12 * np.max(diagonal) + 1e-30)
     on = np.flatnonzero(~by.held(x, model.lower, model.upper))
+    on = on[on < model.n_nominal] if nominal else on
     if on.size == 0:
         return None
     limit = np.where(on < model.n_nominal, 4 * np.minimum(model.prior[on], 1e3), LONGEST)

@@ -11,12 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
-from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, named
+from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, named, threshold
 from samii_rig.diagnose.fit.ranking import moved, ranking
-from samii_rig.diagnose.fit.refit import Fitted, far_off, refit
+from samii_rig.diagnose.fit.refit import Fitted, far_off, profiled, refit
 from samii_rig.diagnose.fit.screen import Screen, Start
 from samii_rig.diagnose.fit.usual import LINES
 from samii_rig.diagnose.physics.effect import Effect
@@ -46,6 +47,7 @@ AHEAD, FINALISTS = 5, 5  # steps of a round of that, and how many go on after it
 FALLING = 0.5  # of its cost, after a leg, below which one is still on its way and runs another
 OTHERS = 3  # of other physics than theirs, that go on too
 SWITCHED = 12  # effects without unknowns that compete so: the nearest as the rig file has the rest
+PROFILED, MOST_PROFILED = 12, 2  # values of each unknown over its range, of so many at most
 BROAD = 4  # single effects of different physics that are extended where none is enough
 
 Candidate = tuple[float, tuple[Effect, ...], list[Float]]  # chi-square hoped for, and starts
@@ -79,6 +81,8 @@ class Search(Explanations):
         if briefly:
             self._plainer()
             return self.ranked()
+        if self.ratio(self.ranked()[0].fitted) > threshold(self.spread):
+            self._along_valleys()
         about = self.nominal.key
         for turn in range(MOST - 1):
             before = self._nearest() if turn == 0 else self.ranked()[0]
@@ -109,9 +113,19 @@ class Search(Explanations):
         if (best := self.ranked()[0]).key != about and best.effects:
             self.rebin_and_refit(best)
             self.take_overdispersion()
+        self._beside_what_was_meant()
         self._from_everywhere()
         self._plainer()
         return self.ranked()
+
+    def _beside_what_was_meant(self) -> None:
+        """Every single effect beside what is wrong with the data: an effect that mimics both hid
+        which of them is there."""
+        best = self.ranked()[0]
+        meant = self.meant(best.effects)
+        if meant is not None and 0 < len(meant.effects) < len(best.effects):
+            self.forward(meant, FIRST)
+            self.take_overdispersion()
 
     def _plainer(self) -> None:
         """The best with a law of fewer unknowns in place of each of its effects: a part that ends
@@ -144,6 +158,27 @@ class Search(Explanations):
             for tenth in TENTHS:
                 start = [math.log(u.starts[tenth * len(u.starts) // 10]) for u in unknowns]
                 end = self.refitted(e.effects, self.nominal, start, e.fitted.cost)
+                if end is not None:
+                    self.keep(e.effects, end)
+        self.take_overdispersion()
+
+    def _along_valleys(self) -> None:
+        """The most promising effect of each physics of several unknowns from all over their range,
+        where the best leaves more than noise: a narrow valley that bends with the nominal
+        parameters is found along these alone."""
+        for e in self.each(list(_each_physics(self.ranked()))[:BROAD], lambda e: named(e.effects)):
+            (effect,) = e.effects
+            if not 1 < len(effect.unknowns) <= MOST_PROFILED:
+                continue
+            each = (
+                np.linspace(math.log(u.low), math.log(u.high), PROFILED) for u in effect.unknowns
+            )
+            model = e.fitted.model
+            known = moved(self.nominal.fitted.model, self.nominal.fitted.x, model)
+            starts = (np.append(known, own) for own in product(*each))
+            found = profiled(model, self.problem, self.nominal.fitted, starts)
+            if found and found[0].cost < e.fitted.cost:
+                end = self.refitted_from(e.effects, found[0].x)
                 if end is not None:
                     self.keep(e.effects, end)
         self.take_overdispersion()

@@ -48,6 +48,7 @@ LESS = 0.08  # of the largest bound, below which a force is not
 PROMISING = 0.25  # of what the best force gains, at least
 AGAIN = 3  # times that the likelihood is made anew about the best explanation
 STILL = 0.5  # standard deviations, a move from one to the next that is none
+NO_MOVE = 1e-3  # of a logarithm: a refit of few steps has ended
 RENEWED = 6  # times that the chain through which a force acts is renewed in between
 RIVALS = 4  # linear explanations that forces are held against
 INCONSISTENT = 1e-4  # chance of a true force to explain lines as unevenly, below which it is none
@@ -57,7 +58,7 @@ BESIDE = 6  # linear effects that are refitted beside the best force, and the ot
 class ForceSearch(RecordSearch):
     """As `RecordSearch`, on the complete likelihood, with every level by itself."""
 
-    def __init__(self, linear: RecordSearch) -> None:
+    def __init__(self, linear: RecordSearch, known: Sequence[Explanation] = ()) -> None:
         assert isinstance(linear.whole, Whole)  # of one state
         self.levels = whole = linear.whole.by_level().with_harmonics()
         self._ways = Ways(acting=tuple(whole.acting.tolist()))
@@ -67,6 +68,10 @@ class ForceSearch(RecordSearch):
         self.forces = tuple(forces(whole.rig, self.paths))
         super().__init__(whole, linear.by_line)
         self.use((*linear.table, *self.forces))
+        for e in known:
+            end = self.refitted(e.effects, e, far=False)
+            if end is not None:
+                self.keep(e.effects, end)
 
     def __post_init__(self) -> None:
         self.stage = self.linear.stage
@@ -216,9 +221,21 @@ class ForceSearch(RecordSearch):
             if self.exhausted:
                 return
             effects = (*rival.effects, *(best.effects[i] for i in force))
-            end = self.refitted(effects, rival, strengths) if self.model(effects) else None
-            if end is not None:
+            if (model := self.model(effects)) is None:
+                continue
+            # The nominal parameters as they are beside the force: without it they stand elsewhere.
+            known = moved(best.fitted.model, best.fitted.x, model)[: model.n_nominal]
+            own = rival.fitted.x[rival.fitted.model.n_nominal :]
+            start = np.concatenate([known, own, strengths])
+            for _ in range(AGAIN):
+                self._ways.clear()
+                end = self.refitted_from(effects, start)
+                if end is None:
+                    break
                 self.keep(effects, end)
+                if float(np.max(np.abs(end.x - start))) < NO_MOVE:
+                    break
+                start = end.x
 
     def _try(self, scores: Sequence[Score], base: Explanation, at: int) -> None:
         """Refit the forces that may be the best beside `base`, by its gains there."""
@@ -396,12 +413,13 @@ class ForceSearch(RecordSearch):
         return self.problem
 
 
-def compete_on_records(linear: RecordSearch) -> ForceSearch:
-    """Let forces compete with what the linear search of whole records found.
+def compete_on_records(linear: RecordSearch, known: Sequence[Explanation] = ()) -> ForceSearch:
+    """Let forces compete with what the linear search of whole records found. known : explanations
+    with a force, of an earlier search.
 
     Raises SamiiRigError where no force can be computed on this rig.
     """
-    search = ForceSearch(linear)
+    search = ForceSearch(linear, known)
     search.settle()
     return search
 

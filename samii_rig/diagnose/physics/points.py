@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Literal
 
@@ -45,6 +45,8 @@ LOSS_STARTS = (0.05,)
 # Damping ratio of an oscillator: that of a steel part clamped well; with more it is a damper and
 # does not resonate.
 LEAST_DAMPED, MOST_DAMPED = 1e-3, 0.3
+# Of the mass of all bodies: who hangs more on a rig knows of it. Ten of SAMII are a car.
+MOST_HUNG = 10.0
 JOINTS = (TorsionalSpring, TranslationalSpring, *ANGLE_SOURCES)
 # Parts of the way along a stretch at which a search begins; its ends are ports. What moves a rigid
 # link goes with the square of the place at most; a beam has its modes between.
@@ -189,6 +191,28 @@ POINTS: tuple[Point, ...] = (
 
 def effects(rig: Rig, where: Places) -> Iterator[Effect]:
     """All of them on this rig."""
+    most = MOST_HUNG * _mass(rig)
+    for effect in _every(rig, where):
+        mass = effect.unknowns[0]
+        if effect.physics != HANGING.physics or most == 0 or mass.high <= most:
+            yield effect
+        elif mass.low < most:  # where hardly anything moves no mass matters
+            starts = tuple(x for x in mass.starts if x < most) or (math.sqrt(mass.low * most),)
+            cut = replace(mass, high=most, starts=starts)
+            yield replace(effect, unknowns=(cut, *effect.unknowns[1:]))
+
+
+def _mass(rig: Rig) -> float:
+    """kg of all bodies of a rig file."""
+    each = (
+        (p["mu"], p["L"]) if "mu" in p else (p["m"],)
+        for p in (parameters(e) for e in rig.element)
+        if "mu" in p or "m" in p
+    )
+    return sum(math.prod(x.value for x in one) for one in each)
+
+
+def _every(rig: Rig, where: Places) -> Iterator[Effect]:
     for row in POINTS:
         for port in range(len(where.names)):
             yield from _at_port(rig, where, row, port)

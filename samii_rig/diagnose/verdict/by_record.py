@@ -9,7 +9,7 @@ from samii_rig.diagnose.data.measured import DIFFER
 from samii_rig.diagnose.fit.agreeing import Given, several_states
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
-from samii_rig.diagnose.fit.explanations import threshold
+from samii_rig.diagnose.fit.explanations import Explanation, threshold
 from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
@@ -60,7 +60,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         best = search.ranked()[0]
         more = search.ratio(best.fitted) > threshold(search.spread)
         if best.key != single and (forced is not None or more):
-            forces = forces_on(search)
+            # What a force did beside a single effect competes with what it does beside pairs.
+            forces = forces_on(search, forced.ranked()[:1] if forced else ()) or forces
             forced = _winning(forces)
     search.begin("what cannot be distinguished")
     if forced is None:
@@ -217,11 +218,11 @@ def _of_lengths(
     )
 
 
-def forces_on(search: RecordSearch) -> ForceSearch | None:
+def forces_on(search: RecordSearch, known: Sequence[Explanation] = ()) -> ForceSearch | None:
     """The search among forces; None where the rig has no partial fractions in which they could be
-    computed."""
+    computed. known : as of `compete_on_records`."""
     try:
-        return compete_on_records(search)
+        return compete_on_records(search, known)
     except SamiiRigError:
         return None
 
