@@ -141,7 +141,7 @@ def _named(state: State) -> tuple[str, ...]:
 
 def _both(first: Case, second: Case, band: Band | None) -> tuple[Both, RecordSearch]:
     """The records of both states, and the search on those before."""
-    common = [name for name in first.clean.sensors if name in second.clean.sensors]
+    common = [name for name in first.sensors if name in second.sensors]
     wholes = []
     for name, case in (("before", first), ("after", second)):
         if why := case.not_whole():

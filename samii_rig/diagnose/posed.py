@@ -157,9 +157,7 @@ def _together(
 
     Raises EstimateError where those of one cannot be used whole, or have other channels.
     """
-    common = [
-        name for name in cases[0].clean.sensors if all(name in c.clean.sensors for c in cases)
-    ]
+    common = [name for name in cases[0].sensors if all(name in c.sensors for c in cases)]
     wholes = []
     for one, case, rig in zip(each, cases, rigs, strict=True):
         where = f"the recordings in pose {one.in_words}"

@@ -58,12 +58,14 @@ class Checked:
     samples: tuple[Finding, ...] = ()
     mend: Mend | None = None
 
-    @property
-    def sensors(self) -> tuple[str, ...]:
+    def sensors(self, rig: Rig) -> tuple[str, ...]:
         """Outputs that half of the responses hold, or more: it costs less to leave out the records
-        of the others."""
+        of the others; and those that a loop of the rig is closed around, without which nothing can
+        be said of any record."""
         held = Counter(c.name for r in self.responses for c in r.outputs)
-        return tuple(n for n, times in held.items() if 2 * times >= len(self.responses))
+        loops = (rig.centring_of(a.name) for a in rig.actuator)
+        closed = {loop.sensor for loop in loops if loop is not None}
+        return tuple(n for n, k in held.items() if n in closed or 2 * k >= len(self.responses))
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics: 9.81 is not 9.80665."""

@@ -160,6 +160,7 @@ class ForceSearch(RecordSearch):
         self.pair()
         self._alone()
         self._rivals()
+        self._plainer()
         self._forget_inconsistent()
         self.take_overdispersion()
 
@@ -214,28 +215,49 @@ class ForceSearch(RecordSearch):
         own = self.linear.found.get(beside)
         if not force or not beside or own is None:
             return
-        strengths = [best.fitted.x[k] for i in force for k in best.fitted.model.own(i)]
         ranked = self.linear.ranked()
         near = [e for e in ranked if e.key != beside and e.weight > own.weight - NEAR]
         for rival in self.each(near[:RIVALS], lambda e: named(e.effects)):
             if self.exhausted:
                 return
             effects = (*rival.effects, *(best.effects[i] for i in force))
-            if (model := self.model(effects)) is None:
+            self._beside_force(effects, rival.fitted.x[rival.fitted.model.n_nominal :], best)
+
+    def _beside_force(self, effects: tuple[Effect, ...], own: Float, best: Explanation) -> None:
+        """Refit the forces of `best` beside other linear effects. effects : these, then the
+        forces. own : unknowns of the linear ones."""
+        if (model := self.model(effects)) is None:
+            return
+        # The nominal parameters as they are beside the force: without it they stand elsewhere.
+        known = moved(best.fitted.model, best.fitted.x, model)[: model.n_nominal]
+        forces = [i for i, e in enumerate(best.effects) if e.force is not None]
+        strengths = [best.fitted.x[k] for i in forces for k in best.fitted.model.own(i)]
+        start = np.concatenate([known, own, strengths])
+        for _ in range(AGAIN):
+            self._ways.clear()
+            end = self.refitted_from(effects, start)
+            if end is None:
+                return
+            self.keep(effects, end)
+            if float(np.max(np.abs(end.x - start))) < NO_MOVE:
+                return
+            start = end.x
+
+    def _plainer(self) -> None:
+        """As of `Search`, beside the force of the best explanation."""
+        best = self.ranked()[0]
+        forces = tuple(e for e in best.effects if e.force is not None)
+        plain, rest = self.linear_part(best)
+        for i, gone in enumerate(rest.effects):
+            some = [e for e in self.linear.table if e.within(gone)]
+            less = plain.without_refit(rest, i) if some and forces else None
+            if less is None or self.exhausted:
                 continue
-            # The nominal parameters as they are beside the force: without it they stand elsewhere.
-            known = moved(best.fitted.model, best.fitted.x, model)[: model.n_nominal]
-            own = rival.fitted.x[rival.fitted.model.n_nominal :]
-            start = np.concatenate([known, own, strengths])
-            for _ in range(AGAIN):
-                self._ways.clear()
-                end = self.refitted_from(effects, start)
-                if end is None:
-                    break
-                self.keep(effects, end)
-                if float(np.max(np.abs(end.x - start))) < NO_MOVE:
-                    break
-                start = end.x
+            screen = Screen.of(plain.problem, less.fitted)
+            own = less.fitted.x[less.fitted.model.n_nominal :]
+            for _, effect, starts in ranking(screen, some, less.effects, plain.model):
+                effects = (*less.effects, effect, *forces)
+                self._beside_force(effects, np.append(own, np.log(starts[0])), best)
 
     def _try(self, scores: Sequence[Score], base: Explanation, at: int) -> None:
         """Refit the forces that may be the best beside `base`, by its gains there."""

@@ -33,7 +33,7 @@ def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | N
     if not case.runs or clean.mended or clean.refusal:
         return None
     try:
-        whole = Whole.of(case.runs, case.search.rig, band, clean.sensors, clean.samples)
+        whole = Whole.of(case.runs, case.search.rig, band, case.sensors, clean.samples)
         return RecordSearch(whole, case.search)
     except EstimateError:
         return None
@@ -256,7 +256,7 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
         unknown = replace(judged, verdict="unknown")
         return replace(looked, judged=unknown, remarks=(*looked.remarks, sides.describe()))
     found = variation(seen, files) if seen and seen.evidence > rival else None
-    if found is not None and found.evidence > rival:
+    if found is not None and found.evidence > rival and found.gain > judged.evidence.worth:
         varies = verdict.varying(judged, own, found, max(rival, 0.0))
         return _Looked(varies, found.before[1], found.after[1], found.gap, looked.remarks)
     more = judged.evidence.left > threshold(forces.spread)

@@ -352,7 +352,8 @@ def _critical_value(search: Search, less: Explanation) -> float:
 def _off(search: Search, e: Explanation) -> float:
     """Chi-square that an explanation leaves because the laws of its effects do not quite hold."""
     rough = max((effect.rough for effect in e.effects), default=0.0)
-    return rough**2 * (search.nominal.fitted.chi2 - e.fitted.chi2)
+    # What is wrong with the data none of them explains.
+    return rough**2 * (as_meant(search, e).fitted.chi2 - e.fitted.chi2) if rough else 0.0
 
 
 def _decided(search: Search, lines: Measured, ranked: list[Explanation]) -> list[Explanation]:

@@ -47,6 +47,11 @@ class Case:
     show: Measured
     files: Sequence[Saved] = ()
 
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """As of `Checked`."""
+        return self.clean.sensors(self.search.rig)
+
     def not_whole(self) -> str:
         """Why these records cannot be held sample by sample against others of one linear rig; ""
         where they can."""
