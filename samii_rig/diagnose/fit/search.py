@@ -35,6 +35,7 @@ TENTHS = (2, 5, 8)  # tenths of their range at which several unknowns start toge
 WEAK = (4, 5, 6)  # tenths of the range at which they start
 BEAM = 2  # explanations to which further effects are added
 HOPELESS = 20.0  # times the best chi-square, above which an explanation is let go
+APART = 3.0  # times the cost that an explanation seemed to have, above which it was no such one
 AGAIN, STILL = 4, 0.3  # times that bins are made anew at most, and a move that is none
 SWAPS = 2  # rounds of them, the second about what won the first
 ANYHOW = 2  # of the most promising in another's place are refitted whatever the screen says
@@ -442,7 +443,7 @@ class Search(Explanations):
         near = [e for e in self.ranked()[:FIRST] if e.weight > best.weight - 4 * NEAR]
         broad = list(_each_physics(self.ranked()))[:BROAD]
         keep = [e for e in (*near, *broad) if e.fitted.cost < HOPELESS * best.fitted.cost]
-        nominal = self.nominal
+        nominal, seemed = self.nominal, best.fitted.cost
         for _ in range(AGAIN):
             self.rebin(best.fitted)
             end = self.refitted(best.effects, best)
@@ -452,6 +453,11 @@ class Search(Explanations):
             best = replace(best, fitted=end)
             if still:
                 break
+        if best.effects and best.fitted.cost > APART * max(seemed, self.problem.expected):
+            # About itself it does nothing of what it seemed to from where it was looked for.
+            self.rebin(nominal.fitted)
+            keep = [e for e in keep if e.key != best.key]
+            best = nominal
         self.found.clear()
         again = list({e.key: e for e in (*keep, best, nominal)}.values())
         for e in self.each(again, lambda e: named(e.effects)):
