@@ -23,7 +23,7 @@ from samii_rig.diagnose.physics.poses import weighty
 from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_line import by_lines
-from samii_rig.diagnose.verdict.by_record import by_records, on_records
+from samii_rig.diagnose.verdict.by_record import by_records, on_records, whole_of
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.progress import Begun, Progress
 from samii_rig.rig.schema import Rig
@@ -80,7 +80,7 @@ def diagnose(
     progress(Begun("nominal model", takes=takes(RECORDS_TAKE if runs else LINES_TAKE, n)))
     case = case_of(responses, rig, band, effects, runs, progress=progress)
     case = replace(case, files=files)
-    search = on_records(case, band)
+    search = on_records(case)
     return by_lines(case) if search is None else by_records(case, search)
 
 
@@ -101,9 +101,12 @@ def case_of(
     lines = measured(trusted, rig, band)
     seen, decide, show = lines.splits()
     at = grid(rig, lines.frequency, lines.sensor, lines.actuator)
+    runs = runs if clean.mend is None else [clean.mend(run) for run in runs]
+    whole = whole_of(clean, runs, rig, band)
     if effects is None:
         low, high = float(lines.frequency[0]), float(lines.frequency[-1])
+        if whole is not None:  # whole records reach to where no response could be estimated
+            low, high = min(low, whole.records.band[0]), max(high, whole.records.band[1])
         effects = table(rig, low, high, signed=signed, recorded_hz=trusted[0].rate_hz)
     by_line = Search(rig, seen, at, clean.competing(effects), progress=progress)
-    runs = runs if clean.mend is None else [clean.mend(run) for run in runs]
-    return Case(clean, trusted, runs, lines, by_line, decide, show)
+    return Case(clean, trusted, runs, lines, by_line, decide, show, whole=whole)

@@ -54,7 +54,7 @@ def runs() -> dict[str, Recording]:
 
 def several(*runs: Recording) -> SeveralStates | None:
     case = case_of(estimate(runs), RIG, None, None, runs)
-    search = on_records(case, None)
+    search = on_records(case)
     assert search is not None
     found = several_states([Given.of(search, case.runs, case.clean.samples)])
     return found[0] if found else None

@@ -46,7 +46,7 @@ TRUE = Discrepancy(0.03, 0.2)
 
 
 def of(*runs: Recording) -> RecordSearch:
-    found = on_records(case_of(estimate(runs), RIG, None, FEW, runs), None)
+    found = on_records(case_of(estimate(runs), RIG, None, FEW, runs))
     assert found is not None
     return found
 

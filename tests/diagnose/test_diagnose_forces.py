@@ -142,7 +142,7 @@ def test_no_dead_band_is_narrower_than_a_step_of_the_commands_converter(
 
 def forces_of(runs: list[Recording]) -> ForceSearch:
     few = table_of(SAMII, 0.5, 20.0, *FEW)
-    linear = on_records(case_of(estimate(runs), SAMII, None, few, runs), None)
+    linear = on_records(case_of(estimate(runs), SAMII, None, few, runs))
     assert linear is not None
     return ForceSearch(linear)
 
@@ -255,7 +255,7 @@ def test_the_real_motor_has_dry_friction(recordings: Path) -> None:
         for f in sorted(recordings.glob(f"*motor-only_swept*amp-{n}_*"))
     ]
     rivals = table_of(motor, *band, "viscous_damping", "actuator_lag")
-    linear = on_records(case_of(estimate(runs, band=band), motor, band, rivals, runs), band)
+    linear = on_records(case_of(estimate(runs, band=band), motor, band, rivals, runs))
     assert linear is not None
     linear.run(briefly=True)
     search = compete_on_records(linear)

@@ -125,7 +125,7 @@ def test_friction_in_one_drive_is_named_there_and_not_at_the_other(how, joint: i
 def test_a_weak_force_at_either_input_does_to_first_order_what_it_does_in_time() -> None:
     """By the contour and each loop's answer against the march and the likelihood of the records."""
     runs = recorded(RIG, together())
-    linear = on_records(case_of(estimate(runs), RIG, None, FEW, runs), None)
+    linear = on_records(case_of(estimate(runs), RIG, None, FEW, runs))
     assert linear is not None
     search = ForceSearch(linear)
     each = list(weak_ones(search))

@@ -118,7 +118,7 @@ def test_a_spring_that_is_stiffer_to_one_side_is_none_that_swings(
 
 def search_in(folder: Path, band: tuple[float, float] | None) -> ForceSearch:
     runs = cut_sweeps(folder, design=DESIGN)
-    linear = on_records(case_of(estimate(runs, band=band), SAMII, band, FEW, runs), band)
+    linear = on_records(case_of(estimate(runs, band=band), SAMII, band, FEW, runs))
     assert linear is not None
     return ForceSearch(linear)
 

@@ -51,12 +51,17 @@ STILL = 0.5  # standard deviations, a move from one to the next that is none
 NO_MOVE = 1e-3  # of a logarithm: a refit of few steps has ended
 RENEWED = 6  # times that the chain through which a force acts is renewed in between
 RIVALS = 4  # linear explanations that forces are held against
-INCONSISTENT = 1e-4  # chance of a true force to explain lines as unevenly, below which it is none
+INCONSISTENT = 1e-4  # chance of a true effect to explain lines as unevenly, below which it is none
 BESIDE = 6  # linear effects that are refitted beside the best force, and the other way round
 
 
 class ForceSearch(RecordSearch):
-    """As `RecordSearch`, on the complete likelihood, with every level by itself."""
+    """As `RecordSearch`, on the complete likelihood, with every level by itself.
+
+    most_explained : of chi-square, the most that any force did, consistent or not.
+    """
+
+    most_explained = 0.0
 
     def __init__(self, linear: RecordSearch, known: Sequence[Explanation] = ()) -> None:
         assert isinstance(linear.whole, Whole)  # of one state
@@ -186,11 +191,24 @@ class ForceSearch(RecordSearch):
     def _consistent(self, before: Fitted, after: Fitted) -> bool:
         """Whether what one fit has more than another shows at all lines as it should, and is more
         than rounding may do along it."""
-        samples = [len(p.z) for p in self.levels.records.pieces]
         a, b = self.unexplained(before, rounded=True), self.unexplained(after)
         fall = (before.chi2 - after.chi2) / as_rounding(a, b)
-        even = evenly(a, b, samples, self.ratio(after)) > INCONSISTENT
-        return even and fall > self.critical_value
+        return self._evenly(a, b, after) and fall > self.critical_value
+
+    def _evenly(
+        self, before: Sequence[Unexplained], after: Sequence[Unexplained], fitted: Fitted
+    ) -> bool:
+        samples = [len(p.z) for p in self.levels.records.pieces]
+        return evenly(before, after, samples, self.ratio(fitted)) > INCONSISTENT
+
+    def explains_evenly(self, before: Explanation, after: Explanation) -> bool:
+        """Whether what one linear explanation has more than another shows at all lines of these
+        records as it should; so where it cannot be refitted to them."""
+        a = self.refitted(before.effects, before, far=False)
+        b = self.refitted(after.effects, after, far=False)
+        if a is None or b is None:
+            return True
+        return self._evenly(self.unexplained(a), self.unexplained(b), b)
 
     def _alone(self) -> None:
         """The force of the best explanation without each linear effect beside it, from where both
@@ -268,6 +286,8 @@ class ForceSearch(RecordSearch):
             effects = (*base.effects, score.effect)
             best = min(e.fitted.cost for e in self.found.values())
             end = self.refitted(effects, base, np.log(score.strengths).tolist(), best)
+            if end is not None:
+                self.most_explained = max(self.most_explained, base.fitted.chi2 - end.chi2)
             if end is not None and base.fitted.chi2 - end.chi2 > (
                 self.critical_value if base.effects else 0
             ):

@@ -61,7 +61,8 @@ class Variation:
     of freedom without it and with it, on the lines fitted and on those shown. gap : on those shown.
     inside : whether what it leaves of the lines fitted is no more than noise. again : whether
     records of one level differ, or one in itself, so that it is no law of the amplitude, and that
-    faster than what wanders; where the stiffness is constant in each, in several recordings.
+    faster than what wanders; where the stiffness is constant in each, in several recordings; and
+    whether no force does as much of it.
     """
 
     sites: tuple[tuple[str, float], ...]
@@ -147,18 +148,20 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     f = parameters.get("f")
     # As slow as what the lines leave out, it goes with what wanders, and its place with that.
     slow = f is not None and f.value * springs.longest < CYCLES
+    gain = float(np.sum(before[0] - after[0])) * each
+    lawful = search.most_explained > RIVAL * gain
     # Within one recording a force that remembers answers the first of several otherwise, too.
     remembered = f is None and files < 2
     return Variation(
         sites=tuple(zip(names, (p / p.sum()).tolist(), strict=True)),
         parameters=parameters,
         evidence=seen.evidence_of(first),
-        gain=float(np.sum(before[0] - after[0])) * each,
+        gain=gain,
         before=(float(np.mean(before[0])), float(np.mean(before[1]))),
         after=(float(np.mean(after[0])), float(np.mean(after[1]))),
         gap=gap_of(before[1], after[1], np.ones(after[1].size)),
         inside=bool(np.mean(after[0]) < threshold(taken.search.spread)),
-        again=taken.again and not (slow or remembered),
+        again=taken.again and not (slow or remembered or lawful),
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from samii_rig.diagnose.data.findings import Checked
 from samii_rig.diagnose.data.measured import DIFFER
 from samii_rig.diagnose.fit.agreeing import Given, several_states
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
@@ -19,6 +20,8 @@ from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.diagnose.verdict.stages import Case, Shown, diagnosis_of, of_states
 from samii_rig.errors import EstimateError, SamiiRigError
+from samii_rig.rig.schema import Rig
+from samii_rig.types import Recording
 
 EXHAUSTED = (
     "not every force that may act was computed to the end, as the records are long; fewer of them "
@@ -27,14 +30,22 @@ EXHAUSTED = (
 MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 
 
-def on_records(case: Case, band: tuple[float, float] | None) -> RecordSearch | None:
-    """The search on whole records, where they can be used as they are."""
-    clean = case.clean
-    if not case.runs or clean.mended or clean.refusal:
+def whole_of(
+    clean: Checked, runs: Sequence[Recording], rig: Rig, band: tuple[float, float] | None
+) -> Whole | None:
+    """The records, where they can be used as they are."""
+    if not runs or clean.mended or clean.refusal:
         return None
     try:
-        whole = Whole.of(case.runs, case.search.rig, band, case.sensors, clean.samples)
-        return RecordSearch(whole, case.search)
+        return Whole.of(runs, rig, band, clean.sensors(rig), clean.samples)
+    except EstimateError:
+        return None
+
+
+def on_records(case: Case) -> RecordSearch | None:
+    """The search on whole records, where there are any."""
+    try:
+        return None if case.whole is None else RecordSearch(case.whole, case.search)
     except EstimateError:
         return None
 
@@ -65,7 +76,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
             forced = _winning(forces)
     search.begin("what cannot be distinguished")
     if forced is None:
-        looked = _consistent(search, _looked(search))
+        looked = _even(forces, search, _consistent(search, _looked(search)))
     else:
         first, bands = _at_first(forced)
         looked = _looked(forced)
@@ -265,6 +276,17 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
         if beside is not None and beside.closed >= verdict.PARTLY:
             return replace(looked, remarks=(*looked.remarks, beside.describe()))
     return looked
+
+
+def _even(forces: ForceSearch | None, search: RecordSearch, looked: _Looked) -> _Looked:
+    """The same, but unknown where an effect does not explain at all lines what it says that it
+    does: a narrow one takes a few lines of what is in no row."""
+    judged = looked.judged
+    if forces is None or not judged.best.effects or judged.verdict not in verdict.WITH_CAUSES:
+        return looked
+    if forces.explains_evenly(verdict.as_meant(search, judged.best), judged.best):
+        return looked
+    return replace(looked, judged=replace(judged, verdict="unknown"))
 
 
 def _is_linear(judged: Judgement) -> bool:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from samii_rig.diagnose.data.findings import Checked, Refusal
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.agreeing import Saved, SeveralStates
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.result import Band, Cause, Diagnosis, Gap, Used
@@ -35,7 +36,8 @@ class Case:
     clean : the responses without what is no physics. responses : those that intervals can rest on.
     runs : the recordings. lines : of all responses; search : on those that are fitted; decide,
     show : those that decide, and those that show on what was found. files : the responses of each
-    file, where they were kept without their recordings.
+    file, where they were kept without their recordings. whole : the records, where they can be used
+    as they are.
     """
 
     clean: Checked
@@ -46,6 +48,7 @@ class Case:
     decide: Measured | None
     show: Measured
     files: Sequence[Saved] = ()
+    whole: Whole | None = None
 
     @property
     def sensors(self) -> tuple[str, ...]:
