@@ -351,9 +351,14 @@ def _critical_value(search: Search, less: Explanation) -> float:
 
 def _off(search: Search, e: Explanation) -> float:
     """Chi-square that an explanation leaves because the laws of its effects do not quite hold."""
-    rough = max((effect.rough for effect in e.effects), default=0.0)
-    # What is wrong with the data none of them explains.
-    return rough**2 * (as_meant(search, e).fitted.chi2 - e.fitted.chi2) if rough else 0.0
+    faults = max((x.rough for x in e.effects if not x.physical), default=0.0)
+    law = max((x.rough for x in e.effects if x.physical), default=0.0)
+    faulty = any(not x.physical for x in e.effects)
+    # What is wrong with the data no law of the rig explains.
+    meant = as_meant(search, e) if law and faulty else search.nominal
+    nominal = search.nominal.fitted.chi2
+    left = e.fitted.chi2
+    return max(faults**2 * (nominal - left), law**2 * (meant.fitted.chi2 - left))
 
 
 def _decided(search: Search, lines: Measured, ranked: list[Explanation]) -> list[Explanation]:
