@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from poses_kit import in_pose, loaded, two_links
 from poses_kit import recorded as swept_in_pose
@@ -58,6 +59,19 @@ def several(*runs: Recording) -> SeveralStates | None:
     assert search is not None
     found = several_states([Given.of(search, case.runs, case.clean.samples)])
     return found[0] if found else None
+
+
+def test_effects_are_looked_for_where_the_records_reach_and_no_response_does(runs) -> None:
+    """Below the first line of a response, where a transient looks the same, whole records say
+    something too."""
+    one = [runs["one"]]
+    case = case_of(estimate(one, band=(5.0, 20.0)), RIG, None, None, one)
+    assert case.whole is not None
+    low, high = case.whole.records.band
+    assert low < 2.0 < 25.0 < high
+    hung = next(e for e in case.search.table if e.physics == "attached_oscillator")
+    assert hung.unknowns[1].low <= 2 * np.pi * low * (1 + 1e-9)
+    assert hung.unknowns[1].high >= 2 * np.pi * high
 
 
 def test_a_spring_that_differs_between_two_recordings_is_told_at_its_place(runs):

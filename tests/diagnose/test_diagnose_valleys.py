@@ -1,23 +1,30 @@
 """A search that is led into a valley gets out of it: each of these once ended at a wrong answer."""
 
 from dataclasses import replace
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from diagnose_kit import ALL, LINES, concealing, effect
 from identify_kit import noiseless, samii
+from table_kit import table_of
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.fit.classes import Class
+from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.records import RecordSearch
-from samii_rig.diagnose.fit.refit import refit
+from samii_rig.diagnose.fit.refit import profiled, refit
 from samii_rig.diagnose.fit.search import PENALISED, Search
 from samii_rig.diagnose.physics import channels
 from samii_rig.diagnose.physics.channels import METERED
 from samii_rig.diagnose.physics.model import Model, grid
-from samii_rig.diagnose.verdict.judge import _is_insignificant
+from samii_rig.diagnose.verdict import by_record
+from samii_rig.diagnose.verdict.judge import Judgement, _is_insignificant
 from samii_rig.identify.bootstrap import redraw
+from samii_rig.rig.load import load_rig
+from samii_rig.rig.schema import parameters
 
 
 def search_of(response, effects, rig=None):
@@ -62,6 +69,64 @@ def test_they_are_tried_though_another_effect_seems_to_be_enough():
     assert best.effects == (mass,)
     assert search._enough(best)
     assert search._bent(best)
+
+
+def test_a_narrow_valley_that_bends_with_the_nominal_parameters_is_followed() -> None:
+    """Of a cylinder whose support gives: beside its oil and its leak 1e-5 of the response are left,
+    along which stiffness and damping change by factors."""
+    rig, _ = load_rig("cylinder")
+    f = np.geomspace(0.3, 50.0, 150)
+    gives = next(e for e in table_of(rig, 0.3, 50.0, "translational_compliance"))
+    model = Model(rig, (gives,))
+    true = [3.456e8, 0.049]
+    x = np.append(np.zeros(model.n_nominal), np.log(true))
+    at = grid(rig, f, np.arange(len(rig.sensor)), np.zeros(len(rig.sensor), dtype=np.int64))
+    exact = replace(noiseless(rig, f), H=model.response(x, at)[:, :, None])
+    exact = replace(exact, covariance=1e-6 * exact.covariance)
+    search = search_of(exact, [gives], rig)
+    known = moved(search.nominal.fitted.model, search.nominal.fitted.x, model)
+    each = [np.linspace(np.log(u.low), np.log(u.high), 12) for u in gives.unknowns]
+    starts = [np.append(known, own) for own in product(*each)]
+    found = profiled(model, search.problem, search.nominal.fitted, starts)
+    assert found[0].cost < 0.5 * search.nominal.fitted.cost
+    end = search.refitted_from((gives,), found[0].x)
+    assert end is not None
+    assert end.cost < 0.05 * search.nominal.fitted.cost
+    np.testing.assert_allclose(np.exp(end.x[-2:]), true, rtol=0.3)
+
+
+def test_nothing_hangs_on_a_rig_that_is_ten_times_as_heavy() -> None:
+    for name in ("sflr", "samii", "two_masses"):
+        rig, _ = load_rig(name)
+        hung = table_of(rig, 0.5, 40.0, "attached_oscillator")
+        bodies = [parameters(e) for e in rig.element]
+        mass = sum(p["m"].value for p in bodies if "m" in p)
+        mass += sum(p["mu"].value * p["L"].value for p in bodies if "mu" in p)
+        assert hung
+        assert all(e.unknowns[0].high <= 10 * mass * (1 + 1e-12) for e in hung)
+        assert all(
+            e.unknowns[0].low < s < e.unknowns[0].high for e in hung for s in e.unknowns[0].starts
+        )
+
+
+@pytest.mark.parametrize(("even", "verdict"), [(True, "named"), (False, "unknown")])
+def test_what_an_effect_explains_at_some_lines_only_is_unknown(even: bool, verdict: str) -> None:
+    hung = effect("attached_oscillator", "beam")
+    nominal = SimpleNamespace(effects=(), key=frozenset())
+    best = SimpleNamespace(effects=(hung,), key=frozenset([hung.key]), fitted=None)
+    best.fitted = SimpleNamespace(model=SimpleNamespace(own=lambda _: ()))
+    asked = []
+
+    def evenly(before: object, after: object) -> bool:
+        asked.append((before, after))
+        return even
+
+    judged = Judgement("named", (Class((best,), (0.0,), 1.0),), 0.0, 0.9, None, 1.0)
+    forces = SimpleNamespace(explains_evenly=evenly)
+    search = SimpleNamespace(found={nominal.key: nominal}, nominal=nominal)
+    looked = by_record._Looked(judged, 2.0, 1.0, None)
+    assert by_record._even(forces, search, looked).judged.verdict == verdict
+    assert asked == [(nominal, best)]
 
 
 def of(chi2, *effects):
