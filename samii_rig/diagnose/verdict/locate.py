@@ -24,6 +24,7 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.result import Trace
 from samii_rig.diagnose.verdict.judge import Judgement
+from samii_rig.errors import SamiiRigError
 from samii_rig.types import Complex, Float
 
 ROUNDS = 4  # of nominal parameters and x in turn
@@ -115,20 +116,21 @@ def traces(search: Search, judged: Judgement) -> tuple[Trace, ...]:
     said to be missing, all are about the refitted nominal model.
     """
     best, problem = judged.best, search.problem.lines
-    shown: list[Located] = []
+    tried: list[Located | None] = []
     for i, effect in enumerate(best.effects):
         base = _without(search, best, i)
         if base is not None and effect.jump is not None and effect.jump.states is not None:
             own = tuple(best.fitted.model.parts(best.fitted.x)[i].tolist())
             about = at_lines(base.fitted, search)
-            shown.append(locate(about, effect, problem, held=True, own=own))
+            tried.append(_located(about, effect, problem, held=True, own=own))
+    shown = [one for one in tried if one is not None]
     base = _without(search, best, 0) if best.effects else search.nominal
     if base is not None:
         taken = {i.effect.jump.place for i in shown if i.effect.jump is not None}
         mine = {e.key for e in base.effects}
         fitted = at_lines(base.fitted, search)
         found = [
-            locate(fitted, e, problem)
+            _located(fitted, e, problem)
             for e in search.table
             if e.physics in PROBES
             and e.jump is not None
@@ -136,8 +138,19 @@ def traces(search: Search, judged: Judgement) -> tuple[Trace, ...]:
             and e.jump.place not in taken
             and e.key not in mine
         ]
-        shown += sorted(found, key=lambda item: item.chi2)
+        shown += sorted((x for x in found if x is not None), key=lambda item: item.chi2)
     return tuple(_trace(item, search) for item in shown[:SHOWN])
+
+
+def _located(
+    base: Fitted, effect: Effect, problem: Problem, *, held: bool = False, own: Start | None = None
+) -> Located | None:
+    """`locate`; None where a part of the strengths that it is probed with leaves no rig: a mass
+    taken off a link that has less."""
+    try:
+        return locate(base, effect, problem, held=held, own=own)
+    except SamiiRigError:
+        return None
 
 
 def at_lines(fitted: Fitted, search: Search) -> Fitted:
