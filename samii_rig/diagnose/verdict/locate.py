@@ -143,7 +143,7 @@ def traces(search: Search, judged: Judgement) -> tuple[Trace, ...]:
 
 
 def _located(
-    base: Fitted, effect: Effect, problem: Problem, *, held: bool = False, own: Start | None = None
+    base: Fitted, effect: Effect, problem: Problem, *, held: bool = False, own: Start = ()
 ) -> Located | None:
     """`locate`; None where a part of the strengths that it is probed with leaves no rig: a mass
     taken off a link that has less."""
