@@ -80,7 +80,7 @@ def whole(name: str, rig: Rig, runs: Sequence[Recording]) -> None:
     """The whole robot without a part: both ways."""
     own = rig if name == "nothing" else sflr.less(rig, name)
     case = case_of(estimate(runs), own, sflr.BAND, table(own, *sflr.BAND), runs)
-    linear = on_records(case, sflr.BAND)
+    linear = on_records(case)
     assert linear is not None
     print(f"\n{name}: the refitted model leaves {linear.ratio(linear.nominal.fitted):.3g}\n")
     print(
@@ -103,7 +103,7 @@ def motor(rig: Rig, data: Path) -> None:
         for r in sflr.runs_of(data, f"*motor-only_swept*amp-{n}_*", "sflr_motor")
     ]
     effects = [e for e in table(own, *band) if e.physics in sflr.MOTOR_RIVALS]
-    linear = on_records(case_of(estimate(runs, band=band), own, band, effects, runs), band)
+    linear = on_records(case_of(estimate(runs, band=band), own, band, effects, runs))
     assert linear is not None
     linear.run(briefly=True)
     search = ForceSearch(linear)

@@ -181,7 +181,7 @@ def motor(data: Path, rig: Rig) -> None:
     ]
     rivals = [e for e in table(alone, *MOTOR_BAND) if e.physics in MOTOR_RIVALS]
     case = case_of(estimate(sweeps, band=MOTOR_BAND), alone, MOTOR_BAND, rivals, sweeps)
-    linear = on_records(case, MOTOR_BAND)
+    linear = on_records(case)
     if linear is None:
         print("\nmotor alone: the recordings cannot be used sample by sample")
         return

@@ -52,7 +52,7 @@ def found(folder: Path, truth: dict[str, Any]) -> Found | None:
     runs = [read_recording(path) for path in sorted(folder.glob("*.mcap"))]
     rig = parse(Rig, runs[0].rig_toml, "rig file")
     case = case_of(estimate(runs, gaps="model"), rig, None, None, runs)
-    search = on_records(case, None)
+    search = on_records(case)
     if not isinstance(search, RecordSearch):
         return None
     model = search.model(())
