@@ -118,10 +118,11 @@ def test_gauges_and_current_agree_with_finite_elements(damping: str) -> None:
     rig = gauged(damping)
     H = Chain(rig).response(F)
     size = np.abs(H).max(axis=0)
-    off = [np.max(np.abs(Fem(rig, elements=n).response(F) - H) / size, axis=0) for n in (40, 80)]
-    # A curvature inside an element is less exact than its motion: it falls with h^2.
-    assert np.max(off[1][:2]) < 2e-4
-    assert np.all(off[1][:2] < 0.35 * off[0][:2])
+    off = [np.max(np.abs(Fem(rig, elements=n).response(F) - H) / size, axis=0) for n in (10, 40)]
+    # A curvature inside an element is less exact than its motion: it falls with h^2, to a 16th.
+    # From 80 elements on rounding, which grows with h^-4, hides that.
+    assert np.max(off[1][:2]) < 2e-5
+    assert np.all(off[1][:2] < 0.1 * off[0][:2])
     assert off[1][2, 0] < 1e-5
     assert by_differences(rig, F) < 2e-5
     if damping:  # without damping the moment of the modes left out is missing

@@ -7,7 +7,7 @@ optimum the logarithm of the response is fitted first, which has fewer wrong min
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,7 +18,7 @@ from samii_rig.diagnose.fit import forms
 from samii_rig.diagnose.fit.forms import Form
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.errors import SamiiRigError
-from samii_rig.levenberg import ByFactor, Normal, Progress, descend, step
+from samii_rig.levenberg import ByFactor, Normal, Point, Progress, descend, step
 from samii_rig.types import Complex, Float
 
 STEPS = 40
@@ -226,15 +226,16 @@ def refit(
 
 def profiled(
     model: Model, problem: Problem, base: Fitted, starts: Iterable[Float]
-) -> list[Profiled]:
+) -> Sequence[Point]:
     """Of vectors of `model`, which is that of `base` and more: each with the nominal parameters
-    brought to where they do best beside its other entries, by the derivatives at `base` alone.
+    brought to where they do best beside its other entries, by the derivatives at `base` alone; the
+    best first.
 
     That follows a curved valley as no step of both together does. Vectors that are no rig are left
     out.
     """
-    n, more = model.n_nominal, model.n - base.model.n
-    J = np.concatenate([base.jacobian, np.zeros((len(base.jacobian), more))], axis=1)
+    more = np.zeros((len(base.jacobian), model.n - base.model.n))
+    J = np.concatenate([base.jacobian, more], axis=1)
     by = _Normal.of(model, np.zeros(model.n), J, np.zeros(len(J)))
     out = []
     for x in starts:
@@ -243,23 +244,14 @@ def profiled(
         except SamiiRigError:
             continue
         at = _Point(x, _cost(model, problem, x, h), h)
-        for _ in range(CORRECTIONS if n else 0):
-            g = _gradient(model, at.x, J, problem.residual(at.h))
-            new = _moved(model, problem, at.x, replace(by, g=g), DAMPING.least, nominal=True)
+        for _ in range(CORRECTIONS if model.n_nominal else 0):
+            new = _back(model, problem, at, by)
             if new is None or not new.cost < at.cost:
                 break
             at = new
         if math.isfinite(at.cost):
-            out.append(Profiled(at.x, at.cost))
+            out.append(at)
     return sorted(out, key=lambda p: p.cost)
-
-
-@dataclass(frozen=True, slots=True)
-class Profiled:
-    """A vector, and the cost there."""
-
-    x: Float
-    cost: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,13 +314,10 @@ def _trial(
     new = _moved(model, problem, at.x, by, damping)
     if new is None:
         return None
-    nominal = 0 < model.n_nominal < model.n
     for _ in range(CORRECTIONS):
         if new.cost < at.cost:
             return new
-        # Back into the curved valley along which the step went, by the same derivatives.
-        g = _gradient(model, new.x, by.J, problem.residual(new.h))
-        back = _moved(model, problem, new.x, replace(by, g=g), DAMPING.least, nominal=nominal)
+        back = _back(model, problem, new, by)
         if back is None:
             break
         new, before = back, new.cost
@@ -336,6 +325,14 @@ def _trial(
             break
     nothing = new.cost >= at.cost and np.max(np.abs(new.x - at.x)) < NOTHING
     return at if nothing else new
+
+
+def _back(model: Model, problem: Problem, at: _Point, by: _Normal) -> _Point | None:
+    """The point to which the derivatives of another lead back from one that left its curved
+    valley: by the nominal parameters alone where there are others. None as of `_moved`."""
+    g = _gradient(model, at.x, by.J, problem.residual(at.h))
+    nominal = 0 < model.n_nominal < model.n
+    return _moved(model, problem, at.x, replace(by, g=g), DAMPING.least, nominal=nominal)
 
 
 def _moved(

@@ -76,10 +76,7 @@ class ForceSearch(RecordSearch):
         self.forces = tuple(forces(whole.rig, self.paths))
         super().__init__(whole, linear.by_line)
         self.use((*linear.table, *self.forces))
-        for e in known:
-            end = self.refitted(e.effects, e, far=False)
-            if end is not None:
-                self.keep(e.effects, end)
+        self._again(known)
 
     def __post_init__(self) -> None:
         self.stage = self.linear.stage
@@ -93,8 +90,11 @@ class ForceSearch(RecordSearch):
     def _only(self, some: Sequence[Explanation]) -> None:
         """Refit some explanations, and forget all others."""
         self.found = {}
-        again = list({e.key: e for e in some}.values())
-        for e in self.each(again, lambda e: named(e.effects)):
+        self._again(list({e.key: e for e in some}.values()))
+
+    def _again(self, some: Sequence[Explanation]) -> None:
+        """Refit some explanations, each from where it ended."""
+        for e in self.each(some, lambda e: named(e.effects)):
             end = self.refitted(e.effects, e, far=False)
             if end is not None:
                 self.keep(e.effects, end)
@@ -289,11 +289,11 @@ class ForceSearch(RecordSearch):
             effects = (*base.effects, score.effect)
             best = min(e.fitted.cost for e in self.found.values())
             end = self.refitted(effects, base, np.log(score.strengths).tolist(), best)
-            if end is not None:
-                self.most_explained = max(self.most_explained, base.fitted.chi2 - end.chi2)
-            if end is not None and base.fitted.chi2 - end.chi2 > (
-                self.critical_value if base.effects else 0
-            ):
+            if end is None:
+                continue
+            fall = base.fitted.chi2 - end.chi2
+            self.most_explained = max(self.most_explained, fall)
+            if fall > (self.critical_value if base.effects else 0):
                 self.keep(effects, end)
 
     def _through(self, best: Explanation) -> None:

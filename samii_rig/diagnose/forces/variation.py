@@ -47,6 +47,8 @@ ROUNDS = 8  # times that the likelihood is made anew at most: 3 or 4 were usual
 # Of what the first explains, from which on another spring may be the one: as long as what varies
 # stands in the noise, neighbours gain nearly as much as the spring that does.
 RIVAL = 0.5
+# Of what it explains, above which a force that does as much makes a law of the amplitude as likely.
+LAWFUL = 0.5
 AGAIN = 1e-3  # chance of noise to make repeats differ as much, below which they do
 
 
@@ -149,7 +151,7 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     # As slow as what the lines leave out, it goes with what wanders, and its place with that.
     slow = f is not None and f.value * springs.longest < CYCLES
     gain = float(np.sum(before[0] - after[0])) * each
-    lawful = search.most_explained > RIVAL * gain
+    lawful = search.most_explained > LAWFUL * gain
     # Within one recording a force that remembers answers the first of several otherwise, too.
     remembered = f is None and files < 2
     return Variation(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, Literal
 
@@ -191,28 +191,6 @@ POINTS: tuple[Point, ...] = (
 
 def effects(rig: Rig, where: Places) -> Iterator[Effect]:
     """All of them on this rig."""
-    most = MOST_HUNG * _mass(rig)
-    for effect in _every(rig, where):
-        mass = effect.unknowns[0]
-        if effect.physics != HANGING.physics or most == 0 or mass.high <= most:
-            yield effect
-        elif mass.low < most:  # where hardly anything moves no mass matters
-            starts = tuple(x for x in mass.starts if x < most) or (math.sqrt(mass.low * most),)
-            cut = replace(mass, high=most, starts=starts)
-            yield replace(effect, unknowns=(cut, *effect.unknowns[1:]))
-
-
-def _mass(rig: Rig) -> float:
-    """kg of all bodies of a rig file."""
-    each = (
-        (p["mu"], p["L"]) if "mu" in p else (p["m"],)
-        for p in (parameters(e) for e in rig.element)
-        if "mu" in p or "m" in p
-    )
-    return sum(math.prod(x.value for x in one) for one in each)
-
-
-def _every(rig: Rig, where: Places) -> Iterator[Effect]:
     for row in POINTS:
         for port in range(len(where.names)):
             yield from _at_port(rig, where, row, port)
@@ -389,22 +367,38 @@ def _standing(
 HANGING = Point("attached_oscillator", "V", "w", "mass", "m", "", LumpedMass, "oscillator_")
 
 
-def _swinging(where: Places, x: float) -> tuple[Unknown, ...]:
-    """Mass, natural frequency and damping ratio of what hangs on; told as m, k, c."""
+def _swinging(rig: Rig, where: Places, x: float) -> tuple[Unknown, ...]:
+    """Mass, natural frequency and damping ratio of what hangs on; told as m, k, c. Empty where
+    hardly anything moves, so that no mass matters."""
     low_w, high_w = (2 * math.pi * float(where.frequency[i]) for i in (0, -1))
     scale = x / middle(where) ** 2
     # At its own frequency a mass does 1/(2 zeta) times what it does elsewhere.
     least = 2 * LEAST_DAMPED * SMALLEST
+    low, high = least * scale, min(3 * scale, MOST_HUNG * _mass(rig) or math.inf)
+    if low >= high:
+        return ()
+    starts = tuple(m for m in spread(SMALLEST * scale, 3 * scale, 7) if m < high)
     return (
-        Unknown("m", "kg", least * scale, 3 * scale, spread(SMALLEST * scale, 3 * scale, 7)),
+        Unknown("m", "kg", low, high, starts or (math.sqrt(low * high),)),
         Unknown("k", "N/m", low_w, 2 * high_w, spread(low_w, high_w, 48)),
         Unknown("c", "N s/m", LEAST_DAMPED, MOST_DAMPED, (0.05,)),
     )
 
 
+def _mass(rig: Rig) -> float:
+    """kg of all bodies of a rig file."""
+    each = (
+        (p["mu"], p["L"]) if "mu" in p else (p["m"],)
+        for p in (parameters(e) for e in rig.element)
+        if "mu" in p or "m" in p
+    )
+    return sum(math.prod(x.value for x in one) for one in each)
+
+
 def _hanging_at(rig: Rig, where: Places, port: int) -> Iterator[Effect]:
     x = where.strength(HANGING.pair, port)
-    if not 0 < x < math.inf:
+    unknowns = _swinging(rig, where, x) if 0 < x < math.inf else ()
+    if not unknowns:
         return
     names = where.names[port]
     name = f"{insert.PREFIX}{HANGING.tag}{port}"
@@ -413,7 +407,7 @@ def _hanging_at(rig: Rig, where: Places, port: int) -> Iterator[Effect]:
     yield Effect(
         physics=HANGING.physics,
         site=site,
-        unknowns=_swinging(where, x),
+        unknowns=unknowns,
         build=lambda r: insert.inserted(r, after, insert.oscillator(name)),
         parameters=lambda x, _: _hung(name, x),
         aliases=tuple((HANGING.physics, o) for o in others),
@@ -426,14 +420,15 @@ def _hanging_at(rig: Rig, where: Places, port: int) -> Iterator[Effect]:
 
 def _hanging_along(rig: Rig, where: Places, at: int, stretch: Along) -> Iterator[Effect]:
     x = _strength(where, HANGING.pair, at)
-    if not 0 < x < math.inf:
+    unknowns = _swinging(rig, where, x) if 0 < x < math.inf else ()
+    if not unknowns:
         return
     name = f"{insert.PREFIX}{HANGING.tag}{at}_{stretch.number}"
     yield _standing(
         rig,
         HANGING,
         stretch,
-        _swinging(where, x),
+        unknowns,
         (name, insert.oscillator(name)),
         lambda x: _hung(name, x),
         lambda x: _oscillating(x[:3]),

@@ -211,6 +211,8 @@ def as_meant(search: Explanations, best: Explanation) -> Explanation:
     """The nominal model of what was meant to be recorded: with what is no physics of `best`, which
     no physics gets the credit for."""
     meant = tuple(e for e in best.effects if not e.physical)
+    if not meant:
+        return search.nominal
     key = frozenset(e.key for e in meant)
     if key not in search.found:
         own = zip(best.effects, map(best.fitted.model.own, range(len(best.effects))), strict=True)
@@ -353,12 +355,11 @@ def _off(search: Search, e: Explanation) -> float:
     """Chi-square that an explanation leaves because the laws of its effects do not quite hold."""
     faults = max((x.rough for x in e.effects if not x.physical), default=0.0)
     law = max((x.rough for x in e.effects if x.physical), default=0.0)
-    faulty = any(not x.physical for x in e.effects)
-    # What is wrong with the data no law of the rig explains.
-    meant = as_meant(search, e) if law and faulty else search.nominal
     nominal = search.nominal.fitted.chi2
+    # What is wrong with the data no law of the rig explains.
+    meant = as_meant(search, e).fitted.chi2 if law else nominal
     left = e.fitted.chi2
-    return max(faults**2 * (nominal - left), law**2 * (meant.fitted.chi2 - left))
+    return max(faults**2 * (nominal - left), law**2 * (meant - left))
 
 
 def _decided(search: Search, lines: Measured, ranked: list[Explanation]) -> list[Explanation]:

@@ -11,6 +11,7 @@ tells whether the part can be there; the uncertain nominal parameters are projec
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -116,41 +117,36 @@ def traces(search: Search, judged: Judgement) -> tuple[Trace, ...]:
     said to be missing, all are about the refitted nominal model.
     """
     best, problem = judged.best, search.problem.lines
-    tried: list[Located | None] = []
+    shown: list[Located] = []
     for i, effect in enumerate(best.effects):
         base = _without(search, best, i)
         if base is not None and effect.jump is not None and effect.jump.states is not None:
             own = tuple(best.fitted.model.parts(best.fitted.x)[i].tolist())
             about = at_lines(base.fitted, search)
-            tried.append(_located(about, effect, problem, held=True, own=own))
-    shown = [one for one in tried if one is not None]
+            with suppress(SamiiRigError):  # as below
+                shown.append(locate(about, effect, problem, held=True, own=own))
     base = _without(search, best, 0) if best.effects else search.nominal
     if base is not None:
         taken = {i.effect.jump.place for i in shown if i.effect.jump is not None}
         mine = {e.key for e in base.effects}
         fitted = at_lines(base.fitted, search)
-        found = [
-            _located(fitted, e, problem)
+        probes = (
+            e
             for e in search.table
             if e.physics in PROBES
             and e.jump is not None
             and e.jump.fixed == 0
             and e.jump.place not in taken
             and e.key not in mine
-        ]
-        shown += sorted((x for x in found if x is not None), key=lambda item: item.chi2)
+        )
+        found = []
+        for probe in probes:
+            # With some of the strengths that it is probed with there may be no rig: a mass taken
+            # off a link that has less.
+            with suppress(SamiiRigError):
+                found.append(locate(fitted, probe, problem))
+        shown += sorted(found, key=lambda item: item.chi2)
     return tuple(_trace(item, search) for item in shown[:SHOWN])
-
-
-def _located(
-    base: Fitted, effect: Effect, problem: Problem, *, held: bool = False, own: Start = ()
-) -> Located | None:
-    """`locate`; None where a part of the strengths that it is probed with leaves no rig: a mass
-    taken off a link that has less."""
-    try:
-        return locate(base, effect, problem, held=held, own=own)
-    except SamiiRigError:
-        return None
 
 
 def at_lines(fitted: Fitted, search: Search) -> Fitted:
