@@ -79,3 +79,19 @@ def test_an_environment_that_was_left_half_made_is_made_again(tmp_path: Path, mo
     made = python.stat().st_ctime_ns
     make.environment()
     assert python.stat().st_ctime_ns == made
+
+
+def test_others_leave_a_processor_to_the_last_until_it_ends(tmp_path: Path, capsys) -> None:
+    if len(make.cpus()) < 2:
+        pytest.skip("there is one processor here")
+    # A process of a process, as a worker of pytest's is.
+    inner = "import os, time; print(os.sched_getaffinity(0)); time.sleep(2.0);"
+    inner += "print(os.sched_getaffinity(0), flush=True)"
+    outer = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {inner!r}])"
+    last = "import time; time.sleep(1.0)"
+    free = min(make.cpus())
+    command = [sys.executable, "-c", outer], [sys.executable, "-c", last]
+    assert make.side_by_side(*command, but=free) == [0, 0]
+    before, after = capsys.readouterr().out.splitlines()
+    assert before == str(make.cpus() - {free})
+    assert after == str(make.cpus())
