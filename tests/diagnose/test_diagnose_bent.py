@@ -55,6 +55,7 @@ def test_masses_have_places_of_their_own_where_a_bend_carries_them() -> None:
 POSES = ("20 deg, bent 60 deg", "80 deg, bent -30 deg")
 
 
+@pytest.mark.slow  # two whole diagnoses
 def test_a_mass_beyond_a_bend_is_found_over_poses_in_which_both_joints_turn() -> None:
     each = [in_pose(RIG, pose, i, loaded(0.1)) for i, pose in enumerate(POSES, 1)]
     found = in_poses(each, RIG, effects=FEW)

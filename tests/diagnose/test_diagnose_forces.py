@@ -52,6 +52,7 @@ def found_in(runs: list[Recording]) -> Diagnosis:
     return diagnose(estimate(runs), SAMII, runs=runs, effects=few)
 
 
+@pytest.mark.slow  # a minute on a loaded machine
 def test_a_hardening_joint_is_named_from_one_sweep_though_a_column_stands_late(tmp_path: Path):
     """Of a sweep that ends with its record. The column alone is a hundred times what the force is,
     and no place for it."""

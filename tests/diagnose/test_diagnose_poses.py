@@ -78,7 +78,10 @@ def test_a_mass_that_is_missing_in_all_poses_has_its_place_and_size():
 
 @pytest.mark.parametrize(
     ("change", "is_", "is_not"),
-    [(held, "ground_spring", "gravity_stiffness"), (weighed, "gravity_stiffness", "ground_spring")],
+    [
+        (held, "ground_spring", "gravity_stiffness"),
+        pytest.param(weighed, "gravity_stiffness", "ground_spring", marks=pytest.mark.slow),
+    ],
 )
 def test_a_spring_to_the_ground_and_a_weight_are_told_apart_by_a_second_pose(change, is_, is_not):
     hidden = [in_pose(RIG, pose, i, change(3.0)) for i, pose in enumerate(POSES, 1)]

@@ -72,6 +72,7 @@ def one_joint(hidden):
     return runs
 
 
+@pytest.mark.slow  # half a minute on a loaded machine
 def test_of_one_joint_driven_nothing_is_missing_where_nothing_is():
     """What the other's loop does follows the noise of its encoder: no change of its response is
     free, which would fit that noise."""

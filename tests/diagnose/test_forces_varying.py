@@ -329,6 +329,7 @@ def swinging(nothing: ForceSearch, site: str, hz: float, depth: float) -> ForceS
     return nothing.on(replace(nothing.levels, records=records), nothing.nominal.fitted)
 
 
+@pytest.mark.slow  # half a minute of a core
 def test_a_swing_that_is_put_into_the_records_is_taken_out_again(nothing: ForceSearch) -> None:
     """By as much as it was put in, to first order in all else that is refitted."""
     hz, depth = 0.7, 0.02
@@ -346,6 +347,7 @@ def test_a_swing_that_is_put_into_the_records_is_taken_out_again(nothing: ForceS
     assert found.after[0] < found.before[0]
 
 
+@pytest.mark.slow  # a minute of a core
 def test_which_spring_swings_is_decided_without_the_swing_in_the_noise(
     nothing: ForceSearch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
