@@ -31,7 +31,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from samii_rig.diagnose.diagnose import diagnose
-from samii_rig.diagnose.fit.records import RecordSearch, Whole
+from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.errors import SamiiRigError
 from samii_rig.likelihood.noise import Disturbances

@@ -24,7 +24,7 @@ from samii_rig.diagnose.diagnose import case_of, table
 from samii_rig.diagnose.fit.discrepancy import Discrepancy, _directions, weighed
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.explanations import Explanation, named
-from samii_rig.diagnose.fit.records import RecordSearch
+from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.verdict.by_record import on_records

@@ -22,7 +22,7 @@ import numpy as np
 from scipy import stats
 
 from samii_rig.diagnose.diagnose import case_of
-from samii_rig.diagnose.fit.records import RecordSearch
+from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.refit import refit
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.errors import SamiiRigError

@@ -14,7 +14,8 @@ from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit.agreeing import Given
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.known import with_known
-from samii_rig.diagnose.fit.records import RecordSearch, Whole, within
+from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.records import Whole, within
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.states import Both, StatesSearch
 from samii_rig.diagnose.fit.usual import STATES, STATES_TAKE, takes

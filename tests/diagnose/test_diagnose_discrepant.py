@@ -19,7 +19,7 @@ from samii_rig.diagnose.diagnose import case_of, table
 from samii_rig.diagnose.fit.discrepancy import Discrepancy
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.explanations import Explanation
-from samii_rig.diagnose.fit.records import RecordProblem, RecordSearch
+from samii_rig.diagnose.fit.record_search import RecordProblem, RecordSearch
 from samii_rig.diagnose.fit.refit import refit
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.physics.model import Model

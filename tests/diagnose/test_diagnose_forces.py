@@ -18,7 +18,8 @@ from weak_forces_kit import weak_ones
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit.explanations import Explanation, Explanations
-from samii_rig.diagnose.fit.records import RecordProblem, Whole
+from samii_rig.diagnose.fit.record_search import RecordProblem
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.fit.stated import IN_DATA

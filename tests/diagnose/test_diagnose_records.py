@@ -13,7 +13,8 @@ from table_kit import Effects, table_of
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose
-from samii_rig.diagnose.fit.records import RecordProblem, Whole, _unfolded
+from samii_rig.diagnose.fit.record_search import RecordProblem
+from samii_rig.diagnose.fit.records import Whole, _unfolded
 from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
 from samii_rig.diagnose.forces.variation import BySpring, Variation
 from samii_rig.diagnose.physics.model import Model, grid

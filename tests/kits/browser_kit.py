@@ -37,8 +37,9 @@ class Browser:
         port = told.read_text().split("\n")[0]
         pages = httpx.get(f"http://127.0.0.1:{port}/json", timeout=WITHIN).json()
         url = next(p["webSocketDebuggerUrl"] for p in pages if p["type"] == "page")
+        # Between two tests nobody reads: pings would find no answer behind what the page has said.
         self._socket: ClientConnection = connect(
-            url, max_size=None, open_timeout=WITHIN
+            url, max_size=None, open_timeout=WITHIN, ping_interval=None
         ).__enter__()
         self._asked = 0
         self.errors: list[str] = []

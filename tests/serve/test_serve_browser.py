@@ -154,12 +154,14 @@ def test_a_run_tells_what_it_knows_while_it_goes_on(
             browser.colours(scheme)
             assert violations(browser) == []
         with service.lease() as lease:
-            service.start(lease, sweep(duration=8.0, repeats=60), diagnosis=True)
+            service.start(lease, sweep(duration=8.0, repeats=150), diagnosis=True)
             # Nothing is measured: all is hatched, and says so.
-            browser.until("document.getElementById('frf-about').textContent.includes('0 of 60')")
+            browser.until("document.getElementById('frf-about').textContent.includes('0 of 150')")
             browser.until("/[1-9] repeats/.test(document.getElementById('frf-about').textContent)")
-            assert "of 60 segments whole" in browser.text("frf-about")
-            browser.until("document.getElementById('diagnosis-age').textContent.includes(' old')")
+            assert "of 150 segments whole" in browser.text("frf-about")
+            # A diagnosis comes after everything else of the machine; the run is long enough for it.
+            old = "document.getElementById('diagnosis-age').textContent.includes(' old')"
+            browser.until(old, within=280.0)
             # Before there are repeats there is no answer, and no chance of one.
             nothing = "textContent.includes('Chance that nothing is missing')"
             browser.until(f"document.getElementById('diagnosis-facts').{nothing}")
@@ -180,7 +182,7 @@ def test_a_run_tells_what_it_knows_while_it_goes_on(
         browser.until("document.getElementById('frf-about').textContent.startsWith('Last run')")
         assert "goes on" not in browser.text("frf-about")
         browser.until("document.getElementById('frf-about').textContent.includes('all that was')")
-        assert re.search(r"recorded: \d+ of 60 segments whole", browser.text("frf-about"))
+        assert re.search(r"recorded: \d+ of 150 segments whole", browser.text("frf-about"))
         assert browser.value("document.getElementById('frf-hatched').hidden")
         service.kill()
         browser.until("document.getElementById('motion').ariaLabel.includes('not live')")

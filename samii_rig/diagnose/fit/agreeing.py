@@ -22,7 +22,8 @@ from functools import cached_property, partial
 import numpy as np
 
 from samii_rig.diagnose.data.measured import DIFFER, PERIODIC, Measured, measured, repeated
-from samii_rig.diagnose.fit.records import RecordSearch, Whole, within
+from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.records import Whole, within
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.likelihood.pieces import Piece

@@ -22,7 +22,8 @@ from samii_rig.diagnose.fit.agreeing import kept
 from samii_rig.diagnose.fit.discrepancy import Discrepancy, weighed
 from samii_rig.diagnose.fit.explanations import UNEXPLAINED, Explanation, named
 from samii_rig.diagnose.fit.ranking import moved
-from samii_rig.diagnose.fit.records import RecordProblem, RecordSearch, Whole
+from samii_rig.diagnose.fit.record_search import RecordProblem, RecordSearch
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.likelihood.reduce import Reduced
 from samii_rig.types import Int

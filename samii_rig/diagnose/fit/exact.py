@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from samii_rig.diagnose.fit.explanations import threshold
-from samii_rig.diagnose.fit.records import RecordSearch, Whole
+from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import LARGE_MISMATCH, Search
 from samii_rig.diagnose.result import Exact, Value

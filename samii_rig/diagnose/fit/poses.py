@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from samii_rig.diagnose.fit.records import RecordSearch, Whole
+from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.summed import Stacked, Summed, parts_of

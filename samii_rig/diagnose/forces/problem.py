@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from scipy import signal
 
-from samii_rig.diagnose.fit.records import RecordProblem, Whole
+from samii_rig.diagnose.fit.record_search import RecordProblem
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.forces.model import ForceModel, RecordGrid
 from samii_rig.diagnose.forces.way import Ways

@@ -16,7 +16,8 @@ import numpy as np
 
 from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, named, threshold
 from samii_rig.diagnose.fit.ranking import moved, ranking
-from samii_rig.diagnose.fit.records import RecordSearch, Whole
+from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import STEPS, Fitted
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.laws import FRICTION

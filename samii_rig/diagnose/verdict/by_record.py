@@ -11,7 +11,8 @@ from samii_rig.diagnose.fit.agreeing import Given, several_states
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
 from samii_rig.diagnose.fit.explanations import Explanation, threshold
-from samii_rig.diagnose.fit.records import TURN, RecordSearch, Whole
+from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.records import TURN, Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.variation import BySpring, Variation, uneven_spring, variation
