@@ -90,6 +90,7 @@ def truth(rng: np.random.Generator, *values: float) -> tuple[Model, Float]:
     return model, x
 
 
+@pytest.mark.slow  # half a minute on a loaded machine
 def test_scale_and_length_of_a_discrepancy_are_found_again(nothing):
     rng = np.random.default_rng(1)
     found = []

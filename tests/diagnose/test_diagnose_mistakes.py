@@ -150,6 +150,7 @@ def test_it_is_told_and_no_physics_is_named(physics, site, said):
     assert any(site in words for words in found.not_physics)
 
 
+@pytest.mark.slow  # half a minute on a loaded machine
 def test_a_shift_stays_a_shift_where_a_dead_time_fits_by_less_than_models_are_exact_to():
     """2 us beside 4 ms are 7 noise units, and 5e-4 of what is wrong."""
     table = list(faults.effects(TWO, TWO.rate_hz))

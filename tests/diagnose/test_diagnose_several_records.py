@@ -42,6 +42,7 @@ def test_where_nothing_is_missing_two_inputs_say_so(how):
     assert found.causes == ()  # of forces neither
 
 
+@pytest.mark.slow  # half a minute each
 @pytest.mark.parametrize("how", [IN_TURN, "together"])
 def test_a_dead_time_of_one_input_is_named_there_and_not_at_the_other(how):
     found = found_in(recorded(late("v_3", 1e-3), HOW[how]()))

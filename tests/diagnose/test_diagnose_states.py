@@ -93,6 +93,7 @@ def test_where_nothing_changed_it_says_so(plain):
     assert two < 0.2 * one
 
 
+@pytest.mark.slow  # two whole diagnoses
 def test_a_change_that_is_stated_is_not_looked_for(plain):
     after = recorded(1, stiffness("joint_2", 0.97))
     k = scene().setup.part("joint_2").values["k"]

@@ -206,6 +206,7 @@ def test_a_strength_is_known_no_better_than_its_law():
     assert sure.with_model_error() is sure
 
 
+@pytest.mark.slow  # half a minute on a loaded machine
 def test_of_two_effects_the_one_behind_what_mimics_both_is_grown():
     """An oil line mimics damper and late sensor together better than either does alone."""
     element = tuple(

@@ -122,6 +122,7 @@ def test_friction_in_one_drive_is_named_there_and_not_at_the_other(how, joint: i
     assert found.with_causes[0] < found.threshold
 
 
+@pytest.mark.slow  # that of one input is test_diagnose_forces
 def test_a_weak_force_at_either_input_does_to_first_order_what_it_does_in_time() -> None:
     """By the contour and each loop's answer against the march and the likelihood of the records."""
     runs = recorded(RIG, together())

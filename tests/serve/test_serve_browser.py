@@ -142,6 +142,7 @@ def type_into(browser: Browser, id_: str, replaced: str) -> None:
     )
 
 
+@pytest.mark.slow  # minutes on a loaded machine, of diagnoses while a run goes on
 def test_a_run_tells_what_it_knows_while_it_goes_on(
     browser: Browser, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
