@@ -174,20 +174,18 @@ def side_by_side(*commands: Sequence[str | Path], but: int | None = None) -> lis
     """Run commands at once; the last prints as it goes, each other when it ends. Their exit
     codes. but : a processor that the others leave to the last, as long as it runs."""
     codes, running = [], []
-    all_cpus = cpus()
     with ExitStack() as stack:
         for command in commands[:-1]:
             said = stack.enter_context(TemporaryFile("w+", encoding="utf-8"))
             words = [str(word) for word in command]
             process = subprocess.Popen(words, cwd=ROOT, stdout=said, stderr=STDOUT)
             if but is not None:
-                os.sched_setaffinity(process.pid, all_cpus - {but})
+                keep_to(process.pid, cpus() - {but})
             running.append((command, process, said))
         last = run(*commands[-1])
-        for _, process, _ in running if but is not None else ():
-            for thread in threads(process.pid):
-                with suppress(OSError):  # it has ended
-                    os.sched_setaffinity(thread, all_cpus)
+        if but is not None:
+            for _, process, _ in running:
+                keep_to(process.pid, cpus())
         for command, process, said in running:
             code = process.wait()
             said.seek(0)
@@ -198,15 +196,13 @@ def side_by_side(*commands: Sequence[str | Path], but: int | None = None) -> lis
     return [*codes, last]
 
 
-def threads(pid: int) -> list[int]:
-    """Of a process and all that it has started, as Linux numbers them."""
-    out = []
-    for task in Path("/proc", str(pid), "task").glob("*"):
-        out.append(int(task.name))
-        with suppress(OSError):
-            for child in (task / "children").read_text().split():
-                out += threads(int(child))
-    return out
+def keep_to(pid: int, processors: set[int]) -> None:
+    """Let a process and all that it has started run on these alone."""
+    for thread in Path("/proc", str(pid), "task").glob("*"):
+        with suppress(OSError):  # it has ended
+            os.sched_setaffinity(int(thread.name), processors)
+            for child in (thread / "children").read_text().split():
+                keep_to(int(child), processors)
 
 
 def docs(arguments: list[str]) -> None:

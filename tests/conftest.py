@@ -88,9 +88,6 @@ def _first() -> Iterator[None]:
     Not by a real-time priority: a test also computes, and Linux takes a processor from who has such
     a priority for 50 ms of each second that he fills; longer than a device waits for its host.
     """
-    if not hasattr(os, "setpriority"):  # Windows
-        yield
-        return
     before = os.getpriority(os.PRIO_PROCESS, 0)
     with suppress(PermissionError):
         os.setpriority(os.PRIO_PROCESS, 0, -10)  # a share of 9 to 1 beside each ordinary process

@@ -43,7 +43,7 @@ def test_where_nothing_is_missing_two_inputs_say_so(how):
 
 
 @pytest.mark.slow  # half a minute each
-@pytest.mark.parametrize("how", [IN_TURN, "together"])
+@pytest.mark.parametrize("how", list(HOW))
 def test_a_dead_time_of_one_input_is_named_there_and_not_at_the_other(how):
     found = found_in(recorded(late("v_3", 1e-3), HOW[how]()))
     assert found.verdict == "named"

@@ -4,6 +4,7 @@ the gate was doing, within the channel's age limit and 50 ms."""
 import re
 import time
 from collections.abc import Iterator
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -180,15 +181,12 @@ def test_a_reader_that_dies_is_an_event(wire, monkeypatch):
     def dies(*_):
         raise SystemExit
 
-    device = open_device(rig, {})
-    try:
+    with closing(open_device(rig, {})) as device:
         gated = Gated(rig, device)
         monkeypatch.setattr(device.parts["ft"].bus, "recv", dies)
         gated.until_fault()
-        assert gated.reason.startswith("ft: ")
-        assert "the reader has ended: SystemExit" in gated.reason
-    finally:
-        device.close()
+    assert gated.reason.startswith("ft: ")
+    assert "the reader has ended: SystemExit" in gated.reason
 
 
 def test_gauges_that_stand_still_while_the_output_moves_are_a_fault(wire):
@@ -210,11 +208,8 @@ def test_frames_that_are_lost_are_never_a_wrong_sample(wire):
     wire.rest()
     # Two seconds without a good sample: only what is taken for a sample is looked at here.
     rig = patient(wire.rig, 2.0)
-    device = open_device(rig, {})
-    try:
+    with closing(open_device(rig, {})) as device:
         lossy(wire, rig, device)
-    finally:
-        device.close()
 
 
 def lossy(wire: CanWire, rig: Rig, device: OpenRig) -> None:

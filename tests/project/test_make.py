@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 from conftest import ROOT
+from wait_kit import WITHIN
 
 sys.path.insert(0, str(ROOT))
 import make
@@ -84,14 +85,22 @@ def test_an_environment_that_was_left_half_made_is_made_again(tmp_path: Path, mo
 def test_others_leave_a_processor_to_the_last_until_it_ends(tmp_path: Path, capsys) -> None:
     if len(make.cpus()) < 2:
         pytest.skip("there is one processor here")
-    # A process of a process, as a worker of pytest's is.
-    inner = "import os, time; print(os.sched_getaffinity(0)); time.sleep(2.0);"
-    inner += "print(os.sched_getaffinity(0), flush=True)"
+    begun, free = str(tmp_path / "begun"), min(make.cpus())
+    # A process of a process, as a worker of pytest is, until it is moved; the last waits for it.
+    inner = f"""
+import os, pathlib, time
+before = os.sched_getaffinity(0)
+print(before, flush=True)
+pathlib.Path({begun!r}).touch()
+end = time.monotonic() + {WITHIN}
+while os.sched_getaffinity(0) == before and time.monotonic() < end:
+    time.sleep(0.01)
+print(os.sched_getaffinity(0), flush=True)
+"""
     outer = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {inner!r}])"
-    last = "import time; time.sleep(1.0)"
-    free = min(make.cpus())
-    command = [sys.executable, "-c", outer], [sys.executable, "-c", last]
-    assert make.side_by_side(*command, but=free) == [0, 0]
+    last = f"import os, time\nwhile not os.path.exists({begun!r}): time.sleep(0.01)"
+    each = [sys.executable, "-c", outer], [sys.executable, "-c", last]
+    assert make.side_by_side(*each, but=free) == [0, 0]
     before, after = capsys.readouterr().out.splitlines()
     assert before == str(make.cpus() - {free})
     assert after == str(make.cpus())

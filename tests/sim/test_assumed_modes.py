@@ -499,8 +499,8 @@ def test_what_a_stiffness_far_off_explains_costs_no_more_than_that(
 
     assert refit.left(of(1.0)).sigma > 10 * abs(far)  # another valley
     found = refit.cooled(of(1.0)) if way == "cooled" else size.grown(refit, of, 1.0)
-    # It is found where its cost is flat, to a few hundredths; how few, rounding decides.
-    assert found.sigma <= abs(far) * 1.05
+    # What grows ends where its cost is flat, to a few hundredths; how few, rounding decides.
+    assert found.sigma <= abs(far) * (1.001 if way == "cooled" else 1.05)
 
 
 def test_a_small_effect_s_sigma_is_that_of_the_linear_algebra(scene: trial.Scene) -> None:

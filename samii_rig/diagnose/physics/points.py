@@ -369,7 +369,9 @@ HANGING = Point("attached_oscillator", "V", "w", "mass", "m", "", LumpedMass, "o
 
 def _swinging(rig: Rig, where: Places, x: float) -> tuple[Unknown, ...]:
     """Mass, natural frequency and damping ratio of what hangs on; told as m, k, c. Empty where
-    hardly anything moves, so that no mass matters."""
+    nothing moves, or hardly anything, so that no mass matters."""
+    if not 0 < x < math.inf:
+        return ()
     low_w, high_w = (2 * math.pi * float(where.frequency[i]) for i in (0, -1))
     scale = x / middle(where) ** 2
     # At its own frequency a mass does 1/(2 zeta) times what it does elsewhere.
@@ -396,8 +398,7 @@ def _mass(rig: Rig) -> float:
 
 
 def _hanging_at(rig: Rig, where: Places, port: int) -> Iterator[Effect]:
-    x = where.strength(HANGING.pair, port)
-    unknowns = _swinging(rig, where, x) if 0 < x < math.inf else ()
+    unknowns = _swinging(rig, where, where.strength(HANGING.pair, port))
     if not unknowns:
         return
     names = where.names[port]
@@ -419,8 +420,7 @@ def _hanging_at(rig: Rig, where: Places, port: int) -> Iterator[Effect]:
 
 
 def _hanging_along(rig: Rig, where: Places, at: int, stretch: Along) -> Iterator[Effect]:
-    x = _strength(where, HANGING.pair, at)
-    unknowns = _swinging(rig, where, x) if 0 < x < math.inf else ()
+    unknowns = _swinging(rig, where, _strength(where, HANGING.pair, at))
     if not unknowns:
         return
     name = f"{insert.PREFIX}{HANGING.tag}{at}_{stretch.number}"
