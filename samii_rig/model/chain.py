@@ -7,7 +7,7 @@ beam that carries an accelerometer is divided there, so it counts as two element
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -87,8 +87,10 @@ class CompiledChain:
         beam, and of that beam's L.
     places : for each port (element, m from its upstream end); the base is at 0 of the first.
     branches : (element of the kernels, chain, index into `parameters` of its first).
-    rigid : indices into `parameters` that cannot change without a new chain, as a sensor or a
-        position divides the beam whose length they are.
+    rigid : indices into `parameters` that cannot change without a new chain, as a sensor stands at
+        the end of the beam whose length they are, or its tension is cut into steps.
+    divided : index into `parameters` of a beam's length, and m of the last sensor or position that
+        divides it: a beam that ends before is another chain.
     readings : (sensor, law of `laws.READINGS`, element of the kernels) of the sensors whose reading
         depends on what they stand on.
     weight : what gravity loads, None without it.
@@ -112,11 +114,17 @@ class CompiledChain:
     places: tuple[tuple[str, float], ...]
     branches: tuple[tuple[int, CompiledChain, int], ...]
     rigid: frozenset[int]
+    divided: tuple[tuple[int, float], ...]
     readings: tuple[tuple[int, str, int], ...] = ()
     weight: Weight | None = None
 
+    def holds(self, values: Float, changed: Iterable[int]) -> bool:
+        """Whether it may have these values of all parameters, of which some are changed."""
+        longer = all(values[i] > last for i, last in self.divided)
+        return longer and self.rigid.isdisjoint(changed)
+
     def with_values(self, values: Float) -> CompiledChain:
-        """The same chain with other values of all parameters; none of `rigid` may change."""
+        """The same chain with other values of all parameters, which it `holds`."""
         padded = _padded(values, self.weight)
         pars = padded[self.slots] + self.fixed
         source = padded[self.source_slots] + self.source_fixed
@@ -128,7 +136,8 @@ class CompiledChain:
             self.weight.load(pars, [c.mass() for _, c, _ in branches])
         system = self.system._replace(pars=pars)
         if self.sources:
-            dual = np.column_stack([system.source_c[:, :4], source[:, 0]])
+            dual = system.source_c.copy()
+            dual[:, 4] = source[:, 0]
             system = system._replace(source_c=dual)
         return replace(self, system=system, values=values, source_values=source, branches=branches)
 
@@ -165,7 +174,9 @@ class CompiledChain:
 
 def _padded(values: Float, weight: Weight | None) -> Float:
     """The values, the loads (still 0) and the 0 of what is no parameter."""
-    return np.append(values, np.zeros(1 + (weight.size if weight else 0)))
+    out = np.zeros(values.size + 1 + (weight.size if weight else 0))
+    out[: values.size] = values
+    return out
 
 
 def _kind(element: Element, pull: float) -> int:
@@ -239,6 +250,7 @@ class _Parts:
         self.lines: list[str] = []
         self.branches: list[tuple[int, CompiledChain, int]] = []
         self.rigid: set[int] = set()
+        self.divided: list[tuple[int, float]] = []
         self.rows = {JUMP: 0, WAVES: 0}
 
     def add(self, element: Element, pull: float) -> None:
@@ -282,7 +294,10 @@ class _Parts:
             self._op(element, slot, fixed)
             self.places.append((element.name, stop))
         if isinstance(element, BEAMS) and inside:
-            self.rigid.add(index[L_OF_BEAM])
+            if pull:  # its tension is cut into steps along its length
+                self.rigid.add(index[L_OF_BEAM])
+            else:
+                self.divided.append((index[L_OF_BEAM], inside[-1]))
 
     def _moment(self, element: Element) -> None:
         """The moment of gravity on a body, before it."""
@@ -471,5 +486,6 @@ def _assemble(
         places=tuple(parts.places),
         branches=tuple(parts.branches),
         rigid=frozenset(parts.rigid),
+        divided=tuple(parts.divided),
         weight=weight,
     )

@@ -12,15 +12,14 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel
 
 from samii_rig.errors import InputError
 from samii_rig.model import timoshenko
+from samii_rig.model.allowed import Allowed
 from samii_rig.model.chain import L_OF_BEAM, compile_chain
 from samii_rig.model.factors import bind, characteristic, differentiate, read, read_slopes
 from samii_rig.model.kernels import respond
@@ -30,11 +29,8 @@ from samii_rig.rig.schema import (
     Element,
     Rig,
     Sensor,
-    Strain,
-    flattened,
     parameters,
 )
-from samii_rig.rig.schema.elements import contradiction, quantities
 from samii_rig.types import Complex, Float
 
 State = Literal["w", "theta", "M", "V"]
@@ -58,8 +54,7 @@ class Chain:
         self._rig = rig
         self._c = compile_chain(rig)
         self._changed: dict[tuple[str, str], float] = {}
-        self._index = {key: i for i, key in enumerate(self._c.parameters)}
-        self._checks = _checks(rig)
+        self._allowed = Allowed(rig, self._c.parameters)
         self.parameters = self._c.parameters
 
     @property
@@ -83,20 +78,15 @@ class Chain:
 
         Raises InputError for an unknown parameter or a value that the rig file would not allow.
         """
-        new, index = self._c.values.copy(), self._index
-        for key, value in values.items():
-            if key not in index:
-                raise InputError("with_values", ".".join(key), value, "a known parameter")
-            new[index[key]] = value
-        for name in {name for name, _ in values}:
-            self._checks[name].refuse(self._c.parameters, new, values)
-        if any(index[key] in self._c.rigid for key in values):
+        new = self._c.values.copy()
+        at = self._allowed.put(values, new)
+        if not self._c.holds(new, at.tolist()):
             return Chain(_with(self.rig, values))
         other = Chain.__new__(Chain)
         other._rig = self._rig
         other._changed = {**self._changed, **values}
         other._c = self._c.with_values(new)
-        other._index, other._checks, other.parameters = index, self._checks, self.parameters
+        other._allowed, other.parameters = self._allowed, self.parameters
         return other
 
     def response(self, frequency_hz: ArrayLike) -> Complex:
@@ -251,59 +241,6 @@ class Chain:
         for i, actuator in enumerate(x.source[:, 1]):
             driven[:, actuator] += out[:, i] * (x.source_c[i, 4] * f.drive[i])[:, None, None]
         return driven
-
-
-@dataclass(frozen=True, slots=True)
-class _Check:
-    """What the values of one element must be.
-
-    first : place of its first parameter among the chain's. reach : m, the farthest sensor on it.
-    """
-
-    kind: type[BaseModel]
-    first: int
-    symbols: tuple[str, ...]
-    reach: float
-
-    def refuse(
-        self,
-        keys: Sequence[tuple[str, str]],
-        values: Float,
-        given: Mapping[tuple[str, str], float],
-    ) -> None:
-        allowed = quantities(self.kind)
-        for i, symbol in enumerate(self.symbols):
-            key = keys[self.first + i]
-            if key in given:
-                value = float(values[self.first + i])
-                quantity = allowed.get(symbol)
-                wrong = quantity.refusal(value) if quantity else None
-                if wrong is None and not math.isfinite(value):
-                    wrong = f"value {value:g}; expected a finite number"
-                if wrong is None and symbol == "L" and value < self.reach:
-                    wrong = (
-                        f"value {value:g} m; expected at least {self.reach:g}, where a sensor is"
-                    )
-                if wrong:
-                    raise InputError.saying("with_values", ".".join(key), wrong)
-        own = dict(zip(self.symbols, values[self.first :].tolist(), strict=False))
-        wrong = contradiction(self.kind, own)
-        if wrong:
-            raise InputError.saying("with_values", keys[self.first][0], wrong)
-
-
-def _checks(rig: Rig) -> dict[str, _Check]:
-    out, first = {}, 0
-    for element in flattened(rig.element):
-        symbols = tuple(parameters(element))
-        on = [
-            x.position
-            for x in rig.sensor
-            if isinstance(x, Acceleration | Strain) and x.on == element.name
-        ]
-        out[element.name] = _Check(type(element), first, symbols, max(on, default=0.0))
-        first += len(symbols)
-    return out
 
 
 def _with(rig: Rig, values: Mapping[tuple[str, str], float]) -> Rig:

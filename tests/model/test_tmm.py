@@ -385,3 +385,35 @@ def test_values_given_are_values_used() -> None:
     up, down = (chain.with_values({("joint_2", "k"): 0.108e5 * (1 + x)}) for x in (h, -h))
     slope = (up.response([5.0]) - down.response([5.0])) / (2 * h * 0.108e5)
     np.testing.assert_allclose(chain.gradient([5.0])[1][..., at], slope, rtol=1e-6)
+
+
+def accelerometer_on_the_beam(length: float) -> Rig:
+    """A clamped beam of some length, 0.3 m from whose root an accelerometer stands."""
+    beam = ("beam", "beam", {**BEAM, "L": length})
+    last = ("last", "rigid_link", {"L": 0.5, "r": 0.2, "m": 3.0, "I": 0.04})
+    made = rig(beam, SOURCE, last, base="clamped", tip="free").model_dump()
+    on = {"name": "a", "kind": "acceleration", "on": "beam", "position": 0.3, "unit": "m/s^2"}
+    return Rig.model_validate({**made, "sensor": [on]})
+
+
+@pytest.mark.parametrize("L", [0.35, 0.70001, 0.9])
+def test_a_beam_that_a_sensor_divides_is_as_long_as_it_is_said_to_be(L: float) -> None:
+    s = 1.0 + 2j * math.pi * np.geomspace(0.5, 300.0, 60)
+    plain = Chain(accelerometer_on_the_beam(0.7))
+    longer, built = plain.with_values({("beam", "L"): L}), Chain(accelerometer_on_the_beam(L))
+    assert np.max(np.abs(longer.evaluate(s) / plain.evaluate(s) - 1)) > 1e-6
+    np.testing.assert_allclose(longer.evaluate(s), built.evaluate(s), rtol=1e-9)
+    np.testing.assert_allclose(longer.gradient_at(s)[1], built.gradient_at(s)[1], rtol=1e-7)
+    for one, other in zip(longer.characteristic(s), built.characteristic(s), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9)
+    again = longer.with_values({("beam", "L"): 0.7})
+    np.testing.assert_allclose(again.evaluate(s), plain.evaluate(s), rtol=1e-9)
+
+
+def test_a_beam_ends_behind_the_sensor_on_it() -> None:
+    chain = Chain(accelerometer_on_the_beam(0.7))
+    with pytest.raises(InputError, match=r"beam\.L.*0\.3"):
+        chain.with_values({("beam", "L"): 0.29})
+    last = chain.with_values({("beam", "L"): 0.3})  # where the sensor is its end
+    built = Chain(accelerometer_on_the_beam(0.3))
+    np.testing.assert_allclose(last.response([1.0, 30.0]), built.response([1.0, 30.0]), rtol=1e-12)

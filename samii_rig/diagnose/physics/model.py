@@ -136,8 +136,7 @@ class Far:
         each, terms = [], []
         for way in (1, -1):
             known = [way * k for k in FAR]
-            T = np.stack([_term(rig, chain, s, k, sensor, actuator) for k in known])
-            T = T / _held(s, rig.rate_hz)
+            T = _terms(rig, chain, s, known, sensor, actuator) / _held(s, rig.rate_hz)
             behind = there([way * k for k in FARTHER])
             size = np.sum(np.abs(T), axis=1)
             octave = np.log2(FAR[-1] / FAR[len(FAR) // 2])
@@ -251,8 +250,8 @@ class Aliases:
     def of(cls, rig: Rig, chain: Chain, few: Float, sensor: Int, actuator: Int) -> Aliases:
         """Of a chain of the rig."""
         s = np.asarray(2j * np.pi * few, np.complex128)
-        near = sum(_term(rig, chain, s, k, sensor, actuator) for k in (0, *NEAR))
-        rest = sampled_response(rig, few, chain)[:, sensor, actuator] - near
+        near = _terms(rig, chain, s, (0, *NEAR), sensor, actuator)
+        rest = sampled_response(rig, few, chain)[:, sensor, actuator] - near.sum(axis=0)
         far = Far.of(rig, chain, few, sensor, actuator)
         return cls(few, rest / _held(s, rig.rate_hz), far)
 
@@ -267,11 +266,14 @@ def _held(s: Complex, rate_hz: float) -> Complex:
     return np.asarray(-np.expm1(-s / rate_hz)[:, None])
 
 
-def _term(rig: Rig, chain: Chain, s: Complex, k: int, sensor: Int, actuator: Int) -> Complex:
-    """(n, q) alias k of a chain at s (n,)."""
-    upper = _upper(s, k, rig.rate_hz)
-    term = chain.evaluate(upper)[:, sensor, actuator] * _around(rig, upper, sensor, actuator)
-    return _lower(term, k)
+def _terms(
+    rig: Rig, chain: Chain, s: Complex, orders: Sequence[int], sensor: Int, actuator: Int
+) -> Complex:
+    """(order, n, q) aliases of a chain at s (n,), all asked for at once."""
+    upper = np.concatenate([_upper(s, k, rig.rate_hz) for k in orders])
+    every = chain.evaluate(upper)[:, sensor, actuator] * _around(rig, upper, sensor, actuator)
+    each = every.reshape(len(orders), s.size, -1)
+    return np.stack([_lower(term, k) for term, k in zip(each, orders, strict=True)])
 
 
 def _upper(s: Complex, k: int, rate_hz: float) -> Complex:
@@ -313,7 +315,7 @@ def grid(
     chain = Chain(rig) if chain is None else chain
     made = aliases(chain, few) if aliases else Aliases.of(rig, chain, few, sensor, actuator)
     s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
-    folded = np.stack([_term(rig, chain, s, k, sensor, actuator) for k in NEAR])
+    folded = _terms(rig, chain, s, NEAR, sensor, actuator)
     every = made.spread(s, rig.rate_hz) + folded.sum(axis=0)
     factor = _around(rig, s, sensor, actuator)
     own: Complex | None = None
