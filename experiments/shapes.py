@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from samii_rig.errors import EstimateError
 from samii_rig.identify.modal import Modes
@@ -133,7 +133,7 @@ def _point(m: int, rig: Rig, sensor: object, value: Value, model: float) -> Shap
 
 def write_table(path: Path, shapes: ScanShapes) -> Path:
     """A CSV file of all points, replaced if it exists."""
-    half = float(stats.norm.ppf((1 + LEVEL) / 2))
+    half = float(special.ndtri((1 + LEVEL) / 2))
     with path.open("w", newline="", encoding="utf-8") as file:
         out = csv.writer(file)
         out.writerow(COLUMNS)
@@ -162,7 +162,7 @@ def draw(path: Path, shapes: ScanShapes, joints: Sequence[tuple[str, float]]) ->
 
 
 def _draw_mode(ax: Axes, shapes: ScanShapes, m: int, joints: Sequence[tuple[str, float]]) -> None:
-    half = float(stats.norm.ppf((1 + LEVEL) / 2))
+    half = float(special.ndtri((1 + LEVEL) / 2))
     ax.plot(*shapes.curves[m], color="0.45", lw=1.3, label="model")
     inside = [p for p in shapes.points if p.mode == m]
     ax.errorbar(

@@ -102,7 +102,7 @@ def pendulum(response: FrequencyResponse, rig: Rig, lowest: float) -> Pendulum:
     larger than the variances say. EstimateError for fewer than three lines.
     """
     # They take seconds; a test's file is looked at without them.
-    from scipy import stats
+    from scipy import special
 
     from samii_rig.model.sampled import sampled_response
     from samii_rig.model.tmm import Chain
@@ -126,7 +126,7 @@ def pendulum(response: FrequencyResponse, rig: Rig, lowest: float) -> Pendulum:
     x = N @ (A.T @ (y / sd))
     free = y.size - 2
     spread = max(1.0, float(np.sum((y / sd - A @ x) ** 2)) / free)
-    half = stats.t.ppf((1 + LEVEL) / 2, free) * np.sqrt(spread * np.diagonal(N))
+    half = special.stdtrit(free, (1 + LEVEL) / 2) * np.sqrt(spread * np.diagonal(N))
     return Pendulum(float(x[0]), float(x[1]), (float(half[0]), float(half[1])))
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from samii_rig.errors import EstimateError, InputError, one_of
 from samii_rig.identify.identifiability import identifiability
@@ -358,7 +358,7 @@ def _fit(r: Float, tests: Float) -> Fit:
     if not tests.size:
         return Fit(1.0, 1.0, r.size)
     chi2, mean, unit = float(r @ r), float(np.sum(tests)), float(np.sum(tests**2) / np.sum(tests))
-    return Fit(chi2 / mean, float(stats.chi2.sf(chi2 / unit, mean / unit)), r.size)
+    return Fit(chi2 / mean, float(special.chdtrc(mean / unit, chi2 / unit)), r.size)
 
 
 def _left(fitted: _Problem, x: Float) -> tuple[ModeLeft, ...]:

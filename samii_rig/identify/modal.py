@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.identify.data import Data, Lines, collect
@@ -249,7 +249,7 @@ def _ratio(model: Rational, m: int, a: int, b: int) -> tuple[complex, Float]:
 
 def _real(model: Rational, m: int) -> bool:
     """Whether noise would hardly make residues as large as those of pair m."""
-    return bool(stats.chi2.sf(wald(model, m), 2 * len(model.coefficients)) < CHANCE)
+    return bool(special.chdtrc(2 * len(model.coefficients), wald(model, m)) < CHANCE)
 
 
 def _zeros(

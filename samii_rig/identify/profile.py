@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from samii_rig.errors import InputError
 from samii_rig.identify.likelihood import minimise, noise_misfit
@@ -47,7 +47,7 @@ def profile(posed: Problem, found: Identification, name: str, level: float = 0.9
     start = float(posed.space.start[i])
     centre = np.log(found.values / posed.space.start)
     here = minimise(noise_misfit, posed.data, posed.space, posed.predictor, centre)
-    quantile = float(stats.norm.ppf((1 + level) / 2))
+    quantile = float(special.ndtri((1 + level) / 2))
     step = quantile * min(float(np.sqrt(found.log_covariance[i, i])), 1.0)
     below, closed_low = _side(posed, here, i, -1.0, quantile, step)
     above, closed_high = _side(posed, here, i, 1.0, quantile, step)

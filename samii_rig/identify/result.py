@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from samii_rig.identify.data import Data
 from samii_rig.identify.identifiability import Identifiability
@@ -82,7 +82,7 @@ class Identification:
         Where the model is refused they are wider by `inflation`: the misfit, taken for noise.
         """
         sd = np.sqrt(np.diag(self.log_covariance)) * self.inflation()
-        factor = np.exp(float(stats.norm.ppf((1 + level) / 2)) * sd)
+        factor = np.exp(float(special.ndtri((1 + level) / 2)) * sd)
         ends = np.stack([self.values / factor, self.values * factor])
         return np.min(ends, axis=0), np.max(ends, axis=0)
 
@@ -94,7 +94,7 @@ class Identification:
         data know is linear in the value, or in its inverse, and no longer in its logarithm.
         """
         low, high = self.interval()
-        reach = float(stats.norm.isf(TAIL)) * self.inflation()
+        reach = -float(special.ndtri(TAIL)) * self.inflation()
         width = reach * np.sqrt(np.diag(self.log_covariance))
         for i, name in enumerate(self.names):
             if name not in self.at_bound:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from samii_rig.errors import EstimateError
 from samii_rig.modal.lines import Lines, lines_of
@@ -55,7 +55,7 @@ class Value:
 
     def half(self, level: float = LEVEL) -> float:
         """Half the width of `interval`."""
-        return float(stats.norm.ppf((1 + level) / 2)) * self.sd
+        return float(special.ndtri((1 + level) / 2)) * self.sd
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,7 @@ class Mode:
     def shape_interval(self, level: float = LEVEL) -> tuple[Float, Float]:
         """(n_out,) half widths of the intervals of the shape's real and imaginary parts."""
         sd = np.sqrt(np.diagonal(self.shape_covariance, axis1=1, axis2=2))
-        half = float(stats.norm.ppf((1 + level) / 2)) * sd
+        half = float(special.ndtri((1 + level) / 2)) * sd
         return half[:, 0], half[:, 1]
 
     @property

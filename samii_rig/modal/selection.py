@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from samii_rig.errors import EstimateError
 from samii_rig.modal.lines import Lines
@@ -167,7 +167,7 @@ def _chance(d: Lines, gain: Float, lines: Float, fit: Fit, count: int) -> Float:
     groups = np.maximum(lines / d.shared[0], 1.0)
     m = 2 * np.minimum(groups * (nu - d.p), 1e9)
     noise = 1.0 if fit.holds else max(fit.ratio, 1.0)
-    return np.minimum(count * stats.f.sf(gain / noise / k, k, m), 1.0)
+    return np.minimum(count * special.fdtrc(k, m, np.maximum(gain, 0.0) / noise / k), 1.0)
 
 
 def _pruned(d: Lines, model: Rational, grid: Complex) -> Rational:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from samii_rig.signal.spectra import Spectrum
 from samii_rig.signal.statistics import octaves
@@ -236,7 +236,7 @@ def _chance(power: Float, noise: Float, scatter: Complex, nu: int, dof: tuple[in
     free = nu**2 / ((nu - 1) * (nu + 2)) * (square - trace / nu)
     most = 2.0 * power.size
     parts = float(np.clip((trace - 2 * free / nu) / free, 1.0, most)) if free > 0 else most
-    return float(stats.f.sf(F, dof[0] * parts, dof[1] * parts))
+    return float(special.fdtrc(dof[0] * parts, dof[1] * parts, F))
 
 
 def _smooth(x: Float) -> Float:

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 from scipy.ndimage import binary_dilation, median_filter
 
 from samii_rig.errors import EstimateError
@@ -164,7 +164,7 @@ def transient_left(Z: Complex) -> Complex:
     # The last two periods differ by noise; a median does not see the few lines that still ring.
     noise = median_filter(np.abs(d[-1, :, 1:]) ** 2, (POOLED, 1)) / np.log(2)
     w = d[:, :, 1:] / np.sqrt(np.maximum(noise, 1e-300))
-    loud = np.sum(np.abs(w[0]) ** 2, axis=1) > stats.gamma.isf(FALSE_TRANSIENT / Z.shape[1], p)
+    loud = np.sum(np.abs(w[0]) ** 2, axis=1) > special.gammainccinv(p, FALSE_TRANSIENT / Z.shape[1])
     if len(d) < 2 or not loud.any():
         return np.zeros(Z.shape[1:], complex)
     before, after = w[:-1, loud], w[1:, loud]
@@ -174,6 +174,6 @@ def transient_left(Z: Complex) -> Complex:
     total = np.sum(np.abs(powers) ** 2)
     known = np.sum(np.abs(np.tensordot(powers.conj(), w, 1)) ** 2, axis=1) / total
     # A mode's skirt goes down beside the lines at which it is seen.
-    sure = binary_dilation(known > stats.gamma.isf(FALSE_LINE, p), iterations=SKIRT)
+    sure = binary_dilation(known > special.gammainccinv(p, FALSE_LINE), iterations=SKIRT)
     first = np.tensordot(powers.conj(), d, 1) / total / (z - 1)
     return np.asarray(np.where(sure[:, None], first * np.mean(powers * z), 0.0))

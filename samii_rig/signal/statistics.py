@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from samii_rig.errors import EstimateError
 from samii_rig.types import Complex, Finding, Float, FrequencyResponse
@@ -107,7 +107,7 @@ def phase_half_width(response: FrequencyResponse, level: float = 0.9) -> Float:
     """
     half = _component(response, level)
     size = np.abs(response.H)
-    zero = np.asarray(stats.f.ppf((1 + level) / 2, 2, 2 * response.entry_dof), float)
+    zero = np.asarray(special.fdtri(2, 2 * response.entry_dof, (1 + level) / 2), float)
     known = size**2 > zero[:, None, None] * response.variance()
     ratio = np.divide(half, size, out=np.ones(size.shape), where=size > 0)
     return np.where(known & (ratio < 1), np.degrees(np.arcsin(np.minimum(ratio, 1.0))), 180.0)
@@ -149,7 +149,7 @@ def hotelling_distribution(p: int, dof: Float) -> tuple[Float, Float, Float]:
 def hotelling_p(t2: Float, p: int, dof: Float) -> Float:
     """Probability of a T^2 at least this large when the hypothesis holds."""
     scale, dfn, dfd = hotelling_distribution(p, dof)
-    return np.asarray(stats.f.sf(t2 / scale, dfn, dfd), float)
+    return np.asarray(special.fdtrc(dfn, dfd, np.maximum(t2, 0.0) / scale), float)
 
 
 def hotelling_mean(p: int, dof: Float) -> Float:
@@ -256,7 +256,7 @@ def _by_band(
         windows = max(1.0, n / share)
         independent = windows if correlated else float(n)
         rest = 2 * p * float(np.mean(nu[inside]) - p + 1) * windows
-        p_value = float(stats.f.sf(ratio * rest / (rest - 2), 2 * p * independent, rest))
+        p_value = float(special.fdtrc(2 * p * independent, rest, ratio * rest / (rest - 2)))
         out.append(Difference(low, high, ratio, p_value, float(np.median(change[inside]))))
     return tuple(out)
 
@@ -315,7 +315,7 @@ def _spread(dof: Float, H: Complex) -> Float:
 
 def _component(response: FrequencyResponse, level: float) -> Float:
     """t quantile times the standard deviation of one real component."""
-    t = np.asarray(stats.t.ppf((1 + level) / 2, 2 * response.entry_dof), float)
+    t = np.asarray(special.stdtrit(2 * response.entry_dof, (1 + level) / 2), float)
     return np.asarray(t[:, None, None] * np.sqrt(response.variance() / 2), float)
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy import fft, signal
+from scipy import fft
 
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.signal._accumulate import accumulate
@@ -70,7 +70,7 @@ def spectra(
     if not 0 <= overlap < 1:
         raise InputError("welch", "overlap", overlap, "at least 0 and below 1")
     step = nperseg - int(nperseg * overlap)
-    w = np.asarray(signal.get_window(window, nperseg) if isinstance(window, str) else window, float)
+    w = _window(window, nperseg) if isinstance(window, str) else np.asarray(window, float)
     if w.shape != (nperseg,):
         raise InputError("welch", "window", w.shape, f"({nperseg},) values or a name")
     c = pieces[0].shape[1]
@@ -164,6 +164,16 @@ def _matrix(total: Float, c: int) -> Complex:
             S[:, j, i] = total[row] - 1j * total[row + 1]
             row += 2
     return S
+
+
+def _window(name: str, n: int) -> Float:
+    """The periodic window of this name, as scipy.signal.get_window gives it."""
+    if name == "hann":
+        # To the bit; scipy.signal takes a second to load, which no estimate needs to wait for.
+        return 0.5 + 0.5 * np.asarray(np.cos(np.linspace(-np.pi, np.pi, n + 1)[:-1]), float)
+    from scipy import signal
+
+    return np.asarray(signal.get_window(name, n), float)
 
 
 def _effective(w: Float, step: int, n_frames: int) -> float:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from samii_rig.errors import EstimateError
 from samii_rig.types import Complex, Float, FrequencyResponse
@@ -137,5 +137,5 @@ def goodness(lines: Sequence[Measured], t2: Sequence[Float], n_free: int) -> Fit
         alone = 1 / max(1.0, len(d.frequency) / d.shared[1])
         spread += n**2 * (alone + 1 / (float(np.mean(d.dof)) * groups)) / d.p
     spread /= float(np.sum(size)) ** 2
-    p_value = float(stats.gamma.sf(ratio, 1 / spread, scale=spread))
+    p_value = float(special.gammaincc(1 / spread, ratio / spread))
     return Fit(ratio, p_value, round(2 * float(np.sum(size))))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from samii_rig.signal.distortion import FALSE_FINDINGS, NOTABLE
 from samii_rig.signal.several.experiments import Columns
@@ -183,7 +183,7 @@ def _distorted(found: Lines, total: Float, noise: Float, names: Sequence[str]) -
     n = len(found.at)
     for i, name in enumerate(names):
         ratio = float(np.mean(total[:, i] / np.maximum(noise[:, i], 1e-300)))
-        p = float(stats.f.sf(ratio, 2 * n * found.nu[1], 2 * n * found.nu[0]))
+        p = float(special.fdtrc(2 * n * found.nu[1], 2 * n * found.nu[0], ratio))
         if p >= FALSE_FINDINGS / len(names):
             continue
         excess = float(np.sum(total[:, i] - noise[:, i]))
