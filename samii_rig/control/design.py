@@ -157,7 +157,7 @@ def design(
     loops = loops_of(bare, first)
     nominal = plant("nominal", bare, loops)
     values = corners_of(bare, goals.spread, draws.seed)
-    at_corners = _plants(bare, values, loops, say, "rigs at the ends of their stiffness")
+    at_corners = _plants(nominal, values, loops, say, "rigs at the ends of their stiffness")
     trials: list[Trial] = []
     if not own:
         for n in [poles] if poles else range(1, MOST_POLES + 1):
@@ -181,8 +181,8 @@ def design(
         judge(nominal, closed),
         judge(nominal, loops),
         tuple(judge(p, closed) for p in at_corners),
-        tuple(judge(p, closed) for p in _plants(bare, inside, loops, say, "rigs in the range")),
-        tuple(judge(p, closed) for p in _plants(bare, drawn, loops, say, "rigs as uncertain")),
+        tuple(judge(p, closed) for p in _plants(nominal, inside, loops, say, "rigs in the range")),
+        tuple(judge(p, closed) for p in _plants(nominal, drawn, loops, say, "rigs as uncertain")),
     )
 
 
@@ -214,10 +214,11 @@ def _accelerometer(rig: Rig, name: str | None) -> str:
 
 
 def _plants(
-    rig: Rig, values: dict[str, Values], loops: Loops, say: Progress, what: str
+    nominal: Plant, values: dict[str, Values], loops: Loops, say: Progress, what: str
 ) -> list[Plant]:
+    rig, near = nominal.rig, nominal.structure
     every = counted(list(values.items()), say, what)
-    return [plant(name, with_values(rig, changed), loops) for name, changed in every]
+    return [plant(name, with_values(rig, changed), loops, near) for name, changed in every]
 
 
 def _best(

@@ -40,7 +40,7 @@ class Plant:
 
     frequency, response : (n,) Hz and (n, n_sensor, n_actuator), sampled. system : the
     realised rig, one actuator. split : rad/s between its modes 1 and 2.
-    mode_1 : its first oscillating pole, loops open, rad/s.
+    mode_1 : its first oscillating pole, loops open, rad/s. structure : all that were found.
     """
 
     name: str
@@ -50,6 +50,7 @@ class Plant:
     system: Sampled
     mode_1: complex
     split: float
+    structure: Complex
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +83,12 @@ class Judgement:
         return min(self.actuator.phase_deg, self.feedback.phase_deg)
 
 
-def plant(name: str, rig: Rig, loops: Loops) -> Plant:
-    """`rig` for loops on the actuator of `loops`; InputError if it has less than two modes."""
-    made = slow_modes(rig)
+def plant(name: str, rig: Rig, loops: Loops, near: Complex | None = None) -> Plant:
+    """`rig` for loops on the actuator of `loops`; InputError if it has less than two modes.
+
+    near : the `structure` of a rig that is nearly the same, from which it takes half the time.
+    """
+    made = slow_modes(rig, near)
     pairs = made.structure.poles[made.structure.poles.imag > 0]
     if pairs.size < 2:
         raise InputError(rig.name, "element", f"{pairs.size} modes", "two oscillating modes")
@@ -101,16 +105,17 @@ def plant(name: str, rig: Rig, loops: Loops) -> Plant:
         sampled_system(rig, made, loops.actuator),
         complex(pairs[0]),
         split,
+        made.structure.poles,
     )
 
 
-def slow_modes(rig: Rig) -> Realisation:
-    """The rig realised no further than a loop on its first modes needs."""
+def slow_modes(rig: Rig, near: Complex | None = None) -> Realisation:
+    """The rig realised no further than a loop on its first modes needs; near : as of `plant`."""
     *narrow, widest = BANDS_OVER_RATE
     for band in narrow:
         with suppress(InputError):
-            return realise(rig, band * rig.rate_hz)
-    return realise(rig, widest * rig.rate_hz)
+            return realise(rig, band * rig.rate_hz, near)
+    return realise(rig, widest * rig.rate_hz, near)
 
 
 def judge(given: Plant, loops: Loops) -> Judgement:
