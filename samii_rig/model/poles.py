@@ -17,7 +17,7 @@ D'/D over it, modulus and phase.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,11 +102,12 @@ class _Box:
     def size(self) -> float:
         return max(self.right - self.left, self.high - self.low)
 
-    def along(self, t: Float) -> Complex:
-        """The boundary, counter-clockwise, as t goes from 0 to 4."""
-        x = np.interp(t, [0, 1, 2, 3, 4], [self.left, self.right, self.right, self.left, self.left])
-        y = np.interp(t, [0, 1, 2, 3, 4], [self.low, self.low, self.high, self.high, self.low])
-        return np.asarray(x + 1j * y)
+    @property
+    def corners(self) -> list[complex]:
+        """Counter-clockwise, the first again at the end."""
+        x = [self.left, self.right, self.right, self.left, self.left]
+        y = [self.low, self.low, self.high, self.high, self.low]
+        return [complex(a, b) for a, b in zip(x, y, strict=True)]
 
     def holds(self, s: complex) -> bool:
         return self.left <= s.real <= self.right and self.low <= s.imag <= self.high
@@ -129,18 +130,15 @@ def find_poles(D: Characteristic, region: Region, near: Complex | None = None) -
             region.holes,
         )
         boxes = _pieces(searched)
-        counts = [_turns(D, box) for box in boxes]
-        if all(n is not None for n in counts):
+        counts = _turns(D, boxes)
+        if None not in counts:
             break
     else:
         raise SamiiRigError("pole search: every contour tried runs through a pole")
     polished = np.zeros(0, complex) if near is None else _newton(D, near)
-    found: list[tuple[complex, int]] = []
-    total = 0
-    for box, n in zip(boxes, counts, strict=True):
-        assert n is not None
-        total += n if box.symmetric else 2 * n
-        found += _isolate(D, box, n, polished)
+    counted = [(box, n) for box, n in zip(boxes, counts, strict=True) if n is not None]
+    total = sum(n if box.symmetric else 2 * n for box, n in counted)
+    found = _isolate(D, counted, polished)
     found.sort(key=lambda item: (abs(item[0]), item[0].imag))
     poles = np.array([p for p, _ in found], dtype=complex)
     multiplicity = np.array([m for _, m in found], dtype=np.int64)
@@ -170,35 +168,58 @@ def _pieces(region: Region) -> list[_Box]:
     return boxes
 
 
-def _turns(D: Characteristic, box: _Box) -> int | None:
-    """Zeros inside the box; None if one lies on its boundary, as far as can be told."""
-    turned = phase_along(D, box.along, np.linspace(0.0, 4.0, 4 * START + 1), box.size / START)
-    return None if turned is None else round(turned / (2 * np.pi))
+def _turns(D: Characteristic, boxes: Sequence[_Box]) -> list[int | None]:
+    """Zeros inside each box; None if one lies on its boundary, as far as can be told."""
+    # The last corner twice, as t = 4 is where it begins and nothing follows.
+    corners = np.array([[*box.corners, box.corners[-1]] for box in boxes])
+
+    def boundary(which: Int, t: Float) -> Complex:
+        k = t.astype(np.int64)
+        begin = corners[which, k]
+        return np.asarray(begin + (corners[which, k + 1] - begin) * (t - k))
+
+    spacing = np.array([box.size / START for box in boxes])
+    turned = phases_along(D, boundary, np.linspace(0.0, 4.0, 4 * START + 1), spacing)
+    return [None if x is None else round(x / (2 * np.pi)) for x in turned]
 
 
 def phase_along(
     D: Characteristic, path: Callable[[Float], Complex], t: Float, spacing: float
 ) -> float | None:
-    """By how much arg D turns as s = path(t) runs over the increasing t (n,), rad.
+    """`phases_along` of one path."""
+    (turned,) = phases_along(D, lambda _, t: path(t), t, np.array([spacing]))
+    return turned
 
-    spacing : rad/s, of the order of the distance between neighbouring path(t). Intervals are
-    halved until phase and modulus agree with the derivative of log D; None if that never
-    happens, as the path runs through a zero.
+
+def phases_along(
+    D: Characteristic, path: Callable[[Int, Float], Complex], t: Float, spacing: Float
+) -> list[float | None]:
+    """By how much arg D turns as s = path(which, t) runs over the increasing t (n,), rad.
+
+    spacing : (n_path,) rad/s, of the order of the distance between neighbouring points of each.
+    Intervals are halved until phase and modulus agree with the derivative of log D; None if that
+    never happens, as the path runs through a zero. All paths go together, since a call of D costs
+    as much for one point as for fifty.
     """
-    s = path(t)
-    slope, mantissa, log_scale = _log_derivative(D, s, NUDGE * spacing)
-    if np.any(mantissa == 0):
-        return None
-    open_ = np.ones(len(t) - 1, dtype=bool)
+    count = spacing.size
+    which, t = np.repeat(np.arange(count), t.size), np.tile(t, count)
+    s = path(which, t)
+    slope, mantissa, log_scale = _log_derivative(D, s, NUDGE * spacing[which])
+    blocked = np.zeros(count, dtype=bool)
+    blocked[which[mantissa == 0]] = True
+    open_ = (which[1:] == which[:-1]) & ~blocked[which[1:]]
     for halving in range(MAX_HALVINGS):
         at = np.flatnonzero(open_)
         if not at.size:
-            return float(np.sum(np.angle(mantissa[1:] / mantissa[:-1])))
-        middle = (t[at] + t[at + 1]) / 2
-        new = path(middle)
-        g, value, scale = _log_derivative(D, new, NUDGE * spacing / 2**halving)
+            break
+        middle, own = (t[at] + t[at + 1]) / 2, which[at]
+        new = path(own, middle)
+        g, value, scale = _log_derivative(D, new, NUDGE * spacing[own] / 2**halving)
         if np.any(value == 0):
-            return None
+            blocked[own[value == 0]] = True
+            on = ~blocked[own]
+            at, middle, own, new = at[on], middle[on], own[on], new[on]
+            g, value, scale = g[on], value[on], scale[on]
         first = np.log(value / mantissa[at]) + scale - log_scale[at]
         second = np.log(mantissa[at + 1] / value) + log_scale[at + 1] - scale
         off = np.maximum(
@@ -208,13 +229,18 @@ def phase_along(
         step = np.maximum(np.abs(first.imag), np.abs(second.imag))
         still = (step > PHASE_STEP) | (off > AGREEMENT)
         t, s = np.insert(t, at + 1, middle), np.insert(s, at + 1, new)
+        which = np.insert(which, at + 1, own)
         slope, mantissa = np.insert(slope, at + 1, g), np.insert(mantissa, at + 1, value)
         log_scale = np.insert(log_scale, at + 1, scale)
         open_ = np.zeros(len(t) - 1, dtype=bool)
         left = at + np.arange(at.size)
         open_[left] = still
         open_[left + 1] = still
-    return None
+    blocked[which[:-1][open_]] = True
+    inner = np.flatnonzero((which[1:] == which[:-1]) & ~blocked[which[1:]])
+    turns = np.angle(mantissa[inner + 1] / mantissa[inner])
+    turned = np.bincount(which[inner], turns, count)
+    return [None if b else float(x) for b, x in zip(blocked, turned, strict=True)]
 
 
 def _log_derivative(
@@ -254,47 +280,62 @@ def _known(polished: Complex, box: _Box, n: int) -> list[tuple[complex, int]]:
     return [(x, 1) for x in inside] if held == n else []
 
 
-def _isolate(D: Characteristic, box: _Box, n: int, polished: Complex) -> list[tuple[complex, int]]:
-    """The zeros in a box that holds n, each with its multiplicity; Im >= 0 only. polished : some
-    that are known, which are all in many a part of it."""
+def _isolate(
+    D: Characteristic, boxes: list[tuple[_Box, int]], polished: Complex
+) -> list[tuple[complex, int]]:
+    """The zeros in boxes that hold so many each, each with its multiplicity; Im >= 0 only.
+    polished : some that are known, which are all in many a part of them."""
     found: list[tuple[complex, int]] = []
-    stack = [(box, n)]
-    while stack:
-        here, count = stack.pop()
-        if count < 0:
-            raise SamiiRigError(
-                f"pole search: negative count around {here.centre:.6g} rad/s; "
-                "the characteristic function has a pole there"
-            )
-        if count == 0:
-            continue
-        if known := _known(polished, here, count):
-            found += known
-            continue
-        if count == 1:
-            root = _polish(D, here)
-            if root is not None:
-                found.append((root, 1))
+    while boxes:
+        crowded = []
+        for here, count in boxes:
+            if count < 0:
+                raise SamiiRigError(
+                    f"pole search: negative count around {here.centre:.6g} rad/s; "
+                    "the characteristic function has a pole there"
+                )
+            if count == 0:
                 continue
-        if here.size < CLUSTER:
-            found.append((here.centre, count))
-            continue
-        stack += _cut(D, here, count)
+            if known := _known(polished, here, count):
+                found += known
+                continue
+            if count == 1:
+                root = _polish(D, here)
+                if root is not None:
+                    found.append((root, 1))
+                    continue
+            if here.size < CLUSTER:
+                found.append((here.centre, count))
+                continue
+            crowded.append((here, count))
+        boxes = _cut(D, crowded)
     return found
 
 
-def _cut(D: Characteristic, box: _Box, count: int) -> list[tuple[_Box, int]]:
+def _cut(D: Characteristic, boxes: list[tuple[_Box, int]]) -> list[tuple[_Box, int]]:
+    """Parts of boxes that hold so many zeros each, and how many each part holds."""
+    out: list[tuple[_Box, int]] = []
     for cut in CUTS:
-        parts, weights = _parts(box, cut)
-        counts = [_turns(D, part) for part in parts]
-        if any(c is None for c in counts):
-            continue
-        known = [c for c in counts if c is not None]
-        if sum(w * c for w, c in zip(weights, known, strict=True)) == count:
-            return list(zip(parts, known, strict=True))
-    raise SamiiRigError(
-        f"pole search: {count} poles around {box.centre:.6g} rad/s cannot be told apart"
-    )
+        if not boxes:
+            return out
+        parts = [_parts(box, cut) for box, _ in boxes]
+        counts = iter(_turns(D, [half for halves, _ in parts for half in halves]))
+        left = []
+        for (box, count), (halves, weights) in zip(boxes, parts, strict=True):
+            each = [next(counts) for _ in halves]
+            known = [c for c in each if c is not None]
+            whole = len(known) == len(each)
+            if whole and sum(w * c for w, c in zip(weights, known, strict=True)) == count:
+                out += zip(halves, known, strict=True)
+            else:
+                left.append((box, count))
+        boxes = left
+    if boxes:
+        box, count = boxes[0]
+        raise SamiiRigError(
+            f"pole search: {count} poles around {box.centre:.6g} rad/s cannot be told apart"
+        )
+    return out
 
 
 def _parts(box: _Box, cut: float) -> tuple[list[_Box], list[int]]:
