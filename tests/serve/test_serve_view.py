@@ -44,7 +44,7 @@ PARTS = [(1 / (1 + f * f), -f / (1 + f * f)) for f in F]
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     folder = tmp_path_factory.mktemp("view")
-    with Service(folder / "runs", "--pace", "4") as service, Browser(folder / "browser") as browser:
+    with Service(folder / "runs", "--pace", "1") as service, Browser(folder / "browser") as browser:
         browser.size(1440, 900)
         browser.go(service.url)
         browser.until("document.querySelectorAll('#margins, #fields input').length > 3")
@@ -300,7 +300,8 @@ def test_layout_and_colours_stay_with_the_browser(page: Browser) -> None:
 def test_a_run_is_seen_without_scrolling(page: Browser) -> None:
     service: Service = page.service  # type: ignore[attr-defined]
     with service.lease() as lease:
-        service.start(lease, sweep(duration=8.0, repeats=60), diagnosis=True)
+        # In real time: each repeat that is whole is estimated and diagnosed, and axe takes seconds.
+        service.start(lease, sweep(duration=4.0, repeats=60), diagnosis=True)
         try:
             page.until("/[1-9] repeats/.test(document.getElementById('frf-about').textContent)")
             seen_at_once(page)
