@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,13 +33,9 @@ class _Element:
 
     def least(self) -> list[float]:
         """The least value that each of its parameters may have."""
-        allowed, largest = quantities(self.kind), np.finfo(float).max
-        out = []
-        for symbol in self.symbols:
-            sign = allowed[symbol].sign if symbol in allowed else "any"
-            low = {"positive": math.ulp(0.0), "not negative": 0.0, "any": -largest}[sign]
-            out.append(max(low, self.reach) if symbol == "L" else low)
-        return out
+        allowed, any_ = quantities(self.kind), -sys.float_info.max
+        least = {x: allowed[x].least if x in allowed else any_ for x in self.symbols}
+        return [max(low, self.reach) if x == "L" else low for x, low in least.items()]
 
     def refuse(self, values: Float, given: Mapping[Key, float]) -> None:
         """InputError of the first of those given that may not be what it is."""
@@ -66,12 +63,11 @@ class _Element:
 
 @dataclass(frozen=True, slots=True)
 class _Given:
-    """Some parameters: at (k,) their places, least (k,) their least values, whose they are, and
-    those of these elements that have a rule for all their values together."""
+    """Some parameters: at (k,) their places, least (k,) their least values, and those of their
+    elements that have a rule for all their values together."""
 
     at: Int
     least: Float
-    whose: tuple[_Element, ...]
     ruled: tuple[_Element, ...]
 
 
@@ -107,7 +103,7 @@ class Allowed:
         new = np.fromiter(values.values(), np.float64, len(keys))
         into[given.at] = new
         if not np.all((new >= given.least) & (new < math.inf)):
-            for element in given.whose:
+            for element in self._whose(values):
                 element.refuse(into, values)
         for element in given.ruled:
             element.refuse_together(into)
@@ -118,11 +114,15 @@ class Allowed:
             if key not in self._place:
                 raise InputError("with_values", ".".join(key), value, "a known parameter")
         at = np.array([self._place[key] for key in values], np.int64)
-        whose = tuple(self._elements[name] for name in dict.fromkeys(name for name, _ in values))
+        whose = self._whose(values)
         least = {
             (e.name, symbol): low
             for e in whose
             for symbol, low in zip(e.symbols, e.least(), strict=True)
         }
         ruled = tuple(e for e in whose if getattr(e.kind, "rule", None) is not None)
-        return _Given(at, np.array([least[key] for key in values]), whose, ruled)
+        return _Given(at, np.array([least[key] for key in values]), ruled)
+
+    def _whose(self, keys: Iterable[Key]) -> list[_Element]:
+        """The elements that have these parameters."""
+        return [self._elements[name] for name in dict.fromkeys(name for name, _ in keys)]

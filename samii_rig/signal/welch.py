@@ -169,8 +169,8 @@ def _matrix(total: Float, c: int) -> Complex:
 def _window(name: str, n: int) -> Float:
     """The periodic window of this name, as scipy.signal.get_window gives it."""
     if name == "hann":
-        # To the bit; scipy.signal takes a second to load, which no estimate needs to wait for.
-        return 0.5 + 0.5 * np.asarray(np.cos(np.linspace(-np.pi, np.pi, n + 1)[:-1]), float)
+        return np.hanning(n + 1)[:-1]
+    # It takes a second to load, which no estimate needs to wait for.
     from scipy import signal
 
     return np.asarray(signal.get_window(name, n), float)

@@ -107,8 +107,8 @@ def test_a_stiff_heavy_beam_is_a_rigid_link() -> None:
     np.testing.assert_allclose(H[0], H[1], rtol=1e-5)
 
 
-def _with_sensor(r: Rig) -> Rig:
-    sensor = {"name": "y", "kind": "acceleration", "on": "body", "position": 0.5, "unit": "m/s^2"}
+def _with_sensor(r: Rig, on: str = "body", position: float = 0.5) -> Rig:
+    sensor = {"name": "y", "kind": "acceleration", "on": on, "position": position, "unit": "m/s^2"}
     return Rig.model_validate({**r.model_dump(), "sensor": [sensor]})
 
 
@@ -391,9 +391,7 @@ def accelerometer_on_the_beam(length: float) -> Rig:
     """A clamped beam of some length, 0.3 m from whose root an accelerometer stands."""
     beam = ("beam", "beam", {**BEAM, "L": length})
     last = ("last", "rigid_link", {"L": 0.5, "r": 0.2, "m": 3.0, "I": 0.04})
-    made = rig(beam, SOURCE, last, base="clamped", tip="free").model_dump()
-    on = {"name": "a", "kind": "acceleration", "on": "beam", "position": 0.3, "unit": "m/s^2"}
-    return Rig.model_validate({**made, "sensor": [on]})
+    return _with_sensor(rig(beam, SOURCE, last, base="clamped", tip="free"), "beam", 0.3)
 
 
 @pytest.mark.parametrize("L", [0.35, 0.70001, 0.9])

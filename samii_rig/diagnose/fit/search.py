@@ -304,9 +304,7 @@ class Search(Explanations):
 
     def _run(self, effects: tuple[Effect, ...], x: Float) -> Fitted | None:
         """A refit for as long as it falls fast: who starts far away is not behind for that."""
-        begun = self.refitted_from(effects, x, steps=0, far=False)
-        cost = math.inf if begun is None else begun.cost
-        end = self.refitted_from(effects, x, steps=AHEAD, far=False)
+        end, cost = self.refitted_from(effects, x, steps=0, far=False), math.inf
         while end is not None and end.cost < FALLING * cost:
             cost = end.cost
             end = self.refitted_from(effects, end.x, steps=AHEAD, far=False) or end

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -54,14 +55,19 @@ class Quantity:
     unit: str
     sign: Literal["positive", "not negative", "any"]
 
+    @property
+    def least(self) -> float:
+        """The least number that is allowed."""
+        least = {"positive": math.ulp(0.0), "not negative": 0.0}
+        return least.get(self.sign, -sys.float_info.max)
+
     def refusal(self, value: float) -> str | None:
         """Why `value` is not allowed, as a statement with what would be; None if it is."""
         if not math.isfinite(value):
             return f"value {value:g} {self.unit}; expected a finite number"
-        if self.sign == "positive" and value <= 0:
-            return f"value {value:g} {self.unit}; expected more than 0"
-        if self.sign == "not negative" and value < 0:
-            return f"value {value:g} {self.unit}; expected 0 or more"
+        if value < self.least:
+            expected = "more than 0" if self.sign == "positive" else "0 or more"
+            return f"value {value:g} {self.unit}; expected {expected}"
         return None
 
     def __call__(self, parameter: Parameter | None) -> Parameter | None:
