@@ -18,6 +18,20 @@ _row, _rows = types.Array(_f8, 1, "C"), types.Array(_f8, 2, "C")
 _FAST = {"reassoc", "contract", "nsz"}
 
 
+@njit(inline="always", fastmath=_FAST)
+def _stepped(wr: Float, wi: Float, tr: Float, ti: Float, er: Float, ei: Float, e: float) -> float:
+    """Take all states a step on, a force e held over it, by rows of `march`; the sum of the real
+    parts."""
+    total = 0.0
+    for k in range(wr.size):
+        real, imag = wr[k] + er[k] * e, wi[k] + ei[k] * e
+        now = tr[k] * real - ti[k] * imag
+        wi[k] = tr[k] * imag + ti[k] * real
+        wr[k] = now
+        total += now
+    return total
+
+
 @njit(_rows(_law, _rows, _rows, _rows, _f8, _f8, _row, _row, _i8, _i8, _row, _rows), cache=True,
       fastmath=_FAST)  # fmt: skip
 def march(
@@ -43,21 +57,21 @@ def march(
     seeds : (m, 2) each change of the numbers p (2,).
     """
     m, n_pole = seeds.shape[0], transition.shape[1]
+    tr, ti, er, ei = transition[0], transition[1], by_e[0], by_e[1]
+    vr, vi = by_v[0], by_v[1]
     wr, wi = np.zeros((1 + m, n_pole)), np.zeros((1 + m, n_pole))
     f = np.zeros((1 + m, v.size * inner))
     out = np.zeros(OUT)
     y, before, held, memory = np.zeros(1 + m), np.zeros(1 + m), np.zeros(1 + m), np.zeros(1 + m)
+    at_once = direct + np.sum(vr)
     for step in range(v.size * inner):
         u = v[(step - late) // inner] if step >= late else 0.0
         for i in range(1 + m):
-            e, total = held[i], (others[step] if i == 0 and others.size else 0.0)
-            given = u if i == 0 else 0.0
-            for k in range(n_pole):
-                real, imag = wr[i, k] + by_e[0, k] * e, wi[i, k] + by_e[1, k] * e
-                wr[i, k] = transition[0, k] * real - transition[1, k] * imag + by_v[0, k] * given
-                wi[i, k] = transition[0, k] * imag + transition[1, k] * real + by_v[1, k] * given
-                total += wr[i, k]
-            y[i] = total + direct * given
+            y[i] = _stepped(wr[i], wi[i], tr, ti, er, ei, held[i])
+        for k in range(n_pole):
+            wr[0, k] += vr[k] * u
+            wi[0, k] += vi[k] * u
+        y[0] += at_once * u + (others[step] if others.size else 0.0)
         out[:] = 0.0
         law(before[0], y[0], u, g, p, memory[0], out)
         f[0, step] = held[0] = out[0]

@@ -52,8 +52,8 @@ class Span:
     def of(cls, piece: Piece, rate_hz: float, highest_hz: float) -> Span:
         """Of a piece whose lines end at `highest_hz`."""
         n, history = len(piece.z), piece.history
-        low = int(fft.next_fast_len(max(int(OVER * highest_hz * n / rate_hz), 16), real=True))
-        low = min(low, n)
+        needed = min(max(int(OVER * highest_hz * n / rate_hz), 16), n)
+        low = int(fft.next_fast_len(needed, real=True))  # more than n where that is quicker
         turns = 2 if history == 0 else 4
         M, m = turns * n, turns * low
         sigma = DAMPING * rate_hz / M
@@ -74,6 +74,8 @@ class Span:
         own = (-1,) + (1,) * (x.ndim - 1)
         decay = np.exp(-sigma / self.rate_hz * np.arange(len(x))).reshape(own)
         damped = fft.rfft(x * decay, M, axis=0)[: self.s.size]
+        if len(damped) < self.s.size:
+            damped = np.pad(damped, [(0, self.s.size - len(damped))] + [(0, 0)] * (x.ndim - 1))
         # Instants run from the record's first sample; the input before it stands at the end.
         turn = np.exp(1j * self.s.imag * (self.history / self.rate_hz)).reshape(own)
         return np.asarray(damped * turn * (self.decay.size / M))

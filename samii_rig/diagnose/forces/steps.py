@@ -20,7 +20,8 @@ from numba import njit, types
 from samii_rig.types import Float
 
 OUT, NUMBERS = 12, 2  # entries of `out`, and numbers of a law at most
-NEWTON = 5  # steps to the root of a law that is monotonous
+NEWTON = 5  # steps at most to the root of a law that is monotonous
+SETTLED = 1e-8  # of the root: Newton's next step would be of the square of it, a rounding error
 _f8, _row = types.float64, types.Array(types.float64, 1, "C")
 SIGNATURE = types.void(_f8, _f8, _f8, _f8, _row, _f8, _row)
 
@@ -52,7 +53,10 @@ def cubic(
     slope = 0.5 * g * k
     x = before
     for _ in range(NEWTON):
-        x -= (x - middle - slope * x * x * x) / (1.0 - 3.0 * slope * x * x)
+        off = (x - middle - slope * x * x * x) / (1.0 - 3.0 * slope * x * x)
+        x -= off
+        if abs(off) <= SETTLED * abs(x):
+            break
     out[0] = k * x * x * x
     # f = k (middle + g f/2)^3, differentiated.
     held = 1.0 - 3.0 * slope * x * x
@@ -132,8 +136,10 @@ def hysteresis(
     dx = free - before - g * memory
     for _ in range(NEWTON):
         h, slope, _, _, _ = advanced(memory, dx, p[0], p[1])
-        off = dx - (free - before) + 0.5 * g * (memory + h)
-        dx -= off / (1.0 + 0.5 * g * slope)
+        off = (dx - (free - before) + 0.5 * g * (memory + h)) / (1.0 + 0.5 * g * slope)
+        dx -= off
+        if abs(off) <= SETTLED * abs(dx):
+            break
     h, slope, by_h, by_top, by_k = advanced(memory, dx, p[0], p[1])
     held = 1.0 + 0.5 * g * slope
     out[0], out[3] = -0.5 * (memory + h), h

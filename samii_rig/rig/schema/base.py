@@ -148,7 +148,8 @@ def quantities(kind: type[BaseModel]) -> dict[str, Quantity]:
 
 def parameters(element: BaseModel) -> dict[str, Parameter]:
     """The element's physical parameters by symbol, in the order of its class."""
-    return {k: v for k, v in iter(element) if isinstance(v, Parameter)}
+    # Not `iter(element)`, which asks first what is private: a search reads them 10,000 times.
+    return {k: v for k, v in vars(element).items() if isinstance(v, Parameter)}
 
 
 def some_stiffness(v: Mapping[str, float]) -> str | None:
