@@ -7,6 +7,7 @@ that of the best amplitudes, which for diffuse Gaussian ones is the marginal lik
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -21,6 +22,10 @@ WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
 MAINS, STRAY, MULTIPLES = (50.0, 60.0), 0.01, (1, 2, 3)
 # Over the median of its neighbours, power of a line that stands out: noise does so at one in 4,000.
 STANDS, NEIGHBOURS = 12.0, 20
+
+# Power, of that of the shape which the lines show most, of one in lost samples that is still looked
+# at: of motion, which may be 10,000 times the noise; of input.
+SHOWN, INPUT = 1e-9, 1e-5
 
 
 def wander(n: int, k: Int, q: int) -> Complex:
@@ -60,6 +65,42 @@ def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
         y = np.concatenate([np.zeros((edge, q)), own])
         out[:, :, j] = np.fft.rfft(y[piece.history :], axis=0)[k]
     return out
+
+
+def lost(piece: Piece, k: Int, H: Complex, contour: Contour) -> Complex:
+    """(n_lines, q, m) of all motion in the samples that a piece has lost, and of their input where
+    that is unknown.
+
+    H : as of `unread`.
+    """
+    n, q = piece.z.shape
+    out = [np.zeros((k.size, q, 0), complex)]
+    for first, behind in piece.lost:
+        shapes, share = _shown(behind - first, n, int(k[0]), k.size)
+        inside = np.zeros((n, shapes.shape[1]))
+        inside[first:behind] = shapes
+        out.append(_by_sensor(inside, k, q))
+        if (first, behind) not in piece.unknown:
+            continue
+        for shape in shapes.T[share > INPUT]:
+            r = np.zeros(len(piece.r))
+            r[piece.history + first : piece.history + behind] = shape
+            each = (contour.predicted(H[:, j :: piece.inputs], r) for j in range(piece.inputs))
+            spectra = [np.fft.rfft(y[piece.history :], axis=0)[k] for y in each]
+            out.append(np.stack(spectra, axis=2))
+    return np.concatenate(out, axis=2)
+
+
+@lru_cache(maxsize=32)
+def _shown(g: int, n: int, first: int, count: int) -> tuple[Float, Float]:
+    """Shapes (g, m) over g samples of n of which `count` lines from the `first` on show any, and
+    how much of the largest each shows (m,), in power: those of Slepian, one for each half period of
+    the band and some more."""
+    turn = 2 * np.pi / n * np.outer(np.arange(g), first + np.arange(count))
+    lines = np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
+    values, shapes = np.linalg.eigh(lines @ lines.T)
+    kept = values > SHOWN * values[-1]
+    return shapes[:, kept], values[kept] / values[-1]
 
 
 def hum(left: Complex, k: Int, rate_hz: float, n: int) -> Complex:

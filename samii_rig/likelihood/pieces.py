@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood import inputs, spikes
+from samii_rig.likelihood.bridged import MOST_GAPS, Bridged, bridge
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import is_open, of_input, proportional
 from samii_rig.signal.groups import segments_of
 from samii_rig.signal.several.undriven import driven_of
-from samii_rig.types import Float, Quality, Recording, Segment
+from samii_rig.types import Float, Int, Quality, Recording, Segment
 
 SPOILT = Quality.MISSING | Quality.CLIPPED | Quality.STALE
 LEAST_SAMPLES = 256  # fewer say nothing of a structure
 # Samples of a piece: a longer stretch is several, so that work grows as its length does. A minute
 # at 1 kHz, in which all that rings comes to rest or is well told.
 LONGEST = 2**16
+KNOWN = 1e-3  # of an input's rms, how far off lost samples of it may be that count as known
 
 
 Loops = tuple[tuple[float, int, int], ...]
@@ -62,7 +64,9 @@ class Piece:
     levels : as the segments state them, with their unit.
     commands : of all records that the piece is a sum of. struck : spikes of each sensor in them.
     edges : (sample of r, input) at which that input jumps at an instant within the sample that
-        nobody knows.
+        nobody knows. lost : (first, behind the last) samples of z that were not recorded, nor their
+        input, which stands in r as it most likely was. unknown : those of them whose input does not
+        follow from that before and after.
     """
 
     name: str
@@ -76,6 +80,8 @@ class Piece:
     commands: tuple[Command, ...] = ()
     struck: tuple[int, ...] = ()
     edges: tuple[tuple[int, int], ...] = ()
+    lost: tuple[tuple[int, int], ...] = ()
+    unknown: tuple[tuple[int, int], ...] = ()
 
     @property
     def inputs(self) -> int:
@@ -198,22 +204,31 @@ def pieces_of(
     step = np.array([steps[n] for n in wired.sensors])
     found: list[Piece] = []
     for recording in recordings:
-        columns = [recording.column(n) for n in wired.sensors]
-        values = recording.columns(wired.sensors)
-        bad = (recording.quality[:, columns] & SPOILT) != 0
-        whole = np.all(np.isfinite(values) & ~bad, axis=1)
-        slower = round(rig.rate_hz / recording.rate_hz) > 1
-        each = [_driving(recording, x, values, wired.sensors, slower=slower) for x in wired.inputs]
-        for x in wired.inputs:  # what went out is known, limited or not
-            if _has(recording, x.command):
-                whole &= np.isfinite(recording.values_of(x.command))
-        v, r, edges = (_beside([one[i] for one in each]) for i in range(3))
+        whole = Bridged.of(recording, _known(recording, wired), _driving_columns(recording, wired))
+        samples = _Samples.of(whole, wired, slower=round(rig.rate_hz / recording.rate_hz) > 1)
         for segment in segments_of(recording):
             if recording.place(segment) in without:
                 continue
-            found += _cut(recording, segment, v, r, values, whole, edges, step)
+            found += _cut(recording, segment, samples, step)
     repeats = _joined(found, levels=False)
     return repeats if by_level else joined(repeats)
+
+
+def _known(recording: Recording, wired: Wiring) -> NDArray[np.bool_]:
+    """(rows,) whether all sensors are as they were, and the commands."""
+    columns = [recording.column(n) for n in wired.sensors]
+    bad = (recording.quality[:, columns] & SPOILT) != 0
+    known = np.all(np.isfinite(recording.columns(wired.sensors)) & ~bad, axis=1)
+    for x in wired.inputs:  # what went out is known, limited or not
+        if _has(recording, x.command):
+            known &= np.isfinite(recording.values_of(x.command))
+    return np.asarray(known)
+
+
+def _driving_columns(recording: Recording, wired: Wiring) -> set[str]:
+    """The columns that inputs are made of."""
+    made = {c.name for c in recording.channels if c.role in ("command", "reference")}
+    return made | {name for x in wired.inputs for name in (x.command, x.centring)}
 
 
 def _driving(
@@ -250,48 +265,106 @@ def joined(pieces: list[Piece]) -> list[Piece]:
     return _joined(pieces, levels=True)
 
 
-def _cut(
-    recording: Recording,
-    segment: Segment,
-    v: Float,
-    r: Float,
-    values: Float,
-    whole: NDArray[np.bool_],
-    edges: NDArray[np.bool_],
-    step: Float,
-) -> list[Piece]:
-    """The stretches of a segment between gaps, each with the input before it. v, r, edges : of the
-    inputs. values : of the sensors. step : of their converters."""
+@dataclass(frozen=True, slots=True)
+class _Samples:
+    """All samples of a recording in turn, those that short gaps have lost included.
+
+    v, r : (n,) or (n, m) of the inputs, edges : of their jumps. values : (n, q) of the sensors.
+    unknown : (gaps,) whether the input there is a guess.
+    """
+
+    whole: Bridged
+    v: Float
+    r: Float
+    edges: NDArray[np.bool_]
+    values: Float
+    unknown: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, whole: Bridged, wired: Wiring, *, slower: bool) -> _Samples:
+        """slower : as of `_driving`."""
+        values = whole.recording.columns(wired.sensors)
+        each = [
+            _driving(whole.recording, x, values, wired.sensors, slower=slower) for x in wired.inputs
+        ]
+        unknown = np.zeros(len(whole.lost), np.bool_)
+        for _, r, _ in each:
+            unknown |= bridge(r, whole.lost) > KNOWN * np.sqrt(np.mean(r**2))
+        v, r, edges = (_beside([one[i] for one in each]) for i in range(3))
+        return cls(whole, v, r, edges, values, unknown)
+
+
+def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float) -> list[Piece]:
+    """The stretches of a segment between gaps, each with the input before it. step : of the
+    sensors' converters."""
     name, level = recording.place(segment), (segment.level, segment.unit)
     out = []
-    for start, low, high in _stretches(recording, segment, whole):
+    for start, low, high in _stretches(recording, segment, samples.whole):
         history = min(low - start, high - low)
+        first = low - history
         # Whatever came before the history may still ring.
         moving = low > history
-        part = r[low - history : high]
-        told = Command(v[low - history : high], 1.0)
-        z, struck = spikes.mended(values[low:high], step)
-        piece = Piece(name, part, z, history, (level,), moving, commands=(told,))
-        own = edges[low - history : high].reshape(high - low + history, -1)
+        told = Command(samples.v[first:high], 1.0)
+        z, struck = spikes.mended(samples.values[low:high], step)
+        piece = Piece(name, samples.r[first:high], z, history, (level,), moving, commands=(told,))
+        own = samples.edges[first:high].reshape(high - first, -1)
         at = tuple((int(i), int(j)) for i, j in np.argwhere(own))
-        out.append(replace(piece, struck=tuple(struck.tolist()), edges=at))
+        gaps = (samples.whole.lost[:, 0] >= low) & (samples.whole.lost[:, 0] < high)
+        lost, unknown = (
+            tuple((int(a) - low, int(b) - low) for a, b in samples.whole.lost[some])
+            for some in (gaps, gaps & samples.unknown)
+        )
+        struck_ = tuple(struck.tolist())
+        out.append(replace(piece, struck=struck_, edges=at, lost=lost, unknown=unknown))
     return out
 
 
 def _stretches(
-    recording: Recording, segment: Segment, whole: NDArray[np.bool_]
+    recording: Recording, segment: Segment, whole: Bridged
 ) -> Iterator[tuple[int, int, int]]:
-    """Rows of a segment without a gap, `LONGEST` at most: from which row on there is none, the
-    first, and the one behind the last."""
-    a, b = np.searchsorted(recording.sequence, [segment.start, segment.stop])
-    jumps = np.flatnonzero(np.diff(recording.sequence) != 1) + 1
-    ends = np.unique(np.concatenate([jumps, np.flatnonzero(np.diff(whole.astype(np.int8))) + 1]))
-    for start, stop in pairwise([0, *ends.tolist(), len(whole)]):
-        first, last = max(start, int(a)), min(stop, int(b))
-        if last - first >= LEAST_SAMPLES and whole[first]:
-            parts = -(-(last - first) // LONGEST)
-            cuts = np.linspace(first, last, parts + 1).astype(np.int64).tolist()
-            yield from ((start, low, high) for low, high in pairwise(cuts))
+    """Stretches of a segment without a long gap, or without any where there are many, `LONGEST` at
+    most: from which sample on all input before is known, the first, and the one behind the last."""
+    a, b = whole.between(_begun(recording, segment), segment.stop)
+    own = whole.lost[(whole.lost[:, 0] > a) & (whole.lost[:, 0] < b)]
+    many = own if len(own) > MOST_GAPS else own[:0]
+    ends = np.concatenate([[a, b], whole.breaks, many.ravel()])
+    ends = np.unique(ends[(ends >= a) & (ends <= b)])
+    for first, last in pairwise(ends.tolist()):
+        if last - first < LEAST_SAMPLES or first in many[:, 0]:
+            continue
+        parts = -(-(last - first) // LONGEST)
+        cuts = np.linspace(first, last, parts + 1).astype(np.int64)
+        for low, high in pairwise(_aside(cuts, own).tolist()):
+            known = np.concatenate([whole.breaks, whole.lost[:, 1]])
+            yield int(known[known <= low].max()), low, high
+
+
+def _aside(cuts: Int, lost: Int) -> Int:
+    """Where to cut instead: not within samples that are lost (gaps, 2)."""
+    within = (cuts[:, None] > lost[:, 0]) & (cuts[:, None] < lost[:, 1])
+    behind = np.max(np.where(within, lost[:, 1], 0), axis=1, initial=0)
+    return np.asarray(np.maximum(cuts, behind))
+
+
+def across(x: Float, lost: Sequence[tuple[int, int]]) -> Float:
+    """x (n, q) with straight lines across samples that are lost."""
+    if not lost:
+        return x
+    lines = x.copy()
+    for first, behind in lost:
+        ends = [max(first - 1, 0), min(behind, len(x) - 1)]
+        for column, own in zip(lines.T, x.T, strict=True):
+            column[first:behind] = np.interp(np.arange(first, behind), ends, own[ends])
+    return lines
+
+
+def _begun(recording: Recording, segment: Segment) -> int:
+    """The sample from which on a segment's excitation acts: a periodic one settles before it, and a
+    whole record holds that too."""
+    if segment.kind != "periodic":
+        return segment.start
+    ends = [s.stop for s in recording.segments if s.stop <= segment.start]
+    return max(ends, default=0)
 
 
 def _joined(pieces: list[Piece], *, levels: bool) -> list[Piece]:
@@ -324,7 +397,7 @@ def _flat(r: Float, scale: Float | None) -> Float:
 
 def _proportional(one: Piece, other: Piece, scale: Float | None, *, levels: bool) -> bool:
     alike = (one.r.size, one.history, one.moving) == (other.r.size, other.history, other.moving)
-    if not alike:
+    if not alike or one.lost or other.lost:
         return False
     if not levels and one.levels != other.levels:
         return False

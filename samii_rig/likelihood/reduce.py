@@ -25,7 +25,7 @@ from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Disturbances, Noise
 from samii_rig.likelihood.past import SAME, directions, likely, shown
-from samii_rig.likelihood.pieces import Loops, Piece, Samples
+from samii_rig.likelihood.pieces import Loops, Piece, Samples, across
 from samii_rig.likelihood.seen import Answers, Seen
 from samii_rig.types import Complex, Float, Int
 
@@ -224,7 +224,8 @@ class Records:
 
 def _left_in_time(samples: Samples | Piece, H: Complex, contour: Contour) -> Float:
     """(n, q) what H on a contour leaves of samples."""
-    return samples.z - contour.predicted(H, samples.r)[len(samples.r) - len(samples.z) :]
+    left = samples.z - contour.predicted(H, samples.r)[len(samples.r) - len(samples.z) :]
+    return across(left, samples.lost) if isinstance(samples, Piece) else left
 
 
 @dataclass(frozen=True, slots=True)

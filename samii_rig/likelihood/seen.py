@@ -13,7 +13,7 @@ import numpy as np
 from samii_rig.likelihood import nuisance
 from samii_rig.likelihood.contour import Contour
 from samii_rig.likelihood.past import Past, likely
-from samii_rig.likelihood.pieces import Loops, Piece
+from samii_rig.likelihood.pieces import Loops, Piece, across
 from samii_rig.likelihood.rounding import Rounding
 from samii_rig.types import Complex, Float, Int
 
@@ -97,7 +97,7 @@ class Seen:
         n = len(piece.z)
         H, exact = answers.H, answers.exact
         y = exact.predicted(H, piece.r)[piece.history :]
-        left_in_time = piece.z - y
+        left_in_time = across(piece.z - y, piece.lost)
         left = np.fft.rfft(left_in_time, axis=0)
         past, wander, steps = answers.alike(piece, k)
         own = [wander, nuisance.hum(left, k, exact.rate_hz, n)]
@@ -106,6 +106,7 @@ class Seen:
         rounding = Rounding.of_piece(piece, k, step, y, exact.rate_hz)
         own += [nuisance.unread(piece, k, rounding.factors, H, exact, answers.loops)]
         own += [nuisance.edges(piece, k, answers.impulse)]
+        own += [nuisance.lost(piece, k, H, exact)]
         beside = _of_size_one(np.concatenate(own, axis=2))
         first = past.shapes.shape[2]
         return cls(

@@ -10,6 +10,7 @@ from scipy import linalg, signal
 
 from samii_rig.diagnose.fit.records import _shown, fitted_lines
 from samii_rig.likelihood import pieces
+from samii_rig.likelihood.bridged import bridged
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
@@ -511,19 +512,126 @@ def test_bursts_in_a_row_are_predicted_however_long_the_rig_rings():
     assert np.mean(power) == pytest.approx(2 * sd**2, rel=0.15)
 
 
-def test_a_gap_and_a_missing_sample_begin_a_piece_that_moves():
+def without_samples(run: Recording, *lost: slice) -> Recording:
+    at = np.delete(np.arange(len(run)), np.concatenate([np.arange(len(run))[x] for x in lost]))
+    return replace(
+        run,
+        time=run.time[at],
+        sequence=run.sequence[at],
+        values=run.values[at],
+        quality=run.quality[at],
+    )
+
+
+def test_a_piece_goes_on_across_a_gap_and_across_missing_samples():
     run = recording()
     run.quality[700:720, 2] = Quality.MISSING
-    kept = np.flatnonzero((np.arange(2000) < 1300) | (np.arange(2000) >= 1350))
-    run = replace(
-        run,
-        time=run.time[kept],
-        sequence=run.sequence[kept],
-        values=run.values[kept],
-        quality=run.quality[kept],
-    )
+    run = without_samples(run, slice(1300, 1350))
+    (one,) = pieces_of([run], SAMII, wiring([run], SAMII))
+    assert (len(one.z), one.moving) == (2000, False)
+    assert one.lost == ((700, 720), (1300, 1350))
+
+
+def test_a_gap_of_more_than_a_second_begins_a_piece():
+    run = without_samples(recording(4000), slice(300, 310), slice(900, 2000))
     found = pieces_of([run], SAMII, wiring([run], SAMII))
-    assert [(len(p.z), p.moving) for p in found] == [(700, False), (580, True), (650, True)]
+    assert [(len(p.z), p.history, p.lost) for p in found] == [
+        (900, 0, ((300, 310),)),
+        (2000, 0, ()),
+    ]
+
+
+def test_where_many_samples_are_missing_each_gap_begins_a_piece():
+    run = recording(6000)
+    run.quality[300::300, 2] = Quality.CLIPPED
+    found = pieces_of([run], SAMII, wiring([run], SAMII))
+    assert [(len(p.z), p.history, p.lost) for p in found] == [
+        (300, 0, ()),
+        *[(299, 0, ())] * 19,
+    ]
+
+
+def test_a_long_stretch_with_a_gap_is_cut_beside_it(monkeypatch):
+    monkeypatch.setattr(pieces, "LONGEST", 1000)
+    run = without_samples(recording(2000), slice(990, 1010))
+    found = pieces_of([run], SAMII, wiring([run], SAMII))
+    assert [(len(p.z), p.history, p.lost) for p in found] == [
+        (1010, 0, ((990, 1010),)),
+        (990, 0, ()),
+    ]
+
+
+def sweeping(u: Float, y: Float) -> Recording:
+    return Recording(
+        (Channel("v_2", "V", "command"), Channel("theta_2", "rad"), Channel("a_0", "m/s^2")),
+        RATE,
+        np.arange(u.size),
+        np.arange(u.size),
+        np.column_stack([u, y]),
+        np.zeros((u.size, 3), np.int64),
+        (Segment("sweep", "single", 0, u.size, 1.0, "V", 0),),
+    )
+
+
+@pytest.mark.parametrize("lost", [3, 30, 100])
+def test_a_record_with_a_gap_loses_no_more_than_its_samples(lost: int):
+    """Wherever a sweep is, just behind the resonance too, where all that the mode does later
+    depends on how it moved before."""
+    u, sd, kept, chi2 = sweep(3000), 0.02, [], []
+    there = from_rest(u, poles()) - from_rest(u, poles(4.002))
+    for seed, first in enumerate((600, 1000, 1400, 1800)):
+        z = from_rest(u, poles()) + sd * np.random.default_rng(seed).standard_normal((u.size, 2))
+        run = without_samples(sweeping(u, z), slice(first, first + lost))
+        (one,) = pieces_of([run], SAMII, without_loop(wiring([run], SAMII)))
+        assert (len(one.z), one.lost) == (3000, ((first, first + lost),))
+        records = Records((one,), RATE, ((0.8, 15.0),))
+        form = reduced(records, lambda s: response(s, poles(4.002)), own_alone)
+        at = form.sigma + 2j * np.pi * form.frequency
+        before = float(form.target @ form.target)
+        after = float(np.sum(form.residual(response(at, poles())) ** 2))
+        known = np.delete(there, slice(first, first + lost), axis=0)
+        kept.append((before - after) / (np.sum(known**2) / sd**2))
+        chi2.append(after / form.known)
+    # Half a second at the resonance leaves the input a guess, and with it what rings behind it.
+    assert 0.81 < np.mean(kept) < 1.15 if lost < 100 else 0.4 < np.mean(kept) < 1.15
+    assert np.mean(chi2) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize("lost", [1, 10, 30])
+def test_lost_samples_of_a_sweep_follow_from_those_beside_them(lost: int):
+    u = sweep(3000)
+    for first in (200, 1000, 2500):
+        x = u.copy()
+        x[first : first + lost] = 0.0
+        values, off = bridged(x, first, first + lost)
+        np.testing.assert_allclose(values, u[first : first + lost], atol=1e-4)
+        assert np.all(off < 1e-3)
+
+
+def test_of_lost_samples_of_noise_it_is_said_how_far_off_they_may_be():
+    rng = np.random.default_rng(3)
+    u = signal.sosfilt(signal.butter(4, 0.2, output="sos"), rng.standard_normal(20_000))
+    error, off = [], []
+    for first in range(1000, 19_000, 300):
+        x = u.copy()
+        x[first : first + 8] = 0.0
+        values, sd = bridged(x, first, first + 8)
+        error.append(values - u[first : first + 8])
+        off.append(sd)
+    assert np.std(error) == pytest.approx(np.sqrt(np.mean(np.square(off))), rel=0.2)
+    assert np.std(error) > 0.1 * np.std(u)
+
+
+def test_a_periodic_excitation_is_a_record_from_where_it_begins_to_settle():
+    u = np.tile(sweep(400), 6)
+    settled = Segment("multisine", "periodic", 800, 2000, 1.0, "V", 0)
+    other = Segment("multisine", "periodic", 2100, 2400, 1.0, "V", 1)
+    run = replace(sweeping(u, np.zeros((u.size, 2))), segments=(settled, other))
+    found = pieces_of([run], SAMII, without_loop(wiring([run], SAMII)))
+    assert [(len(p.z), p.history, p.moving) for p in found] == [
+        (2000, 0, False),
+        (400, 400, True),
+    ]
 
 
 def test_a_record_with_two_commands_has_two_inputs_and_each_has_its_loop():
