@@ -72,12 +72,10 @@ class Screen:
         return cls(problem, base, Q, np.where(known, base.x / prior, 0.0))
 
     def of_data(self) -> Screen:
-        """As if the effect were all there is, and what counts were the data alone: the parameters
-        stand where they are, and their priors hold them, at no cost."""
-        directions = self.directions.copy()
-        directions[len(directions) - self.tail.size :] = 0.0
+        """As if the effect were all there is: the data are what the fit predicts, and moves of the
+        parameters away from it cost what their priors say."""
         problem = self.problem.toward(self.response)
-        return Screen(problem, self.base, directions, np.zeros_like(self.tail))
+        return replace(self, problem=problem, tail=np.zeros_like(self.tail))
 
     def unprojected(self) -> Screen:
         """With no direction projected out."""
