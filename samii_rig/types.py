@@ -43,6 +43,9 @@ class Quality(IntFlag):
     LIMITED = 8  # the device's own limit or deadman changed the output
 
 
+OUTSIDE = 0.01  # of a converter's range, by which a value lies beyond it
+
+
 @dataclass(frozen=True, slots=True)
 class Channel:
     """One column of a recording.
@@ -61,6 +64,15 @@ class Channel:
     high: float = np.inf
     resolution: float = 0.0
     description: str = ""
+
+    def beyond(self, x: Float) -> float:
+        """The value of x (n,) farthest outside the converter's range, by more than a hundredth of
+        it; 0 if there is none. No converter reads that: it has another unit, or is another's."""
+        far = np.maximum(self.low - x, x - self.high)
+        span = self.high - self.low
+        if not np.isfinite(span) or not np.nanmax(far, initial=0.0) > OUTSIDE * span:
+            return 0.0
+        return float(x[int(np.nanargmax(far))])
 
 
 @dataclass(frozen=True, slots=True)

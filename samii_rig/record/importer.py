@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -77,14 +78,15 @@ def import_file(
     rate_hz, time, sequence = _time_base(table, layout)
     offset, dated = _date(layout, time)
     values = np.stack([_scaled(table, c) for c in layout.channel], axis=1)
+    channels = tuple(_channel(c) for c in layout.channel)
     lost = int(sequence[-1] - sequence[0]) + 1 - len(sequence)
     return Recording(
-        channels=tuple(_channel(c) for c in layout.channel),
+        channels=channels,
         rate_hz=rate_hz,
         time=time,
         sequence=sequence,
         values=values,
-        quality=_quality(values, layout),
+        quality=_quality(values, channels),
         segments=segments_of(path, layout.segment, table, sequence, time),
         rig_toml=_rig_text(layout),
         metadata={
@@ -194,7 +196,10 @@ def _time_base(table: Table, layout: ImportMap) -> tuple[float, Int, Int]:
         off = np.flatnonzero((np.abs(steps - np.rint(steps)) > _JITTER) | (steps < 0.5))
         if off.size:
             place = table.place(int(off[0]) + 1, base.column)
-            expected = f"a whole number of periods at {rate:g} Hz after the sample before"
+            expected = (
+                f"a whole number of periods at {rate:g} Hz after the sample before; "
+                "where the clock that stamped them was unsteady, a map without time.column"
+            )
             raise InputError(table.where, place, float(seconds[off[0] + 1]), expected)
         count = np.concatenate([[0.0], np.cumsum(np.rint(steps))])
     if count is None:
@@ -242,10 +247,12 @@ def _channel(channel: ColumnMap) -> Channel:
     )
 
 
-def _quality(values: Float, layout: ImportMap) -> Flags:
-    low = np.array([c.low for c in layout.channel])
-    high = np.array([c.high for c in layout.channel])
+def _quality(values: Float, channels: Sequence[Channel]) -> Flags:
+    """Samples at the end of a converter's range, but of no column that reads more than that."""
+    own = [c.low for c in channels], [c.high for c in channels]
+    low, high = (np.array(x) for x in own)
     clipped = (values <= low) | (values >= high)
+    clipped[:, [bool(c.beyond(x)) for c, x in zip(channels, values.T, strict=True)]] = False
     return np.where(clipped, Quality.CLIPPED, Quality.GOOD).astype(np.uint8)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samii_rig.signal.groups import Selection
-from samii_rig.types import Channel, Finding, Float, Quality, Recording, Segment
+from samii_rig.types import Finding, Float, Quality, Recording, Segment
 
 # Root mean square of the time stamps about a uniform clock, in samples, that is worth a
 # word: 5 % of a sample is 1 degree of phase at 1/18 of the sample rate.
@@ -35,7 +35,6 @@ LIVELY = 0.1  # of the samples, at which one that moves may read the same as bef
 AROUND = 3  # times as long as a sensor stands still, on either side
 STUCK_SAMPLES = 20
 FLAT_RUN, FLAT_RUNS = 3, 3  # as many equal samples at the extreme, as many times
-OUTSIDE = 0.01  # of a converter's range, by which a value lies beyond it
 COARSE = 1000  # distinct values below which equal neighbours mean nothing
 
 
@@ -113,7 +112,7 @@ def clipping(cut: Recording, segment: Segment, selection: Selection) -> list[Fin
         i = cut.column(channel.name)
         x, flags = cut.values[:, i], cut.quality[:, i]
         flagged = (flags & (Quality.CLIPPED | Quality.LIMITED)).astype(bool)
-        if not flagged.any() and (most := _beyond(x, channel)):
+        if not flagged.any() and (most := channel.beyond(x)):
             message = (
                 f"{cut.place(segment)}: {channel.name} reads {most:.4g} {channel.unit}, which "
                 f"is outside its range of {channel.low:g} to {channel.high:g}: another unit, or "
@@ -261,15 +260,6 @@ def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Half-open ranges in which `flags` is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-def _beyond(x: Float, channel: Channel) -> float:
-    """The value farthest outside the converter's range, 0 if there is none."""
-    far = np.maximum(channel.low - x, x - channel.high)
-    span = channel.high - channel.low
-    if not np.isfinite(span) or not np.nanmax(far, initial=0.0) > OUTSIDE * span:
-        return 0.0
-    return float(x[int(np.nanargmax(far))])
 
 
 def _flat_tops(x: Float) -> NDArray[np.bool_]:

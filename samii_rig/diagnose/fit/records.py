@@ -112,6 +112,7 @@ class Whole:
         )
         rests = tuple(j for j, x in enumerate(wired.inputs) if not x.driven)
         all_, of_levels = (replace(one, undriven=rests) for one in (all_, of_levels))
+        without |= _sensors_out(runs, rig, wired, findings)
         left_out, asked = tuple(without.items()), band is not None
         return cls(rig, all_, wired, left_out, of_levels, asked, runs=tuple(runs))
 
@@ -372,6 +373,18 @@ def _energy(r: Float, rate_hz: float) -> tuple[Float, Float, Float]:
     edges = f[2] * 2 ** (np.arange(part[-1] + 2) / PARTS)
     energy = np.asarray(np.bincount(part, power[2:]), np.float64)
     return np.asarray(edges), energy, np.asarray(np.bincount(part), np.float64)
+
+
+def _sensors_out(
+    runs: Sequence[Recording], rig: Rig, wired: Wiring, findings: Sequence[Finding]
+) -> dict[str, str]:
+    """Of each sensor that all runs have and none of which is used, why."""
+    common = set.intersection(*({c.name for c in run.channels} for run in runs))
+    out = {}
+    for name in (s.name for s in rig.sensor if s.name in common - set(wired.sensors)):
+        said = (f.message for f in findings if name in (f.channel or "").split(", "))
+        out[name] = next(said, "not sound in all of them")
+    return out
 
 
 def _named_in(messages: Sequence[str], places: Iterable[str]) -> dict[str, str]:
