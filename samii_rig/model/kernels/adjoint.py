@@ -14,6 +14,8 @@ from samii_rig.model.kernels.registers import (
     SPRING,
     WAVES,
     Flag,
+    Span,
+    States,
     System,
     Work,
     Z,
@@ -58,23 +60,23 @@ def _scatter(W: Float, slot: Int, K: float, n: int, target: Complex) -> None:
 
 @part
 def _scatter_point(
-    W: Float, slope: Complex, slot: Int, K: float, start: int, n: int, target: Complex
+    W: Float, slope: Complex, slot: Int, K: float, span: Span, target: Complex
 ) -> None:
     for m in range(slot.shape[0]):
         if slot[m] >= 0:
-            for i in range(n):
-                target[i, slot[m]] += scaled(get(W, RESULT, i) * slope[m, start + i], K)
+            for i in range(span.n):
+                target[i, slot[m]] += scaled(get(W, RESULT, i) * slope[m, span.start + i], K)
 
 
 @part
 def source_parameters(
-    actuator: int, slopes: Complex, answers: Float, slot: Int, start: int, n: int, dH: Complex
+    actuator: int, slopes: Complex, answers: Float, slot: Int, span: Span, dH: Complex
 ) -> None:
     """dH by the parameters of a source and its line from the answers to f; slopes (n_par, n)."""
     for m in range(slopes.shape[0]):
         if slot[m] >= 0:
-            for i in range(n):
-                relative = slopes[m, start + i]
+            for i in range(span.n):
+                relative = slopes[m, span.start + i]
                 for j in range(answers.shape[0]):
                     y = complex(answers[j, i], answers[j, LANES + i])
                     dH[i, j, actuator, slot[m]] += y * relative
@@ -85,15 +87,13 @@ def element_parameters(
     x: System,
     jump_d: Complex,
     k: Work,
-    elements: Flag,
     slots: Int,
-    z: Float,
-    zh: Float,
-    start: int,
-    n: int,
+    states: States,
+    span: Span,
     dH: Complex,
 ) -> None:
     """Add the derivatives by the parameters of all elements but sources and waves to dH."""
+    elements, z, zh = states.elements, states.z, states.zh
     for e in range(x.kinds.shape[0]):
         kind = x.kinds[e]
         if not elements[e] or kind == WAVES:
@@ -111,22 +111,22 @@ def element_parameters(
                 K = x.source_c[source, 4]
                 if kind in (HINGE, JUMP):
                     point(k.W, x.place[e, 0], direct, z[source, e], zh[j, e])
-                    _scatter_point(k.W, jump_d[x.place[e, 1]], slots[e], K, start, n, target)
+                    _scatter_point(k.W, jump_d[x.place[e, 1]], slots[e], K, span, target)
                 else:
                     contributions(
                         k.W, kind, x.pars[e], k.regimes[e], direct, z[source, e], zh[j, e]
                     )
-                    _scatter(k.W, slots[e], K, n, target)
+                    _scatter(k.W, slots[e], K, span.n, target)
 
 
 @part
-def keep_waves(x: System, elements: Flag, z: Float, start: int, n: int, target: Complex) -> None:
+def keep_waves(x: System, elements: Flag, z: Float, span: Span, target: Complex) -> None:
     """target[row, start:, :, solution]: the states behind and before every WAVES."""
     for e in range(x.kinds.shape[0]):
         if elements[e] and x.kinds[e] == WAVES:
             for solution in range(z.shape[0]):
                 for m in range(8):
-                    for i in range(n):
-                        target[x.place[e, 1], start + i, m, solution] = get(
+                    for i in range(span.n):
+                        target[x.place[e, 1], span.start + i, m, solution] = get(
                             z[solution, e], 2 * m, i
                         )

@@ -36,8 +36,8 @@ TINY = 1e-300  # keeps 0/0 from being NaN where a numerator of 0 shall give 0
 _OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "nsz"}}
 
 
-class _Told(event.Listener):
-    """Who waits can be told why: half a minute, where the cache on the disk has nothing yet."""
+class _Compiling(event.Listener):
+    """Reports a compilation: it takes a minute, where the cache on the disk has nothing yet."""
 
     def on_start(self, event: event.Event) -> None:
         log.info("compiling the model's kernels, once a machine")
@@ -46,7 +46,7 @@ class _Told(event.Listener):
         pass
 
 
-event.register("numba:compile", _Told())  # type: ignore[no-untyped-call]
+event.register("numba:compile", _Compiling())  # type: ignore[no-untyped-call]
 
 
 def kernel(make: Callable[[int], F]) -> F:

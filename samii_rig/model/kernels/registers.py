@@ -121,6 +121,23 @@ class Work(NamedTuple):
     gammas: Float
 
 
+class Span(NamedTuple):
+    """The n values of s of a block, s[start : start + n]; lanes beyond n repeat the last."""
+
+    start: int
+    n: int
+
+
+class States(NamedTuple):
+    """The states of a block at the elements (n_op,) with a derivative, as of
+    `adjoint.element_states`: z (n_source, n_op, 16 LANES) of the sources' solutions, zh (n_sensor,
+    n_op, 16 LANES) of the sensors' dual ones, at unit f and K."""
+
+    elements: Flag
+    z: Float
+    zh: Float
+
+
 SHORT, LONG, MIXED = 0, 1, 2  # all lanes of a beam below the threshold, above, or both
 
 

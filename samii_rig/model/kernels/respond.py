@@ -1,14 +1,14 @@
 """The loop over blocks of s, and what is asked of it.
 
 There is one compiled entry, `_run`, for all of it: each further one would compile the
-sweeps again. It is told what to do as `_blocks` is.
+sweeps again. `Asked` says which task it has, `Found` where the answer goes.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,16 @@ from samii_rig.model.kernels.adjoint import (
     source_parameters,
 )
 from samii_rig.model.kernels.block import block, recall_beam
-from samii_rig.model.kernels.lanes import LANES, conj, get, kernel, norm2, part, put, scaled
+from samii_rig.model.kernels.lanes import (
+    LANES,
+    conj,
+    get,
+    kernel,
+    norm2,
+    part,
+    put,
+    scaled,
+)
 from samii_rig.model.kernels.registers import (
     BEAM_KIND,
     CLAMPED,
@@ -34,6 +43,8 @@ from samii_rig.model.kernels.registers import (
     B,
     Factors,
     Flag,
+    Span,
+    States,
     System,
     Work,
     Z,
@@ -49,10 +60,60 @@ from samii_rig.model.kernels.solve import (
 from samii_rig.types import Complex, Float, Int
 
 RESPOND, FIELD, CHARACTERISTIC = 0, 1, 2
-_NO_FLOAT = np.zeros(0)
-_NO_COMPLEX = np.zeros(0, complex)
-_NO_STATES = np.zeros((0, 0, 0, 0), complex)
-_NO_INT = np.zeros((0, 0), np.int64)
+
+
+class Asked(NamedTuple):
+    """What is asked at every s: the task and, of the arrays, those that it needs.
+
+    slots (n_op, 7), source_slots (n_source, n_par) : as of `gradient`.
+    jumps (n_jump,), jump_c (n_jump, 4) : as of `fields`.
+    """
+
+    task: int
+    slots: Int
+    source_slots: Int
+    jumps: Int
+    jump_c: Float
+
+
+class Found(NamedTuple):
+    """Where the answers go: H, dH and both states of `gradient`, states of `fields`, mantissa and
+    log of `characteristic`; the others are empty."""
+
+    H: Complex
+    dH: Complex
+    states: Complex
+    duals: Complex
+    mantissa: Complex
+    log: Float
+
+
+class Ports(NamedTuple):
+    """Which states a task needs.
+
+    wanted (n_op + 1,) : ports at which a state is read. elements (n_op,) : those with a derivative;
+        adjoint : whether there are any. first, last : ports to sweep to from tip and base.
+        low, high : the outermost wanted ports.
+    """
+
+    wanted: Flag
+    elements: Flag
+    adjoint: bool
+    first: int
+    last: int
+    low: int
+    high: int
+
+
+_ASKED = Asked(
+    RESPOND, np.zeros((0, 0), np.int64), np.zeros((0, 0), np.int64), np.zeros(0, np.int64),
+    np.zeros((0, 4)),
+)  # fmt: skip
+_FOUND = Found(
+    np.zeros((0, 0, 0), complex), np.zeros((0, 0, 0, 0), complex),
+    np.zeros((0, 0, 0, 0), complex), np.zeros((0, 0, 0, 0), complex),
+    np.zeros(0, complex), np.zeros(0),
+)  # fmt: skip
 
 
 def gradient(
@@ -72,20 +133,16 @@ def gradient(
     n_sensor, n_source = x.feed.shape
     z = np.zeros((f.matrix.shape[0], s.size, 8, n_source), complex)
     zh = np.zeros((f.matrix.shape[0], s.size, 8, n_sensor), complex)
-    _run(
-        x, f, s, RESPOND, slots, source_slots, np.zeros(0, np.int64), np.zeros((0, 4)),
-        H, dH, z, zh, _NO_COMPLEX, _NO_FLOAT,
-    )  # fmt: skip
+    asked = _ASKED._replace(slots=slots, source_slots=source_slots)
+    _run(x, f, s, asked, _FOUND._replace(H=H, dH=dH, states=z, duals=zh))
     return z, zh
 
 
 def response(x: System, f: Factors, s: Complex, H: Complex) -> None:
     """`gradient` without derivatives."""
-    _run(
-        x, f, s, RESPOND, np.full((x.kinds.shape[0], 7), -1), np.full((x.source.shape[0], 1), -1),
-        np.zeros(0, np.int64), np.zeros((0, 4)), H, np.zeros((*H.shape, 0), complex),
-        _NO_STATES, _NO_STATES, _NO_COMPLEX, _NO_FLOAT,
-    )  # fmt: skip
+    slots, source_slots = np.full((x.kinds.shape[0], 7), -1), np.full((x.source.shape[0], 1), -1)
+    asked = _ASKED._replace(slots=slots, source_slots=source_slots)
+    _run(x, f, s, asked, _FOUND._replace(H=H, dH=np.zeros((*H.shape, 0), complex)))
 
 
 def fields(x: System, f: Factors, s: Complex, jumps: Int, jump_c: Float, out: Complex) -> None:
@@ -94,105 +151,97 @@ def fields(x: System, f: Factors, s: Complex, jumps: Int, jump_c: Float, out: Co
     jump_c (n_jump, 4): the sensor to which each is dual, see `solve`. At the jump's own
     port the state upstream of it.
     """
-    _run(
-        x, f, s, FIELD, _NO_INT, _NO_INT, jumps, jump_c,
-        np.zeros((0, 0, 0), complex), _NO_STATES, out, _NO_STATES, _NO_COMPLEX, _NO_FLOAT,
-    )  # fmt: skip
+    asked = _ASKED._replace(task=FIELD, jumps=jumps, jump_c=jump_c)
+    _run(x, f, s, asked, _FOUND._replace(states=out))
 
 
 def characteristic(x: System, f: Factors, s: Complex, mantissa: Complex, log: Float) -> None:
     """mantissa exp(log) = D(s), the tip's conditions on the columns from the base; still times
     E1 E2 of every WAVES."""
-    _run(
-        x, f, s, CHARACTERISTIC, _NO_INT, _NO_INT, np.zeros(0, np.int64), np.zeros((0, 4)),
-        np.zeros((0, 0, 0), complex), _NO_STATES, _NO_STATES, _NO_STATES, mantissa, log,
-    )  # fmt: skip
+    asked = _ASKED._replace(task=CHARACTERISTIC)
+    _run(x, f, s, asked, _FOUND._replace(mantissa=mantissa, log=log))
 
 
 @part
-def _blocks(
-    x: System,
-    f: Factors,
-    s: Complex,
-    task: int,
-    slots: Int,
-    source_slots: Int,
-    jumps: Int,
-    jump_c: Float,
-    H: Complex,
-    dH: Complex,
-    out: Complex,
-    duals: Complex,
-    mantissa: Complex,
-    log: Float,
-) -> None:
-    n_op, n_term = x.kinds.shape[0], x.term.shape[0]
-    n_sensor, n_source = x.feed.shape
-    k = workspace(n_op)
-    answers = np.zeros((n_sensor, 2 * LANES))
+def _ports(x: System, asked: Asked) -> Ports:
+    n_op, n_source = x.kinds.shape[0], x.source.shape[0]
     wanted = np.zeros(n_op + 1, np.bool_)
     elements = np.zeros(n_op, np.bool_)
-    first, last = 0, n_op  # ports to sweep to from tip and base
-    if task == RESPOND:
-        for t in range(n_term):
+    if asked.task == RESPOND:
+        for t in range(x.term.shape[0]):
             wanted[x.term[t, 1]] = True
         for source in range(n_source):
             wanted[x.source[source, 0]] = True
         for e in range(n_op):
-            elements[e] = x.kinds[e] != IDENTITY and slots[e].max() >= 0
+            elements[e] = x.kinds[e] != IDENTITY and asked.slots[e].max() >= 0
             if elements[e]:
                 wanted[e + 1] = True
                 wanted[e] |= x.kinds[e] >= BEAM_KIND
     else:
         wanted[:] = True
-    adjoint = elements.any()
-    if task == CHARACTERISTIC:
+    adjoint = bool(elements.any())
+    first, last = 0, n_op
+    if asked.task == CHARACTERISTIC:
         first = n_op
-    elif task == RESPOND and not adjoint:
+    elif asked.task == RESPOND and not adjoint:
         first, last = x.source[0, 0], x.source[-1, 0]
-    z = np.zeros((n_source, n_op if adjoint else 0, 16 * LANES))
-    zh = np.zeros((n_sensor, n_op if adjoint else 0, 16 * LANES))
     low, high = n_op, 0
     for port in range(n_op + 1):
         if wanted[port]:
             low, high = min(low, port), max(high, port)
+    return Ports(wanted, elements, adjoint, first, last, low, high)
+
+
+@part
+def _blocks(x: System, f: Factors, s: Complex, asked: Asked, found: Found) -> None:
+    n_op = x.kinds.shape[0]
+    n_sensor, n_source = x.feed.shape
+    k = workspace(n_op)
+    ports = _ports(x, asked)
+    # Names of their own for what the loop uses: numba counts an array at each look into a tuple.
+    wanted, elements, adjoint = ports.wanted, ports.elements, ports.adjoint
+    first, last, low, high = ports.first, ports.last, ports.low, ports.high
+    slots, source_slots, H, dH = asked.slots, asked.source_slots, found.H, found.dH
+    answers = np.zeros((n_sensor, 2 * LANES))
+    z = np.zeros((n_source, n_op if adjoint else 0, 16 * LANES))
+    zh = np.zeros((n_sensor, n_op if adjoint else 0, 16 * LANES))
     for start in range(0, s.shape[0], LANES):
-        n = block(x, f, k, s, start, first, last, wanted)
-        if task == CHARACTERISTIC:
-            _characteristic(x, k, start, n, mantissa, log)
-        elif task == FIELD:
-            _fields(x, k, start, n, jumps, jump_c, wanted, out)
+        span = Span(start, block(x, f, k, s, start, first, last, wanted))
+        if asked.task == CHARACTERISTIC:
+            _characteristic(x, k, span, found.mantissa, found.log)
+        elif asked.task == FIELD:
+            _fields(x, k, span, asked, wanted, found.states)
         else:
             for source in range(n_source):
                 jump = x.source[source, 0]
                 set_factor(k.W, f.drive[source], start)
                 solve(x, k, jump, x.source_c[source, :4], low, high, wanted)
                 read_sensors(x, f, k, source, answers, start)
-                _store_answers(x, source, answers, n, H[start:])
-                if source_slots[source].max() >= 0:
-                    slot = source_slots[source]
-                    source_parameters(
-                        x.source[source, 1], f.drive_d[source], answers, slot, start, n, dH[start:]
-                    )
+                _store_answers(x, source, answers, span.n, H[start:])
+                slot = source_slots[source]
+                if slot.max() >= 0:
+                    slopes = f.drive_d[source]
+                    source_parameters(x.source[source, 1], slopes, answers, slot, span, dH[start:])
                 if adjoint:
                     element_states(x, k, elements, jump, False, z[source])
             if adjoint:
-                for t in range(n_term):
+                for t in range(x.term.shape[0]):
                     jump = x.term[t, 1]
                     set_term_factor(x, f.jump, k.W, t, start)
                     solve(x, k, jump, x.term_c[t], low, high, wanted)
                     more = t > 0 and x.term[t, 0] == x.term[t - 1, 0]
                     element_states(x, k, elements, jump, more, zh[x.term[t, 0]])
-                element_parameters(x, f.jump_d, k, elements, slots, z, zh, start, n, dH[start:])
-                keep_waves(x, elements, z, start, n, out)
-                keep_waves(x, elements, zh, start, n, duals)
+                states = States(elements, z, zh)
+                element_parameters(x, f.jump_d, k, slots, states, span, dH[start:])
+                keep_waves(x, elements, z, span, found.states)
+                keep_waves(x, elements, zh, span, found.duals)
 
 
 @kernel
 def _run(files: int) -> Callable[..., None]:
-    def run(*asked: Any) -> None:
+    def run(x: System, f: Factors, s: Complex, asked: Asked, found: Found) -> None:
         if files > 0:
-            _blocks(*asked)
+            _blocks(x, f, s, asked, found)
 
     return run
 
@@ -207,24 +256,23 @@ def _store_answers(x: System, source: int, answers: Float, n: int, H: Complex) -
 
 
 @part
-def _fields(
-    x: System, k: Work, start: int, n: int, jumps: Int, jump_c: Float, wanted: Flag, out: Complex
-) -> None:
+def _fields(x: System, k: Work, span: Span, asked: Asked, wanted: Flag, states: Complex) -> None:
     n_op = x.kinds.shape[0]
-    for j in range(jumps.shape[0]):
+    for j in range(asked.jumps.shape[0]):
+        jump = asked.jumps[j]
         for i in range(LANES):
             put(k.W, FACTOR, i, complex(1.0, 0.0))
-        solve(x, k, jumps[j], jump_c[j], 0, n_op, wanted)
+        solve(x, k, jump, asked.jump_c[j], 0, n_op, wanted)
         for port in range(n_op + 1):
-            port_state(k, port, jumps[j], True, False)
-            for i in range(n):
+            port_state(k, port, jump, True, False)
+            for i in range(span.n):
                 for m in range(4):
-                    out[start + i, j, port, m] = get(k.W, Z + 2 * m, i)
+                    states[span.start + i, j, port, m] = get(k.W, Z + 2 * m, i)
 
 
 @part
-def _characteristic(x: System, k: Work, start: int, n: int, mantissa: Complex, log: Float) -> None:
-    n_op = x.kinds.shape[0]
+def _characteristic(x: System, k: Work, span: Span, mantissa: Complex, log: Float) -> None:
+    start, n, n_op = span.start, span.n, x.kinds.shape[0]
     X = k.columns_p[n_op]
     for i in range(n):
         if x.ends[1] == CLAMPED:

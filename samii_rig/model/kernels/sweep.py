@@ -50,6 +50,28 @@ from samii_rig.types import Complex, Float, Int
 
 
 @part
+def _exchange_if(W: Float, swaps: int) -> None:
+    """Exchange the columns of the lanes that need it, if there are any; sets FLAG."""
+    if swaps > 0:
+        exchange(W, X, X + 8, False)
+    else:
+        for i in range(LANES):
+            W[FLAG * LANES + i] = 0.0
+
+
+@part
+def _put_change(W: Float, i: int, rho: complex, E1: complex, E2: complex) -> None:
+    """B of lane i: the exchange where FLAG is 1, column 2 less rho times column 1, then the
+    scales E1 and E2 of the columns."""
+    flag = W[FLAG * LANES + i]
+    keep = 1.0 - flag
+    put(W, B, i, scaled(E1, keep))
+    put(W, B + 2, i, complex(-flag - keep * rho.real, -keep * rho.imag) * E2)
+    put(W, B + 4, i, scaled(E1, flag))
+    put(W, B + 6, i, complex(keep - flag * rho.real, -flag * rho.imag) * E2)
+
+
+@part
 def waves(W: Float, m: Complex, start: int) -> None:
     """Carry X over a matrix given by its waves, as `long_beam`; m (34, n) see `timoshenko`."""
     last = m.shape[1] - 1
@@ -70,11 +92,7 @@ def waves(W: Float, m: Complex, start: int) -> None:
         put(W, X + 10, i, m[8, n] * w + m[10, n] * M + m[11, n] * V)
         put(W, X + 12, i, m[12, n] * w + m[14, n] * M + m[15, n] * V)
         swaps += norm2(a2) > EXCHANGE * norm2(a1)
-    if swaps > 0:
-        exchange(W, X, X + 8, False)
-    else:
-        for i in range(LANES):
-            W[FLAG * LANES + i] = 0.0
+    _exchange_if(W, swaps)
     for i in range(LANES):
         n = min(start + i, last)
         E1, E2 = m[32, n], m[33, n]
@@ -92,12 +110,7 @@ def waves(W: Float, m: Complex, start: int) -> None:
         put(W, THETA2, i, m[21, n] * bo + m[22, n] * co + m[23, n] * do)
         put(W, X + 10, i, m[25, n] * bo + m[26, n] * co + m[27, n] * do)
         put(W, X + 12, i, m[29, n] * bo + m[30, n] * co + m[31, n] * do)
-        flag = W[FLAG * LANES + i]
-        keep = 1.0 - flag
-        put(W, B, i, scaled(E1, keep))
-        put(W, B + 2, i, complex(-flag - keep * rho.real, -keep * rho.imag) * E2)
-        put(W, B + 4, i, scaled(E1, flag))
-        put(W, B + 6, i, complex(keep - flag * rho.real, -flag * rho.imag) * E2)
+        _put_change(W, i, rho, E1, E2)
 
 
 @part
@@ -152,6 +165,13 @@ def long_beam(W: Float) -> None:
     (1, lambda, lambda^2, lambda^3), lambda = 1, -1, j, -j: to and from the waves is a
     discrete Fourier transform of four points.
     """
+    _exchange_if(W, _split(W))
+    _decay(W)
+
+
+@part
+def _split(W: Float) -> int:
+    """X as waves; the number of lanes whose columns must be exchanged."""
     swaps = 0
     for i in range(LANES):
         g1, g2, g3 = get(W, BEAM + 13, i), get(W, BEAM + 15, i), get(W, BEAM + 17, i)
@@ -172,11 +192,12 @@ def long_beam(W: Float) -> None:
         put(W, X + 10, i, pick(upper, d, c))
         put(W, X + 12, i, pick(upper, c, d))
         swaps += norm2(a2) > EXCHANGE * norm2(a1)
-    if swaps > 0:
-        exchange(W, X, X + 8, False)
-    else:
-        for i in range(LANES):
-            W[FLAG * LANES + i] = 0.0
+    return swaps
+
+
+@part
+def _decay(W: Float) -> None:
+    """Carry the waves to the beam's end, as X there, and B."""
     for i in range(LANES):
         a, b, m, n = get(W, X, i), get(W, X + 2, i), get(W, X + 4, i), get(W, X + 6, i)
         rho = get(W, X + 8, i) * scaled(conj(a), 1.0 / (norm2(a) + TINY))
@@ -200,12 +221,7 @@ def long_beam(W: Float) -> None:
         put(W, THETA2, i, h1 * t)
         put(W, X + 10, i, h2 * M)
         put(W, X + 12, i, h3 * V)
-        flag = W[FLAG * LANES + i]
-        keep = 1.0 - flag
-        put(W, B, i, scaled(E1, keep))
-        put(W, B + 2, i, complex(-flag - keep * rho.real, -keep * rho.imag) * E2)
-        put(W, B + 4, i, scaled(E1, flag))
-        put(W, B + 6, i, complex(keep - flag * rho.real, -flag * rho.imag) * E2)
+        _put_change(W, i, rho, E1, E2)
 
 
 @part
