@@ -16,10 +16,10 @@ from samii_rig.model.loops import Loops, Sampled, closed_poles, sampled_system
 from samii_rig.model.realise import Realisation, realise
 from samii_rig.model.sampled import sampled_response
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.schema import Rig, parameters
+from samii_rig.rig.schema import Key, Rig, parameters
 from samii_rig.types import Complex, Float
 
-Values = Mapping[tuple[str, str], float]
+Values = Mapping[Key, float]
 """(element, symbol) -> SI value, as `Chain.with_values` takes it."""
 
 STIFFNESSES = ("k", "EI", "GA")  # symbols of what +-20 % is said of
@@ -152,7 +152,7 @@ def with_values(rig: Rig, values: Values) -> Rig:
     return Chain(rig).with_values(values).rig
 
 
-def stiffnesses(rig: Rig) -> tuple[tuple[str, str], ...]:
+def stiffnesses(rig: Rig) -> tuple[Key, ...]:
     """Every stiffness of the chain that is not 0, as (element, symbol)."""
     return tuple(
         (e.name, symbol)
@@ -187,7 +187,7 @@ def inside(rig: Rig, spread: float, n: int, seed: int) -> dict[str, Values]:
 class Known:
     """What an identification knows: keys, and log_covariance (n, n) of their logarithms."""
 
-    keys: tuple[tuple[str, str], ...]
+    keys: tuple[Key, ...]
     log_covariance: Float
 
 
@@ -210,6 +210,6 @@ def uncertain(rig: Rig, n: int, seed: int, known: Known | None = None) -> dict[s
     return {f"rig {i + 1}": _scaled(rig, tuple(keys), row) for i, row in enumerate(factors)}
 
 
-def _scaled(rig: Rig, keys: tuple[tuple[str, str], ...], factors: Float) -> Values:
+def _scaled(rig: Rig, keys: tuple[Key, ...], factors: Float) -> Values:
     value = {(e.name, s): p.value for e in rig.element for s, p in parameters(e).items()}
     return {key: value[key] * float(x) for key, x in zip(keys, factors, strict=True)}

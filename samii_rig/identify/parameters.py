@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.errors import InputError, one_of
-from samii_rig.rig.schema import Rig, parameters
+from samii_rig.rig.schema import Key, Rig, parameters
 from samii_rig.types import Float
 
 # Default bounds, as a factor of the rig file's value: wide enough that they are met only by
@@ -37,7 +37,7 @@ class Free:
     tolerance: float | None = None
 
     @property
-    def key(self) -> tuple[str, str]:
+    def key(self) -> Key:
         """(element, symbol), as `Chain.parameters` has it."""
         return self.element, self.symbol
 
@@ -66,7 +66,7 @@ class Space:
     units: tuple[str, ...]
 
     @property
-    def keys(self) -> tuple[tuple[str, str], ...]:
+    def keys(self) -> tuple[Key, ...]:
         """(element, symbol) of each, as `Chain.parameters` has them."""
         return tuple(f.key for f in self.free)
 
@@ -79,7 +79,7 @@ class Space:
         """(n,) SI values at x."""
         return np.asarray(self.start * np.exp(x))
 
-    def mapping(self, x: Float) -> dict[tuple[str, str], float]:
+    def mapping(self, x: Float) -> dict[Key, float]:
         """The same as the argument of `Chain.with_values`."""
         return {k: float(v) for k, v in zip(self.keys, self.values(x), strict=True)}
 
@@ -149,7 +149,7 @@ def uncertain(rig: Rig) -> tuple[str, ...]:
     )
 
 
-def changed(rig: Rig, values: Mapping[tuple[str, str], float]) -> Rig:
+def changed(rig: Rig, values: Mapping[Key, float]) -> Rig:
     """The rig with other values of some parameters; `source` says that they were identified."""
     elements = []
     for element in rig.element:

@@ -11,11 +11,9 @@ import numpy as np
 from pydantic import BaseModel
 
 from samii_rig.errors import InputError
-from samii_rig.rig.schema import Acceleration, Rig, Strain, flattened, parameters
+from samii_rig.rig.schema import Acceleration, Key, Rig, Strain, flattened, parameters
 from samii_rig.rig.schema.elements import contradiction, quantities
 from samii_rig.types import Float, Int
-
-Key = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)

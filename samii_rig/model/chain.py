@@ -42,6 +42,7 @@ from samii_rig.rig.schema import (
     Branch,
     Element,
     Gear,
+    Key,
     LumpedMass,
     Rig,
     RigidLink,
@@ -97,7 +98,7 @@ class CompiledChain:
     """
 
     system: System
-    parameters: tuple[tuple[str, str], ...]
+    parameters: tuple[Key, ...]
     values: Float
     slots: Int
     source_slots: Int
@@ -237,7 +238,7 @@ class _Parts:
         self.pull = 0.0  # along the chain at the element that is added
         self.pulls: list[float] = []
         self.bends: list[tuple[int, float]] = []
-        self.keys: list[tuple[str, str]] = []
+        self.keys: list[Key] = []
         self.values: list[float] = []
         self.op: list[tuple[int, int, int]] = []  # kind, pair, row
         self.kinds: list[str] = []

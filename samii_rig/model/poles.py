@@ -315,9 +315,14 @@ def _isolate(
 def _cut(D: Characteristic, boxes: list[tuple[_Box, int]]) -> list[tuple[_Box, int]]:
     """Parts of boxes that hold so many zeros each, and how many each part holds."""
     out: list[tuple[_Box, int]] = []
-    for cut in CUTS:
-        if not boxes:
-            return out
+    cuts = iter(CUTS)
+    while boxes:
+        cut = next(cuts, None)
+        if cut is None:
+            at = boxes[0][0].centre
+            raise SamiiRigError(
+                f"pole search: {boxes[0][1]} poles around {at:.6g} rad/s cannot be told apart"
+            )
         parts = [_parts(box, cut) for box, _ in boxes]
         counts = iter(_turns(D, [half for halves, _ in parts for half in halves]))
         left = []
@@ -330,11 +335,6 @@ def _cut(D: Characteristic, boxes: list[tuple[_Box, int]]) -> list[tuple[_Box, i
             else:
                 left.append((box, count))
         boxes = left
-    if boxes:
-        box, count = boxes[0]
-        raise SamiiRigError(
-            f"pole search: {count} poles around {box.centre:.6g} rad/s cannot be told apart"
-        )
     return out
 
 

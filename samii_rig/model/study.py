@@ -24,7 +24,7 @@ from samii_rig.model.vary import MOST_POINTS
 from samii_rig.model.vary import Varied as Varied
 from samii_rig.model.vary import vary as vary
 from samii_rig.rig.load import parse
-from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema import Key, Rig
 from samii_rig.types import Float, Int
 
 TOGETHER = 8  # points that are one piece of work
@@ -111,13 +111,13 @@ def study(
 
 
 def _some(
-    rig_toml: str, keys: Sequence[tuple[str, str]], points: Float, band: tuple[float, float]
+    rig_toml: str, keys: Sequence[Key], points: Float, band: tuple[float, float]
 ) -> list[Point]:
     chain = Chain(parse(Rig, rig_toml, "the rig file"))
     return [_one(chain, dict(zip(keys, map(float, row), strict=True)), band) for row in points]
 
 
-def _one(chain: Chain, values: dict[tuple[str, str], float], band: tuple[float, float]) -> Point:
+def _one(chain: Chain, values: dict[Key, float], band: tuple[float, float]) -> Point:
     try:
         here = chain.with_values(values)
         region = search_region(here.rig, band[1])

@@ -27,6 +27,7 @@ from samii_rig.rig.schema import (
     Acceleration,
     Branch,
     Element,
+    Key,
     Rig,
     Sensor,
     parameters,
@@ -53,7 +54,7 @@ class Chain:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self._c = compile_chain(rig)
-        self._changed: dict[tuple[str, str], float] = {}
+        self._changed: dict[Key, float] = {}
         self._allowed = Allowed(rig, self._c.parameters)
         self.parameters = self._c.parameters
 
@@ -73,7 +74,7 @@ class Chain:
         """(n_param,) the values of `parameters`, SI units."""
         return self._c.values.copy()
 
-    def with_values(self, values: Mapping[tuple[str, str], float]) -> Chain:
+    def with_values(self, values: Mapping[Key, float]) -> Chain:
         """The same chain with other values of some `parameters`.
 
         Raises InputError for an unknown parameter or a value that the rig file would not allow.
@@ -113,7 +114,7 @@ class Chain:
         return H
 
     def gradient(
-        self, frequency_hz: ArrayLike, wrt: Sequence[tuple[str, str]] | None = None
+        self, frequency_hz: ArrayLike, wrt: Sequence[Key] | None = None
     ) -> tuple[Complex, Complex]:
         """H as `response`, and dH (n_freq, n_sensor, n_actuator, n_param) by the adjoint.
 
@@ -243,13 +244,13 @@ class Chain:
         return driven
 
 
-def _with(rig: Rig, values: Mapping[tuple[str, str], float]) -> Rig:
+def _with(rig: Rig, values: Mapping[Key, float]) -> Rig:
     """The rig with other values, which have been checked."""
     elements = tuple(_element_with(element, values) for element in rig.element)
     return rig.model_copy(update={"element": elements})
 
 
-def _element_with(element: Element, values: Mapping[tuple[str, str], float]) -> Element:
+def _element_with(element: Element, values: Mapping[Key, float]) -> Element:
     new: dict[str, object] = {
         symbol: parameter.model_copy(update={"value": float(values[element.name, symbol])})
         for symbol, parameter in parameters(element).items()

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.errors import InputError
-from samii_rig.rig.schema import Rig, flattened, parameters
+from samii_rig.rig.schema import Key, Rig, flattened, parameters
 from samii_rig.types import Float
 
 MOST_POINTS = 100_000  # some 0.1 s each: three hours of one core
@@ -22,7 +22,7 @@ class Varied:
         highest, in equal steps or, with `log`, equal ratios.
     """
 
-    key: tuple[str, str]
+    key: Key
     unit: str
     own: float
     values: Float

@@ -180,17 +180,8 @@ class Whole:
             return self._aliases[key][1]
 
         chain = model.plain(fitted.x)
-        return grid(
-            self.rig,
-            frequency,
-            sensor,
-            actuator,
-            chain,
-            sigma,
-            self.loop,
-            aliases,
-            self.own_aliases,
-        )
+        open_ = grid(self.rig, frequency, sensor, actuator, chain, sigma, aliases, self.own_aliases)
+        return replace(open_, loop=self.loop)
 
     def with_own_aliases(self) -> Whole:
         """As of `Recorded`."""

@@ -16,13 +16,12 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 
 from samii_rig.model.tmm import Chain
+from samii_rig.rig.schema import Key
 from samii_rig.types import Complex, Float, Int
 
 SPACING = 0.6  # of the logarithm of frequency, between nodes
 RISE = 2 / math.pi  # of the logarithm of stiffness by that of frequency, over eta
 STIFFNESS = ("EI", "GA")
-
-Key = tuple[str, str]
 
 
 class CausalChain:

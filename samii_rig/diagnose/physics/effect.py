@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.model.tmm import State
+from samii_rig.rig.schema import Key as Key
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
     from samii_rig.diagnose.forces.laws import Force
     from samii_rig.diagnose.physics.fractional import Joint
 
-Key = tuple[str, str]
 Values = Mapping[Key, float]
 LEAST = 1e-6  # of the logarithm of a ratio: no record of a structure shows a part in a million
 

@@ -301,14 +301,13 @@ def grid(
     actuator: Int,
     chain: Chain | None = None,
     sigma: float = 0.0,
-    loop: Closed | None = None,
     aliases: Callable[[Chain, Float], Aliases] | None = None,
     own_aliases: bool = False,
 ) -> Grid:
-    """The grid of a rig at sorted frequencies, Hz. chain : whose aliases these are, if they are
-    not the rig's own. sigma : 1/s, how far beside the imaginary axis.
-    loop : closed around the entries. aliases : of a chain at a few frequencies, where they may be
-    known from before. own_aliases : whether every model folds back what is its own."""
+    """The grid of a rig at sorted frequencies, Hz, without a loop. chain : whose aliases these are,
+    if they are not the rig's own. sigma : 1/s, how far beside the imaginary axis. aliases : of a
+    chain at a few frequencies, where they may be known from before. own_aliases : whether every
+    model folds back what is its own."""
     f = np.unique(frequency)
     few = np.geomspace(f[f > 0][0], f[-1], min(ALIAS_POINTS, f.size))
     few[-1] = f[-1]
@@ -324,7 +323,7 @@ def grid(
         own = np.stack([_lower(_around(rig, u, sensor, actuator), k) for u, k in upper])
     return Grid(
         f, factor, every, folded, rig.rate_hz, sensor, actuator,
-        sigma=sigma, loop=loop, far=made.far, own_aliases=own,
+        sigma=sigma, far=made.far, own_aliases=own,
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ become SI), `elements`, `sensors`, `actuators`, `loops`, `limits`, `device`, `po
 from samii_rig.rig.schema.actuators import ActuatorSpec
 from samii_rig.rig.schema.base import (
     Finite,
+    Key,
     Name,
     NonNegative,
     Parameter,
@@ -101,6 +102,7 @@ __all__ = [
     "Gear",
     "GravityStiffness",
     "HydraulicLine",
+    "Key",
     "Limit",
     "LumpedLine",
     "LumpedMass",

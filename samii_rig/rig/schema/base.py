@@ -18,6 +18,9 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
+Key = tuple[str, str]
+"""(element, symbol) of a parameter."""
+
 
 class Strict(BaseModel):
     """A table of the rig file: unknown keys are errors, values cannot be changed."""
