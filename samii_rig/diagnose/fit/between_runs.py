@@ -18,6 +18,7 @@ from samii_rig.diagnose.fit.intervals import TAIL
 from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.fit.stated import IN_DATA
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.result import Value
 from samii_rig.errors import SamiiRigError
@@ -32,7 +33,6 @@ KNOWN = 1e-4  # relative, of a stiffness for which the rig file has no tolerance
 BINS = 100  # of each series
 ROUNDS = 4  # of Gauss and Newton
 MOSTLY = 0.5  # of what one stiffness for all leaves over the noise, that must be explained
-CLEAR = 45.0  # of chi-square that it must be at least
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ def between_runs(search: Search, base: Fitted, decide: Measured) -> Changing | N
     expected = sum(p.expected for _, p in series)
     cost = np.array([e[0] for e, _ in known])
     gain = none[0] - float(np.min(cost))
-    if gain < max(CLEAR, MOSTLY * (none[0] - expected)):
+    if gain < max(IN_DATA, MOSTLY * (none[0] - expected)):
         return None
     # What even the best leaves makes the others less unlikely.
     weight = -0.5 * cost / max(1.0, float(np.min(cost)) / expected)

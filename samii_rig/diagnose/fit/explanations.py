@@ -25,14 +25,14 @@ from samii_rig.diagnose.physics.model import Grid, Model, grid
 from samii_rig.errors import SamiiRigError
 from samii_rig.progress import Begun, Progress, counted
 from samii_rig.rig.schema import Rig
-from samii_rig.types import Float
+from samii_rig.types import Complex, Float
 
 PRIOR = (0.5, 0.4, 0.02)  # before the data: of nothing, one, two effects missing
 FEWER = 0.05  # of each further effect
 FAULTY = 0.4  # before the data, of each that is in how the records were made
 NEAR = 25.0  # of the logarithm of evidence: explanations further below the best are let go
 FIVE = 5.0  # standard deviations of chi-square beyond which what is left is more than noise
-ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and bins over which it is looked for
+ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts; bins or nodes over which it is sought
 UNEXPLAINED = 3e-4  # chance that noise alone leaves more than the threshold
 EXACT = 4e-4  # of the mismatch: what beams, sensors and integrators are modelled to
 
@@ -43,6 +43,19 @@ def threshold(spread: float) -> float:
     """Chi-square per degree of freedom that noise alone exceeds as rarely as `UNEXPLAINED` says.
     spread : its relative variance."""
     return float(stats.gamma.isf(UNEXPLAINED, 1 / spread, scale=spread))
+
+
+def alike(r: Float | Complex) -> float:
+    """The integrated autocorrelation of what a model leaves, r (n, p) by frequency in units of the
+    noise: 1 and twice the sum of its correlations, up to the first below `ALIKE`."""
+    power = float(np.sum(np.abs(r) ** 2))
+    found = 1.0
+    for lag in range(1, min(MOST_ALIKE, len(r) - 1)):
+        rho = float(np.sum(r[lag:] * r[:-lag].conj()).real) / power
+        if rho < ALIKE:
+            break
+        found += 2 * rho
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,14 +215,7 @@ class Explanations:
             return 1.0
         h = fitted.model.response(fitted.x, self.problem.at)
         r = (self.problem.root @ (h - self.problem.data.H)[:, :, None])[:, :, 0]
-        power = float(np.sum(np.abs(r) ** 2))
-        alike = 1.0
-        for lag in range(1, min(MOST_ALIKE, len(r) - 1)):
-            rho = float(np.sum(r[lag:] * r[:-lag].conj()).real) / power
-            if rho < ALIKE:
-                break
-            alike += 2 * rho
-        return left * alike
+        return left * alike(r)
 
     def holds(self, explanation: Explanation) -> bool:
         """Whether it may be told at all, however probable it is."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from samii_rig.diagnose.fit.classes import Class
 from samii_rig.diagnose.fit.explanations import Explanation
+from samii_rig.diagnose.fit.gap import DRAWS
 from samii_rig.diagnose.physics.along import POSITION
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Value
@@ -21,7 +22,6 @@ from samii_rig.types import Float
 
 Bools = NDArray[np.bool_]
 
-DRAWS = 1000
 TAIL = 0.05  # of the draws, beyond either end of an interval of 90 %
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from samii_rig.diagnose.fit import forms
-from samii_rig.diagnose.fit.explanations import FIVE, Explanation, threshold
+from samii_rig.diagnose.fit.explanations import FIVE, Explanation, alike, threshold
 from samii_rig.diagnose.fit.forms import Form
 from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.refit import Fitted, Problem, counted, refit
@@ -39,7 +39,6 @@ MOST_MADE = 6  # times that the likelihood is made about the nominal model
 BETWEEN = 0.5
 ALARM = 2e-3  # chance that noise alone makes the best of all effects look missing
 HIGHEST_CRITICAL = 1e3  # of chi-square, beyond what any table asks for
-ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts, and octaves' parts over which it is sought
 
 
 class Recorded(Protocol):
@@ -304,13 +303,7 @@ class RecordSearch(Search):
         r = self.problem.residual(h)[: F.shape[0]]
         pull = np.tensordot(r, F, 1) / np.linalg.norm(F, axis=0)
         pull = pull.reshape(-1, F.shape[3]).T
-        power, alike = float(np.sum(pull**2)), 1.0
-        for lag in range(1, min(MOST_ALIKE, len(pull) - 1)):
-            rho = float(np.sum(pull[lag:] * pull[:-lag])) / power
-            if rho < ALIKE:
-                break
-            alike += 2 * rho
-        return left * alike
+        return left * alike(pull)
 
     def rebin(self, fitted: Fitted) -> None:
         """The likelihood anew, about this fit, unless the one in use serves: what disturbs the rig

@@ -10,7 +10,7 @@ from samii_rig.diagnose.data.measured import DIFFER
 from samii_rig.diagnose.fit.agreeing import Given, several_states
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
-from samii_rig.diagnose.fit.explanations import Explanation, threshold
+from samii_rig.diagnose.fit.explanations import FIVE, Explanation, threshold
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import TURN, Whole
 from samii_rig.diagnose.fit.rigfile import explained
@@ -28,7 +28,6 @@ EXHAUSTED = (
     "not every force that may act was computed to the end, as the records are long; fewer of them "
     "or a narrower band would let it"
 )
-MORE = 5.0  # standard deviations of chi-square beyond which it is more than noise
 # Logarithm of the odds of a stiffness that varies, from which that is missing where nothing else
 # is: noise alone reaches it in 0.1 % of recordings. Of 309 in which nothing was hidden three had
 # 4.9 to 6.6, as these odds say; none of 27 in which one varied had less than 9.
@@ -307,7 +306,7 @@ def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
     """The same, but where no linear response explains all records something is missing; and that in
     words."""
     left, sd = search.inconsistent()
-    if left < 1 + MORE * sd:
+    if left < 1 + FIVE * sd:
         return looked
     remarks = (
         f"the records disagree: chi-square per degree of freedom {left:.3g} of what no linear "
