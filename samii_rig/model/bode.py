@@ -67,7 +67,7 @@ class Bode:
 
 
 def bode(model: Rig | Chain, frequency_hz: ArrayLike) -> Bode:
-    """The continuous response of a chain; frequencies increasing, Hz.
+    """The continuous response of a chain at increasing frequencies (n_freq,), Hz.
 
     The phase is right if it moves by less than half a turn between neighbours.
     Raises InputError for frequencies that do not increase or are not above 0.

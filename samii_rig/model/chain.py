@@ -120,12 +120,13 @@ class CompiledChain:
     weight: Weight | None = None
 
     def holds(self, values: Float, changed: Iterable[int]) -> bool:
-        """Whether it may have these values of all parameters, of which some are changed."""
+        """Whether it may have these values (n_param,), SI units, of which those at `changed`
+        differ."""
         longer = all(values[i] > last for i, last in self.divided)
         return longer and self.rigid.isdisjoint(changed)
 
     def with_values(self, values: Float) -> CompiledChain:
-        """The same chain with other values of all parameters, which it `holds`."""
+        """The same chain with other values (n_param,), SI units, which it `holds`."""
         padded = _padded(values, self.weight)
         pars = padded[self.slots] + self.fixed
         source = padded[self.source_slots] + self.source_fixed

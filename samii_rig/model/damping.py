@@ -52,7 +52,7 @@ class Relaxations:
         return np.asarray(self.scale * (1 + series) + s * self.tau)
 
     def zeros(self) -> Float:
-        """Where the modulus vanishes: real, negative, one by every relaxation, rad/s."""
+        """(n_relaxation,) rad/s, where the modulus vanishes: negative, one by every relaxation."""
         poly = np.polynomial.Polynomial
         whole = poly.fromroots(-self.b)
         total = whole * poly([self.scale, self.tau])

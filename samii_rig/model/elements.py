@@ -186,6 +186,8 @@ def matrix(element: Element, s: Complex) -> Complex:
     """The (..., 5, 5) matrix of any element of a rig file at s, rad/s.
 
     A line's source has no line in it here: it lets all of its flow through.
+
+    Raises InputError for a kind of element that has no such matrix.
     """
     p = {symbol: parameter.value for symbol, parameter in parameters(element).items()}
     match element:

@@ -92,7 +92,8 @@ def read(c: CompiledChain, s: Complex, H: Complex) -> None:
 
 
 def read_slopes(c: CompiledChain, s: Complex, place: np.ndarray, H: Complex, dH: Complex) -> None:
-    """`read` of H and dH; `place` as in `add_waves`."""
+    """`read` of H (n, n_out, n_in) and of dH (n, n_out, n_in, n_wanted); `place` : see
+    `add_waves`."""
     for sensor, law, e in c.readings:
         dH[:, sensor] *= READINGS[law].value(s, c.system.pars[e])[:, None, None]
         for slope, slot in zip(READINGS[law].slopes(s, c.system.pars[e]), c.slots[e], strict=False):
@@ -191,7 +192,8 @@ def differentiate(
 
 
 def clearing(c: CompiledChain, s: Complex) -> tuple[Complex, Float]:
-    """mantissa exp(log) that clears the poles of point elements and branches from D(s)."""
+    """mantissa exp(log), (n,) each, which clears the poles of point elements and branches from D at
+    s (n,), rad/s."""
     mantissa, log = np.ones_like(s), np.zeros(s.size)
     for e in c.poles:
         factor, more = POINTS[c.kinds[e]].clear(s, c.system.pars[e])
@@ -203,7 +205,8 @@ def clearing(c: CompiledChain, s: Complex) -> tuple[Complex, Float]:
 
 
 def characteristic(c: CompiledChain, s: Complex, clear: bool) -> tuple[Complex, Float]:
-    """D(s) of a compiled chain, see `tmm.Chain.characteristic`."""
+    """D = mantissa exp(log), (n,) each, of a compiled chain at s (n,), rad/s: see
+    `tmm.Chain.characteristic`."""
     mantissa, log = np.zeros(s.size, complex), np.zeros(s.size)
     if not s.size:
         return mantissa, log

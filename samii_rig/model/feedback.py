@@ -26,7 +26,7 @@ MOST_MEMORY = 1_000_000  # samples; a pole slower than this is cut off
 
 
 def analogue(loop: Feedback, s: Complex) -> Complex:
-    """F(s) at complex s, rad/s."""
+    """F at complex s of any shape, rad/s."""
     zeros, poles, k = loop.zpk()
     s = np.asarray(s, dtype=np.complex128)
     value = np.full_like(s, k)
@@ -38,7 +38,8 @@ def analogue(loop: Feedback, s: Complex) -> Complex:
 
 
 def digital(loop: Feedback, z: Complex, rate_hz: float) -> Complex:
-    """The digital filter at complex z (not -1): exactly F at Tustin's s."""
+    """The digital filter at complex z (not -1) of any shape, F at s = 2 f_s (z - 1)/(z + 1)
+    (Tustin)."""
     z = np.asarray(z, dtype=np.complex128)
     return analogue(loop, 2.0 * rate_hz * (z - 1.0) / (z + 1.0))
 

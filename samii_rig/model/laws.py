@@ -286,7 +286,8 @@ def _clear_line(s: Complex, p: Float) -> Clearing:
 
 
 def line_filter(s: Complex, p: Float) -> Complex:
-    """1/cosh(G): what arrives of a flow at the blocked end of a line."""
+    """(n,) 1/cosh(G) at s (n,), rad/s: the part of a flow that arrives at a line's blocked end.
+    p : the line's parameters in the schema's order."""
     return _Line(s, p).tanh()[2]
 
 

@@ -109,7 +109,8 @@ def closed_response(
 def continuous_closed_response(
     rig: Rig, frequency_hz: Float, loops: Loops | None = None, chain: Chain | None = None
 ) -> Complex:
-    """The same without sampling: the chain, the sensors' filters and delays, F(s), no hold."""
+    """(n_freq, n_sensor, n_actuator) at frequency_hz (n_freq,), as `closed_response` without
+    sampling: the chain, the sensors' filters and delays, F(s), no hold."""
     loops = loops_of(rig) if loops is None else loops
     f = np.asarray(frequency_hz, dtype=np.float64)
     G = (Chain(rig) if chain is None else chain).response(f)
@@ -272,6 +273,8 @@ def unstable_count(rig: Rig, loops: Loops | None = None) -> int:
     L itself has none there (the filters are stable, the chain is) but perhaps the source's
     integrator at z = 1, which is passed outside. 1 + L is 1 far out, so each turn of 1 + L
     around 0, as z runs along the circle, is a pole of the closed loop.
+
+    Raises SamiiRigError if the count is no whole number.
     """
     loops = loops_of(rig) if loops is None else loops
     chain = Chain(rig)
@@ -289,8 +292,8 @@ def unstable_count(rig: Rig, loops: Loops | None = None) -> int:
 
 
 def refined(function: Callable[[Float], Complex], f: Float) -> tuple[Float, Complex]:
-    """Frequencies halved where the function's logarithm moves by more than `TURN`, and its
-    values."""
+    """Frequencies (m,) and the function's values there, (m,): increasing f (n,), Hz, with intervals
+    halved until its logarithm moves by less than `TURN` in each."""
     value = function(f)
     for _ in range(ROUNDS):
         step = np.log(value[1:] / value[:-1])

@@ -58,7 +58,7 @@ class Region:
     holes: tuple[tuple[float, float], ...] = ()
 
     def contains(self, s: Complex) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-        """Whether each s lies in the region."""
+        """(n,) whether each s (n,), rad/s, lies in the region."""
         inside = (s.real >= self.left) & (s.real <= self.right) & (np.abs(s.imag) <= self.top)
         for low, high in self.holes:
             half = (high - low) / 2
@@ -169,7 +169,7 @@ def _pieces(region: Region) -> list[_Box]:
 
 
 def _turns(D: Characteristic, boxes: Sequence[_Box]) -> list[int | None]:
-    """Zeros inside each box; None if one lies on its boundary, as far as can be told."""
+    """Zeros inside each box; None if one lies on its boundary, as far as can be seen."""
     # The last corner twice, as t = 4 is where it begins and nothing follows.
     corners = np.array([[*box.corners, box.corners[-1]] for box in boxes])
 
@@ -186,7 +186,7 @@ def _turns(D: Characteristic, boxes: Sequence[_Box]) -> list[int | None]:
 def phase_along(
     D: Characteristic, path: Callable[[Float], Complex], t: Float, spacing: float
 ) -> float | None:
-    """`phases_along` of one path."""
+    """rad, `phases_along` of one path s = path(t), t (n,) increasing."""
     (turned,) = phases_along(D, lambda _, t: path(t), t, np.array([spacing]))
     return turned
 

@@ -125,7 +125,7 @@ def realise(rig: Rig, band_hz: float | None = None, near: Complex | None = None)
     """The chain of `rig` as partial fractions, all poles up to `band_hz` kept.
 
     band_hz : edge of the searched region, default 4 times the sample rate.
-    near : poles of nearly the same chain, from which these are found in less time.
+    near : (n_pole,) rad/s, poles of nearly the same chain, from which these are found in less time.
     A beam's constant loss factor is replaced by relaxations (`samii_rig.model.damping`) fitted
     from LOSS_LOW times the rate to half the rate. InputError if the chain is unstable or has
     a pole of higher order.

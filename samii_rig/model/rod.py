@@ -69,7 +69,8 @@ def _short(L: float, G: Complex, m: Complex) -> Complex:
 
 
 def scaling(s: Complex, p: Float) -> tuple[Complex, Float]:
-    """1/(E1 E2) as mantissa exp(log): what the kernel's scaling took out of the determinant."""
+    """1/(E1 E2) = mantissa exp(log), (n,) each at s (n,), rad/s: what the kernel's scaling took out
+    of the determinant. p : the element's parameters in the schema's order."""
     _, _, lam, long = _waves(s, p)
     total = np.where(long, lam * p[LENGTH], 0.0)
     return np.exp(1j * total.imag), np.asarray(total.real)

@@ -22,7 +22,8 @@ from samii_rig.types import Complex, Float
 
 ALIAS_TOLERANCE = 1e-5  # of each response, change by the last doubling of the aliases
 FIRST_ALIASES = 16  # aliases on each side to begin with
-SETTLED = 0.7  # ratio of a doubling's sum to the last, below which the rest is told: 1/f^2 has 0.5
+# Ratio of a doubling's sum to the last, below which the rest is extrapolated: 1/f^2 has 0.5.
+SETTLED = 0.7
 BLOCK = 128  # frequencies at once, so that memory stays bounded
 MAX_ALIASES = 4096  # on each side; the terms fall at least as 1/f^2 from there
 
@@ -35,13 +36,13 @@ def hold_response(frequency_hz: Float, rate_hz: float, delay: float = 0.0) -> Co
 
 
 def hold_at(s: Complex, rate_hz: float, delay: float = 0.0) -> Complex:
-    """The same at complex s (not 0), rad/s: (1 - e^{-s T})/(s T) e^{-s delay}."""
+    """(1 - e^{-s T})/(s T) e^{-s delay} at complex s of any shape but 0, rad/s; delay in s."""
     s = np.asarray(s, dtype=np.complex128)
     return np.asarray(-np.expm1(-s / rate_hz) * rate_hz / s * np.exp(-s * delay))
 
 
 def lowpass_poles(sensor: SensorBase) -> Complex:
-    """Poles of the sensor's anti-alias Butterworth filter, then of its lag, rad/s."""
+    """(n_pole,) rad/s, of the sensor's anti-alias Butterworth filter, then of its lag."""
     lag = np.full(1 if sensor.lag > 0 else 0, -1 / sensor.lag if sensor.lag > 0 else 0.0)
     if sensor.antialias is None:
         return lag.astype(np.complex128)
@@ -54,7 +55,7 @@ def lowpass_poles(sensor: SensorBase) -> Complex:
 
 
 def filter_poles(sensor: SensorBase) -> Complex:
-    """All poles of `filter_response`, the high-pass's last, rad/s."""
+    """(n_pole,) rad/s, all poles of `filter_response`, the high-pass's last."""
     low = lowpass_poles(sensor)
     if sensor.highpass_hz > 0:
         return np.append(low, -2 * np.pi * sensor.highpass_hz)
@@ -62,7 +63,8 @@ def filter_poles(sensor: SensorBase) -> Complex:
 
 
 def filter_response(sensor: SensorBase, s: Complex) -> Complex:
-    """gain times anti-alias filter, lag and high-pass s/(s + w_hp) at complex s, no delay."""
+    """gain times anti-alias filter, lag and high-pass s/(s + w_hp), without the delay, at complex s
+    of any shape, rad/s."""
     s = np.asarray(s, dtype=np.complex128)
     value = np.full_like(s, sensor.gain)
     for q in lowpass_poles(sensor):
@@ -73,7 +75,8 @@ def filter_response(sensor: SensorBase, s: Complex) -> Complex:
 
 
 def filter_residues(sensor: SensorBase) -> Complex:
-    """Residues of `filter_response` at `filter_poles`, all of which are simple."""
+    """(n_pole,) residues of `filter_response` at `filter_poles`, all of which are simple; rad/s
+    times the gain."""
     low = lowpass_poles(sensor)
     corner = 2 * np.pi * sensor.highpass_hz
     out = [
@@ -93,7 +96,7 @@ def sensor_response(sensors: Sequence[SensorBase], frequency_hz: Float) -> Compl
 
 
 def sensors_at(sensors: Sequence[SensorBase], s: Complex) -> Complex:
-    """The same at complex s, rad/s."""
+    """(n, n_sensor) `filter_response` with the delay of each sensor, at complex s (n,), rad/s."""
     columns = [filter_response(x, s) * np.exp(-s * x.delay) for x in sensors]
     return np.stack(columns, axis=1)
 
@@ -143,6 +146,8 @@ def sampled_response(rig: Rig, frequency_hz: Float, chain: Chain | None = None) 
     Returns (n_freq, n_sensor, n_input) complex, rig-file order. The sensors are read just
     before the output changes, so that a jump of the output is not in the sample taken with it.
     Uses the transfer matrices alone, not the state space of `samii_rig.model.realise`.
+
+    Raises InputError for a frequency outside that range.
     """
     f = np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64))
     if not np.all((f > 0) & (f <= rig.rate_hz / 2)):

@@ -90,7 +90,8 @@ class _Ports:
 
 
 def terms(rig: Rig, places: Sequence[tuple[str, float]]) -> tuple[Int, Float]:
-    """`term` and `term_c` of `System`; places : the ports, see `CompiledChain`."""
+    """`term` (n_term, 4) and `term_c` (n_term, 4) of `System`; places : the ports, see
+    `CompiledChain`."""
     ports = _Ports(rig, places)
     found = [(i, t) for i, sensor in enumerate(rig.sensor) for t in _terms(sensor, rig, ports)]
     term = [(i, t.port, t.factor, t.spring) for i, t in found]

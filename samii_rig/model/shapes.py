@@ -185,7 +185,10 @@ def _state(
 
 
 def root(chain: Chain, start: complex) -> complex:
-    """The root of the determinant next to `start`, by the secant method."""
+    """The root of the determinant next to `start`, rad/s, by the secant method.
+
+    Raises InputError if there is none near.
+    """
     reference = float(chain.characteristic([start], clear=True)[1][0])
 
     def D(s: complex) -> complex:

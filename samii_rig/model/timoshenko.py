@@ -64,7 +64,7 @@ def _g(s: Complex, p: Float) -> Complex:
 
 
 def waves(s: Complex, p: Float) -> Waves:
-    """Wave numbers and states of the four waves."""
+    """Wave numbers and states of the four waves at s (n,), rad/s. p : as of `full`."""
     g = _g(s, p)
     B, G = p[EI] * g, p[GA] * g
     m, j = p[MU] * s**2, p[J] * s**2 + p[TENSION]
@@ -150,7 +150,8 @@ def _matrix(s: Complex, p: Float) -> Complex:
 
 
 def scaling(s: Complex, p: Float) -> tuple[Complex, Float]:
-    """1/(E1 E2) as mantissa exp(log): what the kernel's scaling took out of the determinant."""
+    """1/(E1 E2) = mantissa exp(log), (n,) each at s (n,), rad/s: what the kernel's scaling took out
+    of the determinant. p : the element's parameters in the schema's order."""
     w = waves(s, p)
     total = np.where(w.long, (w.one + w.two) * p[LENGTH], 0.0)
     return np.exp(1j * total.imag), np.asarray(total.real)

@@ -127,9 +127,13 @@ class Chain:
         return self.gradient_at(_s(frequency_hz), wrt)
 
     def gradient_at(
-        self, s: ArrayLike, wrt: Sequence[tuple[str, str]] | None = None
+        self, s: ArrayLike, wrt: Sequence[Key] | None = None
     ) -> tuple[Complex, Complex]:
-        """The same at any complex s, rad/s, as `evaluate`."""
+        """H (n, n_sensor, n_actuator) and dH (n, n_sensor, n_actuator, n_param) of `gradient`, at
+        any complex s (n,), rad/s, as `evaluate`.
+
+        Raises InputError for an unknown parameter or one that is asked for twice.
+        """
         s, c = _vector(s), self._c
         keys = self.parameters if wrt is None else tuple(wrt)
         place = np.full(len(self.parameters) + 1, -1)
@@ -215,7 +219,12 @@ class Chain:
         jumps: Sequence[tuple[int, State]] | None = None,
         positions: Mapping[str, Sequence[float]] | None = None,
     ) -> Complex:
-        """`field` at complex s. Very near a pole it is the mode shape times 1/(s - pole)."""
+        """`field` at complex s (n,), rad/s: (n, n_jump, n_port, 4).
+
+        Very near a pole it is the mode shape times 1/(s - pole).
+
+        Raises InputError for a position that is not on its beam, an unknown port or state.
+        """
         s, c = _vector(s), compile_chain(self.rig, positions)
         n_port = len(c.places)
         x, f = c.system, bind(c, s)

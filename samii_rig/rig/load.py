@@ -24,7 +24,8 @@ from samii_rig.rig.shipped import names_in as names_in
 from samii_rig.rig.shipped import shipped as shipped
 
 LOG = logging.getLogger(__name__)
-_told: set[tuple[str, str]] = set()  # a file is loaded several times, its remarks are told once
+# A file is loaded several times, its remarks are logged once.
+_reported: set[tuple[str, str]] = set()
 Model = TypeVar("Model", bound=BaseModel)
 MAX_BYTES = 4_000_000  # a rig file is a few kB; more is not one
 MAX_PARTS = 16  # of a dotted key; ours have three, and the time to parse one grows with the square
@@ -114,8 +115,8 @@ def load_rig(name: str) -> tuple[Rig, str]:
     hardly meant is logged, as a warning."""
     rig, text = load_named(Rig, name, FOLDER, "--rig", "rig file")
     for remark in remarks(rig):
-        if (name, remark) not in _told:
-            _told.add((name, remark))
+        if (name, remark) not in _reported:
+            _reported.add((name, remark))
             LOG.warning("samii-rig: look: %s, %s", name, remark)
     return rig, text
 
@@ -126,6 +127,8 @@ def load_named(
     """The `model` called `name` (of `folder`, or the path of a file) and the text of its file.
 
     option, what : the command line's option and the kind of file, for the error's line.
+
+    Raises InputError if there is neither such a name nor such a file.
     """
     names = names_in(folder)
     if name in names:

@@ -1,4 +1,4 @@
-"""What a rig file may mean, and hardly does: told, never refused.
+"""What a rig file may mean, and hardly does: reported, never refused.
 
 A length in millimetres that is said to be metres passes every check of its unit and sign.
 """
@@ -37,7 +37,7 @@ class Usual:
 
 
 # By the parameter's unit. A foil of 0.1 mm, a beam as long as a hall; a piezo sensor's gram and
-# less, a machine of ten tons. Other units span too much for a bound to tell anything.
+# less, a machine of ten tons. Other units span too much for a bound to show anything.
 USUAL = {"m": Usual(1e-4, 30.0, "mm"), "kg": Usual(1e-6, 1e4, "g")}
 
 # What a source of motion can push against: it has inertia, or is held by the ground.

@@ -23,8 +23,8 @@ RATE_ERROR = 1e-3  # relative; the frequency axis is off by as much
 # A repeat is foreign when its distance to its nearest fellow is this many times (in power)
 # the distance of the two that agree best: three times in amplitude.
 FOREIGN = 10.0
-# Two repeats cannot be told apart; they are refused when the difference is this part of the
-# signal (power: 10 % in amplitude) and has structure along frequency.
+# Of two repeats neither is known to be the right one; they are refused when the difference is this
+# part of the signal (power: 10 % in amplitude) and has structure along frequency.
 TWO_DIFFER = 0.01
 STRUCTURE = 0.7  # lag-one coherence; noise alone has about 1/sqrt(lines)
 # A moment in which one repeat is this many times as far from the others as usual. Sound repeats
@@ -257,7 +257,7 @@ def knocks(
 
 
 def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Half-open ranges in which `flags` is true."""
+    """Half-open ranges of indices in which `flags` (n,) is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 

@@ -23,7 +23,10 @@ MOVED, ROW_TO_SETTLE = 10.0, 4
 
 
 def drop_stuck(group: Group, *, chosen: bool) -> None:
-    """Leave out outputs that never changed in any piece; refuse when they were asked for."""
+    """Leave out outputs that never changed in any piece.
+
+    Raises EstimateError if the input never moves, or if such an output was `chosen` or is the last.
+    """
     still = [
         i
         for i in range(len(group.selection.outputs))
@@ -55,7 +58,10 @@ def _lines(pieces: Sequence[Piece], rate_hz: float) -> Complex:
 
 
 def drop_foreign(group: Group) -> None:
-    """Exclude repeats that do not repeat; of only two, neither can be trusted."""
+    """Exclude repeats that do not repeat.
+
+    Raises EstimateError if there are only two of them, as neither can be trusted.
+    """
     if len(group.pieces) < 2 or not group.equal_length:
         return
     # Bursts on the way from rest differ from those that start in a tail, for no fault of theirs.

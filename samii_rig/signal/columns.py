@@ -28,8 +28,8 @@ TAPS = 1  # rows to each side of which what a voltmeter shows of a command is ma
 # Rows of that filter's delay: a voltmeter between two commands has half a row, another shift one.
 CENTRED = 0.75
 ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same
-KNOWN = 0.5  # part of the rows of two recordings, of which fewer tell little of either
-LOOKED_AT = 1 << 14  # samples about the largest reference: thousands tell a shift, millions cost
+KNOWN = 0.5  # part of the rows of two recordings, below which too little is known of either
+LOOKED_AT = 1 << 14  # samples about the largest reference: thousands show a shift, millions cost
 QUIETER = 0.5  # of a command's fourth differences, those without what a loop would have added
 SENT = ("reference", "command")  # roles of columns that are sent, not measured
 
@@ -64,7 +64,7 @@ def is_open(recording: Recording, command: str, sensor: str, kp: float) -> bool:
 
 def shift_of(recording: Recording) -> int:
     """Samples by which what was measured stands behind what was sent; 0 where the law of the loop
-    does not tell."""
+    does not show it."""
     centring = centring_of(recording)
     first = next(iter(recording.names("command")), "")
     recording = of_input(recording, first)
@@ -179,14 +179,14 @@ def of_input(recording: Recording, command: str) -> Recording:
 
 
 def proportional(v: Float, w: Float) -> bool:
-    """Whether two inputs are one, but for its size."""
+    """Whether two inputs (n,) are one, but for a positive factor."""
     across, powers = float(v @ w), float(v @ v) * float(w @ w)
     return across > 0 and across**2 > (1 - ALIKE**2) * powers
 
 
 def aligned(recordings: Sequence[Recording]) -> list[tuple[Recording, Finding | None]]:
     """Recordings whose rows hold what was sent and measured at one time, and what was done: by the
-    law of the loop; where that tells nothing, so that all answer the same input alike."""
+    law of the loop; where that shows nothing, so that all answer the same input alike."""
     law = "by the loop's own law what was measured stands"
     own = [_moved(r, shift_of(r), law) for r in recordings]
     out: list[tuple[Recording, Finding | None]] = []
@@ -231,7 +231,7 @@ def _overlap(one: Recording, other: Recording, names: Sequence[str]) -> tuple[Fl
 
 
 def _first(recording: Recording, names: Sequence[str]) -> Float:
-    """(n, p) these columns in the first segment, in the whole where none is told; NaN in rows that
+    """(n, p) these columns in the first segment, in the whole where none is known; NaN in rows that
     are missing."""
     sequence = recording.sequence
     if not sequence.size:

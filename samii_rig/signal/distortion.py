@@ -46,7 +46,7 @@ MEANING = {
 
 @dataclass(frozen=True, slots=True)
 class Distortion:
-    """Levels (n_freq, n_out) at the driven lines, None where the lines cannot tell."""
+    """Levels (n_freq, n_out) at the driven lines, None where the lines cannot separate them."""
 
     even: Float | None
     odd: Float | None

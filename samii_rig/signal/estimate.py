@@ -200,7 +200,7 @@ class _Spectra:
 
 
 def _spectra(group: Group, method: Literal["burst", "settled", "periodic"]) -> _Spectra:
-    """The spectra of what a method takes for repeats; the group is told what was left out."""
+    """The spectra of what a method takes for repeats; what was left out is noted in the group."""
     pieces = group.pieces
     if method == "burst":
         spectra, shared = burst_spectra(pieces, group.rate_hz)

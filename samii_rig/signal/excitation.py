@@ -19,7 +19,7 @@ Interpolation = Literal["linear", "logarithmic"]
 
 
 def sweep_frequency(t: Float, start_hz: float, stop_hz: float, T: float, sweep: Sweep) -> Float:
-    """Instantaneous frequency in Hz at the times `t` (s) of a sweep that lasts `T` s.
+    """Instantaneous frequency in Hz at times `t` of any shape, s, of a sweep that lasts `T` s.
 
     linear: f = f0 + (f1 - f0) t/T. logarithmic: f = f0 (f1/f0)^(t/T), which spends the same
     time in every octave. start_hz may lie above stop_hz.
@@ -31,7 +31,8 @@ def sweep_frequency(t: Float, start_hz: float, stop_hz: float, T: float, sweep: 
 
 
 def sweep_phase(t: Float, start_hz: float, stop_hz: float, T: float, sweep: Sweep) -> Float:
-    """Phase in rad, 2 pi times the integral of `sweep_frequency` from 0 to `t`, closed form.
+    """Phase in rad at times `t` of any shape, s: 2 pi times the integral of `sweep_frequency`
+    from 0 to `t`, closed form.
 
     linear: 2 pi (f0 t + (f1 - f0) t^2/(2 T)).
     logarithmic: 2 pi f0 T (e^(a t/T) - 1)/a with a = ln(f1/f0), and 2 pi f0 t where a = 0.

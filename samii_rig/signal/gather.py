@@ -108,7 +108,7 @@ def _look(
     gaps: Gaps,
     lost: list[Finding],
 ) -> list[_Looked]:
-    """All segments of recordings whose input moves; `lost` is told of the others."""
+    """All segments of recordings whose input moves; `lost` is called for the others."""
     out: list[_Looked] = []
     selection: Selection | None = None
     still: list[EstimateError] = []
@@ -205,7 +205,7 @@ def _examine(
 
 
 def whole_rows(cut: Recording, names: Sequence[str]) -> tuple[NDArray[np.bool_], tuple[int, ...]]:
-    """Rows in which no needed channel is missing, and the breaks among them."""
+    """(n,) the rows in which no needed channel is missing, and the breaks among them."""
     columns = [cut.column(n) for n in names]
     missing = (cut.quality[:, columns] & Quality.MISSING).astype(bool)
     kept: NDArray[np.bool_] = np.all(~missing & np.isfinite(cut.values[:, columns]), axis=1)

@@ -104,7 +104,10 @@ def select(recording: Recording, input: str | None, outputs: Sequence[str] | Non
 
 
 def segments_of(recording: Recording) -> tuple[Segment, ...]:
-    """The recording's segments, or the whole of it as one `single` segment."""
+    """The recording's segments, or the whole of it as one `single` segment.
+
+    Raises EstimateError if it holds no sample, or ended before its first segment did.
+    """
     if recording.segments:
         return recording.segments
     if len(recording) == 0:
@@ -133,10 +136,12 @@ def segments_of(recording: Recording) -> tuple[Segment, ...]:
 def reference_of(
     cut: Recording, selection: Selection, reference: str | None
 ) -> tuple[Float, str, Finding | None]:
-    """The reference of a cut, what it is in words, and a finding when it is the input itself.
+    """The reference (n,) of a cut, what it is in words, and a finding when it is the input itself.
 
     With both u and theta_ref in use the loop v = u + kp (theta_ref - theta) has the
     exogenous input r = u + kp theta_ref; kp comes from the rig file in the recording.
+
+    Raises InputError for a reference that is no column, or for several that may be it.
     """
     where = cut.source or "recording"
     if reference is not None:

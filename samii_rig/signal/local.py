@@ -71,7 +71,7 @@ class Windows:
         reference and what a transient can look like in the window.
 
         A sweep that passes f0 close to the time of a transient, within about 1/W, looks there
-        like that transient; then nothing tells the two apart.
+        like that transient; then nothing distinguishes the two.
         """
         if not self.transients:
             return np.ones(len(self.x))
@@ -103,7 +103,7 @@ class Fit:
 def plan(
     breaks: Sequence[Sequence[float]], p: int, longest: float, *, at_rest: bool
 ) -> tuple[float, Transients]:
-    """Width of the windows in Hz and the transients to be told apart in them.
+    """Width of the windows in Hz and the transients to be distinguished in them.
 
     breaks : for each piece that counts, the times in s at which samples are missing.
     longest : s. The windows hold enough lines for a residual covariance of p outputs.

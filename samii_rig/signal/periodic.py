@@ -157,7 +157,7 @@ def transient_left(Z: Complex) -> Complex:
 
     Z : (n_period, n, 1 + p) of successive periods, the input first. The slowest mode decays by one
     complex factor from period to period, at all lines and outputs; what all periods together say
-    of it at a line tells what it leaves in their mean. 0 where nothing stands out of the noise.
+    of it at a line shows what it leaves in their mean. 0 where nothing stands out of the noise.
     """
     d = np.diff(Z, axis=0)
     p = Z.shape[2] - 1

@@ -18,7 +18,7 @@ LEAST_STEPS = 1.0
 
 
 def floor_of(group: Group, pieces: Sequence[Piece]) -> tuple[Float, dict[int, str]]:
-    """Variance per line of each output's rounding, and a message where it is not zero.
+    """(n_out,) variance per line of each output's rounding, and a message where it is not zero.
 
     A converter's step q makes an error of q^2/12 while its value moves. Errors of repeats
     of one deterministic signal are the same: they do not average out, and do not show.

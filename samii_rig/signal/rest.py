@@ -28,7 +28,7 @@ TAIL_LOUD = 0.03
 # What a burst still knows of the start from rest may reach this many standard deviations of the
 # tail's strongest line: spread over the whole burst it is then below the noise of the estimate.
 FORGOTTEN = 5.0
-AROUND = 5  # lines over which a tail's scatter is told at the least: two repeats have one each
+AROUND = 5  # lines over which a tail's scatter is estimated at the least: two repeats have one each
 # Of the power of the tail's strongest line: noise that bursts without any are taken to have.
 NOISELESS = 1e-24
 NEVER = 1_000_000
@@ -39,7 +39,7 @@ class Ringing:
     """Motion that has not died out at the end of bursts.
 
     settled_after : of bursts that run into each other, after how many what is left of the
-        start from rest is below the noise; `NEVER` where nobody can tell.
+        start from rest is below the noise; `NEVER` where that is not known.
     """
 
     finding: Finding

@@ -22,7 +22,7 @@ SMOOTH_LINES = 9  # the ripple of a swept sine's spectrum is shorter
 TAPER = 0.1  # of the length at most, on either end
 # A step from head to tail is one above this many standard deviations.
 STEP_SIGMA = 5.0
-DRIFT_ORDER = 2  # of the polynomial in time; the means of few periods tell no more
+DRIFT_ORDER = 2  # of the polynomial in time; the means of few periods determine no more
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +48,8 @@ def spectrum(
     """Spectrum of a piece with its mean taken out, or times `window` (n,).
 
     stepped : (1 + p,) channels that end at another level than they started from.
+
+    Raises EstimateError for fewer than 8 samples.
     """
     n = len(piece)
     if n < 8:
@@ -135,16 +137,19 @@ def _steady(pieces: Sequence[Piece]) -> list[Piece]:
 
 
 def rests(r: Float) -> tuple[int, int]:
-    """Samples before the first and after the last at which the reference is not zero."""
+    """Samples before the first and after the last at which the reference (n,) is not zero."""
     busy = np.flatnonzero(r)
     return (int(busy[0]), int(r.size - 1 - busy[-1])) if busy.size else (r.size, r.size)
 
 
 def excited(spectra: Sequence[Spectrum], band: tuple[float, float] | None) -> Int:
-    """Indices of the lines of the longest spectrum that a reference excites, in the band.
+    """(n_line,) indices of the lines of the longest spectrum that a reference excites, in the band
+    (lowest and highest Hz).
 
     Without a band: from the first to the last line at which the smoothed energy of any
     piece's reference stands out (`BAND_POWER`).
+
+    Raises EstimateError if there is none.
     """
     longest = max(spectra, key=lambda s: s.n)
     width = min(SMOOTH_LINES, *(s.R.size for s in spectra))
@@ -168,7 +173,10 @@ def excited(spectra: Sequence[Spectrum], band: tuple[float, float] | None) -> In
 
 
 def comb(spectra: Sequence[Spectrum], band: tuple[float, float] | None) -> Int:
-    """Indices of the lines of a periodic reference: those that stand out by themselves."""
+    """(n_line,) indices of the lines of a periodic reference: those that stand out by themselves.
+
+    Raises EstimateError if there is none in the band (lowest and highest Hz).
+    """
     first = spectra[0]
     power = np.abs(first.R) ** 2
     inside = power > COMB_POWER * power.max(initial=0.0)
@@ -180,7 +188,7 @@ def comb(spectra: Sequence[Spectrum], band: tuple[float, float] | None) -> Int:
 
 
 def period(r: Float) -> int:
-    """Samples of the shortest period that divides the length; the length if there is none."""
+    """Samples of the shortest period of r (n,) that divides n; n if there is none."""
     n = r.size
     size = float(np.abs(r).max(initial=0.0))
     for count in range(n // 8, 1, -1):

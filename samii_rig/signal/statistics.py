@@ -99,7 +99,7 @@ def phase(response: FrequencyResponse) -> Float:
 
 
 def phase_half_width(response: FrequencyResponse, level: float = 0.9) -> Float:
-    """Half width of the phase interval in degrees, 180 where the phase is not known.
+    """(n_freq, n_out) half width of the phase interval in degrees, 180 where it is not known.
 
     Fieller's argument: at the true phase phi the component Im(H exp(-j phi)) has zero mean
     and variance C/2, so sin(half) = t sqrt(C/2)/|H|. That leaves out the opposite phase, so
@@ -119,7 +119,10 @@ def phase_interval(response: FrequencyResponse, level: float = 0.9) -> Interval:
 
 
 def hotelling(error: Complex, covariance: Complex) -> Float:
-    """T^2 = e^H C^-1 e per frequency; `error` (n_freq, p), `covariance` (n_freq, p, p)."""
+    """(n_freq,) T^2 = e^H C^-1 e; `error` (n_freq, p), `covariance` (n_freq, p, p).
+
+    Raises EstimateError for a singular covariance.
+    """
     scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2).real)
     scale = np.where(scale > 0, scale, 1.0)
     unit = error / scale
@@ -147,13 +150,14 @@ def hotelling_distribution(p: int, dof: Float) -> tuple[Float, Float, Float]:
 
 
 def hotelling_p(t2: Float, p: int, dof: Float) -> Float:
-    """Probability of a T^2 at least this large when the hypothesis holds."""
+    """Probability of a T^2 at least this large, of p entries with `dof` degrees of freedom, when
+    the hypothesis holds; shape of `t2` and `dof`."""
     scale, dfn, dfd = hotelling_distribution(p, dof)
     return np.asarray(special.fdtrc(dfn, dfd, np.maximum(t2, 0.0) / scale), float)
 
 
 def hotelling_mean(p: int, dof: Float) -> Float:
-    """Mean of T^2: nu p/(nu - p), infinite for nu <= p."""
+    """Mean of T^2: nu p/(nu - p) with nu = `dof` of any shape, infinite for nu <= p."""
     dof = np.asarray(dof, float)
     return np.where(dof > p, dof * p / np.where(dof > p, dof - p, 1.0), np.inf)
 
@@ -262,7 +266,8 @@ def _by_band(
 
 
 def octaves(frequency: Float) -> tuple[tuple[float, float], ...]:
-    """Octave bands that cover the positive frequencies given, Hz."""
+    """(lowest, highest) of the octave bands, Hz, that cover the positive of the increasing
+    frequencies (n,), Hz."""
     positive = frequency[frequency > 0]
     edges = [float(positive[0])]
     while edges[-1] <= positive[-1]:

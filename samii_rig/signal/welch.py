@@ -126,6 +126,10 @@ def frequency_response(
     H1 = S_yv/S_vv is least squares with noise on y, H2 = S_yy/S_vy with noise on v, Hv total
     least squares with noise of equal variance on both in their units (Rocklin, Crowley and Vold,
     1985). The covariance is that of H1, for an input free of noise and leakage.
+
+    pieces : (n, 1 + n_out) each. nperseg : samples of a window. overlap : part of them that the
+        next one has too.
+    Raises InputError for another method.
     """
     if method not in ("h1", "h2", "hv"):
         raise InputError("welch", "method", method, "one of h1, h2, hv")

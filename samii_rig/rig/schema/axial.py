@@ -94,7 +94,7 @@ def _check_axial(e: Element) -> None:
 
 
 def _listed(kinds: tuple[type[Any], ...]) -> str:
-    """The kinds, each by the last word for it that is no damper: as a bench of masses is told."""
+    """The kinds, each by the last word for it that is no damper, as of a bench of masses."""
     words = [get_args(kind.model_fields["kind"].annotation) for kind in kinds]
     return ", ".join(
         next((w for w in reversed(each) if "damper" not in w), each[0]) for each in words

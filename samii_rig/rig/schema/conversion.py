@@ -57,7 +57,7 @@ def _each(item: Any, change: Callable[[Table], Table]) -> Any:
 
 
 def _units(data: Table) -> dict[str, str]:
-    """Units of actuators, sensors and monitors by name, as far as they are told."""
+    """Units of actuators, sensors and monitors by name, as far as they are given."""
     out = {}
     for key in ("actuator", "sensor", "monitor"):
         items = data.get(key)

@@ -58,7 +58,7 @@ class Limit(Strict):
 
 
 class Agreement(Strict):
-    """Two channels that tell of one thing: if they part, one of them drifts, and no run goes on.
+    """Two channels that measure one quantity: if they part, one of them drifts, and no run goes on.
 
     sensor : an angle, for instance the one that the centring reads. other : a sensor or monitor of
         the same unit, such as a potentiometer; or the actuator whose angular velocity source turns

@@ -54,7 +54,7 @@ def check_references(rig: Rig) -> None:
 
 
 def unlike(names: Iterable[str]) -> None:
-    """Names of one table differ."""
+    """Names of one table differ; else ValueError with the first that does not."""
     known = set[str]()
     for name in names:
         if name in known:

@@ -12,7 +12,7 @@ from samii_rig.signal import spectra
 from samii_rig.signal.choose import Method, at_rest, choose
 from samii_rig.signal.gather import Gaps
 from samii_rig.signal.groups import Piece
-from samii_rig.signal.several import lines, polynomial, solve, told, welch
+from samii_rig.signal.several import lines, polynomial, reported, solve, welch
 from samii_rig.signal.several.experiments import (
     Columns,
     Gathered,
@@ -49,6 +49,8 @@ def inputs_of(
 
     The inputs are those asked for, else the commands that are driven in any recording; none where
     a single one moves or none does, which the estimate of one input finds by itself.
+
+    Raises InputError for an `input` that is no command.
     """
     moving = [n for r in recordings for n in r.names("command") if r.largest(n) > 0]
     driven, undriven = driven_of(recordings, tuple(dict.fromkeys(moving)))
@@ -73,7 +75,8 @@ def together(
 ) -> list[FrequencyResponse]:
     """Responses to all `inputs`, one a level, where more than one moves in an experiment.
 
-    Raises EstimateError where there are fewer independent experiments than inputs.
+    Raises InputError for a method that serves one input alone, EstimateError where there are fewer
+    independent experiments than inputs or stepped sines move several.
     """
     if how.method in ("h2", "hv"):
         expected = "auto, burst, periodic, local or h1 with several inputs"
@@ -89,7 +92,7 @@ def together(
     sets, lost = sets_of(gathered.experiments, gathered.columns, referenced=recorded)
     findings = [*gathered.findings, *lost]
     if not recorded:
-        findings.append(told.closed_loop(inputs))
+        findings.append(reported.closed_loop(inputs))
     out: list[FrequencyResponse] = []
     failed: list[EstimateError] = []
     for own in sets:
@@ -173,7 +176,7 @@ def _lines(
         amplitude = np.sqrt(2 * found.input / parts[0].n_samples)
     else:
         amplitude = _at_passing(own, parts, columns, found.at)
-    return told.of_lines(own, columns, found, amplitude, chosen[0])
+    return reported.of_lines(own, columns, found, amplitude, chosen[0])
 
 
 def _band(
@@ -241,7 +244,7 @@ def _local(own: Set, columns: Columns, how: How, why: str, *, recorded: bool) ->
     fit = polynomial.fit(found, at, n_in, at_rest=still)
     names = [c.name for c in columns.inputs]
     solve.require_independent(fit.apart, n_in, names, f"{len(records)} records")
-    return told.of_local(own, columns, fit, found[0].frequency[at], why, len(records), still)
+    return reported.of_local(own, columns, fit, found[0].frequency[at], why, len(records), still)
 
 
 def _records(own: Set, columns: Columns, *, recorded: bool) -> list[Piece]:
@@ -270,4 +273,4 @@ def _welch(own: Set, columns: Columns, how: How, *, recorded: bool) -> Frequency
     records, n_in = _records(own, columns, recorded=recorded), len(columns.inputs)
     rate = own.experiments[0].group.rate_hz
     found = welch.response([p.z for p in records], rate, n_in, how.nperseg)
-    return told.of_welch(own, columns, found, how.band, how.nperseg)
+    return reported.of_welch(own, columns, found, how.band, how.nperseg)

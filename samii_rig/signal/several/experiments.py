@@ -160,7 +160,7 @@ def _driven_most(piece: Piece, inputs: slice) -> int:
 def _without_foreign(e: Experiment, columns: Columns) -> None:
     seen = outputs_of(e.group, columns)
     drop_foreign(seen)
-    # What was left out breaks the row that `follows` tells of.
+    # What was left out breaks the row that `follows` stands for.
     e.group.pieces = [
         replace(e.group.pieces[p.realisation], follows=p.follows, realisation=0)
         for p in seen.pieces

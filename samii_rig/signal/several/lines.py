@@ -1,6 +1,6 @@
 """Line by line over repeats, periods and realisations of experiments.
 
-The residuals e = Y - H V tell two things apart. Over the repeats (bursts, periods) of an
+The residuals e = Y - H V distinguish two things. Over the repeats (bursts, periods) of an
 experiment they scatter by noise alone. Over more experiments than inputs their means scatter by
 the noise of a mean and by what is not linear, since that repeats with the period and changes with
 the phases (robust method, Pintelon and Schoukens, 2nd ed., sections 4.3.1 and 4.3.2).
@@ -21,7 +21,7 @@ from samii_rig.signal.several import solve
 from samii_rig.signal.several.experiments import Columns, Experiment
 from samii_rig.types import Complex, Float, Int
 
-LEAST_SHARE = 0.2  # of an experiment's residual that solving leaves, below which it tells nothing
+LEAST_SHARE = 0.2  # of an experiment's residual that solving leaves, below which it shows nothing
 EXACT = 1e-24  # of a signal's power: what scatters less over periods is rounding of what was sent
 
 
@@ -48,13 +48,13 @@ class Measured:
 class Lines:
     """H (n_freq, n_out, n_in), covariance (n_freq, p, p), dof (n_freq,) of one input's column.
 
-    at : the lines, of those asked for, that tell the inputs apart.
+    at : the lines, of those asked for, that distinguish the inputs.
     noise : (n_freq, n_out) power of the noise of one repeat, NaN where no repeats show it.
     total : (n_freq, n_out) power of all that scatters over experiments, None where that was not
         looked at. output (n_freq, n_out), input (n_freq, n_in) : mean power over the experiments
         of what the inputs explain of the outputs; largest power of each input in any experiment.
     nu : degrees of freedom a line of noise and total. repeats : of each experiment, on average.
-    n : repeats in all. lost : lines that do not tell the inputs apart.
+    n : repeats in all. lost : lines that do not distinguish the inputs.
     """
 
     at: Int
@@ -119,6 +119,8 @@ def estimate(
     R : (n_freq, n_ref, E) references there, None without any. classes : experiments whose noise
         is alike, such as those that drive one input.
     realised : whether the covariance is taken over experiments, so that it holds distortion.
+
+    Raises EstimateError if a class holds one repeat alone, which shows no noise.
     """
     inputs, outputs = columns.part("inputs"), columns.part("outputs")
     count = np.array([len(m.Z) for m in parts])
@@ -234,7 +236,7 @@ def _rings(parts: Sequence[Measured], at: Int, columns: Columns, found: solve.So
 
 def _left(seen: periodic.Periods, columns: Columns) -> Complex | None:
     """What a transient left in the mean of the periods of each input and output, None where no
-    period was spared to tell. What is sent is exact and never rings."""
+    period was left to estimate it from. What is sent is exact and never rings."""
     if not seen.before:
         return None
     n_ref = len(columns.references)

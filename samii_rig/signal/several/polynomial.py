@@ -50,6 +50,8 @@ def fit(spectra: Sequence[Spectrum], at: Int, n_in: int, *, at_rest: bool) -> Fi
 
     spectra : Z holds n_in references, n_in inputs and the outputs side by side. at_rest : whether
         the records start and end at rest, so that there is nothing to remove.
+
+    Raises EstimateError if the records have too few lines for a local model.
     """
     n_lines, q = spectra[0].Z.shape
     n_out = q - 2 * n_in

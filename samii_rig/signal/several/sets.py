@@ -72,7 +72,7 @@ def sets_of(
 
 
 def _spans(labels: Sequence[tuple[str, ...]], n_in: int) -> bool:
-    """Whether experiments of these labels can tell n_in inputs apart."""
+    """Whether experiments of these labels can distinguish n_in inputs."""
     together = any(len(label) > 1 for label in labels)
     return len(labels) >= n_in and (together or len(set(labels)) >= n_in)
 

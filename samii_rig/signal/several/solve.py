@@ -24,10 +24,10 @@ from samii_rig.errors import EstimateError
 from samii_rig.types import Complex, Float
 
 # Least ratio of the smallest to the largest singular value of V W^H, each input in units of its
-# own size, below which a line does not tell the inputs apart: the worst combination of inputs
+# own size, below which a line does not distinguish the inputs: the worst combination of inputs
 # has 30 times the noise of the best (the ratio goes with the square of V).
 INDEPENDENT = 1e-3
-# Part of the lines that must tell them apart, or the experiments as a whole do not.
+# Part of the lines that must distinguish them, or the experiments as a whole do not.
 MOST = 0.5
 _TINY = 1e-300
 
@@ -52,7 +52,7 @@ def instrument(V: Complex, R: Complex | None, weight: Float) -> Complex:
 
 
 def told_apart(V: Complex, W: Complex) -> NDArray[np.bool_]:
-    """(n_freq,) whether the experiments tell the inputs apart at each line."""
+    """(n_freq,) whether the experiments distinguish the inputs at each line."""
     unit = [x / np.maximum(np.sqrt(np.mean(np.abs(x) ** 2, axis=2, keepdims=True)), _TINY)
             for x in (V, W)]  # fmt: skip
     singular = np.linalg.svd(unit[0] @ unit[1].conj().transpose(0, 2, 1), compute_uv=False)

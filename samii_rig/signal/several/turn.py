@@ -93,6 +93,8 @@ def columns_of(responses: Sequence[FrequencyResponse]) -> FrequencyResponse:
     """One response from those to one input each, on the lines and outputs that all have.
 
     covariance : one block an input. dof : n_in times the smallest of a column.
+
+    Raises EstimateError if they have no line or no output in common.
     """
     lines = _common_lines(responses)
     names = [[c.name for c in r.outputs] for r in responses]

@@ -1,7 +1,8 @@
 """Inputs that nothing excited: their references rest, and their own loops alone move them.
 
-With one experiment the sensors y = H_d v_d + H_u v_u do not tell the columns of the driven inputs
-v_d from those of the undriven ones v_u. What is measured is the response with these loops closed,
+With one experiment the sensors y = H_d v_d + H_u v_u do not distinguish the columns of the driven
+inputs v_d from those of the undriven ones v_u. What is measured is the response with these loops
+closed,
 
     y/v_d = H_d + H_u T,    T = v_u/v_d,
 
@@ -24,7 +25,7 @@ def driven_of(
     """Of the commands that move, those that a reference drives, and those that none does.
 
     All are taken for driven where a recording has no reference in use, or one that does not end
-    with the name of a command: then nothing tells which.
+    with the name of a command: then it is not known which.
     """
     driven: set[str] = set()
     for recording in recordings:

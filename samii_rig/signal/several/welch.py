@@ -29,7 +29,12 @@ class Response:
 
 
 def response(records: Sequence[Float], rate_hz: float, n_in: int, nperseg: int) -> Response:
-    """From records (n, q): n_in references, n_in inputs, and the outputs."""
+    """From records (n, q): n_in references, n_in inputs, and the outputs.
+
+    nperseg : samples of a window.
+
+    Raises EstimateError if there are too few windows to distinguish the inputs.
+    """
     found = welch.spectra(records, rate_hz, nperseg=nperseg)
     r, v, y = slice(0, n_in), slice(n_in, 2 * n_in), slice(2 * n_in, None)
     S = found.S[1:]

@@ -16,7 +16,7 @@ from samii_rig.signal.several.sets import Set
 from samii_rig.signal.several.welch import Response
 from samii_rig.types import Finding, Float, FrequencyResponse
 
-MOST_LOST = 0.1  # of the lines, which experiments do not tell apart, that is worth a warning
+MOST_LOST = 0.1  # of the lines, those that do not distinguish the inputs, that is worth a warning
 
 
 def closed_loop(inputs: Sequence[str]) -> Finding:
