@@ -21,10 +21,10 @@ Progress = Callable[[str], None]
 T = TypeVar("T")
 
 SOON = 1.0  # s of work before a time left is more than a guess
-LEAST = 0.1  # s: the shortest time that is told
-TOLD = 1.0  # s between words that are told elsewhere
+LEAST = 0.1  # s: the shortest time that is reported
+PERIOD = 1.0  # s between words that are reported elsewhere
 START = (0.0, 0.0)  # `Begun.rest` of a first stage, when nothing is spent yet
-# From how many s on times to the end are told in steps of so many.
+# From how many s on times to the end are reported in steps of so many.
 STEPS = ((600.0, 60.0), (120.0, 30.0), (20.0, 5.0), (0.0, 1.0))
 
 
@@ -32,7 +32,7 @@ class Begun(str):
     """The words of a stage that begins. rest : from here to the end of all work, over what was
     spent since the first stage that has one: the tenth and the ninetieth percentile of such work;
     None where nobody knows. takes : the same in s of a processor, for work of its size, before
-    anything is spent that the rest could be told from."""
+    anything is spent that the rest could be estimated from."""
 
     rest: tuple[float, float] | None
     takes: tuple[float, float] | None
@@ -51,7 +51,7 @@ class Begun(str):
 
 class Aside(str):
     """What is done once, whatever else is done, as the compilation of kernels: the time until the
-    next words are told is none of the work's."""
+    next words are reported is none of the work's."""
 
 
 class Counted(str):
@@ -94,7 +94,7 @@ def ahead(
 ) -> str:
     """The same stage, as a part of something larger that is named before it. whole : whether its
     end is that of all work, too. usual : how long the rest of the larger takes from it on; what is
-    not in it is told as any words are."""
+    not in it is reported as any words are."""
     if isinstance(stage, Counted):
         return Counted(words + stage.stage, stage.done, stage.of, stage.at, stage.within)
     said = words + stage
@@ -115,7 +115,7 @@ class Pace:
         self._first, self._begun = 0, clock()
         self._all_begun: float | None = None
         self._ends: tuple[float, float] | None = None
-        self._by_size = False  # that end is told by the work's size alone
+        self._by_size = False  # that end is estimated by the work's size alone
         self._aside: float | None = None
 
     def words(self, stage: str) -> str:
@@ -182,18 +182,20 @@ class Pace:
         return f", {low_} to {high_} to the end"
 
 
-def telling(tell: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> Progress:
-    """Tells what is tried, and the time left, every `TOLD` s at most; a disk that is full for that
-    is no reason to find nothing."""
+def reporting(
+    report: Callable[[str], None], clock: Callable[[], float] = time.monotonic
+) -> Progress:
+    """Reports what is tried, and the time left, every `PERIOD` s at most; a disk that is full for
+    that is no reason to find nothing."""
     pace, due = Pace(clock), -math.inf
 
     def say(stage: str) -> None:
         nonlocal due
         words = pace.words(stage)
         if clock() >= due:
-            due = clock() + TOLD
+            due = clock() + PERIOD
             with suppress(OSError):
-                tell(words)
+                report(words)
 
     return say
 
@@ -208,7 +210,7 @@ def duration(seconds: float) -> str:
     """`0.1 s` and less, `7.4 s`, `48 s`, `3 min 20 s`, `1 h 5 min`."""
     whole = round(seconds)
     if whole < 120:
-        # Less than a tenth of a second is told to nobody's use.
+        # Less than a tenth of a second is of nobody's use.
         return f"{max(seconds, LEAST):.2g} s" if seconds < 9.95 else f"{whole} s"
     minutes, rest = divmod(whole, 60)
     if minutes < 120:

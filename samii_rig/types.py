@@ -138,7 +138,7 @@ class Finding:
 
     kind : one of gap, clipping, range, resolution, stuck, repeat, leakage, timing, clock, offset,
         saturation, closed_loop, distortion, dof.
-    severity : `note` tells, `warning` weakens the result, `error` made us exclude or refuse.
+    severity : `note` informs, `warning` weakens the result, `error` made us exclude or refuse.
     """
 
     kind: str
@@ -276,7 +276,7 @@ class FrequencyResponse:
     even, odd : (n_freq, n_out) relative distortion levels, or None where the excitation
         does not show them.
     noise, distortion : (n_freq, n_out) rms of the noise of one repeat, and of what is not linear
-        in one realisation, relative to the output at the line; None where nothing told them apart.
+        in one realisation, relative to the output at the line; None where they are not separated.
     followers, follow : commands that nothing drove and their loops moved, and (n_freq,
         n_followers, n_in) how far, per unit of each input; None without any. H is that with
         these loops closed (`samii_rig.signal.several.undriven`).

@@ -22,7 +22,7 @@ from samii_rig.progress import (
     ahead,
     counted,
     duration,
-    telling,
+    reporting,
 )
 
 
@@ -181,7 +181,7 @@ def test_the_service_tells_it_once_a_second_whatever_the_disk_says() -> None:
         told.append(words)
         raise OSError("no space")
 
-    say = telling(tell, lambda: now[0])
+    say = reporting(tell, lambda: now[0])
     for tenths in range(25):
         now[0] = tenths / 10
         say(Counted("what is missing", tenths, 25))

@@ -1,6 +1,6 @@
 """Margins of all loops of a rig together: how much every output may change at once.
 
-One loop at a time tells nothing of two that change together (Doyle 1978): with L (k, k) the gain of
+One loop at a time shows nothing of two that change together (Doyle 1978): with L (k, k) the gain of
 all loops cut at the outputs, S = (I + L)^-1 and T = L S,
 
     alpha = 1/max_f mu(S - I/2)

@@ -16,7 +16,7 @@ from samii_rig.control.settle import BAND, Settling
 from samii_rig.model.loops import Loops, closed_poles
 from samii_rig.types import Complex
 
-# Okabe and Ito's colours, which people of any colour vision tell apart.
+# Okabe and Ito's colours, which people of any colour vision distinguish.
 BLUE, RED, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#888888"
 DPI = 130
 FACTORS = np.concatenate([[0.0], np.geomspace(0.01, 4.0, 120)])  # of the gain, in the locus

@@ -1,8 +1,8 @@
 """Somebody else's devices and experiments: what goes wrong in them is one line with their name.
 
 An entry point may come from any package. What it raises, or returns in place of what it promised,
-is told as wrong input, so that a command neither ends with a traceback nor, on a SystemExit, as if
-all had gone well.
+is reported as wrong input, so that a command neither ends with a traceback nor, on a SystemExit,
+as if all had gone well.
 """
 
 from __future__ import annotations
@@ -50,10 +50,12 @@ def checked_device(opened: object, who: str) -> OpenRig:
         found = getattr(opened, part)
         if not isinstance(found, kind):
             raise wrong(who, part, found, f"what has all of a {kind.__name__}")
-    channels, told = opened.sensor.channels, opened.metadata
+    channels, metadata = opened.sensor.channels, opened.metadata
     if not (isinstance(channels, tuple) and all(isinstance(c, Channel) for c in channels)):
         raise wrong(who, "sensor.channels", channels, "a tuple of Channel")
-    texts = isinstance(told, dict) and all(isinstance(x, str) for kv in told.items() for x in kv)
+    texts = isinstance(metadata, dict) and all(
+        isinstance(x, str) for kv in metadata.items() for x in kv
+    )
     if not texts:
-        raise wrong(who, "metadata", told, "texts by name")
+        raise wrong(who, "metadata", metadata, "texts by name")
     return opened

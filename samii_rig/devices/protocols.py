@@ -135,7 +135,7 @@ class Sensor(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class DeviceEvent:
-    """What a device tells beside its samples: `time` in ns of its clock, a word, and fields."""
+    """What a device reports beside its samples: `time` in ns of its clock, a word, and fields."""
 
     time: int
     name: str

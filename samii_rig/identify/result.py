@@ -90,8 +90,8 @@ class Identification:
         """As `interval` of 90 %, but of a parameter on a bound: NaN for the end that the data do
         not set, and for the other a limit that 95 % keep.
 
-        On its lower bound it is told from 0 no more, on its upper one from any larger: what the
-        data know is linear in the value, or in its inverse, and no longer in its logarithm.
+        On its lower bound it is not distinguished from 0, on its upper one from any larger: what
+        the data know is linear in the value, or in its inverse, and no longer in its logarithm.
         """
         low, high = self.interval()
         reach = -float(special.ndtri(TAIL)) * self.inflation()

@@ -1,8 +1,8 @@
 """Whole records, and what no change of one linear response explains of them.
 
-`Reduced` keeps of the lines what tells a response. A force that depends on amplitude moves the rest
-too: harmonics, and levels against each other. With the whitened lines g, nuisances projected out,
-and the whitened columns A = Q C of all changes d on the nodes,
+`Reduced` keeps of the lines what determines a response. A force that depends on amplitude moves the
+rest too: harmonics, and levels against each other. With the whitened lines g, nuisances projected
+out, and the whitened columns A = Q C of all changes d on the nodes,
 
     |g - A d|^2 = |C d - Q' g|^2 + |g - Q Q' g|^2,
 

@@ -2,8 +2,8 @@
 
 v = u + kp (theta_ref - theta) holds for what was sent. A loop that runs k times as fast as the
 record holds it for T/k. A meter shows the mean of both sides of each edge, so that what it shows is
-half a period of the loop late, and has noise that never drove the rig. That delay tells k; with it
-the rig's own input follows from the law at the record's samples.
+half a period of the loop late, and has noise that never drove the rig. That delay determines k;
+with it the rig's own input follows from the law at the record's samples.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ BENT, SMOOTH, OF_ONE = 8.0, 16, 3.0
 def sent(
     recording: Recording, command: int, kp: float, theta: Float | None
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """(n,) the command as it drove the rig, as near as the recording tells; and where it has an
+    """(n,) the command as it drove the rig, as near as the recording shows; and where it has an
     edge within a sample, so that nobody knows when that came.
 
     command : its column. theta : (n,) of the sensor around which a loop of gain kp is closed.

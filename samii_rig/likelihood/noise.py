@@ -11,8 +11,9 @@ and Durrieu 2009, Neural Comput. 21, eq. 2.11; each longer than the one before w
 grows: Salakhutdinov and Roweis 2003, Proc. ICML). Few of them are not zero, so the noise is known
 well from one short record, at lightly damped modes and at its lowest lines too.
 
-What the sum does not give is told by blocks of lines: each has a covariance of its own about it, as
-far from it as all blocks together say that they are (empirical Bayes, inverse Wishart prior).
+What the sum does not give is estimated by blocks of lines: each has a covariance of its own about
+it, as far from it as all blocks together say that they are (empirical Bayes, inverse Wishart
+prior).
 """
 
 from __future__ import annotations

@@ -113,8 +113,8 @@ class Past:
         """
         size = np.sqrt(np.mean(left**2, axis=0))
         own = left[: len(self.start)] / np.where(size > 0, size, 1.0)
-        told = self.start @ amplitudes / np.where(size > 0, size, 1.0)
-        both = np.stack([own, own - told])
+        explained = self.start @ amplitudes / np.where(size > 0, size, 1.0)
+        both = np.stack([own, own - explained])
         both -= np.mean(both, axis=1, keepdims=True)  # of a sensor's offset nobody knows
         without, beside = np.sum(both**2, axis=(1, 2))
         return bool(beside < without)

@@ -22,7 +22,7 @@ from samii_rig.types import Float, Int, Quality, Recording, Segment
 SPOILT = Quality.MISSING | Quality.CLIPPED | Quality.STALE
 LEAST_SAMPLES = 256  # fewer say nothing of a structure
 # Samples of a piece: a longer stretch is several, so that work grows as its length does. A minute
-# at 1 kHz, in which all that rings comes to rest or is well told.
+# at 1 kHz, in which all that rings comes to rest or is well determined.
 LONGEST = 2**16
 KNOWN = 1e-3  # of an input's rms, how far off lost samples of it may be that count as known
 
@@ -52,11 +52,11 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One stretch of samples; of several whose inputs are proportional, what tells the response.
+    """One stretch of samples; of several with proportional inputs, what determines the response.
 
     Proportional inputs c_i r and their sensors z_i are turned by an orthonormal matrix whose first
     row is c/|c|: the first sum has all of the input and the noise of one record, the others have
-    next to no input and tell noise (`repeats`) or what changes with the level (`contrasts`).
+    next to no input and show noise (`repeats`) or what changes with the level (`contrasts`).
 
     r : (history + n,) input of the loop, or of the rig where none is closed; (history + n, m) of a
         rig of m inputs. The rig is at rest before it, unless `moving`.

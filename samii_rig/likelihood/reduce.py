@@ -31,8 +31,8 @@ from samii_rig.types import Complex, Float, Int
 
 SPACING = 0.2  # nodes, times the distance over which the reference's response turns by 1 rad
 WIDEST = 0.1  # nodes, apart over frequency at most
-# Nodes over lines of the contour, at most, of a change that is free where noise is told: at the
-# lowest lines one a line would leave no noise to be seen.
+# Nodes over lines of the contour, at most, of a change that is free where noise is estimated: at
+# the lowest lines one a line would leave no noise to be seen.
 SPARE = 0.1
 BELOW = 2**0.5  # the same, below the band: a change of 1/s is linear between them to 3 %
 ENOUGH = 0.75  # lines over unknowns of a change, from which a piece shows its noise by itself
@@ -68,7 +68,7 @@ class Reduced:
     frequency : (b,) Hz of the nodes, s = sigma + 2 pi j f. reference : (b, q).
     factor : (m, q, 2, b) so that factor . (Re d, Im d) - target (m,) is standard normal noise;
     of one state upper triangular.
-    known : directions of d that the records tell anything of, the mean of chi-square.
+    known : directions of d of which the records hold information, the mean of chi-square.
     inside : chi-square that no d explains, and its mean.
     noise : of a sample. differing : chi-square of levels against each other, and its mean.
     log_determinant : twice the sum over the lines of the logarithm of the determinant of the noise,
@@ -506,7 +506,8 @@ def _beyond(Q: Float, x: Complex) -> Complex:
 def _with_repeats(
     records: Records, H: Complex, seen: Sequence[Seen], rows: Rows, left: Complex, free: Float
 ) -> tuple[Float, Complex, Float, Int]:
-    """Frequency, lines, freedom and piece of all that tells noise: what repeats differ by, too."""
+    """Frequency, lines, freedom and piece of all that the noise is estimated from: what repeats
+    differ by, too."""
     every = [(rows.f, left, free, rows.piece)]
     for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
         if np.any(rounding.alike(piece, records.step) > rounding.ALIKE):
@@ -620,8 +621,8 @@ def _between(nodes: Int, few: Int) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class _Free:
-    """A change that is free where noise is told, and the lines that show it together: each piece's
-    by themselves where they are enough.
+    """A change that is free where noise is estimated, and the lines that show it together: each
+    piece's by themselves where they are enough.
 
     rows : of all lines. groups : pieces, their lines (n,), and (2 n, p) what the change does in
     these, of every sensor.

@@ -27,7 +27,7 @@ HARMONIC = np.arange(1.0, 200.0)  # of a sawtooth: all but 0.3 % of its power
 # Steps within which a motion is not read in proportion: the describing function of a staircase
 # is within 10 % of 1 from here on.
 FEW = 3.0
-STILL = 1e-3  # steps, rms of a motion that has no factor worth to be told
+STILL = 1e-3  # steps, rms of a motion that has no factor worth estimating
 SHORT = 0.5  # s in which a motion that crosses no step is not read: some periods of the band
 ALIKE = 0.05  # of a rounding error, that repeats itself: repeats do not show it
 UNREAD = 6  # parts in which what is hardly read has a factor of its own
@@ -36,10 +36,10 @@ UNREAD = 6  # parts in which what is hardly read has a factor of its own
 DITHERED = 0.5
 UNSEEN = 0.05  # of a staircase's error, what dithering leaves of it that nobody sees
 # Times by which what rounding adds may differ between pieces of one group, and how many groups are
-# told apart at most: each has bins of its own.
+# distinguished at most: each has bins of its own.
 APART, GROUPS = 1.5, 8
 # s for which what wanders, below the band, rests in its step: some periods of the band, from which
-# its place is told.
+# its place is determined.
 REST = 1.0
 OFFSETS = 16  # places of a motion in its step, at which its rounding is tried: within 25 % a line
 LIKELY = 4  # of these, that are nearest to what is read

@@ -85,7 +85,7 @@ def unexplained(
 
 
 def as_rounding(before: Sequence[Unexplained], after: Sequence[Unexplained]) -> float:
-    """Power of the noise along what one model has that another lacks, in units of what it is told,
+    """Power of the noise along what one model has that another lacks, in units of its estimate,
     1 at least: the rounding of a motion of few steps repeats as the motion does, and has more there
     than noise that is independent from line to line."""
     along: dict[int, Float] = {}

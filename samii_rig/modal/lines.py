@@ -20,7 +20,7 @@ class Lines:
     """One response within a band.
 
     frequency : (n,) Hz. G : (n, p) the response, entry by entry (output, then input), hold,
-        filters and delays divided out where the rig file tells them. seen : (n, p) these.
+        filters and delays divided out where the rig file gives them. seen : (n, p) these.
     outputs, inputs : names; p = n_out n_in.
     s : (n,) j omega over `scale`, rad/s. W : (n, p, p) weights: chi-square is sum e^H W e.
     root : (n, p, p) root^H root = C^-1 of G. sd : (n, p) standard deviation of G.

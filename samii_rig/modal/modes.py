@@ -7,7 +7,7 @@ Poles of the stabilisation diagram (`stabilisation`) start a maximum likelihood 
 (`refine`), enlarged and pruned until noise explains the rest (`selection`). What is estimated are
 the poles of the measured response: from a command, those of the plant that it drives, whatever loop
 computes the command; from a reference, those of the closed loop. A zero-order hold, delays and
-filters move no pole; they turn residues, and are divided out where the rig file tells them.
+filters move no pole; they turn residues, and are divided out where the rig file gives them.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def find_modes(
 ) -> ModalModel:
     """Modes of `response`.
 
-    rig : tells hold, filters and delays, which are divided out. band : Hz.
+    rig : gives hold, filters and delays, which are divided out. band : Hz.
     pick : Hz, poles of the diagram that a person chose; these and no others are modes then.
     coefficients : of the diagram's polynomials; by default real ones, complex ones for a band
         that spans less than an octave.

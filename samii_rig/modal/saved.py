@@ -47,7 +47,7 @@ class SavedModes:
 
     @property
     def name(self) -> str:
-        """The level, which tells it from the others."""
+        """The level, which distinguishes it from the others."""
         return f"{self.level:g} {self.level_unit}"
 
     def numbers(self) -> Float:

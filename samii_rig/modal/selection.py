@@ -130,7 +130,8 @@ def places(d: Lines) -> Complex:
 
 
 def lines_that_count(d: Lines, pole: complex) -> float:
-    """Lines that a pair tells its residue to: (sum |f|^2)^2/sum |f|^4 of f = 1/(s - pole)."""
+    """Effective number of lines that determine the residue of a pair: (sum |f|^2)^2/sum |f|^4 of
+    f = 1/(s - pole)."""
     f2 = 1 / np.abs(d.s - pole) ** 2
     return float(np.sum(f2) ** 2 / np.sum(f2**2))
 
@@ -232,6 +233,6 @@ def _candidates(d: Lines, model: Rational, grid: Complex) -> list[complex]:
         if len(chosen) == LOOKED_AT:
             break
     chosen.append(_beyond(d))
-    told = [(score(model, d.s, d.G, d.W, a), a) for a in chosen]
-    told.sort(key=lambda both: -both[0])
-    return [a for gain, a in told[:TRIED] if gain > WORTH * 2 * d.p]
+    ranked = [(score(model, d.s, d.G, d.W, a), a) for a in chosen]
+    ranked.sort(key=lambda both: -both[0])
+    return [a for gain, a in ranked[:TRIED] if gain > WORTH * 2 * d.p]

@@ -62,10 +62,10 @@ def arrays(response: FrequencyResponse) -> Arrays:
         out["partial_coherence"] = partial_coherence(r)
     if r.follow is not None:
         out |= {"followers": np.array([c.name for c in r.followers]), "follow": r.follow}
-    return out | told(r)
+    return out | known_levels(r)
 
 
-def told(response: FrequencyResponse) -> dict[str, Float]:
+def known_levels(response: FrequencyResponse) -> dict[str, Float]:
     """What of `even`, `odd`, `noise` and `distortion` is known, (n_freq, n_out) each."""
     r = response
     every = {"even": r.even, "odd": r.odd, "noise": r.noise, "distortion": r.distortion}
@@ -144,7 +144,7 @@ def lines(response: FrequencyResponse) -> xarray.Dataset:
         "coherence": ((f, y), r.coherence),
         "input_rms": ((f, u), r.input_rms),
     }
-    held |= {k: ((f, y), v) for k, v in told(r).items()}
+    held |= {k: ((f, y), v) for k, v in known_levels(r).items()}
     if len(r.inputs) > 1:
         held["partial_coherence"] = ((f, y, u), partial_coherence(r))
     made: xarray.Dataset = xr.Dataset(

@@ -144,7 +144,7 @@ def read_header(
 ) -> Text:
     """Read up to the first row of data and find the columns' names and units.
 
-    wanted : columns by which a wrong delimiter is told.
+    wanted : columns by which a wrong delimiter is detected.
     """
     where = str(path)
     encoding(path)

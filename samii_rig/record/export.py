@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from samii_rig.errors import InputError
-from samii_rig.record.convert import arrays, told
+from samii_rig.record.convert import arrays, known_levels
 from samii_rig.record.uff.channels import response_sets
 from samii_rig.record.uff.file import write_uff
 from samii_rig.signal.coherence import partial_coherence
@@ -111,7 +111,7 @@ def table(response: FrequencyResponse) -> tuple[list[str], Float]:
     for i, u in enumerate(r.inputs):
         names.append(f"amplitude {u.name} [{u.unit}]")
         columns.append(r.input_rms[:, i])
-    for what, level in told(r).items():
+    for what, level in known_levels(r).items():
         said = f"{what} distortion" if what in ("even", "odd") else what
         for i, y in enumerate(r.outputs):
             names.append(f"{said} {y.name} [1]")

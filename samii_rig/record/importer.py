@@ -38,7 +38,7 @@ _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 _LAST_SECOND = 9.2e9  # s, int64 nanoseconds end a little later
 _LAST_COUNT = 2.0**53  # beyond it a float64 column cannot count samples
 # A step of a time column may be off a whole number of periods by this many periods: a
-# column rounded to its last digit is, and beyond it gap and jitter cannot be told apart.
+# column rounded to its last digit is, and beyond it gap and jitter cannot be distinguished.
 _JITTER = 0.25
 # ns, 30 years: no device has run for so long, so that a time beyond it counts from 1970.
 _COUNTS_FROM_1970 = 30 * 365 * 86_400 * 1_000_000_000

@@ -89,7 +89,7 @@ class Zero:
         self._device, self._outputs = device, outputs
         names = [c.name for c in device.sensor.channels]
         self._columns = [names.index(output.channel) for output in outputs]
-        # What each output's converter cannot tell from zero.
+        # What each output's converter cannot distinguish from zero.
         self._least = np.array([output.slack / 2 for output in outputs])
         self.trouble = ""
 

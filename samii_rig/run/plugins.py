@@ -1,4 +1,4 @@
-"""Somebody else's experiments: a plan that is not one is told as wrong input, field by field."""
+"""Somebody else's experiments: a wrong plan is reported as wrong input, field by field."""
 
 from __future__ import annotations
 

@@ -36,11 +36,11 @@ FASTEST = 0.2  # of the centring sensor's unit per s, at which a person can stil
 SPEED = 0.05  # the same, where nothing is asked for
 FURTHEST = 0.8  # of the centring sensor's limit
 # How near a move comes to where it was to go: parts of the way, of which five time constants leave
-# 0.7 %, and multiples of what the sensor cannot tell.
+# 0.7 %, and multiples of what the sensor cannot resolve.
 NEAR, NEAR_NOISE = 0.02, 5.0
 SETTLE = 0.5  # s at the end of a move, and so many time constants of the centring loop
 SETTLE_CONSTANTS, LONGEST_SETTLE = 5.0, 10.0  # and s
-PULSE = 0.2  # s of the pulse that tells the encoder's sign
+PULSE = 0.2  # s of the pulse that shows the encoder's sign
 PULSE_PART = 0.05  # of the actuator's limit
 
 

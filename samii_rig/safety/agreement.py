@@ -52,12 +52,12 @@ def apart(
         e' = theta' - gain v - e/over,    e = 0 at first,
 
     a sensor's way less that of an angular velocity source, forgotten over `over` s: a drift of r
-    per second comes to r over. columns : of sensor and other. A value that was not told says
+    per second comes to r over. columns : of sensor and other. A value that was not reported says
     nothing here; how long that may last is the channel's own limit.
     """
     values = block.values[:, columns]
-    told = ((block.quality[:, columns] & UNTOLD) == 0).all(axis=1) & np.isfinite(values).all(axis=1)
-    values, times = values[told], block.time[told]
+    good = ((block.quality[:, columns] & UNTOLD) == 0).all(axis=1) & np.isfinite(values).all(axis=1)
+    values, times = values[good], block.time[good]
     if a.gain == 0.0:
         return before, float(np.abs(values[:, 0] - values[:, 1]).max(initial=0.0))
     now, most = before, 0.0

@@ -30,7 +30,7 @@ class Latest:
     since : (n,) time of the newest good value that differed from the one before it.
     travel, effort : (n,) integral of v and of |v| since then, in actuator unit times s.
     clipped : (n,) a converter at its end. limited : the device itself changed the output.
-    stray : how far the output of the newest block was from what the device was told, see
+    stray : how far the output of the newest block was from what the device was commanded, see
         `readback.stray`.
     apart : how far the two of each agreement parted in the newest block, see `agreement.apart`.
     disorder : samples came out of order, now or before.

@@ -49,7 +49,7 @@ NOISE_AFTER = 1.0  # s
 NOISE_STEPS = 4.0  # of the actuator's converter: smallest mean |v| that counts as moving
 
 
-# How far the output that a device reads back may be from what it was told, in steps of its
+# How far the output that a device reads back may be from what it was commanded, in steps of its
 # converter (it rounds the reference, the product and the sum) and as a part of its limit.
 READBACK_STEPS = 4.0
 READBACK_PART = 0.01

@@ -1,4 +1,4 @@
-"""Whether the output that a device reads back is the one that it was told to put out."""
+"""Whether the output that a device reads back is the one that it was commanded to put out."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Places:
 
 
 def stray(sent: Sent, block: SampleBlock, places: Places, kp: float) -> float:
-    """Largest distance between what the device put out and what it was told, in its unit.
+    """Largest distance between what the device put out and what it was commanded, in its unit.
 
     At every sample of `block` for which a reference was sent,
 
@@ -94,8 +94,8 @@ def stray(sent: Sent, block: SampleBlock, places: Places, kp: float) -> float:
     must be zero. 0 where nothing can be compared.
     """
     if sent.first < 0:
-        told = (block.quality[:, places.v] & UNJUDGED) == 0
-        return float(np.abs(block.values[told, places.v]).max(initial=0.0))
+        judged = (block.quality[:, places.v] & UNJUDGED) == 0
+        return float(np.abs(block.values[judged, places.v]).max(initial=0.0))
     at = block.sequence - sent.first
     inside = np.flatnonzero((at >= 0) & (at < len(sent.u)))
     if not len(inside) or (kp != 0.0 and places.theta is None):
@@ -106,11 +106,11 @@ def stray(sent: Sent, block: SampleBlock, places: Places, kp: float) -> float:
     if not len(rows):
         return 0.0
     values, at = block.values[rows], at[rows]
-    told = sent.u[at] + kp * sent.theta_ref[at]
+    due = sent.u[at] + kp * sent.theta_ref[at]
     away = 0.0
     if places.u is not None:
         used = values[:, places.u] + kp * values[:, places.theta_ref]
-        off = np.abs(used - told)[values[:, places.u] != 0.0]
-        away, told = float(off.max(initial=0.0)), used
+        off = np.abs(used - due)[values[:, places.u] != 0.0]
+        away, due = float(off.max(initial=0.0)), used
     theta = values[:, places.theta] if kp != 0.0 else 0.0
-    return max(away, float(np.abs(values[:, places.v] - told + kp * theta).max()))
+    return max(away, float(np.abs(values[:, places.v] - due + kp * theta).max()))

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from samii_rig.errors import RecordingError, SamiiRigError
-from samii_rig.progress import telling
+from samii_rig.progress import reporting
 from samii_rig.record.reader import read_events, read_recording
 from samii_rig.record.writer import PARTIAL
 from samii_rig.rig.load import parse
@@ -178,7 +178,7 @@ def _diagnosing(line: Connection, rig_toml: str) -> None:
             about, responses = line.recv()
             begun = time.monotonic()
             try:
-                found = said(diagnose(responses, rig, progress=telling(line.send)))
+                found = said(diagnose(responses, rig, progress=reporting(line.send)))
             except SamiiRigError as error:
                 found = {"verdict": "", "trouble": str(error)}
             line.send({**about, **found, "took_s": time.monotonic() - begun})

@@ -24,7 +24,7 @@ import numpy as np
 
 from samii_rig.errors import GateError, SamiiRigError
 from samii_rig.index.remarks import add_note, set_diagnosis
-from samii_rig.progress import telling
+from samii_rig.progress import reporting
 from samii_rig.record.reader import read_events
 from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
@@ -218,7 +218,7 @@ class Runner:
                 outcome.responses,
                 run.setup.rig,
                 runs=[outcome.recording],
-                progress=telling(lambda words: self._set(doing=words)),
+                progress=reporting(lambda words: self._set(doing=words)),
             )
             set_diagnosis(self.path, {**found.plain(), "lines": list(found.lines())})
             following_toml = following(found.experiment, run.experiment_toml)
