@@ -18,12 +18,12 @@ from samii_rig.diagnose.fit import forms
 from samii_rig.diagnose.fit.forms import Form
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.errors import SamiiRigError
+from samii_rig.identify.likelihood import LOG_FLOOR
 from samii_rig.levenberg import ByFactor, Normal, Point, Progress, descend, step
 from samii_rig.types import Complex, Float
 
 STEPS = 40
 LOG_STEPS = 20
-LOG_FLOOR = 0.1  # of the response's logarithm: see identify.likelihood
 FAR = 20.0  # chi-square per degree of freedom above which the logarithm is fitted first
 LONGEST = 1.2  # a step of an effect's logarithm at most
 # Of chi-square, for a step of the largest allowed size.
