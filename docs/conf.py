@@ -5,6 +5,7 @@
 The source folder is the checkout, so a link that works beside the sources works in the site.
 """
 
+import os
 import re
 import sys
 import tomllib
@@ -13,6 +14,9 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
+# The site shows docstrings and runs nothing: kernels that numba compiles when their module is
+# imported would only cost seconds. Read when numba is imported.
+os.environ["NUMBA_DISABLE_JIT"] = "1"
 
 _data = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
 project, release = _data["name"], _data["version"]

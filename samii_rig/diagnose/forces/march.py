@@ -14,7 +14,7 @@ from samii_rig.types import Float, Int
 
 _law = types.FunctionType(SIGNATURE)
 _f8, _i8 = types.float64, types.int64
-_row, _rows = types.Array(_f8, 1, "C"), types.Array(_f8, 2, "C")
+_row, _rows, _cube = (types.Array(_f8, n, "C") for n in (1, 2, 3))
 _FAST = {"reassoc", "contract", "nsz"}
 
 
@@ -89,7 +89,7 @@ def march(
     return f
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(_row(_row, _rows, _rows, _f8, _i8, _i8), cache=True, fastmath=_FAST)
 def moved(v: Float, transition: Float, by_v: Float, direct: float, late: int, inner: int) -> Float:
     """(n inner,) what a command v (n,) alone does from rest; as `march` has it."""
     n_pole = transition.shape[1]
@@ -107,7 +107,7 @@ def moved(v: Float, transition: Float, by_v: Float, direct: float, late: int, in
     return out
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(_rows(_row, _rows, _cube, _row, _i8, types.Array(_i8, 1, "C")), cache=True, fastmath=_FAST)
 def read(e: Float, transition: Float, by_e: Float, direct: Float, inner: int, late: Int) -> Float:
     """(n, q) what sensors show of a force e (n inner,), before each sample's steps.
 

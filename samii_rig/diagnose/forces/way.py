@@ -29,6 +29,7 @@ class Sensed:
 
     def of(self, e: Float) -> Float:
         """(n, q) of a force e (n INNER,) from rest."""
+        e = np.ascontiguousarray(e)
         return read(e, self.transition, self.by_e, self.direct, INNER, self.late)
 
 
