@@ -13,12 +13,12 @@ import resource
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context
 from typing import Any
 
 from samii_rig import errors
 from samii_rig.errors import SamiiRigError
 from samii_rig.plain import plain
+from samii_rig.serve.loaded import CONTEXT
 from samii_rig.serve.places import Places
 from samii_rig.workers import ends_with_its_parent
 
@@ -79,9 +79,7 @@ class _Workers:
         async with self._places.place(by):
             pool = self._idle.pop()
             try:
-                loop = asyncio.get_running_loop()
-                answer = loop.run_in_executor(pool, _answered, work, arguments)
-                return await asyncio.wait_for(answer, WITHIN)
+                return await asyncio.wait_for(_asked(pool, work, arguments), WITHIN)
             except (BrokenProcessPool, TimeoutError, asyncio.CancelledError) as error:
                 # It is broken, or still works on what nobody waits for.
                 _end(pool)
@@ -110,7 +108,15 @@ def _end(pool: ProcessPoolExecutor) -> None:
 
 
 def _pool() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, get_context("spawn"), _begin)
+    return ProcessPoolExecutor(1, CONTEXT, _begin)
+
+
+async def _asked(
+    pool: ProcessPoolExecutor, work: Callable[..., dict[str, Any]], arguments: tuple[Any, ...]
+) -> dict[str, Any]:
+    # In a thread: the first who asks waits until there is a process to be copied (see `loaded`).
+    answer = await asyncio.to_thread(pool.submit, _answered, work, arguments)
+    return await asyncio.wrap_future(answer)
 
 
 def _begin() -> None:
