@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from contextlib import suppress
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 import samii_rig.report.drawing
 import samii_rig.run.order
 import samii_rig.serve.motion
+import samii_rig.serve.runner
 import samii_rig.serve.words  # noqa: F401
 from samii_rig.model.realise import realise
 from samii_rig.model.sampled import sampled_response
@@ -25,3 +27,6 @@ def _kernels() -> None:
 # Who needs them and has them not says what is wrong.
 with suppress(Exception):
     _kernels()
+# It stays in use: no copy looks through it for garbage, and its memory stays shared.
+gc.collect()
+gc.freeze()

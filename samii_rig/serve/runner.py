@@ -1,11 +1,8 @@
 """One run in a process of its own.
 
-    python -m samii_rig.serve.runner JOB_FOLDER RECORDINGS LOCK
-
-LOCK is the descriptor of the job's lock, held by whoever started this and from now on by this
-process alone. It shares no pipe, no terminal and no parent with the service, so that it goes on
-when the service is killed; how it stands is in the job's folder and in the live data. A signal
-ends it at zero.
+It holds the job's lock, which whoever started it had, and from now on alone. It shares no pipe that
+it needs, no terminal and no session with the service, so that it goes on when the service is
+killed; how it stands is in the job's folder and in the live data. A signal ends it at zero.
 """
 
 from __future__ import annotations
@@ -35,8 +32,9 @@ from samii_rig.run.outputs import plan_limits
 from samii_rig.run.plan import Plan
 from samii_rig.run.progress import Progress
 from samii_rig.serve.following import following
-from samii_rig.serve.job import DIAGNOSIS, ESTIMATE, LOST_AFTER, Job, JobState
+from samii_rig.serve.job import DIAGNOSIS, ESTIMATE, LOG, LOST_AFTER, Job, JobState
 from samii_rig.serve.live import LiveWriter, live_folder
+from samii_rig.serve.loaded import Descriptor
 from samii_rig.serve.planned import averages, planned
 from samii_rig.serve.sofar import SoFar
 from samii_rig.types import SampleBlock, StopRecord
@@ -235,19 +233,18 @@ def _numbers(data: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Entry point."""
-    folder, recordings, lock = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
-    os.set_inheritable(lock, False)
+def begin(folder: Path, recordings: Path, lock: Descriptor) -> None:
+    """What the process does, from its first line on. folder : of the job. lock : the job's."""
+    os.setsid()
+    with (folder / LOG).open("ab") as log, Path(os.devnull).open("rb") as nothing:
+        for number, file in enumerate((nothing, log, log)):
+            os.dup2(file.fileno(), number)
+    os.set_inheritable(lock.number, False)
     # Who stops us finds our number here where our state cannot be read.
-    os.ftruncate(lock, 0)
-    os.write(lock, str(os.getpid()).encode())
+    os.ftruncate(lock.number, 0)
+    os.write(lock.number, str(os.getpid()).encode())
     try:
         Runner(Job(folder), recordings).go()
     except SamiiRigError as error:
         print(f"samii-rig: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-
-
-if __name__ == "__main__":
-    main()

@@ -7,11 +7,11 @@ run and the queue again when it is started anew.
 from __future__ import annotations
 
 import shutil
-import subprocess
-import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, replace
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,6 @@ from samii_rig.serve.job import (
     ESTIMATE,
     ID,
     JOBS,
-    LOG,
     OVER,
     RESPONSES,
     SO_FAR,
@@ -37,7 +36,9 @@ from samii_rig.serve.job import (
     asked_to_stop,
 )
 from samii_rig.serve.live import LiveReader
+from samii_rig.serve.loaded import Descriptor, independent
 
+RUNNER = "samii_rig.serve.runner"  # what a run's process does
 MOST_QUEUED = 50
 KEPT = 200  # jobs that are over
 
@@ -72,7 +73,7 @@ class Supervisor:
     def __init__(self, rig: Rig, rig_toml: str, index: Index, pace: float) -> None:
         self._rig, self._rig_toml, self._index, self._pace = rig, rig_toml, index, pace
         self._jobs = index.folder / PRIVATE / JOBS
-        self._children: list[subprocess.Popen[bytes]] = []
+        self._children: list[BaseProcess] = []
         self._open: list[Job] = []
         self._readers: dict[str, LiveReader] = {}
         # One thing after the other, beside the service's loop, which must be free for a stop.
@@ -194,7 +195,8 @@ class Supervisor:
 
     def turn(self) -> None:
         """Look after the jobs: take note of what ended and was asked, start what is next."""
-        self._children = [c for c in self._children if c.poll() is None]
+        for child in [c for c in self._children if c.exitcode is not None]:
+            self._children.remove(child)
         running = None
         for job in list(self._open):
             state = job.state
@@ -218,20 +220,21 @@ class Supervisor:
             self.held = f"stop asked by {by}"
 
     def _start(self, job: Job) -> None:
-        command = [sys.executable, "-m", "samii_rig.serve.runner"]
-        with (job.folder / LOG).open("ab") as log, job.held() as lock:
+        with ExitStack() as stack:
+            lock = stack.enter_context(job.held())
             job.set(JobState(phase="starting"))
-            # The lock goes over to the child: from now on somebody holds it until the run is over.
-            child = subprocess.Popen(
-                [*command, str(job.folder), str(self._index.folder), str(lock)],
-                pass_fds=(lock,),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-            )
-        self._children.append(child)
+            held = stack.pop_all()
+        # In a thread: our loop must not wait until there is a process to be copied (see `loaded`).
+        starting = threading.Thread(target=self._begin, args=(job, lock, held))
+        starting.start()
         self.current = job
+
+    def _begin(self, job: Job, lock: int, held: ExitStack) -> None:
+        # The lock goes over to the child: from now on somebody holds it until the run is over.
+        # Where the service ends before there is one, the job is found to have died.
+        with held, suppress(EOFError):
+            runner = (RUNNER, job.folder, self._index.folder, Descriptor(lock))
+            self._children.append(independent(*runner))
 
     def _ended(self, job: Job, state: JobState) -> None:
         self._open.remove(job)
