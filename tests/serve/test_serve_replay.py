@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from browser_kit import Browser, violations
@@ -27,19 +28,35 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield opened_
 
 
-@pytest.fixture
-def service(tmp_path: Path, browser: Browser) -> Iterator[Service]:
-    runs = tmp_path / "runs"
-    runs.mkdir()
+@pytest.fixture(scope="module")
+def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
+    runs = tmp_path_factory.mktemp("runs")
     # 36 s with 40 samples lost in the midst.
     write_run(
         runs / GAPPED, [block(n, 500) for n in (*range(0, 9000, 500), *range(9040, 18040, 500))]
     )
     with Service(runs, "--pace", "4") as started:
-        browser.go(started.url)
-        browser.until("document.getElementById('link').textContent === 'live'")
         yield started
-        assert browser.errors == []
+
+
+@pytest.fixture
+def service(serving: Service, browser: Browser) -> Iterator[Service]:
+    """With the one recording, and a page that was just opened."""
+    serving.until(lambda: serving.state()["running"] is None)
+    for path in serving.folder.glob("*.mcap"):
+        if path.name != GAPPED:
+            path.unlink()
+    listed = [GAPPED]
+    serving.until(lambda: [e["path"] for e in recorded(serving)] == listed)
+    browser.go(serving.url)
+    browser.until("document.getElementById('link').textContent === 'live'")
+    yield serving
+    assert browser.errors == []
+
+
+def recorded(service: Service) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = service.http.get("/api/recordings").json()["recordings"]
+    return found
 
 
 def test_every_sample_is_shown_and_a_gap_is_one(service: Service, browser: Browser) -> None:

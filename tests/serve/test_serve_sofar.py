@@ -88,6 +88,11 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Recording, in
     return made(tmp_path_factory.mktemp("swept"), SWEEPS)
 
 
+@pytest.fixture(scope="module")
+def of_periods(tmp_path_factory: pytest.TempPathFactory) -> tuple[Plan, Recording, int]:
+    return made(tmp_path_factory.mktemp("periods"), PERIODS)
+
+
 def until(recording: Recording, stop: int) -> Recording:
     """As it is on the disk when its newest sample is `stop` - 1."""
     kept = recording.sequence < stop
@@ -125,7 +130,7 @@ def test_a_sweep_grows_with_what_it_has_passed(swept: tuple[Plan, Recording, int
 
 def test_of_two_inputs_a_level_is_known_once_both_were_driven(tmp_path: Path) -> None:
     rig, rig_toml = load_rig("samii_two_joints")
-    text = sweep(duration=20.0, repeats=1).replace('"v_2"', '"v_2"\nbeside = ["v_3"]')
+    text = sweep(duration=8.0, repeats=1).replace('"v_2"', '"v_2"\nbeside = ["v_3"]')
     plan, recording, start = made(tmp_path, text, rig, rig_toml)
     one, both = (start + sum(len(s.u) for s in plan.segments[:k]) for k in (1, 2))
     assert first(plan) == both - start
@@ -143,9 +148,11 @@ def test_of_two_inputs_a_level_is_known_once_both_were_driven(tmp_path: Path) ->
     assert {(c["output"], c["input"]) for c in told["responses"][0]["curves"]} == pairs
 
 
-@pytest.mark.parametrize("text", [SWEEPS, PERIODS])
-def test_when_the_first_estimate_comes_is_known_before(tmp_path: Path, text: str) -> None:
-    plan, recording, start = made(tmp_path, text)
+@pytest.mark.parametrize("run", ["swept", "of_periods"])
+def test_when_the_first_estimate_comes_is_known_before(
+    run: str, request: pytest.FixtureRequest
+) -> None:
+    plan, recording, start = request.getfixturevalue(run)
     n = first(plan)
     assert n is not None
     assert 0 < n < len(plan.segments[0].u)
@@ -206,8 +213,8 @@ def test_a_level_counts_once_whatever_is_driven_at_it(
         assert so_far.levels == levels
 
 
-def test_of_a_multisine_whole_periods_count(tmp_path: Path) -> None:
-    plan, recording, start = made(tmp_path, PERIODS)
+def test_of_a_multisine_whole_periods_count(of_periods: tuple[Plan, Recording, int]) -> None:
+    plan, recording, start = of_periods
     so_far = SoFar(plan)
     begin, last = plan.segments[0].recorded or (0, len(plan.segments[0].u))
     length = round(4.0 * RIG.rate_hz)
@@ -391,12 +398,14 @@ def test_the_last_word_of_the_runner_is_none_of_the_analyst(tmp_path: Path) -> N
     assert analysis.certain == ""
 
 
-def test_a_run_that_ends_while_it_is_looked_at_is_looked_at_once_more(tmp_path: Path) -> None:
-    plan, _, _ = made(tmp_path, SWEEPS)
+def test_a_run_that_ends_while_it_is_looked_at_is_looked_at_once_more(
+    swept: tuple[Plan, Recording, int], tmp_path: Path
+) -> None:
+    plan, recording, _ = swept
     job = Job.make(tmp_path / "jobs", Request("swept_sine", "run.mcap"), RIG_TOML, SWEEPS)
     job.set(JobState(phase="analysing"))
     with patch("samii_rig.serve.analyst.Diagnoser"):
-        Analyst(job, tmp_path).go()
+        Analyst(job, Path(recording.source).parent).go()
     told = json.loads((job.folder / RESPONSES).read_text())
     assert told["done"] == told["of"] == len(plan.segments)
     assert [(r["level"], r["n"], r["going_on"]) for r in told["responses"]] == [
