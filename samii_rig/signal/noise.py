@@ -112,7 +112,8 @@ def _shape(e: Complex, dof_per_line: float) -> tuple[float, Complex, int]:
     eye = np.eye(p)
     best = (np.inf, np.broadcast_to(eye, (n_freq, p, p)).astype(complex), 0)
     for order in ORDERS:
-        if order and data < DATA_PER_COEFFICIENT * p * order:
+        # So many lines have as many lags, however many residuals there are at each.
+        if order and (data < DATA_PER_COEFFICIENT * p * order or order >= n_freq):
             break
         A, sigma = _yule_walker(gamma, order)
         values = np.linalg.eigvalsh(sigma)

@@ -92,3 +92,16 @@ def test_bursts_that_share_a_faded_tail_share_their_noise():
     plain, right = (over_repeats(R, Z, 25, np.zeros(2), 1.0, c) for c in (0.0, correlation))
     ratio = (right.covariance / plain.covariance).real
     np.testing.assert_allclose(ratio, (1 + correlation) / (1 - correlation), rtol=1e-9)
+
+
+@pytest.mark.parametrize("lines", [1, 2, 5, 9])
+def test_many_residuals_at_few_lines_have_no_more_lags_than_lines(lines):
+    """A level that was repeated a hundred times."""
+    rng = np.random.default_rng(0)
+    size = (100, lines, 2)
+    e = rng.normal(size=size) + 1j * rng.normal(size=size)
+    found = noise.pooled(e, 99, lines)
+    assert found.order < lines
+    # Of 99 degrees of freedom it is known to 10 %; 4 such deviations about the 2 of both parts.
+    variances = np.diagonal(found.covariance, axis1=1, axis2=2).real
+    np.testing.assert_allclose(variances, 2.0, rtol=0.4)
