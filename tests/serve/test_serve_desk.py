@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import sys
 import time
 from contextlib import AsyncExitStack
 from pathlib import Path
@@ -23,7 +24,7 @@ from samii_rig.errors import InputError, RecordingError
 from samii_rig.rig.load import load_rig
 from samii_rig.run import dryrun
 from samii_rig.run.experiments import shipped
-from samii_rig.serve import desk, questions
+from samii_rig.serve import desk, loaded, questions
 from samii_rig.serve.access import Role, Tokens
 from samii_rig.serve.lease import Lease
 from samii_rig.serve.rooms import Rooms
@@ -117,6 +118,22 @@ def test_a_worker_that_died_is_replaced() -> None:
         asyncio.run(ask())
     finally:
         made.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere each worker loads for itself")
+def test_who_loads_for_all_is_replaced_once_it_is_gone() -> None:
+    async def loader() -> int:
+        made = desk.Desk()
+        try:
+            return await made.do(os.getppid, by="Ada")  # type: ignore[arg-type, return-value]
+        finally:
+            made.close()
+
+    first = asyncio.run(loader())
+    assert asyncio.run(loader()) == first
+    loaded.end()
+    os.waitid(os.P_PID, first, os.WEXITED | os.WNOWAIT)
+    assert asyncio.run(loader()) not in (first, os.getpid())
 
 
 def test_a_run_never_waits_for_viewers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
