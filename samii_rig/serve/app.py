@@ -23,7 +23,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 import samii_rig
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig
-from samii_rig.serve import driving, library, loaded
+from samii_rig.serve import driving, library
 from samii_rig.serve.access import MAX_HEAD, PLAIN_PAGE, STOP, App, Guard, Receive, Scope, Send
 from samii_rig.serve.door import Door, Guest, room
 from samii_rig.serve.job import LOST_AFTER, Job
@@ -58,7 +58,6 @@ def application(rooms: Rooms) -> FastAPI:
         finally:
             for task in tasks:
                 task.cancel()
-            loaded.end()
             await asyncio.gather(*tasks, return_exceptions=True)
             rooms.analysis.close()
             rooms.desk.close()

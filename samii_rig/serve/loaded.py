@@ -9,12 +9,10 @@ algebra does not survive a fork, each loads for itself.
 from __future__ import annotations
 
 import os
-import signal
 import sys
 from collections.abc import Callable
-from contextlib import suppress
 from importlib import import_module
-from multiprocessing import forkserver, get_context, process
+from multiprocessing import get_context
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from multiprocessing.reduction import DupFd
@@ -42,25 +40,15 @@ class Descriptor:
 
 
 def independent(module: str, *arguments: Any) -> BaseProcess:
-    """A process that goes on when we end: it does `begin` of that module with these arguments."""
+    """Let a process do `begin` of that module with these arguments, and go on when we end: it has
+    no parent. What is returned is who began it, and ends at once."""
     # By its name: what it loads is no burden of ours.
-    child = CONTEXT.Process(target=_begun, args=(module, arguments))
-    child.start()
-    # At our end multiprocessing would wait for it.
-    vars(process)["_children"].discard(child)
-    return child
+    starter = CONTEXT.Process(target=_begun, args=(module, arguments))
+    starter.start()
+    return starter
 
 
 def _begun(module: str, arguments: tuple[Any, ...]) -> None:
-    import_module(module).begin(*arguments)
-
-
-def end() -> None:
-    """End the one that has loaded it all, and may still do so: nobody would end before it has.
-
-    What was forked from it goes on.
-    """
-    pid = vars(getattr(forkserver, "_forkserver")).get("_forkserver_pid")  # noqa: B009
-    if pid:
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
+    # Who started it is waited for when we end, and is over by then.
+    if os.fork() == 0:
+        import_module(module).begin(*arguments)
