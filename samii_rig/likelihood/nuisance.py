@@ -23,9 +23,9 @@ MAINS, STRAY, MULTIPLES = (50.0, 60.0), 0.01, (1, 2, 3)
 # Over the median of its neighbours, power of a line that stands out: noise does so at one in 4,000.
 STANDS, NEIGHBOURS = 12.0, 20
 
-# Power, of that of the shape which the lines show most, of one in lost samples that is still looked
-# at: of motion, which may be 10,000 times the noise; of input.
-SHOWN, INPUT = 1e-9, 1e-5
+# Power, of that of the shape which the lines show most, of one in lost samples that is looked at:
+# of what the reference leaves beside a straight line, 100 times the noise where much is amiss.
+SHOWN = 1e-5
 
 
 def wander(n: int, k: Int, q: int) -> Complex:
@@ -58,49 +58,49 @@ def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
 
     impulse : (m, q) answer to an impulse of the input; (m, q inputs) of several.
     """
-    q = piece.z.shape[1]
-    out = np.zeros((k.size, q, len(piece.edges)), complex)
-    for j, (edge, of) in enumerate(piece.edges):
-        own = impulse[: len(piece.r) - edge, of :: piece.inputs]
-        y = np.concatenate([np.zeros((edge, q)), own])
-        out[:, :, j] = np.fft.rfft(y[piece.history :], axis=0)[k]
-    return out
+    return _after(piece, k, impulse, piece.edges)
 
 
-def lost(piece: Piece, k: Int, H: Complex, contour: Contour) -> Complex:
+def lost(piece: Piece, k: Int, impulse: Float) -> Complex:
     """(n_lines, q, m) of all motion in the samples that a piece has lost, and of their input where
-    that is unknown.
+    that is unknown: impulses, as many as the lines tell apart.
 
-    H : as of `unread`.
+    impulse : as of `edges`.
     """
     n, q = piece.z.shape
     out = [np.zeros((k.size, q, 0), complex)]
     for first, behind in piece.lost:
-        shapes, share = _shown(behind - first, n, int(k[0]), k.size)
+        shapes = _shown(behind - first, n, int(k[0]), k.size)
         inside = np.zeros((n, shapes.shape[1]))
         inside[first:behind] = shapes
         out.append(_by_sensor(inside, k, q))
-        if (first, behind) not in piece.unknown:
-            continue
-        for shape in shapes.T[share > INPUT]:
-            r = np.zeros(len(piece.r))
-            r[piece.history + first : piece.history + behind] = shape
-            each = (contour.predicted(H[:, j :: piece.inputs], r) for j in range(piece.inputs))
-            spectra = [np.fft.rfft(y[piece.history :], axis=0)[k] for y in each]
-            out.append(np.stack(spectra, axis=2))
+        if (first, behind) in piece.unknown:
+            at = np.linspace(first, behind - 1, shapes.shape[1]).astype(np.int64)
+            each = ((int(i), j) for i in at for j in range(piece.inputs))
+            out.append(_after(piece, k, impulse, [(piece.history + i, j) for i, j in each]))
     return np.concatenate(out, axis=2)
 
 
+def _after(piece: Piece, k: Int, impulse: Float, each: Sequence[tuple[int, int]]) -> Complex:
+    """(n_lines, q, m) of impulses at some samples of r, of some inputs. impulse : as of `edges`."""
+    q = piece.z.shape[1]
+    out = np.zeros((k.size, q, len(each)), complex)
+    for j, (at, of) in enumerate(each):
+        own = impulse[: len(piece.r) - at, of :: piece.inputs]
+        y = np.concatenate([np.zeros((at, q)), own])
+        out[:, :, j] = np.fft.rfft(y[piece.history :], axis=0)[k]
+    return out
+
+
 @lru_cache(maxsize=32)
-def _shown(g: int, n: int, first: int, count: int) -> tuple[Float, Float]:
-    """Shapes (g, m) over g samples of n of which `count` lines from the `first` on show any, and
-    how much of the largest each shows (m,), in power: those of Slepian, one for each half period of
-    the band and some more."""
+def _shown(g: int, n: int, first: int, count: int) -> Float:
+    """Shapes (g, m) over g samples of n of which `count` lines from the `first` on show any:
+    those of Slepian, one for each half period of the band and some more."""
     turn = 2 * np.pi / n * np.outer(np.arange(g), first + np.arange(count))
     lines = np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
     values, shapes = np.linalg.eigh(lines @ lines.T)
     kept = values > SHOWN * values[-1]
-    return shapes[:, kept], values[kept] / values[-1]
+    return np.asarray(shapes[:, kept])
 
 
 def hum(left: Complex, k: Int, rate_hz: float, n: int) -> Complex:

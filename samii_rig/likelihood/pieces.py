@@ -24,6 +24,9 @@ LEAST_SAMPLES = 256  # fewer say nothing of a structure
 # Samples of a piece: a longer stretch is several, so that work grows as its length does. A minute
 # at 1 kHz, in which all that rings comes to rest or is well determined.
 LONGEST = 2**16
+# Samples: across a longer gap whose input is a guess there are more nuisances than where a piece
+# begins, and no more is known of the motion behind it.
+GUESSED = 64
 KNOWN = 1e-3  # of an input's rms, how far off lost samples of it may be that count as known
 
 
@@ -299,7 +302,7 @@ def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float)
     sensors' converters."""
     name, level = recording.place(segment), (segment.level, segment.unit)
     out = []
-    for start, low, high in _stretches(recording, segment, samples.whole):
+    for start, low, high in _stretches(recording, segment, samples):
         history = min(low - start, high - low)
         first = low - history
         # Whatever came before the history may still ring.
@@ -320,13 +323,16 @@ def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float)
 
 
 def _stretches(
-    recording: Recording, segment: Segment, whole: Bridged
+    recording: Recording, segment: Segment, samples: _Samples
 ) -> Iterator[tuple[int, int, int]]:
     """Stretches of a segment without a long gap, or without any where there are many, `LONGEST` at
     most: from which sample on all input before is known, the first, and the one behind the last."""
+    whole = samples.whole
     a, b = whole.between(_begun(recording, segment), segment.stop)
-    own = whole.lost[(whole.lost[:, 0] > a) & (whole.lost[:, 0] < b)]
-    many = own if len(own) > MOST_GAPS else own[:0]
+    within = (whole.lost[:, 0] > a) & (whole.lost[:, 0] < b)
+    begins = samples.unknown & (np.diff(whole.lost)[:, 0] > GUESSED)
+    begins |= np.count_nonzero(within & ~begins) > MOST_GAPS
+    many, own = whole.lost[within & begins], whole.lost[within & ~begins]
     ends = np.concatenate([[a, b], whole.breaks, many.ravel()])
     ends = np.unique(ends[(ends >= a) & (ends <= b)])
     for first, last in pairwise(ends.tolist()):

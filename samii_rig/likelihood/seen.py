@@ -106,7 +106,7 @@ class Seen:
         rounding = Rounding.of_piece(piece, k, step, y, exact.rate_hz)
         own += [nuisance.unread(piece, k, rounding.factors, H, exact, answers.loops)]
         own += [nuisance.edges(piece, k, answers.impulse)]
-        own += [nuisance.lost(piece, k, H, exact)]
+        own += [nuisance.lost(piece, k, answers.impulse)]
         beside = _of_size_one(np.concatenate(own, axis=2))
         first = past.shapes.shape[2]
         return cls(
