@@ -42,11 +42,9 @@ class Bridged:
     def of(
         cls, recording: Recording, known: NDArray[np.bool_], driving: Collection[str]
     ) -> Bridged:
-        """known : (rows,) whether a row counts. driving : the columns that inputs are made of, as
-        `bridged` has them; the others go straight from side to side."""
+        """known : (rows,) whether a row counts; one does. driving : the columns that inputs are made
+        of, as `bridged` has them; the others go straight from side to side."""
         rows = np.flatnonzero(known)
-        if rows.size == 0:
-            return cls(recording, np.zeros((0, 2), np.int64), np.zeros(0, np.int64))
         sequence = recording.sequence[rows]
         steps = np.diff(sequence)
         short = (steps > 1) & (steps <= LONGEST_GAP * recording.rate_hz)

@@ -207,7 +207,10 @@ def pieces_of(
     step = np.array([steps[n] for n in wired.sensors])
     found: list[Piece] = []
     for recording in recordings:
-        whole = Bridged.of(recording, _known(recording, wired), _driving_columns(recording, wired))
+        known = _known(recording, wired)
+        if not known.any():
+            continue
+        whole = Bridged.of(recording, known, _driving_columns(recording, wired))
         samples = _Samples.of(whole, wired, slower=round(rig.rate_hz / recording.rate_hz) > 1)
         for segment in segments_of(recording):
             if recording.place(segment) in without:
@@ -366,11 +369,11 @@ def across(x: Float, lost: Sequence[tuple[int, int]]) -> Float:
 
 def _begun(recording: Recording, segment: Segment) -> int:
     """The sample from which on a segment's excitation acts: a periodic one settles before it, and a
-    whole record holds that too."""
+    whole record holds that too, of at most as many samples as the segment has."""
     if segment.kind != "periodic":
         return segment.start
     ends = [s.stop for s in recording.segments if s.stop <= segment.start]
-    return max(ends, default=0)
+    return max(2 * segment.start - segment.stop, 0, *ends)
 
 
 def _joined(pieces: list[Piece], *, levels: bool) -> list[Piece]:

@@ -547,6 +547,21 @@ def test_a_gap_in_which_the_input_is_a_guess_begins_a_piece():
     assert [(len(p.z), p.history, p.lost) for p in found] == [(800, 0, ()), (1100, 0, ())]
 
 
+def test_a_recording_without_a_sound_sample_has_no_piece():
+    one, none = recording(), recording(repeat=1)
+    none.quality[:, 2] = Quality.MISSING
+    found = pieces_of([one, none], SAMII, wiring([one, none], SAMII))
+    assert [(len(p.z), len(p.repeats)) for p in found] == [(2000, 0)]
+
+
+def test_what_was_long_before_a_periodic_excitation_is_not_its_settling():
+    u = np.concatenate([np.zeros(3000), np.tile(sweep(400), 3)])
+    run = sweeping(u, np.zeros((u.size, 2)))
+    run = replace(run, segments=(Segment("multisine", "periodic", 3400, 4200, 1.0, "V", 0),))
+    (one,) = pieces_of([run], SAMII, without_loop(wiring([run], SAMII)))
+    assert (len(one.z), one.history) == (1600, 1600)
+
+
 def test_where_many_samples_are_missing_each_gap_begins_a_piece():
     run = recording(6000)
     run.quality[300::300, 2] = Quality.CLIPPED
@@ -629,7 +644,7 @@ def test_of_lost_samples_of_noise_it_is_said_how_far_off_they_may_be():
 
 def test_a_periodic_excitation_is_a_record_from_where_it_begins_to_settle():
     u = np.tile(sweep(400), 6)
-    settled = Segment("multisine", "periodic", 800, 2000, 1.0, "V", 0)
+    settled = Segment("multisine", "periodic", 800, 2000, 1.0, "V", 0)  # two periods before it
     other = Segment("multisine", "periodic", 2100, 2400, 1.0, "V", 1)
     run = replace(sweeping(u, np.zeros((u.size, 2))), segments=(settled, other))
     found = pieces_of([run], SAMII, without_loop(wiring([run], SAMII)))
