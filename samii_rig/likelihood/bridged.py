@@ -42,8 +42,8 @@ class Bridged:
     def of(
         cls, recording: Recording, known: NDArray[np.bool_], driving: Collection[str]
     ) -> Bridged:
-        """known : (rows,) whether a row counts; one does. driving : the columns that inputs are made
-        of, as `bridged` has them; the others go straight from side to side."""
+        """known : (rows,) whether a row counts; one does. driving : the columns of which inputs are
+        made, as `bridged` has them; the others go straight from side to side."""
         rows = np.flatnonzero(known)
         sequence = recording.sequence[rows]
         steps = np.diff(sequence)
