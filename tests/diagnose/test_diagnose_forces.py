@@ -149,6 +149,7 @@ def forces_of(runs: list[Recording]) -> ForceSearch:
     return ForceSearch(linear)
 
 
+@pytest.mark.slow  # a minute on a loaded machine; trials of two effects show the same
 def test_a_force_and_a_linear_effect_are_both_named(tmp_path: Path) -> None:
     found = found_in(
         cut_sweeps(
