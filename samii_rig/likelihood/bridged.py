@@ -72,9 +72,12 @@ class Bridged:
         return cls(filled, lost, breaks)
 
     def between(self, start: int, stop: int) -> tuple[int, int]:
-        """Where the samples numbered from `start` to before `stop` begin and end."""
-        a, b = np.searchsorted(self.recording.sequence, [start, stop])
-        return int(a), int(b)
+        """Where samples numbered from `start` to before `stop` begin and end; neither is lost."""
+        a, b = (int(i) for i in np.searchsorted(self.recording.sequence, [start, stop]))
+        for first, behind in self.lost.tolist():
+            a = behind if first <= a < behind else a
+            b = first if first < b <= behind else b
+        return a, max(a, b)
 
 
 def bridge(x: Float, lost: Int) -> Float:

@@ -338,13 +338,13 @@ def _stretches(
     many, own = whole.lost[within & begins], whole.lost[within & ~begins]
     ends = np.concatenate([[a, b], whole.breaks, many.ravel()])
     ends = np.unique(ends[(ends >= a) & (ends <= b)])
+    known = np.concatenate([whole.breaks, whole.lost[:, 1]])
     for first, last in pairwise(ends.tolist()):
         if last - first < LEAST_SAMPLES or first in many[:, 0]:
             continue
         parts = -(-(last - first) // LONGEST)
         cuts = np.linspace(first, last, parts + 1).astype(np.int64)
         for low, high in pairwise(_aside(cuts, own).tolist()):
-            known = np.concatenate([whole.breaks, whole.lost[:, 1]])
             yield int(known[known <= low].max()), low, high
 
 

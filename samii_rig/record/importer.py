@@ -249,8 +249,8 @@ def _channel(channel: ColumnMap) -> Channel:
 
 def _quality(values: Float, channels: Sequence[Channel]) -> Flags:
     """Samples at the end of a converter's range, but of no column that reads more than that."""
-    own = [c.low for c in channels], [c.high for c in channels]
-    low, high = (np.array(x) for x in own)
+    low = np.array([c.low for c in channels])
+    high = np.array([c.high for c in channels])
     clipped = (values <= low) | (values >= high)
     clipped[:, [bool(c.beyond(x)) for c, x in zip(channels, values.T, strict=True)]] = False
     return np.where(clipped, Quality.CLIPPED, Quality.GOOD).astype(np.uint8)

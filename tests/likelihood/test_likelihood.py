@@ -465,6 +465,20 @@ def recording(n: int = 2000, level: float = 0.5, repeat: int = 0) -> Recording:
     )
 
 
+def sweeping(u: Float, y: Float, *segments: Segment) -> Recording:
+    """Of an input u (n,) and two sensors y (n, 2); one sweep if no segments are given."""
+    whole = Segment("sweep", "single", 0, u.size, 1.0, "V", 0)
+    return Recording(
+        (Channel("v_2", "V", "command"), Channel("theta_2", "rad"), Channel("a_0", "m/s^2")),
+        RATE,
+        np.arange(u.size),
+        np.arange(u.size),
+        np.column_stack([u, y]),
+        np.zeros((u.size, 3), np.int64),
+        segments or (whole,),
+    )
+
+
 def without_loop(wired: Wiring) -> Wiring:
     return replace(wired, inputs=tuple(Input(x.command) for x in wired.inputs))
 
@@ -488,17 +502,8 @@ def test_bursts_in_a_row_are_predicted_however_long_the_rig_rings():
     u = np.tile(np.concatenate([sweep(800), np.zeros(200)]), bursts)
     mode = poles(4.0, 0.002)
     y = from_rest(u, mode) + sd * np.random.default_rng(6).standard_normal((u.size, 2))
-    run = Recording(
-        (Channel("v_2", "V", "command"), Channel("theta_2", "rad"), Channel("a_0", "m/s^2")),
-        RATE,
-        np.arange(u.size),
-        np.arange(u.size),
-        np.column_stack([u, y]),
-        np.zeros((u.size, 3), np.int64),
-        tuple(
-            Segment(f"burst_{i}", "burst", i * n, (i + 1) * n, 1.0, "V", i) for i in range(bursts)
-        ),
-    )
+    each = (Segment(f"burst_{i}", "burst", i * n, (i + 1) * n, 1.0, "V", i) for i in range(bursts))
+    run = sweeping(u, y, *each)
     wired = without_loop(wiring([run], SAMII))
     found = pieces_of([run], SAMII, wired)
     assert [(p.moving, len(p.repeats)) for p in found] == [(False, 0), (False, 0), (True, 5)]
@@ -532,6 +537,14 @@ def test_a_piece_goes_on_across_a_gap_and_across_missing_samples():
     assert one.lost == ((700, 720), (1300, 1350))
 
 
+def test_a_segment_that_ends_or_begins_within_a_gap_has_none_of_its_samples():
+    u = sweep(2000)
+    each = (Segment(f"part_{i}", "single", i * 1000, (i + 1) * 1000, 1.0, "V", i) for i in (0, 1))
+    run = without_samples(sweeping(u, from_rest(u, poles()), *each), slice(990, 1010))
+    found = pieces_of([run], SAMII, without_loop(wiring([run], SAMII)))
+    assert [(len(p.z), p.lost) for p in found] == [(990, ()), (990, ())]
+
+
 def test_a_gap_of_more_than_a_second_begins_a_piece():
     run = without_samples(recording(4000), slice(300, 310), slice(900, 2000))
     found = pieces_of([run], SAMII, wiring([run], SAMII))
@@ -556,8 +569,8 @@ def test_a_recording_without_a_sound_sample_has_no_piece():
 
 def test_what_was_long_before_a_periodic_excitation_is_not_its_settling():
     u = np.concatenate([np.zeros(3000), np.tile(sweep(400), 3)])
-    run = sweeping(u, np.zeros((u.size, 2)))
-    run = replace(run, segments=(Segment("multisine", "periodic", 3400, 4200, 1.0, "V", 0),))
+    own = Segment("multisine", "periodic", 3400, 4200, 1.0, "V", 0)
+    run = sweeping(u, np.zeros((u.size, 2)), own)
     (one,) = pieces_of([run], SAMII, without_loop(wiring([run], SAMII)))
     assert (len(one.z), one.history) == (1600, 1600)
 
@@ -580,18 +593,6 @@ def test_a_long_stretch_with_a_gap_is_cut_beside_it(monkeypatch):
         (1010, 0, ((990, 1010),)),
         (990, 0, ()),
     ]
-
-
-def sweeping(u: Float, y: Float) -> Recording:
-    return Recording(
-        (Channel("v_2", "V", "command"), Channel("theta_2", "rad"), Channel("a_0", "m/s^2")),
-        RATE,
-        np.arange(u.size),
-        np.arange(u.size),
-        np.column_stack([u, y]),
-        np.zeros((u.size, 3), np.int64),
-        (Segment("sweep", "single", 0, u.size, 1.0, "V", 0),),
-    )
 
 
 @pytest.mark.parametrize("lost", [3, 10, 30])
@@ -646,7 +647,7 @@ def test_a_periodic_excitation_is_a_record_from_where_it_begins_to_settle():
     u = np.tile(sweep(400), 6)
     settled = Segment("multisine", "periodic", 800, 2000, 1.0, "V", 0)  # two periods before it
     other = Segment("multisine", "periodic", 2100, 2400, 1.0, "V", 1)
-    run = replace(sweeping(u, np.zeros((u.size, 2))), segments=(settled, other))
+    run = sweeping(u, np.zeros((u.size, 2)), settled, other)
     found = pieces_of([run], SAMII, without_loop(wiring([run], SAMII)))
     assert [(len(p.z), p.history, p.moving) for p in found] == [
         (2000, 0, False),
