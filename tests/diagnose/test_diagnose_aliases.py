@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from samii_rig.diagnose.physics.channels import effects
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.model import Grid, Model, grid
 from samii_rig.likelihood.contour import EXACT, Contour
 from samii_rig.model.realise import realise
 from samii_rig.model.sampled import sampled_response
@@ -86,6 +86,39 @@ def test_what_is_late_is_late_in_every_alias(physics: str, unknown: float, late:
     assert np.all(off < 1e-4)
     near_alone = model.response(x, replace(at, far=None))
     assert np.max(np.abs(near_alone - theirs)[:, -1]) > 1e-3 * np.max(np.abs(theirs)[:, -1])
+
+
+def on_a_slow_coil(physics: str) -> tuple[Model, Grid]:
+    """A model with an effect on the input, and a grid up to 0.4 of the rate, where a delay of
+    samples turns every alias by radians."""
+    rig = load_rig("two_masses")[0].model_copy(update={"rate_hz": 100.0})
+    found = next(
+        e for e in effects(rig, 0.7, 40.0) if e.physics == physics and len(e.unknowns) == 1
+    )
+    q = len(rig.sensor)
+    at = grid(rig, np.linspace(0.7, 40.0, 80), np.arange(q), np.zeros(q, int))
+    return Model(rig, (found,)), at
+
+
+def test_a_delay_of_whole_samples_is_one_of_the_samples():
+    model, at = on_a_slow_coil("transport_delay")
+    x = np.append(np.zeros(model.n_nominal), np.log(0.02))
+    whole = (
+        Model(model.rig).response(x[:-1], at) * np.exp(-2j * np.pi * at.frequency * 0.02)[:, None]
+    )
+    np.testing.assert_allclose(model.response(x, at), whole, atol=1e-9 * np.max(np.abs(whole)))
+
+
+@pytest.mark.parametrize("physics", ["transport_delay", "actuator_lag"])
+def test_what_turns_the_aliases_has_its_slope(physics: str):
+    model, at = on_a_slow_coil(physics)
+    x = np.append(
+        np.zeros(model.n_nominal), np.log(0.023 if physics == "transport_delay" else 60.0)
+    )
+    h, dh = model.gradient(x, at)
+    x[-1] += 1e-7
+    slope = (model.response(x, at) - h) / 1e-7
+    np.testing.assert_allclose(dh[:, :, -1], slope, atol=1e-5 * np.max(np.abs(slope)))
 
 
 def test_a_model_of_other_parameters_folds_back_what_is_its_own():

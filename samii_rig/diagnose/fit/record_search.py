@@ -238,16 +238,14 @@ class RecordSearch(Search):
         there = fitted.model.response(fitted.x, self.problem.at)
         middle = fitted.model.response(fitted.x, between) - reference
         most = BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
-        if self.reduced.interpolation_error(there - self.reduced.reference, middle) > most:
-            return False
+        bends = self.reduced.interpolation_error(there - self.reduced.reference, middle)
         # What folds back from above is that of the fit about which the likelihood was made, or of
         # each model itself once that shows.
         own = fitted.model.response(fitted.x, self.whole.nodes(self.reduced, fitted))
-        if float(np.linalg.norm(self.reduced.slopes((own - there)[:, :, None]))) < most:
-            return True
-        if not self.whole.own_aliases:
+        folds = float(np.linalg.norm(self.reduced.slopes((own - there)[:, :, None])))
+        if folds >= most and not self.whole.own_aliases:
             self.whole = self.whole.with_own_aliases()
-        return False
+        return bends <= most and folds < most
 
     @property
     def reduced(self) -> Reduced:
@@ -308,7 +306,7 @@ class RecordSearch(Search):
     def rebin(self, fitted: Fitted) -> None:
         """The likelihood anew, about this fit, unless the one in use serves: what disturbs the rig
         comes out through it, so that the noise is that of one rig."""
-        if self._rig != fitted.model.effects or not self._stands(fitted):
+        if not self._stands(fitted) or self._rig != fitted.model.effects:
             self._about(fitted)
 
     def _nearest(self) -> Explanation:

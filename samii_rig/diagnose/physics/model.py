@@ -24,8 +24,9 @@ ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smoo
 NEAR = (-1, 1, -2, 2)
 OWN = 2  # of them, those of each model itself where that shows: modes are seldom above 1.5 rates
 # Aliases beyond those, each by itself at a few frequencies, as a factor changes each otherwise:
-# what it leaves of them is smooth between. Behind the last of `FAR` every term falls as the one
-# before it did; up to the last of all a delay is 7e-5 of the largest off, and 2e-3 without any.
+# what it leaves of them beside its phase at the frequency itself is smooth between. Behind the last
+# of `FAR` every term falls as the one before it did; up to the last of all a delay is 7e-5 of the
+# largest off, of whole samples 1e-9, and 2e-3 without any.
 FAR_POINTS, FAR, FARTHER = 9, range(3, 17), range(17, 65)
 STEEPEST = 8.0  # power of the frequency with which such a term falls, at most: nothing is left then
 STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
@@ -116,7 +117,8 @@ Closed = Loop | JointLoops
 class Far:
     """Aliases beyond the nearest, each by itself at a few frequencies (m,) Hz.
 
-    s : (order m,) rad/s of all of them. terms : (order, m, q), without the hold's 1 - e^{-s T}.
+    s : (order m,) rad/s of all of them, before them these frequencies themselves. terms :
+        (order, m, q), without the hold's 1 - e^{-s T}; 0 of the first.
     """
 
     few: Float
@@ -133,7 +135,7 @@ class Far:
             turns = 2j * np.pi * rig.rate_hz * np.array(orders)
             return np.asarray(s + turns[:, None])
 
-        each, terms = [], []
+        each, terms = [s[None]], [np.zeros((1, s.size, sensor.size), np.complex128)]
         for way in (1, -1):
             known = [way * k for k in FAR]
             T = _terms(rig, chain, s, known, sensor, actuator) / _held(s, rig.rate_hz)
@@ -149,12 +151,41 @@ class Far:
             terms += [T, last]
         return cls(few, np.concatenate(each).ravel(), np.concatenate(terms))
 
-    def changed(self, factor: Complex, s: Complex, rate_hz: float) -> Complex:
-        """(n, q) what a factor (order m, q) of each alias adds to all of them at s (n,) rad/s."""
-        left = np.sum(self.terms * factor.reshape(self.terms.shape), axis=0)
-        f = s.imag / (2 * np.pi)
-        between = np.stack([np.interp(f, self.few, one) for one in left.T], axis=1)
-        return np.asarray(_held(s, rate_hz) * between)
+    def added(self, at: Grid, own: Complex, passed: Complex) -> Complex:
+        """(n, q) what a factor adds to all aliases. own : (n, q) the factor at s itself. passed :
+        (order m, q) at all of `self.s`."""
+        F, turn = passed.reshape(self.terms.shape), _turn(own)
+        left = np.sum(self.terms * (F * _turn(F[0]).conj() - 1), axis=0)
+        return np.asarray(at.rest * (turn - 1) + self._between(at, left) * turn)
+
+    def slope(
+        self, at: Grid, own: Complex, passed: Complex, d_own: Complex, d_passed: Complex
+    ) -> Complex:
+        """(n, q) the slope of `added`. d_own, d_passed : those of the factor."""
+        shape = self.terms.shape
+        F, dF, turn = passed.reshape(shape), d_passed.reshape(shape), _turn(own)
+        back, d_back, d_turn = _turn(F[0]).conj(), _turned(F[0], dF[0]).conj(), _turned(own, d_own)
+        left = np.sum(self.terms * (F * back - 1), axis=0)
+        d_left = np.sum(self.terms * (dF * back + F * d_back), axis=0)
+        between = (at.rest + self._between(at, left)) * d_turn
+        return np.asarray(between + self._between(at, d_left) * turn)
+
+    def _between(self, at: Grid, few: Complex) -> Complex:
+        f = at.s.imag / (2 * np.pi)
+        between = np.stack([np.interp(f, self.few, one) for one in few.T], axis=1)
+        return np.asarray(_held(at.s, at.rate_hz) * between)
+
+
+def _turn(factor: Complex) -> Complex:
+    """Of a factor its phase alone: that of a delay of samples turns by radians between `few`."""
+    size = np.abs(factor)
+    return np.divide(factor, size, out=np.ones_like(factor), where=size > 0)
+
+
+def _turned(factor: Complex, d: Complex) -> Complex:
+    """The slope of `_turn`, d that of the factor."""
+    angle = np.divide(d, factor, out=np.zeros_like(factor), where=factor != 0).imag
+    return np.asarray(1j * angle * _turn(factor))
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,6 +233,11 @@ class Grid:
             self.sensor, self.actuator, sigma=self.sigma, loop=self.loop, far=self.far,
             own_aliases=None if self.own_aliases is None else self.own_aliases[:, i],
         )  # fmt: skip
+
+    @property
+    def rest(self) -> Complex:
+        """(n, q) of the aliases those that are not in `folded`."""
+        return np.asarray(self.aliases - np.sum(self.folded, axis=0))
 
     def without_aliases(self) -> Grid:
         """The same of the rig before it is sampled, no loop closed."""
@@ -355,7 +391,7 @@ def _through(
         return at.factor, aliases
     aliases = aliases + np.sum(folded * (near.F[1:] - 1), axis=0)
     if beyond is not None and at.far is not None:
-        aliases = aliases + at.far.changed(beyond.F[0] - 1, at.s, at.rate_hz)
+        aliases = aliases + at.far.added(at, near.F[0], beyond.F[0])
     return np.asarray(at.factor * near.F[0]), np.asarray(aliases)
 
 
@@ -483,11 +519,13 @@ class Model:
             terms = np.concatenate([(G * at.factor)[None], folded])
             for j, on, slope in near.slopes():
                 dH[:, on, j] += np.sum(terms[:, :, on] * slope, axis=0)
-        if beyond is not None and at.far is not None:
-            for j, on, slope in beyond.slopes():
-                whole = np.zeros_like(beyond.F[0])
-                whole[:, on] = slope[0]
-                dH[:, :, j] += at.far.changed(whole, at.s, at.rate_hz)
+        if near is not None and beyond is not None and at.far is not None:
+            for (j, on, d_own), (_, _, d_passed) in zip(
+                near.slopes(), beyond.slopes(), strict=True
+            ):
+                own, passed = np.zeros_like(near.F[0]), np.zeros_like(beyond.F[0])
+                own[:, on], passed[:, on] = d_own[0], d_passed[0]
+                dH[:, :, j] += at.far.slope(at, near.F[0], beyond.F[0], own, passed)
         H = G * factor + aliases
         return (H, dH) if at.loop is None else (at.loop.closed(H), at.loop.slopes(H, dH))
 
