@@ -115,6 +115,7 @@ class Search(Explanations):
             self.rebin_and_refit(best)
             self.take_overdispersion()
         self._beside_what_was_meant()
+        self._behind_the_input()
         self._from_everywhere()
         self._plainer()
         return self.ranked()
@@ -127,6 +128,27 @@ class Search(Explanations):
         if meant is not None and 0 < len(meant.effects) < len(best.effects):
             self.forward(meant, FIRST)
             self.take_overdispersion()
+
+    def _behind_the_input(self) -> None:
+        """Where every sensor is early, it is the input that is late: what is wrong with it, and one
+        more effect beside that. No exchange of one early sensor for it leads there."""
+        best = self.ranked()[0]
+        early = {e.site for e in best.effects if e.physics == "time_offset"}
+        if len(early) < 2 or len(early) < np.unique(self.grid.sensor).size:
+            return
+        bases = []
+        for effect in self.table:
+            of_input = effect.factor is not None and effect.factor.kind == "input"
+            model = self.model((effect,))
+            if effect.physical or effect.unknowns or not of_input or model is None:
+                continue
+            x = moved(best.fitted.model, best.fitted.x, model)[: model.n]
+            there = refit(model, self.problem, x, far=False, steps=0)
+            bases.append(Explanation((effect,), there, 0.0))
+        for base in sorted(bases, key=lambda e: e.fitted.cost)[:BROAD]:
+            self.forward(base, LATER, again=True)
+        self.take_overdispersion()
+        self.backward()
 
     def _plainer(self) -> None:
         """The best with a law of fewer unknowns in place of each of its effects: a part that ends
