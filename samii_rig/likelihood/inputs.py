@@ -35,9 +35,9 @@ METER, QUIET, UPPER = 9.0, 1e-3, 0.5
 # Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a
 # smaller one that came half a sample earlier is below a hundredth of what the rest makes.
 JUMP, REST = 0.01, 4
-# An input that is smooth on both sides of a jump bends there, in its fourth difference, this many
-# times as much as anywhere within so many samples; a jump of 1 has 3.
-BENT, SMOOTH, OF_ONE = 8.0, 16, 3.0
+# An input that is smooth on both sides of a jump or a turn bends there this many times as much as
+# anywhere within so many samples.
+BENT, SMOOTH = 8.0, 16
 
 
 def sent(
@@ -122,20 +122,35 @@ def jumps(recording: Recording, command: int, kp: float, theta: Float | None) ->
     before = np.append(rests[REST:], np.zeros(REST, np.bool_))  # a rest begins just behind
     least = JUMP * np.nanmax(np.abs(u))
     edge = ~quiet & (np.abs(d) > least) & (after | before)
-    edge[2:-1] |= _bends(np.abs(np.diff(u, 4)), OF_ONE * least)
+    edge |= _bends(u, least) & ~ndimage.binary_dilation(edge, iterations=REST)
     found[1:] |= edge
     found[:-1] |= edge
     return found
 
 
-def _bends(bent: Float, least: float) -> NDArray[np.bool_]:
-    """(n,) the first of both fourth differences (n,) that a jump makes largest."""
+def _bends(u: Float, least: float) -> NDArray[np.bool_]:
+    """(n - 1,) of an input u (n,) the steps d = diff(u) at which it does not go on as it came: by
+    more than `least`, d leaves the oscillation d[i + 1] + d[i - 1] = 2 cos(w) d[i], whose w is that
+    of `SMOOTH` samples before, behind, or on both sides: there a sweep's own change of w cancels.
+    """
+    d = np.diff(u)
+    out = np.zeros(d.size, np.bool_)
+    if d.size <= 2 * (SMOOTH + REST):
+        return out
+    both, mid = d[2:] + d[:-2], d[1:-1]
+    bent = np.full(mid.size, np.inf)
+    for before, behind in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0)):
+        sides = np.zeros(2 * (SMOOTH + REST) + 1)
+        sides[:SMOOTH], sides[-SMOOTH:] = behind, before  # a convolution turns them round
+        turn, power = (np.convolve(x, sides, "same") for x in (mid * both, 2 * mid**2))
+        cosine = np.divide(turn, power, out=np.ones_like(power), where=power > 0)
+        bent = np.minimum(bent, np.abs(both - 2 * np.clip(cosine, -1.0, 1.0) * mid))
     around = np.ones(2 * SMOOTH + 1, np.bool_)
     around[SMOOTH - REST : SMOOTH + REST + 1] = False  # what the same jump bends
     beside = ndimage.maximum_filter(bent, footprint=around)
-    pair = np.minimum(bent, np.append(bent[1:], 0.0))
-    highest = pair == ndimage.maximum_filter1d(pair, 2 * REST + 1)
-    return np.asarray(highest & (pair > BENT * beside) & (pair > least / 2))
+    highest = bent == ndimage.maximum_filter1d(bent, 2 * REST + 1)
+    out[1:-1] = highest & (bent > BENT * beside) & (bent > least)
+    return out
 
 
 def _law(recording: Recording, command: int, kp: float, theta: Float | None) -> Float:

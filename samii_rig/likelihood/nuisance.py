@@ -23,6 +23,12 @@ MAINS, STRAY, MULTIPLES = (50.0, 60.0), 0.01, (1, 2, 3)
 # Over the median of its neighbours, power of a line that stands out: noise does so at one in 4,000.
 STANDS, NEIGHBOURS = 12.0, 20
 
+# Of the rate, up to where records are used: aliases of both sides meet above.
+HIGHEST = 0.45
+# Shapes of an edge within a sample, of which a fifth adds less than 0.5 %, and the samples on
+# either side that make them to 0.5 %; lines and instants, more than they tell apart.
+WITHIN, TAPS, LINES = 4, 12, 64
+
 # Power, of that of the shape which the lines show most, of one in lost samples that is looked at:
 # of what the reference leaves beside a straight line, 100 times the noise where much is amiss.
 SHOWN = 1e-5
@@ -54,11 +60,49 @@ def offsets(piece: Piece, k: Int, steps: Sequence[Float]) -> Complex:
 
 
 def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
-    """(n_lines, q, m) of the input's edges, which came some part of a sample earlier or later.
+    """(n_lines, q, m) of the input's edges, which came some part of a sample earlier or later: an
+    impulse each; of two that follow one another, all that an edge between them may be.
 
     impulse : (m, q) answer to an impulse of the input; (m, q inputs) of several.
     """
-    return _after(piece, k, impulse, piece.edges)
+    alone = [e for e in piece.edges if not _beside(e) & set(piece.edges)]
+    between = [e for e in piece.edges if (e[0] + 1, e[1]) in piece.edges]
+    each = [(at + i, of) for at, of in between for i in range(1 - TAPS, 1 + TAPS)]
+    out = _after(piece, k, impulse, [*alone, *each])
+    taps = out[:, :, len(alone) :].reshape(*out.shape[:2], len(between), 2 * TAPS)
+    shapes = (taps @ _within()).reshape(*out.shape[:2], -1)
+    return np.concatenate([out[:, :, : len(alone)], shapes], axis=2)
+
+
+def _beside(edge: tuple[int, int]) -> set[tuple[int, int]]:
+    at, of = edge
+    return {(at - 1, of), (at + 1, of)}
+
+
+@lru_cache(maxsize=1)
+def _within() -> Float:
+    """(2 TAPS, WITHIN) impulses, the samples from 1 - TAPS to TAPS, which make up to `HIGHEST` of
+    the rate what an input has of more than its samples where it jumps or turns between 0 and 1: the
+    largest parts of all such (jumps and turns of any tau, less the interpolation of what is
+    sampled of them)."""
+    f = (np.arange(LINES) + 0.5) * (HIGHEST / LINES)
+    s = 2j * np.pi * f[:, None]
+    tau = (np.arange(LINES) + 0.5) / LINES
+    steps = np.exp(-s) / (1 - np.exp(-s))  # from sample 1 on
+    jumps = steps - np.exp(-s * tau) / s
+    turns = steps / (1 - np.exp(-s)) - tau * steps - np.exp(-s * tau) / s**2
+    impulses = np.exp(-s * np.arange(1 - TAPS, 1 + TAPS))
+    every, impulses = (
+        np.concatenate([x.real, x.imag])
+        for x in (np.hstack([_of_one(jumps), _of_one(turns)]), impulses)
+    )
+    parts = np.linalg.svd(every, full_matrices=False)[0][:, :WITHIN]
+    return np.asarray(np.linalg.lstsq(impulses, parts, rcond=None)[0])
+
+
+def _of_one(x: Complex) -> Complex:
+    """All columns together of size 1."""
+    return np.asarray(x / np.linalg.norm(x))
 
 
 def lost(piece: Piece, k: Int, impulse: Float) -> Complex:
@@ -86,8 +130,9 @@ def _after(piece: Piece, k: Int, impulse: Float, each: Sequence[tuple[int, int]]
     q = piece.z.shape[1]
     out = np.zeros((k.size, q, len(each)), complex)
     for j, (at, of) in enumerate(each):
-        own = impulse[: len(piece.r) - at, of :: piece.inputs]
-        y = np.concatenate([np.zeros((at, q)), own])
+        own = impulse[max(-at, 0) : max(len(piece.r) - at, 0), of :: piece.inputs]
+        y = np.zeros((len(piece.r), q))
+        y[max(at, 0) :][: len(own)] = own
         out[:, :, j] = np.fft.rfft(y[piece.history :], axis=0)[k]
     return out
 

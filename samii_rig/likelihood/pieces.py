@@ -36,10 +36,12 @@ Loops = tuple[tuple[float, int, int], ...]
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """r (history + n,) input or (history + n, m) of m inputs, z (n, q) sensors."""
+    """r (history + n,) input or (history + n, m) of m inputs, z (n, q) sensors, mended where some
+    samples were taken for spikes."""
 
     r: Float
     z: Float
+    struck: tuple[spikes.Spike, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +67,12 @@ class Piece:
         rig of m inputs. The rig is at rest before it, unless `moving`.
     z : (n, q) sensors. history : samples of input before them.
     levels : as the segments state them, with their unit.
-    commands : of all records that the piece is a sum of. struck : spikes of each sensor in them.
-    edges : (sample of r, input) at which that input jumps at an instant within the sample that
-        nobody knows. lost : (first, behind the last) samples of z that were not recorded, nor their
-        input, which stands in r as it most likely was. unknown : those of them whose input does not
-        follow from that before and after.
+    commands : of all records that the piece is a sum of. struck : as of `Samples`, in it.
+    edges : (sample of r, input) at which that input jumps or turns at an instant that nobody
+        knows, within the sample or, of two that follow one another, between them.
+    lost : (first, behind the last) samples of z that were not recorded, nor their input, which
+        stands in r as it most likely was. unknown : those of them whose input does not follow from
+        that before and after.
     """
 
     name: str
@@ -81,7 +84,7 @@ class Piece:
     repeats: tuple[Samples, ...] = ()
     contrasts: tuple[Samples, ...] = ()
     commands: tuple[Command, ...] = ()
-    struck: tuple[int, ...] = ()
+    struck: tuple[spikes.Spike, ...] = ()
     edges: tuple[tuple[int, int], ...] = ()
     lost: tuple[tuple[int, int], ...] = ()
     unknown: tuple[tuple[int, int], ...] = ()
@@ -320,8 +323,7 @@ def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float)
             tuple((int(a) - low, int(b) - low) for a, b in samples.whole.lost[some])
             for some in (gaps, gaps & samples.unknown)
         )
-        struck_ = tuple(struck.tolist())
-        out.append(replace(piece, struck=struck_, edges=at, lost=lost, unknown=unknown))
+        out.append(replace(piece, struck=struck, edges=at, lost=lost, unknown=unknown))
     return out
 
 
@@ -427,7 +429,8 @@ def _turned(group: list[Piece], scale: Float | None, *, levels: bool) -> Piece:
     U = turn_to(c)
     r = (U @ np.stack([p.r.ravel() for p in group])).reshape(len(group), *first.r.shape)
     z = np.tensordot(U, np.stack([p.z for p in group]), axes=1)
-    others = tuple(Samples(r[i], z[i]) for i in range(1, len(group)))
+    struck = [_struck(group, parts) for parts in U]
+    others = tuple(Samples(r[i], z[i], struck[i]) for i in range(1, len(group)))
     return Piece(
         first.name,
         r[0],
@@ -442,6 +445,15 @@ def _turned(group: list[Piece], scale: Float | None, *, levels: bool) -> Piece:
             for part, p in zip(U[0], group, strict=True)
             for told in p.commands
         ),
-        tuple(np.sum([p.struck for p in group], axis=0).tolist()),
+        struck[0],
         tuple(sorted({edge for p in group for edge in p.edges})),
     )
+
+
+def _struck(group: Sequence[Piece], parts: Float) -> tuple[spikes.Spike, ...]:
+    """The spikes of a sum of pieces, of each so many times."""
+    more: dict[tuple[int, int], float] = {}
+    for p, part in zip(group, parts, strict=True):
+        for at, sensor, own in p.struck:
+            more[at, sensor] = more.get((at, sensor), 0.0) + float(part) * own
+    return tuple((at, sensor, own) for (at, sensor), own in more.items())

@@ -196,19 +196,27 @@ class Records:
 
     def without_spikes(self, H: Complex) -> Records:
         """The same, without spikes that show beside what H on `exact` predicts: as `spikes`, whose
-        cubic is blind to them where the motion is fast."""
+        cubic is blind to them where the motion is fast; and with those that it predicts."""
         exact = self.exact()
 
-        def residual(samples: Samples | Piece) -> Float:
+        def without(samples: Samples | Piece) -> Float:
             e = _left_in_time(samples, H, exact)
-            mended, count = spikes.mended(e, self.step)
-            return samples.z + (mended - e) if count.any() else samples.z
+            z = samples.z
+            if none := spikes.as_predicted(e, samples.struck, self.step):
+                at, sensor, more = zip(*none, strict=True)
+                z, e = z.copy(), e.copy()
+                z[at, sensor] += more
+                e[at, sensor] += more
+            mended, found = spikes.mended(e, self.step)
+            return z + (mended - e) if found else z
 
         def each(found: tuple[Samples, ...]) -> tuple[Samples, ...]:
-            return tuple(replace(x, z=residual(x)) for x in found)
+            return tuple(replace(x, z=without(x), struck=()) for x in found)
 
         pieces = tuple(
-            replace(p, z=residual(p), repeats=each(p.repeats), contrasts=each(p.contrasts))
+            replace(
+                p, z=without(p), struck=(), repeats=each(p.repeats), contrasts=each(p.contrasts)
+            )
             for p in self.pieces
         )
         return replace(self, pieces=pieces)

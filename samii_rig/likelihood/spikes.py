@@ -7,6 +7,8 @@ sensors, takes the cubic's value. The loop's input is computed before: the loop 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,17 +20,23 @@ REACH = 2  # samples on either side, through which the cubic runs
 BLOCK = 256  # samples, over which the scale of what is missed is one number
 MOST = 0.01  # of all samples: more are no spikes
 TO_SD = 1.4826  # median of |x| to the standard deviation of a Gaussian x
+# Robust standard deviations from what a model predicts, of a sample that is none of a spike but the
+# rig's own motion: that of one in 400, and so little of a spike does no harm.
+AS_PREDICTED = 3.0
+
+Spike = tuple[int, int, float]
+"""Sample, sensor, and how much more was recorded there than is taken."""
 
 
-def mended(z: Float, step: Float) -> tuple[Float, NDArray[np.int64]]:
-    """z (n, q) without spikes, and how many each sensor had (q,).
+def mended(z: Float, step: Float) -> tuple[Float, tuple[Spike, ...]]:
+    """z (n, q) without spikes, and these.
 
     step : (q,) of the converters, 0 where it is not known.
     """
     n, q = z.shape
-    count = np.zeros(q, np.int64)
+    spikes: list[Spike] = []
     if n < 4 * BLOCK:
-        return z, count
+        return z, ()
     off = np.stack([_missed(z[:, i]) for i in range(q)], axis=1)
     scale = np.stack([_scale(off[:, i], step[i]) for i in range(q)], axis=1)
     loud = np.abs(off) > QUIET * scale
@@ -39,8 +47,24 @@ def mended(z: Float, step: Float) -> tuple[Float, NDArray[np.int64]]:
         if 0 < found.size <= MOST * n:
             out = z.copy() if out is z else out
             out[found, i] -= off[found, i]
-            count[i] = found.size
-    return out, count
+            spikes += [(int(at), i, float(off[at, i])) for at in found]
+    return out, tuple(spikes)
+
+
+def as_predicted(e: Float, spikes: Sequence[Spike], step: Float) -> list[Spike]:
+    """Of these, which are none: a start that rings at many frequencies has samples that stand as
+    far from a cubic, and a model of the rig predicts them. e : (n, q) what it leaves of the mended
+    samples. step : as of `mended`."""
+    scale = {
+        i: _scale(_missed(e[:, i]), step[i]) for i in {i for _, i, _ in spikes}
+    }  # that of the noise, where the model is right
+    found = []
+    for at, i, more in spikes:
+        around = e[at - REACH : at + REACH + 1, i].copy()
+        around[REACH] += more
+        if abs(_missed(around)[REACH]) <= AS_PREDICTED * scale[i][at]:
+            found.append((at, i, more))
+    return found
 
 
 def _alone(z: Float, off: Float, scale: Float, others: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -129,7 +129,7 @@ def test_a_lossy_beam_is_stiffer_the_faster_it_is_bent():
     there = causal.response(f)
     for i, one in enumerate(f):
         stiff = chain.with_values({(beam, "EI"): EI * (one / f0) ** (RISE * eta)})
-        assert np.allclose(there[i], stiff.response([one])[0], rtol=2e-3)
+        assert np.allclose(there[i], stiff.response([one])[0], rtol=1e-4)
     assert np.all(np.abs(there - chain.response(f)).max(axis=(1, 2)) > 1e-5)
 
 
@@ -167,3 +167,21 @@ def test_a_cause_is_shown_at_its_own_place_about_the_rig_with_the_other_one():
     sure = first.sd < 0.1 * np.abs(first.x)
     assert sure.sum() > 20
     assert np.median((1 / first.x[sure]).real) == pytest.approx(-1e6, rel=0.05)
+
+
+def test_of_sensors_that_are_all_early_it_is_the_input_that_is_late():
+    """Each sensor early by a part of a sample fits as well, and is found first where one of them is
+    late beside the others."""
+    names = [x.name for x in samii().sensor]
+    not_held, late = effect("input_not_held", "v_2"), effect("sensor_delay", "a_1")
+    early = tuple(effect("time_offset", name) for name in names)
+    here = measured([concealing((not_held, []), (late, [2e-4]))], samii())
+    at = grid(samii(), here.frequency, here.sensor, here.actuator)
+    search = Search(samii(), here, at, [not_held, late, *early])
+    half = 0.5 / samii().rate_hz
+    start = np.log([half - 2e-4 if name == "a_1" else half for name in names])
+    end = search.refitted(early, search.nominal, start.tolist())
+    search.keep(early, end)
+    assert search.ranked()[0].effects == early
+    search._behind_the_input()
+    assert set(search.ranked()[0].effects) == {not_held, late}

@@ -177,6 +177,19 @@ def test_a_jump_between_two_smooth_stretches_is_an_edge() -> None:
     assert found.tolist() == [1999, 2000]
 
 
+@pytest.mark.parametrize("periods", [0.02, 0.15, 0.36])  # of the oscillation, per sample
+def test_where_a_sweep_turns_back_it_has_an_edge(periods: float) -> None:
+    run = recorded(1, 0.0)
+    n = np.arange(2000)
+    up = 0.1 + np.sin(2 * np.pi * (periods - 1e-5 * (2000 - n)) * n + 0.9)
+    values = run.values.copy()
+    values[:, 0] = np.concatenate([up, up[::-1], np.full(N - 4000, up[0])])
+    run = replace(run, values=values)
+    found = np.flatnonzero(jumps(run, 1, 0.0, None))
+    assert found.size in (2, 4)  # where it comes to rest, if that is a jump
+    assert 1997 <= found[0] < found[1] <= 2002
+
+
 def test_without_a_reference_a_closed_loop_rests_within_a_step_of_its_command() -> None:
     run = recorded(2)
     u = np.zeros(N)

@@ -21,9 +21,9 @@ def motion(seed: int = 1) -> Float:
 
 def test_a_sound_record_is_left_as_it_is() -> None:
     z = motion()
-    out, count = mended(z, NO_STEP)
+    out, found = mended(z, NO_STEP)
     np.testing.assert_array_equal(out, z)
-    assert count.tolist() == [0, 0]
+    assert found == ()
 
 
 def test_spikes_take_the_value_of_the_motion() -> None:
@@ -31,8 +31,8 @@ def test_spikes_take_the_value_of_the_motion() -> None:
     at = np.random.default_rng(2).choice(np.arange(100, N - 100), 30, replace=False)
     struck = z.copy()
     struck[at, 0] += 30 * NOISE * np.where(np.arange(30) % 2, 1, -1)
-    out, count = mended(struck, NO_STEP)
-    assert count.tolist() == [30, 0]
+    out, found = mended(struck, NO_STEP)
+    assert {(at, i) for at, i, _ in found} == {(int(i), 0) for i in at}
     assert np.max(np.abs(out - z)) < 6 * NOISE
     np.testing.assert_array_equal(np.delete(out, at, axis=0), np.delete(z, at, axis=0))
 
@@ -40,9 +40,9 @@ def test_spikes_take_the_value_of_the_motion() -> None:
 def test_what_all_sensors_show_at_once_is_a_blow_and_stays() -> None:
     z = motion()
     z[5000] += 50 * NOISE
-    out, count = mended(z, NO_STEP)
+    out, found = mended(z, NO_STEP)
     np.testing.assert_array_equal(out, z)
-    assert not count.any()
+    assert not found
 
 
 def test_what_rings_on_stays() -> None:

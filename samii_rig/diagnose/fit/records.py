@@ -20,6 +20,7 @@ from samii_rig.diagnose.physics.model import Aliases, Closed, Grid, JointLoops, 
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.noise import Disturbances, Noise
+from samii_rig.likelihood.nuisance import HIGHEST
 from samii_rig.likelihood.pieces import Loops, Piece, Wiring, joined, pieces_of, wiring
 from samii_rig.likelihood.reduce import (
     CYCLES,
@@ -51,7 +52,6 @@ HARMONIC = 3  # the lowest that a force makes which is alike both ways
 MOST_LINES = 12000
 MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
 ALIASES = 16  # sums over aliases that are kept
-HIGHEST = 0.45  # of the rate: aliases of both sides meet above
 # Where not every sample was recorded: of an input's power what may fold back, 1 % of its amplitude;
 # of the rate, from where that is judged, and up to where it is taken for none; lines as one.
 FOLDS, EDGE, UNFOLDED, TOGETHER = 1e-4, 0.47, 0.3, 16
