@@ -2,8 +2,8 @@
 
 A short run on the simulated SAMII with its diagnosis uses the kernels of the model, the estimate,
 the fit and the forces; a short trial of each concealed plant and a moment of a rig with two outputs
-use those of the plants. Then pytest collects the tests, for which it rewrites their assertions.
-All of it is kept beside the sources.
+use those of the plants. Both need those of the model, which come first. Beside them pytest collects
+the tests, for which it rewrites their assertions. All of it is kept beside the sources.
 """
 
 from __future__ import annotations
@@ -32,7 +32,13 @@ order = "by_level"
 seed = 1
 """
 
+MODEL = """
+import numpy as np
+from samii_rig.model.sampled import sampled_response
+from samii_rig.rig.load import load_rig
 
+sampled_response(load_rig("one_mass")[0], np.array([1.0]))
+"""
 # Beside the run: of its kernels they use those of the model alone.
 PLANTS = """
 from pathlib import Path
@@ -52,23 +58,28 @@ trial.make("nothing", 1, Path("second"), load_rig("one_mass")[1], ("clean",))
 
 
 def main() -> int:
-    """Run both in a folder that goes again, then collect; the exit code of a run that failed."""
+    """Compile in a folder that goes again, and collect; the exit code of a run that failed."""
     with tempfile.TemporaryDirectory() as name:
         path = Path(name) / "short.toml"
         path.write_text(SWEEP, encoding="utf-8")
         program = "from samii_rig.cli import main; main()"
         options = ("--rig", "samii", "--out", "short.mcap", "--seed", "1", "--no-report")
-        each = ([program, "run", str(path), *options], [PLANTS])
-        begun = [
-            subprocess.Popen([sys.executable, "-c", *words], cwd=name, stdout=subprocess.DEVNULL)
-            for words in each
-        ]
-        if code := max(process.wait() for process in begun):
+        if code := begun(name, "-c", MODEL).wait():
             return code
-    # What cannot be collected is no error here: the tests tell it, with the reason.
-    collect = (sys.executable, "-m", "pytest", "--collect-only", "-p", "no:terminal")
-    subprocess.run(collect, cwd=Path(__file__).parent.parent, check=False)
-    return 0
+        both = [
+            begun(name, "-c", program, "run", str(path), *options),
+            begun(name, "-c", PLANTS),
+        ]
+        # What cannot be collected is no error here: the tests tell it, with the reason.
+        root = Path(__file__).parent.parent
+        collects = begun(root, "-m", "pytest", "--collect-only", "-p", "no:terminal")
+        collects.wait()
+        return max(process.wait() for process in both)
+
+
+def begun(folder: str | Path, *words: str) -> subprocess.Popen[bytes]:
+    """A program of Python that runs in a folder; what it prints is for nobody."""
+    return subprocess.Popen([sys.executable, *words], cwd=folder, stdout=subprocess.DEVNULL)
 
 
 if __name__ == "__main__":

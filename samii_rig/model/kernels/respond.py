@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -160,6 +161,11 @@ def characteristic(x: System, f: Factors, s: Complex, mantissa: Complex, log: Fl
     E1 E2 of every WAVES."""
     asked = _ASKED._replace(task=CHARACTERISTIC)
     _run(x, f, s, asked, _FOUND._replace(mantissa=mantissa, log=log))
+
+
+def compiled() -> bool:
+    """Whether the disk keeps these kernels compiled; who calls them else waits for a minute."""
+    return any(Path(cast(Any, _run).stats.cache_path).glob("respond.*.nbi"))
 
 
 @part
