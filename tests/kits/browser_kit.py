@@ -17,6 +17,12 @@ from wait_kit import WITHIN, found
 from websockets.sync.client import ClientConnection, connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
+# A display of 20 frames a second, as a slow machine has: without one the page draws 60, which takes
+# half a processor of the machine that the tests share.
+SLOW_DISPLAY = """
+window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 50);
+window.cancelAnimationFrame = clearTimeout;
+"""
 # What a key is to a browser besides its name: number, and the text that it types.
 KEYS = {"Tab": (9, ""), "Enter": (13, "\r"), "Escape": (27, ""), "ArrowDown": (40, "")}
 
@@ -45,6 +51,7 @@ class Browser:
         self.errors: list[str] = []
         for domain in ("Page", "Runtime", "Log"):
             self.call(f"{domain}.enable")
+        self.call("Page.addScriptToEvaluateOnNewDocument", source=SLOW_DISPLAY)
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """Ask the browser; what goes wrong in the page meanwhile is kept in `errors`."""

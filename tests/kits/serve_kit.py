@@ -145,10 +145,12 @@ class Service:
         done = silent or threading.Event()
 
         def live() -> None:
-            while not done.wait(1.0):
-                # A service that is killed is what some tests are about.
-                with suppress(httpx.TransportError):
-                    httpx.post(f"{self.url}/api/lease/beat", headers=headers, timeout=WITHIN)
+            # A client of its own, and one for all: each loads the machine's certificates anew.
+            with httpx.Client(base_url=self.url, timeout=WITHIN, verify=self.trust) as client:
+                while not done.wait(1.0):
+                    # A service that is killed is what some tests are about.
+                    with suppress(httpx.TransportError):
+                        client.post("/api/lease/beat", headers=headers)
 
         beats = threading.Thread(target=live, daemon=True)
         beats.start()

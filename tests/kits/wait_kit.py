@@ -13,11 +13,13 @@ WITHIN = 90.0  # s for what takes a few on a machine with nothing else to do
 
 
 def found(what: Callable[[], T], within: float, every: float = 0.05, said: str = "") -> T:
-    """What `what()` gives, once it is true."""
-    end = time.monotonic() + within
+    """What `what()` gives, once it is true. What takes long is asked for less often: to answer
+    takes time from it."""
+    began = time.monotonic()
     while not (it := what()):
-        assert time.monotonic() < end, f"it did not happen: {said}"
-        time.sleep(every)
+        waited = time.monotonic() - began
+        assert waited < within, f"it did not happen: {said}"
+        time.sleep(min(max(every, 0.02 * waited), 0.25))
     return it
 
 

@@ -486,11 +486,12 @@ def test_a_run_that_may_end_early_ends_at_rest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing is missing on a rig that is its model; its one level is measured again and again.
-    A rig of two masses and a spring: it has a third of SAMII's table, and so of the wait."""
+    A rig of two masses and a spring: it has a third of SAMII's table, and so of the wait. Slowly:
+    what is measured while a diagnosis is made takes time from it."""
     monkeypatch.setenv("SAMII_RIG_STATE", str(tmp_path / "state"))
     text = sweep(duration=4.0, repeats=200).replace("[0.02]", "[2.0]").replace('"v_2"', '"v"')
     rig = ("--rig", "flexible_joint")
-    with Service(tmp_path / "runs", "--pace", "6", *rig) as service, service.lease() as lease:
+    with Service(tmp_path / "runs", "--pace", "2", *rig) as service, service.lease() as lease:
         id_ = service.start(lease, text, diagnosis=True, stop_when_certain=True)
         service.until(lambda: (service.state()["so_far"] or {}).get("diagnosis"))
         last = service.until(lambda: service.state()["last"])
