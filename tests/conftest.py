@@ -26,8 +26,11 @@ LONG = {
     "test_serve_run.py",
     "test_serve_sofar.py",
     "test_serve_foxglove.py",
+    "test_serve_keyboard.py",
     "test_diagnose_records.py",
     "test_diagnose_forces.py",
+    "test_forces_varying.py",
+    "test_papers_story.py",
 }
 # How long an example takes is the machine's affair. The examples are the same in every run, so that
 # a change is judged by what it changed; HYPOTHESIS_PROFILE=explore draws new ones.
