@@ -18,7 +18,7 @@ from samii_rig.signal.estimate import estimate
 from sim.concealed.runs import Design
 
 STORY = Path(__file__).resolve().parents[2] / "benchmarks" / "papers_story.py"
-SHORT = Design(levels=(1.0,), burst=20.0, ring_down=3.0, bursts=2, period=4.0, settle=2,
+SHORT = Design(levels=(1.0,), burst=20.0, ring_down=3.0, bursts=1, period=4.0, settle=2,
                periods=3, steps=1)  # fmt: skip
 CLOSE = 0.06  # relative
 BAND = (0.5, 30.0)  # Hz
