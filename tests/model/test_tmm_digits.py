@@ -29,6 +29,7 @@ from samii_rig.rig.schema import (
     RelativeAngle,
     Rig,
     RigidLink,
+    Sensor,
     TimoshenkoBeam,
     TorsionalGroundSpring,
     TorsionalSpring,
@@ -114,8 +115,8 @@ def values(rig: Rig) -> Values:
     return {(e.name, k): mp.mpf(p.value) for e in rig.element for k, p in parameters(e).items()}
 
 
-def reference(rig: Rig, f: float, v: Values) -> list[mp.mpc]:
-    """Every sensor's response to the one actuator."""
+def states(rig: Rig, f: float, v: Values) -> list[mp.matrix]:
+    """w, theta, M, V and 1 at the base and after each element, for the one actuator."""
     s = 2j * mp.pi * mp.mpf(f)
     products = [mp.eye(5)]
     for e in rig.element:
@@ -128,7 +129,13 @@ def reference(rig: Rig, f: float, v: Values) -> list[mp.mpc]:
     z0[4] = 1
     z0[a] = (S[c, b] * S[d, 4] - S[d, b] * S[c, 4]) / det
     z0[b] = (S[d, a] * S[c, 4] - S[c, a] * S[d, 4]) / det
-    z = [U * z0 for U in products]
+    return [U * z0 for U in products]
+
+
+def reference(rig: Rig, f: float, v: Values) -> list[mp.mpc]:
+    """Every sensor's response to the one actuator."""
+    s = 2j * mp.pi * mp.mpf(f)
+    z = states(rig, f, v)
     names = [e.name for e in rig.element]
     out = []
     for sensor in rig.sensor:
@@ -164,6 +171,20 @@ def derivative(rig: Rig, f: float, v: Values, key: tuple[str, str]) -> list[mp.m
 
 def error(found: complex, true: mp.mpc) -> float:
     return float(abs(mp.mpmathify(complex(found)) - true) / abs(true))
+
+
+def rounding(rig: Rig, f: float, sensor: Sensor, true: mp.mpc) -> float:
+    """Four units in the last place of the largest angle that a relative angle adds up, over it.
+
+    Across a source and what yields behind it that angle is what the source's jump and the
+    compliance leave of each other. How the compiler joins products and sums moves its last digits.
+    """
+    if not isinstance(sensor, RelativeAngle):
+        return 0.0
+    names = [e.name for e in rig.element]
+    first, last = names.index(sensor.across[0]), names.index(sensor.across[-1])
+    largest = max(abs(z[1]) for z in states(rig, f, values(rig))[first : last + 2])
+    return float(4 * np.finfo(float).eps * largest / abs(true))
 
 
 def unlike_the_shipped_ones() -> Rig:
@@ -234,7 +255,8 @@ def test_twelve_digits_at_ten_kilohertz_where_the_plain_product_has_none(name: s
     with mp.workdps(DIGITS):
         for i, x in enumerate((5000, 10000)):
             for j, true in enumerate(reference(rig, x, values(rig))):
-                assert error(H[i, j, 0], true) < 1e-12, (x, rig.sensor[j].name)
+                allowed = max(1e-12, rounding(rig, x, rig.sensor[j], true))
+                assert error(H[i, j, 0], true) < allowed, (x, rig.sensor[j].name)
 
 
 @pytest.mark.parametrize("name", ["samii", "sflr", "other"])
