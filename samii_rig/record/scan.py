@@ -186,6 +186,7 @@ def _unpack_lz4(packed: memoryview, size: int) -> bytes:
     # One byte more than claimed, so that too much shows and the end mark is read.
     raw = cast(bytes, decompressor.decompress(packed, max_length=size + 1))
     if not decompressor.eof or decompressor.unused_data:
+        del raw  # what is known of the error holds this frame, and with it all that was unpacked
         raise ValueError("the LZ4 frame does not end with the chunk")
     return raw
 
