@@ -12,14 +12,17 @@ T = TypeVar("T")
 WITHIN = 90.0  # s for what takes a few on a machine with nothing else to do
 
 
-def found(what: Callable[[], T], within: float, every: float = 0.05, said: str = "") -> T:
-    """What `what()` gives, once it is true. What takes long is asked for less often: to answer
-    takes time from it."""
+def found(what: Callable[[], T], within: float, every: float | None = None, said: str = "") -> T:
+    """What `what()` gives, once it is true.
+
+    every : s, for what must be asked so often: a reader whose buffer fills. What takes long is else
+    asked for less often, as to answer takes time from it.
+    """
     began = time.monotonic()
     while not (it := what()):
         waited = time.monotonic() - began
         assert waited < within, f"it did not happen: {said}"
-        time.sleep(min(max(every, 0.02 * waited), 0.25))
+        time.sleep(min(max(0.05, 0.02 * waited), 0.25) if every is None else every)
     return it
 
 
