@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre
+from scipy import signal
 
 from samii_rig.likelihood.contour import Contour
 from samii_rig.likelihood.pieces import Loops, Piece
@@ -65,18 +66,15 @@ def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
 
     impulse : (m, q) answer to an impulse of the input; (m, q inputs) of several.
     """
-    alone = [e for e in piece.edges if not _beside(e) & set(piece.edges)]
-    between = [e for e in piece.edges if (e[0] + 1, e[1]) in piece.edges]
-    each = [(at + i, of) for at, of in between for i in range(1 - TAPS, 1 + TAPS)]
-    out = _after(piece, k, impulse, [*alone, *each])
-    taps = out[:, :, len(alone) :].reshape(*out.shape[:2], len(between), 2 * TAPS)
-    shapes = (taps @ _within()).reshape(*out.shape[:2], -1)
-    return np.concatenate([out[:, :, : len(alone)], shapes], axis=2)
-
-
-def _beside(edge: tuple[int, int]) -> set[tuple[int, int]]:
-    at, of = edge
-    return {(at - 1, of), (at + 1, of)}
+    every = set(piece.edges)
+    between = [(at, of) for at, of in piece.edges if (at + 1, of) in every]
+    alone = [(a, of) for a, of in piece.edges if not {(a - 1, of), (a + 1, of)} & every]
+    out = [_after(piece, k, impulse, alone)]
+    if between:
+        first = [(at + 1 - TAPS, of) for at, of in between]
+        shapes = (signal.upfirdn(taps, impulse, axis=0) for taps in _within().T)
+        out += [_after(piece, k, one, first) for one in shapes]
+    return np.concatenate(out, axis=2)
 
 
 @lru_cache(maxsize=1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from samii_rig.likelihood.spikes import mended
+from samii_rig.likelihood.spikes import as_predicted, mended
 from samii_rig.types import Float
 
 RATE, N, NOISE = 1000.0, 20_000, 1e-3
@@ -61,3 +61,11 @@ def test_a_converters_own_steps_are_no_spikes() -> None:
 def test_a_short_stretch_is_left_as_it_is(n: int) -> None:
     z = motion()[:n]
     np.testing.assert_array_equal(mended(z, NO_STEP)[0], z)
+
+
+def test_what_a_model_predicts_was_no_spike() -> None:
+    """Two samples taken for spikes: of one the model leaves its noise, of the other the spike."""
+    e = NOISE * np.random.default_rng(4).standard_normal((N, 2))
+    own, spike = (5000, 0, 30 * NOISE), (7000, 1, 30 * NOISE)
+    e[5000, 0] -= 30 * NOISE  # mended, it is off from what the model predicts
+    assert as_predicted(e, (own, spike), NO_STEP) == [own]

@@ -101,9 +101,7 @@ def _lines_of_command(
     for command in piece.commands:
         e, slopes = of_command(between(by_input(command.v)[on], every), p)
         all_ = np.concatenate([e[None], (slopes @ seeds.T).T])
-        r.reshape(*r.shape[:2], -1)[:, :, on] += command.part * (
-            all_ if every == 1 else _recorded(all_, every)
-        )
+        r.reshape(*r.shape[:2], -1)[:, :, on] += command.part * _recorded(all_, every)
     still = np.zeros_like(piece.z)
     return [Samples(own, still) for own in r]
 
@@ -120,6 +118,8 @@ def between(v: Float, every: int) -> Float:
 
 def _recorded(v: Float, every: int) -> Float:
     """(k, n, ...) what of commands (k, n every, ...) a record of every so-manieth sample has."""
+    if every == 1:
+        return v
     passed = signal.upfirdn(_passing(every), v, 1, every, axis=1)
     return np.asarray(passed[:, REACH : REACH + v.shape[1] // every])
 
