@@ -26,9 +26,9 @@ STANDS, NEIGHBOURS = 12.0, 20
 
 # Of the rate, up to where records are used: aliases of both sides meet above.
 HIGHEST = 0.45
-# Shapes of an edge within a sample, of which a fifth adds less than 0.5 %, and the samples on
-# either side that make them to 0.5 %; lines and instants, more than they tell apart.
-WITHIN, TAPS, LINES = 4, 12, 64
+# Shapes of an edge within a sample, which leave 2e-4 of any, and the samples on either side that
+# make them as well; lines, instants and oscillations, more than they tell apart.
+WITHIN, TAPS, LINES = 7, 24, 64
 
 # Power, of that of the shape which the lines show most, of one in lost samples that is looked at:
 # of what the reference leaves beside a straight line, 100 times the noise where much is amiss.
@@ -80,27 +80,21 @@ def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
 @lru_cache(maxsize=1)
 def _within() -> Float:
     """(2 TAPS, WITHIN) impulses, the samples from 1 - TAPS to TAPS, which make up to `HIGHEST` of
-    the rate what an input has of more than its samples where it jumps or turns between 0 and 1: the
-    largest parts of all such (jumps and turns of any tau, less the interpolation of what is
-    sampled of them)."""
+    the rate what an input has of more than its samples where another begins between 0 and 1: the
+    largest parts of oscillations of any frequency up to there that begin at any tau, less the
+    interpolation of what is sampled of them. A jump is one of none, a turn the slope along it."""
     f = (np.arange(LINES) + 0.5) * (HIGHEST / LINES)
-    s = 2j * np.pi * f[:, None]
     tau = (np.arange(LINES) + 0.5) / LINES
-    steps = np.exp(-s) / (1 - np.exp(-s))  # from sample 1 on
-    jumps = steps - np.exp(-s * tau) / s
-    turns = steps / (1 - np.exp(-s)) - tau * steps - np.exp(-s * tau) / s**2
+    s = 2j * np.pi * f[:, None]
+    begins = 2j * np.pi * np.arange(LINES) * (HIGHEST / LINES)  # between the lines: no pole is met
+    z = (s - np.concatenate([begins, -begins]))[:, :, None]
+    begun = np.exp(-z) / (1 - np.exp(-z)) - np.exp(-z * tau) / z
+    one, other = np.split(begun.reshape(LINES, -1), 2, axis=1)
+    real = np.hstack([one + other, (one - other) / 1j])  # cosines and sines
     impulses = np.exp(-s * np.arange(1 - TAPS, 1 + TAPS))
-    every, impulses = (
-        np.concatenate([x.real, x.imag])
-        for x in (np.hstack([_of_one(jumps), _of_one(turns)]), impulses)
-    )
+    every, impulses = (np.concatenate([x.real, x.imag]) for x in (real, impulses))
     parts = np.linalg.svd(every, full_matrices=False)[0][:, :WITHIN]
     return np.asarray(np.linalg.lstsq(impulses, parts, rcond=None)[0])
-
-
-def _of_one(x: Complex) -> Complex:
-    """All columns together of size 1."""
-    return np.asarray(x / np.linalg.norm(x))
 
 
 def lost(piece: Piece, k: Int, impulse: Float) -> Complex:

@@ -279,7 +279,7 @@ class _Samples:
     """All samples of a recording in turn, those that short gaps have lost included.
 
     v, r : (n,) or (n, m) of the inputs, edges : of their jumps. values : (n, q) of the sensors.
-    unknown : (gaps,) whether the input there is a guess.
+    unknown : (gaps,) whether the input there is a guess. slower : as of `_driving`.
     """
 
     whole: Bridged
@@ -288,10 +288,11 @@ class _Samples:
     edges: NDArray[np.bool_]
     values: Float
     unknown: NDArray[np.bool_]
+    slower: bool
 
     @classmethod
     def of(cls, whole: Bridged, wired: Wiring, *, slower: bool) -> _Samples:
-        """slower : as of `_driving`."""
+        """Of a recording, as `whole`."""
         values = whole.recording.columns(wired.sensors)
         each = [
             _driving(whole.recording, x, values, wired.sensors, slower=slower) for x in wired.inputs
@@ -300,7 +301,7 @@ class _Samples:
         for _, r, _ in each:
             unknown |= bridge(r, whole.lost) > KNOWN * np.sqrt(np.mean(r**2))
         v, r, edges = (_beside([one[i] for one in each]) for i in range(3))
-        return cls(whole, v, r, edges, values, unknown)
+        return cls(whole, v, r, edges, values, unknown, slower)
 
 
 def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float) -> list[Piece]:
@@ -317,14 +318,24 @@ def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float)
         z, struck = spikes.mended(samples.values[low:high], step)
         piece = Piece(name, samples.r[first:high], z, history, (level,), moving, commands=(told,))
         own = samples.edges[first:high].reshape(high - first, -1)
-        at = tuple((int(i), int(j)) for i, j in np.argwhere(own))
+        at = [(int(i), int(j)) for i, j in np.argwhere(own)]
+        if samples.slower:
+            at += _cut_off(piece.r)
         gaps = (samples.whole.lost[:, 0] >= low) & (samples.whole.lost[:, 0] < high)
         lost, unknown = (
             tuple((int(a) - low, int(b) - low) for a, b in samples.whole.lost[some])
             for some in (gaps, gaps & samples.unknown)
         )
-        out.append(replace(piece, struck=struck, edges=at, lost=lost, unknown=unknown))
+        out.append(replace(piece, struck=struck, edges=tuple(at), lost=lost, unknown=unknown))
     return out
+
+
+def _cut_off(r: Float) -> list[tuple[int, int]]:
+    """The edges of inputs r (n,) or (n, m) that go on behind their last sample: what they are
+    between the last ones depends on those that nobody knows."""
+    last, largest = np.abs(np.atleast_1d(r[-1])), np.max(np.abs(r), axis=0)
+    on = np.flatnonzero(last > inputs.JUMP * np.atleast_1d(largest))
+    return [(len(r) - 1 + i, int(j)) for j in on for i in (0, 1)]
 
 
 def _stretches(

@@ -417,16 +417,17 @@ def _with_past(
     for which, on, X in change.groups:
         own = [(i, seen[i]) for i in which]
         group = change.rows.piece[on]
-        blocks = [(np.flatnonzero(group == i), s.past.likely, s.N[:, :, s.beside]) for i, s in own]
+        blocks = []
+        for i, s in own:
+            before = s.past.likely / math.sqrt(len(pieces[i].z))  # lines are a sample's
+            blocks.append((np.flatnonzero(group == i), before, s.N[:, :, s.beside]))
         found = _past_of(orthonormal(X), blocks, change.rows.e[on], W[on])
         if found is None:
             continue
         for i, s in own:
             amplitudes, found = np.split(found, [s.past.impulses.shape[1]])
-            piece = pieces[i]
-            amplitudes = math.sqrt(len(piece.z)) * amplitudes  # lines are a sample's
             if s.past.begins(s.left, amplitudes):
-                pieces[i] = s.past.before(piece, amplitudes)
+                pieces[i] = s.past.before(pieces[i], amplitudes)
     if all(a is b for a, b in zip(pieces, records.pieces, strict=True)):
         return None
     return replace(records, pieces=tuple(pieces))

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import special
 
 from samii_rig.likelihood import nuisance
-from samii_rig.likelihood.pieces import Piece
+from samii_rig.likelihood.pieces import Piece, _cut_off
 from samii_rig.types import Complex, Float, Int
 
 N, AT = 1024, 500
@@ -25,20 +26,26 @@ def response(s: Complex) -> Complex:
 
 
 @pytest.mark.parametrize("tau", [0.1, 0.37, 0.8])
-@pytest.mark.parametrize("kind", ["jump", "turn"])
+@pytest.mark.parametrize("kind", ["jump", "turn", "wave"])
 def test_an_edge_between_two_samples_is_known_but_for_its_size_and_instant(kind: str, tau: float):
     s = 2j * np.pi * np.arange(N // 2 + 1) / N
     k = np.arange(5, int(0.44 * N))
-    # Of a band's spectrum, folded: what is sampled of a jump or a turn at AT + tau, less its own.
-    of = 1 if kind == "jump" else 2
+    # Of a band's spectrum, folded: what is sampled of a jump, a turn or an oscillation of 0.4 of
+    # the rate that begins at AT + tau, less its own.
+    w = 0.8j * np.pi
+    spectrum = {
+        "jump": lambda z: 1 / z,
+        "turn": lambda z: 1 / z**2,
+        "wave": lambda z: z / (z**2 - w**2),
+    }[kind]
     others = 2j * np.pi * np.array([i for i in range(-3000, 3001) if i])
-    beyond = sum(np.exp(-(s[k] + o) * (AT + tau)) / (s[k] + o) ** of for o in others)
+    beyond = sum(np.exp(-(s[k] + o) * (AT + tau)) * spectrum(s[k] + o) for o in others)
     impulse = np.fft.irfft(response(s))[:, None]
     piece = Piece("steps", np.zeros(N), np.zeros((N, 1)), 0, (), edges=((AT, 0), (AT + 1, 0)))
     shapes = nuisance.edges(piece, k, impulse)
-    assert shapes.shape == (k.size, 1, 4)
+    assert shapes.shape == (k.size, 1, 7)
     left = fraction_of(response(s[k]) * beyond, shapes)
-    assert left < 0.01
+    assert left < 0.001
     assert left < fraction_of(response(s[k]) * beyond, impulses(piece, k, impulse)) / 2
 
 
@@ -49,3 +56,24 @@ def impulses(piece: Piece, k: Int, impulse: Float) -> Complex:
         for at, _ in piece.edges
     ]
     return np.concatenate(alone, axis=2)
+
+
+def test_between_its_last_samples_an_input_depends_on_those_behind_them():
+    """What a record's end cuts off still shows before it, at a rate that is not the rig's own."""
+    many, k = 8 * N, np.arange(5, int(0.44 * N))
+    s = 2j * np.pi * np.arange(many // 2 + 1) / many
+    rng = np.random.default_rng(4)
+    narrow = np.where(np.abs(s) < 2 * np.pi * 0.42, 1.0, 0.0)
+    going_on = np.fft.irfft(narrow * np.fft.rfft(rng.standard_normal(many)))
+    going_on[many // 2 :] = 0.0  # so that it has died out where it begins
+    cut = np.where(np.arange(many) < N, going_on, 0.0)
+    # What the filter that stands for the input's own makes of both.
+    wide = special.erfc((np.abs(s) / np.pi - 1) / 0.03) / 2
+    H = wide * response(s)
+    e = np.fft.irfft(H * np.fft.rfft(going_on - cut))[:N]
+    piece = Piece("cut", cut[:N], np.zeros((N, 1)), 0, (), edges=tuple(_cut_off(cut[:N])))
+    assert piece.edges == ((N - 1, 0), (N, 0))
+    shapes = nuisance.edges(piece, k, np.fft.irfft(H)[:, None])
+    lines = np.fft.rfft(e)[k]
+    assert fraction_of(lines, shapes) < 0.02
+    assert _cut_off(np.zeros(N)) == []

@@ -342,7 +342,7 @@ def excited(
 def _unfolded(piece: Piece, rate_hz: float) -> float:
     """Hz up to which an input has more than what folds back from above half the rate may be: as
     much as it has just below. An edge that was found counts by itself."""
-    if piece.edges:
+    if any(at < len(piece.r) - 1 for at, _ in piece.edges):
         return rate_hz / 2
     tops = []
     for r in by_input(piece.r):
