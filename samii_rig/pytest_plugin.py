@@ -276,7 +276,7 @@ def _diagnosed(
 
     def responses(runs: Sequence[Recording]) -> Sequence[FrequencyResponse]:
         # As `samii-rig diagnose` does: a segment with a gap is left out, and that is said.
-        return estimate(runs, gaps="exclude", band=band)
+        return estimate(runs, gaps="auto", band=band)
 
     if len(set(poses)) > 1:
         each = sorted_by_pose(recordings, poses, responses)

@@ -102,7 +102,7 @@ class DiagnoseOptions:
         ),
     ] = None
     output: OutputOption = None
-    gaps: GapsOption = "exclude"
+    gaps: GapsOption = "auto"
     band: BandOption = None
     each: Annotated[
         bool,

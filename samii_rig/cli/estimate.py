@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 # The words of `samii_rig.signal`, which takes a second to import; a test holds them to it.
 METHODS = ("auto", "burst", "periodic", "local", "h1", "h2", "hv")
-GAPS = ("refuse", "exclude", "model")
+GAPS = ("auto", "refuse", "exclude", "model")
 ALL = (0.0, float("inf"))  # Hz: every line that was estimated
 
 RigOverride = Annotated[
@@ -63,7 +63,11 @@ MethodOption = Annotated[
     str, typer.Option(help="auto, burst, periodic, local, h1, h2 or hv (Welch).")
 ]
 GapsOption = Annotated[
-    str, typer.Option(help="A segment that misses samples: refuse, exclude or model it.")
+    str,
+    typer.Option(
+        help="A segment that misses samples: refuse, exclude or model it; auto excludes it while "
+        "others are left, else models it."
+    ),
 ]
 BandOption = Annotated[
     tuple[float, float] | None, typer.Option(help="Lowest and highest frequency, Hz.")

@@ -32,7 +32,7 @@ class How:
 
     rig_toml: str = ""
     outputs: tuple[str, ...] | None = None
-    gaps: Gaps = "exclude"
+    gaps: Gaps = "auto"
     band: tuple[float, float] | None = None
 
 

@@ -39,14 +39,11 @@ def diagnose_folder(folder: Path) -> dict[str, Any]:
     evidence that its probability rests on."""
     from samii_rig.diagnose.batch import How, together
     from samii_rig.errors import InputError
-    from samii_rig.record.reader import read_recording
 
     logs = sorted(folder.glob("*.mcap"))
     if not logs:
         raise InputError(str(folder), "", "no recording", "a folder with .mcap files")
-    # What follows a gap can be a new transient where there is one input.
-    one = len(read_recording(logs[0]).names("command")) == 1
-    found = together(logs, How(gaps="model" if one else "exclude"))
+    found = together(logs, How())
     return {**found.plain(), "evidence": {**found.evidence, "sigma": found.sigma}}
 
 

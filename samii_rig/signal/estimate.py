@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -43,6 +44,10 @@ RATIONAL_GAIN = 0.1
 # Least 1 - rho^2 between reference and transient (see `local.Windows.distinct`); in simulation
 # the error is as stated above it, and up to 8 sigma off below.
 DISTINCT = 0.5
+# Lines that can be told from a transient below which a response is estimated by Welch's windows:
+# with fewer nothing is diagnosed. Windows for each output, so that with those that overlap the
+# covariance of all outputs' noise is known; and samples of one, below which it has hardly a line.
+LEAST_CLEAR, WINDOWS, LEAST_SAMPLES = 12, 4, 64
 
 
 def estimate(
@@ -70,7 +75,8 @@ def estimate(
     method : `auto`; `burst` and `periodic` line by line over repeats; `local` local
         polynomial or rational models; `h1`, `h2`, `hv` Welch, for comparison.
     gaps : what to do with a segment that misses samples: `refuse`, `exclude` it, or `model`
-        what follows a gap as a new transient (local models). Nothing is made up.
+        what follows a gap as a new transient (local models); `auto` excludes, and models where
+        that would leave nothing. Nothing is made up.
     band : Hz; without it, where the reference has energy.
     nperseg : samples per window (Welch).
 
@@ -146,7 +152,8 @@ def _one(
     recordings: Sequence[Recording], input: str | None, reference: str | None, how: How
 ) -> list[FrequencyResponse]:
     """Responses to one input; what could not be estimated is a finding of the first."""
-    method, band, gaps = how.method, how.band, how.gaps
+    method, band = how.method, how.band
+    gaps: Gaps = "exclude" if how.gaps == "auto" else how.gaps
     out: list[FrequencyResponse] = []
     failed: list[EstimateError] = []
     if method in ("auto", "periodic"):
@@ -156,9 +163,15 @@ def _one(
         )
     groups: list[Group] = []
     if recordings or not (out or failed):
-        groups = gather(
-            recordings, input=input, outputs=how.outputs, reference=reference, gaps=gaps
+        gathered = partial(
+            gather, recordings, input=input, outputs=how.outputs, reference=reference
         )
+        try:
+            groups = gathered(gaps=gaps)
+        except EstimateError:
+            if how.gaps != "auto":
+                raise
+            groups = gathered(gaps="model")
     usable: list[Group] = []
     for group in groups:
         try:
@@ -175,7 +188,7 @@ def _one(
                 continue
             choice, why = choose(group, method)
             if choice == "local":
-                out.append(_local(group, why, band))
+                out.append(_local_or_windows(group, why, band, chosen=method == "local"))
             else:
                 out.append(_repeats(group, choice, why, band))
         except EstimateError as error:
@@ -337,7 +350,33 @@ def _no_lead_in(name: str) -> Finding:
     return Finding("dof", "note", message)
 
 
-def _local(group: Group, why: str, band: tuple[float, float] | None) -> FrequencyResponse:
+class _UnclearError(EstimateError):
+    """Hardly a line can be told from a transient. band : Hz of the lines that are excited."""
+
+    def __init__(self, message: str, band: tuple[float, float]) -> None:
+        super().__init__(message)
+        self.band = band
+
+
+def _local_or_windows(
+    group: Group, why: str, band: tuple[float, float] | None, *, chosen: bool
+) -> FrequencyResponse:
+    """By local models; where hardly a line can be told from a transient, as of an input of few
+    steps, by Welch's windows, unless local models were chosen. Whole records begin at those."""
+    try:
+        return _local(group, why, band, least=1 if chosen else LEAST_CLEAR)
+    except _UnclearError as error:
+        shortest, p = min(len(piece.z) for piece in group.pieces), len(group.selection.outputs)
+        samples = shortest // (WINDOWS * p)
+        if chosen or samples < LEAST_SAMPLES:
+            raise
+        return _welch(group, "h1", samples, error.band, str(error))
+
+
+def _local(
+    group: Group, why: str, band: tuple[float, float] | None, *, least: int
+) -> FrequencyResponse:
+    """least : lines that can be told from a transient."""
     spectra = [spectrum(p, group.rate_hz) for p in group.pieces]
     longest = max(spectra, key=lambda s: s.n)
     lines = excited(spectra, band)
@@ -353,6 +392,13 @@ def _local(group: Group, why: str, band: tuple[float, float] | None) -> Frequenc
     width, transients = local.plan(breaks, p, longest.n / rate, at_rest=still)
     data = local.windows(spectra, f0, width, transients)
     clear = data.distinct() > DISTINCT
+    if np.count_nonzero(clear) < least:
+        message = "the sweep cannot be told from a transient anywhere; a lead-in at rest would help"
+        if clear.any():
+            message = (
+                f"{np.count_nonzero(clear)} lines of {clear.size} can be told from a transient"
+            )
+        raise _UnclearError(message, (float(f0[0]), float(f0[-1])))
     if not clear.all():
         group.findings.append(_unclear(f0, clear))
         lines, f0 = lines[clear], f0[clear]
@@ -387,10 +433,6 @@ def _local(group: Group, why: str, band: tuple[float, float] | None) -> Frequenc
 
 
 def _unclear(f0: Float, clear: NDArray[np.bool_]) -> Finding:
-    if not clear.any():
-        raise EstimateError(
-            "the sweep cannot be told from a transient anywhere; a lead-in at rest would help"
-        )
     left = f0[~clear]
     message = (
         f"{left.size} lines between {left[0]:.3g} and {left[-1]:.3g} Hz left out: the sweep "
@@ -417,7 +459,11 @@ def _best_degree(press: Sequence[Float]) -> Int:
 
 
 def _welch(
-    group: Group, method: str, nperseg: int, band: tuple[float, float] | None
+    group: Group,
+    method: str,
+    nperseg: int,
+    band: tuple[float, float] | None,
+    why: str = "asked for",
 ) -> FrequencyResponse:
     result = welch.frequency_response(
         [p.z for p in group.pieces], group.rate_hz, nperseg=nperseg, method=method
@@ -441,7 +487,7 @@ def _welch(
         input_rms=np.full(int(keep.sum()), np.nan),
     )
     done = f"{method} (Welch, {nperseg} samples, Hann)"
-    return _response(group, found, result.n_frames, done, "asked for")
+    return _response(group, found, result.n_frames, done, why)
 
 
 def _coherence(H: Complex, gain: Complex, power: Float, noise: Complex) -> Float:

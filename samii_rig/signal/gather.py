@@ -23,7 +23,7 @@ from samii_rig.signal.groups import (
 from samii_rig.signal.quantisation import coarse
 from samii_rig.types import Finding, Quality, Recording, Segment
 
-Gaps = Literal["refuse", "exclude", "model"]
+Gaps = Literal["auto", "refuse", "exclude", "model"]
 LEAST_SAMPLES = 256  # fewer are mostly transient
 
 

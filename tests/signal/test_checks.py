@@ -99,6 +99,14 @@ def test_excluding_every_segment_is_an_error():
         estimate([without(sweeps(1), slice(700, 702))], gaps="exclude")
 
 
+def test_where_every_segment_has_a_gap_auto_models_it():
+    gappy = without(sweeps(1), slice(700, 702))
+    alike, modelled = (estimate([gappy], gaps=gaps)[0] for gaps in ("auto", "model"))
+    np.testing.assert_array_equal(alike.H, modelled.H)
+    beside = without(sweeps(), slice(2000, 2002))
+    assert estimate([beside], gaps="auto")[0].n_averages == 2
+
+
 def test_a_gap_modelled_as_a_transient_gives_the_response_of_the_whole():
     whole = estimate([sweeps(3)], band=(2, 12))[0]
     gappy = without(without(sweeps(3), slice(700, 703)), slice(4000, 4001))

@@ -34,6 +34,7 @@ DRIFTING = 4.5
 # Of a bin's precision, what is below is rounding: its lines know a sum of entries alone.
 SUMS = 1e-12
 DIFFER = 1.5  # chi-square per degree of freedom of levels against each other
+WELCH = ("h1", "h2", "hv")  # methods by windows, whose leakage is not in their covariance
 TRANSIENTS = "local"  # method of responses from single transients: see `usable`
 
 
@@ -173,6 +174,8 @@ def summed(values: Complex, which: Int, n: int) -> Complex:
 
 def repeated(response: FrequencyResponse) -> bool:
     """Whether repeats tell a response's noise."""
+    if response.estimator in WELCH:
+        return False
     return response.n_averages > 1 or response.estimator != TRANSIENTS
 
 

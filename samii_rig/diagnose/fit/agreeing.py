@@ -227,7 +227,7 @@ def _own(run: Recording, findings: Sequence[Finding]) -> Sequence[Finding]:
     those of another state are foreign to it."""
     if not any(f.kind == REPEAT for f in findings):
         return findings
-    alone = estimate([run], gaps="exclude")
+    alone = estimate([run], gaps="auto")
     if not alone or any(r.n_averages < 2 for r in alone):
         return findings
     foreign = [f for r in alone for f in r.findings if f.kind == REPEAT and f.severity == "error"]

@@ -1,0 +1,83 @@
+"""Records of which hardly a line can be told from a transient: an input of few steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from few_kit import only
+from scipy import signal
+
+from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.errors import EstimateError
+from samii_rig.rig.load import load_rig
+from samii_rig.signal.estimate import estimate
+from samii_rig.types import Channel, Recording, Segment
+
+RIG = load_rig("one_mass")[0]
+RATE, N, STEP = 500.0, 6000, 0.5e-6
+STEPS = (250, 334)  # samples at which the command jumps between two values
+M, K, C, GAIN, CORNER = 1.2, 6000.0, 6.0, 4.0, 2 * np.pi * 120.0
+
+
+def recorded(seed: int, corner: float, level: float) -> Recording:
+    """Steps of the command, and x of a sensor that shows nothing slow, below `corner` in Hz."""
+    v = np.zeros(N)
+    for first in STEPS:
+        v[first:] = level - v[first:]
+    # The mass, and the coil's force behind its lag.
+    A = np.array([[0.0, 1.0, 0.0], [-K / M, -C / M, 1 / M], [0.0, 0.0, -CORNER]])
+    B = np.array([[0.0], [0.0], [GAIN * CORNER]])
+    held = signal.cont2discrete((A, B, np.eye(3)[:1], np.zeros((1, 1))), 1 / RATE)
+    x = signal.dlsim(held, v)[1][:, 0]
+    fast = signal.cont2discrete(([1.0, 0.0], [1.0, 2 * np.pi * corner]), 1 / RATE, "bilinear")
+    x = signal.lfilter(fast[0].ravel(), fast[1], x)
+    x = x + np.random.default_rng(seed).normal(0.0, 1e-6, N)
+    x = STEP * np.rint(x / STEP)
+    channels = (
+        Channel("v", "V", "command", resolution=0.3e-3),
+        Channel("x", "m", "sensor", resolution=STEP),
+    )
+    return Recording(
+        channels=channels,
+        rate_hz=RATE,
+        time=np.round(np.arange(N) * (1e9 / RATE)).astype(np.int64),
+        sequence=np.arange(N),
+        values=np.column_stack([v, x]),
+        quality=np.zeros((N, 2), np.uint8),
+        segments=(Segment("steps", "single", 0, N, level, "V", 0),),
+        source=f"steps_{seed}.mcap",
+    )
+
+
+@pytest.mark.parametrize("corner", [0.0, 0.02])
+def test_whole_records_tell_what_lines_alone_do_not(
+    corner: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only(
+        monkeypatch, ("sensor_highpass", "x"), ("viscous_damping", "spring"), ("added_mass", "mass")
+    )
+    runs = [recorded(1, corner, 0.3), recorded(2, corner, 0.5)]
+    responses = estimate(runs)
+    assert {r.estimator for r in responses} == {"h1"}
+    assert "told from a transient" in responses[0].why
+    found = diagnose(responses, RIG, runs=runs)
+    assert found.used.lines > 500
+    if corner:
+        assert [(c.physics, c.site) for c in found.causes] == [("sensor_highpass", "x")]
+        found_corner = found.causes[0].parameters["corner"]
+        assert found_corner.low < corner < found_corner.high
+    else:
+        assert found.verdict == "no_mismatch"
+    assert not any("Welch" in words for words in found.not_physics)
+
+
+def test_windows_that_leak_name_nothing_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    only(monkeypatch, ("sensor_highpass", "x"), ("viscous_damping", "spring"))
+    found = diagnose(estimate([recorded(1, 0.3, 0.3), recorded(2, 0.3, 0.5)]), RIG)
+    assert found.verdict != "named"
+    assert any("leakage" in words for words in found.not_physics)
+
+
+def test_local_models_that_were_chosen_stay() -> None:
+    with pytest.raises(EstimateError, match="cannot be told from a transient anywhere"):
+        estimate([recorded(1, 0.0, 0.3)], method="local")
