@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from samii_rig.types import Complex, Float
@@ -26,6 +27,9 @@ TERMS = 26  # of the power series: 1.5^26/26! < 1e-22
 # digits at |lambda_1| L = 5, and 5^48/48! < 1e-27.
 TENSE_LONG, TENSE_TERMS = 5.0, 48
 EI, MU, LENGTH, ETA, TAU, GA, J, TENSION, SLOPE = range(9)  # places among the parameters
+# Of a sum, terms that add nothing to it, and how many of them one after another end it: those of
+# one state come every fourth time.
+TINY, SMALL = 1e-17, 4
 RIGID_IN_SHEAR = 1e150  # N, GA of a beam without shear: its reciprocal adds to no other number
 ROWS = 34  # P (16), Q (16), E1, E2
 SORT = np.zeros((4, 4))  # (w, theta, M, V) to (theta, w, M, V): theta leads, as in the sweep
@@ -68,38 +72,57 @@ def waves(s: Complex, p: Float) -> Waves:
     g = _g(s, p)
     B, G = p[EI] * g, p[GA] * g
     m, j = p[MU] * s**2, p[J] * s**2 + p[TENSION]
-    b, c = m / G + j / B, m * (1 + j / G) / B
-    root = np.sqrt((m / G - j / B) ** 2 - 4 * m / B)
-    root = np.where((root.conj() * b).real < 0, -root, root)
-    big = (b + root) / 2
-    other = c / np.where(big == 0, 1.0, big)
-    other = np.where(np.abs(other) < 1e-14 * np.abs(big), 1e-14 * big, other)
-    one, two = np.sqrt(big), np.sqrt(other)
-    swap = two.real > one.real
-    one, two = np.where(swap, two, one), np.where(swap, one, two)
+    numbers, vectors, dual = _waves(m, j, B, G)
     reach = TENSE_LONG if _tense(p) else LONG
-    long = np.maximum(np.abs(one), np.abs(two)) * p[LENGTH] > reach
-    vectors = np.zeros((s.size, 4, 4), complex)
-    for k, x in ((0, one), (2, two)):
-        x = np.where(x == 0, 1.0, x)
-        # shear = lambda^2 - m/GA and rotary = EI lambda^2 - j multiply to -m; the one that
-        # cancels is taken from the other.
-        shear, rotary = x**2 - m / G, B * x**2 - j
-        bad = np.abs(shear) * np.abs(B * x**2) < np.abs(rotary) * np.abs(x**2)
-        safe = np.where(rotary == 0, 1.0, rotary)
-        shear = np.where(bad, -m / safe, shear)
-        for i, sign in ((k, 1.0), (k + 1, -1.0)):
-            vectors[:, i, 0] = 1.0
-            vectors[:, i, 1] = sign * shear / x
-            vectors[:, i, 2] = B * shear
-            vectors[:, i, 3] = -sign * m / x
-    dual = np.zeros_like(vectors)
-    for i, mirrored in ((0, 1), (1, 0), (2, 3), (3, 2)):
-        v, u = vectors[:, i], vectors[:, mirrored]
-        row = np.stack([-u[:, 3], u[:, 2], -u[:, 1], u[:, 0]], axis=1)  # u^T J
-        scale = np.sum(row * v, axis=1)
-        dual[:, i] = row / np.where(scale == 0, 1.0, scale)[:, None]
-    return Waves(g, one, two, np.asarray(long), vectors, dual)
+    long = np.max(np.abs(numbers), axis=0) * p[LENGTH] > reach
+    return Waves(g, numbers[0], numbers[1], np.asarray(long), vectors, dual)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _waves(m: Complex, j: Complex, B: Complex, G: Complex) -> tuple[Complex, Complex, Complex]:
+    """Wave numbers (2, n), vectors and dual (n, 4, 4) as in `Waves`."""
+    numbers = np.empty((2, m.size), np.complex128)
+    vectors = np.empty((m.size, 4, 4), np.complex128)
+    dual = np.empty((m.size, 4, 4), np.complex128)
+    for n in range(m.size):
+        shears, rotates = m[n] / G[n], j[n] / B[n]
+        b, c = shears + rotates, m[n] * (1 + j[n] / G[n]) / B[n]
+        root = np.sqrt((shears - rotates) ** 2 - 4 * m[n] / B[n])
+        if (root.conjugate() * b).real < 0:
+            root = -root
+        big = (b + root) / 2
+        other = c / big if big != 0 else c
+        if abs(other) < 1e-14 * abs(big):
+            other = 1e-14 * big
+        one, two = np.sqrt(big), np.sqrt(other)
+        if two.real > one.real:
+            one, two = two, one
+        numbers[0, n], numbers[1, n] = one, two
+        for k in range(2):
+            x = numbers[k, n] if numbers[k, n] != 0 else 1.0 + 0.0j
+            # shear = lambda^2 - m/GA and rotary = EI lambda^2 - j multiply to -m; the one that
+            # cancels is taken from the other.
+            bends = B[n] * x**2
+            shear, rotary = x**2 - shears, bends - j[n]
+            if abs(shear) * abs(bends) < abs(rotary) * abs(x**2):
+                shear = -m[n] / rotary if rotary != 0 else -m[n]
+            for i in range(2):
+                sign = 1.0 - 2.0 * i
+                own = vectors[n, 2 * k + i]
+                own[0] = 1.0
+                own[1] = sign * shear / x
+                own[2] = B[n] * shear
+                own[3] = -sign * m[n] / x
+        for i in range(4):
+            v, u = vectors[n, i], vectors[n, i + 1 - 2 * (i % 2)]  # u : of the mirrored wave
+            scale = -u[3] * v[0] + u[2] * v[1] - u[1] * v[2] + u[0] * v[3]  # u^T J v
+            if scale == 0:
+                scale = 1.0 + 0.0j
+            dual[n, i, 0] = -u[3] / scale
+            dual[n, i, 1] = u[2] / scale
+            dual[n, i, 2] = -u[1] / scale
+            dual[n, i, 3] = u[0] / scale
+    return numbers, vectors, dual
 
 
 def _series(s: Complex, p: Float, z: Complex) -> Complex:
@@ -121,6 +144,55 @@ def _series(s: Complex, p: Float, z: Complex) -> Complex:
     return out
 
 
+def _across(s: Complex, p: Float) -> Complex:
+    """(n, 4, 4) from the state before the beam to that behind it, by the power series."""
+    g = _g(s, p)
+    L, B, G = p[LENGTH], p[EI] * g, p[GA] * g
+    m, j = p[MU] * s**2, p[J] * s**2 + p[TENSION] - p[SLOPE] * L / 2
+    terms = TENSE_TERMS if _tense(p) else TERMS
+    return np.asarray(_summed(m, j, 1 / B, 1 / G, float(L), float(p[SLOPE]), terms))
+
+
+@numba.njit(inline="always")
+def _adds(term: complex, total: complex) -> bool:
+    return abs(term.real) + abs(term.imag) > TINY * (abs(total.real) + abs(total.imag))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _summed(
+    m: Complex, j: Complex, by_B: Complex, by_G: Complex, L: float, slope: float, terms: int
+) -> Complex:
+    """The sum of `_series` for the four unit states, up to where no further term adds to it."""
+    U = np.zeros((m.size, 4, 4), np.complex128)
+    for n in range(m.size):
+        for state in range(4):
+            w = 1.0 + 0.0j if state == 0 else 0.0j
+            t = 1.0 + 0.0j if state == 1 else 0.0j
+            M = 1.0 + 0.0j if state == 2 else 0.0j
+            V = 1.0 + 0.0j if state == 3 else 0.0j
+            before = 0.0j  # theta's coefficient one term back
+            W, T, B, S = w, t, M, V
+            small = 0
+            for k in range(1, terms):
+                step = L / k
+                bent = step * (V + j[n] * t) + slope * L * step * before
+                before = t
+                w, t, M, V = step * (t - V * by_G[n]), step * M * by_B[n], bent, -step * m[n] * w
+                W += w
+                T += t
+                B += M
+                S += V
+                adds = _adds(w, W) or _adds(t, T) or _adds(M, B) or _adds(V, S)
+                small = 0 if adds else small + 1
+                if small == SMALL:
+                    break
+            U[n, 0, state] = W
+            U[n, 1, state] = T
+            U[n, 2, state] = B
+            U[n, 3, state] = S
+    return U
+
+
 def matrix(s: Complex, p: Float) -> Complex:
     """(2, ROWS, n) for the kernel, forwards and mirrored: a uniform beam is its own mirror, one
     whose tension falls is that of one whose tension rises."""
@@ -139,9 +211,7 @@ def _matrix(s: Complex, p: Float) -> Complex:
     Q = np.swapaxes(w.vectors, 1, 2).copy()
     short = ~w.long
     if short.any():
-        eye = np.broadcast_to(np.eye(4, dtype=complex), (int(short.sum()), 4, 4))
-        U = _series(s[short], p, eye).sum(axis=0)
-        Q[short] = U @ SORT
+        Q[short] = _across(s[short], p) @ SORT
     out[:16] = P.reshape(-1, 16).T
     out[16:32] = Q.reshape(-1, 16).T
     out[32] = np.where(short, 1.0, np.exp(-w.one * p[LENGTH]))
