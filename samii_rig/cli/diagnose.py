@@ -255,9 +255,13 @@ def _found(
     """The diagnosis, and the responses that a page shows."""
     from samii_rig.diagnose.changed import State, changed
     from samii_rig.diagnose.diagnose import diagnose as found_by
-    from samii_rig.diagnose.posed import in_poses, sorted_by_pose
+    from samii_rig.diagnose.posed import in_poses, of_any_kind, sorted_by_pose
 
-    of = Estimating(output=o.output, gaps=o.gaps, band=o.band).of
+    estimating = Estimating(output=o.output, gaps=o.gaps, band=o.band)
+
+    def of(runs: Sequence[Recording]) -> Sequence[FrequencyResponse]:
+        return estimating.of(of_any_kind(runs))
+
     say("frequency responses")
     if asked.saved:
         files = [(file.source, chosen(file, o.output)) for file in asked.saved]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from samii_rig.diagnose.posed import in_poses, sorted_by_pose
+from samii_rig.diagnose.posed import in_poses, of_any_kind, sorted_by_pose
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.errors import InputError, SamiiRigError
 from samii_rig.identify.poses import poses_of
@@ -48,7 +48,7 @@ def together(logs: Sequence[Path], how: How) -> Diagnosis:
     rig = parse(Rig, text, "the rig file")
 
     def estimated(runs: Sequence[Recording]) -> Sequence[FrequencyResponse]:
-        return estimate(runs, outputs=how.outputs, gaps=how.gaps, band=how.band)
+        return estimate(of_any_kind(runs), outputs=how.outputs, gaps=how.gaps, band=how.band)
 
     each = sorted_by_pose(recordings, poses_of(recordings, rig, ()), estimated)
     return in_poses(each, rig, band=how.band)

@@ -28,7 +28,7 @@ from samii_rig.rig.load import parse
 from samii_rig.rig.pose import in_words, pose_of
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
-from samii_rig.types import FrequencyResponse, Recording
+from samii_rig.types import FrequencyResponse, Recording, Segment
 
 Band = tuple[float, float]
 FORCES = (
@@ -59,6 +59,19 @@ def sorted_by_pose(
     """The recordings of each pose, in order of appearance. poses : of each recording; estimated :
     responses of those of one pose."""
     return [InPose(pose, estimated(own), own) for pose, own in by_pose(recordings, poses)]
+
+
+def of_any_kind(runs: Sequence[Recording]) -> list[Recording]:
+    """The same, to be estimated: whole records take steps and decays, which are for the eye else,
+    and begin at responses."""
+    return [
+        replace(run, segments=tuple(_of_any_kind(segment) for segment in run.segments))
+        for run in runs
+    ]
+
+
+def _of_any_kind(segment: Segment) -> Segment:
+    return replace(segment, kind="single") if segment.kind == "transient" else segment
 
 
 def one_pose(poses: Sequence[Angle], option: str, expected: str) -> Angle:

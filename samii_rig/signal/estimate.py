@@ -48,6 +48,8 @@ DISTINCT = 0.5
 # with fewer nothing is diagnosed. Windows for each output, so that with those that overlap the
 # covariance of all outputs' noise is known; and samples of one, below which it has hardly a line.
 LEAST_CLEAR, WINDOWS, LEAST_SAMPLES = 12, 4, 64
+# Of an input's largest line, power up to which windows are of use: a step has that at 300 lines.
+REACH = 1e-5
 
 
 def estimate(
@@ -351,7 +353,7 @@ def _no_lead_in(name: str) -> Finding:
 
 
 class _UnclearError(EstimateError):
-    """Hardly a line can be told from a transient. band : Hz of the lines that are excited."""
+    """Hardly a line can be told from a transient. band : Hz that the input reaches."""
 
     def __init__(self, message: str, band: tuple[float, float]) -> None:
         super().__init__(message)
@@ -393,12 +395,12 @@ def _local(
     data = local.windows(spectra, f0, width, transients)
     clear = data.distinct() > DISTINCT
     if np.count_nonzero(clear) < least:
-        message = "the sweep cannot be told from a transient anywhere; a lead-in at rest would help"
-        if clear.any():
-            message = (
-                f"{np.count_nonzero(clear)} lines of {clear.size} can be told from a transient"
-            )
-        raise _UnclearError(message, (float(f0[0]), float(f0[-1])))
+        few = f"{np.count_nonzero(clear)} lines of {clear.size} can be told from a transient"
+        none = "the sweep cannot be told from a transient anywhere; a lead-in at rest would help"
+        power = np.abs(longest.R) ** 2
+        reached = longest.frequency[power > REACH * np.max(power)]
+        top = max(float(f0[-1]), float(reached[-1]))
+        raise _UnclearError(few if clear.any() else none, (float(f0[0]), top))
     if not clear.all():
         group.findings.append(_unclear(f0, clear))
         lines, f0 = lines[clear], f0[clear]

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from few_kit import only
 from scipy import signal
 
-from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.diagnose import case_of, diagnose
+from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.records import within
+from samii_rig.diagnose.posed import of_any_kind
+from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.errors import EstimateError
 from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
@@ -76,6 +82,27 @@ def test_windows_that_leak_name_nothing_by_themselves(monkeypatch: pytest.Monkey
     found = diagnose(estimate([recorded(1, 0.3, 0.3), recorded(2, 0.3, 0.5)]), RIG)
     assert found.verdict != "named"
     assert any("leakage" in words for words in found.not_physics)
+
+
+def test_steps_that_are_for_the_eye_are_taken_whole_too() -> None:
+    run = recorded(1, 0.0, 0.3)
+    (segment,) = run.segments
+    run = replace(run, segments=(replace(segment, kind="transient"),))
+    with pytest.raises(EstimateError, match="steps and other transients only"):
+        estimate([run])
+    assert estimate(of_any_kind([run]))[0].estimator == "h1"
+
+
+def test_too_few_lines_for_the_noise_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    only(monkeypatch, ("sensor_highpass", "x"))
+    runs = [recorded(1, 0.0, 0.3)]
+    case = case_of(estimate(runs), RIG, None, None, runs)
+    assert case.whole is not None
+    narrow = replace(case.whole, records=within(case.whole.records, (0.4, 1.1)))
+    with pytest.raises(EstimateError, match="so nothing shows the noise"):
+        RecordSearch(narrow, case.search)
+    with pytest.raises(EstimateError, match="so nothing shows the noise"):
+        on_records(replace(case, whole=narrow))
 
 
 def test_local_models_that_were_chosen_stay() -> None:

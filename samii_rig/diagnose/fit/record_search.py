@@ -26,6 +26,7 @@ from samii_rig.diagnose.fit.usual import RECORDS
 from samii_rig.diagnose.physics.model import Grid, Model
 from samii_rig.diagnose.physics.rows import RESONANT
 from samii_rig.diagnose.result import Band, Gap, Used
+from samii_rig.errors import EstimateError
 from samii_rig.likelihood.pieces import Wiring
 from samii_rig.likelihood.reduce import LineResiduals, Reduced
 from samii_rig.signal.statistics import octaves
@@ -104,6 +105,11 @@ class RecordProblem(Problem):
     def about(cls, whole: Recorded, fitted: Fitted, by_line: Problem) -> RecordProblem:
         """About a fit."""
         found = whole.about(fitted)
+        if found.inside[1] < 1:
+            raise EstimateError(
+                f"the records excite {whole.lines} lines, no more than a response has unknowns, so "
+                "nothing shows the noise; a longer record or one that excites a wider band would"
+            )
         at = whole.nodes(found, fitted)
         return cls(by_line.data, by_line.root, at, by_line=by_line, reduced=found)
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.findings import Checked
-from samii_rig.diagnose.data.measured import DIFFER
+from samii_rig.diagnose.data.measured import DIFFER, WELCH
 from samii_rig.diagnose.fit.agreeing import Given, several_states
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
@@ -47,10 +47,16 @@ def whole_of(
 
 
 def on_records(case: Case) -> RecordSearch | None:
-    """The search on whole records, where there are any."""
+    """The search on whole records, where there are any.
+
+    Raises EstimateError where they cannot be searched, and Welch's windows, which leak, are all
+    that there is beside them.
+    """
     try:
         return None if case.whole is None else RecordSearch(case.whole, case.search)
     except EstimateError:
+        if all(r.estimator in WELCH for r in case.responses):
+            raise
         return None
 
 
