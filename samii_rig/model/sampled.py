@@ -38,7 +38,8 @@ def hold_response(frequency_hz: Float, rate_hz: float, delay: float = 0.0) -> Co
 def hold_at(s: Complex, rate_hz: float, delay: float = 0.0) -> Complex:
     """(1 - e^{-s T})/(s T) e^{-s delay} at complex s of any shape but 0, rad/s; delay in s."""
     s = np.asarray(s, dtype=np.complex128)
-    return np.asarray(-np.expm1(-s / rate_hz) * rate_hz / s * np.exp(-s * delay))
+    held = -np.expm1(-s / rate_hz) * rate_hz / s
+    return np.asarray(held * np.exp(-s * delay) if delay else held)
 
 
 def lowpass_poles(sensor: SensorBase) -> Complex:
@@ -66,12 +67,16 @@ def filter_response(sensor: SensorBase, s: Complex) -> Complex:
     """gain times anti-alias filter, lag and high-pass s/(s + w_hp), without the delay, at complex s
     of any shape, rad/s."""
     s = np.asarray(s, dtype=np.complex128)
-    value = np.full_like(s, sensor.gain)
-    for q in lowpass_poles(sensor):
-        value = value * (-q / (s - q))
-    if sensor.highpass_hz > 0:
-        value = value * (s / (s + 2 * np.pi * sensor.highpass_hz))
-    return value
+    poles = filter_poles(sensor)
+    low = poles[:-1] if sensor.highpass_hz > 0 else poles
+    at_rest = sensor.gain * np.prod(-low)
+    value = np.full_like(s, at_rest) if low.size == poles.size else at_rest * s
+    if poles.size == 0:
+        return value
+    below = s - poles[0]
+    for q in poles[1:]:
+        below *= s - q
+    return np.asarray(value / below)
 
 
 def filter_residues(sensor: SensorBase) -> Complex:
@@ -97,8 +102,22 @@ def sensor_response(sensors: Sequence[SensorBase], frequency_hz: Float) -> Compl
 
 def sensors_at(sensors: Sequence[SensorBase], s: Complex) -> Complex:
     """(n, n_sensor) `filter_response` with the delay of each sensor, at complex s (n,), rad/s."""
-    columns = [filter_response(x, s) * np.exp(-s * x.delay) for x in sensors]
+    filters = _filters_at(sensors, s)
+    late = {delay: np.exp(-s * delay) for delay in {x.delay for x in sensors} if delay}
+    columns = [f * late[x.delay] if x.delay else f for f, x in zip(filters, sensors, strict=True)]
     return np.stack(columns, axis=1)
+
+
+def _filters_at(sensors: Sequence[SensorBase], s: Complex) -> list[Complex]:
+    """`filter_response` of each sensor; most sensors of a rig share one, found once."""
+    found: dict[tuple[object, ...], Complex] = {}
+    out = []
+    for x in sensors:
+        alike = (x.gain, x.antialias, x.lag, x.highpass_hz)
+        if alike not in found:
+            found[alike] = filter_response(x, s)
+        out.append(found[alike])
+    return out
 
 
 def dead_time(rig: Rig) -> Float:
@@ -188,14 +207,24 @@ def _aliased(rig: Rig, chain: Chain, f: Float) -> Complex:
 
 def _terms(rig: Rig, chain: Chain, f: Float, k: np.ndarray) -> Complex:
     """Sum over the aliases k of hold G F, (n_freq, n_sensor, n_input)."""
-    at = (f[:, None] + k * rig.rate_hz).ravel()
+    at = f[:, None] + k * rig.rate_hz
     # The response to a real input at -f is the conjugate of that at f.
-    G = chain.response(np.abs(at))
-    G = np.where((at < 0)[:, None, None], G.conj(), G)
-    F = sensor_response(rig.sensor, at)
-    hold = np.stack([hold_response(at, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
-    terms = G * F[:, :, None] * hold[:, None, :]
-    return np.asarray(terms.reshape(f.size, k.size, *terms.shape[1:]).sum(axis=1))
+    G = chain.response(np.abs(at).ravel())
+    np.conjugate(G, out=G, where=(at < 0).ravel()[:, None, None])
+    filters = _filters_at(rig.sensor, np.asarray(2j * np.pi * at, np.complex128))
+    # Of hold and delays e^{-j w late} is a factor of f times one of k; so is the hold's sine.
+    held = (np.sin(np.pi / rig.rate_hz * f)[:, None] * (1 - 2 * (k % 2))) / (
+        np.pi / rig.rate_hz * at
+    )
+    G = G.reshape(f.size, k.size, *G.shape[1:])
+    out = np.empty((f.size, *G.shape[2:]), np.complex128)
+    for i, (x, F) in enumerate(zip(rig.sensor, filters, strict=True)):
+        passed = F * held
+        for j, actuator in enumerate(rig.actuator):
+            late = 0.5 / rig.rate_hz + actuator.delay + x.delay
+            turned = np.exp(-2j * np.pi * k * (late * rig.rate_hz))
+            out[:, i, j] = np.exp(-2j * np.pi * f * late) * ((G[:, :, i, j] * passed) @ turned)
+    return out
 
 
 def _half_jumps(rig: Rig, chain: Chain, f: Float) -> Complex:

@@ -12,7 +12,7 @@ from samii_rig.diagnose.physics.causal import CausalChain
 from samii_rig.diagnose.physics.effect import Effect, Key
 from samii_rig.diagnose.physics.fractional import ChainLike, FractionalChain
 from samii_rig.diagnose.physics.poses import turned
-from samii_rig.model.sampled import hold_at, sampled_response, sensors_at
+from samii_rig.model.sampled import sampled_response, sensors_at
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.rig.schema.elements import flattened
@@ -307,9 +307,10 @@ def _terms(
 ) -> Complex:
     """(order, n, q) aliases of a chain at s (n,), all asked for at once."""
     upper = np.concatenate([_upper(s, k, rig.rate_hz) for k in orders])
-    every = chain.evaluate(upper)[:, sensor, actuator] * _around(rig, upper, sensor, actuator)
-    each = every.reshape(len(orders), s.size, -1)
-    return np.stack([_lower(term, k) for term, k in zip(each, orders, strict=True)])
+    G = chain.evaluate(upper)[:, sensor, actuator].reshape(len(orders), s.size, -1)
+    each = np.stack([_lower(term, k) for term, k in zip(G, orders, strict=True)])
+    each *= _around(rig, s, orders, sensor, actuator)
+    return each
 
 
 def _upper(s: Complex, k: int, rate_hz: float) -> Complex:
@@ -324,10 +325,15 @@ def _lower(term: Complex, k: int) -> Complex:
     return np.asarray(term if k >= 0 else term.conj())
 
 
-def _around(rig: Rig, s: Complex, sensor: Int, actuator: Int) -> Complex:
-    """(n, q) hold, filters and delays."""
-    hold = np.stack([hold_at(s, rig.rate_hz, a.delay) for a in rig.actuator], axis=1)
-    return np.asarray(sensors_at(rig.sensor, s)[:, sensor] * hold[:, actuator])
+def _around(rig: Rig, s: Complex, orders: Sequence[int], sensor: Int, actuator: Int) -> Complex:
+    """(order, n, q) hold, filters and delays at the aliases of s (n,)."""
+    every = s + 2j * np.pi * rig.rate_hz * np.array(orders)[:, None]
+    # Of the hold, 1 - e^{-s T} is the same for all aliases.
+    held = _held(s, rig.rate_hz)[:, 0] * rig.rate_hz / every
+    late = {d: np.exp(-every * d) * held for d in {a.delay for a in rig.actuator} if d}
+    hold = np.stack([late.get(a.delay, held) for a in rig.actuator], axis=2)
+    seen = sensors_at(rig.sensor, every.ravel()).reshape(*every.shape, -1)
+    return np.asarray(seen[:, :, sensor] * hold[:, :, actuator])
 
 
 def grid(
@@ -352,14 +358,12 @@ def grid(
     s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
     folded = _terms(rig, chain, s, NEAR, sensor, actuator)
     every = made.spread(s, rig.rate_hz) + folded.sum(axis=0)
-    factor = _around(rig, s, sensor, actuator)
-    own: Complex | None = None
-    if own_aliases:
-        upper = [(_upper(s, k, rig.rate_hz), k) for k in NEAR[:OWN]]
-        own = np.stack([_lower(_around(rig, u, sensor, actuator), k) for u, k in upper])
+    orders = (0, *NEAR[:OWN]) if own_aliases else (0,)
+    factor, *own = _around(rig, s, orders, sensor, actuator)
     return Grid(
         f, factor, every, folded, rig.rate_hz, sensor, actuator,
-        sigma=sigma, far=made.far, own_aliases=own,
+        sigma=sigma, far=made.far,
+        own_aliases=np.stack(own) if own_aliases else None,
     )  # fmt: skip
 
 
