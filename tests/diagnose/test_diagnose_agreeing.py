@@ -42,7 +42,7 @@ STIFFER = TOML.replace("value = 12.0", "value = 15.6")  # its first spring by 30
 
 def recorded(toml: str, seed: int, name: str) -> Recording:
     return swept(
-        parse(Rig, toml, name), 1.0, repeats=3, duration=10.0, ring_down=3.0, seed=seed,
+        parse(Rig, toml, name), 1.0, repeats=3, duration=6.0, ring_down=3.0, seed=seed,
         actuator="v", source=f"{name}.mcap",
     )  # fmt: skip
 
