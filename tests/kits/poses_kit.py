@@ -25,7 +25,7 @@ from sim.rig import open_rig
 
 RATE = 200.0
 BAND = (0.6, 25.0)  # Hz
-SWEEP = 12.0  # s
+SWEEP = 8.0  # s
 LEVEL = 1.0  # V, 1 N m
 Change = Callable[[Rig], Rig]
 
