@@ -15,7 +15,7 @@ from samii_rig.rig.schema import Parameter, Rig, TorqueSource
 from samii_rig.types import Channel, FrequencyResponse
 
 BAND = (0.5, 40.0)
-LINES = np.geomspace(*BAND, 60)
+LINES = np.geomspace(*BAND, 40)
 PHYSICS = ("torsional_compliance", "transport_delay")
 
 
