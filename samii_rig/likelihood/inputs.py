@@ -8,6 +8,8 @@ with it the rig's own input follows from the law at the record's samples.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, signal
@@ -32,6 +34,9 @@ WHOLE = 0.02  # samples, from the delay of a loop that runs a whole number of ti
 # which it is a meter's noise; of the largest line, the power that it stays below; the part of the
 # lines, the upper ones, that show it.
 METER, QUIET, UPPER = 9.0, 1e-3, 0.5
+# Of a meter's noise, the part of its power that second differences show at least, to which an input
+# adds.
+EVERY = 0.5
 # Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a
 # smaller one that came half a sample earlier is below a hundredth of what the rest makes.
 JUMP, REST = 0.01, 4
@@ -95,6 +100,9 @@ def meter_noise(r: Float, step: float) -> float:
     upper = apart[int((1 - UPPER) * power.size) :]
     floor = float(np.median(upper)) / np.log(2)
     white = float(np.mean(upper)) < LOUDER * floor
+    # An input that is held for some samples has a wide spectrum, too, but noise is in every sample.
+    bends = TO_SD * float(np.median(np.abs(np.diff(r, 2)))) / math.sqrt(6)
+    white = white and bends**2 > EVERY * floor
     shown = white and METER * step**2 / 12 <= floor <= QUIET * np.max(power)
     return float(np.sqrt(floor)) if shown else 0.0
 

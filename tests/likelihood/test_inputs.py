@@ -150,6 +150,14 @@ def test_of_a_meters_noise_lines_lose_the_part_that_is_none_of_the_input() -> No
     assert meter_noise(held, STEP) == meter_noise(wide, STEP) == 0.0
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_binary_input_is_as_wide_as_noise_and_is_none(seed: int) -> None:
+    v = 0.5 * np.sign(np.repeat(np.random.default_rng(seed).standard_normal(500), 10))
+    v = np.rint(v / STEP) * STEP
+    assert meter_noise(v, STEP) == 0.0
+    np.testing.assert_array_equal(calibrated(v, STEP), v)
+
+
 def test_jumps_beside_a_rest_are_edges_and_a_sweep_has_none() -> None:
     run = recorded(1, 0.0)
     u = np.zeros(N)
