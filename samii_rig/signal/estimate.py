@@ -393,14 +393,20 @@ def _local(
     breaks = [[k / rate for k in group.pieces[i].breaks] for i in used]
     width, transients = local.plan(breaks, p, longest.n / rate, at_rest=still)
     data = local.windows(spectra, f0, width, transients)
+    power = np.abs(longest.R) ** 2
+    reached = longest.frequency[power > REACH * np.max(power)]
+    reach = float(f0[0]), max(float(f0[-1]), float(reached[-1]))
+    told = data.determined()
+    if np.count_nonzero(told) < least:
+        raise _UnclearError("the reference has no lines between its own", reach)
+    if not told.all():
+        lines, f0 = lines[told], f0[told]
+        data = local.windows(spectra, f0, width, transients)
     clear = data.distinct() > DISTINCT
     if np.count_nonzero(clear) < least:
         few = f"{np.count_nonzero(clear)} lines of {clear.size} can be told from a transient"
         none = "the sweep cannot be told from a transient anywhere; a lead-in at rest would help"
-        power = np.abs(longest.R) ** 2
-        reached = longest.frequency[power > REACH * np.max(power)]
-        top = max(float(f0[-1]), float(reached[-1]))
-        raise _UnclearError(few if clear.any() else none, (float(f0[0]), top))
+        raise _UnclearError(few if clear.any() else none, reach)
     if not clear.all():
         group.findings.append(_unclear(f0, clear))
         lines, f0 = lines[clear], f0[clear]

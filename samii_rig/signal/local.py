@@ -26,6 +26,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from samii_rig.signal.spectra import Spectrum
 from samii_rig.types import Complex, Float, Int
@@ -38,6 +39,8 @@ KOERNER_STEPS = 3
 NEWTON_STEPS = 6
 # A channel without noise (the input of an open loop) is given this part of its size.
 FAINT = 1e-6
+# Of the reference's largest line, what is none: a transform rounds to 1e-13 of it.
+NOTHING = 1e-10
 CHUNK = 512  # windows at a time: some MB of matrices
 
 
@@ -65,6 +68,12 @@ class Windows:
         return Windows(
             self.x[rows], self.R[rows], self.Z[rows], self.piece, self.turn[rows], self.transients
         )
+
+    def determined(self) -> NDArray[np.bool_]:
+        """(n_freq,) whether the reference has enough lines in the window to tell a response there:
+        one that repeats itself has none between its own."""
+        size = np.abs(np.diagonal(np.linalg.qr(_references(self), "r"), axis1=1, axis2=2))
+        return np.asarray(np.min(size, axis=1) > NOTHING * np.max(np.abs(self.R)))
 
     def distinct(self) -> Float:
         """(n_freq,) 1 - rho^2, rho the largest canonical correlation between what the

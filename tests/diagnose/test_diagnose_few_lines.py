@@ -105,6 +105,15 @@ def test_too_few_lines_for_the_noise_are_told(monkeypatch: pytest.MonkeyPatch) -
         on_records(replace(case, whole=narrow))
 
 
+def test_an_input_that_repeats_itself_has_no_lines_between_its_own() -> None:
+    run = recorded(1, 0.0, 0.3)
+    values = run.values.copy()
+    values[:, 0] = np.tile(np.repeat([0.5, -0.5], 125), N // 250)
+    (response,) = estimate([replace(run, values=values)])
+    assert response.estimator == "h1"
+    assert response.why == "the reference has no lines between its own"
+
+
 def test_local_models_that_were_chosen_stay() -> None:
     with pytest.raises(EstimateError, match="cannot be told from a transient anywhere"):
         estimate([recorded(1, 0.0, 0.3)], method="local")
