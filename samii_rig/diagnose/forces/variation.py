@@ -44,8 +44,7 @@ from samii_rig.types import Float
 
 STILL = 0.25  # of chi-square of each number that a step promises: half its standard deviation
 ROUNDS = 8  # times that the likelihood is made anew at most: 3 or 4 were usual
-# Of what the first explains, from which on another spring may be the one: as long as what varies
-# stands in the noise, neighbours gain nearly as much as the spring that does.
+# Of the evidence that the first gains in one round, from which on another spring may be the one.
 RIVAL = 0.5
 # Of what it explains, above which a force that does as much makes a law of the amplitude as likely.
 LAWFUL = 0.5
@@ -135,12 +134,20 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     for site, modulation in found:
         k = search.paths.scale((site, STIFFNESS))
         # None varies by more than all of it: something else does.
-        if RIVAL * found[0][1].gain < modulation.gain < modulation.known * k**2:
-            tried.append(_Taken.of(seen, site).settled(best))
+        if modulation.gain < modulation.known * k**2:
+            tried.append(_Taken.of(seen, site))
     if not tried:
         return None
+    # As long as what varies stands in the noise, a neighbour gains more than the spring that does:
+    # the noise there is what that spring does. One round tells.
+    nothing = tried[0].evidence
+    for one in tried:
+        one.closer(best)
     tried.sort(key=lambda one: -one.evidence)
-    taken, first = tried[0], dict(found)[tried[0].site]
+    least = nothing + RIVAL * (tried[0].evidence - nothing)
+    tried = [one.settled(best) for one in tried if one.evidence >= least]
+    tried.sort(key=lambda one: -one.evidence)
+    taken = tried[0]
     before = taken.residuals(search.levels, best.fitted)
     after = taken.residuals(taken.search.levels, taken.fitted)
     each = 2.0 * search.levels.sensor.size
@@ -157,7 +164,7 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     return Variation(
         sites=tuple(zip(names, (p / p.sum()).tolist(), strict=True)),
         parameters=parameters,
-        evidence=seen.evidence_of(first),
+        evidence=seen.evidence,
         gain=gain,
         before=(float(np.mean(before[0])), float(np.mean(before[1]))),
         after=(float(np.mean(after[0])), float(np.mean(after[1]))),
