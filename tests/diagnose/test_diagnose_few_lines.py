@@ -11,7 +11,7 @@ from scipy import signal
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit.record_search import RecordSearch
-from samii_rig.diagnose.fit.records import within
+from samii_rig.diagnose.fit.records import Whole, within
 from samii_rig.diagnose.posed import of_any_kind
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.errors import EstimateError
@@ -112,6 +112,20 @@ def test_an_input_that_repeats_itself_has_no_lines_between_its_own() -> None:
     (response,) = estimate([replace(run, values=values)])
     assert response.estimator == "h1"
     assert response.why == "the reference has no lines between its own"
+
+
+def test_a_square_wave_drives_the_rig_far_above_its_band() -> None:
+    """There, too, a response may change; a sweep that fades in and out drives nothing beyond it."""
+    t = np.arange(N) / RATE
+    sweep = np.hanning(N) * signal.chirp(t, 2.0, t[-1], 30.0)
+    run = recorded(1, 0.0, 0.3)
+    driven = []
+    for v in (np.sign(np.sin(2 * np.pi * 0.8 * t + 0.2)), sweep):
+        whole = Whole.of([replace(run, values=np.column_stack([v, run.values[:, 1]]))], RIG)
+        assert whole.records.band[1] < 60.0
+        driven.append(whole.with_harmonics().records.driven)
+    assert driven[0] > 200.0
+    assert driven[1] < 60.0
 
 
 def test_local_models_that_were_chosen_stay() -> None:

@@ -45,6 +45,9 @@ GOLDEN = (5**0.5 - 1) / 2
 # Of the largest, an input's energy in a third of an octave that excites: steps through frequencies,
 # of as many periods each, and steps of the input have that over 2.5 decades.
 EXCITED, PARTS = 0.003, 3
+# The same, from which on an input moves a rig by more than its noise: a thousandth in amplitude. A
+# square wave does so far above its band.
+DRIVES = 1e-6
 METER = 9.0  # times a converter's rounding, power of an input that is more than that
 HARMONIC = 3  # the lowest that a force makes which is alike both ways
 # Lines to which harmonics may add: a quadratic form of so many takes 5 s of a core. Many records
@@ -133,7 +136,9 @@ class Whole:
         records, most = self.records, HIGHEST * self.records.rate_hz
         times = min(float(HARMONIC), max(MOST_LINES / records.count, 1.0))
         bands = tuple((low, min(times * high, most)) for low, high in records.bands)
-        return replace(self, records=replace(records, bands=bands, driven=records.band[1]))
+        reached = excited(records.pieces, records.rate_hz, part=DRIVES)
+        driven = max(records.band[1], *(band[1] for band in reached if band))
+        return replace(self, records=replace(records, bands=bands, driven=driven))
 
     @property
     def sensor(self) -> Int:
@@ -311,7 +316,7 @@ def _records(
 
 
 def excited(
-    pieces: Sequence[Piece], rate_hz: float, rounding: Float | None = None
+    pieces: Sequence[Piece], rate_hz: float, rounding: Float | None = None, part: float = EXCITED
 ) -> list[tuple[float, float] | None]:
     """Hz, of each piece the band in which an input has more than a small part of its largest
     energy in any; None for one that nothing drives: what is left of a sweep behind a gap.
@@ -326,7 +331,7 @@ def excited(
     for piece, inputs in zip(pieces, each, strict=True):
         edges = inputs[0][0]
         over = [
-            (energy > EXCITED * top) & (energy > floor * lines)
+            (energy > part * top) & (energy > floor * lines)
             for (_, energy, lines), top, floor in zip(inputs, most, still, strict=True)
         ]
         on = np.flatnonzero(np.any(over, axis=0))
