@@ -275,7 +275,7 @@ def _diagnosed(
     poses = poses_of(recordings, held, ())
 
     def responses(runs: Sequence[Recording]) -> Sequence[FrequencyResponse]:
-        # As `samii-rig diagnose` does: a segment with a gap is left out, and that is said.
+        # As `samii-rig diagnose` does: what is done about segments with gaps is said.
         return estimate(runs, gaps="auto", band=band)
 
     if len(set(poses)) > 1:

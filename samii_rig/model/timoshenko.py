@@ -125,12 +125,16 @@ def _waves(m: Complex, j: Complex, B: Complex, G: Complex) -> tuple[Complex, Com
     return numbers, vectors, dual
 
 
+def _of_series(s: Complex, p: Float) -> tuple[float, Complex, Complex, Complex, Complex, int]:
+    """L, EI g, GA g, mu s^2, J s^2 + N at the beam's start, and how many terms the series has."""
+    g, L = _g(s, p), float(p[LENGTH])
+    m, j = p[MU] * s**2, p[J] * s**2 + p[TENSION] - p[SLOPE] * L / 2
+    return L, p[EI] * g, p[GA] * g, m, j, TENSE_TERMS if _tense(p) else TERMS
+
+
 def _series(s: Complex, p: Float, z: Complex) -> Complex:
     """c_k (terms, n, 4, m) with z(x) = sum_k (x/L)^k c_k for the states z (n, 4, m) at x = 0."""
-    g = _g(s, p)
-    L, B, G = p[LENGTH], p[EI] * g, p[GA] * g
-    m, j = p[MU] * s**2, p[J] * s**2 + p[TENSION] - p[SLOPE] * L / 2
-    terms = TENSE_TERMS if _tense(p) else TERMS
+    L, B, G, m, j, terms = _of_series(s, p)
     out = np.zeros((terms, *z.shape), complex)
     out[0] = z
     for k in range(1, terms):
@@ -146,11 +150,8 @@ def _series(s: Complex, p: Float, z: Complex) -> Complex:
 
 def _across(s: Complex, p: Float) -> Complex:
     """(n, 4, 4) from the state before the beam to that behind it, by the power series."""
-    g = _g(s, p)
-    L, B, G = p[LENGTH], p[EI] * g, p[GA] * g
-    m, j = p[MU] * s**2, p[J] * s**2 + p[TENSION] - p[SLOPE] * L / 2
-    terms = TENSE_TERMS if _tense(p) else TERMS
-    return np.asarray(_summed(m, j, 1 / B, 1 / G, float(L), float(p[SLOPE]), terms))
+    L, B, G, m, j, terms = _of_series(s, p)
+    return np.asarray(_summed(m, j, 1 / B, 1 / G, L, float(p[SLOPE]), terms))
 
 
 @numba.njit(inline="always")

@@ -47,7 +47,7 @@ DISTINCT = 0.5
 # Lines that can be told from a transient below which a response is estimated by Welch's windows:
 # with fewer nothing is diagnosed. Windows for each output, so that with those that overlap the
 # covariance of all outputs' noise is known; and samples of one, below which it has hardly a line.
-LEAST_CLEAR, WINDOWS, LEAST_SAMPLES = 12, 4, 64
+LEAST_CLEAR, WINDOWS, SHORTEST = 12, 4, 64
 # Of an input's largest line, power up to which windows are of use: a step has that at 300 lines.
 REACH = 1e-5
 
@@ -178,14 +178,14 @@ def _one(
     for group in groups:
         try:
             drop_stuck(group, chosen=how.outputs is not None)
-            if method not in ("h1", "h2", "hv"):
+            if method not in welch.METHODS:
                 drop_foreign(group)
             usable.append(group)
         except EstimateError as error:
             failed.append(error)
     for group in periodic.joined(usable) if method in ("auto", "periodic") else usable:
         try:
-            if method in ("h1", "h2", "hv"):
+            if method in welch.METHODS:
                 out.append(_welch(group, method, how.nperseg, band))
                 continue
             choice, why = choose(group, method)
@@ -370,7 +370,7 @@ def _local_or_windows(
     except _UnclearError as error:
         shortest, p = min(len(piece.z) for piece in group.pieces), len(group.selection.outputs)
         samples = shortest // (WINDOWS * p)
-        if chosen or samples < LEAST_SAMPLES:
+        if chosen or samples < SHORTEST:
             raise
         return _welch(group, "h1", samples, error.band, str(error))
 
@@ -393,10 +393,7 @@ def _local(
     breaks = [[k / rate for k in group.pieces[i].breaks] for i in used]
     width, transients = local.plan(breaks, p, longest.n / rate, at_rest=still)
     data = local.windows(spectra, f0, width, transients)
-    power = np.abs(longest.R) ** 2
-    reached = longest.frequency[power > REACH * np.max(power)]
-    reach = float(f0[0]), max(float(f0[-1]), float(reached[-1]))
-    told = data.determined()
+    reach, told = _reach(longest, lines), data.determined()
     if np.count_nonzero(told) < least:
         raise _UnclearError("the reference has no lines between its own", reach)
     if not told.all():
@@ -438,6 +435,13 @@ def _local(
     ends = f"{len(transients)} transients" if transients else "at rest at both ends: no transient"
     why = f"{why}; windows of {width:.3g} Hz, {ends}"
     return _response(group, found, len(group.pieces), done, why)
+
+
+def _reach(of: Spectrum, lines: Int) -> tuple[float, float]:
+    """Hz from the lowest of some lines of a piece to the highest that its input reaches."""
+    power = np.abs(of.R) ** 2
+    top = max(int(lines[-1]), int(np.flatnonzero(power > REACH * np.max(power))[-1]))
+    return float(of.frequency[lines[0]]), float(of.frequency[top])
 
 
 def _unclear(f0: Float, clear: NDArray[np.bool_]) -> Finding:

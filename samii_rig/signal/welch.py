@@ -18,6 +18,7 @@ from samii_rig.errors import EstimateError, InputError
 from samii_rig.signal._accumulate import accumulate
 from samii_rig.types import Complex, Float
 
+METHODS = ("h1", "h2", "hv")
 # Samples of one block over all channels: 0.5 MB in and 0.5 MB out, a core's second cache.
 BLOCK_SAMPLES = 65536
 
@@ -131,7 +132,7 @@ def frequency_response(
         next one has too.
     Raises InputError for another method.
     """
-    if method not in ("h1", "h2", "hv"):
+    if method not in METHODS:
         raise InputError("welch", "method", method, "one of h1, h2, hv")
     result = spectra(
         pieces, rate_hz, nperseg=nperseg, window=window, overlap=overlap, detrend=detrend

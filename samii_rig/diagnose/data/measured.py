@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from samii_rig.errors import InputError
 from samii_rig.identify.data import collect
 from samii_rig.rig.schema import Rig
+from samii_rig.signal import welch
 from samii_rig.types import Complex, Float, FrequencyResponse, Int
 
 BINS = 180  # to begin with; a refit costs a few milliseconds
@@ -34,7 +35,6 @@ DRIFTING = 4.5
 # Of a bin's precision, what is below is rounding: its lines know a sum of entries alone.
 SUMS = 1e-12
 DIFFER = 1.5  # chi-square per degree of freedom of levels against each other
-WELCH = ("h1", "h2", "hv")  # methods by windows, whose leakage is not in their covariance
 TRANSIENTS = "local"  # method of responses from single transients: see `usable`
 
 
@@ -174,7 +174,7 @@ def summed(values: Complex, which: Int, n: int) -> Complex:
 
 def repeated(response: FrequencyResponse) -> bool:
     """Whether repeats tell a response's noise."""
-    if response.estimator in WELCH:
+    if response.estimator in welch.METHODS:  # whose leakage is not in their covariance
         return False
     return response.n_averages > 1 or response.estimator != TRANSIENTS
 

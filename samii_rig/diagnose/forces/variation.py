@@ -116,12 +116,12 @@ class BySpring:
 
     @property
     def evidence(self) -> float:
-        """Logarithm of the evidence of the spring that most speaks for, of all of them."""
-        return max((self.evidence_of(one) for _, one in self.strongest), default=-math.inf)
-
-    def evidence_of(self, modulation: Modulation) -> float:
-        """Logarithm of the evidence of one spring's, as any other could have been the one."""
-        return modulation.evidence - math.log(len(self.springs.each))
+        """Logarithm of the evidence of the spring that most speaks for, as any other could have
+        been the one."""
+        if not self.strongest:
+            return -math.inf
+        most = max(one.evidence for _, one in self.strongest)
+        return most - math.log(len(self.springs.each))
 
 
 def variation(seen: BySpring, files: int) -> Variation | None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.findings import Checked
-from samii_rig.diagnose.data.measured import DIFFER, WELCH
+from samii_rig.diagnose.data.measured import DIFFER
 from samii_rig.diagnose.fit.agreeing import Given, several_states
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
@@ -22,6 +22,7 @@ from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.diagnose.verdict.stages import Case, Shown, diagnosis_of, of_states
 from samii_rig.errors import EstimateError, SamiiRigError
 from samii_rig.rig.schema import Rig
+from samii_rig.signal import welch
 from samii_rig.types import Recording
 
 EXHAUSTED = (
@@ -55,7 +56,7 @@ def on_records(case: Case) -> RecordSearch | None:
     try:
         return None if case.whole is None else RecordSearch(case.whole, case.search)
     except EstimateError:
-        if all(r.estimator in WELCH for r in case.responses):
+        if all(r.estimator in welch.METHODS for r in case.responses):
             raise
         return None
 
