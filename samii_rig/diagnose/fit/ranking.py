@@ -27,6 +27,9 @@ def ranking(
     """
     names = {e.key for e in base}
     linear = all(e.force is None for e in base)
+    # A dead time turns an alias by more than it turns the line itself, and that may be all of it
+    # that no nominal parameter does too.
+    folding = screen.problem.at.own_aliases is not None
     places: dict[tuple[str, Start], Place | None] = {}
     out = []
     for effect in table:
@@ -35,7 +38,7 @@ def ranking(
         found: Found | None = None
         if linear and effect.jump is not None:
             found = _at_place(screen, base, effect, model_of, places)
-        elif linear and effect.factor is not None:
+        elif linear and effect.factor is not None and not (folding and effect.unknowns):
             found = screen.channel(effect)
         else:
             model = model_of((*base, effect))

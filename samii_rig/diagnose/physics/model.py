@@ -23,11 +23,11 @@ ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smoo
 # a channel changes.
 NEAR = (-1, 1, -2, 2)
 OWN = 2  # of them, those of each model itself where that shows: modes are seldom above 1.5 rates
-# Aliases beyond those, each by itself at a few frequencies, as a factor changes each otherwise:
-# what it leaves of them beside its phase at the frequency itself is smooth between. Behind the last
-# of `FAR` every term falls as the one before it did; up to the last of all a delay is 7e-5 of the
-# largest off, of whole samples 1e-9, and 2e-3 without any.
-FAR_POINTS, FAR, FARTHER = 9, range(3, 17), range(17, 65)
+# Aliases beyond those, at a few frequencies, as a factor changes each otherwise: what it leaves of
+# them beside its phase at the frequency itself is smooth between. `ALONE` are by themselves, then
+# blocks of `BLOCKS` an octave, in which a factor grows by one ratio from order to order. Terms are
+# those of the chain up to `ASKED`, behind it they fall as they did there.
+FAR_POINTS, ALONE, BLOCKS, ASKED, LAST = 9, range(3, 16), 4, 64, 4096
 STEEPEST = 8.0  # power of the frequency with which such a term falls, at most: nothing is left then
 STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
 FARTHEST = 6.0  # tolerances that a refit moves a nominal parameter at most
@@ -113,12 +113,25 @@ class JointLoops:
 Closed = Loop | JointLoops
 
 
+def _blocks() -> list[tuple[int, int]]:
+    """First order and number of orders, a power of two, of each block of far aliases."""
+    out = [(k, 1) for k in ALONE]
+    while (first := sum(out[-1])) < LAST:
+        many = 1 << (first.bit_length() - 1)  # from one power of two to the next
+        out += [(first + i * (many // BLOCKS), many // BLOCKS) for i in range(BLOCKS)]
+    return out
+
+
+FAR = tuple(_blocks())
+SEVERAL = sum(many == 1 for _, many in FAR)  # first block of more than one order
+
+
 @dataclass(frozen=True, slots=True)
 class Far:
-    """Aliases beyond the nearest, each by itself at a few frequencies (m,) Hz.
+    """Aliases beyond the nearest, in blocks, at a few frequencies (m,) Hz.
 
-    s : (order m,) rad/s of all of them, before them these frequencies themselves. terms :
-        (order, m, q), without the hold's 1 - e^{-s T}; 0 of the first.
+    s : rad/s, these frequencies, then either way (n, m) the first order of each block, and the one
+    behind it. terms : (2, n, m, q) the sum of a block, either way, without the hold's 1 - e^{-s T}.
     """
 
     few: Float
@@ -135,45 +148,107 @@ class Far:
             turns = 2j * np.pi * rig.rate_hz * np.array(orders)
             return np.asarray(s + turns[:, None])
 
-        each, terms = [s[None]], [np.zeros((1, s.size, sensor.size), np.complex128)]
+        each, terms = [], []
+        asked = sum(k <= ASKED for k, _ in FAR)
+        lines = few[:, None] / rig.rate_hz
         for way in (1, -1):
-            known = [way * k for k in FAR]
+            known = [way * k for k, _ in FAR[:asked]]
             T = _terms(rig, chain, s, known, sensor, actuator) / _held(s, rig.rate_hz)
-            behind = there([way * k for k in FARTHER])
-            size = np.sum(np.abs(T), axis=1)
-            octave = np.log2(FAR[-1] / FAR[len(FAR) // 2])
+            size = np.sum(np.abs(T[[asked - 1 - BLOCKS, asked - 1]]), axis=1)  # an octave apart
             with np.errstate(divide="ignore", invalid="ignore"):
-                falls = np.log2(size[len(FAR) // 2] / size[-1]) / octave
-            falls = np.maximum(np.where(np.isfinite(falls), falls, np.inf), 1.0)
-            ratio = there(known[-1:]) / behind  # below 1
-            last = T[-1] * np.exp(np.log(ratio)[:, :, None] * np.minimum(falls, STEEPEST))
-            each += [there(known), behind]
-            terms += [T, last]
-        return cls(few, np.concatenate(each).ravel(), np.concatenate(terms))
+                falls = np.log2(size[0] / size[1])
+            falls = np.clip(np.where(np.isfinite(falls), falls, np.inf), 1.0, STEEPEST)
+            # Of an order k a term is that of s/rate = 2 pi j (k + f/rate), to a power.
+            first = np.array([k for k, _ in FAR])[:, None, None] + way * lines
+            many = np.array([many for _, many in FAR])[:, None, None]
+            last = (first[asked - 1] / first[asked:]) ** falls * T[-1]
+            terms.append(np.concatenate([T, last]) * _summed(first, many, falls))
+            each.append(there([way * k for k, _ in FAR]))
+            each.append(there([way * (k + 1) for k, _ in FAR]))
+        return cls(few, np.concatenate([s[None], *each]).ravel(), np.array(terms))
 
     def added(self, at: Grid, own: Complex, passed: Complex) -> Complex:
         """(n, q) what a factor adds to all aliases. own : (n, q) the factor at s itself. passed :
-        (order m, q) at all of `self.s`."""
-        F, turn = passed.reshape(self.terms.shape), _turn(own)
-        left = np.sum(self.terms * (F * _turn(F[0]).conj() - 1), axis=0)
+        (..., q) at all of `self.s`."""
+        own_few, first, behind = self._apart(passed)
+        mean, turn = _mean(first, behind / first), _turn(own)
+        left = np.sum(self.terms * (mean * _turn(own_few).conj() - 1), axis=(0, 1))
         return np.asarray(at.rest * (turn - 1) + self._between(at, left) * turn)
 
     def slope(
         self, at: Grid, own: Complex, passed: Complex, d_own: Complex, d_passed: Complex
     ) -> Complex:
         """(n, q) the slope of `added`. d_own, d_passed : those of the factor."""
-        shape = self.terms.shape
-        F, dF, turn = passed.reshape(shape), d_passed.reshape(shape), _turn(own)
-        back, d_back, d_turn = _turn(F[0]).conj(), _turned(F[0], dF[0]).conj(), _turned(own, d_own)
-        left = np.sum(self.terms * (F * back - 1), axis=0)
-        d_left = np.sum(self.terms * (dF * back + F * d_back), axis=0)
+        (own_few, first, behind), (d_own_few, *d) = self._apart(passed), self._apart(d_passed)
+        ratio, d_first = behind / first, d[0] / first
+        mean, d_mean = _slope_of_mean(first, ratio, ratio * (d[1] / behind - d_first))
+        d_mean += mean * d_first
+        turn, back = _turn(own), _turn(own_few).conj()
+        d_turn, d_back = _turned(own, d_own), _turned(own_few, d_own_few).conj()
+        left = np.sum(self.terms * (mean * back - 1), axis=(0, 1))
+        d_left = np.sum(self.terms * (d_mean * back + mean * d_back), axis=(0, 1))
         between = (at.rest + self._between(at, left)) * d_turn
         return np.asarray(between + self._between(at, d_left) * turn)
+
+    def _apart(self, each: Complex) -> tuple[Complex, Complex, Complex]:
+        """At these frequencies (m, q), at each block's first order (2, n, m, q), and behind it."""
+        m, q = self.few.size, each.shape[-1]
+        each = each.reshape(-1, m, q)
+        first, behind = each[1:].reshape(2, 2, len(FAR), m, q).swapaxes(0, 1)
+        return each[0], first, behind
 
     def _between(self, at: Grid, few: Complex) -> Complex:
         f = at.s.imag / (2 * np.pi)
         between = np.stack([np.interp(f, self.few, one) for one in few.T], axis=1)
         return np.asarray(_held(at.s, at.rate_hz) * between)
+
+
+def _summed(first: Float, many: Int, falls: Float) -> Float:
+    """(n, m, q) what a block is of its first term, where these fall as the order (n, m, 1) to a
+    power: Euler and Maclaurin's sum from middle to middle."""
+
+    def integral(u: Float) -> Float:
+        steep = np.maximum(falls, 1 + 1e-9) - 1  # at 1 itself it is a logarithm
+        return np.asarray(-((u / first) ** -steep) * first / steep)
+
+    def slope(u: Float) -> Float:
+        return np.asarray(-falls * (u / first) ** (-falls - 1) / first)
+
+    low, high = first - 0.5, first - 0.5 + many
+    whole = integral(high) - integral(low) - (slope(high) - slope(low)) / 24
+    return np.where(many == 1, 1.0, whole)
+
+
+def _doublings() -> Iterator[slice]:
+    """The blocks that are 2, 4, 8 ... orders long at least."""
+    many = [many for _, many in FAR]
+    for i in range(1, many[-1].bit_length()):
+        yield slice(sum(n < 1 << i for n in many), None)
+
+
+def _mean(first: Complex, ratio: Complex) -> Complex:
+    """(2, n, m, q) of a factor over each block, of its value at the first order and by how much it
+    is larger at each next: 1 + r + ... + r^{2 k - 1} = (1 + r^k) (1 + r + ... + r^{k - 1})."""
+    out, power = first.copy(), ratio.copy()
+    for on in _doublings():
+        r = power[:, on]
+        out[:, on] *= 0.5 + 0.5 * r
+        r *= r
+    return out
+
+
+def _slope_of_mean(first: Complex, ratio: Complex, d_ratio: Complex) -> tuple[Complex, Complex]:
+    """(2, n, m, q) the same, and its slope by the ratio."""
+    out, power = first.copy(), ratio.copy()
+    d_out, d_power = np.zeros_like(out), d_ratio.copy()
+    for on in _doublings():
+        r, d = power[:, on], d_power[:, on]
+        d_out[:, on] *= 0.5 + 0.5 * r
+        d_out[:, on] += 0.5 * out[:, on] * d
+        out[:, on] *= 0.5 + 0.5 * r
+        d *= 2 * r
+        r *= r
+    return out, d_out
 
 
 def _turn(factor: Complex) -> Complex:
@@ -186,6 +261,24 @@ def _turned(factor: Complex, d: Complex) -> Complex:
     """The slope of `_turn`, d that of the factor."""
     angle = np.divide(d, factor, out=np.zeros_like(factor), where=factor != 0).imag
     return np.asarray(1j * angle * _turn(factor))
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """What of a model folds back. near : (order, n, q) of the orders `NEAR`. times : (q,) by how
+    much all beyond the model's own are larger than those of the grid; None where none is its own.
+    """
+
+    near: Complex
+    times: Float | None = None
+
+
+def _larger(own: Complex, of_grid: Complex) -> Float:
+    """(q,) how many times an entry's own aliases (order, n, q) are those of a grid, in the mean of
+    the logarithm: far above its modes a rig answers as K p / (s ...) does, all aliases alike."""
+    known = (own != 0) & (of_grid != 0)
+    ratio = np.divide(own, of_grid, out=np.ones_like(own), where=known)
+    return np.asarray(np.exp(np.mean(np.log(np.abs(ratio)), axis=(0, 1))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,14 +347,16 @@ class Grid:
         """Answers there, as rows, of the grid and of each of these aliases."""
         return np.split(answers, 1 if self.own_aliases is None else 1 + OWN)
 
-    def response_and_folded(self, answers: Complex) -> tuple[Complex, Complex]:
-        """Answers (n ..., q) there as those of the grid (n, q), and what folds back
-        (order, n, q): of the chain itself where it was asked."""
+    def response_and_folded(self, answers: Complex) -> tuple[Complex, Folded]:
+        """Answers (n ..., q) there as those of the grid (n, q), and what folds back: of the chain
+        itself where it was asked."""
         G, *terms = self.by_alias(answers)
         if self.own_aliases is None:
-            return G, self.folded
-        own = [_lower(t, k) * f for t, k, f in zip(terms, NEAR, self.own_aliases, strict=False)]
-        return G, np.concatenate([np.stack(own), self.folded[OWN:]])
+            return G, Folded(self.folded)
+        each = zip(terms, NEAR, self.own_aliases, strict=False)
+        own = np.stack([_lower(t, k) * f for t, k, f in each])
+        times = _larger(own, self.folded[:OWN])
+        return G, Folded(np.concatenate([own, times * self.folded[OWN:]]), times)
 
     def orders(self) -> list[Complex]:
         """s (n,) of each order of `folded`."""
@@ -384,19 +479,19 @@ class _Passed:
 
 
 def _through(
-    at: Grid, folded: Complex, near: _Passed | None, beyond: _Passed | None
-) -> tuple[Complex, Complex]:
-    """(n, q) hold, filters and delays of a grid and its aliases, each times its factors. folded :
-    as of the grid, of the model."""
-    aliases = at.aliases
-    if folded is not at.folded:
-        aliases = aliases + np.sum(folded - at.folded, axis=0)
-    if near is None:
-        return at.factor, aliases
-    aliases = aliases + np.sum(folded * (near.F[1:] - 1), axis=0)
-    if beyond is not None and at.far is not None:
-        aliases = aliases + at.far.added(at, near.F[0], beyond.F[0])
-    return np.asarray(at.factor * near.F[0]), np.asarray(aliases)
+    at: Grid, folded: Folded, near: _Passed | None, beyond: _Passed | None
+) -> tuple[Complex, Complex, Complex]:
+    """(n, q) hold, filters and delays of a grid, its aliases, and of these the ones that are no
+    model's own, each times its factors. folded : of the model."""
+    rest, each, factor = at.rest, folded.near, at.factor
+    if near is not None:
+        each, factor = each * near.F[1:], np.asarray(factor * near.F[0])
+        if beyond is not None and at.far is not None:
+            rest = rest + at.far.added(at, near.F[0], beyond.F[0])
+    if folded.times is not None:
+        rest = folded.times * rest
+    far = np.asarray(rest + np.sum(each[OWN:], axis=0))
+    return factor, np.asarray(far + np.sum(each[:OWN], axis=0)), far
 
 
 class Model:
@@ -488,7 +583,7 @@ class Model:
         """(n, q) at the grid's frequencies."""
         chain = self.chain.with_values(self.values(x))
         G, folded = at.response_and_folded(chain.evaluate(at.asked())[:, at.sensor, at.actuator])
-        factor, aliases = _through(at, folded, *self._passed(x, at))
+        factor, aliases, _ = _through(at, folded, *self._passed(x, at))
         H = np.asarray(G * factor + aliases)
         return H if at.loop is None else at.loop.closed(H)
 
@@ -500,13 +595,19 @@ class Model:
         every, slopes = chain.gradient_at(at.asked(), keys)
         G, folded = at.response_and_folded(every[:, at.sensor, at.actuator])
         near, beyond = self._passed(x, at)
-        factor, aliases = _through(at, folded, near, beyond)
+        factor, aliases, far = _through(at, folded, near, beyond)
         own, *folds = at.by_alias(slopes[:, at.sensor, at.actuator])
         dG = own * factor[:, :, None]
+        larger = np.zeros(dG.shape[1:])
         for i, (k, d) in enumerate(zip(NEAR, folds, strict=False)):
             assert at.own_aliases is not None
-            passed = at.own_aliases[i] if near is None else at.own_aliases[i] * near.F[1 + i]
-            dG += _lower(d, k) * passed[:, :, None]
+            by, d = at.own_aliases[i], _lower(d, k)
+            dG += d * (by if near is None else by * near.F[1 + i])[:, :, None]
+            own = folded.near[i]
+            part = np.divide(by, own, out=np.zeros_like(own), where=own != 0) / (OWN * len(own))
+            larger += np.matmul(part.T[:, None, :], d.swapaxes(0, 1))[:, 0].real
+        if folds:
+            dG += far[:, :, None] * larger  # the slope of `Folded.times`
         dH = np.zeros((*G.shape, self.n), complex)
         n = self.n_nominal
         dH[:, :, :n] = dG[:, :, :n] * np.array([values[k] for k in self.keys])
@@ -520,7 +621,7 @@ class Model:
                 map_[:, i] = [(there[k] - values[k]) / STEP for k in keys]
             dH[:, :, read] = dG @ map_
         if near is not None:
-            terms = np.concatenate([(G * at.factor)[None], folded])
+            terms = np.concatenate([(G * at.factor)[None], folded.near])
             for j, on, slope in near.slopes():
                 dH[:, on, j] += np.sum(terms[:, :, on] * slope, axis=0)
         if near is not None and beyond is not None and at.far is not None:
@@ -529,7 +630,8 @@ class Model:
             ):
                 own, passed = np.zeros_like(near.F[0]), np.zeros_like(beyond.F[0])
                 own[:, on], passed[:, on] = d_own[0], d_passed[0]
-                dH[:, :, j] += at.far.slope(at, near.F[0], beyond.F[0], own, passed)
+                slope = at.far.slope(at, near.F[0], beyond.F[0], own, passed)
+                dH[:, :, j] += slope if folded.times is None else folded.times * slope
         H = G * factor + aliases
         return (H, dH) if at.loop is None else (at.loop.closed(H), at.loop.slopes(H, dH))
 
