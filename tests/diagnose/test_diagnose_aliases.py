@@ -128,6 +128,17 @@ def test_a_delay_of_whole_samples_is_one_of_the_samples():
     np.testing.assert_allclose(model.response(x, at), whole, atol=1e-9 * np.max(np.abs(whole)))
 
 
+def test_an_input_that_is_not_held_has_no_alias():
+    rig = load_rig("two_masses")[0]
+    found = next(e for e in effects(rig, 0.7, 40.0) if e.physics == "input_not_held")
+    model, q = Model(rig, (found,)), len(rig.sensor)
+    at = grid(rig, np.linspace(0.7, 40.0, 40), np.arange(q), np.zeros(q, int))
+    x = np.zeros(model.n)
+    plain = Chain(rig).evaluate(at.s)[:, :, 0]
+    np.testing.assert_allclose(model.response(x, at), plain, rtol=1e-8)
+    assert np.all(np.isfinite(model.gradient(x, at)[1]))
+
+
 @pytest.mark.parametrize("physics", ["transport_delay", "actuator_lag"])
 def test_what_turns_the_aliases_has_its_slope(physics: str):
     model, at = on_a_slow_coil(physics)

@@ -171,7 +171,7 @@ class Far:
         """(n, q) what a factor adds to all aliases. own : (n, q) the factor at s itself. passed :
         (..., q) at all of `self.s`."""
         own_few, first, behind = self._apart(passed)
-        mean, turn = _mean(first, behind / first), _turn(own)
+        mean, turn = _mean(first, _over(behind, first)), _turn(own)
         left = np.sum(self.terms * (mean * _turn(own_few).conj() - 1), axis=(0, 1))
         return np.asarray(at.rest * (turn - 1) + self._between(at, left) * turn)
 
@@ -180,8 +180,9 @@ class Far:
     ) -> Complex:
         """(n, q) the slope of `added`. d_own, d_passed : those of the factor."""
         (own_few, first, behind), (d_own_few, *d) = self._apart(passed), self._apart(d_passed)
-        ratio, d_first = behind / first, d[0] / first
-        mean, d_mean = _slope_of_mean(first, ratio, ratio * (d[1] / behind - d_first))
+        ratio, d_first = _over(behind, first), _over(d[0], first)
+        grows = ratio * (_over(d[1], behind) - d_first)
+        mean, d_mean = _slope_of_mean(first, ratio, grows)
         d_mean += mean * d_first
         turn, back = _turn(own), _turn(own_few).conj()
         d_turn, d_back = _turned(own, d_own), _turned(own_few, d_own_few).conj()
@@ -249,6 +250,11 @@ def _slope_of_mean(first: Complex, ratio: Complex, d_ratio: Complex) -> tuple[Co
         d *= 2 * r
         r *= r
     return out, d_out
+
+
+def _over(a: Complex, b: Complex) -> Complex:
+    """a/b, 0 where b is: what is not held has no alias."""
+    return np.divide(a, b, out=np.zeros_like(a), where=b != 0)
 
 
 def _turn(factor: Complex) -> Complex:
