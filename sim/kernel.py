@@ -7,14 +7,17 @@ v[n] out. The plant then moves on by one sample in `inner` exact steps.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from samii_rig.types import Flags, Float, Int, Quality
 from sim.plant import Tables
 
+F = TypeVar("F", bound=Callable[..., Any])
 CLIPPED, LIMITED, MISSING = int(Quality.CLIPPED), int(Quality.LIMITED), int(Quality.MISSING)
 # Columns of a block: the two references, the command, then the sensors.
 U, THETA_REF, V, SENSORS = 0, 1, 2, 3
@@ -163,7 +166,14 @@ def free(tables: Tables) -> Contact:
     return Contact(0.0, 0.0, none, 0.0, 0.0, none, *now, rows, np.zeros(m), none, x, held)
 
 
-@njit(cache=True)
+def part(function: F) -> F:
+    """Let compiled functions call it. It is compiled with them, without how Python and C would
+    call it, and stays Python here."""
+    register_jitable(no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
+    return function
+
+
+@part
 def _touch(g: Contact, s: State, before: float, both: float) -> None:
     """Set the force of contact of one step. before, both : the input on both sides of its
     change."""
@@ -171,7 +181,7 @@ def _touch(g: Contact, s: State, before: float, both: float) -> None:
     g.held[0] = min(max(g.gain * y, -g.most), g.most)
 
 
-@njit(cache=True)
+@part
 def _motion(x: Float, of_force: Float, look: Float, own: Float) -> float:
     """The motion that a force of contact looks at, from the states of the output and its own."""
     y = 0.0
@@ -191,7 +201,7 @@ def contact_now(g: Contact, s: State) -> float:
     return float(min(max(g.at_once * y, -g.most), g.most))
 
 
-@njit(cache=True)
+@part
 def _push(t: Tables, g: Contact) -> None:
     """Move the states of the force of contact on by one step."""
     for q in range(g.x.shape[1]):
@@ -210,7 +220,7 @@ def touched(g: Contact, i: int, force: float) -> float:
     return float(y)
 
 
-@njit(cache=True)
+@part
 def _read(t: Tables, s: State, i: int, old: float, new: float, extra: float) -> float:
     y = t.row_old[i] * old + t.row_new[i] * new + t.row_extra[i] * extra
     x = s.x
@@ -219,7 +229,7 @@ def _read(t: Tables, s: State, i: int, old: float, new: float, extra: float) -> 
     return float(y)
 
 
-@njit(cache=True)
+@part
 def _convert(c: Converters, i: int, n: int, y: float, noise: float) -> tuple[float, int]:
     """One sample of sensor i: its value and its flags."""
     if n >= c.lost[i]:
@@ -236,7 +246,7 @@ def _convert(c: Converters, i: int, n: int, y: float, noise: float) -> tuple[flo
     return y, 0
 
 
-@njit(cache=True)
+@part
 def _feedback(f: Filters, y: Float) -> float:
     """Sum of the loops' outputs for the sensors' values y, (m,), each clipped."""
     total = 0.0
@@ -252,7 +262,7 @@ def _feedback(f: Filters, y: Float) -> float:
     return total
 
 
-@njit(cache=True)
+@part
 def _lost(k: Control, f: Filters, y: Float) -> bool:
     """Whether theta is beyond its limit, or a sensor that a loop reads gives no number."""
     lost = not abs(y[k.theta]) <= k.max_angle
@@ -261,7 +271,7 @@ def _lost(k: Control, f: Filters, y: Float) -> bool:
     return lost
 
 
-@njit(cache=True)
+@part
 def _command(
     c: Converters, k: Control, f: Filters, s: State, u: float, ref: float, given: bool, y: Float
 ) -> tuple[float, int]:
@@ -293,7 +303,7 @@ def _command(
     return v, limited
 
 
-@njit(cache=True)
+@part
 def _friction(d: Drive, speed: float, u: float) -> tuple[float, float]:
     """Dry friction of the drive over one step, as an input, and the speed after the step.
 

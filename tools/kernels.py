@@ -48,12 +48,13 @@ from sim.concealed.runs import Design
 from sim.concealed.trial import make
 from sim.rig import open_rig
 
-two = open_rig(load_rig("samii_two_joints")[0], {})
-two.clock.sleep(0.1)
-two.sensor.read()
 short = Design(levels=(0.1,), bursts=1, burst=9.0, steps=1, periods=1, settle=1, period=2.0)
 make("nothing", 1, Path("first"), load_rig("samii")[1], short)
 trial.make("nothing", 1, Path("second"), load_rig("one_mass")[1], ("clean",))
+# Last: what it has in common with the run is compiled there by now.
+two = open_rig(load_rig("samii_two_joints")[0], {})
+two.clock.sleep(0.1)
+two.sensor.read()
 """
 
 
