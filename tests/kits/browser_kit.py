@@ -17,10 +17,10 @@ from wait_kit import WITHIN, found
 from websockets.sync.client import ClientConnection, connect
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
-# A display of 20 frames a second, as a slow machine has: without one the page draws 60, which takes
+# A display of 10 frames a second, as a slow machine has: without one the page draws 60, which takes
 # half a processor of the machine that the tests share.
 SLOW_DISPLAY = """
-window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 50);
+window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 100);
 window.cancelAnimationFrame = clearTimeout;
 """
 # What a key is to a browser besides its name: number, and the text that it types.
