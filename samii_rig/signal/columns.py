@@ -78,9 +78,10 @@ def shift_of(recording: Recording) -> int:
         return 0
 
     theta, v = (recording.values_of(name)[around] for name in (sensor, command[0]))
-    sent = asked(recording, command[0], kp, around)
+    sent = _beside(asked(recording, command[0], kp, around))
+    v = v[FARTHEST + TAPS : v.size - FARTHEST - TAPS]
     shifts = range(-FARTHEST, FARTHEST + 1)
-    laws = [_Law.of(v, sent, -kp * np.roll(theta, -m)) for m in shifts]
+    laws = [_Law.of(v, sent, _beside(-kp * np.roll(theta, -m))) for m in shifts]
     if not all(law.known for law in laws):
         return 0
     left = [law.left if law.centred else math.inf for law in laws]
@@ -110,23 +111,21 @@ class _Law:
 
     @classmethod
     def of(cls, v: Float, sent: Float, back: Float) -> _Law:
-        inside = slice(FARTHEST + TAPS, v.size - FARTHEST - TAPS)
-
-        def around(x: Float) -> Float:
-            return np.stack([np.roll(x, j)[inside] for j in range(-TAPS, TAPS + 1)], axis=1)
-
-        asked, fed, v = around(sent), around(back), v[inside]
-        known = np.isfinite(v) & np.isfinite(asked).all(axis=1) & np.isfinite(fed).all(axis=1)
-        asked, fed, v = (x[known] - x[known].mean(axis=0) for x in (asked, fed, v))
-        if len(v) <= 2 * FARTHEST:
+        """v (n,) of rows; sent and fed back (2 `TAPS` + 1, n) as `_beside` has them."""
+        known = np.isfinite(v + sent.sum(axis=0) + back.sum(axis=0))
+        if not known.all():
+            v, sent, back = v[known], sent[:, known], back[:, known]
+        if v.size <= 2 * FARTHEST:
             return cls(*[np.nan] * 6)
-        kept = np.ones(len(v), bool)
+        v = v - v.mean()
+        sent, back = (x - x.mean(axis=1, keepdims=True) for x in (sent, back))
+        law, kept = (sent + back).T, np.ones(v.size, bool)
         for _ in range(2):  # again without spikes
-            taps = np.linalg.lstsq((asked + fed)[kept], v[kept], rcond=None)[0]
-            rest = v - (asked + fed) @ taps
+            taps = np.linalg.lstsq(law[kept], v[kept], rcond=None)[0]
+            rest = v - law @ taps
             kept = np.abs(rest) <= SPIKE * np.median(np.abs(rest))
-        b = (fed @ taps)[kept]
-        own = float((v - asked @ taps)[kept] @ b) / max(float(b @ b), np.finfo(float).tiny)
+        b = (taps @ back)[kept]
+        own = float((v - taps @ sent)[kept] @ b) / max(float(b @ b), np.finfo(float).tiny)
         left = float(np.mean(rest[kept] ** 2))
         rest = np.where(kept, rest, 0.0)
         alike = float(rest[1:] @ rest[:-1]) / max(float(rest @ rest), np.finfo(float).tiny)
@@ -148,6 +147,12 @@ class _Law:
         """What it leaves is little, or a meter's noise; another loop leaves what moves slowly."""
         rest = self.part < LEFT**2 or abs(self.alike) < LEFT
         return rest and self.centred and abs(self.fed - 1) < LEFT and abs(self.gain - 1) < LEFT
+
+
+def _beside(x: Float) -> Float:
+    """(2 `TAPS` + 1, n) of x its rows to each side, where every shift has some."""
+    inside = slice(FARTHEST + TAPS, x.size - FARTHEST - TAPS)
+    return np.stack([np.roll(x, j)[inside] for j in range(-TAPS, TAPS + 1)])
 
 
 def asked(recording: Recording, command: str, kp: float, rows: slice = slice(None)) -> Float:
