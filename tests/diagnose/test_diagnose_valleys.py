@@ -17,6 +17,7 @@ from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.refit import profiled, refit
 from samii_rig.diagnose.fit.search import PENALISED, Search
+from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.physics import channels
 from samii_rig.diagnose.physics.channels import METERED
 from samii_rig.diagnose.physics.model import Model, grid
@@ -127,6 +128,22 @@ def test_what_an_effect_explains_at_some_lines_only_is_unknown(even: bool, verdi
     looked = by_record._Looked(judged, 2.0, 1.0, None)
     assert by_record._even(forces, search, looked).judged.verdict == verdict
     assert asked == [(nominal, best)]
+
+
+@pytest.mark.parametrize(("left", "even"), [(5000.0, False), (5990.0, True)])
+def test_lines_at_which_nothing_is_left_of_an_effect_do_not_judge_it(
+    left: float, even: bool
+) -> None:
+    """A refit to more lines, of which a model leaves more than noise, may lose what is there."""
+    ends = iter([SimpleNamespace(chi2=6000.0), SimpleNamespace(chi2=left)])
+    forces = SimpleNamespace(
+        refitted=lambda *_, **__: next(ends),
+        critical_value=28.0,
+        unexplained=lambda _: [],
+        _even=lambda *_: 0.0,
+    )
+    base, best = SimpleNamespace(effects=()), SimpleNamespace(effects=("hung",))
+    assert ForceSearch.explains_evenly(forces, base, best) is even
 
 
 def of(chi2, *effects):

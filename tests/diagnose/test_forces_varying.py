@@ -381,6 +381,14 @@ def test_which_spring_swings_is_decided_without_the_swing_in_the_noise(
     assert found.parameters["f"].value == pytest.approx(1.0, rel=0.01)
 
 
+def test_what_is_gone_once_the_rig_moves_as_it_is_fitted_does_not_vary(
+    nothing: ForceSearch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = iter([[("joint_2", Modulation(0.7, 40.0, 6, 1e-6))]])
+    monkeypatch.setattr(Springs, "strongest", lambda *_: next(found, []))
+    assert variation(BySpring.of(nothing, replace(nothing.nominal)), 3) is None
+
+
 def shown_by(each: list[tuple[float, float]]) -> Modulation:
     """A modulation of two phases in each of some records. each : chi-square, known."""
     rows = np.array([(chi2, 2.0, known) for chi2, known in each])

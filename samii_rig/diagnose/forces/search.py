@@ -207,10 +207,11 @@ class ForceSearch(RecordSearch):
 
     def explains_evenly(self, before: Explanation, after: Explanation) -> bool:
         """Whether what one linear explanation has more than another shows at all lines of these
-        records as it should; so where it cannot be refitted to them."""
+        records as it should; so where it cannot be refitted to them. Their lines are among these:
+        where nothing is left of what it explained there, these are not understood well enough."""
         a = self.refitted(before.effects, before, far=False)
         b = self.refitted(after.effects, after, far=False)
-        if a is None or b is None:
+        if a is None or b is None or b.chi2 > a.chi2 - self.critical_value:
             return True
         return self._even(self.unexplained(a), self.unexplained(b), b) > LINEAR_INCONSISTENT
 

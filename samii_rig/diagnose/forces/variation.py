@@ -148,6 +148,8 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     tried = [one.settled(best) for one in tried if one.evidence >= least]
     tried.sort(key=lambda one: -one.evidence)
     taken = tried[0]
+    if not taken.modulations:  # once the rig moves as it is fitted, nothing of it varies
+        return None
     before = taken.residuals(search.levels, best.fitted)
     after = taken.residuals(taken.search.levels, taken.fitted)
     each = 2.0 * search.levels.sensor.size
