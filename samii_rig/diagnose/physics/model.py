@@ -123,7 +123,6 @@ def _blocks() -> list[tuple[int, int]]:
 
 
 FAR = tuple(_blocks())
-SEVERAL = sum(many == 1 for _, many in FAR)  # first block of more than one order
 
 
 @dataclass(frozen=True, slots=True)
