@@ -144,12 +144,14 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     for one in tried:
         one.closer(best)
     tried.sort(key=lambda one: -one.evidence)
+    # Once the rig moves as it is fitted, it may be that nothing of it varies.
+    tried = [one for one in tried if one.modulations]
+    if not tried or tried[0].evidence <= nothing:
+        return None
     least = nothing + RIVAL * (tried[0].evidence - nothing)
     tried = [one.settled(best) for one in tried if one.evidence >= least]
     tried.sort(key=lambda one: -one.evidence)
     taken = tried[0]
-    if not taken.modulations:  # once the rig moves as it is fitted, nothing of it varies
-        return None
     before = taken.residuals(search.levels, best.fitted)
     after = taken.residuals(taken.search.levels, taken.fitted)
     each = 2.0 * search.levels.sensor.size
