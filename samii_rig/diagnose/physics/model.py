@@ -123,6 +123,10 @@ def _blocks() -> list[tuple[int, int]]:
 
 
 FAR = tuple(_blocks())
+# The blocks that are 2, 4, 8 ... orders long at least.
+DOUBLED = tuple(
+    slice(sum(many < 1 << i for _, many in FAR), None) for i in range(1, FAR[-1][1].bit_length())
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,27 +147,25 @@ class Far:
         few = np.interp(np.linspace(0, few.size - 1, FAR_POINTS), np.arange(few.size), few)
         s = np.asarray(2j * np.pi * few, np.complex128)
 
-        def there(orders: Sequence[int]) -> Complex:
-            turns = 2j * np.pi * rig.rate_hz * np.array(orders)
-            return np.asarray(s + turns[:, None])
+        def there(orders: Int) -> Complex:
+            return np.asarray(s + 2j * np.pi * rig.rate_hz * orders[:, None])
 
         each, terms = [], []
-        asked = sum(k <= ASKED for k, _ in FAR)
+        order, many = np.array(FAR).T
+        asked = int(np.count_nonzero(order <= ASKED))
         lines = few[:, None] / rig.rate_hz
         for way in (1, -1):
-            known = [way * k for k, _ in FAR[:asked]]
+            known = (way * order[:asked]).tolist()
             T = _terms(rig, chain, s, known, sensor, actuator) / _held(s, rig.rate_hz)
             size = np.sum(np.abs(T[[asked - 1 - BLOCKS, asked - 1]]), axis=1)  # an octave apart
             with np.errstate(divide="ignore", invalid="ignore"):
                 falls = np.log2(size[0] / size[1])
             falls = np.clip(np.where(np.isfinite(falls), falls, np.inf), 1.0, STEEPEST)
             # Of an order k a term is that of s/rate = 2 pi j (k + f/rate), to a power.
-            first = np.array([k for k, _ in FAR])[:, None, None] + way * lines
-            many = np.array([many for _, many in FAR])[:, None, None]
+            first = order[:, None, None] + way * lines
             last = (first[asked - 1] / first[asked:]) ** falls * T[-1]
-            terms.append(np.concatenate([T, last]) * _summed(first, many, falls))
-            each.append(there([way * k for k, _ in FAR]))
-            each.append(there([way * (k + 1) for k, _ in FAR]))
+            terms.append(np.concatenate([T, last]) * _summed(first, many[:, None, None], falls))
+            each += [there(way * order), there(way * (order + 1))]
         return cls(few, np.concatenate([s[None], *each]).ravel(), np.array(terms))
 
     def added(self, at: Grid, own: Complex, passed: Complex) -> Complex:
@@ -219,18 +221,11 @@ def _summed(first: Float, many: Int, falls: Float) -> Float:
     return np.where(many == 1, 1.0, whole)
 
 
-def _doublings() -> Iterator[slice]:
-    """The blocks that are 2, 4, 8 ... orders long at least."""
-    many = [many for _, many in FAR]
-    for i in range(1, many[-1].bit_length()):
-        yield slice(sum(n < 1 << i for n in many), None)
-
-
 def _mean(first: Complex, ratio: Complex) -> Complex:
     """(2, n, m, q) of a factor over each block, of its value at the first order and by how much it
     is larger at each next: 1 + r + ... + r^{2 k - 1} = (1 + r^k) (1 + r + ... + r^{k - 1})."""
     out, power = first.copy(), ratio.copy()
-    for on in _doublings():
+    for on in DOUBLED:
         r = power[:, on]
         out[:, on] *= 0.5 + 0.5 * r
         r *= r
@@ -241,7 +236,7 @@ def _slope_of_mean(first: Complex, ratio: Complex, d_ratio: Complex) -> tuple[Co
     """(2, n, m, q) the same, and its slope by the ratio."""
     out, power = first.copy(), ratio.copy()
     d_out, d_power = np.zeros_like(out), d_ratio.copy()
-    for on in _doublings():
+    for on in DOUBLED:
         r, d = power[:, on], d_power[:, on]
         d_out[:, on] *= 0.5 + 0.5 * r
         d_out[:, on] += 0.5 * out[:, on] * d
@@ -264,8 +259,7 @@ def _turn(factor: Complex) -> Complex:
 
 def _turned(factor: Complex, d: Complex) -> Complex:
     """The slope of `_turn`, d that of the factor."""
-    angle = np.divide(d, factor, out=np.zeros_like(factor), where=factor != 0).imag
-    return np.asarray(1j * angle * _turn(factor))
+    return np.asarray(1j * _over(d, factor).imag * _turn(factor))
 
 
 @dataclass(frozen=True, slots=True)
@@ -485,9 +479,11 @@ class _Passed:
 
 def _through(
     at: Grid, folded: Folded, near: _Passed | None, beyond: _Passed | None
-) -> tuple[Complex, Complex, Complex]:
-    """(n, q) hold, filters and delays of a grid, its aliases, and of these the ones that are no
-    model's own, each times its factors. folded : of the model."""
+) -> tuple[Complex, Complex]:
+    """(n, q) hold, filters and delays of a grid and its aliases, each times its factors. folded :
+    of the model."""
+    if near is None and folded.times is None:
+        return at.factor, at.aliases
     rest, each, factor = at.rest, folded.near, at.factor
     if near is not None:
         each, factor = each * near.F[1:], np.asarray(factor * near.F[0])
@@ -495,8 +491,7 @@ def _through(
             rest = rest + at.far.added(at, near.F[0], beyond.F[0])
     if folded.times is not None:
         rest = folded.times * rest
-    far = np.asarray(rest + np.sum(each[OWN:], axis=0))
-    return factor, np.asarray(far + np.sum(each[:OWN], axis=0)), far
+    return factor, np.asarray(rest + np.sum(each, axis=0))
 
 
 class Model:
@@ -588,7 +583,7 @@ class Model:
         """(n, q) at the grid's frequencies."""
         chain = self.chain.with_values(self.values(x))
         G, folded = at.response_and_folded(chain.evaluate(at.asked())[:, at.sensor, at.actuator])
-        factor, aliases, _ = _through(at, folded, *self._passed(x, at))
+        factor, aliases = _through(at, folded, *self._passed(x, at))
         H = np.asarray(G * factor + aliases)
         return H if at.loop is None else at.loop.closed(H)
 
@@ -600,17 +595,19 @@ class Model:
         every, slopes = chain.gradient_at(at.asked(), keys)
         G, folded = at.response_and_folded(every[:, at.sensor, at.actuator])
         near, beyond = self._passed(x, at)
-        factor, aliases, far = _through(at, folded, near, beyond)
+        factor, aliases = _through(at, folded, near, beyond)
         own, *folds = at.by_alias(slopes[:, at.sensor, at.actuator])
         dG = own * factor[:, :, None]
-        larger = np.zeros(dG.shape[1:])
+        far, larger = aliases, np.zeros(dG.shape[1:])
         for i, (k, d) in enumerate(zip(NEAR, folds, strict=False)):
             assert at.own_aliases is not None
-            by, d = at.own_aliases[i], _lower(d, k)
-            dG += d * (by if near is None else by * near.F[1 + i])[:, :, None]
-            own = folded.near[i]
-            part = np.divide(by, own, out=np.zeros_like(own), where=own != 0) / (OWN * len(own))
+            by, d, alias = at.own_aliases[i], _lower(d, k), folded.near[i]
+            part = _over(by, alias) / (OWN * len(alias))
             larger += np.matmul(part.T[:, None, :], d.swapaxes(0, 1))[:, 0].real
+            if near is not None:
+                by, alias = by * near.F[1 + i], alias * near.F[1 + i]
+            dG += d * by[:, :, None]
+            far = far - alias
         if folds:
             dG += far[:, :, None] * larger  # the slope of `Folded.times`
         dH = np.zeros((*G.shape, self.n), complex)
