@@ -49,10 +49,13 @@ class Command:
     """What one of the records behind a piece told the rig, and its part in the piece.
 
     v : as recorded, of the shape of r. part : the piece's r and z have so many times this record's.
+    meter : of each input, the standard deviation of a meter's noise that was taken out of r as far
+    as the record shows it.
     """
 
     v: Float
     part: float
+    meter: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,26 +245,27 @@ def _driving_columns(recording: Recording, wired: Wiring) -> set[str]:
 
 def _driving(
     recording: Recording, x: Input, values: Float, sensors: Sequence[str], *, slower: bool
-) -> tuple[Float, Float, NDArray[np.bool_]]:
-    """(n,) of an input: the command, what drives its loop, and where it has edges.
+) -> tuple[Float, Float, NDArray[np.bool_], float]:
+    """(n,) of an input: the command, what drives its loop, and where it has edges; the standard
+    deviation of a meter's noise that was on what drives its loop.
 
     values : (n, q) of the sensors. slower : whether not every sample of the rig was recorded.
     """
     if not _has(recording, x.command):
         still = np.zeros(len(values))
-        return still, still, np.zeros(len(values), np.bool_)
+        return still, still, np.zeros(len(values), np.bool_), 0.0
     recording = of_input(recording, x.command)
     column = recording.column(x.command)
     theta = values[:, sensors.index(x.centring)] if x.kp else None
     v, edges = inputs.sent(recording, column, x.kp, theta)
     if slower:
         edges = edges | inputs.jumps(recording, column, x.kp, theta)
-    r = v.copy()
+    r, meter = v.copy(), 0.0
     if theta is not None:
         r += x.kp * theta
     if not recording.names("reference"):
-        r = inputs.calibrated(r, recording.channels[column].resolution)
-    return v, r, edges
+        r, meter = inputs.calibrated(r, recording.channels[column].resolution)
+    return v, r, edges, meter
 
 
 def _beside(each: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -279,6 +283,7 @@ class _Samples:
     """All samples of a recording in turn, those that short gaps have lost included.
 
     v, r : (n,) or (n, m) of the inputs, edges : of their jumps. values : (n, q) of the sensors.
+    meter : of each input, as of `Command`.
     unknown : (gaps,) whether the input there is a guess. slower : as of `_driving`.
     """
 
@@ -287,6 +292,7 @@ class _Samples:
     r: Float
     edges: NDArray[np.bool_]
     values: Float
+    meter: tuple[float, ...]
     unknown: NDArray[np.bool_]
     slower: bool
 
@@ -298,10 +304,13 @@ class _Samples:
             _driving(whole.recording, x, values, wired.sensors, slower=slower) for x in wired.inputs
         ]
         unknown = np.zeros(len(whole.lost), np.bool_)
-        for _, r, _ in each:
+        for _, r, _, _ in each:
             unknown |= bridge(r, whole.lost) > KNOWN * np.sqrt(np.mean(r**2))
-        v, r, edges = (_beside([one[i] for one in each]) for i in range(3))
-        return cls(whole, v, r, edges, values, unknown, slower)
+        v = _beside([one for one, _, _, _ in each])
+        r = _beside([one for _, one, _, _ in each])
+        edges = _beside([one for _, _, one, _ in each])
+        meter = tuple(one for _, _, _, one in each)
+        return cls(whole, v, r, edges, values, meter, unknown, slower)
 
 
 def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float) -> list[Piece]:
@@ -314,7 +323,7 @@ def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float)
         first = low - history
         # Whatever came before the history may still ring.
         moving = low > history
-        told = Command(samples.v[first:high], 1.0)
+        told = Command(samples.v[first:high], 1.0, samples.meter)
         z, struck = spikes.mended(samples.values[low:high], step)
         piece = Piece(name, samples.r[first:high], z, history, (level,), moving, commands=(told,))
         own = samples.edges[first:high].reshape(high - first, -1)
@@ -452,7 +461,7 @@ def _turned(group: list[Piece], scale: Float | None, *, levels: bool) -> Piece:
         tuple(s for p in group for s in p.repeats) + (() if levels else others),
         tuple(s for p in group for s in p.contrasts) + (others if levels else ()),
         tuple(
-            Command(told.v, float(part) * told.part)
+            Command(told.v, float(part) * told.part, told.meter)
             for part, p in zip(U[0], group, strict=True)
             for told in p.commands
         ),

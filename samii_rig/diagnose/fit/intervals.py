@@ -23,6 +23,9 @@ from samii_rig.types import Float
 Bools = NDArray[np.bool_]
 
 TAIL = 0.05  # of the draws, beyond either end of an interval of 90 %
+# Of every error, for that of the noise and of the model: of 250 intervals of concealed trials 87 %
+# held the truth without it, 90 % with it.
+WIDER = 1.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +102,7 @@ def drawn(explanation: Explanation, overdispersion: float) -> list[dict[str, Dra
     fitted = explanation.fitted
     model, x = fitted.model, fitted.x
     n = model.n_nominal
-    cov = fitted.covariance()[n:, n:] * overdispersion
+    cov = fitted.covariance()[n:, n:] * (overdispersion * WIDER**2)
     rng = np.random.default_rng(0)
     draws = rng.multivariate_normal(x[n:], cov, DRAWS, method="eigh") if x.size > n else None
     out = []

@@ -48,7 +48,7 @@ EXCITED, PARTS = 0.003, 3
 # The same, from which on an input moves a rig by more than its noise: a thousandth in amplitude. A
 # square wave does so far above its band.
 DRIVES = 1e-6
-METER = 9.0  # times a converter's rounding, power of an input that is more than that
+METER = 9.0  # times a converter's rounding or a meter's noise, power of an input that is more
 HARMONIC = 3  # the lowest that a force makes which is alike both ways
 # Lines to which harmonics may add: a quadratic form of so many takes 5 s of a core. Many records
 # show a force at the lines of their excitation too.
@@ -136,7 +136,8 @@ class Whole:
         records, most = self.records, HIGHEST * self.records.rate_hz
         times = min(float(HARMONIC), max(MOST_LINES / records.count, 1.0))
         bands = tuple((low, min(times * high, most)) for low, high in records.bands)
-        reached = excited(records.pieces, records.rate_hz, part=DRIVES)
+        meter = np.max([c.meter for p in records.pieces for c in p.commands], axis=0)
+        reached = excited(records.pieces, records.rate_hz, meter**2, part=DRIVES)
         driven = max(records.band[1], *(band[1] for band in reached if band))
         return replace(self, records=replace(records, bands=bands, driven=driven))
 
@@ -301,7 +302,8 @@ def _records(
 ) -> Records:
     """Those that anything drives. rounding : (m,) of each input's converter, its power. slower :
     whether not every sample of the rig was recorded."""
-    bands_of = excited(pieces, rate_hz, rounding)
+    several = rounding.size > 1  # a rig's only input is never at rest
+    bands_of = excited(pieces, rate_hz, rounding if several else None)
     if slower:
         tops = [_unfolded(p, rate_hz) for p in pieces]
         bands_of = [
@@ -316,17 +318,16 @@ def _records(
 
 
 def excited(
-    pieces: Sequence[Piece], rate_hz: float, rounding: Float | None = None, part: float = EXCITED
+    pieces: Sequence[Piece], rate_hz: float, noise: Float | None = None, part: float = EXCITED
 ) -> list[tuple[float, float] | None]:
     """Hz, of each piece the band in which an input has more than a small part of its largest
     energy in any; None for one that nothing drives: what is left of a sweep behind a gap.
 
-    rounding : (m,) of several inputs the power of each one's converter; one that never has more is
-    at rest.
+    noise : (m,) power of each input that is none; one that never has more is at rest.
     """
     each = [[_energy(r, rate_hz) for r in by_input(p.r)] for p in pieces]
     most = np.max([[np.max(power) for _, power, _ in inputs] for inputs in each], axis=0)
-    still = np.zeros(most.size) if rounding is None or most.size == 1 else METER * rounding
+    still = np.zeros(most.size) if noise is None else METER * noise
     out: list[tuple[float, float] | None] = []
     for piece, inputs in zip(pieces, each, strict=True):
         edges = inputs[0][0]

@@ -69,6 +69,13 @@ class ForceModel(Model):
         rows = [own[self.unknowns.index(j)] if j in self.unknowns else by_scale for j in moving]
         return np.ascontiguousarray(rows, np.float64).reshape(-1, 2)
 
+    def metered(self, command: str) -> bool:
+        """Whether a meter recorded a command, which its rig followed between samples, too."""
+        return any(
+            e.rough and not e.physical and e.factor is not None and e.factor.channel == command
+            for e in self.effects
+        )
+
     def channels(
         self, x: Float, s: Complex
     ) -> tuple[dict[str, Complex], dict[str, Complex]] | None:

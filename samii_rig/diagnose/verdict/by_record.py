@@ -103,6 +103,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         last = discrepant = DiscrepantSearch(search)
         discrepant.settle()
         looked = _consistent(discrepant, _looked(discrepant))
+        if looked.judged.verdict == "no_mismatch":  # beside what no law describes
+            looked = _unknown(looked)
     return _agreeing(case, last, first, bands, looked, [given])
 
 
@@ -173,6 +175,10 @@ def _looked(search: RecordSearch) -> _Looked:
         judged = verdict.confirmed(judged)
     judged = verdict.shown(judged, gap, judged.evidence.drop / (TURN - 1))
     return _Looked(judged, plain, after, gap)
+
+
+def _unknown(looked: _Looked) -> _Looked:
+    return replace(looked, judged=replace(looked.judged, verdict="unknown"))
 
 
 def _at_first(search: RecordSearch) -> tuple[float, tuple[Band, ...]]:
@@ -275,8 +281,7 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
     seen = None if _is_linear(judged) else BySpring.of(forces, base)
     sides = uneven_spring(seen) if seen else None
     if sides is not None and sides.chi2 / 2 > rival:
-        unknown = replace(judged, verdict="unknown")
-        return replace(looked, judged=unknown, remarks=(*looked.remarks, sides.describe()))
+        return replace(_unknown(looked), remarks=(*looked.remarks, sides.describe()))
     physical = any(e.physical for e in judged.best.effects)
     least = rival if physical else max(rival, VARIES)
     found = variation(seen, files) if seen and seen.evidence > least else None
@@ -299,7 +304,7 @@ def _even(forces: ForceSearch | None, search: RecordSearch, looked: _Looked) -> 
         return looked
     if forces.explains_evenly(verdict.as_meant(search, judged.best), judged.best):
         return looked
-    return replace(looked, judged=replace(judged, verdict="unknown"))
+    return _unknown(looked)
 
 
 def _is_linear(judged: Judgement) -> bool:
@@ -319,7 +324,6 @@ def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
         f"the records disagree: chi-square per degree of freedom {left:.3g} of what no linear "
         "model can explain, so something depends on amplitude or changed between runs",
     )
-    judged = looked.judged
-    if judged.verdict == "no_mismatch" or left > DIFFER:
-        judged = replace(judged, verdict="unknown")
-    return replace(looked, judged=judged, remarks=remarks)
+    if looked.judged.verdict == "no_mismatch" or left > DIFFER:
+        looked = _unknown(looked)
+    return replace(looked, remarks=remarks)
