@@ -49,6 +49,7 @@ JUMP, REST = 0.01, 4
 # An input that is smooth on both sides of a jump or a turn bends there this many times as much as
 # anywhere within so many samples.
 BENT, SMOOTH = 8.0, 16
+SURE = 6.0  # standard deviations of what noise bends: of 1e8 samples none are beyond
 
 
 def sent(
@@ -77,19 +78,20 @@ def sent(
     return np.where(np.isfinite(drawn), drawn, v), far
 
 
-def calibrated(r: Float, step: float) -> Float:
+def calibrated(r: Float, step: float) -> tuple[Float, float]:
     """(n,) the input as likely as a meter's white noise on r (n,) leaves it: every line by the part
     of its power that is not noise (regression calibration: Carroll et al. 2006, Measurement Error
-    in Nonlinear Models, ch. 4). r itself where the meter shows none, or the input is as wide as
-    what was recorded.
+    in Nonlinear Models, ch. 4). A line shows that part by itself where it stands out alone, the
+    others together with their neighbours. r itself where the meter shows none, or the input is as
+    wide as what was recorded. And the standard deviation of that noise.
 
     step : of the command's converter, whose rounding is the input's own.
     """
     floor = meter_noise(r, step) ** 2
     if floor == 0:
         return r, 0.0
-    mean = np.mean(r)
-    x = r - mean
+    known: Float = _stairs(r, math.sqrt(floor)) + float(np.mean(r))
+    x: Float = r - known
     way = np.concatenate([_on(x[::-1])[::-1], x, _on(x)])
     spectrum = np.fft.rfft(way)
     power = np.abs(spectrum) ** 2 / r.size
@@ -99,8 +101,19 @@ def calibrated(r: Float, step: float) -> Float:
     expected = np.where(power > clear, power, np.where(loud, around, 0.0))
     spectrum *= 1 - floor / np.maximum(expected, floor)
     more = (way.size - r.size) // 2
-    own = np.fft.irfft(spectrum, way.size)[more : more + r.size] + mean
-    return np.asarray(own), math.sqrt(floor)
+    own: Float = known + np.fft.irfft(spectrum, way.size)[more : more + r.size]
+    return own, math.sqrt(floor)
+
+
+def _stairs(r: Float, noise: float) -> Float:
+    """(n,) the jumps of r (n,) that stand out of a meter's noise, less how it goes on beside them:
+    each of their lines may have less than the noise has. noise : its standard deviation."""
+    d = np.diff(r)
+    steps = np.zeros(d.size)
+    for i in np.flatnonzero(_bends(r, 0.0, noise)):  # a meter may show both sides between
+        some = slice(max(i - 1, 0), i + 2)
+        steps[some] = d[some] - (d[max(i - 2, 0)] + d[min(i + 2, d.size - 1)]) / 2
+    return np.asarray(np.append(0.0, np.cumsum(steps)))
 
 
 def _on(x: Float) -> Float:
@@ -164,9 +177,9 @@ def jumps(recording: Recording, command: int, kp: float, theta: Float | None) ->
     return found
 
 
-def _bends(u: Float, least: float) -> NDArray[np.bool_]:
+def _bends(u: Float, least: float, noise: float = 0.0) -> NDArray[np.bool_]:
     """(n - 1,) of an input u (n,) the steps d = diff(u) at which it does not go on as it came: by
-    more than `least`, d leaves the oscillation d[i + 1] + d[i - 1] = 2 cos(w) d[i], whose w is that
+    more than `least`, and than white noise on u of a standard deviation may, d leaves the oscillation d[i + 1] + d[i - 1] = 2 cos(w) d[i], whose w is that
     of `SMOOTH` samples before, behind, or on both sides: there a sweep's own change of w cancels.
     """
     d = np.diff(u)
@@ -180,7 +193,9 @@ def _bends(u: Float, least: float) -> NDArray[np.bool_]:
         sides[:SMOOTH], sides[-SMOOTH:] = behind, before  # a convolution turns them round
         turn, power = (np.convolve(x, sides, "same") for x in (mid * both, 2 * mid**2))
         cosine = np.divide(turn, power, out=np.ones_like(power), where=power > 0)
-        bent = np.minimum(bent, np.abs(both - 2 * np.clip(cosine, -1.0, 1.0) * mid))
+        twice = 2 * np.clip(cosine, -1.0, 1.0)
+        by_noise = SURE * noise * np.sqrt(2 + 2 * (1 + twice) ** 2)
+        bent = np.minimum(bent, np.maximum(np.abs(both - twice * mid) - by_noise, 0.0))
     around = np.ones(2 * SMOOTH + 1, np.bool_)
     around[SMOOTH - REST : SMOOTH + REST + 1] = False  # what the same jump bends
     beside = ndimage.maximum_filter(bent, footprint=around)

@@ -264,7 +264,9 @@ def _driving(
     if theta is not None:
         r += x.kp * theta
     if not recording.names("reference"):
-        r, meter = inputs.calibrated(r, recording.channels[column].resolution)
+        noisy = r
+        r, meter = inputs.calibrated(noisy, recording.channels[column].resolution)
+        v = v + (r - noisy)
     return v, r, edges, meter
 
 

@@ -172,6 +172,22 @@ def test_a_meters_noise_is_none_of_an_input_that_is_cut(kind: str) -> None:
     assert np.mean(power[above]) < 0.05 * meter**2
 
 
+@pytest.mark.parametrize("behind", [1.0, 0.5])
+def test_the_jumps_of_steps_stay_as_sharp_as_they_are(behind: float) -> None:
+    """Line by line they are below a meter's noise. behind : part of a jump that a sample shows
+    which a meter reads at its instant."""
+    rng, n, meter = np.random.default_rng(7), 12000, 4 * METER
+    r = np.zeros(n)
+    for at, size in ((2000, 0.4), (5000, -0.7), (9000, 0.3)):
+        r[at:] += size
+        r[at] -= (1 - behind) * size
+    made, noise = calibrated(r + meter * rng.standard_normal(n), STEP)
+    assert noise == pytest.approx(meter, rel=0.1)
+    off = made - r
+    assert np.max(np.abs(off)) < 5 * meter
+    assert np.std(off) < 0.3 * meter
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_binary_input_is_as_wide_as_noise_and_is_none(seed: int) -> None:
     v = 0.5 * np.sign(np.repeat(np.random.default_rng(seed).standard_normal(500), 10))
