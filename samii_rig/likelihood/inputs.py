@@ -110,7 +110,7 @@ def _stairs(r: Float, noise: float) -> Float:
     each of their lines may have less than the noise has. noise : its standard deviation."""
     d = np.diff(r)
     steps = np.zeros(d.size)
-    for i in np.flatnonzero(_bends(r, 0.0, noise)):  # a meter may show both sides between
+    for i in np.flatnonzero(_bends(r, 0.0, noise)).tolist():  # a meter may show both sides between
         some = slice(max(i - 1, 0), i + 2)
         steps[some] = d[some] - (d[max(i - 2, 0)] + d[min(i + 2, d.size - 1)]) / 2
     return np.asarray(np.append(0.0, np.cumsum(steps)))
@@ -179,8 +179,9 @@ def jumps(recording: Recording, command: int, kp: float, theta: Float | None) ->
 
 def _bends(u: Float, least: float, noise: float = 0.0) -> NDArray[np.bool_]:
     """(n - 1,) of an input u (n,) the steps d = diff(u) at which it does not go on as it came: by
-    more than `least`, and than white noise on u of a standard deviation may, d leaves the oscillation d[i + 1] + d[i - 1] = 2 cos(w) d[i], whose w is that
-    of `SMOOTH` samples before, behind, or on both sides: there a sweep's own change of w cancels.
+    more than `least`, and than white noise on u of a standard deviation may, d leaves the
+    oscillation d[i + 1] + d[i - 1] = 2 cos(w) d[i], whose w is that of `SMOOTH` samples before,
+    behind, or on both sides: there a sweep's own change of w cancels.
     """
     d = np.diff(u)
     out = np.zeros(d.size, np.bool_)

@@ -113,8 +113,8 @@ def anything(seen: BySpring, _files: int) -> Variation | None:
     return Variation(
         sites=(("joint_1", 1.0),),
         parameters={"depth": Value(0.01, "1", 0.009, 0.011), "f": Value(1.0, "Hz", 0.99, 1.01)},
-        evidence=1e9, gain=1e9, before=(9.0, 9.0), after=(1.0, 1.0), gap=Gap(1.0, 0.99, 1.0),
-        inside=True, again=True,
+        evidence=1e9, likelihood=1e9, gain=1e9, before=(9.0, 9.0), after=(1.0, 1.0),
+        gap=Gap(1.0, 0.99, 1.0), inside=True, again=True,
     )  # fmt: skip
 
 

@@ -57,9 +57,10 @@ class Variation:
 
     sites : (site, probability among springs that may be the one), the likeliest first.
     parameters : of the largest change there, by symbol. evidence : logarithm of the likelihood that
-    it adds, in units of the noise without it, which holds what varies. All else is in units of the
-    noise with it. gain : of chi-square on the lines fitted. before, after : chi-square per degree
-    of freedom without it and with it, on the lines fitted and on those shown. gap : on those shown.
+    it adds, in units of the noise without it, which holds what varies. likelihood : its logarithm
+    as of `likelihood`, less what was sought. All else is in units of the noise with it.
+    gain : of chi-square on the lines fitted. before, after : chi-square per degree of freedom
+    without it and with it, on the lines fitted and on those shown. gap : on those shown.
     inside : whether what it leaves of the lines fitted is no more than noise. again : whether
     records of one level differ, or one in itself, so that it is no law of the amplitude, and that
     faster than what wanders; where the stiffness is constant in each, in several recordings; and
@@ -69,6 +70,7 @@ class Variation:
     sites: tuple[tuple[str, float], ...]
     parameters: dict[str, Value]
     evidence: float
+    likelihood: float
     gain: float
     before: tuple[float, float]
     after: tuple[float, float]
@@ -146,12 +148,15 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     tried.sort(key=lambda one: -one.evidence)
     # Once the rig moves as it is fitted, it may be that nothing of it varies.
     tried = [one for one in tried if one.modulations]
-    if not tried or tried[0].evidence <= nothing:
+    if not tried:
         return None
-    least = nothing + RIVAL * (tried[0].evidence - nothing)
-    tried = [one.settled(best) for one in tried if one.evidence >= least]
-    tried.sort(key=lambda one: -one.evidence)
+    # A first round that is far off the frequency may gain nothing yet.
+    least = nothing + RIVAL * max(tried[0].evidence - nothing, 0.0)
+    some = [one for one in tried if one.evidence >= least] or tried[:1]
+    tried = sorted((one.settled(best) for one in some), key=lambda one: -one.evidence)
     taken = tried[0]
+    if taken.evidence <= nothing:
+        return None
     before = taken.residuals(search.levels, best.fitted)
     after = taken.residuals(taken.search.levels, taken.fitted)
     each = 2.0 * search.levels.sensor.size
@@ -169,6 +174,7 @@ def variation(seen: BySpring, files: int) -> Variation | None:
         sites=tuple(zip(names, (p / p.sum()).tolist(), strict=True)),
         parameters=parameters,
         evidence=seen.evidence,
+        likelihood=taken.evidence,
         gain=gain,
         before=(float(np.mean(before[0])), float(np.mean(before[1]))),
         after=(float(np.mean(after[0])), float(np.mean(after[1]))),
@@ -245,16 +251,10 @@ class _Taken:
 
     @property
     def evidence(self) -> float:
-        """Logarithm of the likelihood of the records, the noise its own: that of the lines fitted,
-        less what phases and frequencies that were looked for add by themselves."""
-        each = _some(self.search.unexplained(self.fitted))
-        found = sum(
-            len(x.white) * float(np.sum(2 * np.linalg.slogdet(x.root)[1]))
-            - float(np.sum(np.abs(x.white) ** 2)) / 2
-            for x in each
-        )
+        """As of `likelihood`, less what phases and frequencies that were looked for add by
+        themselves."""
         sought = sum(one.chi2 / 2 - one.evidence for one in self.modulations)
-        return found - self.fitted.penalty / 2 - sought
+        return likelihood(self.search, self.fitted) - sought
 
     def closer(self, best: Explanation) -> bool:
         """Take out what varies still, and make the likelihood anew. False if noise could do it."""
@@ -357,6 +357,27 @@ class _Taken:
         seen = [x[:, m].ravel() for x, m in zip(own, on, strict=True)]
         kept = [x[:, ~m].ravel() for x, m in zip(own, on, strict=True)]
         return np.concatenate(seen), np.concatenate(kept)
+
+
+def likelihood(search: ForceSearch, fitted: Fitted) -> float:
+    """Logarithm of the likelihood of the lines fitted, the noise that of the search."""
+    each = _some(search.unexplained(fitted))
+    found = sum(
+        len(x.white) * float(np.sum(2 * np.linalg.slogdet(x.root)[1]))
+        - float(np.sum(np.abs(x.white) ** 2)) / 2
+        for x in each
+    )
+    return found - fitted.penalty / 2
+
+
+def of_its_own(search: ForceSearch, explanation: Explanation) -> float:
+    """As `likelihood`, of a linear explanation with the noise that it leaves; -inf where it is no
+    rig on these records."""
+    fitted = search.refitted(explanation.effects, explanation, far=False)
+    if fitted is None:
+        return -math.inf
+    own = search.on(search.levels, fitted)
+    return likelihood(own, own.refitted(explanation.effects, explanation, far=False) or fitted)
 
 
 def _repeats_differ(pieces: Sequence[PieceModulation], hz: float) -> bool | None:

@@ -15,7 +15,13 @@ from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import TURN, Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
-from samii_rig.diagnose.forces.variation import BySpring, Variation, uneven_spring, variation
+from samii_rig.diagnose.forces.variation import (
+    BySpring,
+    Variation,
+    of_its_own,
+    uneven_spring,
+    variation,
+)
 from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
@@ -284,7 +290,12 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
         return replace(_unknown(looked), remarks=(*looked.remarks, sides.describe()))
     physical = any(e.physical for e in judged.best.effects)
     least = rival if physical else max(rival, VARIES)
-    found = variation(seen, files) if seen and seen.evidence > least else None
+    # What leaves more than noise has had that for noise: each is held against its own.
+    linear = physical and judged.partly and all(e.force is None for e in judged.best.effects)
+    found = variation(seen, files) if seen and (linear or seen.evidence > least) else None
+    if found is not None and linear:
+        ahead = found.likelihood - of_its_own(forces, judged.best)
+        least = rival = min(rival, found.evidence - ahead)
     if found is not None and found.evidence > least and found.gain > judged.evidence.worth:
         varies = verdict.varying(judged, own, found, max(rival, 0.0))
         return _Looked(varies, found.before[1], found.after[1], found.gap, looked.remarks)
