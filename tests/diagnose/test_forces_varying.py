@@ -21,7 +21,13 @@ from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.paths import Span
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.swings import Swings
-from samii_rig.diagnose.forces.variation import BySpring, _less, _repeats_differ, variation
+from samii_rig.diagnose.forces.variation import (
+    BySpring,
+    _less,
+    _repeats_differ,
+    of_its_own,
+    variation,
+)
 from samii_rig.diagnose.forces.varying import (
     Modulation,
     PieceModulation,
@@ -342,10 +348,11 @@ def swinging(nothing: ForceSearch, site: str, hz: float, depth: float) -> ForceS
 def test_a_swing_that_is_put_into_the_records_is_taken_out_again(nothing: ForceSearch) -> None:
     """By as much as it was put in, to first order in all else that is refitted."""
     hz, depth = 0.7, 0.02
-    found = variation(
-        BySpring.of(swinging(nothing, "joint_2", hz, depth), replace(nothing.nominal)), 3
-    )
+    records = swinging(nothing, "joint_2", hz, depth)
+    found = variation(BySpring.of(records, replace(nothing.nominal)), 3)
     assert found is not None
+    # Each with the noise that it leaves: what has the swing for noise is far less likely.
+    assert found.likelihood > of_its_own(records, nothing.nominal) + 100.0
     assert found.sites[0][0] == "joint_2"
     told = found.parameters["depth"]
     assert told.low is not None
