@@ -38,7 +38,7 @@ METER, QUIET, UPPER = 9.0, 1e-3, 0.5
 # adds.
 EVERY = 0.5
 # Lines of a record that are taken for the input's though they are a meter's noise, in the mean. And
-# lines among which another is judged: of so many the median is known to 12 %. And how many times
+# lines among which another is judged: of so many the median is known to 10 %. And how many times
 # the noise these must have: of less than half input the rest would move a rig more than that does.
 ONCE, BESIDE, HALF = 0.01, 201, 2.0
 # Samples by which a record's going on is foretold, and until it is at rest.

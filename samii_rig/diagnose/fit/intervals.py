@@ -23,8 +23,8 @@ from samii_rig.types import Float
 Bools = NDArray[np.bool_]
 
 TAIL = 0.05  # of the draws, beyond either end of an interval of 90 %
-# Of every error, for that of the noise and of the model: of 250 intervals of concealed trials 87 %
-# held the truth without it, 90 % with it.
+# Times the error of a fit, for that of the noise and of the model: of 250 intervals of concealed
+# trials (seeds 271M to 311M) 87 % held the truth without it, 90 % with it.
 WIDER = 1.1
 
 
