@@ -12,7 +12,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, special
+from scipy import ndimage, signal, special
 
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.physics.disturbed import Disturbed
@@ -49,6 +49,7 @@ EXCITED, PARTS = 0.003, 3
 # square wave does so far above its band.
 DRIVES = 1e-6
 METER = 9.0  # times a converter's rounding or a meter's noise, power of an input that is more
+TAPER = 0.05  # of a record, both ends that count less where its spectrum is held against noise
 HARMONIC = 3  # the lowest that a force makes which is alike both ways
 # Lines to which harmonics may add: a quadratic form of so many takes 5 s of a core. Many records
 # show a force at the lines of their excitation too.
@@ -136,9 +137,10 @@ class Whole:
         records, most = self.records, HIGHEST * self.records.rate_hz
         times = min(float(HARMONIC), max(MOST_LINES / records.count, 1.0))
         bands = tuple((low, min(times * high, most)) for low, high in records.bands)
-        meter = np.max([c.meter for p in records.pieces for c in p.commands], axis=0)
-        reached = excited(records.pieces, records.rate_hz, meter**2, part=DRIVES)
-        driven = max(records.band[1], *(band[1] for band in reached if band))
+        driven = records.driven
+        if not np.isfinite(driven):
+            reached = excited(records.pieces, records.rate_hz, part=DRIVES)
+            driven = max(records.band[1], *(band[1] for band in reached if band))
         return replace(self, records=replace(records, bands=bands, driven=driven))
 
     @property
@@ -314,7 +316,22 @@ def _records(
     if not driven:
         raise EstimateError("nothing drives the rig for five cycles of any line")
     bands = tuple(band or b for _, b in driven)
-    return Records(tuple(p for p, _ in driven), rate_hz, bands, step)
+    some = tuple(p for p, _ in driven)
+    return Records(some, rate_hz, bands, step, driven=_above_meter(some, rate_hz))
+
+
+def _above_meter(pieces: Sequence[Piece], rate_hz: float) -> float:
+    """Hz up to which an input has more than a meter's noise, where one was on any: beyond, a change
+    of the response would be that of a rig that does not follow its meter. inf where none was."""
+    meter = np.max([c.meter for p in pieces for c in p.commands], axis=0)
+    if not np.any(meter):
+        return np.inf
+    tapered = []
+    for p in pieces:  # the end of a record that is cut leaks, and drives nothing that is seen
+        window = signal.windows.tukey(len(p.r), TAPER).reshape(-1, *(1,) * (p.r.ndim - 1))
+        tapered.append(replace(p, r=p.r * window))
+    reached = excited(tapered, rate_hz, np.asarray(meter**2), part=DRIVES)
+    return max((band[1] for band in reached if band), default=np.inf)
 
 
 def excited(
