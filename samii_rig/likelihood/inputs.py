@@ -78,18 +78,18 @@ def sent(
     return np.where(np.isfinite(drawn), drawn, v), far
 
 
-def calibrated(r: Float, step: float) -> tuple[Float, float]:
+def calibrated(r: Float, step: float) -> tuple[Float, float, float]:
     """(n,) the input as likely as a meter's white noise on r (n,) leaves it: every line by the part
     of its power that is not noise (regression calibration: Carroll et al. 2006, Measurement Error
     in Nonlinear Models, ch. 4). A line shows that part by itself where it stands out alone, the
     others together with their neighbours. r itself where the meter shows none, or the input is as
-    wide as what was recorded. And the standard deviation of that noise.
+    wide as what was recorded. And the standard deviation of that noise, and of what of it is left.
 
     step : of the command's converter, whose rounding is the input's own.
     """
     floor = meter_noise(r, step) ** 2
     if floor == 0:
-        return r, 0.0
+        return r, 0.0, 0.0
     known: Float = _stairs(r, math.sqrt(floor)) + float(np.mean(r))
     x: Float = r - known
     way = np.concatenate([_on(x[::-1])[::-1], x, _on(x)])
@@ -99,10 +99,11 @@ def calibrated(r: Float, step: float) -> tuple[Float, float]:
     clear = math.log(power.size / ONCE) * floor
     loud = around > HALF * floor
     expected = np.where(power > clear, power, np.where(loud, around, 0.0))
-    spectrum *= 1 - floor / np.maximum(expected, floor)
+    part = 1 - floor / np.maximum(expected, floor)
+    spectrum *= part
     more = (way.size - r.size) // 2
     own: Float = known + np.fft.irfft(spectrum, way.size)[more : more + r.size]
-    return own, math.sqrt(floor)
+    return own, math.sqrt(floor), math.sqrt(floor * float(np.mean(part)))
 
 
 def _stairs(r: Float, noise: float) -> Float:

@@ -49,13 +49,13 @@ class Command:
     """What one of the records behind a piece told the rig, and its part in the piece.
 
     v : as recorded, of the shape of r. part : the piece's r and z have so many times this record's.
-    meter : of each input, the standard deviation of a meter's noise that was taken out of r as far
-    as the record shows it.
+    meter : of each input, the noise of a meter that was on it, by its standard deviation, and what
+    of that was left in v and r, as the record does not show it.
     """
 
     v: Float
     part: float
-    meter: tuple[float, ...]
+    meter: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,28 +245,28 @@ def _driving_columns(recording: Recording, wired: Wiring) -> set[str]:
 
 def _driving(
     recording: Recording, x: Input, values: Float, sensors: Sequence[str], *, slower: bool
-) -> tuple[Float, Float, NDArray[np.bool_], float]:
-    """(n,) of an input: the command, what drives its loop, and where it has edges; the standard
-    deviation of a meter's noise that was on what drives its loop.
+) -> tuple[Float, Float, NDArray[np.bool_], tuple[float, float]]:
+    """(n,) of an input: the command, what drives its loop, and where it has edges; and a meter's
+    noise, as of `Command`.
 
     values : (n, q) of the sensors. slower : whether not every sample of the rig was recorded.
     """
     if not _has(recording, x.command):
         still = np.zeros(len(values))
-        return still, still, np.zeros(len(values), np.bool_), 0.0
+        return still, still, np.zeros(len(values), np.bool_), (0.0, 0.0)
     recording = of_input(recording, x.command)
     column = recording.column(x.command)
     theta = values[:, sensors.index(x.centring)] if x.kp else None
     v, edges = inputs.sent(recording, column, x.kp, theta)
     if slower:
         edges = edges | inputs.jumps(recording, column, x.kp, theta)
-    r, meter = v.copy(), 0.0
+    r, meter = v.copy(), (0.0, 0.0)
     if theta is not None:
         r += x.kp * theta
     if not recording.names("reference"):
         noisy = r
-        r, meter = inputs.calibrated(noisy, recording.channels[column].resolution)
-        v = v + (r - noisy)
+        r, there, left = inputs.calibrated(noisy, recording.channels[column].resolution)
+        v, meter = v + (r - noisy), (there, left)
     return v, r, edges, meter
 
 
@@ -294,7 +294,7 @@ class _Samples:
     r: Float
     edges: NDArray[np.bool_]
     values: Float
-    meter: tuple[float, ...]
+    meter: tuple[tuple[float, float], ...]
     unknown: NDArray[np.bool_]
     slower: bool
 

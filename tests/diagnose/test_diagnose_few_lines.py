@@ -128,6 +128,36 @@ def test_a_square_wave_drives_the_rig_far_above_its_band() -> None:
     assert driven[1] < 60.0
 
 
+def metered(seed: int, high_hz: float) -> Recording:
+    """A sweep that is cut, its command as a meter of much noise shows it; no reference."""
+    finer = 4
+    t = np.arange(N * finer) / (RATE * finer)
+    v = 0.4 * signal.chirp(t, 1.0, t[-1], high_hz)
+    A = np.array([[0.0, 1.0, 0.0], [-K / M, -C / M, 1 / M], [0.0, 0.0, -CORNER]])
+    B = np.array([[0.0], [0.0], [GAIN * CORNER]])
+    held = signal.cont2discrete((A, B, np.eye(3)[:1], np.zeros((1, 1))), 1 / (RATE * finer))
+    rng = np.random.default_rng(seed)
+    x = signal.dlsim(held, v)[1][::finer, 0] + rng.normal(0.0, 1e-6, N)
+    shown = (v + np.append(v[0], v[:-1]))[::finer] / 2 + rng.normal(0.0, 4e-3, N)
+    run = recorded(seed, 0.0, 0.3)
+    return replace(run, values=np.column_stack([shown, STEP * np.rint(x / STEP)]))
+
+
+def test_a_meters_noise_drives_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Above the sweep the mass does not follow what the meter adds, and nothing is missing."""
+    only(
+        monkeypatch, ("input_not_held", "v"), ("viscous_damping", "spring"), ("added_mass", "mass")
+    )
+    runs = [metered(seed, 15.0) for seed in (1, 2)]
+    whole = Whole.of(runs, RIG)
+    assert 14.0 < whole.records.driven < 22.0
+    assert whole.with_harmonics().records.driven == whole.records.driven
+    found = diagnose(estimate(runs), RIG, runs=runs)
+    assert found.verdict == "no_mismatch"
+    assert any("was not held between samples" in words for words in found.not_physics)
+    assert Whole.of([recorded(1, 0.0, 0.3)], RIG).records.driven == np.inf
+
+
 def test_local_models_that_were_chosen_stay() -> None:
     with pytest.raises(EstimateError, match="cannot be told from a transient anywhere"):
         estimate([recorded(1, 0.0, 0.3)], method="local")

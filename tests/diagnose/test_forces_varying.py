@@ -232,7 +232,8 @@ def test_the_motion_that_a_swing_changes_is_that_of_a_spring_that_swings() -> No
     m, c, k, rate, hz, depth = 1.0, 4.0, 900.0, 100.0, 0.7, 0.1
     rng = np.random.default_rng(3)
     v = rng.standard_normal(1000)
-    piece = Piece("held", v, np.zeros((v.size, 1)), 0, (), commands=(Command(v, 1.0, (0.0,)),))
+    told = Command(v, 1.0, ((0.0, 0.0),))
+    piece = Piece("held", v, np.zeros((v.size, 1)), 0, (), commands=(told,))
     span = Span.of(piece, rate, rate / 4)
 
     def moved(soft: float) -> Float:

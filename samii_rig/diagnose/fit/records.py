@@ -323,7 +323,7 @@ def _records(
 def _above_meter(pieces: Sequence[Piece], rate_hz: float) -> float:
     """Hz up to which an input has more than a meter's noise, where one was on any: beyond, a change
     of the response would be that of a rig that does not follow its meter. inf where none was."""
-    meter = np.max([c.meter for p in pieces for c in p.commands], axis=0)
+    meter = np.max([c.meter for p in pieces for c in p.commands], axis=0)[:, 0]
     if not np.any(meter):
         return np.inf
     tapered = []

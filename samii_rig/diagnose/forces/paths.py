@@ -25,6 +25,8 @@ from samii_rig.model.sampled import dead_time, hold_at, sensors_at
 from samii_rig.types import Complex, Float, Int
 
 OVER = 4.0  # rate over the highest line: third harmonics fold beside the band, not into it
+# Of the samples, of a command that rests: one that swings passes 0 in a hundredth of them.
+RESTS = 0.05
 DAMPING = 5.0  # of the contour: 0.7 % wraps around, what is cut above the rate grows 12 times
 
 
@@ -153,11 +155,19 @@ class TransferPaths:
         """Standard deviation of the noise that a meter has put on that command, 0 where it was
         recorded as it was sent: then its noise drives the rig. step : of the command's converter.
         """
+        on, pieces = self.column(place), self.whole.records.pieces
+        if left := max(c.meter[on][1] for p in pieces for c in p.commands):
+            return left
         # Of what is wrong with the data a meter alone is not exactly known.
         if not any(e.rough and not e.physical for e in self.model.effects):
             return 0.0
-        on, pieces = self.column(place), self.whole.records.pieces
         return max(meter_noise(by_input(c.v)[on], step) for p in pieces for c in p.commands[:1])
+
+    def rests(self, place: Place, width: float) -> bool:
+        """Whether the command that a force is on stays within a width about 0 in any piece."""
+        on, pieces = self.column(place), self.whole.records.pieces
+        each = (by_input(c.v)[on] for p in pieces for c in p.commands[:1])
+        return any(float(np.mean(np.abs(v) < width)) > RESTS for v in each)
 
     def column(self, place: Place) -> int:
         """Which input a force is on; the first where it has one of its own."""

@@ -118,7 +118,8 @@ def _drive(
     # What is narrower than a step of the command's converter is that converter's rounding; what is
     # as narrow as the noise of a meter takes that out where the command rests.
     noise = BEYOND * paths.meter_noise(drive, actuator.resolution)
-    low, high = max(WIDTHS[0] * largest, actuator.resolution, noise), WIDTHS[1] * largest
+    at_rest = noise if paths.rests(drive, noise) else 0.0
+    low, high = max(WIDTHS[0] * largest, actuator.resolution, at_rest), WIDTHS[1] * largest
     wide = low < high
     if wide and turns and paths.ports(drive, of_speed=True) is not None:
         yield effect(FRICTION, drive, source, alias, (_log("T_c", unit, low, high),))
