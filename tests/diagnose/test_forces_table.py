@@ -15,14 +15,18 @@ from samii_rig.rig.schema import ActuatorSpec
 class Moved:
     """Under a command of 1 V that turns nothing, recorded as it was sent or by a meter."""
 
-    def __init__(self, noise: float = 0.0) -> None:
+    def __init__(self, noise: float = 0.0, *, resting: bool = True) -> None:
         self.noise = noise
+        self.resting = resting
 
     def largest(self, place: Place) -> float:
         return 1.0
 
     def meter_noise(self, place: Place, step: float) -> float:
         return self.noise
+
+    def rests(self, place: Place, width: float) -> bool:
+        return self.resting
 
     def ports(self, place: Place, *, of_speed: bool) -> Any:
         return None
@@ -47,5 +51,8 @@ def test_what_is_as_narrow_as_a_meters_noise_is_none_of_the_rig() -> None:
         ends[noise] = {e.physics: (e.unknowns[0].low, e.unknowns[0].high) for e in found}
     assert ends[0.0]["valve_deadband"][0] == pytest.approx(1e-3)
     assert ends[0.01]["valve_deadband"][0] == pytest.approx(0.03)
+    swings = _drive(cast(TransferPaths, Moved(0.01, resting=False)), "motor", valve, turns=False)
+    (narrowest,) = (e.unknowns[0].low for e in swings if e.physics == "valve_deadband")
+    assert narrowest == pytest.approx(1e-3)
     assert ends[0.0]["output_saturation"][1] == pytest.approx(1.0)
     assert ends[0.01]["output_saturation"][1] == pytest.approx(0.94)
