@@ -306,13 +306,12 @@ class _Samples:
             _driving(whole.recording, x, values, wired.sensors, slower=slower) for x in wired.inputs
         ]
         unknown = np.zeros(len(whole.lost), np.bool_)
-        for _, r, _, _ in each:
-            unknown |= bridge(r, whole.lost) > KNOWN * np.sqrt(np.mean(r**2))
-        v = _beside([one for one, _, _, _ in each])
-        r = _beside([one for _, one, _, _ in each])
-        edges = _beside([one for _, _, one, _ in each])
-        meter = tuple(one for _, _, _, one in each)
-        return cls(whole, v, r, edges, values, meter, unknown, slower)
+        v, r, edges, meter = zip(*each, strict=True)
+        for one in r:
+            unknown |= bridge(one, whole.lost) > KNOWN * np.sqrt(np.mean(one**2))
+        return cls(
+            whole, _beside(v), _beside(r), _beside(edges), values, meter, unknown, slower
+        )  # fmt: skip
 
 
 def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float) -> list[Piece]:

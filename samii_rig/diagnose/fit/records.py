@@ -326,10 +326,9 @@ def _above_meter(pieces: Sequence[Piece], rate_hz: float) -> float:
     meter = np.max([c.meter for p in pieces for c in p.commands], axis=0)[:, 0]
     if not np.any(meter):
         return np.inf
-    tapered = []
-    for p in pieces:  # the end of a record that is cut leaks, and drives nothing that is seen
-        window = signal.windows.tukey(len(p.r), TAPER).reshape(-1, *(1,) * (p.r.ndim - 1))
-        tapered.append(replace(p, r=p.r * window))
+    # The end of a record that is cut leaks, and drives nothing that is seen.
+    each = (np.asarray((signal.windows.tukey(len(p.r), TAPER) * p.r.T).T) for p in pieces)
+    tapered = [replace(p, r=r) for p, r in zip(pieces, each, strict=True)]
     reached = excited(tapered, rate_hz, np.asarray(meter**2), part=DRIVES)
     return max((band[1] for band in reached if band), default=np.inf)
 

@@ -71,10 +71,8 @@ class ForceModel(Model):
 
     def metered(self, command: str) -> bool:
         """Whether a meter recorded a command, which its rig followed between samples, too."""
-        return any(
-            e.rough and not e.physical and e.factor is not None and e.factor.channel == command
-            for e in self.effects
-        )
+        each = (e.factor for e in self.effects if e.metered)
+        return any(factor is not None and factor.channel == command for factor in each)
 
     def channels(
         self, x: Float, s: Complex

@@ -147,9 +147,7 @@ class TransferPaths:
 
     def largest(self, place: Place) -> float:
         """Amplitude of the command that a force is on."""
-        on, pieces = self.column(place), self.whole.records.pieces
-        each = [by_input(c.v)[on] for p in pieces for c in p.commands[:1]]
-        return max(float(np.max(np.abs(v))) for v in each)
+        return max(float(np.max(np.abs(v))) for v in self._recorded(place))
 
     def meter_noise(self, place: Place, step: float) -> float:
         """Standard deviation of the noise that a meter has put on that command, 0 where it was
@@ -158,16 +156,18 @@ class TransferPaths:
         on, pieces = self.column(place), self.whole.records.pieces
         if left := max(c.meter[on][1] for p in pieces for c in p.commands):
             return left
-        # Of what is wrong with the data a meter alone is not exactly known.
-        if not any(e.rough and not e.physical for e in self.model.effects):
+        if not any(e.metered for e in self.model.effects):
             return 0.0
-        return max(meter_noise(by_input(c.v)[on], step) for p in pieces for c in p.commands[:1])
+        return max(meter_noise(v, step) for v in self._recorded(place))
 
     def rests(self, place: Place, width: float) -> bool:
         """Whether the command that a force is on stays within a width about 0 in any piece."""
+        return any(float(np.mean(np.abs(v) < width)) > RESTS for v in self._recorded(place))
+
+    def _recorded(self, place: Place) -> list[Float]:
+        """Of each piece the command that a force is on, as its first record has it."""
         on, pieces = self.column(place), self.whole.records.pieces
-        each = (by_input(c.v)[on] for p in pieces for c in p.commands[:1])
-        return any(float(np.mean(np.abs(v) < width)) > RESTS for v in each)
+        return [by_input(c.v)[on] for p in pieces for c in p.commands[:1]]
 
     def column(self, place: Place) -> int:
         """Which input a force is on; the first where it has one of its own."""

@@ -134,6 +134,12 @@ class Effect:
         return row is None or row.physical
 
     @property
+    def metered(self) -> bool:
+        """Whether it is that a meter recorded a column: of what is wrong with the data that alone
+        is not exactly known."""
+        return self.rough > 0 and not self.physical
+
+    @property
     def name(self) -> tuple[str, str]:
         """(physics, site)."""
         return self.physics, self.site
