@@ -15,6 +15,7 @@ from samii_rig.diagnose.data import findings
 from samii_rig.diagnose.data.measured import measured, usable
 from samii_rig.diagnose.fit.agreeing import Saved
 from samii_rig.diagnose.fit.classes import merge_equivalent
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.usual import LINES_TAKE, RECORDS_TAKE, takes
 from samii_rig.diagnose.physics.effect import Effect
@@ -103,6 +104,9 @@ def case_of(
     at = grid(rig, lines.frequency, lines.sensor, lines.actuator)
     runs = runs if clean.mend is None else [clean.mend(run) for run in runs]
     whole = whole_of(clean, runs, rig, band)
+    if whole is not None and whole.rig.rate_hz != rig.rate_hz:
+        clean = replace(clean, remarks=(*clean.remarks, _loop_runs(whole, rig)))
+        rig = whole.rig
     if effects is None:
         low, high = float(lines.frequency[0]), float(lines.frequency[-1])
         if whole is not None:  # whole records reach to where no response could be estimated
@@ -110,3 +114,14 @@ def case_of(
         effects = table(rig, low, high, signed=signed, recorded_hz=trusted[0].rate_hz)
     by_line = Search(rig, seen, at, clean.competing(effects), progress=progress)
     return Case(clean, trusted, runs, lines, by_line, decide, show, whole=whole)
+
+
+def _loop_runs(whole: Whole, rig: Rig) -> str:
+    """That the loop was found to run at another rate than the rig file has it, in words."""
+    commands = " and ".join(x.command for x in whole.wired.inputs)
+    were = "were" if len(whole.wired.inputs) > 1 else "was"
+    return (
+        f"{commands} {were} recorded as a meter sees it, and the loop runs at "
+        f"{whole.rig.rate_hz:g} Hz, {whole.every} times for each sample: that is how late its own "
+        f"law is shown; the rig file states {rig.rate_hz:g} Hz"
+    )

@@ -129,6 +129,7 @@ def in_poses(
         case_of(one.responses, own, band, effects, one.runs, progress=progress)
         for one, own in zip(each, rigs, strict=True)
     ]
+    rigs = [case.search.rig for case in cases]
     records = _together(each, cases, rigs, band)
     first = cases[0]
     for case in cases[1:]:

@@ -71,6 +71,14 @@ class Bridged:
         )  # fmt: skip
         return cls(filled, lost, breaks)
 
+    @property
+    def gaps(self) -> NDArray[np.bool_]:
+        """(n,) which samples are lost."""
+        out = np.zeros(len(self.recording), np.bool_)
+        for first, behind in self.lost:
+            out[first:behind] = True
+        return out
+
     def between(self, start: int, stop: int) -> tuple[int, int]:
         """Where samples numbered from `start` to before `stop` begin and end; neither is lost."""
         a, b = (int(i) for i in np.searchsorted(self.recording.sequence, [start, stop]))

@@ -2,13 +2,15 @@
 
 v = u + kp (theta_ref - theta) holds for what was sent. A loop that runs k times as fast as the
 record holds it for T/k. A meter shows the mean of both sides of each edge, so that what it shows is
-half a period of the loop late, and has noise that never drove the rig. That delay determines k;
-with it the rig's own input follows from the law at the record's samples.
+half a period of the loop late, and has noise that never drove the rig. That delay determines k,
+and the law what was sent at the record's samples.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +32,7 @@ ORDER = np.arange(NEIGHBOURS.size, dtype=np.float64)
 ROUNDS, STEP = 4, 1e-3  # of Gauss and Newton, and samples for a slope
 LATEST = 0.5  # samples: of a loop that runs at the record's rate
 WHOLE = 0.02  # samples, from the delay of a loop that runs a whole number of times as fast
+LEAST = 3e-4  # samples, deviation of a delay at least: loops of up to 16 times are told apart
 # Of what is neither the command's converter's nor excitation, the power over that of its steps from
 # which it is a meter's noise; of the largest line, the power that it stays below; the part of the
 # lines, the upper ones, that show it.
@@ -52,30 +55,89 @@ BENT, SMOOTH = 8.0, 16
 SURE = 6.0  # standard deviations of what noise bends: of 1e8 samples none are beyond
 
 
+@dataclass(frozen=True, slots=True)
+class Meter:
+    """What a meter showed of a command that follows from its law.
+
+    law : (n,) what was sent. kp : gain of the loop in it, 0 where none ran. late : samples by which
+    the meter shows it later, sd : standard deviation of that by its noise. far : (n,) where the
+    command has an edge within a sample, so that nobody knows when that came.
+    """
+
+    law: Float
+    kp: float
+    late: float
+    sd: float
+    far: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        command: int,
+        kp: float,
+        theta: Float | None,
+        lost: NDArray[np.bool_] | None = None,
+    ) -> Meter | None:
+        """Of a command; None where it was recorded as it was sent, or its law is not known.
+        Arguments as of `sent`."""
+        if not recording.names("reference"):
+            return None
+        channel = recording.channels[command]
+        v = np.array(recording.values[:, command], np.float64)
+        if lost is not None:
+            v[lost] = np.nan  # a guess is no reading
+        laws = {k: _law(recording, command, k, theta) for k in (kp, 0.0)}
+        shown = {k: _shown(recording, v, law) for k, law in laws.items()}
+        runs = min(shown, key=lambda k: float(np.nansum(shown[k][2] ** 2)))
+        late, sd, off = shown[runs]
+        far = _far(off)
+        rests = not np.any(asked(recording, channel.name, kp))
+        # What moves at rest is the loop's answer to the rig, and may be far below a meter's noise.
+        moves = laws[runs] if rests else v
+        small = rests or _sd(off) < NOISE * float(np.std(v[np.isfinite(off) & np.isfinite(v)]))
+        if not small or not _noise(off, moves, far, channel.resolution):
+            return None
+        return cls(laws[runs], runs, late, sd, far)
+
+
+def times_of(found: Sequence[Meter | None]) -> int:
+    """How often the loop behind all commands ran for each sample that was recorded; 0 where that is
+    not known of one of them, or not to a whole number."""
+    known = [meter for meter in found if meter is not None and np.isfinite(meter.sd)]
+    if not known or len(known) < len(found):
+        return 0
+    weight = np.array([max(meter.sd, LEAST) ** -2 for meter in known])
+    late = float(weight @ [meter.late for meter in known] / np.sum(weight))
+    off = SURE / math.sqrt(float(np.sum(weight)))
+    times = round(1 / (2 * late)) if late > 0 else 0
+    if times < 1 or abs(late - 1 / (2 * times)) > off:
+        return 0
+    return times if late - off > 1 / (2 * (times + 1)) else 0
+
+
 def sent(
-    recording: Recording, command: int, kp: float, theta: Float | None
+    recording: Recording,
+    command: int,
+    kp: float,
+    theta: Float | None,
+    times: int = 0,
+    lost: NDArray[np.bool_] | None = None,
 ) -> tuple[Float, NDArray[np.bool_]]:
     """(n,) the command as it drove the rig, as near as the recording shows; and where it has an
     edge within a sample, so that nobody knows when that came.
 
     command : its column. theta : (n,) of the sensor around which a loop of gain kp is closed.
+    times : how often the loop is known to run for each sample, 0 where it is not: then the command
+    is a smooth one, the mean over the last hold. lost : (n,) samples that were not recorded.
     """
-    channel = recording.channels[command]
     v = np.asarray(recording.values[:, command], np.float64)
-    none = np.zeros(v.size, np.bool_)
-    if not recording.names("reference"):
-        return v, none
-    each = [_shown(recording, v, _law(recording, command, k, theta)) for k in {kp, 0.0}]
-    law, late, off = min(each, key=lambda one: float(np.nansum(one[2] ** 2)))
-    far = _far(off)
-    rests = not np.any(asked(recording, channel.name, kp))
-    # What moves at rest is the loop's answer to the rig, and may be far below a meter's noise.
-    moves = law if rests else v
-    small = rests or _sd(off) < NOISE * float(np.std(v[np.isfinite(off) & np.isfinite(v)]))
-    if not small or not _noise(off, moves, far, channel.resolution):
-        return v, none
-    drawn = _filtered(recording, law, _held(late))
-    return np.where(np.isfinite(drawn), drawn, v), far
+    meter = Meter.of(recording, command, kp, theta, lost)
+    if meter is None:
+        return v, np.zeros(v.size, np.bool_)
+    late = _near(meter.late)
+    drawn = meter.law if times else _filtered(recording, meter.law, _held(late))
+    return np.where(np.isfinite(drawn), drawn, v), meter.far
 
 
 def calibrated(r: Float, step: float) -> tuple[Float, float, float]:
@@ -212,9 +274,10 @@ def _law(recording: Recording, command: int, kp: float, theta: Float | None) -> 
     return law if theta is None or kp == 0 else law - kp * theta
 
 
-def _shown(recording: Recording, v: Float, law: Float) -> tuple[Float, float, Float]:
-    """The law, how many samples late a meter shows it as v, and what that leaves of v."""
-    late = 0.0
+def _shown(recording: Recording, v: Float, law: Float) -> tuple[float, float, Float]:
+    """How many samples late a meter shows a law as v, the standard deviation of that, and what that
+    leaves of v."""
+    late, sd = 0.0, math.inf
     for _ in range(ROUNDS):
         off = v - _filtered(recording, law, _mean(late))
         slope = _filtered(recording, law, (_mean(late + STEP) - _mean(late - STEP)) / (2 * STEP))
@@ -228,11 +291,15 @@ def _shown(recording: Recording, v: Float, law: Float) -> tuple[Float, float, Fl
             break
         late += float(off[known] @ slope[known]) / turns
         late = min(max(late, 0.0), LATEST)
+        sd = _sd(off) / math.sqrt(turns)
+    off = v - _filtered(recording, law, _mean(_near(late)))
+    return late, sd, np.where(np.isfinite(off), off, np.nan)
+
+
+def _near(late: float) -> float:
+    """A delay, or that of the loop that runs a whole number of times as fast, if one is near."""
     times = round(1 / (2 * late)) if late > 0 else 0
-    if times and abs(late - 1 / (2 * times)) < WHOLE:
-        late = 1 / (2 * times)
-    off = v - _filtered(recording, law, _mean(late))
-    return law, late, np.where(np.isfinite(off), off, np.nan)
+    return 1 / (2 * times) if times and abs(late - 1 / (2 * times)) < WHOLE else late
 
 
 def _mean(late: float) -> Float:

@@ -181,9 +181,18 @@ def _input(
                 f"{recording.source or 'a recording'} has no column {command}; expected one, as "
                 f"the rig file closes a loop from {sensor} to it"
             )
-    if all(is_open(of_input(r, command), command, sensor, kp) for r in recordings):
+    if all(_is_open(of_input(r, command), command, sensor, kp) for r in recordings):
         return Input(command)
     return Input(command, sensor, kp)
+
+
+def _is_open(recording: Recording, command: str, sensor: str, kp: float) -> bool:
+    """Whether no loop ran, also where a meter recorded the command: late, and with noise."""
+    if is_open(recording, command, sensor, kp):
+        return True
+    theta = recording.values_of(sensor)
+    meter = inputs.Meter.of(recording, recording.column(command), kp, theta)
+    return meter is not None and meter.kp == 0
 
 
 def _has(recording: Recording, name: str) -> bool:
@@ -201,10 +210,11 @@ def pieces_of(
     without: Collection[str] = (),
     *,
     by_level: bool = False,
+    times: int = 0,
 ) -> list[Piece]:
     """Every segment as a piece, those with proportional inputs as one. without : places of
     segments to leave out, as `Recording.place` gives them. by_level : of one level only, for what
-    depends on the level.
+    depends on the level. times : as of `faster`.
 
     The input of the loop is v + kp theta as they were recorded: it holds the reference, the
     rounding and the clipping of the command, and nothing of the sensors' noise.
@@ -217,13 +227,28 @@ def pieces_of(
         if not known.any():
             continue
         whole = Bridged.of(recording, known, _driving_columns(recording, wired))
-        samples = _Samples.of(whole, wired, slower=round(rig.rate_hz / recording.rate_hz) > 1)
+        slower = round(rig.rate_hz / recording.rate_hz) > 1
+        samples = _Samples.of(whole, wired, slower=slower, times=times)
         for segment in segments_of(recording):
             if recording.place(segment) in without:
                 continue
             found += _cut(recording, segment, samples, step)
     repeats = _joined(found, levels=False)
     return repeats if by_level else joined(repeats)
+
+
+def faster(recordings: Sequence[Recording], wired: Wiring) -> int:
+    """How often the rig's loop ran for each sample that was recorded, by what a meter shows of its
+    commands; 0 where these were recorded as they were sent, or do not show it."""
+    found = []
+    for recording in recordings:
+        for x in wired.inputs:
+            if not _has(recording, x.command):
+                continue
+            theta = recording.values_of(x.centring) if x.kp else None
+            own = of_input(recording, x.command)
+            found.append(inputs.Meter.of(own, own.column(x.command), x.kp, theta))
+    return inputs.times_of(found)
 
 
 def _known(recording: Recording, wired: Wiring) -> NDArray[np.bool_]:
@@ -244,20 +269,22 @@ def _driving_columns(recording: Recording, wired: Wiring) -> set[str]:
 
 
 def _driving(
-    recording: Recording, x: Input, values: Float, sensors: Sequence[str], *, slower: bool
+    whole: Bridged, x: Input, values: Float, sensors: Sequence[str], *, slower: bool, times: int
 ) -> tuple[Float, Float, NDArray[np.bool_], tuple[float, float]]:
     """(n,) of an input: the command, what drives its loop, and where it has edges; and a meter's
     noise, as of `Command`.
 
     values : (n, q) of the sensors. slower : whether not every sample of the rig was recorded.
+    times : as of `faster`.
     """
+    recording = whole.recording
     if not _has(recording, x.command):
         still = np.zeros(len(values))
         return still, still, np.zeros(len(values), np.bool_), (0.0, 0.0)
     recording = of_input(recording, x.command)
     column = recording.column(x.command)
     theta = values[:, sensors.index(x.centring)] if x.kp else None
-    v, edges = inputs.sent(recording, column, x.kp, theta)
+    v, edges = inputs.sent(recording, column, x.kp, theta, times, whole.gaps)
     if slower:
         edges = edges | inputs.jumps(recording, column, x.kp, theta)
     r, meter = v.copy(), (0.0, 0.0)
@@ -299,11 +326,12 @@ class _Samples:
     slower: bool
 
     @classmethod
-    def of(cls, whole: Bridged, wired: Wiring, *, slower: bool) -> _Samples:
-        """Of a recording, as `whole`."""
+    def of(cls, whole: Bridged, wired: Wiring, *, slower: bool, times: int) -> _Samples:
+        """Of a recording, as `whole`. times : as of `faster`."""
         values = whole.recording.columns(wired.sensors)
         each = [
-            _driving(whole.recording, x, values, wired.sensors, slower=slower) for x in wired.inputs
+            _driving(whole, x, values, wired.sensors, slower=slower, times=times)
+            for x in wired.inputs
         ]
         unknown = np.zeros(len(whole.lost), np.bool_)
         v, r, edges, meter = zip(*each, strict=True)

@@ -128,9 +128,11 @@ def test_a_square_wave_drives_the_rig_far_above_its_band() -> None:
     assert driven[1] < 60.0
 
 
-def metered(seed: int, high_hz: float) -> Recording:
-    """A sweep that is cut, its command as a meter of much noise shows it; no reference."""
-    finer = 4
+def metered(
+    seed: int, high_hz: float, finer: int = 4, meter: float = 4e-3, *, reference: bool = False
+) -> Recording:
+    """A sweep that is cut, its command as a meter of much noise shows it, by a loop `finer` times
+    as fast as the record."""
     t = np.arange(N * finer) / (RATE * finer)
     v = 0.4 * signal.chirp(t, 1.0, t[-1], high_hz)
     A = np.array([[0.0, 1.0, 0.0], [-K / M, -C / M, 1 / M], [0.0, 0.0, -CORNER]])
@@ -138,9 +140,13 @@ def metered(seed: int, high_hz: float) -> Recording:
     held = signal.cont2discrete((A, B, np.eye(3)[:1], np.zeros((1, 1))), 1 / (RATE * finer))
     rng = np.random.default_rng(seed)
     x = signal.dlsim(held, v)[1][::finer, 0] + rng.normal(0.0, 1e-6, N)
-    shown = (v + np.append(v[0], v[:-1]))[::finer] / 2 + rng.normal(0.0, 4e-3, N)
+    shown = (v + np.append(v[0], v[:-1]))[::finer] / 2 + rng.normal(0.0, meter, N)
     run = recorded(seed, 0.0, 0.3)
-    return replace(run, values=np.column_stack([shown, STEP * np.rint(x / STEP)]))
+    if reference:
+        asked = Channel("u_v", "V", "reference")
+        run = replace(run, channels=(asked, *run.channels), quality=np.zeros((N, 3), np.uint8))
+    columns = [v[::finer]] * reference + [shown, STEP * np.rint(x / STEP)]
+    return replace(run, values=np.column_stack(columns))
 
 
 def test_a_meters_noise_drives_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,6 +162,25 @@ def test_a_meters_noise_drives_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.verdict == "no_mismatch"
     assert any("was not held between samples" in words for words in found.not_physics)
     assert Whole.of([recorded(1, 0.0, 0.3)], RIG).records.driven == np.inf
+
+
+def test_a_loop_that_runs_faster_than_the_record_is_held_as_it_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The law tells that a meter shows it a quarter of a sample late."""
+    only(
+        monkeypatch, ("input_not_held", "v"), ("viscous_damping", "spring"), ("added_mass", "mass")
+    )
+    runs = [metered(seed, 60.0, 2, reference=True) for seed in (1, 2)]
+    whole = Whole.of(runs, RIG)
+    assert whole.rig.rate_hz == 2 * RATE
+    assert whole.every == 2
+    assert Whole.of(runs, whole.rig).rig == whole.rig
+    found = diagnose(estimate(runs), RIG, runs=runs)
+    assert found.verdict == "no_mismatch"
+    assert found.chi2_per_dof < 1.2
+    assert any("runs at 1000 Hz, 2 times for each sample" in words for words in found.not_physics)
+    assert not any("was not held between samples" in words for words in found.not_physics)
 
 
 def test_local_models_that_were_chosen_stay() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt, windows
 
-from samii_rig.likelihood.inputs import calibrated, jumps, meter_noise, sent
+from samii_rig.likelihood.inputs import Meter, calibrated, jumps, meter_noise, sent, times_of
 from samii_rig.types import Channel, Float, Recording
 
 RATE, N, KP, STEP = 500.0, 6000, 3.0, 3e-4
@@ -56,6 +56,42 @@ def test_a_meters_noise_is_gone_and_the_hold_is_the_loops(times: int, kp: float)
     inside = slice(5, -5)
     assert not edges.any()
     assert np.std((v - want)[inside]) < 2e-4 < METER / 10
+
+
+@pytest.mark.parametrize("times", [1, 2, 4, 10])
+@pytest.mark.parametrize("kp", [0.0, KP])
+def test_how_often_the_loop_ran_is_told_and_so_is_what_was_sent(times: int, kp: float) -> None:
+    runs = [recorded(times, kp, seed) for seed in (1, 2)]
+    found = [Meter.of(run, 1, KP, run.values[:, 2]) for run in runs]
+    assert times_of(found) == times
+    for run, meter in zip(runs, found, strict=True):
+        assert meter is not None
+        assert meter.kp == kp
+        assert abs(meter.late - 0.5 / times) < 5 * meter.sd < 5e-3
+        v, _ = sent(run, 1, KP, run.values[:, 2], times)
+        np.testing.assert_array_equal(v, run.values[:, 0] - kp * run.values[:, 2])
+
+
+def test_how_often_is_not_told_where_two_numbers_are_as_near() -> None:
+    meter = Meter.of(run := recorded(10), 1, KP, run.values[:, 2])
+    assert meter is not None
+    assert times_of([meter]) == 10
+    assert times_of([replace(meter, sd=2e-3)]) == 0  # a ninth as well as an eleventh
+    assert times_of([replace(meter, late=0.4)]) == 0  # no whole number
+    assert times_of([meter, None]) == 0
+    assert times_of([]) == 0
+
+
+def test_samples_that_were_lost_are_no_edges() -> None:
+    run = recorded(2)
+    lost = np.zeros(N, np.bool_)
+    lost[2000:2100] = True
+    run.values[lost, 0] += 0.5  # a guess that is far off
+    assert Meter.of(run, 1, KP, run.values[:, 2]) is None
+    meter = Meter.of(run, 1, KP, run.values[:, 2], lost)
+    assert meter is not None
+    assert not meter.far[lost].any()
+    assert times_of([meter]) == 2
 
 
 def test_a_command_that_was_recorded_as_sent_is_left_as_it_is() -> None:

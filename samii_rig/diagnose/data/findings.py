@@ -63,9 +63,8 @@ class Checked:
         of the others; and those that a loop of the rig is closed around, without which nothing can
         be said of any record."""
         held = Counter(c.name for r in self.responses for c in r.outputs)
-        loops = (rig.centring_of(a.name) for a in rig.actuator)
-        closed = {loop.sensor for loop in loops if loop is not None}
-        return tuple(n for n, k in held.items() if n in closed or 2 * k >= len(self.responses))
+        often = [n for n, k in held.items() if 2 * k >= len(self.responses)]
+        return tuple(dict.fromkeys([*often, *sorted(_closed_around(rig))]))
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics: 9.81 is not 9.80665."""
@@ -125,8 +124,16 @@ def checked(
             for f in r.findings
             if (f.severity == "error" and f.kind not in (*OF_LINES, "gap"))
             or (f.severity == "warning" and f.kind in ("clock", "resolution"))
+            if f.kind != "resolution" or f.channel not in _closed_around(rig)
         ),
     )
+
+
+def _closed_around(rig: Rig) -> set[str]:
+    """Sensors that loops are closed around. Whole records count their rounding, which hides the
+    response line by line."""
+    loops = (rig.centring_of(a.name) for a in rig.actuator)
+    return {loop.sensor for loop in loops if loop is not None}
 
 
 def estimated(

@@ -21,7 +21,7 @@ from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.noise import Disturbances, Noise
 from samii_rig.likelihood.nuisance import HIGHEST
-from samii_rig.likelihood.pieces import Loops, Piece, Wiring, joined, pieces_of, wiring
+from samii_rig.likelihood.pieces import Loops, Piece, Wiring, faster, joined, pieces_of, wiring
 from samii_rig.likelihood.reduce import (
     CYCLES,
     LineResiduals,
@@ -100,14 +100,16 @@ class Whole:
         if not in_order:
             runs = [run for run, _ in aligned(runs)]
         wired = wiring(runs, rig, sensors)
+        (rate,) = {run.rate_hz for run in runs}
+        if times := faster(runs, wired):
+            rig = rig.model_copy(update={"rate_hz": times * rate})
         bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
         without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
-        levels = pieces_of(runs, rig, wired, without, by_level=True)
+        levels = pieces_of(runs, rig, wired, without, by_level=True, times=times)
         if not levels:
             raise EstimateError("no segment is sound")
         steps = {s.name: s.resolution for s in rig.sensor}
         step = tuple(steps[n] for n in wired.sensors)
-        (rate,) = {run.rate_hz for run in runs}
         finest = {a.name: a.resolution for a in rig.actuator}
         rounding = np.array([finest[x.command] ** 2 / 12 for x in wired.inputs])
         slower = round(rig.rate_hz / rate) > 1
