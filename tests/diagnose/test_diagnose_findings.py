@@ -19,7 +19,7 @@ from samii_rig.errors import EstimateError, InputError, SamiiRigError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Quality
+from samii_rig.types import Finding, Quality
 
 LEVELS = (0.3, 0.5)
 RIVALS = ("torsional_compliance", "velocity_feedback", "sensor_delay", "sensor_gain")
@@ -304,3 +304,23 @@ def test_what_does_not_belong_together_is_refused_in_one_line(responses, rig, ba
     assert isinstance(raised.value, InputError)
     assert words in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+def test_a_coarse_sensor_that_a_loop_is_closed_around_stays_in_whole_records():
+    """Line by line its rounding hides the response; nothing is said of the sensor itself."""
+    rig = samii()
+    lines = np.geomspace(0.8, 35.0, 60)
+    others = [s.name for s in rig.sensor if s.name != "theta_2"]
+    coarse = Finding("resolution", "warning", "theta_2 moves by 0.3 of its step", "theta_2")
+    small = replace(noiseless(rig, lines, others), findings=(coarse,))
+    large = noiseless(rig, lines, [*others, "theta_2"])
+    hidden, read = findings.checked([small], rig), findings.checked([small, large], rig)
+    assert hidden.hidden == {"theta_2"}
+    assert set(hidden.sensors(rig)) == {*others, "theta_2"}
+    assert coarse not in hidden.samples
+    table = [e for e in table_of(rig, 0.8, 35.0, "sensor_delay") if e.site in ("theta_2", "a_1")]
+    assert {e.site for e in hidden.competing(table)} == {"a_1"}
+    # Where some records show it, the others are left out.
+    assert read.hidden == set()
+    assert coarse in read.samples
+    assert {e.site for e in read.competing(table)} == {"theta_2", "a_1"}

@@ -23,6 +23,7 @@ from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.fit.stated import IN_DATA
+from samii_rig.diagnose.forces import search as force_search
 from samii_rig.diagnose.forces.laws import CLIPPED
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.problem import ForceProblem
@@ -337,3 +338,56 @@ def test_a_force_that_stopped_elsewhere_is_refitted_from_where_it_stands_beside_
     search.found = {e.key: e for e in (both, alone)}
     search._alone()
     assert search.found[alone.key].weight == first
+
+
+def test_beside_a_force_all_compete_that_do_there_as_well_as_what_was_found_without_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A lag had fitted best without the force, where a shift of the columns is right."""
+    force = Effect("cubic_stiffness", "spring", force=object())  # type: ignore[arg-type]
+    lag = Effect("actuator_lag", "motor")
+    shift, other = (Effect("columns_shifted", "v", variant=f"{n}") for n in (2, 3))
+    costs = {lag.key: 1269.0, shift.key: 1270.0, other.key: 3000.0}
+
+    def fit(effects: tuple[Effect, ...]) -> SimpleNamespace:
+        cost = costs[effects[0].key] if effects else 1.5e4
+        return SimpleNamespace(cost=cost, effects=effects)
+
+    def explained(*effects: Effect) -> SimpleNamespace:
+        return SimpleNamespace(effects=effects, fitted=fit(effects))
+
+    class Plain:
+        problem, model = None, None
+
+        def without_refit(self, rest: SimpleNamespace, i: int) -> SimpleNamespace:
+            assert rest.effects[i] is lag
+            return explained()
+
+        def refitted(self, effects: tuple[Effect, ...], *_: object) -> SimpleNamespace:
+            return fit(effects)
+
+    tried: list[tuple[Effect, ...]] = []
+
+    class Kept(ForceSearch):
+        def ranked(self) -> list[SimpleNamespace]:  # type: ignore[override]
+            return [SimpleNamespace(effects=(lag, force))]
+
+        def linear_part(self, best: object) -> tuple[Plain, SimpleNamespace]:  # type: ignore[override]
+            del best
+            return Plain(), explained(lag)
+
+        def each(self, some, _name):  # type: ignore[no-untyped-def, override]
+            return some
+
+        def _beside_force(self, effects, plain, best) -> None:  # type: ignore[no-untyped-def, override]
+            del best
+            assert plain.effects == effects[:1]
+            tried.append(effects)
+
+    monkeypatch.setattr(force_search.Screen, "of", lambda *_: None)
+    found = [(100.0, e, [()]) for e in (lag, shift, other)]
+    monkeypatch.setattr(force_search, "ranking", lambda *_: found)
+    search = object.__new__(Kept)
+    search.linear = SimpleNamespace(table=())  # type: ignore[assignment]
+    search._rivals()
+    assert tried == [(shift, force)]

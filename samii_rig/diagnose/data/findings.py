@@ -45,7 +45,8 @@ class Checked:
     units : channels whose unit was mended. mended : whether anything was, in the responses alone;
     mend : of all recordings' columns, the same as in the responses.
     of_lines : of `remarks`, what concerns responses alone. samples : why segments or channels were
-    left out for what their samples are."""
+    left out for what their samples are. hidden : sensors that loops are closed around, of which
+    rounding hides the response line by line; whole records count it."""
 
     responses: tuple[FrequencyResponse, ...]
     remarks: tuple[str, ...]
@@ -56,6 +57,7 @@ class Checked:
     guessed: Refusal | None = None
     of_lines: frozenset[str] = frozenset()
     samples: tuple[Finding, ...] = ()
+    hidden: frozenset[str] = frozenset()
     mend: Mend | None = None
 
     def sensors(self, rig: Rig) -> tuple[str, ...]:
@@ -63,16 +65,19 @@ class Checked:
         of the others; and those that a loop of the rig is closed around, without which nothing can
         be said of any record."""
         held = Counter(c.name for r in self.responses for c in r.outputs)
-        often = [n for n, k in held.items() if 2 * k >= len(self.responses)]
-        return tuple(dict.fromkeys([*often, *sorted(_closed_around(rig))]))
+        closed = _closed_around(rig)
+        often = [n for n, k in held.items() if n in closed or 2 * k >= len(self.responses)]
+        return (*often, *sorted(self.hidden))
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
-        """The table, with what is left of a wrong unit as no physics: 9.81 is not 9.80665."""
+        """The table, with what is left of a wrong unit as no physics, as 9.81 is not 9.80665; and
+        without what a sensor would do of which rounding hides the response."""
         return [
             replace(e, physics="unit_rest")
             if e.physics == "sensor_gain" and e.site in self.units
             else e
             for e in effects
+            if e.factor is None or e.factor.kind != "sensor" or e.factor.channel not in self.hidden
         ]
 
 
@@ -105,6 +110,9 @@ def checked(
     paced(finite, rig)
     found = wired(finite, rig)
     steady, changed = _steady(found.responses)
+    rounded = {f.channel for r in given for f in r.findings if f.kind == "resolution"}
+    read = {c.name for r in steady for c in r.outputs}
+    hidden = frozenset(_closed_around(rig) & rounded - read)
     guessed = None
     if not any(repeated(r) for r in steady):
         guessed = Refusal(NO_REPEATS, "repeat each run three times, each from rest", "ambiguous")
@@ -124,14 +132,14 @@ def checked(
             for f in r.findings
             if (f.severity == "error" and f.kind not in (*OF_LINES, "gap"))
             or (f.severity == "warning" and f.kind in ("clock", "resolution"))
-            if f.kind != "resolution" or f.channel not in _closed_around(rig)
+            if f.kind != "resolution" or f.channel not in hidden
         ),
+        hidden=hidden,
     )
 
 
 def _closed_around(rig: Rig) -> set[str]:
-    """Sensors that loops are closed around. Whole records count their rounding, which hides the
-    response line by line."""
+    """Sensors that loops are closed around."""
     loops = (rig.centring_of(a.name) for a in rig.actuator)
     return {loop.sensor for loop in loops if loop is not None}
 

@@ -169,7 +169,6 @@ class ForceSearch(RecordSearch):
         self.pair()
         self._alone()
         self._rivals()
-        self._plainer()
         self._forget_inconsistent()
         self.take_overdispersion()
 
@@ -223,39 +222,41 @@ class ForceSearch(RecordSearch):
         if not isinstance(best.fitted.model, ForceModel):
             return
         for i, gone in enumerate(best.effects):
-            if gone.force is None and not self.exhausted:
+            if gone.force is None:
                 old = self.found.pop(best.key - {gone.key}, None)
                 self.without(best, i)
                 if old is not None:
                     self.keep(old.effects, old.fitted)
 
     def _rivals(self) -> None:
-        """The force of the best explanation beside what does as well as its linear effects do: what
-        the linear search cannot distinguish, a force beside it does not either."""
+        """The forces of the best explanation beside what does as well as each linear effect there
+        does while these are as they are: which of them fit best without the forces says little."""
         best = self.ranked()[0]
-        force = [i for i, e in enumerate(best.effects) if e.force is not None]
-        beside = frozenset(e.key for e in best.effects if e.force is None)
-        own = self.linear.found.get(beside)
-        if not force or not beside or own is None:
-            return
-        ranked = self.linear.ranked()
-        near = [e for e in ranked if e.key != beside and e.weight > own.weight - NEAR]
-        for rival in self.each(near[:RIVALS], lambda e: named(e.effects)):
-            if self.exhausted:
-                return
-            effects = (*rival.effects, *(best.effects[i] for i in force))
-            self._beside_force(effects, rival.fitted.x[rival.fitted.model.n_nominal :], best)
+        forces = tuple(e for e in best.effects if e.force is not None)
+        plain, rest = self.linear_part(best)
+        for i, gone in enumerate(rest.effects):
+            less = plain.without_refit(rest, i) if forces else None
+            if less is None:
+                continue
+            screen = Screen.of(plain.problem, less.fitted)
+            ranked = ranking(screen, self.linear.table, less.effects, plain.model)
+            others = [r for r in ranked if r[1].key != gone.key]
+            some = [*others[:BESIDE], *(r for r in others[BESIDE:] if r[1].within(gone))]
+            for _, effect, starts in self.each(some, lambda r: named([r[1]])):
+                effects = (*less.effects, effect)
+                end = plain.refitted(effects, less, np.log(starts[0]).tolist())
+                if end is not None and end.cost < rest.fitted.cost + 2 * NEAR:
+                    self._beside_force((*effects, *forces), end, best)
 
-    def _beside_force(self, effects: tuple[Effect, ...], own: Float, best: Explanation) -> None:
-        """Refit the forces of `best` beside other linear effects. effects : these, then the
-        forces. own : unknowns of the linear ones."""
+    def _beside_force(self, effects: tuple[Effect, ...], plain: Fitted, best: Explanation) -> None:
+        """Refit the forces of `best` beside other linear effects, from where these fit what it
+        leaves without them. effects : the linear ones, then the forces."""
         if (model := self.model(effects)) is None:
             return
-        # The nominal parameters as they are beside the force: without it they stand elsewhere.
-        known = moved(best.fitted.model, best.fitted.x, model)[: model.n_nominal]
+        linear = moved(plain.model, plain.x, model)
         forces = [i for i, e in enumerate(best.effects) if e.force is not None]
         strengths = [best.fitted.x[k] for i in forces for k in best.fitted.model.own(i)]
-        start = np.concatenate([known, own, strengths])
+        start = np.concatenate([linear, strengths])
         for _ in range(AGAIN):
             self._ways.clear()
             end = self.refitted_from(effects, start)
@@ -265,22 +266,6 @@ class ForceSearch(RecordSearch):
             if float(np.max(np.abs(end.x - start))) < NO_MOVE:
                 return
             start = end.x
-
-    def _plainer(self) -> None:
-        """As of `Search`, beside the force of the best explanation."""
-        best = self.ranked()[0]
-        forces = tuple(e for e in best.effects if e.force is not None)
-        plain, rest = self.linear_part(best)
-        for i, gone in enumerate(rest.effects):
-            some = [e for e in self.linear.table if e.within(gone)]
-            less = plain.without_refit(rest, i) if some and forces else None
-            if less is None or self.exhausted:
-                continue
-            screen = Screen.of(plain.problem, less.fitted)
-            own = less.fitted.x[less.fitted.model.n_nominal :]
-            for _, effect, starts in ranking(screen, some, less.effects, plain.model):
-                effects = (*less.effects, effect, *forces)
-                self._beside_force(effects, np.append(own, np.log(starts[0])), best)
 
     def _try(self, scores: Sequence[Score], base: Explanation, at: int) -> None:
         """Refit the forces that may be the best beside `base`, by its gains there."""
@@ -335,7 +320,7 @@ class ForceSearch(RecordSearch):
         best = self.ranked()[0]
         real = [e for e in best.effects if e.physical]
         single = len(real) == 1 and isinstance(best.fitted.model, ForceModel)
-        if not single:
+        if not single or self.exhausted:  # one that did not come to rest would lack much beside it
             return
         plain, rest = self.linear_part(best)
         assert isinstance(plain, RecordSearch)
