@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,18 +141,26 @@ def sent(
     return np.where(np.isfinite(drawn), drawn, v), meter.far
 
 
-def calibrated(r: Float, step: float) -> tuple[Float, float, float]:
+class MeterNoise(NamedTuple):
+    """Standard deviation of what a meter put on a command: in its record, and left of that where
+    it was taken out as far as the record shows it."""
+
+    shown: float = 0.0
+    left: float = 0.0
+
+
+def calibrated(r: Float, step: float) -> tuple[Float, MeterNoise]:
     """(n,) the input as likely as a meter's white noise on r (n,) leaves it: every line by the part
     of its power that is not noise (regression calibration: Carroll et al. 2006, Measurement Error
     in Nonlinear Models, ch. 4). A line shows that part by itself where it stands out alone, the
     others together with their neighbours. r itself where the meter shows none, or the input is as
-    wide as what was recorded. And the standard deviation of that noise, and of what of it is left.
+    wide as what was recorded. And that noise.
 
     step : of the command's converter, whose rounding is the input's own.
     """
     floor = meter_noise(r, step) ** 2
     if floor == 0:
-        return r, 0.0, 0.0
+        return r, MeterNoise()
     known: Float = _stairs(r, math.sqrt(floor)) + float(np.mean(r))
     x: Float = r - known
     way = np.concatenate([_on(x[::-1])[::-1], x, _on(x)])
@@ -165,7 +174,7 @@ def calibrated(r: Float, step: float) -> tuple[Float, float, float]:
     spectrum *= part
     more = (way.size - r.size) // 2
     own: Float = known + np.fft.irfft(spectrum, way.size)[more : more + r.size]
-    return own, math.sqrt(floor), math.sqrt(floor * float(np.mean(part)))
+    return own, MeterNoise(math.sqrt(floor), math.sqrt(floor * float(np.mean(part))))
 
 
 def _stairs(r: Float, noise: float) -> Float:

@@ -49,13 +49,12 @@ class Command:
     """What one of the records behind a piece told the rig, and its part in the piece.
 
     v : as recorded, of the shape of r. part : the piece's r and z have so many times this record's.
-    meter : of each input, the noise of a meter that was on it, by its standard deviation, and what
-    of that was left in v and r, as the record does not show it.
+    meter : of each input, what is left is in v and r.
     """
 
     v: Float
     part: float
-    meter: tuple[tuple[float, float], ...]
+    meter: tuple[inputs.MeterNoise, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +269,7 @@ def _driving_columns(recording: Recording, wired: Wiring) -> set[str]:
 
 def _driving(
     whole: Bridged, x: Input, values: Float, sensors: Sequence[str], *, slower: bool, times: int
-) -> tuple[Float, Float, NDArray[np.bool_], tuple[float, float]]:
+) -> tuple[Float, Float, NDArray[np.bool_], inputs.MeterNoise]:
     """(n,) of an input: the command, what drives its loop, and where it has edges; and a meter's
     noise, as of `Command`.
 
@@ -280,20 +279,20 @@ def _driving(
     recording = whole.recording
     if not _has(recording, x.command):
         still = np.zeros(len(values))
-        return still, still, np.zeros(len(values), np.bool_), (0.0, 0.0)
+        return still, still, np.zeros(len(values), np.bool_), inputs.MeterNoise()
     recording = of_input(recording, x.command)
     column = recording.column(x.command)
     theta = values[:, sensors.index(x.centring)] if x.kp else None
     v, edges = inputs.sent(recording, column, x.kp, theta, times, whole.gaps)
     if slower:
         edges = edges | inputs.jumps(recording, column, x.kp, theta)
-    r, meter = v.copy(), (0.0, 0.0)
+    r, meter = v.copy(), inputs.MeterNoise()
     if theta is not None:
         r += x.kp * theta
     if not recording.names("reference"):
         noisy = r
-        r, there, left = inputs.calibrated(noisy, recording.channels[column].resolution)
-        v, meter = v + (r - noisy), (there, left)
+        r, meter = inputs.calibrated(noisy, recording.channels[column].resolution)
+        v = v + (r - noisy)
     return v, r, edges, meter
 
 
@@ -321,7 +320,7 @@ class _Samples:
     r: Float
     edges: NDArray[np.bool_]
     values: Float
-    meter: tuple[tuple[float, float], ...]
+    meter: tuple[inputs.MeterNoise, ...]
     unknown: NDArray[np.bool_]
     slower: bool
 

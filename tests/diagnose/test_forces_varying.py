@@ -39,6 +39,7 @@ from samii_rig.diagnose.forces.varying import (
 )
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import on_records
+from samii_rig.likelihood.inputs import MeterNoise
 from samii_rig.likelihood.pieces import Command, Piece
 from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.record.reader import read_recording
@@ -232,7 +233,7 @@ def test_the_motion_that_a_swing_changes_is_that_of_a_spring_that_swings() -> No
     m, c, k, rate, hz, depth = 1.0, 4.0, 900.0, 100.0, 0.7, 0.1
     rng = np.random.default_rng(3)
     v = rng.standard_normal(1000)
-    told = Command(v, 1.0, ((0.0, 0.0),))
+    told = Command(v, 1.0, (MeterNoise(),))
     piece = Piece("held", v, np.zeros((v.size, 1)), 0, (), commands=(told,))
     span = Span.of(piece, rate, rate / 4)
 

@@ -12,6 +12,7 @@ from samii_rig.diagnose.fit.records import _shown, fitted_lines
 from samii_rig.likelihood import pieces
 from samii_rig.likelihood.bridged import bridged
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
+from samii_rig.likelihood.inputs import MeterNoise
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.past import Past, likely
@@ -723,7 +724,7 @@ def coarse(u: Float, denominator: Float, place: float, rng: np.random.Generator)
     z = from_rest(u, denominator)
     z[:, 0] = np.rint(z[:, 0] / 2 + place) * 2 - 2 * place
     z[:, 1] += 1e-2 * rng.standard_normal(u.size)
-    return replace(piece(u, z), commands=(pieces.Command(u, 1.0, ((0.0, 0.0),)),))
+    return replace(piece(u, z), commands=(pieces.Command(u, 1.0, (MeterNoise(),)),))
 
 
 def test_what_rests_at_one_place_in_its_step_is_rounded_alike_in_all_records():

@@ -325,12 +325,13 @@ def _records(
 def _above_meter(pieces: Sequence[Piece], rate_hz: float) -> float:
     """Hz up to which an input has more than a meter's noise, where one was on any: beyond, a change
     of the response would be that of a rig that does not follow its meter. inf where none was."""
-    meter = np.max([c.meter for p in pieces for c in p.commands], axis=0)[:, 0]
+    each = [[noise.shown for noise in c.meter] for p in pieces for c in p.commands]
+    meter = np.max(each, axis=0)
     if not np.any(meter):
         return np.inf
     # The end of a record that is cut leaks, and drives nothing that is seen.
-    each = (np.asarray((signal.windows.tukey(len(p.r), TAPER) * p.r.T).T) for p in pieces)
-    tapered = [replace(p, r=r) for p, r in zip(pieces, each, strict=True)]
+    ends = (np.asarray((signal.windows.tukey(len(p.r), TAPER) * p.r.T).T) for p in pieces)
+    tapered = [replace(p, r=r) for p, r in zip(pieces, ends, strict=True)]
     reached = excited(tapered, rate_hz, np.asarray(meter**2), part=DRIVES)
     return max((band[1] for band in reached if band), default=np.inf)
 
