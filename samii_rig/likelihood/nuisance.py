@@ -77,6 +77,34 @@ def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
     return np.concatenate(out, axis=2)
 
 
+def folded(piece: Piece, k: Int, impulse: Float, fine: Float, every: int) -> Complex:
+    """(n_lines, q, m) of what the input's edges between two samples excite above half the rate, and
+    what folds back from there: a jump at the first of the rig's samples between, less that of a
+    record as `impulse` answers it, and an impulse at each of the others.
+
+    impulse : as of `edges`. fine : (m, q) or (m, q inputs) answer to an impulse of a sample of the
+    rig, of which every so-manieth was recorded.
+    """
+    n, q = len(piece.r), piece.z.shape[1]
+    each = set(piece.edges)
+    out = []
+    for at, of in sorted(each):
+        if (at + 1, of) not in each or at + 1 >= n:
+            continue
+        own, known = fine[:, of :: piece.inputs], impulse[:, of :: piece.inputs]
+        jump = np.zeros((n, q))
+        behind = n - at - 1
+        jump[at + 1 :] = np.cumsum(own, axis=0)[: behind * every : every]
+        jump[at + 1 :] -= np.cumsum(known, axis=0)[:behind]
+        shapes = [jump]
+        for late in range(1, every):
+            y = np.zeros((n, q))
+            y[at + 1 :] = own[every - late :: every][:behind]
+            shapes.append(y)
+        out += [np.fft.rfft(y[piece.history :], axis=0)[k] for y in shapes]
+    return np.stack(out, axis=2) if out else np.zeros((k.size, q, 0), complex)
+
+
 @lru_cache(maxsize=1)
 def _within() -> Float:
     """(2 TAPS, WITHIN) impulses, the samples from 1 - TAPS to TAPS, which make up to `HIGHEST` of

@@ -47,7 +47,8 @@ AT_ONCE = 1024  # lines whose products are formed together: 4 MB at 120 nodes, w
 
 Response = Callable[[Complex], Complex]
 """(n,) s -> (n, q) of the reference model, from input to sensors; (n, q m) of m inputs, all inputs
-of the first sensor first."""
+of the first sensor first. Beyond half the rate of records that hold not every sample of the rig:
+from and to all of its samples."""
 
 Part = Callable[[Int], NDArray[np.bool_]]
 """Which lines of a piece, by their number."""
@@ -137,6 +138,7 @@ class Records:
     enough at least, so that those of other records are the same. driven : Hz up to which the input
     is more than noise, so that a change of the response shows. undriven : inputs that nothing
     excites. What they did is known; a change of the response to it would fit the noise in it.
+    every : samples of the rig for each that was recorded.
     """
 
     pieces: tuple[Piece, ...]
@@ -146,6 +148,7 @@ class Records:
     least: int = 0
     driven: float = np.inf
     undriven: tuple[int, ...] = ()
+    every: int = 1
 
     @property
     def changing(self) -> tuple[float, float]:
@@ -176,6 +179,10 @@ class Records:
     def exact(self) -> Contour:
         """The contour of predictions."""
         return Contour.over(self.longest, self.rate_hz, EXACT)
+
+    def fine(self) -> Contour:
+        """That of all samples of the rig, where not every one was recorded."""
+        return Contour.over(self.longest * self.every, self.rate_hz * self.every, EXACT)
 
     def smooth(self) -> Contour:
         """The contour of the nodes."""
@@ -221,12 +228,16 @@ class Records:
         )
         return replace(self, pieces=pieces)
 
-    def seen(self, H: Complex, loop: Loops) -> list[Seen]:
-        """Of each piece what H on `exact` leaves, and what else is in it."""
+    def seen(self, H: Complex, loop: Loops, response: Response) -> list[Seen]:
+        """Of each piece what H on `exact`, of a response, leaves, and what else is in it."""
         rms = [np.sqrt(np.mean(by_input(p.r) ** 2, axis=1)) for p in self.pieces]
         answers = Answers.of(
             H, self.exact(), loop, self.longest, np.max(rms, axis=0), self.pieces[0].inputs
         )
+        if self.every > 1 and any(p.edges for p in self.pieces):
+            contour = self.fine()
+            fine = contour.record(response(contour.s), self.longest * self.every)
+            answers = replace(answers, fine=fine, every=self.every)
         return [Seen.of(p, self.lines(p).k, answers, self.step) for p in self.pieces]
 
 
@@ -256,7 +267,7 @@ def residuals_by_line(
     some parts, nuisances at their best there; of all lines where none is said."""
     H = response(records.exact().s)
     records = records.without_spikes(H)
-    every = _rows(records, None, records.seen(H, loop))
+    every = _rows(records, None, records.seen(H, loop, response))
     out = []
     for part in parts or (lambda k: np.ones(k.size, bool),):
         rows = every.take(part(every.k))
@@ -367,7 +378,7 @@ def formed(
         nodes = nodes_of(smooth, shape, records.changing)
     else:
         nodes = np.rint(at * (smooth.samples / smooth.rate_hz)).astype(np.int64)
-    seen = records.seen(H, loop)
+    seen = records.seen(H, loop, response)
     free = _between(nodes, nodes_of(smooth, shape, records.changing, spare=True))
 
     known = rounding.Added.of([s.rounding for s in seen])

@@ -61,7 +61,9 @@ def unexplained(
     H = response(exact.s)
     records = records.without_spikes(H)
     out = []
-    for i, (piece, seen) in enumerate(zip(records.pieces, records.seen(H, loop), strict=True)):
+    for i, (piece, seen) in enumerate(
+        zip(records.pieces, records.seen(H, loop, response), strict=True)
+    ):
         lines = records.lines(piece)
         root = np.sqrt(2) * np.linalg.inv(
             noise.noise.root(lines.frequency, np.full(lines.k.size, i))

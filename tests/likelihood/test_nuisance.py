@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy import special
+from scipy import signal, special
 
 from samii_rig.likelihood import nuisance
 from samii_rig.likelihood.pieces import Piece, _cut_off
@@ -47,6 +47,38 @@ def test_an_edge_between_two_samples_is_known_but_for_its_size_and_instant(kind:
     left = fraction_of(response(s[k]) * beyond, shapes)
     assert left < 0.001
     assert left < fraction_of(response(s[k]) * beyond, impulses(piece, k, impulse)) / 2
+
+
+@pytest.mark.parametrize("late", [0, 1, 4])
+def test_what_an_edge_excites_above_half_the_rate_folds_back(late: int) -> None:
+    """Of a rig with a mode there, of which every fifth sample was recorded."""
+    every, many, k = 5, 8 * N, np.arange(5, int(0.44 * N))
+    modes = [(0.12, 0.01), (0.8, 0.003)]  # of the record's rate, damping
+    A = np.zeros((4, 4))
+    for i, (f, zeta) in enumerate(modes):
+        w = 2 * np.pi * f / every
+        A[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [[0.0, w], [-w, -2 * zeta * w]]
+    B = np.array([[0.0], [1.0], [0.0], [1.0]])
+    C = np.array([[1.0, 0.0, 0.3, 0.0]])
+    rig = signal.cont2discrete((A, B, C, np.zeros((1, 1))), 1.0)
+    u = np.zeros(N * every)
+    u[AT * every + late :] = 1.0
+    once = np.zeros(N * every)
+    once[0] = 1.0
+    z, fine = (signal.dlsim(rig, x)[1][:, 0] for x in (u, once))
+    r = u[::every]
+    # In the band, of a record that is long enough, beyond it nothing.
+    f = np.arange(many // 2 + 1) / many
+    zinv = np.exp(2j * np.pi * f / every)
+    H = np.array([(rig[2] @ np.linalg.solve(x * np.eye(4) - rig[0], rig[1]))[0, 0] for x in zinv])
+    H *= special.erfc((2 * f - 1) / 0.03) / 2
+    impulse = np.fft.irfft(H)[:, None]
+    e = np.fft.rfft(z[::every] - np.fft.irfft(H * np.fft.rfft(r, many))[:N])[k]
+    piece = Piece("steps", r, np.zeros((N, 1)), 0, (), edges=((AT - 1, 0), (AT, 0), (AT + 1, 0)))
+    edges = nuisance.edges(piece, k, impulse)
+    both = np.concatenate([edges, nuisance.folded(piece, k, impulse, fine[:, None], every)], axis=2)
+    assert fraction_of(e, both) < 0.01
+    assert fraction_of(e, edges) > 10 * fraction_of(e, both)
 
 
 def impulses(piece: Piece, k: Int, impulse: Float) -> Complex:

@@ -117,7 +117,9 @@ class Whole:
             _records(p, rate, band, step, rounding, slower=slower) for p in (joined(levels), levels)
         )
         rests = tuple(j for j, x in enumerate(wired.inputs) if not x.driven)
-        all_, of_levels = (replace(one, undriven=rests) for one in (all_, of_levels))
+        every = round(rig.rate_hz / rate)
+        both = (replace(one, undriven=rests, every=every) for one in (all_, of_levels))
+        all_, of_levels = both
         without |= _sensors_out(runs, rig, wired, findings)
         left_out, asked = tuple(without.items()), band is not None
         return cls(rig, all_, wired, left_out, of_levels, asked, runs=tuple(runs))
@@ -219,8 +221,12 @@ class Whole:
         """Of a fit, at any s of one contour."""
 
         def at(s: Complex) -> Complex:
-            f = np.minimum(s.imag / (2 * np.pi), self.records.rate_hz / 2)  # but for rounding
-            sigma = float(s.real[0])
+            f, sigma = s.imag / (2 * np.pi), float(s.real[0])
+            half = self.records.rate_hz / 2
+            if f[-1] > 1.5 * half:  # all that the rig does
+                f = np.minimum(f, self.rig.rate_hz / 2)
+                return fitted.model.response(fitted.x, self.grid(f, sigma, fitted))
+            f = np.minimum(f, half)  # but for rounding
             H = fitted.model.response(fitted.x, self.grid(f, sigma, fitted))
             return H if self.every == 1 else self._recorded(f, H, sigma, fitted)
 
