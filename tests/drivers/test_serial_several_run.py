@@ -38,7 +38,8 @@ def ran(folder: Path, driver: str, *settings: str) -> Path:
     """The recording of one `samii-rig run`."""
     # A loaded machine may be late with either way.
     text = load_rig("samii_two_joints")[1].replace("deadman = 0.05", "deadman = 0.2")
-    text = text.replace("stale_after = 0.05", "stale_after = 0.5")
+    text = text.replace("stale_after = 0.05\n", "")
+    text = text.replace("[[sensor]]\n", "[[sensor]]\nstale_after = 0.5\n")
     head = text[: text.index("[device]")]
     rig, experiment, out = folder / "rig.toml", folder / "both.toml", folder / "run.mcap"
     rows = "".join(f"{s}\n" for s in settings)
