@@ -60,11 +60,12 @@ def offsets(piece: Piece, k: Int, steps: Sequence[Float]) -> Complex:
     return np.stack([np.fft.rfft(y[piece.history :], axis=0)[k] for y in steps], axis=2)
 
 
-def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
+def edges(piece: Piece, k: Int, impulse: Float, folded: Sequence[Float] = ()) -> Complex:
     """(n_lines, q, m) of the input's edges, which came some part of a sample earlier or later: an
     impulse each; of two that follow one another, all that an edge between them may be.
 
-    impulse : (m, q) answer to an impulse of the input; (m, q inputs) of several.
+    impulse : (m, q) answer to an impulse of the input; (m, q inputs) of several. folded : as of
+    `folding`.
     """
     every = set(piece.edges)
     between = [(at, of) for at, of in piece.edges if (at + 1, of) in every]
@@ -74,35 +75,22 @@ def edges(piece: Piece, k: Int, impulse: Float) -> Complex:
         first = [(at + 1 - TAPS, of) for at, of in between]
         shapes = (signal.upfirdn(taps, impulse, axis=0) for taps in _within().T)
         out += [_after(piece, k, one, first) for one in shapes]
+        second = [(at + 1, of) for at, of in between]
+        out += [_after(piece, k, one, second) for one in folded]
     return np.concatenate(out, axis=2)
 
 
-def folded(piece: Piece, k: Int, impulse: Float, fine: Float, every: int) -> Complex:
-    """(n_lines, q, m) of what the input's edges between two samples excite above half the rate, and
-    what folds back from there: a jump at the first of the rig's samples between, less that of a
-    record as `impulse` answers it, and an impulse at each of the others.
+def folding(impulse: Float, fine: Float, every: int) -> tuple[Float, ...]:
+    """Shapes (m, q) or (m, q inputs), from the second of two samples on, of what an edge between
+    them excites above half the rate, and what folds back from there: a jump at the second less that
+    of a record as `impulse` answers it, and an impulse at each of the rig's samples between.
 
-    impulse : as of `edges`. fine : (m, q) or (m, q inputs) answer to an impulse of a sample of the
-    rig, of which every so-manieth was recorded.
+    impulse : as of `edges`. fine : (m every, q) or (m every, q inputs) answer to an impulse of a
+    sample of the rig, of which every so-manieth was recorded.
     """
-    n, q = len(piece.r), piece.z.shape[1]
-    each = set(piece.edges)
-    out = []
-    for at, of in sorted(each):
-        if (at + 1, of) not in each or at + 1 >= n:
-            continue
-        own, known = fine[:, of :: piece.inputs], impulse[:, of :: piece.inputs]
-        jump = np.zeros((n, q))
-        behind = n - at - 1
-        jump[at + 1 :] = np.cumsum(own, axis=0)[: behind * every : every]
-        jump[at + 1 :] -= np.cumsum(known, axis=0)[:behind]
-        shapes = [jump]
-        for late in range(1, every):
-            y = np.zeros((n, q))
-            y[at + 1 :] = own[every - late :: every][:behind]
-            shapes.append(y)
-        out += [np.fft.rfft(y[piece.history :], axis=0)[k] for y in shapes]
-    return np.stack(out, axis=2) if out else np.zeros((k.size, q, 0), complex)
+    jump = np.cumsum(fine, axis=0)[::every]
+    jump -= np.cumsum(impulse[: len(jump)], axis=0)
+    return (jump, *(fine[every - late :: every] for late in range(1, every)))
 
 
 @lru_cache(maxsize=1)

@@ -180,18 +180,23 @@ def _input(
                 f"{recording.source or 'a recording'} has no column {command}; expected one, as "
                 f"the rig file closes a loop from {sensor} to it"
             )
-    if all(_is_open(of_input(r, command), command, sensor, kp) for r in recordings):
-        return Input(command)
-    return Input(command, sensor, kp)
+    closed = Input(command, sensor, kp)
+    return Input(command) if all(_is_open(r, closed) for r in recordings) else closed
 
 
-def _is_open(recording: Recording, command: str, sensor: str, kp: float) -> bool:
+def _is_open(recording: Recording, x: Input) -> bool:
     """Whether no loop ran, also where a meter recorded the command: late, and with noise."""
-    if is_open(recording, command, sensor, kp):
+    if is_open(of_input(recording, x.command), x.command, x.centring, x.kp):
         return True
-    theta = recording.values_of(sensor)
-    meter = inputs.Meter.of(recording, recording.column(command), kp, theta)
+    meter = _meter(recording, x)
     return meter is not None and meter.kp == 0
+
+
+def _meter(recording: Recording, x: Input) -> inputs.Meter | None:
+    """What a meter showed of an input, as of `inputs.Meter.of`."""
+    theta = recording.values_of(x.centring) if x.kp else None
+    own = of_input(recording, x.command)
+    return inputs.Meter.of(own, own.column(x.command), x.kp, theta)
 
 
 def _has(recording: Recording, name: str) -> bool:
@@ -239,15 +244,8 @@ def pieces_of(
 def faster(recordings: Sequence[Recording], wired: Wiring) -> int:
     """How often the rig's loop ran for each sample that was recorded, by what a meter shows of its
     commands; 0 where these were recorded as they were sent, or do not show it."""
-    found = []
-    for recording in recordings:
-        for x in wired.inputs:
-            if not _has(recording, x.command):
-                continue
-            theta = recording.values_of(x.centring) if x.kp else None
-            own = of_input(recording, x.command)
-            found.append(inputs.Meter.of(own, own.column(x.command), x.kp, theta))
-    return inputs.times_of(found)
+    each = ((r, x) for r in recordings for x in wired.inputs if _has(r, x.command))
+    return inputs.times_of([_meter(r, x) for r, x in each])
 
 
 def _known(recording: Recording, wired: Wiring) -> NDArray[np.bool_]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from samii_rig.errors import EstimateError
-from samii_rig.likelihood import rounding, spikes
+from samii_rig.likelihood import nuisance, rounding, spikes
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Disturbances, Noise
@@ -237,7 +237,8 @@ class Records:
         if self.every > 1 and any(p.edges for p in self.pieces):
             contour = self.fine()
             fine = contour.record(response(contour.s), self.longest * self.every)
-            answers = replace(answers, fine=fine, every=self.every)
+            folded = nuisance.folding(answers.impulse, fine, self.every)
+            answers = replace(answers, folded=folded)
         return [Seen.of(p, self.lines(p).k, answers, self.step) for p in self.pieces]
 
 

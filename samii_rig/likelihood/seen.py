@@ -24,10 +24,9 @@ class Answers:
 
     H : (M//2 + 1, q), or (M//2 + 1, q inputs) of several, all inputs of the first sensor first.
     loops : that H has closed. impulse : (m, q) or (m, q inputs) its answer to an impulse.
-    strength : (inputs,) rms of what is known to act. fine : (m, q) or (m, q inputs) the answer to
-    an impulse of a sample of the rig, of which every so-manieth was recorded; None where no edge
-    needs it. What pieces of one length have in common is kept: most are repeats and levels of one
-    excitation.
+    strength : (inputs,) rms of what is known to act. folded : as of `nuisance.folding`, none where
+    no edge needs it. What pieces of one length have in common is kept: most are repeats and levels
+    of one excitation.
     """
 
     H: Complex
@@ -39,8 +38,7 @@ class Answers:
     kept: dict[tuple[int, int, int, int], tuple[Past, Complex, Complex]] = field(
         default_factory=dict
     )
-    fine: Float | None = None
-    every: int = 1
+    folded: tuple[Float, ...] = ()
 
     @classmethod
     def of(
@@ -109,9 +107,7 @@ class Seen:
             y = y + _before(past, left[k], wander, answers.impulse, piece)
         rounding = Rounding.of_piece(piece, k, step, y, exact.rate_hz)
         own += [nuisance.unread(piece, k, rounding.factors, H, exact, answers.loops)]
-        own += [nuisance.edges(piece, k, answers.impulse)]
-        if answers.fine is not None:
-            own += [nuisance.folded(piece, k, answers.impulse, answers.fine, answers.every)]
+        own += [nuisance.edges(piece, k, answers.impulse, answers.folded)]
         own += [nuisance.lost(piece, k, answers.impulse)]
         beside = _of_size_one(np.concatenate(own, axis=2))
         first = past.shapes.shape[2]

@@ -69,14 +69,15 @@ def test_what_an_edge_excites_above_half_the_rate_folds_back(late: int) -> None:
     r = u[::every]
     # In the band, of a record that is long enough, beyond it nothing.
     f = np.arange(many // 2 + 1) / many
-    zinv = np.exp(2j * np.pi * f / every)
-    H = np.array([(rig[2] @ np.linalg.solve(x * np.eye(4) - rig[0], rig[1]))[0, 0] for x in zinv])
+    turn = np.exp(2j * np.pi * f / every)
+    H = np.array([(rig[2] @ np.linalg.solve(x * np.eye(4) - rig[0], rig[1]))[0, 0] for x in turn])
     H *= special.erfc((2 * f - 1) / 0.03) / 2
     impulse = np.fft.irfft(H)[:, None]
     e = np.fft.rfft(z[::every] - np.fft.irfft(H * np.fft.rfft(r, many))[:N])[k]
     piece = Piece("steps", r, np.zeros((N, 1)), 0, (), edges=((AT - 1, 0), (AT, 0), (AT + 1, 0)))
     edges = nuisance.edges(piece, k, impulse)
-    both = np.concatenate([edges, nuisance.folded(piece, k, impulse, fine[:, None], every)], axis=2)
+    folded = nuisance.folding(impulse, fine[:, None], every)
+    both = nuisance.edges(piece, k, impulse, folded)
     assert fraction_of(e, both) < 0.01
     assert fraction_of(e, edges) > 10 * fraction_of(e, both)
 

@@ -112,14 +112,12 @@ class Whole:
         step = tuple(steps[n] for n in wired.sensors)
         finest = {a.name: a.resolution for a in rig.actuator}
         rounding = np.array([finest[x.command] ** 2 / 12 for x in wired.inputs])
-        slower = round(rig.rate_hz / rate) > 1
+        every = round(rig.rate_hz / rate)
         all_, of_levels = (
-            _records(p, rate, band, step, rounding, slower=slower) for p in (joined(levels), levels)
+            _records(p, rate, band, step, rounding, every) for p in (joined(levels), levels)
         )
         rests = tuple(j for j, x in enumerate(wired.inputs) if not x.driven)
-        every = round(rig.rate_hz / rate)
-        both = (replace(one, undriven=rests, every=every) for one in (all_, of_levels))
-        all_, of_levels = both
+        all_, of_levels = (replace(one, undriven=rests) for one in (all_, of_levels))
         without |= _sensors_out(runs, rig, wired, findings)
         left_out, asked = tuple(without.items()), band is not None
         return cls(rig, all_, wired, left_out, of_levels, asked, runs=tuple(runs))
@@ -127,7 +125,7 @@ class Whole:
     @property
     def every(self) -> int:
         """Samples of the rig for each that was recorded."""
-        return round(self.rig.rate_hz / self.records.rate_hz)
+        return self.records.every
 
     def by_level(self) -> Whole:
         """The same records, the levels not summed up: for what depends on amplitude."""
@@ -223,12 +221,11 @@ class Whole:
         def at(s: Complex) -> Complex:
             f, sigma = s.imag / (2 * np.pi), float(s.real[0])
             half = self.records.rate_hz / 2
-            if f[-1] > 1.5 * half:  # all that the rig does
-                f = np.minimum(f, self.rig.rate_hz / 2)
-                return fitted.model.response(fitted.x, self.grid(f, sigma, fitted))
-            f = np.minimum(f, half)  # but for rounding
+            beyond = round(f[-1] / half) > 1
+            f = np.minimum(f, self.rig.rate_hz / 2 if beyond else half)  # but for rounding
             H = fitted.model.response(fitted.x, self.grid(f, sigma, fitted))
-            return H if self.every == 1 else self._recorded(f, H, sigma, fitted)
+            whole = beyond or self.every == 1
+            return H if whole else self._recorded(f, H, sigma, fitted)
 
         return at
 
@@ -307,14 +304,13 @@ def _records(
     band: tuple[float, float] | None,
     step: tuple[float, ...],
     rounding: Float,
-    *,
-    slower: bool = False,
+    every: int,
 ) -> Records:
-    """Those that anything drives. rounding : (m,) of each input's converter, its power. slower :
-    whether not every sample of the rig was recorded."""
+    """Those that anything drives. rounding : (m,) of each input's converter, its power. every : as
+    of `Records`."""
     several = rounding.size > 1  # a rig's only input is never at rest
     bands_of = excited(pieces, rate_hz, rounding if several else None)
-    if slower:
+    if every > 1:
         tops = [_unfolded(p, rate_hz) for p in pieces]
         bands_of = [
             (b[0], min(b[1], top)) if b and b[0] < top else None
@@ -325,7 +321,8 @@ def _records(
         raise EstimateError("nothing drives the rig for five cycles of any line")
     bands = tuple(band or b for _, b in driven)
     some = tuple(p for p, _ in driven)
-    return Records(some, rate_hz, bands, step, driven=_above_meter(some, rate_hz))
+    driven_hz = _above_meter(some, rate_hz)
+    return Records(some, rate_hz, bands, step, driven=driven_hz, every=every)
 
 
 def _above_meter(pieces: Sequence[Piece], rate_hz: float) -> float:
