@@ -6,9 +6,7 @@ they look in all sensors: u_k(f) of disturbance k. At a line
 
     C(f) = sum_k p_k(f) u_k(f) u_k(f)^H,  p_k(f) = sum_c lambda_kc/(1 + (f/f_c)^2),  lambda >= 0.
 
-The powers are the most likely ones (Whittle's likelihood, multiplicative steps: Fevotte, Bertin
-and Durrieu 2009, Neural Comput. 21, eq. 2.11; each longer than the one before while the likelihood
-grows: Salakhutdinov and Roweis 2003, Proc. ICML). Few of them are not zero, so the noise is known
+The powers are the most likely ones (see `powers`). Few of them are not zero, so the noise is known
 well from one short record, at lightly damped modes and at its lowest lines too.
 
 What the sum does not give is estimated by blocks of lines: each has a covariance of its own about
@@ -27,6 +25,7 @@ import numpy as np
 from scipy.special import gammaln
 
 from samii_rig.errors import EstimateError
+from samii_rig.likelihood.powers import most_likely
 from samii_rig.types import Complex, Float, Int
 
 # Degrees of freedom for each sensor in a block of lines, and its width over its frequency, at
@@ -38,12 +37,6 @@ NARROWEST = 0.1
 APART = 4.0
 SMALL = 0.02  # of a bin's frequency, its width: over it no colour changes by more than 4 %
 TURN = 0.15  # nepers or rad, by which what a disturbance makes may change within a bin
-STEPS = 200  # of the powers, at most: without progress they end before
-PROGRESS = 0.02  # of the logarithm of the likelihood, gained by a step, that goes on
-# Power of a multiplicative step that never lowers the likelihood, and by how much longer the next
-# is: 55 steps lead as far as 200 that are all sure, and one in 15 comes back.
-SURE, LONGER = 0.5, 1.2
-LOUD = 1e-6  # of all, power of a component that counts
 # Of the largest, what a disturbance makes that is rounding: a force at a place that is held. What
 # moves anything, in any unit, makes more than 1e-6.
 NOTHING = 1e-12
@@ -121,7 +114,7 @@ class Noise:
         # its rounding has next to nothing.
         weight = np.asarray(np.bincount(which, free, at.size), np.float64)
         own = _mean(known(at, group), weight, bins)
-        power = _powers(u, S, w, _colours(at[middle], corners), own)
+        power = most_likely(u, S, w, _colours(at[middle], corners), own)
         plain = cls(
             disturbances,
             known,
@@ -238,42 +231,6 @@ def _mean(x: Float, weight: Float, bins: Int) -> Float:
     n = int(bins.max()) + 1
     sums = [np.bincount(bins, weight * one, n) for one in x.T]
     return np.asarray(np.stack(sums, axis=1) / np.bincount(bins, weight, n)[:, None])
-
-
-def _powers(u: Complex, S: Complex, w: Float, g: Float, known: Float) -> Float:
-    """(K, c) most likely powers. u : (b, q, K). S : (b, q, q) sums of w lines each. g : (b, c).
-    known : (b, q)."""
-    q, K = u.shape[1:]
-    size = np.sum(np.abs(u) ** 2, axis=1)
-    mean = (w @ size) / np.sum(w)
-    power = np.repeat(q / np.where(mean > 0, mean, np.inf)[:, None], g.shape[1], axis=1)
-    power /= K * g.shape[1] * np.mean(g, axis=0)
-    before, far = -np.inf, SURE
-    last, change = power, np.ones_like(power)
-    for _ in range(STEPS):
-        p = g @ power.T
-        p[:, :q] += known
-        C = (u * p[:, None, :]) @ u.conj().swapaxes(1, 2)
-        C[:, range(q), range(q)] *= 1 + 1e-9
-        own = np.linalg.inv(C)
-        back = own @ S
-        log = -float(w @ np.linalg.slogdet(C)[1] + np.sum(np.trace(back, axis1=1, axis2=2).real))
-        if log < before:  # too far: from the same place, a step that is sure
-            far = SURE if far > SURE else far / 2
-            power = last * change**far
-            continue
-        if log - before < PROGRESS:
-            break
-        before, last = log, power
-        a = np.sum(u.conj() * ((back @ own) @ u), axis=1).real
-        b = np.sum(u.conj() * (own @ u), axis=1).real
-        down = (w[:, None] * b).T @ g
-        change = np.divide(a.T @ g, down, out=np.zeros_like(power), where=down > 0)
-        far *= LONGER
-        power = last * change**far
-    power = last
-    share = power * ((w @ size)[:, None] / np.sum(w))
-    return np.where(share > LOUD * np.sum(share), power, 0.0)
 
 
 def _blocks(f: Float, free: Float, least: float) -> list[int]:

@@ -29,6 +29,7 @@ AN_OCTAVE, BEHIND = 3.0, 1.0
 # Of a contour, how far the answer to an impulse is known: what rings before its cause, as filters
 # are known to half the rate only, stands at its end and grows to there.
 AS_FAR = 0.6
+BEGINS = 256  # samples that are looked at first
 NEW = 1e-5  # of the largest, a direction in which past inputs still differ
 SAME = 1e-9  # of the largest, power in a direction that columns do not have
 # Of chi-square, motion from before a piece whose change shows: 10 noise units, of which a tenth
@@ -75,7 +76,7 @@ class Past:
                 y = one[lag + piece.history : lag + known]
                 # Of what has died out rounding alone would be left, in directions that nothing
                 # moves.
-                if lag == 1 or np.any(np.max(np.abs(y), axis=0) > off * most):
+                if lag == 1 or _moves(y, off * most):
                     spectra.append(np.fft.rfft(y, axis=0)[k])
                     at.append((int(lag), j))
         lag, of = np.array(at).T
@@ -126,6 +127,11 @@ class Past:
         np.add.at(r, (most - self.lags, self.of), self.impulses @ amplitudes)
         r = r[:, 0] if piece.r.ndim == 1 else r
         return replace(piece, r=np.concatenate([r, piece.r]), history=most + piece.history)
+
+
+def _moves(y: Float, least: Float) -> bool:
+    """Whether any of y (n, q) is more than `least` (q,): what does so mostly begins with that."""
+    return bool(np.any(np.abs(y[:BEGINS]) > least) or np.any(np.abs(y[BEGINS:]) > least))
 
 
 def _period(piece: Piece, k: Int) -> int:

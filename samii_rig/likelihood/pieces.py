@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood import inputs, spikes
@@ -24,6 +25,7 @@ LEAST_SAMPLES = 256  # fewer say nothing of a structure
 # Samples of a piece: a longer stretch is several, so that work grows as its length does. A minute
 # at 1 kHz, in which all that rings comes to rest or is well determined.
 LONGEST = 2**16
+SHORT = 4096  # samples of a piece whose DFT takes a millisecond at most
 # Samples: across a longer gap whose input is a guess there are more nuisances than where a piece
 # begins, and no more is known of the motion behind it.
 GUESSED = 64
@@ -345,6 +347,7 @@ def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float)
     name, level = recording.place(segment), (segment.level, segment.unit)
     out = []
     for start, low, high in _stretches(recording, segment, samples):
+        high = _soon_transformed(low, high, samples.whole.lost)
         history = min(low - start, high - low)
         first = low - history
         # Whatever came before the history may still ring.
@@ -363,6 +366,16 @@ def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float)
         )
         out.append(replace(piece, struck=struck, edges=tuple(at), lost=lost, unknown=unknown))
     return out
+
+
+def _soon_transformed(low: int, high: int, lost: Int) -> int:
+    """Where a stretch ends whose DFT takes no longer than it has to, at most 0.5 % earlier: that of
+    a length with a large prime factor takes twelve times as long. Not within a gap (gaps, 2)."""
+    if high - low < SHORT:
+        return high
+    end = low + int(fft.prev_fast_len(high - low, real=False))
+    within = np.any((lost[:, 0] <= end) & (end <= lost[:, 1]))
+    return high if within else end
 
 
 def _cut_off(r: Float) -> list[tuple[int, int]]:

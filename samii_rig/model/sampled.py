@@ -158,10 +158,16 @@ def feedthrough(chain: Chain) -> Float:
     return np.asarray(np.where(np.abs(G[1]) > 0.9 * np.abs(G[0]), D, 0.0))
 
 
-def sampled_response(rig: Rig, frequency_hz: Float, chain: Chain | None = None) -> Complex:
+def sampled_response(
+    rig: Rig,
+    frequency_hz: Float,
+    chain: Chain | None = None,
+    tolerance: float = ALIAS_TOLERANCE,
+) -> Complex:
     """Response of the sampled sensors to the sampled commands, by summation over aliases.
 
-    frequency_hz : (n_freq,), above 0 and at most half the rate.
+    frequency_hz : (n_freq,), above 0 and at most half the rate. tolerance : of each response,
+    change by the last doubling of the aliases.
     Returns (n_freq, n_sensor, n_input) complex, rig-file order. The sensors are read just
     before the output changes, so that a jump of the output is not in the sample taken with it.
     Uses the transfer matrices alone, not the state space of `samii_rig.model.realise`.
@@ -173,11 +179,11 @@ def sampled_response(rig: Rig, frequency_hz: Float, chain: Chain | None = None) 
         wrong = f[~((f > 0) & (f <= rig.rate_hz / 2))][0]
         raise InputError(rig.name, "frequency_hz", float(wrong), f"0 to {rig.rate_hz / 2:g} Hz")
     chain = Chain(rig) if chain is None else chain
-    blocks = [_aliased(rig, chain, f[i : i + BLOCK]) for i in range(0, f.size, BLOCK)]
+    blocks = [_aliased(rig, chain, f[i : i + BLOCK], tolerance) for i in range(0, f.size, BLOCK)]
     return np.concatenate(blocks) - _half_jumps(rig, chain, f)
 
 
-def _aliased(rig: Rig, chain: Chain, f: Float) -> Complex:
+def _aliased(rig: Rig, chain: Chain, f: Float, tolerance: float) -> Complex:
     """Sum over as many aliases as the slowest of these frequencies needs.
 
     Far up, terms are smooth in k: their sum to k = K, the last one halved, is an integral but for
@@ -200,7 +206,7 @@ def _aliased(rig: Rig, chain: Chain, f: Float) -> Complex:
         rest = np.where(np.abs(ratio) < SETTLED, part * ratio / (1 - ratio), half)
         off = np.minimum(np.abs(part), np.abs(total + rest - estimate))
         estimate, last, end = total + rest, part, half
-        if upto >= MAX_ALIASES or np.all(off <= ALIAS_TOLERANCE * np.abs(total)):
+        if upto >= MAX_ALIASES or np.all(off <= tolerance * np.abs(total)):
             return estimate
         reached, upto = upto, 2 * upto
 

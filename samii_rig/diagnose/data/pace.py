@@ -9,9 +9,11 @@ import numpy as np
 from samii_rig.diagnose.data.wiring import MISFIT, POINTS, SWAPPED, misfit
 from samii_rig.errors import InputError
 from samii_rig.model.sampled import sampled_response
+from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse
 
+ROUGHLY = 0.01  # of a response, what its aliases may be off by: misfits of 0.5 are told apart
 PACES = (2.0, 4.0, 5.0, 10.0)  # one of so many samples was kept, or so many times as many
 
 
@@ -31,10 +33,12 @@ def _pace(r: FrequencyResponse, rig: Rig) -> float:
     on = [[s.name for s in rig.sensor].index(c.name) for c in r.outputs]
     by = [[a.name for a in rig.actuator].index(c.name) for c in r.inputs]
 
+    chain = Chain(rig)
+
     def misfit_at(k: float) -> float:
         f = r.frequency[pick] / k
         inside = f < rig.rate_hz / 2
-        model = sampled_response(rig, f[inside])[:, on][:, :, by]
+        model = sampled_response(rig, f[inside], chain, ROUGHLY)[:, on][:, :, by]
         return misfit(r.H[pick][inside], model)
 
     as_it_is = misfit_at(1.0)

@@ -6,9 +6,10 @@ Their likelihood (`samii_rig.likelihood`) is made about a fit.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,15 @@ from scipy import ndimage, signal, special
 
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.physics.disturbed import Disturbed
-from samii_rig.diagnose.physics.model import Aliases, Closed, Grid, JointLoops, Loop, Model, grid
+from samii_rig.diagnose.physics.model import (
+    Aliases,
+    Closed,
+    Grid,
+    JointLoops,
+    Loop,
+    alias_points,
+    grid,
+)
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.noise import Disturbances, Noise
@@ -32,11 +41,12 @@ from samii_rig.likelihood.reduce import (
     reduced,
     residuals_by_line,
 )
-from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned
 from samii_rig.signal.groups import segments_of
 from samii_rig.types import Complex, Finding, Float, Int, Recording
+
+T = TypeVar("T")
 
 TURN = 10  # one line in so many is a test line
 # Test lines: by turns of this part, so that of every second, fifth or tenth line, where a
@@ -55,7 +65,8 @@ HARMONIC = 3  # the lowest that a force makes which is alike both ways
 # show a force at the lines of their excitation too.
 MOST_LINES = 12000
 MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
-ALIASES = 16  # sums over aliases that are kept
+KEPT = 16  # fits of which the sums over aliases, and answers on contours, are kept
+LONGEST_KEPT = 2**20  # numbers of an answer that is kept: 16 of them are 256 MB
 # Where not every sample was recorded: of an input's power what may fold back, 1 % of its amplitude;
 # of the rate, from where that is judged, and up to where it is taken for none; lines as one.
 FOLDS, EDGE, UNFOLDED, TOGETHER = 1e-4, 0.47, 0.3, 16
@@ -63,6 +74,32 @@ FOLDS, EDGE, UNFOLDED, TOGETHER = 1e-4, 0.47, 0.3, 16
 # at `HIGHEST` they are to 1e-6, after 130 samples of either side nothing is left. And how many
 # widths count: 1e-12 behind them.
 PASSING, FAR = 0.03, 5.0
+
+
+@dataclass(frozen=True)
+class Latest(Generic[T]):
+    """What was computed last, by what it was computed of; no more than `KEPT`."""
+
+    made: dict[Hashable, tuple[object, T]] = field(default_factory=dict)
+
+    def get(self, key: Hashable, of: object, make: Callable[[], T]) -> T:
+        """What was made of a key, or is now. of : objects whose `id` is in it."""
+        if key not in self.made:
+            found = make()
+            if isinstance(found, np.ndarray) and found.size > LONGEST_KEPT:
+                return found
+            while len(self.made) >= KEPT:
+                self.made.pop(next(iter(self.made)), None)
+            self.made[key] = of, found
+        return self.made[key][1]
+
+
+@dataclass(frozen=True)
+class Computed:
+    """Of the latest fits: sums over aliases, and answers on contours."""
+
+    aliases: Latest[Aliases] = field(default_factory=Latest)
+    answers: Latest[Complex] = field(default_factory=Latest)
 
 
 @dataclass(frozen=True)
@@ -77,6 +114,8 @@ class Whole:
     asked: bool = False  # whether somebody said which lines count
     own_aliases: bool = False  # whether every model folds back what is its own from above the rate
     runs: tuple[Recording, ...] = field(default=(), repr=False, compare=False)  # as `aligned`
+    # Of all that are made from these records: levels by themselves have the same contours.
+    kept: Computed = field(default_factory=Computed, repr=False, compare=False)
 
     @classmethod
     def of(
@@ -178,29 +217,23 @@ class Whole:
         acting = self.acting
         sensor = np.repeat(self.sensor, acting.size)
         actuator = np.tile(acting, self.sensor.size)
-        model = fitted.model
+        chain, contour = fitted.model.plain(fitted.x), self.records.exact()
 
-        def aliases(chain: Chain, few: Float) -> Aliases:
-            key = id(model), fitted.x.tobytes(), few.tobytes()
-            if key not in self._aliases:
-                if len(self._aliases) == ALIASES:
-                    self._aliases.clear()
-                made = Aliases.of(self.rig, chain, few, sensor, actuator)
-                self._aliases[key] = model, made
-            return self._aliases[key][1]
+        def summed() -> Aliases:
+            few = alias_points(contour.rate_hz / contour.samples, self.rig.rate_hz / 2)
+            return Aliases.of(self.rig, chain, few, sensor, actuator)
 
-        chain = model.plain(fitted.x)
-        open_ = grid(self.rig, frequency, sensor, actuator, chain, sigma, aliases, self.own_aliases)
+        key = *self._of(fitted), contour.samples
+        made = self.kept.aliases.get(key, (self.rig, fitted.model), summed)
+        open_ = grid(self.rig, frequency, sensor, actuator, chain, sigma, made, self.own_aliases)
         return replace(open_, loop=self.loop)
+
+    def _of(self, fitted: Fitted) -> tuple[int, int, bytes]:
+        return id(self.rig), id(fitted.model), fitted.x.tobytes()
 
     def with_own_aliases(self) -> Whole:
         """As of `Recorded`."""
         return replace(self, own_aliases=True)
-
-    @cached_property
-    def _aliases(self) -> dict[tuple[int, bytes, bytes], tuple[Model, Aliases]]:
-        """Of the latest fits: one is asked for on several contours."""
-        return {}
 
     def nodes(self, found: Reduced, fitted: Fitted) -> Grid:
         """The nodes of a likelihood."""
@@ -219,6 +252,10 @@ class Whole:
         """Of a fit, at any s of one contour."""
 
         def at(s: Complex) -> Complex:
+            key = *self._of(fitted), self.own_aliases, s.size, complex(s[-1])
+            return self.kept.answers.get(key, (self.rig, fitted.model), lambda: computed(s))
+
+        def computed(s: Complex) -> Complex:
             f, sigma = s.imag / (2 * np.pi), float(s.real[0])
             half = self.records.rate_hz / 2
             beyond = round(f[-1] / half) > 1

@@ -430,6 +430,13 @@ def _around(rig: Rig, s: Complex, orders: Sequence[int], sensor: Int, actuator: 
     return np.asarray(seen[:, :, sensor] * hold[:, :, actuator])
 
 
+def alias_points(low_hz: float, high_hz: float, most: int = ALIAS_POINTS) -> Float:
+    """(m,) Hz at which aliases are summed, `most` of them at most."""
+    few = np.geomspace(low_hz, high_hz, min(ALIAS_POINTS, most))
+    few[-1] = high_hz
+    return few
+
+
 def grid(
     rig: Rig,
     frequency: Float,
@@ -437,26 +444,25 @@ def grid(
     actuator: Int,
     chain: Chain | None = None,
     sigma: float = 0.0,
-    aliases: Callable[[Chain, Float], Aliases] | None = None,
+    aliases: Aliases | None = None,
     own_aliases: bool = False,
 ) -> Grid:
     """The grid of a rig at sorted frequencies, Hz, without a loop. chain : whose aliases these are,
-    if they are not the rig's own. sigma : 1/s, how far beside the imaginary axis. aliases : of a
-    chain at a few frequencies, where they may be known from before. own_aliases : whether every
-    model folds back what is its own."""
+    if they are not the rig's own. sigma : 1/s, how far beside the imaginary axis. aliases : those
+    of the chain, where they are known from before. own_aliases : whether every model folds back
+    what is its own."""
     f = np.unique(frequency)
-    few = np.geomspace(f[f > 0][0], f[-1], min(ALIAS_POINTS, f.size))
-    few[-1] = f[-1]
     chain = Chain(rig) if chain is None else chain
-    made = aliases(chain, few) if aliases else Aliases.of(rig, chain, few, sensor, actuator)
+    if aliases is None:
+        aliases = Aliases.of(rig, chain, alias_points(f[f > 0][0], f[-1], f.size), sensor, actuator)
     s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
     folded = _terms(rig, chain, s, NEAR, sensor, actuator)
-    every = made.spread(s, rig.rate_hz) + folded.sum(axis=0)
+    every = aliases.spread(s, rig.rate_hz) + folded.sum(axis=0)
     orders = (0, *NEAR[:OWN]) if own_aliases else (0,)
     factor, *own = _around(rig, s, orders, sensor, actuator)
     return Grid(
         f, factor, every, folded, rig.rate_hz, sensor, actuator,
-        sigma=sigma, far=made.far,
+        sigma=sigma, far=aliases.far,
         own_aliases=np.stack(own) if own_aliases else None,
     )  # fmt: skip
 
