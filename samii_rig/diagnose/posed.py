@@ -28,7 +28,7 @@ from samii_rig.rig.load import parse
 from samii_rig.rig.pose import in_words, pose_of
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
-from samii_rig.types import FrequencyResponse, Recording, Segment
+from samii_rig.types import Finding, FrequencyResponse, Recording, Segment
 
 Band = tuple[float, float]
 FORCES = (
@@ -58,7 +58,27 @@ def sorted_by_pose(
 ) -> list[InPose]:
     """The recordings of each pose, in order of appearance. poses : of each recording; estimated :
     responses of those of one pose."""
-    return [InPose(pose, estimated(own), own) for pose, own in by_pose(recordings, poses)]
+    each = by_pose(recordings, poses)
+    return [InPose(pose, _responses(own, estimated), own) for pose, own in each]
+
+
+def _responses(
+    runs: Sequence[Recording],
+    estimated: Callable[[Sequence[Recording]], Sequence[FrequencyResponse]],
+) -> Sequence[FrequencyResponse]:
+    """Of all runs; where these do not repeat each other, of each by itself: what differs from run
+    to run is to be explained, too."""
+    try:
+        return estimated(runs)
+    except EstimateError as error:
+        if len(runs) < 2:
+            raise
+        try:
+            first, *others = [r for run in runs for r in estimated([run])]
+        except EstimateError:
+            raise error from None
+        told = Finding("repeat", "warning", f"{error}; each was estimated by itself")
+        return [replace(first, findings=(*first.findings, told)), *others]
 
 
 def of_any_kind(runs: Sequence[Recording]) -> list[Recording]:

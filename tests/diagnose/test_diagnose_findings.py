@@ -15,6 +15,7 @@ from table_kit import table_of
 from samii_rig.diagnose.data import findings, wiring
 from samii_rig.diagnose.diagnose import diagnose, table
 from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.posed import in_poses, sorted_by_pose
 from samii_rig.errors import EstimateError, InputError, SamiiRigError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.rig.load import load_rig
@@ -324,3 +325,17 @@ def test_a_coarse_sensor_that_a_loop_is_closed_around_stays_in_whole_records():
     assert read.hidden == set()
     assert coarse in read.samples
     assert {e.site for e in read.competing(table)} == {"theta_2", "a_1"}
+
+
+def test_two_recordings_that_differ_are_diagnosed_and_that_they_do_is_told(rivals):
+    runs = [sweeps(0.5, seed) for seed in (31, 32)]
+    runs = [replace(r, segments=r.segments[:1], source=f"run_{i}") for i, r in enumerate(runs)]
+    runs = faulty(runs, times("a_1", 1.3), {1})
+    with pytest.raises(EstimateError, match="a third repeat would tell"):
+        estimate(runs)
+    each = sorted_by_pose(runs, [0.0, 0.0], estimate)
+    found = in_poses(each, samii(), effects=rivals)
+    assert found.verdict in ("no_mismatch", "unknown") and not found.causes
+    (told,) = (text for text in found.not_physics if "and not by noise" in text)
+    assert told.endswith("each was estimated by itself")
+    assert any("run_1 as if of another state" in text for text in found.not_physics)
