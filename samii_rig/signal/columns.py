@@ -20,6 +20,9 @@ from samii_rig.types import Finding, Float, Int, Recording
 
 FARTHEST = 5  # samples; a logger that is later has another fault
 LEFT = 0.2  # part of what is fed back, or of a command's size, by which a law that holds is off
+# Of the power by which two runs differ, what a shift leaves at most, and samples by which it may
+# look as if it were not whole: where noise has a tenth of that power, by 0.05.
+HALF, WHOLE = 0.5, 0.15
 # Of a law that holds, log likelihood by which a shift is seen: 1e-5 by chance among eleven.
 SEEN = 14.0
 # Part of a command's step that rounding leaves, and medians from which a residual is a spike.
@@ -272,7 +275,19 @@ def _against(first: Recording, recording: Recording) -> int:
         return 0
     # A sensor that shows next to nothing but noise has no say.
     best = int(np.argmin(np.sum(np.log(off), axis=0)))
-    return best - FARTHEST if np.min(off[:, best] / off[:, FARTHEST]) < LEFT else 0
+    clear = np.min(off[:, best] / off[:, FARTHEST]) < LEFT or _is_whole(off, best)
+    return best - FARTHEST if clear else 0
+
+
+def _is_whole(off: Float, best: int) -> bool:
+    """Whether sensors have their least at a shift itself, not between two: what else lets them
+    answer later does not do so by whole samples. off : (q, shifts) what each leaves of them."""
+    if best in (0, off.shape[1] - 1):
+        return False
+    before, least, behind = off[:, best - 1 : best + 2].T
+    seen = least < HALF * off[:, FARTHEST]
+    lowest = (before - behind) / (2 * (before - 2 * least + behind))  # of a parabola
+    return bool(seen.any() and np.all(np.abs(lowest[seen]) < WHOLE))
 
 
 def _moved(recording: Recording, m: int, law: str) -> tuple[Recording, Finding | None]:

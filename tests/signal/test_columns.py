@@ -221,3 +221,24 @@ def test_whether_a_loop_ran_is_seen_in_its_command(told: bool):
     for run, want in ((closed, False), (opened, True)):
         seen = run if told else without_reference(run)
         assert is_open(seen, "v", "theta", KP) is want
+
+
+@pytest.mark.parametrize(("samples", "noise", "moved"), [(1.0, 0.5, 1), (0.7, 0.1, 0)])
+def test_beside_noise_what_one_run_is_late_by_is_a_shift_if_it_is_whole(samples, noise, moved):
+    """A part of a sample is a delay. noise : its power in what two runs differ by, over that of a
+    sample."""
+    rng, rows_ = np.random.default_rng(3), np.arange(-50, N)
+    t = np.maximum(rows_, 0) / RATE
+    theta = np.cumsum(np.sin(2 * np.pi * (0.5 + 2.0 * t) * t)) * 2e-3
+    sd = np.sqrt(noise / 2) * np.sqrt(np.mean(np.diff(theta) ** 2))
+
+    def run(by: float) -> Recording:
+        own = loop(rig_toml="")
+        values = own.values.copy()
+        values[:, 2] = np.interp(np.arange(N) - by, rows_, theta) + sd * rng.standard_normal(N)
+        values[:, 3] = 1e-3 * rng.standard_normal(N)
+        return replace(own, values=values)
+
+    (_, _), (found, said) = aligned([run(0.0), run(samples)])
+    assert (said is not None) == bool(moved)
+    assert len(found) == N - moved
