@@ -286,8 +286,9 @@ def _is_whole(off: Float, best: int) -> bool:
         return False
     before, least, behind = off[:, best - 1 : best + 2].T
     seen = least < HALF * off[:, FARTHEST]
-    lowest = (before - behind) / (2 * (before - 2 * least + behind))  # of a parabola
-    return bool(seen.any() and np.all(np.abs(lowest[seen]) < WHOLE))
+    # Of a parabola through three shifts the least is at (before - behind)/2 over its bend.
+    whole = np.abs(before - behind) < 2 * WHOLE * (before - 2 * least + behind)
+    return bool(seen.any() and np.all(whole[seen]))
 
 
 def _moved(recording: Recording, m: int, law: str) -> tuple[Recording, Finding | None]:
