@@ -29,7 +29,8 @@ from samii_rig.diagnose.diagnose import diagnose, table
 from samii_rig.diagnose.fit.refit import Problem, refit
 from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.physics.effect import Effect
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig, parameters

@@ -28,7 +28,7 @@ from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.verdict.by_record import on_records
-from samii_rig.likelihood.reduce import Reduced
+from samii_rig.likelihood.form import Reduced
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.estimate import estimate

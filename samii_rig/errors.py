@@ -93,6 +93,10 @@ class EstimateError(SamiiRigError):
     exit_code = 2
 
 
+class RepeatsDifferError(EstimateError):
+    """Two repeats differ, and not by noise: of one state or of two, each can be estimated alone."""
+
+
 class LimitError(SamiiRigError):
     """A plan would break a limit; the line names the number and the amplitude that would not."""
 

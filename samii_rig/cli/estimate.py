@@ -117,7 +117,7 @@ class Estimating:
             )
         except EstimateError as error:  # its advice in the words of the command line
             said = re.sub(r"(gaps|input)='(\w+)'", r"--\1 \2", str(error))
-            raise EstimateError(said) from error
+            raise type(error)(said) from error
 
 
 @dataclass(frozen=True, kw_only=True)

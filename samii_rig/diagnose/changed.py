@@ -15,7 +15,7 @@ from samii_rig.diagnose.fit.agreeing import Given
 from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.known import with_known
 from samii_rig.diagnose.fit.record_search import RecordSearch
-from samii_rig.diagnose.fit.records import Whole, within
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.states import Both, StatesSearch
 from samii_rig.diagnose.fit.usual import STATES, STATES_TAKE, takes
@@ -25,6 +25,7 @@ from samii_rig.diagnose.result import Before, Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError
+from samii_rig.likelihood.excited import within
 from samii_rig.progress import Begun, Progress, ahead
 from samii_rig.rig.schema import RelativeAngle, Rig
 from samii_rig.rig.schema.elements import Branch, flattened, parameters

@@ -19,7 +19,7 @@ from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.usual import LINES_TAKE, RECORDS_TAKE, takes
 from samii_rig.diagnose.physics.effect import Effect
-from samii_rig.diagnose.physics.model import grid
+from samii_rig.diagnose.physics.grid import grid
 from samii_rig.diagnose.physics.poses import weighty
 from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.result import Diagnosis

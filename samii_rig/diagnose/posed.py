@@ -21,7 +21,7 @@ from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case
-from samii_rig.errors import EstimateError, InputError
+from samii_rig.errors import EstimateError, InputError, RepeatsDifferError
 from samii_rig.identify.poses import at_pose, by_pose
 from samii_rig.progress import Begun, Progress
 from samii_rig.rig.load import parse
@@ -70,13 +70,10 @@ def _responses(
     to run is to be explained, too."""
     try:
         return estimated(runs)
-    except EstimateError as error:
+    except RepeatsDifferError as error:
         if len(runs) < 2:
             raise
-        try:
-            first, *others = [r for run in runs for r in estimated([run])]
-        except EstimateError:
-            raise error from None
+        first, *others = [r for run in runs for r in estimated([run])]
         told = Finding("repeat", "warning", f"{error}; each was estimated by itself")
         return [replace(first, findings=(*first.findings, told)), *others]
 

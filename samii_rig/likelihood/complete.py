@@ -18,18 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from samii_rig.likelihood.algebra import as_complex, as_real, orthonormal
+from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.noise import Disturbances
 from samii_rig.likelihood.pieces import Loops
-from samii_rig.likelihood.reduce import (
-    Records,
-    Reduced,
-    Response,
-    Rows,
-    as_complex,
-    as_real,
-    formed,
-    orthonormal,
-)
+from samii_rig.likelihood.records import Records, Response
+from samii_rig.likelihood.reduce import formed
+from samii_rig.likelihood.rows import Rows
 from samii_rig.types import Complex, Float, Int
 
 

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from samii_rig.likelihood.algebra import SAME, directions
 from samii_rig.likelihood.contour import Contour
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.types import Complex, Float, Int
@@ -31,7 +32,6 @@ AN_OCTAVE, BEHIND = 3.0, 1.0
 AS_FAR = 0.6
 BEGINS = 256  # samples that are looked at first
 NEW = 1e-5  # of the largest, a direction in which past inputs still differ
-SAME = 1e-9  # of the largest, power in a direction that columns do not have
 # Of chi-square, motion from before a piece whose change shows: 10 noise units, of which a tenth
 # makes one.
 SHOWN = 100.0
@@ -173,14 +173,3 @@ def _independent(shapes: Complex) -> tuple[Float, Float]:
     size = np.linalg.norm(rows, axis=0)
     _, values, turn = np.linalg.svd(np.linalg.qr(rows / size, mode="r"), full_matrices=False)
     return size, np.asarray(turn[values > NEW * values[0]])
-
-
-def directions(square: Float) -> tuple[Float, Float]:
-    """Values (m,) of a matrix (m, m) of products, increasing, and the directions (m, m) that have
-    them."""
-    if not len(square):
-        return np.zeros(0), square
-    # Each in units of its own size: a metre and a metre a second squared are of one kind here.
-    size = np.sqrt(np.maximum(np.diagonal(square), np.finfo(np.float64).tiny))
-    values, turn = np.linalg.eigh(square / np.outer(size, size))
-    return values, turn / size[:, None]

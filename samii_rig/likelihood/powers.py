@@ -66,6 +66,34 @@ def _products(u: Complex) -> Float:
     return np.ascontiguousarray(np.where(lower, both.real, both.imag.swapaxes(1, 2)))
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _inverted(C: Complex, L: Complex, own: Complex) -> float:
+    """log det C of C (q, q), of which the lower half counts, and its inverse as own; L : room."""
+    q, log = len(C), 0.0
+    for i in range(q):  # C = L L^H
+        C[i, i] *= 1 + REGULAR
+        for j in range(i + 1):
+            x = C[i, j]
+            for k in range(j):
+                x -= L[i, k] * L[j, k].conjugate()
+            L[i, j] = np.sqrt(x.real) if i == j else x / L[j, j].real
+        log += 2 * np.log(L[i, i].real)
+    for j in range(q):  # L by its inverse
+        L[j, j] = 1 / L[j, j].real
+        for i in range(j + 1, q):
+            x = 0j
+            for k in range(j, i):
+                x -= L[i, k] * L[k, j]
+            L[i, j] = x / L[i, i].real
+    for i in range(q):
+        for j in range(q):
+            x = 0j
+            for k in range(max(i, j), q):
+                x += L[k, i].conjugate() * L[k, j]
+            own[i, j] = x
+    return log
+
+
 @numba.njit(cache=True, fastmath={"reassoc", "contract", "nsz"}, error_model="numpy")
 def _pulls(A: Float, S: Complex, w: Float, p: Float) -> tuple[float, Float, Float]:
     """log L, and of each power (b, K) what lets it grow, u^H C^-1 S C^-1 u, and what holds it, w
@@ -85,28 +113,7 @@ def _pulls(A: Float, S: Complex, w: Float, p: Float) -> tuple[float, Float, Floa
                     for k in range(K):
                         imag += A[b, j, i, k] * p[b, k]
                 C[i, j] = complex(real, imag)
-        # C = L L^H, then L by its inverse.
-        for i in range(q):
-            C[i, i] *= 1 + REGULAR
-            for j in range(i + 1):
-                x = C[i, j]
-                for k in range(j):
-                    x -= L[i, k] * L[j, k].conjugate()
-                L[i, j] = np.sqrt(x.real) if i == j else x / L[j, j].real
-            total -= 2 * w[b] * np.log(L[i, i].real)
-        for j in range(q):
-            L[j, j] = 1 / L[j, j].real
-            for i in range(j + 1, q):
-                x = 0j
-                for k in range(j, i):
-                    x -= L[i, k] * L[k, j]
-                L[i, j] = x / L[i, i].real
-        for i in range(q):
-            for j in range(q):
-                x = 0j
-                for k in range(max(i, j), q):
-                    x += L[k, i].conjugate() * L[k, j]
-                own[i, j] = x
+        total -= w[b] * _inverted(C, L, own)
         for i in range(q):
             for j in range(q):
                 x = 0j

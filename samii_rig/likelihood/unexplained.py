@@ -8,15 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
+from samii_rig.likelihood.algebra import as_complex, as_real, orthonormal
+from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.pieces import Loops
-from samii_rig.likelihood.reduce import (
-    Records,
-    Reduced,
-    Response,
-    as_complex,
-    as_real,
-    orthonormal,
-)
+from samii_rig.likelihood.records import Records, Response
 from samii_rig.types import Complex, Float, Int
 
 # Parts of the lines in each of which what is added does as much, and what it may be off by in one:

@@ -21,7 +21,7 @@ from samii_rig.diagnose.diagnose import table
 from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.search import FIRST, Search
 from samii_rig.diagnose.physics.effect import Effect
-from samii_rig.diagnose.physics.model import grid
+from samii_rig.diagnose.physics.grid import grid
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from samii_rig.errors import EstimateError
+from samii_rig.errors import EstimateError, RepeatsDifferError
 from samii_rig.signal import checks
 from samii_rig.signal.groups import Group, Piece, Selection
 from samii_rig.signal.rest import Ringing, ringing
@@ -60,7 +60,7 @@ def _lines(pieces: Sequence[Piece], rate_hz: float) -> Complex:
 def drop_foreign(group: Group) -> None:
     """Exclude repeats that do not repeat.
 
-    Raises EstimateError if there are only two of them, as neither can be trusted.
+    Raises RepeatsDifferError if there are only two of them, as neither can be trusted.
     """
     if len(group.pieces) < 2 or not group.equal_length:
         return
@@ -71,7 +71,7 @@ def drop_foreign(group: Group) -> None:
     names = [p.name for p in pieces]
     foreign = checks.foreign_repeats(_lines(pieces, group.rate_hz), names, group.selection.names)
     if foreign and len(pieces) == 2:
-        raise EstimateError(
+        raise RepeatsDifferError(
             f"{foreign[min(foreign)].message}; a third repeat would tell which is wrong, or "
             "estimate each by itself"
         )

@@ -86,8 +86,7 @@ def estimate(
     -------
     One `FrequencyResponse` per group, in order of appearance, those of stepped sines first.
     `method` and `why` say what was done; `findings` what was noticed, excluded or weakened.
-    `input_rms` is the rms of the sine at the time the sweep passes a frequency (periodic: of
-    the line).
+    `input_rms` : of the sine at the time the sweep passes a frequency (periodic: of the line).
 
     Raises
     ------

@@ -24,7 +24,8 @@ from samii_rig.diagnose.fit.refit import Problem, refit
 from samii_rig.diagnose.fit.rigfile import toml
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics import vocabulary
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.verdict.locate import locate, moebius
 from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw

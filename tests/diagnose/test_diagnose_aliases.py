@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from samii_rig.diagnose.physics.channels import effects
-from samii_rig.diagnose.physics.model import Grid, Model, grid
+from samii_rig.diagnose.physics.grid import Grid, grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.likelihood.contour import EXACT, Contour
 from samii_rig.model.realise import realise
 from samii_rig.model.sampled import sampled_response

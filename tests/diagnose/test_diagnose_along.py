@@ -12,7 +12,8 @@ from samii_rig.diagnose.fit.intervals import Drawn
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.rigfile import explained, toml
 from samii_rig.diagnose.physics.along import Along, stretches
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.diagnose.result import Value
 from samii_rig.errors import InputError

@@ -17,7 +17,8 @@ from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.moebius import place_of
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.stated import Evidence, probability
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.result import Gap
 from samii_rig.diagnose.verdict.judge import Judgement, confirmed, judge, shown
 from samii_rig.identify.bootstrap import redraw

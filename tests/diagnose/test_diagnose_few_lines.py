@@ -11,10 +11,11 @@ from scipy import signal
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit.record_search import RecordSearch
-from samii_rig.diagnose.fit.records import Whole, within
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.posed import of_any_kind
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.errors import EstimateError
+from samii_rig.likelihood.excited import within
 from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Channel, Recording, Segment

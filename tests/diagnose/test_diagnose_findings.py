@@ -14,7 +14,8 @@ from table_kit import table_of
 
 from samii_rig.diagnose.data import findings, wiring
 from samii_rig.diagnose.diagnose import diagnose, table
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.posed import in_poses, sorted_by_pose
 from samii_rig.errors import EstimateError, InputError, SamiiRigError
 from samii_rig.identify.bootstrap import redraw
@@ -339,3 +340,10 @@ def test_two_recordings_that_differ_are_diagnosed_and_that_they_do_is_told(rival
     (told,) = (text for text in found.not_physics if "and not by noise" in text)
     assert told.endswith("each was estimated by itself")
     assert any("run_1 as if of another state" in text for text in found.not_physics)
+
+
+def test_the_same_file_twice_is_refused_all_the_same():
+    run = sweeps(0.5, 31)
+    run = replace(run, segments=run.segments[:1], source="run_0")
+    with pytest.raises(EstimateError, match="the same file twice"):
+        sorted_by_pose([run, replace(run, source="run_1")], [0.0, 0.0], estimate)

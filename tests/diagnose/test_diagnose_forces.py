@@ -30,7 +30,8 @@ from samii_rig.diagnose.forces.problem import ForceProblem
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.way import Ways
 from samii_rig.diagnose.physics.effect import Effect
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict import by_line
 from samii_rig.diagnose.verdict.by_record import on_records

@@ -10,7 +10,8 @@ from samii_rig.diagnose.forces.model import model_of
 from samii_rig.diagnose.forces.place import Place
 from samii_rig.diagnose.physics.effect import Effect, Unknown
 from samii_rig.diagnose.physics.fractional import FractionalChain, Joint
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.model.tmm import Chain
 
 F = np.geomspace(0.5, 40.0, 20)

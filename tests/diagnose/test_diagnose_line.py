@@ -9,7 +9,8 @@ from table_kit import Effects, table_of
 
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.rigfile import toml
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.result import Gap
 from samii_rig.fem.model import Fem
 from samii_rig.fem.reduce import reduce

@@ -16,7 +16,8 @@ from samii_rig.diagnose.data.pace import paced
 from samii_rig.diagnose.data.wiring import outputs_of, scaled, wired
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.physics import faults, insert
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.rig.load import load_rig

@@ -14,12 +14,14 @@ from table_kit import Effects, table_of
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.record_search import RecordProblem
-from samii_rig.diagnose.fit.records import Whole, _unfolded
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem, refit
 from samii_rig.diagnose.forces.variation import BySpring, Variation
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.result import Diagnosis, Gap, Value
 from samii_rig.diagnose.verdict import by_record
+from samii_rig.likelihood.excited import _unfolded
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.progress import Counted
 from samii_rig.signal.estimate import estimate

@@ -11,7 +11,8 @@ from samii_rig.diagnose.fit.refit import Problem, refit
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.causal import RISE, CausalChain
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.verdict.judge import judge
 from samii_rig.diagnose.verdict.locate import traces
 from samii_rig.identify.bootstrap import redraw

@@ -9,7 +9,7 @@ from two_joints_kit import BAND, RIG, in_turn, late, recorded, together
 
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.records import Whole
-from samii_rig.diagnose.physics.model import JointLoops, Loop
+from samii_rig.diagnose.physics.loops import JointLoops, Loop
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.pieces import wiring
 from samii_rig.signal.estimate import estimate

@@ -22,8 +22,9 @@ from samii_rig.diagnose.fit.known import stated, with_known
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.states import Both, BothGrid, States
+from samii_rig.diagnose.physics.grid import grid
 from samii_rig.diagnose.physics.insert import inserted, oscillator
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.errors import InputError
 from samii_rig.report.diagnosis.page import write_diagnosis

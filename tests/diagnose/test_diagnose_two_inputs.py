@@ -8,7 +8,8 @@ from identify_kit import samii
 from table_kit import Effects, table_of
 
 from samii_rig.diagnose.diagnose import diagnose
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.model.sampled import sampled_response
 from samii_rig.rig.schema import Parameter, Rig, TorqueSource

@@ -20,7 +20,8 @@ from samii_rig.diagnose.fit.search import PENALISED, Search
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.physics import channels
 from samii_rig.diagnose.physics.channels import METERED
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.verdict import by_record
 from samii_rig.diagnose.verdict.judge import Judgement, _is_insignificant
 from samii_rig.identify.bootstrap import redraw

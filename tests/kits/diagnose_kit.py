@@ -4,7 +4,8 @@ import numpy as np
 from identify_kit import noiseless, samii
 from table_kit import Effects, table_of
 
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.identify.bootstrap import redraw
 
 BAND = (0.5, 40.0)

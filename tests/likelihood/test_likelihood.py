@@ -10,24 +10,20 @@ from scipy import linalg, signal
 
 from samii_rig.diagnose.fit.records import _shown, fitted_lines
 from samii_rig.likelihood import pieces
+from samii_rig.likelihood.algebra import as_real
+from samii_rig.likelihood.before import _beyond, _past_of
 from samii_rig.likelihood.bridged import bridged
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
+from samii_rig.likelihood.free import _of_pieces
 from samii_rig.likelihood.inputs import MeterNoise
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.past import Past, likely
 from samii_rig.likelihood.pieces import Input, Piece, Wiring, pieces_of, wiring
-from samii_rig.likelihood.reduce import (
-    Records,
-    Rows,
-    _beyond,
-    _of_pieces,
-    _past_of,
-    as_real,
-    reduced,
-    residuals_by_line,
-)
+from samii_rig.likelihood.records import Records
+from samii_rig.likelihood.reduce import reduced, residuals_by_line
 from samii_rig.likelihood.rounding import Added, Rounding, repeating
+from samii_rig.likelihood.rows import Rows
 from samii_rig.likelihood.spikes import mended
 from samii_rig.rig.load import load_rig
 from samii_rig.types import Channel, Complex, Float, Int, Quality, Recording, Segment

@@ -6,7 +6,8 @@ from scipy import signal
 
 from samii_rig.likelihood.contour import EXACT, Contour
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.likelihood.reduce import Records, reduced
+from samii_rig.likelihood.records import Records
+from samii_rig.likelihood.reduce import reduced
 
 RATE = 200.0
 # In powers of 1/z, of each sensor and input.

@@ -14,8 +14,9 @@ from report_kit import Page, recorded
 
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.physics.channels import NOT_PHYSICS
+from samii_rig.diagnose.physics.grid import grid
 from samii_rig.diagnose.physics.insert import DISPLACEMENT
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.result import Band, Cause, Diagnosis, Gap, Trace, Value
 from samii_rig.errors import InputError

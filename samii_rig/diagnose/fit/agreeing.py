@@ -23,11 +23,14 @@ import numpy as np
 
 from samii_rig.diagnose.data.measured import DIFFER, PERIODIC, Measured, measured, repeated
 from samii_rig.diagnose.fit.record_search import RecordSearch
-from samii_rig.diagnose.fit.records import Whole, within
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.errors import EstimateError, InputError
+from samii_rig.likelihood.algebra import orthonormal
+from samii_rig.likelihood.excited import within
+from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.likelihood.reduce import Reduced, Response, orthonormal
+from samii_rig.likelihood.records import Response
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import proportional
 from samii_rig.signal.estimate import estimate

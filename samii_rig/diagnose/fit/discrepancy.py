@@ -15,7 +15,7 @@ import numpy as np
 from scipy import linalg
 
 from samii_rig.diagnose.fit.refit import Fitted
-from samii_rig.likelihood.reduce import Reduced
+from samii_rig.likelihood.form import Reduced
 from samii_rig.types import Complex, Float
 
 # Nepers of frequency, l: from what nodes resolve, a tenth apart, to half a decade and more.

@@ -25,7 +25,7 @@ from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.record_search import RecordProblem, RecordSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
-from samii_rig.likelihood.reduce import Reduced
+from samii_rig.likelihood.form import Reduced
 from samii_rig.types import Int
 
 ROUNDS = 3  # of scale and search; two do where the first round finds what is missing

@@ -21,7 +21,8 @@ from samii_rig.diagnose.fit.refit import STEPS, Fitted, Problem, refit
 from samii_rig.diagnose.fit.stated import IN_DATA
 from samii_rig.diagnose.fit.usual import Usual
 from samii_rig.diagnose.physics.effect import Effect
-from samii_rig.diagnose.physics.model import Grid, Model, grid
+from samii_rig.diagnose.physics.grid import Grid, grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
 from samii_rig.progress import Begun, Progress, counted
 from samii_rig.rig.schema import Rig

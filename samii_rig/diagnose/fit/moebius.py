@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.diagnose.physics.effect import Effect
-from samii_rig.diagnose.physics.model import Grid, Model
+from samii_rig.diagnose.physics.grid import Grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.types import Complex, Float
 
 STRENGTH_RATIO = 10.0  # between the two strengths at which the chain is evaluated

@@ -18,10 +18,12 @@ from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.summed import Stacked, Summed, parts_of
 from samii_rig.diagnose.fit.usual import POSES
 from samii_rig.diagnose.physics.effect import Effect
-from samii_rig.diagnose.physics.model import Grid, Model
+from samii_rig.diagnose.physics.grid import Grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.physics.poses import in_pose
+from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.pieces import Wiring
-from samii_rig.likelihood.reduce import LineResiduals, Reduced
+from samii_rig.likelihood.reduce import LineResiduals
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, Int
 

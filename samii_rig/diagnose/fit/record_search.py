@@ -23,12 +23,14 @@ from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.refit import Fitted, Problem, counted, refit
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.usual import RECORDS
-from samii_rig.diagnose.physics.model import Grid, Model
+from samii_rig.diagnose.physics.grid import Grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.physics.rows import RESONANT
 from samii_rig.diagnose.result import Band, Gap, Used
 from samii_rig.errors import EstimateError
+from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.pieces import Wiring
-from samii_rig.likelihood.reduce import LineResiduals, Reduced
+from samii_rig.likelihood.reduce import LineResiduals
 from samii_rig.signal.statistics import octaves
 from samii_rig.types import Complex, Float, Int
 

@@ -16,7 +16,8 @@ import numpy as np
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit import forms
 from samii_rig.diagnose.fit.forms import Form
-from samii_rig.diagnose.physics.model import Grid, Model
+from samii_rig.diagnose.physics.grid import Grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
 from samii_rig.identify.likelihood import LOG_FLOOR
 from samii_rig.levenberg import ByFactor, Normal, Point, Progress, descend, step

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import linalg
 
-from samii_rig.diagnose.physics.model import Grid
-from samii_rig.likelihood.reduce import Reduced, by_sensor
+from samii_rig.diagnose.physics.grid import Grid
+from samii_rig.likelihood.algebra import by_sensor
+from samii_rig.likelihood.form import Reduced
 from samii_rig.types import Complex, Float
 
 RANK = 1e-10  # of the largest, a direction of rounding alone

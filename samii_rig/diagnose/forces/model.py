@@ -9,7 +9,8 @@ import numpy as np
 
 from samii_rig.diagnose.forces.laws import Force
 from samii_rig.diagnose.physics.effect import Effect
-from samii_rig.diagnose.physics.model import Grid, Model
+from samii_rig.diagnose.physics.grid import Grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import InputError
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig

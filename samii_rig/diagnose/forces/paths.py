@@ -18,9 +18,9 @@ from samii_rig.diagnose.forces.problem import mean_command
 from samii_rig.diagnose.physics.effect import Key
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
+from samii_rig.likelihood.algebra import by_input
 from samii_rig.likelihood.inputs import meter_noise
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.likelihood.reduce import by_input
 from samii_rig.model.sampled import dead_time, hold_at, sensors_at
 from samii_rig.types import Complex, Float, Int
 

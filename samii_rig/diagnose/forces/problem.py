@@ -25,10 +25,10 @@ from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.forces.model import ForceModel, RecordGrid
 from samii_rig.diagnose.forces.way import Ways
-from samii_rig.diagnose.physics.model import Grid
+from samii_rig.diagnose.physics.grid import Grid
+from samii_rig.likelihood.algebra import by_input
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.pieces import Piece, Samples
-from samii_rig.likelihood.reduce import by_input
 from samii_rig.types import Complex, Float
 
 # Of a command between the samples that were recorded, what its interpolation is off by, and the

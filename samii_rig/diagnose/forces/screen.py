@@ -27,7 +27,7 @@ from samii_rig.diagnose.forces.laws import (
 from samii_rig.diagnose.forces.paths import Span, TransferPaths
 from samii_rig.diagnose.forces.problem import ForceProblem
 from samii_rig.diagnose.physics.effect import Effect
-from samii_rig.likelihood.reduce import by_input
+from samii_rig.likelihood.algebra import by_input
 from samii_rig.types import Complex, Float
 
 # Widths of a gap over the largest motion at which it is tried: what it does to the rest has its

@@ -38,7 +38,7 @@ from samii_rig.diagnose.forces.varying import (
 )
 from samii_rig.diagnose.result import Gap, Value
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.likelihood.reduce import CYCLES
+from samii_rig.likelihood.records import CYCLES
 from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.types import Float
 

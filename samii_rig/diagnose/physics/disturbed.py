@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.diagnose.physics import insert
-from samii_rig.diagnose.physics.model import Closed, Model
+from samii_rig.diagnose.physics.loops import Closed
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.model.sampled import sensor_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import (

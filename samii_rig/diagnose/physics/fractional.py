@@ -16,8 +16,8 @@ from typing import Protocol
 
 import numpy as np
 
-from samii_rig.diagnose.physics.effect import Key
 from samii_rig.model.tmm import Chain
+from samii_rig.rig.schema import Key
 from samii_rig.types import Complex, Float
 
 DASHPOT_RATIO = 10.0  # between the two dashpots: far enough for R, near enough for both to be seen

@@ -11,7 +11,7 @@ from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.refit import Problem
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics import insert
-from samii_rig.diagnose.physics.model import Grid
+from samii_rig.diagnose.physics.grid import Grid
 from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.errors import SamiiRigError
 from samii_rig.model.sampled import hold_response, sensor_response

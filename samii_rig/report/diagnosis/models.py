@@ -18,7 +18,8 @@ from samii_rig.diagnose.fit.refit import Problem, refit
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.physics import insert
 from samii_rig.diagnose.physics.along import POSITION
-from samii_rig.diagnose.physics.model import Model, grid
+from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.physics.points import POINTS
 from samii_rig.diagnose.result import Cause
 from samii_rig.model.sampled import sampled_response

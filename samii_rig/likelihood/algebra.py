@@ -1,0 +1,60 @@
+"""Lines as real numbers, and the directions that they span."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from samii_rig.types import Complex, Float
+
+SAME = 1e-9  # of the largest, power in a direction that columns do not have
+
+
+def by_sensor(dh: Complex) -> Float:
+    """(q 2 b, p) of derivatives (b, q, p): of each sensor all real parts, then imaginary ones."""
+    b, q, p = dh.shape
+    return np.stack([dh.real, dh.imag]).transpose(2, 0, 1, 3).reshape(2 * q * b, p)
+
+
+def as_real(x: Complex) -> Float:
+    """Real parts over imaginary parts."""
+    return np.concatenate([x.real, x.imag])
+
+
+def as_complex(x: Float) -> Complex:
+    """From real parts over imaginary parts."""
+    half = len(x) // 2
+    return np.asarray(x[:half] + 1j * x[half:])
+
+
+def by_input(r: Float) -> Float:
+    """(m, n) of r (n,) or (n, m)."""
+    return r[None] if r.ndim == 1 else r.T
+
+
+def lengths(Q: Float) -> Float:
+    """(n,) squares of the rows of Q (n, m)."""
+    return np.asarray(np.einsum("ij,ij->i", Q, Q))
+
+
+def orthonormal(X: Float) -> Float:
+    """The directions of the columns of X (n, m), n > m."""
+    scale = np.linalg.norm(X, axis=0)
+    return spanned(X / np.where(scale > 0, scale, 1.0))
+
+
+def spanned(X: Float) -> Float:
+    """The directions of columns that are of size 1, or were before something was projected out."""
+    values, vectors = np.linalg.eigh(X.T @ X)
+    kept = values > SAME * np.max(values, initial=0.0)
+    return np.asarray(X @ (vectors[:, kept] / np.sqrt(values[kept])))
+
+
+def directions(square: Float) -> tuple[Float, Float]:
+    """Values (m,) of a matrix (m, m) of products, increasing, and the directions (m, m) that have
+    them."""
+    if not len(square):
+        return np.zeros(0), square
+    # Each in units of its own size: a metre and a metre a second squared are of one kind here.
+    size = np.sqrt(np.maximum(np.diagonal(square), np.finfo(np.float64).tiny))
+    values, turn = np.linalg.eigh(square / np.outer(size, size))
+    return values, turn / size[:, None]

@@ -1,0 +1,171 @@
+"""What a change of the response that is free leaves of all lines: there the noise is seen.
+
+Pieces, repeats and levels that differ by more than noise are not noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from samii_rig.likelihood import rounding
+from samii_rig.likelihood.algebra import as_complex, as_real, lengths, spanned
+from samii_rig.likelihood.noise import Noise
+from samii_rig.likelihood.pieces import Piece, Samples
+from samii_rig.likelihood.records import Records
+from samii_rig.likelihood.rows import Rows
+from samii_rig.likelihood.seen import Seen
+from samii_rig.types import Complex, Float, Int
+
+ENOUGH = 0.75  # lines over unknowns of a change, from which a piece shows its noise by itself
+# Of an input's largest in any piece, what it does in one that it does not excite: where noise is
+# told no change of its response is free there, which would fit that with its converter's rounding.
+RESTS = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Free:
+    """A change that is free where noise is estimated, and the lines that show it together: each
+    piece's by themselves where they are enough.
+
+    rows : of all lines. groups : pieces, their lines (n,), and (2 n, p) what the change does in
+    these, of every sensor.
+    """
+
+    rows: Rows
+    groups: list[tuple[Sequence[int], Int, Float]]
+
+    @classmethod
+    def of(cls, rows: Rows, changes: Sequence[Complex], spare: Float) -> Free:
+        """changes : of each piece, as `changes_of`. spare : (b, m) the change that is free, on the
+        nodes."""
+        b, n = len(spare), len(rows.e)
+        parts = range(0, rows.X.shape[1], b)
+        each = []
+        for change in changes:
+            real = as_real(change)
+            each.append(np.concatenate([real[:, i : i + b] @ spare for i in parts], axis=1))
+        if len(parts) > 2:
+            _excited(each, len(parts) // 2)
+        pieces = [on for on, _ in rows.each()]
+        if all(len(on) >= ENOUGH * _free(X) for on, X in zip(pieces, each, strict=True)):
+            alone = zip(pieces, each, strict=True)
+            return cls(rows, [([i], on, X) for i, (on, X) in enumerate(alone)])
+        X = np.empty((2 * n, each[0].shape[1]))
+        for on, own in zip(pieces, each, strict=True):
+            X[np.concatenate([on, n + on])] = own
+        return cls(rows, [(range(len(each)), np.arange(n), X)])
+
+
+def residual_of(change: Free, seen: Sequence[Seen]) -> tuple[Complex, Float]:
+    """What the best change of each sensor in each piece leaves (n, q), and the freedom (n,) that
+    each line has left: pieces that differ by more than noise are not noise."""
+    n, q = change.rows.e.shape
+    left, free = np.zeros((n, q), complex), np.zeros(n)
+    for which, on, X in change.groups:
+        piece = change.rows.piece[on]
+        each = [(np.flatnonzero(piece == i), seen[i].N) for i in which]
+        left[on], free[on] = _of_pieces(change.rows.e[on], each, X)
+    return left, free
+
+
+def _excited(each: Sequence[Float], inputs: int) -> None:
+    """Take out of what changes do in each piece (2 n, p) what those of an input do that rests in
+    it."""
+    parts = [X.reshape(len(X), inputs, -1) for X in each]
+    size = np.sqrt([np.mean(np.sum(X**2, axis=2), axis=0) for X in parts])
+    for X, rests in zip(parts, size < RESTS * size.max(axis=0), strict=True):
+        X[:, rests] = 0.0
+
+
+def _free(X: Float) -> int:
+    """Columns that do anything."""
+    return int(np.count_nonzero(np.any(X != 0, axis=0)))
+
+
+def _of_pieces(e: Complex, each: Sequence[tuple[Int, Complex]], X: Float) -> tuple[Complex, Float]:
+    """As `residual_of`, of pieces that share one change X (2 n, p). Nuisances are projected out
+    piece by piece: side by side those of many pieces would be many times as much as all lines.
+
+    each : of every piece its lines, and their nuisances.
+    """
+    n, q = e.shape
+    goal, used = as_real(e), np.zeros(2 * n)
+    size = np.linalg.norm(X, axis=0)
+    X = X / np.where(size > 0, size, 1.0)
+    for c in range(q):
+        change = X.copy()
+        for on, N in each:
+            at = np.concatenate([on, n + on]) if len(each) > 1 else slice(None)
+            own = spanned(_nuisances_of(N[:, c]))
+            change[at] -= own @ (own.T @ change[at])
+            goal[at, c] -= own @ (own.T @ goal[at, c])
+            used[at] += lengths(own)
+        change = spanned(change)
+        goal[:, c] -= change @ (change.T @ goal[:, c])
+        used += lengths(change)
+    return as_complex(goal), np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
+
+
+def _nuisances_of(N: Complex) -> Float:
+    """(2 n, m) those of (n, m_all) that there are in one sensor, of size 1."""
+    some = as_real(N[:, np.any(N != 0, axis=0)])
+    return np.asarray(some / np.linalg.norm(some, axis=0))
+
+
+def with_repeats(
+    records: Records, H: Complex, seen: Sequence[Seen], rows: Rows, left: Complex, free: Float
+) -> tuple[Float, Complex, Float, Int]:
+    """Frequency, lines, freedom and piece of all that the noise is estimated from: what repeats
+    differ by, too."""
+    every = [(rows.f, left, free, rows.piece)]
+    for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
+        if np.any(rounding.alike(piece, records.step) > rounding.ALIKE):
+            continue
+        for f, e, some in _beside(records, piece, piece.repeats, H, own):
+            every.append((f, e, some, np.full(f.size, i)))
+    f, left, free, which = (np.concatenate(x) for x in zip(*every, strict=True))
+    order = np.argsort(f, kind="stable")
+    return f[order], left[order], free[order], which[order]
+
+
+def _beside(
+    records: Records, piece: Piece, others: Sequence[Samples], H: Complex, own: Seen
+) -> list[tuple[Float, Complex, Float]]:
+    """Of the repeats or contrasts of a piece: Hz (n,), what H leaves without nuisances (n, q), and
+    the freedom left (n,)."""
+    if not others:
+        return []
+    lines, exact = records.lines(piece), records.exact()
+    left = np.stack([records.residual(samples, lines.k, H, exact) for samples in others], axis=2)
+    left, free = _without(left, own.N)
+    return [(lines.frequency, left[:, :, i], free) for i in range(len(others))]
+
+
+def differing(
+    records: Records, H: Complex, seen: Sequence[Seen], noise: Noise
+) -> tuple[float, float]:
+    """Chi-square of the levels against each other, and its mean."""
+    total = count = 0.0
+    for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
+        every = _beside(records, piece, piece.contrasts, H, own)
+        if every:
+            f, left = every[0][0], np.stack([e for _, e, _ in every], axis=2)
+            total += 2 * float(np.sum(np.abs(noise.whitened(f, np.full(f.size, i), left)) ** 2))
+            count += 2.0 * left.shape[1] * sum(float(np.sum(free)) for _, _, free in every)
+    return total, count
+
+
+def _without(e: Complex, N: Complex) -> tuple[Complex, Float]:
+    """(n, q, p) without nuisances (n, q, m), each sensor's by itself, and the freedom left (n,)."""
+    n, q = e.shape[:2]
+    out, used = np.zeros_like(e), np.zeros(2 * n)
+    for c in range(q):
+        Q = spanned(_nuisances_of(N[:, c]))
+        goal = as_real(e[:, c])
+        goal = goal - Q @ (Q.T @ goal)
+        used += lengths(Q)
+        out[:, c] = as_complex(goal)
+    return out, np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)

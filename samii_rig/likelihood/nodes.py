@@ -1,0 +1,46 @@
+"""Lines of a contour between which a change of the response is taken for linear."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from samii_rig.likelihood.contour import Contour
+from samii_rig.types import Complex, Float, Int
+
+SPACING = 0.2  # nodes, times the distance over which the reference's response turns by 1 rad
+WIDEST = 0.1  # nodes, apart over frequency at most
+# Nodes over lines of the contour, at most, of a change that is free where noise is estimated: at
+# the lowest lines one a line would leave no noise to be seen.
+SPARE = 0.1
+BELOW = 2**0.5  # the same, below the band: a change of 1/s is linear between them to 3 %
+
+
+def nodes_of(
+    contour: Contour, H: Complex, band: tuple[float, float], *, spare: bool = False
+) -> Int:
+    """Lines of the contour between which a change of the response is taken for linear.
+
+    H : (M//2 + 1, q) reference on the contour, each sensor in units of its noise. spare : few of
+    them at the lowest lines, but where the response turns more than a double integrator's.
+    """
+    f = contour.frequency
+    inside = (f >= band[0]) & (f <= band[1])
+    turning = np.linalg.norm(np.gradient(H, axis=0), axis=1) / np.linalg.norm(H, axis=1)
+    each = 1 / np.maximum(np.arange(f.size), 1)
+    if spare:
+        density = np.maximum(turning - 2 * each, 0.0) / SPACING + np.minimum(each / WIDEST, SPARE)
+    else:
+        density = turning / SPACING + each / WIDEST
+    place = np.cumsum(np.where(inside, np.minimum(density, 1.0), 0.0))
+    first, last = np.flatnonzero(inside)[[0, -1]]
+    marks = np.arange(place[first], place[last], 1.0)
+    # An input below the band moves what integrates it, and the end of a record makes that seen
+    # at all lines.
+    below = first / BELOW ** np.arange(1.0, np.log(max(first, 1)) / np.log(BELOW))
+    low = np.rint(np.append(below, 0.0)).astype(np.int64)
+    return np.unique(np.concatenate([low, np.searchsorted(place, marks), [last]]))
+
+
+def between(nodes: Int, few: Int) -> Float:
+    """(b, m) a change on the nodes, of one on few of them, linear between."""
+    return np.stack([np.interp(nodes, few, one) for one in np.eye(few.size)], axis=1)
