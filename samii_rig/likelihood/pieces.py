@@ -369,7 +369,7 @@ def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float)
 
 
 def _soon_transformed(low: int, high: int, lost: Int) -> int:
-    """Where a stretch ends whose DFT takes no longer than it has to, at most 0.5 % earlier: that of
+    """Where a stretch ends whose DFT takes no longer than it has to, at most 2 % earlier: that of
     a length with a large prime factor takes twelve times as long. Not within a gap (gaps, 2)."""
     if high - low < SHORT:
         return high
