@@ -89,7 +89,7 @@ class Meter:
         if lost is not None:
             v[lost] = np.nan  # a guess is no reading
         laws = {k: _law(recording, command, k, theta) for k in (kp, 0.0)}
-        if not all(np.any(np.abs(v - law) > channel.resolution) for law in laws.values()):
+        if any(not np.any(np.abs(v - law) > channel.resolution) for law in laws.values()):
             return None  # as it was sent
         shown = {k: _shown(recording, v, law) for k, law in laws.items()}
         runs = min(shown, key=lambda k: float(np.nansum(shown[k][2] ** 2)))

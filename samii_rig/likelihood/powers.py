@@ -35,13 +35,13 @@ def most_likely(u: Complex, S: Complex, w: Float, g: Float, known: Float) -> Flo
     mean = (w @ size) / np.sum(w)
     power = np.repeat(q / np.where(mean > 0, mean, np.inf)[:, None], g.shape[1], axis=1)
     power /= K * g.shape[1] * np.mean(g, axis=0)
-    A, S = _products(u), np.ascontiguousarray(S, np.complex128)
+    A = _products(u)
     before, far = -np.inf, SURE
     last, change = power, np.ones_like(power)
     for _ in range(STEPS):
         p = g @ power.T
         p[:, :q] += known
-        log, a, b = _pulls(A, S, w, np.ascontiguousarray(p))
+        log, a, b = _pulls(A, S, w, p)
         if log < before:  # too far: from the same place, a step that is sure
             far = SURE if far > SURE else far / 2
             power = last * change**far

@@ -14,9 +14,8 @@ from samii_rig.likelihood.pieces import Loops, Piece, Samples, across
 from samii_rig.likelihood.seen import Answers, Seen
 from samii_rig.types import Complex, Float, Int
 
-CYCLES = (
-    5  # in a record, of its lowest line: below, wandering is as large as what polynomials leave
-)
+# In a record, of its lowest line: below, wandering is as large as what polynomials leave.
+CYCLES = 5
 Response = Callable[[Complex], Complex]
 """(n,) s -> (n, q) of the reference model, from input to sensors; (n, q m) of m inputs, all inputs
 of the first sensor first. Beyond half the rate of records that hold not every sample of the rig:

@@ -20,7 +20,8 @@ PACES = (2.0, 4.0, 5.0, 10.0)  # one of so many samples was kept, or so many tim
 def paced(responses: Sequence[FrequencyResponse], rig: Rig) -> None:
     """Raise InputError where each response is the rig's, as the swapped channels' test asks for it,
     at frequencies that are all the same multiple of those recorded, and is not at those."""
-    found = [_pace(r, rig) for r in responses]
+    chain = Chain(rig)
+    found = [_pace(r, chain) for r in responses]
     if found and found[0] != 1.0 and all(k == found[0] for k in found):
         k, rate = found[0], responses[0].rate_hz
         many = f"{k:g} times" if k > 1 else f"1/{1 / k:g} of"
@@ -28,12 +29,11 @@ def paced(responses: Sequence[FrequencyResponse], rig: Rig) -> None:
         raise InputError("recording", "rate_hz", rate, f"{what}; were samples left out?")
 
 
-def _pace(r: FrequencyResponse, rig: Rig) -> float:
+def _pace(r: FrequencyResponse, chain: Chain) -> float:
+    rig = chain.rig
     pick = np.unique(np.linspace(0, r.frequency.size - 1, POINTS).astype(int))
     on = [[s.name for s in rig.sensor].index(c.name) for c in r.outputs]
     by = [[a.name for a in rig.actuator].index(c.name) for c in r.inputs]
-
-    chain = Chain(rig)
 
     def misfit_at(k: float) -> float:
         f = r.frequency[pick] / k

@@ -30,11 +30,10 @@ from samii_rig.likelihood.algebra import orthonormal
 from samii_rig.likelihood.excited import within
 from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.likelihood.records import Response
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import proportional
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Complex, Finding, Float, FrequencyResponse, Recording
+from samii_rig.types import Finding, Float, FrequencyResponse, Recording
 
 REPEAT = "repeat"  # kind of finding that tells a repeat which is unlike the others
 SURE = 5.0  # standard deviations of chi-square beyond which two recordings differ
@@ -105,17 +104,17 @@ class SeveralStates:
 
 @dataclass(frozen=True)
 class _Alone:
-    """A recording by itself. whole : its records. about : their likelihood about what all
-    recordings led to."""
+    """A recording by itself. whole : its records. given : all recordings, about whose model it is
+    held against others."""
 
     name: str
     whole: Whole
-    about: Callable[[Whole], Reduced]
+    given: Given
 
     @cached_property
     def form(self) -> Reduced:
         """Its likelihood, computed where the recording is compared."""
-        return self.about(self.whole)
+        return self.whole.about(self.given.fitted, self.given.frequency)
 
     @property
     def pieces(self) -> tuple[Piece, ...]:
@@ -192,11 +191,6 @@ def _alone(given: Given) -> list[_Alone]:
     whole = given.whole
     records, sensors = whole.records, whole.wired.sensors
     band = records.bands[0] if whole.asked else None
-    response = kept(whole.response(given.fitted))
-
-    def about(own: Whole) -> Reduced:
-        return own.about(given.fitted, given.frequency, response)
-
     out = []
     for i, run in enumerate(whole.runs):
         try:
@@ -207,22 +201,10 @@ def _alone(given: Given) -> list[_Alone]:
         except EstimateError:
             continue
         if own.wired == whole.wired:
-            long = replace(own, records=replace(among, least=records.longest))
-            out.append(_Alone(run.source or f"recording {i + 1}", long, about))
+            # As long as all, so that what the model answers is computed once.
+            long = replace(own, records=replace(among, least=records.longest), kept=whole.kept)
+            out.append(_Alone(run.source or f"recording {i + 1}", long, given))
     return out
-
-
-def kept(response: Response) -> Response:
-    """The same, computed once on each contour: those of all recordings are as long."""
-    made: dict[tuple[int, complex], Complex] = {}
-
-    def at(s: Complex) -> Complex:
-        key = s.size, complex(s[-1])
-        if key not in made:
-            made[key] = response(s)
-        return made[key]
-
-    return at
 
 
 def _own(run: Recording, findings: Sequence[Finding]) -> Sequence[Finding]:

@@ -18,7 +18,6 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg, stats
 
-from samii_rig.diagnose.fit.agreeing import kept
 from samii_rig.diagnose.fit.discrepancy import Discrepancy, weighed
 from samii_rig.diagnose.fit.explanations import UNEXPLAINED, Explanation, named
 from samii_rig.diagnose.fit.ranking import moved
@@ -192,7 +191,6 @@ class DiscrepantSearch(RecordSearch):
         if len(levels) < 2:
             return []
         fitted, at = self.ranked()[0].fitted, self.plain.reduced.frequency
-        response = kept(whole.response(fitted))
         out = []
         for level in levels:
             of = [i for i, p in enumerate(records.pieces) if p.levels == level]
@@ -203,7 +201,7 @@ class DiscrepantSearch(RecordSearch):
                 least=records.longest,
             )
             words = " and ".join(f"{value:g} {unit}" for value, unit in level)
-            out.append((words, replace(whole, records=some).about(fitted, at, response)))
+            out.append((words, replace(whole, records=some).about(fitted, at)))
         return out
 
 

@@ -87,7 +87,8 @@ class Whole:
             runs = [run for run, _ in aligned(runs)]
         wired = wiring(runs, rig, sensors)
         (rate,) = {run.rate_hz for run in runs}
-        if times := faster(runs, wired):
+        times = faster(runs, wired)
+        if times and times * rate != rig.rate_hz:
             rig = rig.model_copy(update={"rate_hz": times * rate})
         bad = [f.message for f in findings if not f.channel or f.channel in wired.sensors]
         without = _named_in(bad, (r.place(s) for r in runs for s in segments_of(r)))
@@ -252,13 +253,10 @@ class Whole:
         once, which = np.unique(f, return_inverse=True)
         return np.asarray(fitted.model.response(fitted.x, self.grid(once, 0.0, fitted))[which])
 
-    def about(
-        self, fitted: Fitted, at: Float | None = None, response: Response | None = None
-    ) -> Reduced:
-        """The likelihood near a fit, on the lines that are fitted. at : Hz of its nodes. response :
-        that of the fit, where it is known."""
-        response = self.response(fitted) if response is None else response
-        return reduced(self.records, response, self.disturbed(fitted), self._loop, fitted_lines, at)
+    def about(self, fitted: Fitted, at: Float | None = None) -> Reduced:
+        """The likelihood near a fit, on the lines that are fitted. at : Hz of its nodes."""
+        response, disturbed = self.response(fitted), self.disturbed(fitted)
+        return reduced(self.records, response, disturbed, self._loop, fitted_lines, at)
 
     def complete(self, fitted: Fitted) -> Complete:
         """The same, with what no linear model explains."""

@@ -49,8 +49,7 @@ class Grid:
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
     folded : (order, n, q) of these the ones of `NEAR`, or none. far : of these those beyond.
     own_aliases : (`OWN`, n, q) hold, filters and delays of the first of `folded`, if every model
-    has its
-        own there; None where those of one chain are near enough.
+    has its own there; None where those of one chain are near enough.
     rate_hz : of the samples.
     sensor, actuator : (q,) entries. loop : closed around them, if responses are to the references.
     sigma : of all, or (n,) of each.
