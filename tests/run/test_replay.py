@@ -136,8 +136,8 @@ def test_after_its_last_sample_it_says_so(rig):
 
 
 def test_at_real_pace_it_takes_its_time(rig):
-    device = open_device(rig, {"pace": "real"})
     start = time.monotonic()
+    device = open_device(rig, {"pace": "real"})
     device.clock.sleep(0.2)
     n = len(device.sensor.read())
     passed = time.monotonic() - start
