@@ -66,7 +66,11 @@ def ringing(pieces: Sequence[Piece], channels: Sequence[Channel], highest: float
     ends = ends - ends.mean(axis=1, keepdims=True)
     size = np.sqrt(np.mean(ends.mean(axis=0) ** 2, axis=0))
     peak = np.max([np.ptp(p.z[:, 1:], axis=0) for p in pieces], axis=0) / 2
-    snr = _against_scatter(ends, highest) if len(pieces) > 1 else _against_itself(ends[0], peak)
+    step = np.array([c.resolution for c in channels[1:]])
+    if len(pieces) > 1:
+        snr = _against_scatter(ends, highest, step)
+    else:
+        snr = _against_itself(ends[0], peak)
     loud = size > TAIL_LOUD * peak
     if loud.any() and len(pieces) > 1:
         snr = np.maximum(snr, np.where(loud, 1 / TAIL_LOUD, 0.0))
@@ -119,10 +123,15 @@ def _hann(x: Float) -> Complex:
     return np.asarray(np.fft.rfft(x * np.hanning(x.shape[0])[:, None], axis=0))
 
 
-def _against_scatter(ends: Float, highest: float) -> Float:
-    """(p,) signal to noise of the mean tail's strongest line, 0 where the tail is but noise."""
+def _against_scatter(ends: Float, highest: float, step: Float) -> Float:
+    """(p,) signal to noise of the mean tail's strongest line, 0 where the tail is but noise.
+
+    step : (p,) of the converters. The mean's noise is at least what they make of a motion: where
+    repeats read alike, no scatter shows it and none of it averages out.
+    """
     n, tail, outputs = ends.shape
-    spectra = np.fft.rfft(ends * np.hanning(tail)[:, None], axis=1)
+    window = np.hanning(tail)
+    spectra = np.fft.rfft(ends * window[:, None], axis=1)
     # A line of the windowed tail is 2 lines wide: every second one is nearly independent.
     spectra = spectra[:, 2 : max(4, int(highest * tail) + 1) : 2]
     bins = spectra.shape[1]
@@ -134,7 +143,10 @@ def _against_scatter(ends: Float, highest: float) -> Float:
     if p == 0 or (n - 1) * lines <= p or not np.any(scatter):
         return np.where(lively & np.any(mean, axis=0), np.inf, np.zeros(outputs))
     noise = pooled(scatter, n - 1, lines)
-    t2 = hotelling(mean[:, lively], noise.covariance / n)
+    C = noise.covariance / n
+    every, rounding = np.arange(p), step[lively] ** 2 / 12 * np.sum(window**2)
+    C[:, every, every] = np.maximum(C[:, every, every].real, rounding)
+    t2 = hotelling(mean[:, lively], C)
     if hotelling_p(t2, p, np.maximum(noise.dof, p)).min() >= RINGING / bins:
         return np.zeros(outputs)
     rms = np.sqrt(np.mean(np.abs(spectra - mean) ** 2, axis=(0, 1)) / (n - 1)) + 1e-300

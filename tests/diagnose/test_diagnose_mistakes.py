@@ -112,6 +112,19 @@ def test_what_the_wiring_tells_is_mended_in_the_columns_to_the_last_bit(order, f
     assert np.array_equal(run.values, wrong)
 
 
+@pytest.mark.parametrize("factor", [9.80665, -9.80665])
+def test_a_sensor_that_shows_its_noise_alone_is_in_no_other_unit(factor):
+    """Where noise is ten times what the sensor answers, its lines are as large as in g."""
+    H = response(TWO)
+    quiet = measured(TWO, H, noise=10.0)
+    shown = factor * H[:, 1]  # of one size and phase, as chance may have it
+    noise = replace(quiet, H=np.stack([H[:, 0], shown], axis=1)[:, :, None])
+    assert not wired([noise], TWO).remarks
+    said = wired([replace(noise, covariance=1e-4 * noise.covariance)], TWO).remarks
+    assert said
+    assert all(x.startswith("a_2") for x in said)
+
+
 def test_a_rate_that_is_five_times_another_is_refused_in_one_line():
     lines = LINES[LINES < 15.0]
     slow = replace(measured(RIG, response(RIG, lines=lines), lines), frequency=5 * lines)

@@ -27,6 +27,9 @@ SWAPPED = 0.15  # of the misfit of two channels that is left when they are excha
 MISFIT = 0.5  # least misfit (squared logarithm a line) for which they are
 MOST_MISFIT = 4.0  # of one line: what is far off in any case
 FEW_LINES = 12  # below which nothing can be told from noise
+# Standard deviations of an estimate from which a line says what it is to the model: noise alone is
+# as large in one line of 3,000. A sensor that shows next to nothing but noise is no unit off.
+SHOWN = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +107,8 @@ def _mended(
     acting = [a.name for a in rig.actuator]
     model = sampled_response(rig, r.frequency[pick])[:, on]
     model = as_measured(lines_of(r, pick), model, acting)
-    H, remarks = r.H[pick], []
+    hidden = np.abs(r.H[pick]) < SHOWN * np.sqrt(r.variance()[pick])
+    H, remarks = np.where(hidden, 0.0, r.H[pick]), []
     order = list(range(len(on)))
     for a, b in _swaps(H, model):
         order[a], order[b] = order[b], order[a]
@@ -122,13 +126,15 @@ def _mended(
 def _ratio(H: Complex, model: Complex) -> Complex:
     """Logarithm of measurement over model (n, n_out, n_in); nan where one of them is 0."""
     good = (np.abs(H) > 0) & (np.abs(model) > 0)
-    return np.asarray(np.log(np.where(good, H, np.nan) / np.where(good, model, np.nan)))
+    log = np.log(np.where(good, H, 1.0) / np.where(good, model, 1.0))
+    return np.asarray(np.where(good, log, np.nan))
 
 
 def misfit(H: Complex, model: Complex) -> float:
     """Mean squared logarithm of measurement over model, of one line `MOST_MISFIT` at most."""
     log = np.abs(_ratio(H, model)) ** 2
-    return float(np.nanmean(np.minimum(log, MOST_MISFIT)))
+    known = np.minimum(log[np.isfinite(log)], MOST_MISFIT)
+    return float(np.mean(known)) if known.size else 0.0
 
 
 def _swaps(H: Complex, model: Complex) -> list[tuple[int, int]]:
