@@ -12,6 +12,7 @@ from samii_rig.diagnose.physics.model import Model
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.model.sampled import sensors_at
 from samii_rig.model.tmm import Chain
+from samii_rig.rig.load import load_rig
 
 RIG = samii()
 BAND = (0.5, 40.0)
@@ -47,3 +48,10 @@ def test_it_is_told_and_no_physics_is_named():
     assert found.verdict == "no_mismatch"
     assert any("v_2 was not held between samples" in words for words in found.not_physics)
     assert not found.causes
+
+
+def test_a_soft_spring_that_a_force_sensor_in_line_shows_is_in_the_table() -> None:
+    """25 N/m beside a cylinder of some 1e6 N/m: it shows where nothing else holds the mass."""
+    every = table_of(load_rig("cylinder")[0], 0.9, 30.0)
+    (k,) = (e.unknowns[0] for e in every if e.physics == "ground_spring")
+    assert k.starts[0] < 25.0 < k.high

@@ -140,7 +140,7 @@ def summed(plain):
     every = table_of(RIG, 0.5, 30.0)
     wholes = [Whole.of(plain.runs, RIG, None) for _ in range(2)]
     model = States(Model(RIG), RIG, (next(e for e in every if e.physics == "added_mass"),))
-    starts = [u.starts[0] for u in model.effects[0].unknowns]
+    starts = [u.starts[len(u.starts) // 2] for u in model.effects[0].unknowns]
     x = np.append(np.zeros(model.n_nominal), np.log(starts))
     fitted = Fitted(model, x, 0.0, 0.0, np.zeros((0, model.n)), np.eye(model.n))
     return wholes, fitted
@@ -181,11 +181,10 @@ def test_an_effect_changes_the_state_after_alone(summed):
     both = Both(after, before)
     at = both.nodes(both.about(fitted), fitted)
     model, x = fitted.model, fitted.x
-    h, dh = model.gradient(x, at)
+    _, dh = model.gradient(x, at)
     for j in (0, model.n_nominal):
-        ahead = x.copy()
-        ahead[j] += 1e-6
-        slope = (model.response(ahead, at) - h) / 1e-6
+        step = 1e-6 * (np.arange(x.size) == j)
+        slope = (model.response(x + step, at) - model.response(x - step, at)) / 2e-6
         assert slope == pytest.approx(dh[:, :, j], abs=1e-3 * np.max(np.abs(dh[:, :, j])))
     assert np.all(dh[at.split :, :, model.n_nominal :] == 0)
 

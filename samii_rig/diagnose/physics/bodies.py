@@ -13,7 +13,7 @@ from samii_rig.diagnose.physics.along import Along, stretches
 from samii_rig.diagnose.physics.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.physics.fractional import Joint
 from samii_rig.diagnose.physics.points import ON_LINK
-from samii_rig.diagnose.physics.scales import PAIRS, RANGE, Places, middle, spread
+from samii_rig.diagnose.physics.scales import PAIRS, RANGE, STARTS, Places, middle, spread
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     BEAMS,
@@ -182,7 +182,7 @@ def _links(rig: Rig, where: Places) -> Iterator[Effect]:
             physics="added_mass",
             site=e.name,
             unknowns=(
-                Unknown("m", "kg", *bounds, spread(*bounds, 11)),
+                Unknown("m", "kg", *bounds, spread(*bounds, STARTS)),
                 stretch.unknown(ON_LINK),
             ),
             parameters=values,

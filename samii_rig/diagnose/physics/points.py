@@ -19,7 +19,7 @@ from samii_rig.diagnose.physics import insert
 from samii_rig.diagnose.physics.along import Along, stretches
 from samii_rig.diagnose.physics.effect import Effect, Jump, Key, Unknown, Values
 from samii_rig.diagnose.physics.insert import DISPLACEMENT, VOLUME
-from samii_rig.diagnose.physics.scales import PAIRS, RANGE, SMALLEST, Places, middle, spread
+from samii_rig.diagnose.physics.scales import PAIRS, RANGE, SMALLEST, STARTS, Places, middle, spread
 from samii_rig.model.tmm import State
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
@@ -108,7 +108,7 @@ class Point:
         """The strong one, and the loss over it."""
         low, high = self.bounds(x, w)
         unit = VOLUME if self.law == "column" else self.units[self.strong]
-        strong = Unknown(self.reported or self.strong, unit, low, high, spread(low, high, 11))
+        strong = Unknown(self.reported or self.strong, unit, low, high, spread(low, high, STARTS))
         if not self.loss:
             return (strong,)
         return strong, Unknown(self.loss, self.units[self.loss], *LOSS, LOSS_STARTS)

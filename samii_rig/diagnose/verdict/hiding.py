@@ -20,7 +20,7 @@ from samii_rig.types import Float
 
 FOUND = 0.9  # probability with which an effect of the size that is told would have been found
 Screens = tuple[Screen, Screen]  # without directions projected out, and with
-TRIES = 16  # strengths over the range of an effect, log-spaced, for one that is weak
+TRIES = 20  # strengths over the range of an effect, log-spaced, for one that is weak
 
 
 def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
