@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,10 +21,13 @@ from samii_rig.diagnose.fit.discrepancy import Discrepancy
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.record_search import RecordProblem, RecordSearch
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import refit
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.verdict.by_record import on_records
+from samii_rig.errors import EstimateError
+from samii_rig.likelihood.form import Reduced
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.estimate import estimate
@@ -166,6 +170,19 @@ def test_an_oscillator_at_one_of_two_levels_is_refused_and_one_at_both_is_not():
         search.discrepancy = TRUE
         search._with_discrepancy()
         assert search.worse(with_oscillator(search)) == worse
+
+
+def test_a_level_that_is_too_short_to_show_its_noise_has_no_say(monkeypatch):
+    search = DiscrepantSearch(of(sweep(RIG, 1.0, 1), sweep(RIG, 0.5, 2)))
+    about = Whole.about
+
+    def shown(whole: Whole, *arguments: Any) -> Reduced:
+        if {p.levels for p in whole.records.pieces} == {((0.5, "V"),)}:
+            raise EstimateError("the records are too short")
+        return about(whole, *arguments)
+
+    monkeypatch.setattr(Whole, "about", shown)
+    assert [words for words, _ in search._levels] == ["1 V"]
 
 
 def test_what_leaves_a_nominal_parameter_at_the_end_of_its_range_does_not_hold(nothing):

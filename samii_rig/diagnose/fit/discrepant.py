@@ -12,6 +12,7 @@ again. A second effect would be the discrepancy's. An effect counts only if
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,6 +25,7 @@ from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.record_search import RecordProblem, RecordSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
+from samii_rig.errors import EstimateError
 from samii_rig.likelihood.form import Reduced
 from samii_rig.types import Int
 
@@ -183,7 +185,8 @@ class DiscrepantSearch(RecordSearch):
 
     @cached_property
     def _levels(self) -> list[tuple[str, Reduced]]:
-        """The likelihood of each level by itself, on the nodes of all, where there are several."""
+        """The likelihood of each level by itself, on the nodes of all, where there are several: not
+        of one that is too short to show its noise."""
         whole = self.whole
         assert isinstance(whole, Whole)
         records = whole.by_level().records
@@ -201,7 +204,8 @@ class DiscrepantSearch(RecordSearch):
                 least=records.longest,
             )
             words = " and ".join(f"{value:g} {unit}" for value, unit in level)
-            out.append((words, replace(whole, records=some).about(fitted, at)))
+            with suppress(EstimateError):
+                out.append((words, replace(whole, records=some).about(fitted, at)))
         return out
 
 
