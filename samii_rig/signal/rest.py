@@ -11,6 +11,7 @@ from scipy.ndimage import uniform_filter1d
 
 from samii_rig.signal.groups import Piece
 from samii_rig.signal.noise import pooled
+from samii_rig.signal.quantisation import step_of
 from samii_rig.signal.spectra import rests
 from samii_rig.signal.statistics import hotelling, hotelling_p
 from samii_rig.types import Channel, Complex, Finding, Float
@@ -66,9 +67,9 @@ def ringing(pieces: Sequence[Piece], channels: Sequence[Channel], highest: float
     ends = ends - ends.mean(axis=1, keepdims=True)
     size = np.sqrt(np.mean(ends.mean(axis=0) ** 2, axis=0))
     peak = np.max([np.ptp(p.z[:, 1:], axis=0) for p in pieces], axis=0) / 2
-    step = np.array([c.resolution for c in channels[1:]])
     if len(pieces) > 1:
-        snr = _against_scatter(ends, highest, step)
+        read = zip(channels[1:], pieces[0].z[-tail:, 1:].T, strict=True)
+        snr = _against_scatter(ends, highest, np.array([step_of(c, x) for c, x in read]))
     else:
         snr = _against_itself(ends[0], peak)
     loud = size > TAIL_LOUD * peak

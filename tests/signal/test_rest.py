@@ -71,11 +71,12 @@ def test_a_valve_that_is_disturbed_does_not_hide_that_mode_1_decays(seed: int) -
     assert (found.estimator, found.n_averages) == ("settled", 2)
 
 
-def test_an_encoder_that_repeats_read_alike_is_no_ring() -> None:
+@pytest.mark.parametrize("stated", [True, False])
+def test_an_encoder_that_repeats_read_alike_is_no_ring(stated: bool) -> None:
     """All lines of one repeat less their mean are 0: its rounding is the noise that is known."""
     pieces = row(2, 0.5, 0.0)
     step = 1e-3
-    channels = (*CHANNELS[:2], replace(CHANNELS[2], resolution=step))
+    channels = (*CHANNELS[:2], replace(CHANNELS[2], resolution=step if stated else 0.0))
     for p in pieces:
         p.z[:, 2] = step * np.rint(300 * p.r)
         p.z[N - 40, 2] = step  # where it rests between two steps
