@@ -133,6 +133,13 @@ def test_a_rate_that_is_five_times_another_is_refused_in_one_line():
     assert "\n" not in str(e.value)
 
 
+def test_a_rate_that_leaves_no_line_is_not_another():
+    """Were these ten times as high, all of them would stand beyond half the rate."""
+    lines = np.geomspace(30.0, 40.0, 40)
+    assert lines[0] * 10 > RIG.rate_hz / 2
+    paced([measured(RIG, 5 * response(RIG, lines=lines), lines)], RIG)
+
+
 @pytest.mark.parametrize("rig", ["samii", "two_masses", "beam_on_shaker", "sflr"])
 def test_a_rig_a_quarter_stiffer_than_its_file_is_no_wrong_rate(rig):
     """Every frequency is an eighth too high there."""

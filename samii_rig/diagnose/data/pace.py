@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -38,6 +39,8 @@ def _pace(r: FrequencyResponse, chain: Chain) -> float:
     def misfit_at(k: float) -> float:
         f = r.frequency[pick] / k
         inside = f < rig.rate_hz / 2
+        if not inside.any():
+            return math.inf
         model = sampled_response(rig, f[inside], chain, ROUGHLY)[:, on][:, :, by]
         return misfit(r.H[pick][inside], model)
 

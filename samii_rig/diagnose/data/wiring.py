@@ -131,10 +131,11 @@ def _ratio(H: Complex, model: Complex) -> Complex:
 
 
 def misfit(H: Complex, model: Complex) -> float:
-    """Mean squared logarithm of measurement over model, of one line `MOST_MISFIT` at most."""
+    """Mean squared logarithm of measurement over model, of one line `MOST_MISFIT` at most; infinite
+    where no line shows any."""
     log = np.abs(_ratio(H, model)) ** 2
     known = np.minimum(log[np.isfinite(log)], MOST_MISFIT)
-    return float(np.mean(known)) if known.size else 0.0
+    return float(np.mean(known)) if known.size else math.inf
 
 
 def _swaps(H: Complex, model: Complex) -> list[tuple[int, int]]:
