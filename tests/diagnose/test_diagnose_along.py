@@ -131,7 +131,7 @@ def test_the_derivative_by_the_place_is_that_of_differences(physics, on) -> None
     body = next(e for e in RIG.element if e.name == on)
     found, u = effect(physics, on, 0.3 * body.L.value)
     model = Model(RIG, (found,))
-    values = [u_.starts[len(u_.starts) // 2] for u_ in found.unknowns[:-1]]
+    values = [u_.middle for u_ in found.unknowns[:-1]]
     x = np.append(np.zeros(model.n_nominal), np.log([*values, u]))
     slope = model.gradient(x, at)[1][:, :, -1]
     step = 1e-4 * np.eye(model.n)[-1]

@@ -140,7 +140,7 @@ def summed(plain):
     every = table_of(RIG, 0.5, 30.0)
     wholes = [Whole.of(plain.runs, RIG, None) for _ in range(2)]
     model = States(Model(RIG), RIG, (next(e for e in every if e.physics == "added_mass"),))
-    starts = [u.starts[len(u.starts) // 2] for u in model.effects[0].unknowns]
+    starts = [u.middle for u in model.effects[0].unknowns]
     x = np.append(np.zeros(model.n_nominal), np.log(starts))
     fitted = Fitted(model, x, 0.0, 0.0, np.zeros((0, model.n)), np.eye(model.n))
     return wholes, fitted

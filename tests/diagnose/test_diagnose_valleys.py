@@ -281,7 +281,7 @@ def test_of_two_unknowns_a_rival_is_refitted_from_weak_to_strong():
     spring, late = effect("ground_spring", "joint_1"), effect("sensor_delay", "a_1")
     search = search_of(concealing((spring, [3e3, 20.0])), [spring, late])
     for one in (spring, late):
-        start = [np.log(u.starts[len(u.starts) // 2]) for u in one.unknowns]
+        start = [np.log(u.middle) for u in one.unknowns]
         search.keep((one,), search.refitted((one,), search.nominal, start))
     found = search.found[frozenset({spring.key})]
     x, valley = found.fitted.x.copy(), found.fitted.chi2

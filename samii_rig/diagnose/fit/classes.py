@@ -180,7 +180,7 @@ def _at_start(rig: Rig, effect: Effect, frequency: np.ndarray) -> np.ndarray:
     """The response of a rig with an effect, from the middle of where its refit starts."""
     trial = Model(rig, (effect,))
     x = np.zeros(trial.n)
-    x[trial.n_nominal :] = [math.log(u.starts[len(u.starts) // 2]) for u in effect.unknowns]
+    x[trial.n_nominal :] = [math.log(u.middle) for u in effect.unknowns]
     h = trial.chain.with_values(trial.values(x)).response(frequency)
     if effect.factor is not None:
         F = effect.factor.value(2j * np.pi * frequency, trial.parts(x)[0])[0]

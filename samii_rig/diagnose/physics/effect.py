@@ -41,6 +41,11 @@ class Unknown:
     starts: tuple[float, ...]
     ratio: bool = False
 
+    @property
+    def middle(self) -> float:
+        """The start in the middle."""
+        return self.starts[len(self.starts) // 2]
+
     def small(self, x: float) -> float:
         """Logarithm of how much more probable the logarithm x of a ratio is before the data than if
         it were even between the bounds."""

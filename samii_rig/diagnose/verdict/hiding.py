@@ -46,7 +46,7 @@ def _smallest(
     with its inverse, in proportion: so far as a refit bends, this is exact for what is weak."""
     first, others = effect.unknowns[0], effect.unknowns[1:]
     strength = np.geomspace(first.low, first.high, TRIES)
-    middle = [u.starts[len(u.starts) // 2] for u in others]
+    middle = [u.middle for u in others]
     values = np.column_stack([strength, np.tile(middle, (TRIES, 1))])
     with np.errstate(all="ignore"):
         changed = _changed(search, best, screens, effect, values)
