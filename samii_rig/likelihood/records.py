@@ -36,8 +36,9 @@ class Records:
 
     bands : Hz, of the lines of each that take part. steps : of each sensor's converter, none where
     they are not known. least : samples for which the contours are long
-    enough at least, so that those of other records are the same. driven : Hz up to which the input
-    is more than noise, so that a change of the response shows. undriven : inputs that nothing
+    enough at least, so that those of other records are the same. driven : Hz up to which, and
+    driven_from : from which the input is more than noise, so that a change of the response shows.
+    undriven : inputs that nothing
     excites. What they did is known; a change of the response to it would fit the noise in it.
     every : samples of the rig for each that was recorded.
     """
@@ -48,6 +49,7 @@ class Records:
     steps: tuple[float, ...] = ()
     least: int = 0
     driven: float = np.inf
+    driven_from: float = 0.0
     undriven: tuple[int, ...] = ()
     every: int = 1
 
@@ -55,7 +57,7 @@ class Records:
     def changing(self) -> tuple[float, float]:
         """Hz between which a change of the response shows."""
         low, high = self.band
-        return low, min(high, self.driven)
+        return max(low, self.driven_from), min(high, self.driven)
 
     @property
     def band(self) -> tuple[float, float]:

@@ -100,7 +100,8 @@ def formed(
     smooth, exact = records.smooth(), records.exact()
     H, S = response(exact.s), response(smooth.s)
     records = records.without_spikes(H)
-    inside = (smooth.frequency > records.band[0]) & (smooth.frequency < records.band[1])
+    low, high = max(records.band[0], records.driven_from), records.band[1]
+    inside = (smooth.frequency > low) & (smooth.frequency < high)
     shape = S / np.median(np.abs(S[inside]), axis=0)
     if at is None:
         nodes = nodes_of(smooth, shape, records.changing)

@@ -129,8 +129,9 @@ def _drive(
     on_command = Place("command", across)
     if wide:
         yield effect(OVERLAP, on_command, source, alias, (_log("width", unit, low, high),))
-    # So is what clips the noise on top of the largest command, which has as much on either side.
-    top, least = largest - 2 * noise, LEAST_LIMIT * largest
+    # So is what clips the noise on top of the largest command, which has as much on either side; a
+    # limit as far below that again still took more noise from tops than it bent them.
+    top, least = largest - 4 * noise, LEAST_LIMIT * largest
     if top > least:
         yield effect(CLIPPED, on_command, source, alias, (_log("limit", unit, least, top),))
 
