@@ -286,7 +286,8 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
     rival = max(judged.best.weight - own.weight, (own.fitted.cost - judged.best.fitted.cost) / 2)
     seen = None if _is_linear(judged) else BySpring.of(forces, base)
     sides = uneven_spring(seen) if seen else None
-    if sides is not None and sides.chi2 / 2 > rival:
+    # What is in no row is not told of less than what is.
+    if sides is not None and sides.chi2 > max(2 * rival, judged.evidence.worth):
         return replace(_unknown(looked), remarks=(*looked.remarks, sides.describe()))
     physical = any(e.physical for e in judged.best.effects)
     least = rival if physical else max(rival, VARIES)
