@@ -10,9 +10,12 @@ from few_kit import only
 from scipy import signal
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
+from samii_rig.diagnose.fit import records as whole_records
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
+from samii_rig.diagnose.forces.variation import Uneven
 from samii_rig.diagnose.posed import of_any_kind
+from samii_rig.diagnose.verdict import by_record
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.excited import within
@@ -187,3 +190,73 @@ def test_a_loop_that_runs_faster_than_the_record_is_held_as_it_runs(
 def test_local_models_that_were_chosen_stay() -> None:
     with pytest.raises(EstimateError, match="cannot be told from a transient anywhere"):
         estimate([recorded(1, 0.0, 0.3)], method="local")
+
+
+def rubbed(T_c: float) -> list[Recording]:
+    """Two records of one multisine of 0.5 to 2 Hz, below the mode at 11 Hz, with dry friction
+    beside the spring; by the equation of motion in 64 steps a sample."""
+    fine = 64
+    t = np.arange(N) / RATE
+    phases = np.random.default_rng(1).uniform(0, 2 * np.pi, 19)
+    lines = zip(np.arange(6, 25) * (RATE / N), phases, strict=True)
+    v = 0.06 * sum(np.cos(2 * np.pi * f * t + phase) for f, phase in lines)
+    dt = 1 / (RATE * fine)
+    lag = np.exp(-CORNER * dt)
+    x = speed = push = 0.0
+    way = np.empty(N)
+    for i, command in enumerate(v.tolist()):
+        way[i] = x
+        for _ in range(fine):
+            push = lag * push + (1 - lag) * GAIN * command
+            free = speed + dt * (push - K * x - C * speed) / M
+            held = dt * T_c / M
+            speed = 0.0 if abs(free) <= held else free - np.copysign(held, free)
+            x += dt * speed
+    out = []
+    for seed in (1, 2):
+        run = recorded(seed, 0.0, 0.3)
+        shown = way + np.random.default_rng(seed).normal(0.0, 1e-6, N)
+        out.append(replace(run, values=np.column_stack([v, STEP * np.rint(shown / STEP)])))
+    return out
+
+
+def test_friction_shows_far_above_a_narrow_excitation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its harmonics reach a mode that nothing else drives: they tell a third more."""
+    only(
+        monkeypatch,
+        ("coulomb_friction", "spring"),
+        ("viscous_damping", "spring"),
+        ("added_mass", "mass"),
+    )
+    runs = rubbed(T_c=2e-3)
+    explained = []
+    for highest in (3, whole_records.HARMONIC):
+        monkeypatch.setattr(whole_records, "HARMONIC", highest)
+        found = diagnose(estimate(runs), RIG, runs=runs)
+        assert [(c.physics, c.site) for c in found.causes] == [("coulomb_friction", "spring")]
+        T_c = found.causes[0].parameters["T_c"]
+        assert T_c.low < 2e-3 < T_c.high
+        explained.append(found.evidence["drop"])
+    assert explained[1] > 1.2 * explained[0]
+
+
+def test_a_force_is_looked_for_below_what_is_excited_where_no_response_may_change() -> None:
+    whole = Whole.of(rubbed(T_c=0.0), RIG)
+    low, high = whole.records.band
+    more = whole.with_harmonics().records
+    assert more.bands[0] == (0.0, pytest.approx(whole_records.HARMONIC * high))
+    assert more.changing == (low, pytest.approx(high))
+
+
+@pytest.mark.parametrize(("chi2", "verdict"), [(6.0, "no_mismatch"), (200.0, "unknown")])
+def test_what_is_in_no_row_is_not_told_of_less_than_what_is(
+    chi2: float, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only(monkeypatch, ("viscous_damping", "spring"), ("added_mass", "mass"))
+    monkeypatch.setattr(by_record, "uneven_spring", lambda seen: Uneven("spring", chi2))
+    runs = [recorded(1, 0.0, 0.3), recorded(2, 0.0, 0.5)]
+    found = diagnose(estimate(runs), RIG, runs=runs)
+    assert found.verdict == verdict
+    assert any("not the same to both sides" in said for said in found.not_physics) == (
+        verdict == "unknown"
+    )
