@@ -188,6 +188,24 @@ def test_a_fault_is_told_as_itself_and_no_physics_is_named(name, sound, rivals):
     assert found.causes == ()
 
 
+@pytest.mark.parametrize(("others", "told"), [(1.0, True), (0.9, False), (0.93, False)])
+def test_a_gain_that_noise_hides_in_the_other_channels_is_no_channels_own(sound, others, told):
+    """A command that was clipped makes all of them smaller; one channel shows it beyond noise."""
+    quiet, loud = estimate(sound, gaps="exclude")
+    noise = np.full(len(quiet.outputs), 40.0)
+    noise[0] = 1.0
+    covariance = [r.covariance * noise[:, None] * noise for r in (quiet, loud)]
+    gain = np.full((len(noise), 1), others)
+    gain[0] = 0.9
+    quiet, loud = (
+        replace(r, covariance=C, H=quiet.H * g)
+        for r, C, g in zip((quiet, loud), covariance, (1.0, gain), strict=True)
+    )
+    found = findings.checked([quiet, loud], samii())
+    assert any("its gain was changed between the runs" in said for said in found.remarks) == told
+    assert [len(r.outputs) for r in found.responses] == [len(noise) - told] * 2
+
+
 def test_the_rest_is_diagnosed_once_a_unit_is_mended(sound, rivals):
     late = every(times("theta_2", 57.29578), ahead("a_2", -2))
     found = diagnose(estimate(faulty(sound, late)), samii(), effects=rivals)

@@ -26,6 +26,7 @@ from samii_rig.types import Finding, FrequencyResponse
 LOST_GAIN = 0.02  # relative change of one channel's gain between levels that is told
 FLAT = 2.0  # chi-square per degree of freedom up to which a change is a constant
 ELSE = 5.0  # chi-square per degree of freedom from which two levels differ
+APART = 4.0  # standard deviations by which another channel's gain is not the changed one
 FEW_REPEATS = 3
 SAID_PER_KIND = 3  # findings of one kind that are told; the rest is counted
 
@@ -307,11 +308,16 @@ def _changed(levels: Sequence[FrequencyResponse]) -> list[tuple[int, str]]:
         n = len(a.outputs)
         if n < 2:
             continue
-        gain, flat, same = np.array([_change(a, b, k) for k in range(n)]).T
+        gain, flat, same, sd = np.array([_change(a, b, k) for k in range(n)]).T
         moved = [k for k in range(n) if abs(gain[k] - 1) > LOST_GAIN and same[k] > ELSE]
-        others = [same[k] for k in range(n) if k not in moved]
-        if len(moved) == 1 and flat[moved[0]] < FLAT and max(others) < FLAT:
-            k = moved[0]
+        if len(moved) != 1:
+            continue
+        (k,) = moved
+        others = np.arange(n) != k
+        # A command that was clipped changes all of them, which noise may hide in the others.
+        off = np.abs(gain - gain[k])[others]
+        alone = np.all(off > np.abs(gain - 1)[others]) and np.any(off > APART * sd[others])
+        if flat[k] < FLAT and max(same[others]) < FLAT and alone:
             found.setdefault(
                 k,
                 f"{a.outputs[k].name} reads {gain[k]:.4g} times as much {named(b)} as "
@@ -321,18 +327,22 @@ def _changed(levels: Sequence[FrequencyResponse]) -> list[tuple[int, str]]:
     return [(k, found[k]) for k in sorted(found, reverse=True)]
 
 
-def _change(a: FrequencyResponse, b: FrequencyResponse, k: int) -> tuple[float, float, float]:
-    """Output k of b over that of a: the best constant, and chi-square per degree of freedom
-    about it and about 1."""
+def _change(
+    a: FrequencyResponse, b: FrequencyResponse, k: int
+) -> tuple[float, float, float, float]:
+    """Output k of b over that of a: the best constant, chi-square per degree of freedom about it
+    and about 1, and the standard deviation of the constant."""
     x, y = a.H[:, k, 0], b.H[:, k, 0]
     at = k * len(a.inputs)
     var = (a.covariance[:, at, at] + b.covariance[:, at, at]).real
     weight = np.where(var > 0, 1 / np.where(var > 0, var, 1.0), 0.0)
-    gain = float(np.sum(weight * (x.conj() * y).real) / np.sum(weight * np.abs(x) ** 2))
+    known = float(np.sum(weight * np.abs(x) ** 2))
+    gain = float(np.sum(weight * (x.conj() * y).real)) / known
     # The noise of what is multiplied grows with it.
     variance = (a.covariance[:, at, at] * gain**2 + b.covariance[:, at, at]).real
     flat = float(np.mean(np.abs(y - gain * x) ** 2 / np.where(variance > 0, variance, np.inf)))
-    return gain, flat, float(np.mean(weight * np.abs(y - x) ** 2))
+    # Half of the noise is along what is multiplied.
+    return gain, flat, float(np.mean(weight * np.abs(y - x) ** 2)), (2 * known) ** -0.5
 
 
 def _foreign(levels: Sequence[FrequencyResponse]) -> int | None:
