@@ -260,3 +260,27 @@ def test_what_is_in_no_row_is_not_told_of_less_than_what_is(
     assert any("not the same to both sides" in said for said in found.not_physics) == (
         verdict == "unknown"
     )
+
+
+def pushed(seed: int, k: float) -> Recording:
+    """A command that jumps between two values twenty times a second, alike in every record, on a
+    spring of stiffness k in N/m."""
+    v = 0.3 * np.sign(np.random.default_rng(5).standard_normal(N // 25)).repeat(25)
+    A = np.array([[0.0, 1.0, 0.0], [-k / M, -C / M, 1 / M], [0.0, 0.0, -CORNER]])
+    B = np.array([[0.0], [0.0], [GAIN * CORNER]])
+    held = signal.cont2discrete((A, B, np.eye(3)[:1], np.zeros((1, 1))), 1 / RATE)
+    x = signal.dlsim(held, v)[1][:, 0] + np.random.default_rng(seed).normal(0.0, 1e-6, N)
+    return replace(recorded(seed, 0.0, 0.3), values=np.column_stack([v, STEP * np.rint(x / STEP)]))
+
+
+def test_what_two_recordings_differ_by_is_explained_though_it_was_taken_for_noise(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A spring that is 10 % stiffer in the second of two: it was two states that nothing told."""
+    only(monkeypatch, ("attached_oscillator", "mass"), ("viscous_damping", "spring"))
+    runs = [pushed(1, 0.95 * K), pushed(2, 1.05 * K)]
+    found = diagnose(estimate(of_any_kind(runs)), RIG, runs=runs)
+    assert [(c.physics, c.site) for c in found.causes] == [("stiffness_variation", "spring")]
+    spread = found.causes[0].parameters["spread"]
+    assert spread.low < 0.05 * 2**0.5 < spread.high
+    assert not found.states

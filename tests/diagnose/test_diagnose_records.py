@@ -65,8 +65,8 @@ def test_who_waits_is_told_what_is_tried_in_every_stage(answer):
     assert fits < stages.index("what is missing")
     assert stages[-3:] == [
         "what cannot be distinguished",
-        "whether stiffnesses are constant",
         "whether the recordings agree",
+        "whether stiffnesses are constant",
     ]
     assert any(isinstance(s, Counted) and s.stage == "amplitude levels" for s in said)
     tried = [s for s in said if isinstance(s, Counted) and s.stage == "what is missing"]

@@ -43,7 +43,8 @@ def test_a_coarse_converter_hides_a_dead_band_and_no_limit(step: float, known: s
 
 
 def test_what_is_as_narrow_as_a_meters_noise_is_none_of_the_rig() -> None:
-    """A dead band takes the noise out where the command rests, a limit at its top."""
+    """A dead band takes the noise out where the command rests, a limit at its top; it bends the
+    top by less than that until it is as far again below."""
     valve = ActuatorSpec(name="v", unit="V", low=-10.0, high=10.0, resolution=1e-3)
     ends = {}
     for noise in (0.0, 0.01):
@@ -55,4 +56,4 @@ def test_what_is_as_narrow_as_a_meters_noise_is_none_of_the_rig() -> None:
     (narrowest,) = (e.unknowns[0].low for e in swings if e.physics == "valve_deadband")
     assert narrowest == pytest.approx(1e-3)
     assert ends[0.0]["output_saturation"][1] == pytest.approx(1.0)
-    assert ends[0.01]["output_saturation"][1] == pytest.approx(0.94)
+    assert ends[0.01]["output_saturation"][1] == pytest.approx(0.88)

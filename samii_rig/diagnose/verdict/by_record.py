@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from samii_rig.diagnose.data.findings import Checked
 from samii_rig.diagnose.data.measured import DIFFER
-from samii_rig.diagnose.fit.agreeing import Given, several_states
+from samii_rig.diagnose.fit.agreeing import Given, SeveralStates, several_states
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
 from samii_rig.diagnose.fit.explanations import FIVE, Explanation, threshold
@@ -99,10 +99,13 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         looked = _looked(forced)
         if forced.exhausted:
             looked = replace(looked, remarks=(*looked.remarks, EXHAUSTED))
-    if forces is not None:
-        search.begin("whether stiffnesses are constant")
-        looked = _constant(forces, forced or search, looked, len(case.runs))
     given = Given.of(search, case.runs, case.clean.samples)
+    several = None
+    if forces is not None:
+        if all(e.force is None for e in looked.judged.best.effects):
+            several = _several(search, [given], None)
+        search.begin("whether stiffnesses are constant")
+        looked = _constant(forces, forced or search, looked, len(case.runs), differ=bool(several))
     last = forced or search
     if _not_explained(looked.judged, forced, search):
         search.begin("what is missing, beside a discrepancy")
@@ -111,7 +114,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         looked = _consistent(discrepant, _looked(discrepant))
         if looked.judged.verdict == "no_mismatch":  # beside what no law describes
             looked = _unknown(looked)
-    return _agreeing(case, last, first, bands, looked, [given])
+    return _agreeing(case, last, first, bands, looked, [given], several=several)
 
 
 def _not_explained(judged: Judgement, forced: ForceSearch | None, search: RecordSearch) -> bool:
@@ -149,16 +152,28 @@ def _agreeing(
     looked: _Looked,
     given: Sequence[Given],
     left: float | None = None,
+    *,
+    several: Sequence[SeveralStates] | None = None,
 ) -> Diagnosis:
-    """The answer, with what the recordings of one state differ by, where they are of several."""
+    """The answer, with what the recordings of one state differ by, where they are of several.
+    several : these, if they are known."""
     # What was found to differ from record to record is what they do not agree in.
     between = looked.judged.verdict in verdict.WITH_CAUSES and looked.judged.between
-    if not between and any(len(one.runs) > 1 for one in given):
-        search.begin("whether the recordings agree")
-    several = [] if between else several_states(given, left)
+    if between:
+        several = []
+    elif several is None:
+        several = _several(search, given, left)
     for one in several:
         looked = replace(looked, judged=verdict.of_several_states(looked.judged, one.part))
     return of_states(_answer(case, search, first, bands, looked), several)
+
+
+def _several(
+    search: RecordSearch, given: Sequence[Given], left: float | None
+) -> Sequence[SeveralStates]:
+    if any(len(one.runs) > 1 for one in given):
+        search.begin("whether the recordings agree")
+    return several_states(given, left)
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,17 +289,20 @@ def _winning(forces: ForceSearch | None) -> ForceSearch | None:
     return forces if forces is not None and forces.won else None
 
 
-def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files: int) -> _Looked:
+def _constant(
+    forces: ForceSearch, search: RecordSearch, looked: _Looked, files: int, *, differ: bool
+) -> _Looked:
     """The same, but where a stiffness varies that is the answer: in the place of another that the
     data make less likely, or in words beside it. What no row explains as well as a spring that is
-    not the same to both sides is unknown. search : what was looked at. files : recordings.
+    not the same to both sides is unknown. search : what was looked at. files : recordings; differ :
+    whether they do although the answer leaves no more than noise: it had that for noise.
     """
     judged = looked.judged
     base = verdict.as_meant(forces, judged.best)
     own = verdict.as_meant(search, judged.best)
     # At the noise itself: while a mismatch is large all weights are smaller, a variation's not.
     rival = max(judged.best.weight - own.weight, (own.fitted.cost - judged.best.fitted.cost) / 2)
-    seen = None if _is_linear(judged) else BySpring.of(forces, base)
+    seen = None if _is_linear(judged) and not differ else BySpring.of(forces, base)
     sides = uneven_spring(seen) if seen else None
     # What is in no row is not told of less than what is.
     if sides is not None and sides.chi2 > max(2 * rival, judged.evidence.worth):
@@ -292,7 +310,8 @@ def _constant(forces: ForceSearch, search: RecordSearch, looked: _Looked, files:
     physical = any(e.physical for e in judged.best.effects)
     least = rival if physical else max(rival, VARIES)
     # What leaves more than noise has had that for noise: each is held against its own.
-    linear = physical and judged.partly and all(e.force is None for e in judged.best.effects)
+    plain = all(e.force is None for e in judged.best.effects)
+    linear = plain and (differ or (physical and judged.partly))
     found = variation(seen, files) if seen and (linear or seen.evidence > least) else None
     if found is not None and linear:
         ahead = found.likelihood - of_its_own(forces, judged.best)
