@@ -206,6 +206,12 @@ def test_a_gain_that_noise_hides_in_the_other_channels_is_no_channels_own(sound,
     assert [len(r.outputs) for r in found.responses] == [len(noise) - told] * 2
 
 
+def test_levels_without_noise_are_told_of_no_gain_that_was_changed(sound):
+    levels = [replace(r, covariance=np.zeros_like(r.covariance)) for r in estimate(sound)]
+    found = findings.checked(levels, samii())
+    assert not any("its gain was changed" in said for said in found.remarks)
+
+
 def test_the_rest_is_diagnosed_once_a_unit_is_mended(sound, rivals):
     late = every(times("theta_2", 57.29578), ahead("a_2", -2))
     found = diagnose(estimate(faulty(sound, late)), samii(), effects=rivals)

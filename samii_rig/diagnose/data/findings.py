@@ -337,6 +337,8 @@ def _change(
     var = (a.covariance[:, at, at] + b.covariance[:, at, at]).real
     weight = np.where(var > 0, 1 / np.where(var > 0, var, 1.0), 0.0)
     known = float(np.sum(weight * np.abs(x) ** 2))
+    if not known > 0:  # nothing is told without noise, or of a channel that shows nothing
+        return 1.0, 0.0, 0.0, math.inf
     gain = float(np.sum(weight * (x.conj() * y).real)) / known
     # The noise of what is multiplied grows with it.
     variance = (a.covariance[:, at, at] * gain**2 + b.covariance[:, at, at]).real

@@ -171,6 +171,7 @@ def _agreeing(
 def _several(
     search: RecordSearch, given: Sequence[Given], left: float | None
 ) -> Sequence[SeveralStates]:
+    """As of `several_states`."""
     if any(len(one.runs) > 1 for one in given):
         search.begin("whether the recordings agree")
     return several_states(given, left)
