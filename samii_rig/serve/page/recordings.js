@@ -17,7 +17,7 @@ export class Recordings {
   // state : the newest. play : takes a recording to replay. lay : takes a recording's responses and
   // notes. tried : wraps what may go wrong.
   constructor({ $, put, ask, tried, state, play, lay }) {
-    Object.assign(this, { $, put, ask, tried, state, play, lay, looked: "", listed: [] });
+    Object.assign(this, { $, put, ask, tried, state, play, lay, looked: "", listed: [], asked: 0, shown: 0 });
     $("search").onsubmit = tried(() => this.find());
     $("other").onchange = tried(() => this.compare());
     $("note").onsubmit = tried(async () => {
@@ -30,7 +30,9 @@ export class Recordings {
   async find() {
     const { $, put, ask } = this;
     const query = new URLSearchParams({ text: $("words").value, experiment: $("by-experiment").value, since: $("since").value, limit: 50 });
-    const found = await ask("GET", `/recordings?${query}`);
+    const asked = ++this.asked, found = await ask("GET", `/recordings?${query}`);
+    if (asked < this.shown) return; // a later question was answered before
+    this.shown = asked;
     $("found").textContent = `${found.total} found`;
     this.listed = found.recordings;
     $("list").replaceChildren();
