@@ -35,10 +35,9 @@ class Records:
     """All pieces, on common contours.
 
     bands : Hz, of the lines of each that take part. steps : of each sensor's converter, none where
-    they are not known. least : samples for which the contours are long
-    enough at least, so that those of other records are the same. driven : Hz up to which, and
-    driven_from : from which the input is more than noise, so that a change of the response shows.
-    undriven : inputs that nothing
+    they are not known. least : samples for which the contours are long enough at least, so that
+    those of other records are the same. driven : Hz up to which, and driven_from : from which the
+    input is more than noise, so that a change of the response shows. undriven : inputs that nothing
     excites. What they did is known; a change of the response to it would fit the noise in it.
     every : samples of the rig for each that was recorded.
     """

@@ -100,7 +100,7 @@ def formed(
     smooth, exact = records.smooth(), records.exact()
     H, S = response(exact.s), response(smooth.s)
     records = records.without_spikes(H)
-    low, high = max(records.band[0], records.driven_from), records.band[1]
+    low, high = records.changing[0], records.band[1]
     inside = (smooth.frequency > low) & (smooth.frequency < high)
     shape = S / np.median(np.abs(S[inside]), axis=0)
     if at is None:

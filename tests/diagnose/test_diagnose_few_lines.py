@@ -21,7 +21,7 @@ from samii_rig.errors import EstimateError
 from samii_rig.likelihood.excited import within
 from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Channel, Recording, Segment
+from samii_rig.types import Channel, Float, Recording, Segment
 
 RIG = load_rig("one_mass")[0]
 RATE, N, STEP = 500.0, 6000, 0.5e-6
@@ -29,16 +29,21 @@ STEPS = (250, 334)  # samples at which the command jumps between two values
 M, K, C, GAIN, CORNER = 1.2, 6000.0, 6.0, 4.0, 2 * np.pi * 120.0
 
 
+def way_of(v: Float, k: float = K, finer: int = 1) -> Float:
+    """(n,) m, of the mass on a spring of k in N/m under commands v (n,), the coil's force behind
+    its lag, at `finer` times the record's rate."""
+    A = np.array([[0.0, 1.0, 0.0], [-k / M, -C / M, 1 / M], [0.0, 0.0, -CORNER]])
+    B = np.array([[0.0], [0.0], [GAIN * CORNER]])
+    held = signal.cont2discrete((A, B, np.eye(3)[:1], np.zeros((1, 1))), 1 / (RATE * finer))
+    return np.asarray(signal.dlsim(held, v)[1][:, 0])
+
+
 def recorded(seed: int, corner: float, level: float) -> Recording:
     """Steps of the command, and x of a sensor that shows nothing slow, below `corner` in Hz."""
     v = np.zeros(N)
     for first in STEPS:
         v[first:] = level - v[first:]
-    # The mass, and the coil's force behind its lag.
-    A = np.array([[0.0, 1.0, 0.0], [-K / M, -C / M, 1 / M], [0.0, 0.0, -CORNER]])
-    B = np.array([[0.0], [0.0], [GAIN * CORNER]])
-    held = signal.cont2discrete((A, B, np.eye(3)[:1], np.zeros((1, 1))), 1 / RATE)
-    x = signal.dlsim(held, v)[1][:, 0]
+    x = way_of(v)
     fast = signal.cont2discrete(([1.0, 0.0], [1.0, 2 * np.pi * corner]), 1 / RATE, "bilinear")
     x = signal.lfilter(fast[0].ravel(), fast[1], x)
     x = x + np.random.default_rng(seed).normal(0.0, 1e-6, N)
@@ -139,11 +144,8 @@ def metered(
     as fast as the record."""
     t = np.arange(N * finer) / (RATE * finer)
     v = 0.4 * signal.chirp(t, 1.0, t[-1], high_hz)
-    A = np.array([[0.0, 1.0, 0.0], [-K / M, -C / M, 1 / M], [0.0, 0.0, -CORNER]])
-    B = np.array([[0.0], [0.0], [GAIN * CORNER]])
-    held = signal.cont2discrete((A, B, np.eye(3)[:1], np.zeros((1, 1))), 1 / (RATE * finer))
     rng = np.random.default_rng(seed)
-    x = signal.dlsim(held, v)[1][::finer, 0] + rng.normal(0.0, 1e-6, N)
+    x = way_of(v, finer=finer)[::finer] + rng.normal(0.0, 1e-6, N)
     shown = (v + np.append(v[0], v[:-1]))[::finer] / 2 + rng.normal(0.0, meter, N)
     run = recorded(seed, 0.0, 0.3)
     if reference:
@@ -266,10 +268,7 @@ def pushed(seed: int, k: float) -> Recording:
     """A command that jumps between two values twenty times a second, alike in every record, on a
     spring of stiffness k in N/m."""
     v = 0.3 * np.sign(np.random.default_rng(5).standard_normal(N // 25)).repeat(25)
-    A = np.array([[0.0, 1.0, 0.0], [-k / M, -C / M, 1 / M], [0.0, 0.0, -CORNER]])
-    B = np.array([[0.0], [0.0], [GAIN * CORNER]])
-    held = signal.cont2discrete((A, B, np.eye(3)[:1], np.zeros((1, 1))), 1 / RATE)
-    x = signal.dlsim(held, v)[1][:, 0] + np.random.default_rng(seed).normal(0.0, 1e-6, N)
+    x = way_of(v, k) + np.random.default_rng(seed).normal(0.0, 1e-6, N)
     return replace(recorded(seed, 0.0, 0.3), values=np.column_stack([v, STEP * np.rint(x / STEP)]))
 
 

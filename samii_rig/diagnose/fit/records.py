@@ -122,8 +122,8 @@ class Whole:
         return self if self.of_levels is None else replace(self, records=self.of_levels)
 
     def with_harmonics(self) -> Whole:
-        """The same records, with the lines at which a force shows that depends on the level: up to
-        the highest harmonics of what is excited that show one, and no others than those that were
+        """The same records, with the lines at which a force shows that depends on the level: below
+        what is excited, and above it up to harmonic `HARMONIC`; no others than those that were
         asked for."""
         if self.asked:
             return self
@@ -135,9 +135,8 @@ class Whole:
         if not np.isfinite(driven):
             reached = excited(records.pieces, records.rate_hz, part=DRIVES)
             driven = max(records.band[1], *(band[1] for band in reached if band))
-        low = records.band[0]
-        records = replace(records, bands=bands, driven=driven, driven_from=low)
-        return replace(self, records=records)
+        wide = replace(records, bands=bands, driven=driven, driven_from=records.band[0])
+        return replace(self, records=wide)
 
     @property
     def sensor(self) -> Int:

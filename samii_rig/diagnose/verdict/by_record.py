@@ -102,7 +102,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     given = Given.of(search, case.runs, case.clean.samples)
     several = None
     if forces is not None:
-        if all(e.force is None for e in looked.judged.best.effects):
+        if _without_force(looked.judged):
             several = _several(search, [given], None)
         search.begin("whether stiffnesses are constant")
         looked = _constant(forces, forced or search, looked, len(case.runs), differ=bool(several))
@@ -192,7 +192,7 @@ class _Looked:
 def _looked(search: RecordSearch) -> _Looked:
     judged = verdict.judge(search)
     plain, after, gap = search.shown(search.nominal.fitted, judged.best.fitted)
-    if any(e.force is not None for e in judged.best.effects) and gap.low > 0:
+    if not _without_force(judged) and gap.low > 0:
         # Computed in time, and seen on lines that it was not fitted to.
         judged = verdict.confirmed(judged)
     judged = verdict.shown(judged, gap, judged.evidence.drop / (TURN - 1))
@@ -311,8 +311,7 @@ def _constant(
     physical = any(e.physical for e in judged.best.effects)
     least = rival if physical else max(rival, VARIES)
     # What leaves more than noise has had that for noise: each is held against its own.
-    plain = all(e.force is None for e in judged.best.effects)
-    linear = plain and (differ or (physical and judged.partly))
+    linear = _without_force(judged) and (differ or (physical and judged.partly))
     found = variation(seen, files) if seen and (linear or seen.evidence > least) else None
     if found is not None and linear:
         ahead = found.likelihood - of_its_own(forces, judged.best)
@@ -342,8 +341,13 @@ def _even(forces: ForceSearch | None, search: RecordSearch, looked: _Looked) -> 
 def _is_linear(judged: Judgement) -> bool:
     """Whether a linear response is told and leaves no more than noise: what varies is then beside
     it. Modulations of any phase in every record would do the work of such a response, too."""
-    linear = all(e.force is None for e in judged.best.effects)
-    return linear and judged.verdict in verdict.WITH_CAUSES and not judged.partly
+    told = judged.verdict in verdict.WITH_CAUSES and not judged.partly
+    return told and _without_force(judged)
+
+
+def _without_force(judged: Judgement) -> bool:
+    """Whether what explains the records best is linear."""
+    return all(e.force is None for e in judged.best.effects)
 
 
 def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
