@@ -8,6 +8,7 @@ rows behind what was sent: each row is read at another time than the one before.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,13 +17,10 @@ import numpy as np
 
 from samii_rig.errors import InputError
 from samii_rig.rig.load import tables
+from samii_rig.signal.shifts import FARTHEST, compared, driving
 from samii_rig.types import Finding, Float, Int, Recording
 
-FARTHEST = 5  # samples; a logger that is later has another fault
 LEFT = 0.2  # part of what is fed back, or of a command's size, by which a law that holds is off
-# Of the power by which two runs differ, what a shift leaves at most, and samples by which it may
-# look as if it were not whole: where noise has a tenth of that power, by 0.05.
-HALF, WHOLE = 0.5, 0.15
 # Of a law that holds, log likelihood by which a shift is seen: 1e-5 by chance among eleven.
 SEEN = 14.0
 # Part of a command's step that rounding leaves, and medians from which a residual is a spike.
@@ -31,7 +29,6 @@ TAPS = 1  # rows to each side of which what a voltmeter shows of a command is ma
 # Rows of that filter's delay: a voltmeter between two commands has half a row, another shift one.
 CENTRED = 0.75
 ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same
-KNOWN = 0.5  # part of the rows of two recordings, below which too little is known of either
 LOOKED_AT = 1 << 14  # samples about the largest reference: thousands show a shift, millions cost
 QUIETER = 0.5  # of a command's fourth differences, those without what a loop would have added
 SENT = ("reference", "command")  # roles of columns that are sent, not measured
@@ -194,101 +191,30 @@ def proportional(v: Float, w: Float) -> bool:
 
 def aligned(recordings: Sequence[Recording]) -> list[tuple[Recording, Finding | None]]:
     """Recordings whose rows hold what was sent and measured at one time, and what was done: by the
-    law of the loop; where that shows nothing, so that all answer the same input alike."""
+    law of the loop; where that shows nothing, so that all answer alike."""
     law = "by the loop's own law what was measured stands"
-    own = [_moved(r, shift_of(r), law) for r in recordings]
-    out: list[tuple[Recording, Finding | None]] = []
-    for recording, said in own:
-        first = next((r for r, _ in out if _alike(r, recording)), None)
-        if said is None and first is not None:
-            m = _against(first, recording)
-            said_of = f"beside {first.source or 'another recording'} what was measured stands"
-            recording, said = _moved(recording, m, said_of)
-        out.append((recording, said))
+    out = [_moved(r, shift_of(r), law) for r in recordings]
+    alike: dict[object, list[int]] = {}
+    for i, (r, _) in enumerate(out):
+        alike.setdefault((driving(r), r.names("sensor"), r.rate_hz), []).append(i)
+    for those in alike.values():
+        _set_beside(out, those)
     return out
 
 
-def _alike(one: Recording, other: Recording) -> bool:
-    """Whether two recordings are of one input, but for its size."""
-    names = _driving(one)
-    if names != _driving(other) or not names:
-        return False
-    v, w = _overlap(one, other, names)
-    known = np.isfinite(v).all(axis=1) & np.isfinite(w).all(axis=1)
-    v, w = v[known], w[known]
-    if len(v) <= max(2 * FARTHEST, KNOWN * known.size):
-        return False
-    if len(names) > 1:  # each in units of its largest, by which they compare
-        size = np.max(np.abs(np.concatenate([v, w])), axis=0)
-        v, w = (x / np.where(size > 0, size, 1.0) for x in (v, w))
-    return proportional(v.ravel(), w.ravel())
-
-
-def _driving(recording: Recording) -> list[str]:
-    """Columns that drive a run: references that move, in which no loop is, or the commands."""
-    references = [n for n in recording.names("reference") if np.ptp(recording.values_of(n)) > 0]
-    return references or list(recording.names("command"))
-
-
-def _overlap(one: Recording, other: Recording, names: Sequence[str]) -> tuple[Float, Float]:
-    """(n, p) these columns in the first segments of both, row by row from their starts; no row
-    where these are not as long, but for the ends that a shift takes."""
-    a, b = _first(one, names), _first(other, names)
-    n = min(len(a), len(b)) if abs(len(a) - len(b)) <= 2 * FARTHEST else 0
-    return a[:n], b[:n]
-
-
-def _first(recording: Recording, names: Sequence[str]) -> Float:
-    """(n, p) these columns in the first segment, in the whole where none is known; NaN in rows that
-    are missing."""
-    sequence = recording.sequence
-    if not sequence.size:
-        return np.zeros((0, len(names)))
-    start, stop = int(sequence[0]), int(sequence[-1]) + 1
-    if recording.segments:
-        start, stop = recording.segments[0].start, recording.segments[0].stop
-    a, b = (int(x) for x in np.searchsorted(sequence, [start, stop]))
-    out = np.full((stop - start, len(names)), np.nan)
-    out[sequence[a:b] - start] = recording.columns(names)[a:b]
-    return out
-
-
-def _against(first: Recording, recording: Recording) -> int:
-    """Samples by which the sensors of a recording stand behind those of another of the same input;
-    0 where no shift makes them clearly more alike."""
-    driving = _driving(first)[0]
-    names = [n for n in first.names("sensor") if n in recording.names("sensor")]
-    x, y = _overlap(first, recording, [driving, *names])
-    known = np.isfinite(x[:, 0]) & np.isfinite(y[:, 0])
-    size = float(x[known, 0] @ y[known, 0]) / float(x[known, 0] @ x[known, 0])
-    x, y = size * x[:, 1:], y[:, 1:]
-    x, y = (z - np.nanmean(z, axis=0) for z in (x, y))
-    inside = slice(FARTHEST, len(x) - FARTHEST)
-    off = np.array(
-        [
-            np.nanmean((np.roll(y, -m, axis=0) - x)[inside] ** 2, axis=0)
-            for m in range(-FARTHEST, FARTHEST + 1)
-        ]
-    ).T
-    off = off[np.all(off > 0, axis=1)]
-    if not len(off):
-        return 0
-    # A sensor that shows next to nothing but noise has no say.
-    best = int(np.argmin(np.sum(np.log(off), axis=0)))
-    clear = np.min(off[:, best] / off[:, FARTHEST]) < LEFT or _is_whole(off, best)
-    return best - FARTHEST if clear else 0
-
-
-def _is_whole(off: Float, best: int) -> bool:
-    """Whether sensors have their least at a shift itself, not between two: what else lets them
-    answer later does not do so by whole samples. off : (q, shifts) what each leaves of them."""
-    if best in (0, off.shape[1] - 1):
-        return False
-    before, least, behind = off[:, best - 1 : best + 2].T
-    seen = least < HALF * off[:, FARTHEST]
-    # Of a parabola through three shifts the least is at (before - behind)/2 over its bend.
-    whole = np.abs(before - behind) < 2 * WHOLE * (before - 2 * least + behind)
-    return bool(seen.any() and np.all(whole[seen]))
+def _set_beside(out: list[tuple[Recording, Finding | None]], those: Sequence[int]) -> None:
+    """Of recordings that compare, those that no law moved stand as those that one did; else as
+    most of them do."""
+    ruled = [i for i in those if out[i][1]]
+    those = [*ruled[:1], *(i for i in those if i not in ruled)]
+    if len(those) == 1:
+        return
+    by = compared([out[i][0] for i in those])
+    most = by[0] if ruled else Counter(by).most_common(1)[0][0]
+    beside = out[those[by.index(most)]][0].source or "another recording"
+    for i, m in zip(those, by, strict=True):
+        if i not in ruled:
+            out[i] = _moved(out[i][0], m - most, f"beside {beside} what was measured stands")
 
 
 def _moved(recording: Recording, m: int, law: str) -> tuple[Recording, Finding | None]:

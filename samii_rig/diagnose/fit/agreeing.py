@@ -48,7 +48,8 @@ class Given:
 
     whole : all of them; fitted : a model of that state, about which they are held against each
     other, on the nodes frequency, Hz. findings : of their samples, as of `Whole.of`. where : which
-    of the recordings these are, " before" or " in pose 30 deg".
+    of the recordings these are, " before" or " in pose 30 deg". nominal : the nominal model, where
+    that is another: what it leaves is what there is to explain.
     """
 
     runs: Sequence[Recording]
@@ -57,15 +58,18 @@ class Given:
     frequency: Float
     findings: Sequence[Finding] = ()
     where: str = ""
+    nominal: Fitted | None = None
 
     @classmethod
     def of(
         cls, search: RecordSearch, runs: Sequence[Recording], findings: Sequence[Finding]
     ) -> Given:
-        """All recordings of a search that is ended."""
+        """All recordings of a search that is ended, about what explains them best: far from what
+        they show, responses of one rig would differ by what the likelihood is not exact to."""
         assert isinstance(search.whole, Whole)
-        fitted = search.nominal.fitted
-        return cls(runs, search.whole, fitted, search.reduced.frequency, findings)
+        best, nominal = search.ranked()[0].fitted, search.nominal.fitted
+        at = search.reduced.frequency
+        return cls(runs, search.whole, best, at, findings, nominal=nominal)
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,10 +245,10 @@ def _difference(a: Reduced, b: Reduced) -> tuple[float, float, float]:
 
 def _left(given: Given, each: Sequence[_Alone]) -> float:
     """Chi-square, over its mean, that the nominal model leaves in units of each one's noise."""
-    total = 0.0
+    total, fitted = 0.0, given.nominal or given.fitted
     for one in each:
         at = given.whole.nodes(one.form, given.fitted)
-        r = one.form.residual(given.fitted.model.response(given.fitted.x, at))
+        r = one.form.residual(fitted.model.response(fitted.x, at))
         total += float(r @ r) - one.form.known
     return total
 

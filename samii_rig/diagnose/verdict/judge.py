@@ -217,8 +217,11 @@ def as_meant(search: Explanations, best: Explanation) -> Explanation:
     if key not in search.found:
         own = zip(best.effects, map(best.fitted.model.own, range(len(best.effects))), strict=True)
         more = [best.fitted.x[k] for e, at in own if not e.physical for k in at]
-        if (end := search.refitted(meant, search.nominal, more)) is not None:
-            search.keep(meant, end)
+        # What no unknown mends, as a shift by whole samples, has left the nominal model far away.
+        near = replace(best.fitted, x=best.fitted.x[: best.fitted.model.n_nominal])
+        for start in (search.nominal, replace(best, fitted=near)):
+            if (end := search.refitted(meant, start, more)) is not None:
+                search.keep(meant, end)
     return search.found.get(key, search.nominal)
 
 
