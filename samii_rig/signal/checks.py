@@ -34,6 +34,9 @@ STUCK_PART = 0.2  # of the samples in which the input moves
 LIVELY = 0.1  # of the samples, at which one that moves may read the same as before
 AROUND = 3  # times as long as a sensor stands still, on either side
 STUCK_SAMPLES = 20
+# Changes of one step each in a row, with which a sensor that rested moves again; one that was
+# frozen comes back where the rig is by then.
+GENTLE = 3
 FLAT_RUN, FLAT_RUNS = 3, 3  # as many equal samples at the extreme, as many times
 COARSE = 1000  # distinct values below which equal neighbours mean nothing
 
@@ -146,8 +149,8 @@ def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Findin
     """Outputs that stand still while the input moves.
 
     One that never changes is an error, and so is one that freezes although its noise moves
-    it at nearly every other sample, before and after it too. A coarse sensor that rests for long
-    is a warning: dry friction looks the same.
+    it at nearly every other sample, before and after it too, and comes back with a jump. A coarse
+    sensor that rests for long is a warning: dry friction looks the same.
     """
     out = []
     v = cut.values[:, cut.column(selection.input.name)]
@@ -169,8 +172,9 @@ def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Findin
             continue
         beside = AROUND * length  # where it has stood still so often before and after, it rests
         near = still[max(longest[0] - beside, 0) : longest[1] + beside]
-        lively = all(
-            np.count_nonzero(x) - length < LIVELY * (x.size - length) for x in (still, near)
+        lively = not _goes_on(x, *longest, channel.resolution) and all(
+            np.count_nonzero(some) - length < LIVELY * (some.size - length)
+            for some in (still, near)
         )
         if lively or inside > STUCK_PART * np.count_nonzero(moving):
             message = (
@@ -180,6 +184,15 @@ def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Findin
             severity: Literal["error", "warning"] = "error" if lively else "warning"
             out.append(Finding("stuck", severity, message, channel.name, segment.name))
     return out
+
+
+def _goes_on(x: Float, first: int, last: int, step: float) -> bool:
+    """Whether a sensor (n,) that stands still from sample `first` to `last` moves on by single
+    steps of its converter, as it had come to rest: it was not frozen."""
+    change = np.diff(x)
+    beside = [side[side != 0][:GENTLE] for side in (change[:first][::-1], change[last:])]
+    rested = np.abs(np.concatenate(beside)) < 1.5 * step
+    return beside[1].size == GENTLE and bool(rested.all())
 
 
 def foreign_repeats(
