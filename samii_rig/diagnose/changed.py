@@ -144,11 +144,13 @@ def _named(state: State) -> tuple[str, ...]:
 def _both(first: Case, second: Case, band: Band | None) -> tuple[Both, RecordSearch]:
     """The records of both states, and the search on those before."""
     common = [name for name in first.sensors if name in second.sensors]
+    hidden = first.clean.hidden | second.clean.hidden
     wholes = []
     for name, case in (("before", first), ("after", second)):
         if why := case.not_whole():
             raise EstimateError(f"the recordings {name} cannot be compared sample by sample: {why}")
-        wholes.append(Whole.of(case.runs, case.search.rig, band, common, case.clean.samples))
+        rig, samples = case.search.rig, case.clean.samples
+        wholes.append(Whole.of(case.runs, rig, band, common, samples, hidden=hidden))
     if wholes[0].wired != wholes[1].wired:
         raise EstimateError("the two states have no command and no sensor in common")
     longest = max(w.records.longest for w in wholes)

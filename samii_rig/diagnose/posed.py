@@ -189,13 +189,15 @@ def _together(
     Raises EstimateError where those of one cannot be used whole, or have other channels.
     """
     common = [name for name in cases[0].sensors if all(name in c.sensors for c in cases)]
+    hidden = frozenset[str]().union(*(c.clean.hidden for c in cases))
     wholes = []
     for one, case, rig in zip(each, cases, rigs, strict=True):
         where = f"the recordings in pose {one.in_words}"
         if why := case.not_whole():
             raise EstimateError(f"{where} cannot be fitted with the others: {why}")
         try:
-            wholes.append(Whole.of(case.runs, rig, band, common, case.clean.samples))
+            samples = case.clean.samples
+            wholes.append(Whole.of(case.runs, rig, band, common, samples, hidden=hidden))
         except EstimateError as error:
             raise EstimateError(f"{where} cannot be fitted with the others: {error}") from error
         if wholes[-1].wired != wholes[0].wired:

@@ -138,17 +138,23 @@ class Wiring:
 
 
 def wiring(
-    recordings: Sequence[Recording], rig: Rig, sensors: Collection[str] | None = None
+    recordings: Sequence[Recording],
+    rig: Rig,
+    sensors: Collection[str] | None = None,
+    hidden: Collection[str] = (),
 ) -> Wiring:
     """The columns of all recordings that the rig file knows, of `sensors` alone if given.
 
+    hidden : sensors that show next to nothing but their converter's steps. A loop around one of
+    them does nothing that its command does not show: that is an input as of an open loop, and the
+    rest of the noise has not gone round.
     An input is a command that any of them has. Where one has no column of it, it rested there.
 
     Raises EstimateError where they have no sensor in common or no command, where a loop is closed
     around a sensor that is left out, or around an input that one of them has no column of.
     """
     known = [s.name for s in rig.sensor]
-    common = set.intersection(*({c.name for c in r.channels} for r in recordings))
+    common = set.intersection(*({c.name for c in r.channels} for r in recordings)) - set(hidden)
     asked = common if sensors is None else common & set(sensors)
     found = tuple(n for n in known if n in asked)
     having = [a.name for a in rig.actuator if any(_has(r, a.name) for r in recordings)]
@@ -168,8 +174,8 @@ def _input(
     common: Collection[str],
     found: Collection[str],
 ) -> Input:
-    """An input and the loop that runs around it. common : columns of all recordings. found : the
-    sensors that are read."""
+    """An input and the loop that runs around it. common : columns of all recordings, but for
+    hidden ones. found : the sensors that are read."""
     centring = rig.centring_of(command)
     if centring is None or centring.sensor not in common or rig.feedback:
         return Input(command)

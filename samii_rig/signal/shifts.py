@@ -62,7 +62,7 @@ class Phases:
         S = matrix.S[SKIPPED:-SKIPPED]
         power = np.maximum(np.einsum("fii->fi", S).real, np.finfo(float).tiny)
         cross = S[:, p:, :p]
-        coherence = np.abs(cross) ** 2 / (power[:, p:, None] * power[:, None, :p])
+        coherence = np.abs(cross / power[:, None, :p] * (cross.conj() / power[:, p:, None]))
         coherence = np.clip(coherence, np.finfo(float).eps, 1.0)
         # Of a phase, for averages of `dof` frames (Bendat and Piersol, Random Data, 2010, 9.91).
         variance = (1 - coherence) / (2 * matrix.dof * coherence)

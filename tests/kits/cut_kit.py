@@ -16,11 +16,13 @@ from sim.concealed.trial import make
 DESIGN = Design(levels=(0.5, 1.0), bursts=1, burst=30.0, steps=1, periods=2, settle=1, period=4.0)
 
 
-def cut_sweeps(folder: Path, *effects: str, design: Design = DESIGN) -> list[Recording]:
-    """One sweep a level, each record cut off where its sweep ends."""
+def cut_sweeps(
+    folder: Path, *effects: str, design: Design = DESIGN, toml: str = SAMII_TOML
+) -> list[Recording]:
+    """One sweep a level, each record cut off where its sweep ends. toml : the rig file."""
     stated = tuple(Stated.of(words.split()) for words in effects)
     kind = "stated" if stated else "nothing"
-    made = make(kind, 11, folder, SAMII_TOML, design, stated)
+    made = make(kind, 11, folder, toml, design, stated)
     out = []
     for path in sorted(made.glob("*.mcap")):
         run = read_recording(path)

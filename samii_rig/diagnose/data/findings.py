@@ -47,7 +47,7 @@ class Checked:
     mend : of all recordings' columns, the same as in the responses.
     of_lines : of `remarks`, what concerns responses alone. samples : why segments or channels were
     left out for what their samples are. hidden : sensors that loops are closed around, of which
-    rounding hides the response line by line; whole records count it."""
+    rounding hides the response in most of what was recorded; whole records do without them."""
 
     responses: tuple[FrequencyResponse, ...]
     remarks: tuple[str, ...]
@@ -63,12 +63,11 @@ class Checked:
 
     def sensors(self, rig: Rig) -> tuple[str, ...]:
         """Outputs that half of the responses hold, or more: it costs less to leave out the records
-        of the others; and those that a loop of the rig is closed around, without which nothing can
-        be said of any record."""
+        of the others; and those that a loop of the rig is closed around, but for `hidden`."""
         held = Counter(c.name for r in self.responses for c in r.outputs)
         closed = _closed_around(rig)
         often = [n for n, k in held.items() if n in closed or 2 * k >= len(self.responses)]
-        return (*often, *sorted(self.hidden))
+        return tuple(n for n in often if n not in self.hidden)
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics, as 9.81 is not 9.80665; and
@@ -112,14 +111,13 @@ def checked(
     found = wired(finite, rig)
     steady, changed = _steady(found.responses)
     rounded = {f.channel for r in given for f in r.findings if f.kind == "resolution"}
-    read = {c.name for r in steady for c in r.outputs}
-    hidden = frozenset(_closed_around(rig) & rounded - read)
+    hidden = frozenset(n for n in _closed_around(rig) & rounded if _is_hidden(n, steady))
     guessed = None
     if not any(repeated(r) for r in steady):
         guessed = Refusal(NO_REPEATS, "repeat each run three times, each from rest", "ambiguous")
     return Checked(
         tuple(steady),
-        tuple(remarks + lost + found.remarks + changed),
+        tuple(remarks + lost + found.remarks + changed + [_direct(n) for n in sorted(hidden)]),
         lacks(steady, rig),
         refusal,
         found.units,
@@ -133,9 +131,22 @@ def checked(
             for f in r.findings
             if (f.severity == "error" and f.kind not in (*OF_LINES, "gap"))
             or (f.severity == "warning" and f.kind in ("clock", "resolution"))
-            if f.kind != "resolution" or f.channel not in hidden
         ),
         hidden=hidden,
+    )
+
+
+def _is_hidden(sensor: str, responses: Sequence[FrequencyResponse]) -> bool:
+    """Whether less than half of what was recorded shows a sensor."""
+    read = sum(r.n_averages for r in responses if any(c.name == sensor for c in r.outputs))
+    return 2 * read < sum(r.n_averages for r in responses)
+
+
+def _direct(sensor: str) -> str:
+    """How whole records do without a sensor that a loop is closed around, in words."""
+    return (
+        f"{sensor} is left out: its rounding hides most of its motion; what its loop made of that "
+        "stands in the command, which is taken as it was recorded"
     )
 
 

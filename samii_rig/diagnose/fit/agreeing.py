@@ -48,8 +48,7 @@ class Given:
 
     whole : all of them; fitted : a model of that state, about which they are held against each
     other, on the nodes frequency, Hz. findings : of their samples, as of `Whole.of`. where : which
-    of the recordings these are, " before" or " in pose 30 deg". nominal : the nominal model, where
-    that is another: what it leaves is what there is to explain.
+    of the recordings these are, " before" or " in pose 30 deg".
     """
 
     runs: Sequence[Recording]
@@ -58,18 +57,15 @@ class Given:
     frequency: Float
     findings: Sequence[Finding] = ()
     where: str = ""
-    nominal: Fitted | None = None
 
     @classmethod
     def of(
         cls, search: RecordSearch, runs: Sequence[Recording], findings: Sequence[Finding]
     ) -> Given:
-        """All recordings of a search that is ended, about what explains them best: far from what
-        they show, responses of one rig would differ by what the likelihood is not exact to."""
+        """All recordings of a search that is ended."""
         assert isinstance(search.whole, Whole)
-        best, nominal = search.ranked()[0].fitted, search.nominal.fitted
-        at = search.reduced.frequency
-        return cls(runs, search.whole, best, at, findings, nominal=nominal)
+        fitted = search.nominal.fitted
+        return cls(runs, search.whole, fitted, search.reduced.frequency, findings)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +195,9 @@ def _alone(given: Given) -> list[_Alone]:
     for i, run in enumerate(whole.runs):
         try:
             findings = _own(run, given.findings)
-            own = Whole.of([run], whole.rig, band, sensors, findings, in_order=True)
+            own = Whole.of(
+                [run], whole.rig, band, sensors, findings, in_order=True, hidden=whole.hidden
+            )
             # On two states, those lines alone that both have.
             among = within(own.records, records.band)
         except EstimateError:
@@ -245,10 +243,10 @@ def _difference(a: Reduced, b: Reduced) -> tuple[float, float, float]:
 
 def _left(given: Given, each: Sequence[_Alone]) -> float:
     """Chi-square, over its mean, that the nominal model leaves in units of each one's noise."""
-    total, fitted = 0.0, given.nominal or given.fitted
+    total = 0.0
     for one in each:
         at = given.whole.nodes(one.form, given.fitted)
-        r = one.form.residual(fitted.model.response(fitted.x, at))
+        r = one.form.residual(given.fitted.model.response(given.fitted.x, at))
         total += float(r @ r) - one.form.known
     return total
 

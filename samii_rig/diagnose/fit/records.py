@@ -6,7 +6,7 @@ Their likelihood (`samii_rig.likelihood`) is made about a fit.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -63,6 +63,7 @@ class Whole:
     of_levels: Records | None = None  # the same, every level by itself
     asked: bool = False  # whether somebody said which lines count
     own_aliases: bool = False  # whether every model folds back what is its own from above the rate
+    hidden: tuple[str, ...] = ()  # as of `wiring`
     runs: tuple[Recording, ...] = field(default=(), repr=False, compare=False)  # as `aligned`
     # Of all that are made from these records: levels by themselves have the same contours.
     kept: Computed = field(default_factory=Computed, repr=False, compare=False)
@@ -77,18 +78,20 @@ class Whole:
         findings: Sequence[Finding] = (),
         *,
         in_order: bool = False,
+        hidden: Collection[str] = (),
     ) -> Whole:
         """All runs of one rig.
 
         sensors : those that are sound, all that were recorded if None. findings : of the samples;
         segments that they are about are left out, but not for a sensor that is left out itself.
         in_order : whether their rows hold what was sent and measured at one time, as `runs` do.
+        hidden : as of `wiring`.
 
         Raises EstimateError where they hold nothing to compare.
         """
         if not in_order:
             runs = [run for run, _ in aligned(runs)]
-        wired = wiring(runs, rig, sensors)
+        wired = wiring(runs, rig, sensors, hidden)
         (rate,) = {run.rate_hz for run in runs}
         times = faster(runs, wired)
         if times and times * rate != rig.rate_hz:
@@ -110,7 +113,9 @@ class Whole:
         all_, of_levels = (replace(one, undriven=rests) for one in (all_, of_levels))
         without |= _sensors_out(runs, rig, wired, findings)
         left_out, asked = tuple(without.items()), band is not None
-        return cls(rig, all_, wired, left_out, of_levels, asked, runs=tuple(runs))
+        return cls(
+            rig, all_, wired, left_out, of_levels, asked, hidden=tuple(hidden), runs=tuple(runs)
+        )
 
     @property
     def every(self) -> int:

@@ -1,0 +1,67 @@
+"""A loop around an encoder whose single step is more than most of its motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from concealed_kit import SAMII_TOML
+from cut_kit import DESIGN, cut_sweeps
+from table_kit import Effects, table_of
+
+from samii_rig.diagnose.diagnose import case_of, diagnose
+from samii_rig.diagnose.verdict.by_record import on_records
+from samii_rig.likelihood.pieces import wiring
+from samii_rig.rig.load import parse
+from samii_rig.rig.schema import Rig
+from samii_rig.signal.estimate import estimate
+from samii_rig.types import Recording
+
+# Of the joint's encoder; a sweep of 1 V moves it by less than half of that, root mean square.
+STEP = 0.1  # rad
+FINE = "resolution = 3.834951969714103e-5"
+assert FINE in SAMII_TOML
+TOML = SAMII_TOML.replace(FINE, f"resolution = {STEP}", 1)
+RIG = parse(Rig, TOML, "coarse")
+FEW = Effects(lambda: table_of(RIG, 0.5, 40.0, "actuator_lag", "added_mass", "viscous_damping"))
+SHORT = replace(DESIGN, levels=(1.0,), burst=20.0, high_hz=20.0)
+
+
+@pytest.fixture(scope="module")
+def nothing(tmp_path_factory: pytest.TempPathFactory) -> list[Recording]:
+    return cut_sweeps(tmp_path_factory.mktemp("nothing"), design=SHORT, toml=TOML)
+
+
+def test_the_encoder_is_left_out_and_the_command_is_what_was_recorded(
+    nothing: list[Recording],
+) -> None:
+    assert 0 < np.std(nothing[0].values_of("theta_2")) < STEP
+    assert wiring(nothing, RIG).only.kp > 0
+    assert wiring(nothing, RIG, hidden=["theta_2"]).only.kp == 0
+    case = case_of(estimate(nothing), RIG, None, FEW, nothing)
+    assert case.clean.hidden == {"theta_2"}
+    assert case.whole is not None
+    assert case.whole.wired.sensors == ("a_0", "a_1", "a_2")
+    ((channel, why),) = case.whole.left_out  # no record is
+    assert channel == "theta_2"
+    assert "so its rounding hides the response" in why
+    search = on_records(case)
+    assert search is not None
+    assert search.ratio(search.nominal.fitted) == pytest.approx(1.0, abs=0.1)
+
+
+def test_nothing_is_found_where_nothing_is_missing(nothing: list[Recording]) -> None:
+    found = diagnose(estimate(nothing), RIG, runs=nothing, effects=FEW)
+    assert found.verdict == "no_mismatch"
+    assert any("which is taken as it was recorded" in said for said in found.not_physics)
+
+
+def test_what_is_missing_is_named_by_the_other_sensors(tmp_path: Path) -> None:
+    runs = cut_sweeps(tmp_path, "actuator_lag joint_2_source p=150", design=SHORT, toml=TOML)
+    found = diagnose(estimate(runs), RIG, runs=runs, effects=FEW)
+    assert found.verdict == "named"
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("actuator_lag", "joint_2_source")
+    assert found.sigma > 10
