@@ -196,7 +196,7 @@ def aligned(recordings: Sequence[Recording]) -> list[tuple[Recording, Finding | 
     out = [_moved(r, shift_of(r), law) for r in recordings]
     alike: dict[object, list[int]] = {}
     for i, (r, _) in enumerate(out):
-        alike.setdefault((driving(r), r.names("sensor"), r.rate_hz), []).append(i)
+        alike.setdefault((driving(r), r.rate_hz), []).append(i)
     for those in alike.values():
         _set_beside(out, those)
     return out

@@ -51,9 +51,10 @@ class Phases:
     of_sensor: tuple[str, ...]
 
     @classmethod
-    def of(cls, recording: Recording, n: int) -> Phases | None:
-        """None where too little was recorded in one go for windows of n samples."""
-        drives, sensors = driving(recording), recording.names("sensor")
+    def of(cls, recording: Recording, sensors: Sequence[str], n: int) -> Phases | None:
+        """Of these sensors; None where too little was recorded in one go for windows of n
+        samples."""
+        drives = driving(recording)
         rows, p = recording.columns([*drives, *sensors]), len(drives)
         try:
             matrix = spectra(_whole(recording, rows), recording.rate_hz, nperseg=n)
@@ -82,12 +83,14 @@ def driving(recording: Recording) -> tuple[str, ...]:
 
 
 def compared(recordings: Sequence[Recording]) -> list[int]:
-    """Of each the samples by which its sensors stand behind those of the first, as `shift_between`;
-    0 where too little was recorded to tell."""
+    """Of each, driven alike, the samples by which its sensors stand behind those of the first, as
+    `shift_between`; 0 where too little was recorded to tell."""
+    common = set.intersection(*(set(r.names("sensor")) for r in recordings))
+    sensors = [name for name in recordings[0].names("sensor") if name in common]
     n = 2 ** int(np.log2(max(min(len(r) for r in recordings) / FRAMES, 1)))
-    if n < SHORTEST:
+    if n < SHORTEST or not sensors:
         return [0] * len(recordings)
-    first, *others = (Phases.of(r, min(n, LONGEST)) for r in recordings)
+    first, *others = (Phases.of(r, sensors, min(n, LONGEST)) for r in recordings)
     return [0, *(shift_between(first, o) if first and o else 0 for o in others)]
 
 

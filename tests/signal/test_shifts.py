@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal
@@ -81,3 +83,10 @@ def test_recordings_stand_as_most_of_them_do():
     runs = [two_masses(random_input(rng), rng, late=late) for late in (2, 0, 0)]
     assert moved(runs) == ["2 samples later", "", ""]
     assert "beside late_0.mcap" in aligned(runs)[0][1].message  # type: ignore[union-attr]
+
+
+def test_recordings_compare_by_the_sensors_that_all_have():
+    rng = np.random.default_rng(5)
+    first, other = (two_masses(random_input(rng), rng, late=late) for late in (0, 2))
+    other = replace(other, channels=other.channels[:3], values=other.values[:, :3])
+    assert moved([first, other]) == ["", "2 samples later"]
