@@ -211,6 +211,26 @@ def test_a_coarse_sensor_that_rests_before_it_moves_is_not_frozen():
     assert not [f for f in estimate([coarse])[0].findings if f.kind == "stuck"]
 
 
+@pytest.mark.parametrize(("jump", "frozen"), [(1, False), (40, True)])
+def test_a_sensor_that_moves_on_by_single_steps_had_come_to_rest(jump: int, frozen: bool):
+    """One that was frozen comes back where the rig is by then."""
+    n, rest, step = 600, 100, 1e-3
+    steps = np.where(np.arange(n) % 2 == 0, 1, -2) * (1 + np.arange(n) // 50)
+    steps[:rest] = 0
+    steps[rest : rest + 4] = [jump, 1, 1, 1]
+    values = np.zeros((n, len(CHANNELS)))
+    values[:, 1] = np.sin(0.3 * np.arange(n))
+    values[:, 2] = step * np.cumsum(steps)
+    channels = tuple(replace(c, resolution=step) if c.name == "theta" else c for c in CHANNELS)
+    segment = Segment("sweep", "single", 0, n, 1.0, "V", 0)
+    run = Recording(
+        channels, RATE, np.arange(n) * 10_000_000, np.arange(n), values,
+        np.zeros(values.shape, np.uint8), (segment,),
+    )  # fmt: skip
+    found = checks.stuck(run, segment, Selection(channels[1], channels[2:3]))
+    assert [f.severity == "error" for f in found] == ([True] if frozen else [False] * len(found))
+
+
 def test_a_repeat_that_does_not_repeat_is_named_and_left_out():
     recording = sweeps(4)
     r = estimate([changed(recording, slice(N, 2 * N), 2, 1.1 * recording.values[N : 2 * N, 2])])[0]
