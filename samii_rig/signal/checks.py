@@ -159,7 +159,8 @@ def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Findin
         return []
     for channel in selection.outputs:
         x = cut.values[:, cut.column(channel.name)]
-        still = np.diff(x) == 0
+        change = np.diff(x)
+        still = change == 0
         place = f"{cut.place(segment)}: {channel.name}"
         if still.all():
             message = f"{place} never changes while {selection.input.name} moves"
@@ -172,7 +173,7 @@ def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Findin
             continue
         beside = AROUND * length  # where it has stood still so often before and after, it rests
         near = still[max(longest[0] - beside, 0) : longest[1] + beside]
-        lively = not _goes_on(x, *longest, channel.resolution) and all(
+        lively = not _goes_on(change, *longest, channel.resolution) and all(
             np.count_nonzero(some) - length < LIVELY * (some.size - length)
             for some in (still, near)
         )
@@ -186,10 +187,9 @@ def stuck(cut: Recording, segment: Segment, selection: Selection) -> list[Findin
     return out
 
 
-def _goes_on(x: Float, first: int, last: int, step: float) -> bool:
-    """Whether a sensor (n,) that stands still from sample `first` to `last` moves on by single
-    steps of its converter, as it had come to rest: it was not frozen."""
-    change = np.diff(x)
+def _goes_on(change: Float, first: int, last: int, step: float) -> bool:
+    """Whether a sensor moves on by single steps of its converter: it had come to rest and was not
+    frozen. change : (n,) from each sample to the next, none from `first` to `last`."""
     beside = [side[side != 0][:GENTLE] for side in (change[:first][::-1], change[last:])]
     rested = np.abs(np.concatenate(beside)) < 1.5 * step
     return beside[1].size == GENTLE and bool(rested.all())

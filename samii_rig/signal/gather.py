@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from samii_rig.errors import EstimateError
 from samii_rig.signal import checks
@@ -21,7 +20,8 @@ from samii_rig.signal.groups import (
     select,
 )
 from samii_rig.signal.quantisation import coarse
-from samii_rig.types import Finding, Quality, Recording, Segment
+from samii_rig.signal.rows import whole_rows
+from samii_rig.types import Finding, Recording, Segment
 
 Gaps = Literal["auto", "refuse", "exclude", "model"]
 LEAST_SAMPLES = 256  # fewer are mostly transient
@@ -202,15 +202,6 @@ def _examine(
     found += stand + clipped + coarse(cut, segment, selection)
     spoilt = {f.channel for f in (*frozen, *clipped) if f.severity == "error"}
     return looked(not spoilt, spoilt)
-
-
-def whole_rows(cut: Recording, names: Sequence[str]) -> tuple[NDArray[np.bool_], tuple[int, ...]]:
-    """(n,) the rows in which no needed channel is missing, and the breaks among them."""
-    columns = [cut.column(n) for n in names]
-    missing = (cut.quality[:, columns] & Quality.MISSING).astype(bool)
-    kept: NDArray[np.bool_] = np.all(~missing & np.isfinite(cut.values[:, columns]), axis=1)
-    jumps = np.flatnonzero(np.diff(cut.sequence[kept]) > 1) + 1
-    return kept, tuple(int(j) for j in jumps)
 
 
 def _group_for(

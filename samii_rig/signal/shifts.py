@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from samii_rig.errors import EstimateError
+from samii_rig.signal.rows import whole_rows
 from samii_rig.signal.welch import spectra
 from samii_rig.types import Complex, Float, Recording
 
@@ -27,37 +27,40 @@ CHANCE = 10.0
 # Lines times the square of their mean cosine about a shift, from which a band is none where frames
 # are few that hold a line: 8 of 100 bands of noise reach it, 1 in 10 of them near the shift.
 ALIKE = 2.5
-SHORTEST, LONGEST = 32, 2048  # samples of a window: 14 lines, and those that resolve a resonance
+SHORTEST, LONGEST = 32, 2048  # samples of a window: 13 lines, and those that resolve a resonance
 SKIPPED = 2  # lines from 0 on, where the window leaks what was taken out with the mean
 # Bands of equal information that each show the same shift: what turns the phase about a resonance
 # turns it in one of them. Each knows it to `SURE` samples (one standard deviation) and may miss it
-# by `WHOLE` and two of these, by three quarters of a sample at most; all together by half of it.
+# by `WHOLE` and two of these, by three quarters of a sample at most; all together by half of
+# `WHOLE` and two of theirs, by 0.41 of one.
 BANDS, SURE, WHOLE = 3, 0.25, 0.25
 FINE = 0.05  # samples between two shifts that are tried
 
 
 @dataclass(frozen=True, slots=True)
 class Phases:
-    """What `recording` shows of the responses of all sensors to all that drives it.
+    """What a recording shows of the responses of all sensors to all that drives it.
 
-    H (m, n_freq) each pair's, variance (m, n_freq) of its phase in rad^2, infinite where it
-    may be noise; of_sensor (m,) names.
-    omega : (n_freq,) rad/sample.
+    omega : (n_freq,) rad/sample. H : (m, n_freq) of each sensor to every one of `drives` columns,
+    the first sensor's first; variance : (m, n_freq) of its phase in rad^2, infinite where it may be
+    noise.
     """
 
     omega: Float
     H: Complex
     variance: Float
-    of_sensor: tuple[str, ...]
+    drives: int
 
     @classmethod
     def of(cls, recording: Recording, sensors: Sequence[str], n: int) -> Phases | None:
         """Of these sensors; None where too little was recorded in one go for windows of n
         samples."""
         drives = driving(recording)
-        rows, p = recording.columns([*drives, *sensors]), len(drives)
+        names, p = [*drives, *sensors], len(drives)
+        kept, breaks = whole_rows(recording, names)
+        pieces = np.split(recording.columns(names)[kept], breaks)
         try:
-            matrix = spectra(_whole(recording, rows), recording.rate_hz, nperseg=n)
+            matrix = spectra(pieces, recording.rate_hz, nperseg=n)
         except EstimateError:
             return None
         S = matrix.S[SKIPPED:-SKIPPED]
@@ -72,8 +75,7 @@ class Phases:
         omega = 2 * np.pi * matrix.frequency[SKIPPED:-SKIPPED] / recording.rate_hz
         H = cross / power[:, None, :p]
         flat = (len(omega), -1)
-        of_sensor = tuple(name for name in sensors for _ in drives)
-        return cls(omega, H.reshape(flat).T, variance.reshape(flat).T, of_sensor)
+        return cls(omega, H.reshape(flat).T, variance.reshape(flat).T, p)
 
 
 def driving(recording: Recording) -> tuple[str, ...]:
@@ -110,11 +112,10 @@ def shift_between(first: Phases, other: Phases) -> int:
     shift = round(best)
     if abs(best - shift) > WHOLE / 2 + 2 / np.sqrt(told.sum()):
         return 0
-    parts: list[tuple[Any, Any]] = [(slice(None), b) for b in _bands(told.sum(axis=0))]
-    for name in dict.fromkeys(first.of_sensor):
-        mine = np.array([name == other for other in first.of_sensor])
-        if told[mine].sum() * BANDS >= told.sum():
-            parts.append((mine, slice(None)))
+    every, p = slice(None), first.drives
+    sensors = [(slice(i, i + p), every) for i in range(0, len(told), p)]
+    parts = [(every, band) for band in _bands(told.sum(axis=0))]
+    parts += [one for one in sensors if told[one].sum() * BANDS >= told.sum()]
     # A shift of all is one of each, and its lines agree in more than what chance brings together.
     for part in parts:
         late = tried[np.argmin(off[part].sum(axis=(0, 1)))]
@@ -131,11 +132,3 @@ def _bands(told: Float) -> list[slice]:
     inner = np.searchsorted(reached, reached[-1] * np.arange(1, BANDS) / BANDS)
     edges = [0, *inner.tolist(), len(told)]
     return [slice(a, b) for a, b in pairwise(edges)]
-
-
-def _whole(recording: Recording, rows: Float) -> Sequence[Float]:
-    """What stands between rows that are missing or hold no number."""
-    known = np.all(np.isfinite(rows), axis=1)
-    ends = np.flatnonzero((np.diff(recording.sequence) != 1) | (known[1:] != known[:-1])) + 1
-    parts = zip([0, *ends.tolist()], [*ends.tolist(), len(rows)], strict=True)
-    return [rows[a:b] for a, b in parts if known[a]]

@@ -228,7 +228,7 @@ def test_a_sensor_that_moves_on_by_single_steps_had_come_to_rest(jump: int, froz
         np.zeros(values.shape, np.uint8), (segment,),
     )  # fmt: skip
     found = checks.stuck(run, segment, Selection(channels[1], channels[2:3]))
-    assert [f.severity == "error" for f in found] == ([True] if frozen else [False] * len(found))
+    assert [f.severity for f in found] == ["error"] * frozen
 
 
 def test_a_repeat_that_does_not_repeat_is_named_and_left_out():

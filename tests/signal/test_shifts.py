@@ -90,3 +90,10 @@ def test_recordings_compare_by_the_sensors_that_all_have():
     first, other = (two_masses(random_input(rng), rng, late=late) for late in (0, 2))
     other = replace(other, channels=other.channels[:3], values=other.values[:, :3])
     assert moved([first, other]) == ["", "2 samples later"]
+
+
+def test_a_sensor_that_one_of_them_never_read_is_no_error():
+    rng = np.random.default_rng(6)
+    runs = [two_masses(random_input(rng), rng, late=late) for late in (0, 2)]
+    runs[1].values[:, 3] = np.nan
+    assert moved(runs) == ["", ""]

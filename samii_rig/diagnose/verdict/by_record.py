@@ -102,7 +102,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
             looked = replace(looked, remarks=(*looked.remarks, EXHAUSTED))
     given = Given.of(search, case.runs, case.clean.samples)
     several = None
-    if forces is not None:
+    if forces is not None and not given.whole.one_is_left:
         if _without_force(looked.judged):
             several = _several(search, [given], None)
         search.begin("whether stiffnesses are constant")
@@ -304,8 +304,7 @@ def _constant(
     own = verdict.as_meant(search, judged.best)
     # At the noise itself: while a mismatch is large all weights are smaller, a variation's not.
     rival = max(judged.best.weight - own.weight, (own.fitted.cost - judged.best.fitted.cost) / 2)
-    blind = _is_linear(judged) and not differ
-    seen = None if blind or _one_is_left(search) else BySpring.of(forces, base)
+    seen = None if _is_linear(judged) and not differ else BySpring.of(forces, base)
     sides = uneven_spring(seen) if seen else None
     # What is in no row is not told of less than what is.
     if sides is not None and sides.chi2 > max(2 * rival, judged.evidence.worth):
@@ -327,13 +326,6 @@ def _constant(
         if beside is not None and beside.closed >= verdict.PARTLY:
             return replace(looked, remarks=(*looked.remarks, beside.describe()))
     return looked
-
-
-def _one_is_left(search: RecordSearch) -> bool:
-    """Whether but one sensor shows anything, and not what disturbs the rig from what a spring does
-    that varies: a mode that both keep ringing looks the same in it."""
-    whole = search.whole
-    return isinstance(whole, Whole) and bool(whole.hidden) and whole.sensor.size == 1
 
 
 def _even(forces: ForceSearch | None, search: RecordSearch, looked: _Looked) -> _Looked:

@@ -14,9 +14,10 @@ import numpy as np
 from samii_rig.errors import EstimateError, InputError, one_of
 from samii_rig.signal import checks
 from samii_rig.signal.choose import drop_foreign
-from samii_rig.signal.gather import LEAST_SAMPLES, whole_rows
+from samii_rig.signal.gather import LEAST_SAMPLES
 from samii_rig.signal.groups import Group, Piece, Selection, Waveform, segments_of
 from samii_rig.signal.quantisation import coarse
+from samii_rig.signal.rows import whole_rows
 from samii_rig.types import Channel, Finding, Float, Recording, Segment
 
 _TINY = 1e-300
