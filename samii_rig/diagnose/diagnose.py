@@ -28,6 +28,7 @@ from samii_rig.diagnose.verdict.by_record import by_records, on_records, whole_o
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.progress import Begun, Progress
 from samii_rig.rig.schema import Rig
+from samii_rig.signal.columns import is_aligned
 from samii_rig.types import FrequencyResponse, Recording
 
 EQUIVALENCE_POINTS = 40
@@ -97,7 +98,7 @@ def case_of(
 ) -> Case:
     """What is to be explained, the nominal model refitted; arguments as of `diagnose`, `signed` as
     of `table`."""
-    clean = findings.checked(responses, rig, band)
+    clean = replace(findings.checked(responses, rig, band), aligned=is_aligned(runs))
     trusted = usable(clean.responses)
     lines = measured(trusted, rig, band)
     seen, decide, show = lines.splits()

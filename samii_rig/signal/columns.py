@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -65,43 +65,67 @@ def is_open(recording: Recording, command: str, sensor: str, kp: float) -> bool:
 def shift_of(recording: Recording) -> int:
     """Samples by which what was measured stands behind what was sent; 0 where the law of the loop
     does not show it."""
+    laws, rounded = _laws(recording)
+    best = _best(laws)
+    if best is None:
+        return 0
+    plain = laws[FARTHEST]
+    return best - FARTHEST if plain.apart(laws[best], rounded) > SEEN else 0
+
+
+def is_aligned(recordings: Iterable[Recording]) -> bool:
+    """Whether the law of the loop tells of any of them, of which one logger made all, by how many
+    samples what was measured stands behind what was sent, none included."""
+    for recording in recordings:
+        laws, rounded = _laws(recording)
+        best = _best(laws)
+        if best is not None:
+            others = (law for law in laws if law is not laws[best])
+            return all(law.apart(laws[best], rounded) > SEEN for law in others)
+    return False
+
+
+def _best(laws: Sequence[_Law]) -> int | None:
+    """Which of the laws holds; None where none does."""
+    left = [law.left if law.centred else math.inf for law in laws]
+    best = int(np.argmin(left)) if left else 0
+    return best if left and laws[best].holds else None
+
+
+def _laws(recording: Recording) -> tuple[list[_Law], float]:
+    """That of the loop of every shift, none where they are not known, and the square of what the
+    command's rounding leaves."""
     centring = centring_of(recording)
     first = next(iter(recording.names("command")), "")
     recording = of_input(recording, first)
     names = {c.name: c for c in recording.channels}
     command, references = recording.names("command"), recording.names("reference")
     if centring is None or centring[0] not in names or len(command) != 1 or not references:
-        return 0
+        return [], 0.0
     sensor, kp = centring
     around = _about_the_largest(recording, references)
     if around.stop - around.start <= 2 * FARTHEST:
-        return 0
+        return [], 0.0
 
     theta, v = (recording.values_of(name)[around] for name in (sensor, command[0]))
     sent = _beside(asked(recording, command[0], kp, around))
     v = v[FARTHEST + TAPS : v.size - FARTHEST - TAPS]
     shifts = range(-FARTHEST, FARTHEST + 1)
     laws = [_Law.of(v, sent, _beside(-kp * np.roll(theta, -m))) for m in shifts]
-    if not all(law.known for law in laws):
-        return 0
-    left = [law.left if law.centred else math.inf for law in laws]
-    best = int(np.argmin(left))
-    if not laws[best].holds:
-        return 0
     rounded = (ROUNDED * names[command[0]].resolution) ** 2
-    gain = 0.5 * theta.size * np.log(max(left[FARTHEST], rounded) / max(left[best], rounded))
-    return shifts[best] if gain > SEEN else 0
+    return (laws, rounded) if all(law.known for law in laws) else ([], 0.0)
 
 
 @dataclass(frozen=True)
 class _Law:
     """v = F (sent + fed back), F a short filter: a voltmeter shows what is between two commands.
 
-    left : variance of the rest, without spikes; part : the same of what is fed back. alike :
-    correlation of the rest with the sample before. fed, gain : what v holds of `fed back`, and the
-    filter's gain; both 1 where the law holds. late : rows of the filter's delay.
+    rows : n. left : variance of the rest, without spikes; part : the same of what is fed back.
+    alike : correlation of the rest with the sample before. fed, gain : what v holds of `fed back`,
+    and the filter's gain; both 1 where the law holds. late : rows of the filter's delay.
     """
 
+    rows: int
     left: float
     part: float
     alike: float
@@ -116,7 +140,7 @@ class _Law:
         if not known.all():
             v, sent, back = v[known], sent[:, known], back[:, known]
         if v.size <= 2 * FARTHEST:
-            return cls(*[np.nan] * 6)
+            return cls(0, *[np.nan] * 6)
         v = v - v.mean()
         sent, back = (x - x.mean(axis=1, keepdims=True) for x in (sent, back))
         law, kept = (sent + back).T, np.ones(v.size, bool)
@@ -131,11 +155,18 @@ class _Law:
         alike = float(rest[1:] @ rest[:-1]) / max(float(rest @ rest), np.finfo(float).tiny)
         gain, late = float(taps.sum()), float(taps @ np.arange(-TAPS, TAPS + 1))
         part = left / max(float(np.mean(b**2)), 1e-300)
-        return cls(left, part, alike, own, gain, late)
+        return cls(v.size, left, part, alike, own, gain, late)
 
     @property
     def known(self) -> bool:
         return math.isfinite(self.left)
+
+    def apart(self, law: _Law, rounded: float) -> float:
+        """Log likelihood of another law over this one, as far as rounding shows them apart; of any
+        over one that the filter delays."""
+        if not self.centred:
+            return math.inf
+        return 0.5 * self.rows * math.log(max(self.left, rounded) / max(law.left, rounded))
 
     @property
     def centred(self) -> bool:

@@ -12,6 +12,7 @@ from cut_kit import DESIGN, cut_sweeps
 from table_kit import Effects, table_of
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
+from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.likelihood.pieces import wiring
 from samii_rig.rig.load import parse
@@ -50,6 +51,11 @@ def test_the_encoder_is_left_out_and_the_command_is_what_was_recorded(
     ((channel, why),) = case.whole.left_out  # no record is
     assert channel == "theta_2"
     assert "so its rounding hides the response" in why
+    every = hypotheses(RIG, 0.5, 40.0)
+    for aligned in (True, False):
+        told = replace(case.clean, aligned=aligned).competing(every)
+        assert ("columns_shifted" in {e.physics for e in told}) != aligned
+    assert case.clean.aligned  # by the steps that the encoder took
     search = on_records(case)
     assert search is not None
     assert search.ratio(search.nominal.fitted) == pytest.approx(1.0, abs=0.1)

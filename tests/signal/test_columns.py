@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from samii_rig.signal.columns import FARTHEST, aligned, is_open, shift_of
+from samii_rig.signal.columns import FARTHEST, aligned, is_aligned, is_open, shift_of
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Channel, Recording, Segment
 
@@ -131,6 +131,21 @@ def test_recordings_of_other_inputs_are_left_as_they_are():
 )
 def test_where_the_law_is_not_known_nothing_is_moved(unknown: Recording):
     assert shift_of(unknown) == 0
+
+
+@pytest.mark.parametrize("m", [-1, 0, 3])
+def test_a_law_that_holds_tells_of_every_shift_of_none_too(m: int):
+    """A dead time of as much is then the rig's."""
+    assert is_aligned([loop(rig_toml=""), late(loop(), m)])
+
+
+def test_a_law_says_nothing_of_shifts_where_its_encoder_hardly_moves():
+    run = loop()
+    still = replace(run, values=run.values * [1.0, 1.0, 0.0, 1.0])
+    values = still.values.copy()
+    values[:, 1] = np.rint(values[:, 0] / STEP) * STEP
+    assert not is_aligned([replace(still, values=values)])
+    assert not is_aligned([])
 
 
 def test_a_measured_command_shows_a_shift_too():

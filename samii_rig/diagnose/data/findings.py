@@ -47,7 +47,8 @@ class Checked:
     mend : of all recordings' columns, the same as in the responses.
     of_lines : of `remarks`, what concerns responses alone. samples : why segments or channels were
     left out for what their samples are. hidden : sensors that loops are closed around, of which
-    rounding hides the response in most of what was recorded; whole records do without them."""
+    rounding hides the response in most of what was recorded; whole records do without them.
+    aligned : whether a loop's law tells that what was sent and measured stand at one time."""
 
     responses: tuple[FrequencyResponse, ...]
     remarks: tuple[str, ...]
@@ -60,6 +61,7 @@ class Checked:
     samples: tuple[Finding, ...] = ()
     hidden: frozenset[str] = frozenset()
     mend: Mend | None = None
+    aligned: bool = False
 
     def sensors(self, rig: Rig) -> tuple[str, ...]:
         """Outputs that half of the responses hold, or more: it costs less to leave out the records
@@ -71,14 +73,21 @@ class Checked:
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics, as 9.81 is not 9.80665; and
-        without what a sensor would do of which rounding hides the response."""
+        without what a sensor would do of which rounding hides the response, and a logger's shift
+        that a loop's law refutes."""
         return [
             replace(e, physics="unit_rest")
             if e.physics == "sensor_gain" and e.site in self.units
             else e
             for e in effects
-            if e.factor is None or e.factor.kind != "sensor" or e.factor.channel not in self.hidden
+            if not self._refuted(e)
         ]
+
+    def _refuted(self, effect: Effect) -> bool:
+        if effect.physics == "columns_shifted":
+            return self.aligned
+        on = effect.factor
+        return on is not None and on.kind == "sensor" and on.channel in self.hidden
 
 
 @dataclass(frozen=True, slots=True)
