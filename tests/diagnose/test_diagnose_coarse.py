@@ -45,9 +45,6 @@ def test_the_encoder_is_left_out_and_the_command_is_what_was_recorded(
     assert case.clean.hidden == {"theta_2"}
     assert case.whole is not None
     assert case.whole.wired.sensors == ("a_0", "a_1", "a_2")
-    assert not case.whole.one_is_left
-    alone = replace(case.whole, wired=wiring(nothing, RIG, ["a_1"], ["theta_2"]))
-    assert alone.one_is_left
     ((channel, why),) = case.whole.left_out  # no record is
     assert channel == "theta_2"
     assert "so its rounding hides the response" in why

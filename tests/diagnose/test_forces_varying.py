@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,12 +20,14 @@ from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit.exact import NINETY
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.paths import Span
+from samii_rig.diagnose.forces.problem import ForceProblem
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.swings import Swings
 from samii_rig.diagnose.forces.variation import (
     BySpring,
     _less,
     _repeats_differ,
+    likelihood,
     of_its_own,
     variation,
 )
@@ -393,9 +396,25 @@ def test_which_spring_swings_is_decided_without_the_swing_in_the_noise(
 def test_what_is_gone_once_the_rig_moves_as_it_is_fitted_does_not_vary(
     nothing: ForceSearch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = iter([[("joint_2", Modulation(0.7, 40.0, 6, 1e-6))]])
+    found = iter(2 * [[("joint_2", Modulation(0.7, 40.0, 6, 1e-6))]])  # then in its own noise
     monkeypatch.setattr(Springs, "strongest", lambda *_: next(found, []))
     assert variation(BySpring.of(nothing, replace(nothing.nominal)), 3) is None
+
+
+def test_a_stiffness_is_weighed_in_the_noise_that_its_explanation_leaves(
+    nothing: ForceSearch,
+) -> None:
+    """Not in that of another fit, which all that tells it anew would gain on."""
+    problem, nominal = nothing.problem, nothing.nominal
+    assert isinstance(problem, ForceProblem)
+    noise = problem.reduced.noise
+    noise = replace(noise, about=9 * noise.about)
+    loud = copy(nothing)
+    loud.problem = replace(problem, reduced=replace(problem.reduced, noise=noise))
+    usual = likelihood(nothing, nominal.fitted)
+    assert likelihood(loud, nominal.fitted) < usual - 1000.0
+    own = BySpring.of(loud, nominal).in_own_noise()
+    assert likelihood(own.search, own.best.fitted) == pytest.approx(usual, abs=1.0)
 
 
 def shown_by(each: list[tuple[float, float]]) -> Modulation:

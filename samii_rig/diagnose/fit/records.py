@@ -122,12 +122,6 @@ class Whole:
         """Samples of the rig for each that was recorded."""
         return self.records.every
 
-    @property
-    def one_is_left(self) -> bool:
-        """Whether but one sensor shows anything, and not what disturbs the rig from what a spring
-        does that varies: a mode that both keep ringing looks the same in it."""
-        return bool(self.hidden) and len(self.wired.sensors) == 1
-
     def by_level(self) -> Whole:
         """The same records, the levels not summed up: for what depends on amplitude."""
         return self if self.of_levels is None else replace(self, records=self.of_levels)

@@ -111,6 +111,14 @@ class BySpring:
         left = _some(search.unexplained(best.fitted))
         return cls(search, best, springs, springs.pieces(search, left))
 
+    def in_own_noise(self) -> BySpring:
+        """The same in the noise that the explanation itself leaves. In that of another all that
+        tells noise anew gains, a stiffness that does not vary too."""
+        search = self.search.on(self.search.levels, self.best.fitted)
+        fitted = search.refitted(self.best.effects, self.best, far=False)
+        best = replace(self.best, fitted=fitted or self.best.fitted)
+        return BySpring.of(search, best)
+
     @cached_property
     def strongest(self) -> list[tuple[str, Modulation]]:
         """As of `Springs`."""
@@ -129,9 +137,10 @@ class BySpring:
 def variation(seen: BySpring, files: int) -> Variation | None:
     """The stiffness that varies; None where noise could do that. files : recordings, each of which
     may have a stiffness of its own."""
-    search, best, springs, found = seen.search, seen.best, seen.springs, seen.strongest
-    if not found:
+    if not seen.strongest:
         return None
+    seen = seen.in_own_noise()
+    search, best, springs, found = seen.search, seen.best, seen.springs, seen.strongest
     tried = []
     for site, modulation in found:
         k = search.paths.scale((site, STIFFNESS))

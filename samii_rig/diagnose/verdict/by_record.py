@@ -102,7 +102,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
             looked = replace(looked, remarks=(*looked.remarks, EXHAUSTED))
     given = Given.of(search, case.runs, case.clean.samples)
     several = None
-    if forces is not None and not given.whole.one_is_left:
+    if forces is not None:
         if _without_force(looked.judged):
             several = _several(search, [given], None)
         search.begin("whether stiffnesses are constant")
