@@ -39,7 +39,7 @@ class Records:
     those of other records are the same. driven : Hz up to which, and driven_from : from which the
     input is more than noise, so that a change of the response shows. undriven : inputs that nothing
     excites. What they did is known; a change of the response to it would fit the noise in it.
-    every : samples of the rig for each that was recorded.
+    every : samples of the rig for each that was recorded. one_of : lines of which one takes part.
     """
 
     pieces: tuple[Piece, ...]
@@ -51,6 +51,7 @@ class Records:
     driven_from: float = 0.0
     undriven: tuple[int, ...] = ()
     every: int = 1
+    one_of: int = 1
 
     @property
     def changing(self) -> tuple[float, float]:
@@ -95,7 +96,8 @@ class Records:
         n = len(piece.z)
         band = self.bands[next(i for i, p in enumerate(self.pieces) if p is piece)]
         low, high = (f * n / self.rate_hz for f in band)
-        k = np.arange(max(CYCLES, int(np.ceil(low))), min(int(high), (n - 1) // 2) + 1)
+        first, last = max(CYCLES, int(np.ceil(low))), min(int(high), (n - 1) // 2)
+        k = np.arange(first, last + 1, self.one_of)
         return Lines(k, np.asarray(k * (self.rate_hz / n), np.float64))
 
     def residual(self, samples: Samples | Piece, k: Int, H: Complex, contour: Contour) -> Complex:

@@ -12,6 +12,7 @@ from cut_kit import DESIGN, cut_sweeps
 from table_kit import Effects, table_of
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
+from samii_rig.diagnose.fit import record_search
 from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.likelihood.pieces import wiring
@@ -56,6 +57,26 @@ def test_the_encoder_is_left_out_and_the_command_is_what_was_recorded(
     search = on_records(case)
     assert search is not None
     assert search.ratio(search.nominal.fitted) == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_nominal_model_is_found_at_some_of_many_lines_and_stands_at_all(
+    nothing: list[Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case = case_of(estimate(nothing), RIG, None, FEW, nothing)
+    assert case.whole is not None
+    few = case.whole.thinned(500)
+    assert 400 < few.lines <= 500
+    assert few.thinned(200).lines <= 200
+    assert case.whole.thinned(case.whole.lines) is case.whole
+    at_once = on_records(case)
+    monkeypatch.setattr(record_search, "FIRST_LINES", case.whole.lines // 3)
+    by_few = on_records(case)
+    assert at_once is not None
+    assert by_few is not None
+    assert by_few.whole.lines == case.whole.lines
+    a, b = at_once.nominal.fitted, by_few.nominal.fitted
+    assert b.away(a) < 0.5
+    assert by_few.ratio(b) == pytest.approx(at_once.ratio(a), abs=0.02)
 
 
 def test_nothing_is_found_where_nothing_is_missing(nothing: list[Recording]) -> None:

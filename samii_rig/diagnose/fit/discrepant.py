@@ -17,10 +17,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg
 
 from samii_rig.diagnose.fit.discrepancy import Discrepancy, weighed
-from samii_rig.diagnose.fit.explanations import UNEXPLAINED, Explanation, named
+from samii_rig.diagnose.fit.explanations import Explanation, named, unlikely
 from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.record_search import RecordProblem, RecordSearch
 from samii_rig.diagnose.fit.records import Whole
@@ -33,7 +33,6 @@ ROUNDS = 3  # of scale and search; two do where the first round finds what is mi
 STILL = 0.15  # nepers of the scale that are no change: a seventh of an interval of 90 %
 KEPT = 12  # explanations that are refitted beside another discrepancy
 WORSE = 9.0  # of chi-square, three noise units: a level or sensor that is explained worse
-AT_END = 1e-3  # of a nominal parameter's range, from its end
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,16 +128,7 @@ class DiscrepantSearch(RecordSearch):
         parameters at unlikely values."""
         if not any(e.physical for e in explanation.effects):
             return True
-        return not self.unlikely(explanation.fitted) and not self.worse(explanation)
-
-    def unlikely(self, fitted: Fitted) -> bool:
-        """Whether nominal parameters stand where their tolerances make it unlikely: together, or
-        one of them at the end of its range."""
-        n = fitted.model.n_nominal
-        x, low, high = fitted.x[:n], fitted.model.lower[:n], fitted.model.upper[:n]
-        if np.any(np.minimum(x - low, high - x) < AT_END * (high - low)):
-            return True
-        return fitted.penalty > float(stats.chi2.isf(UNEXPLAINED, n)) if n else False
+        return not unlikely(explanation.fitted) and not self.worse(explanation)
 
     def worse(self, explanation: Explanation) -> list[str]:
         """Levels and sensors that by themselves speak against the effects of an explanation.

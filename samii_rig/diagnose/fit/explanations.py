@@ -35,9 +35,20 @@ NEAR = 25.0  # of the logarithm of evidence: explanations further below the best
 FIVE = 5.0  # standard deviations of chi-square beyond which what is left is more than noise
 ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts; bins or nodes over which it is sought
 UNEXPLAINED = 3e-4  # chance that noise alone leaves more than the threshold
+AT_END = 1e-3  # of a nominal parameter's range, from its end
 EXACT = 4e-4  # of the mismatch: what beams, sensors and integrators are modelled to
 
 T = TypeVar("T")
+
+
+def unlikely(fitted: Fitted) -> bool:
+    """Whether nominal parameters stand where their tolerances make it unlikely: together, or one of
+    them at the end of its range."""
+    n = fitted.model.n_nominal
+    x, low, high = fitted.x[:n], fitted.model.lower[:n], fitted.model.upper[:n]
+    if np.any(np.minimum(x - low, high - x) < AT_END * (high - low)):
+        return True
+    return fitted.penalty > float(stats.chi2.isf(UNEXPLAINED, n)) if n else False
 
 
 def threshold(spread: float) -> float:

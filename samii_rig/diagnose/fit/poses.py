@@ -109,6 +109,10 @@ class InPoses:
         """As of `Recorded`."""
         return replace(self, each=tuple(w.with_own_aliases() for w in self.each))
 
+    def thinned(self, most: int) -> InPoses:
+        """As of `Recorded`."""
+        return replace(self, each=tuple(w.thinned(most) for w in self.each))
+
     def about(self, fitted: Fitted) -> Summed:
         """As of `Recorded`."""
         each = zip(self.each, _each(fitted), strict=True)

@@ -5,6 +5,7 @@ Their likelihood (`samii_rig.likelihood`) is made about a fit.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -121,6 +122,11 @@ class Whole:
     def every(self) -> int:
         """Samples of the rig for each that was recorded."""
         return self.records.every
+
+    def thinned(self, most: int) -> Whole:
+        """As of `Recorded`."""
+        times = self.records.one_of * math.ceil(self.lines / most)
+        return replace(self, records=replace(self.records, one_of=times)) if times > 1 else self
 
     def by_level(self) -> Whole:
         """The same records, the levels not summed up: for what depends on amplitude."""

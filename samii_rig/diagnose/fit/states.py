@@ -164,6 +164,10 @@ class Both:
             self, after=self.after.with_own_aliases(), before=self.before.with_own_aliases()
         )
 
+    def thinned(self, most: int) -> Both:
+        """As of `Recorded`."""
+        return replace(self, after=self.after.thinned(most), before=self.before.thinned(most))
+
     def about(self, fitted: Fitted) -> Summed:
         """As of `Recorded`."""
         before = self.before.about(_before(fitted))

@@ -19,7 +19,7 @@ from scipy import stats
 
 from samii_rig.diagnose.fit.between_runs import STIFFNESS, spread_of
 from samii_rig.diagnose.fit.exact import NINETY
-from samii_rig.diagnose.fit.explanations import Explanation, threshold
+from samii_rig.diagnose.fit.explanations import Explanation, threshold, unlikely
 from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.records import Whole, fitted_lines
 from samii_rig.diagnose.fit.refit import Fitted
@@ -64,7 +64,8 @@ class Variation:
     inside : whether what it leaves of the lines fitted is no more than noise. again : whether
     records of one level differ, or one in itself, so that it is no law of the amplitude, and that
     faster than what wanders; where the stiffness is constant in each, in several recordings; and
-    whether no force does as much of it.
+    whether no force does as much of it. likely : whether it leaves the nominal parameters at
+    likely values.
     """
 
     sites: tuple[tuple[str, float], ...]
@@ -77,6 +78,7 @@ class Variation:
     gap: Gap
     inside: bool
     again: bool
+    likely: bool
 
     @property
     def closed(self) -> float:
@@ -190,6 +192,7 @@ def variation(seen: BySpring, files: int) -> Variation | None:
         gap=gap_of(before[1], after[1], np.ones(after[1].size)),
         inside=bool(np.mean(after[0]) < threshold(taken.search.spread)),
         again=taken.again and not (slow or remembered or lawful),
+        likely=not unlikely(taken.fitted),
     )
 
 

@@ -314,6 +314,8 @@ def _constant(
     # What leaves more than noise has had that for noise: each is held against its own.
     linear = _without_force(judged) and (differ or (physical and judged.partly))
     found = variation(seen, files) if seen and (linear or seen.evidence > least) else None
+    if found is not None and not found.likely:  # a rig that is far from its file is none to tell of
+        found = None
     if found is not None and linear:
         ahead = found.likelihood - of_its_own(forces, judged.best)
         least = rival = min(rival, found.evidence - ahead)
