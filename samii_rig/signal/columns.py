@@ -79,9 +79,9 @@ def is_aligned(recordings: Iterable[Recording]) -> bool:
     for recording in recordings:
         laws, rounded = _laws(recording)
         best = _best(laws)
-        if best is not None:
-            others = (law for law in laws if law is not laws[best])
-            return all(law.apart(laws[best], rounded) > SEEN for law in others)
+        others = (law for k, law in enumerate(laws) if k != best)
+        if best is not None and all(law.apart(laws[best], rounded) > SEEN for law in others):
+            return True
     return False
 
 
