@@ -16,6 +16,9 @@ from samii_rig.types import Complex, Float, Int
 
 # In a record, of its lowest line: below, wandering is as large as what polynomials leave.
 CYCLES = 5
+# Lines of which one of n takes part are those whose number times this has a fraction below 1/n:
+# evenly spread, and no period of a multisine, which excites every tenth line say, is missed.
+SPREAD = 2**0.5
 Response = Callable[[Complex], Complex]
 """(n,) s -> (n, q) of the reference model, from input to sensors; (n, q m) of m inputs, all inputs
 of the first sensor first. Beyond half the rate of records that hold not every sample of the rig:
@@ -97,7 +100,9 @@ class Records:
         band = self.bands[next(i for i, p in enumerate(self.pieces) if p is piece)]
         low, high = (f * n / self.rate_hz for f in band)
         first, last = max(CYCLES, int(np.ceil(low))), min(int(high), (n - 1) // 2)
-        k = np.arange(first, last + 1, self.one_of)
+        k = np.arange(first, last + 1)
+        if self.one_of > 1:
+            k = k[(k * SPREAD) % 1.0 < 1 / self.one_of]
         return Lines(k, np.asarray(k * (self.rate_hz / n), np.float64))
 
     def residual(self, samples: Samples | Piece, k: Int, H: Complex, contour: Contour) -> Complex:

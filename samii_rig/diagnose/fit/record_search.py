@@ -96,7 +96,7 @@ class Recorded(Protocol):
         ...
 
     def thinned(self, most: int) -> Recorded:
-        """The same at every so many of its lines that each state has no more than `most`."""
+        """The same at so few of its lines that each state has hardly more than `most`."""
         ...
 
 
