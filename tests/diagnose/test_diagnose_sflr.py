@@ -1,11 +1,14 @@
 """The diagnosis on real recordings: a part taken out of the author's model is put back."""
 
+from dataclasses import replace
+
 import pytest
 
-from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.diagnose import case_of, diagnose, table
 from samii_rig.record.importer import import_file
 from samii_rig.record.maps import load_map
 from samii_rig.rig.load import load_rig
+from samii_rig.signal.columns import is_aligned, shift_of
 from samii_rig.signal.estimate import estimate
 
 RIVALS = (
@@ -21,9 +24,24 @@ RIVALS = (
 
 
 @pytest.fixture(scope="module")
-def responses(recordings):
+def runs(recordings):
     files = sorted(recordings.glob("*full-robot*amp-75*"))
-    return estimate([import_file(path, load_map("sflr")[0]) for path in files])
+    return [import_file(path, load_map("sflr")[0]) for path in files]
+
+
+@pytest.fixture(scope="module")
+def responses(runs):
+    return estimate(runs)
+
+
+def test_the_robot_s_own_loop_tells_that_its_columns_stand_together(runs, responses):
+    """So that a lag of the motor is not told as a logger's shift."""
+    rig = load_rig("sflr")[0]
+    made = [replace(run, rig_toml=load_rig("sflr")[1]) for run in runs]
+    assert is_aligned(made)
+    assert all(shift_of(run) == 0 for run in made)
+    case = case_of(responses, rig, (1, 24), None, made)
+    assert "columns_shifted" not in {e.physics for e in case.search.table}
 
 
 def without(rig, name):
