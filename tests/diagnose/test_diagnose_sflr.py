@@ -36,8 +36,8 @@ def responses(runs):
 
 def test_the_robot_s_own_loop_tells_that_its_columns_stand_together(runs, responses):
     """So that a lag of the motor is not told as a logger's shift."""
-    rig = load_rig("sflr")[0]
-    made = [replace(run, rig_toml=load_rig("sflr")[1]) for run in runs]
+    rig, text = load_rig("sflr")
+    made = [replace(run, rig_toml=text) for run in runs]
     assert is_aligned(made)
     assert all(shift_of(run) == 0 for run in made)
     case = case_of(responses, rig, (1, 24), None, made)

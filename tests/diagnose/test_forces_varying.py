@@ -25,7 +25,6 @@ from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.swings import Swings
 from samii_rig.diagnose.forces.variation import (
     BySpring,
-    Variation,
     _less,
     _repeats_differ,
     likelihood,
@@ -42,7 +41,6 @@ from samii_rig.diagnose.forces.varying import (
     uneven,
 )
 from samii_rig.diagnose.result import Diagnosis
-from samii_rig.diagnose.verdict import by_record
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.likelihood.inputs import MeterNoise
 from samii_rig.likelihood.pieces import Command, Piece
@@ -118,13 +116,7 @@ def test_a_joint_that_differs_from_run_to_run_is_named(
     assert spread.low < truth["parameters"]["spread"]["value"] < spread.high
     assert not found.states
     # Nor is it told of a rig whose parameters it drives to where they cannot be.
-    far = variation
-
-    def unlikely(seen: BySpring, files: int) -> Variation | None:
-        told = far(seen, files)
-        return told and replace(told, likely=False)
-
-    monkeypatch.setattr(by_record, "variation", unlikely)
+    monkeypatch.setattr("samii_rig.diagnose.forces.variation.unlikely", lambda _: True)
     assert "stiffness_variation" not in {c.physics for c in found_in(runs).causes}
 
 

@@ -137,9 +137,8 @@ def test_where_the_law_is_not_known_nothing_is_moved(unknown: Recording):
 def test_a_law_that_holds_tells_of_every_shift_of_none_too(m: int):
     """A dead time of as much is then the rig's."""
     run = loop()
-    slow = replace(
-        run, values=run.values * [1.0, 1.0, 1e-3, 1.0]
-    )  # and another of which none is told
+    # And another that hardly moves, of which it tells none.
+    slow = replace(run, values=run.values * [1.0, 1.0, 1e-3, 1.0])
     slow.values[:, 1] = slow.values[:, 0] - KP * slow.values[:, 2]
     assert is_aligned([loop(rig_toml=""), slow, late(run, m)])
     assert not is_aligned([slow])

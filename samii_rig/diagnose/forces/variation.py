@@ -64,8 +64,7 @@ class Variation:
     inside : whether what it leaves of the lines fitted is no more than noise. again : whether
     records of one level differ, or one in itself, so that it is no law of the amplitude, and that
     faster than what wanders; where the stiffness is constant in each, in several recordings; and
-    whether no force does as much of it. likely : whether it leaves the nominal parameters at
-    likely values.
+    whether no force does as much of it.
     """
 
     sites: tuple[tuple[str, float], ...]
@@ -78,7 +77,6 @@ class Variation:
     gap: Gap
     inside: bool
     again: bool
-    likely: bool
 
     @property
     def closed(self) -> float:
@@ -116,10 +114,8 @@ class BySpring:
     def in_own_noise(self) -> BySpring:
         """The same in the noise that the explanation itself leaves. In that of another all that
         tells noise anew gains, a stiffness that does not vary too."""
-        search = self.search.on(self.search.levels, self.best.fitted)
-        fitted = search.refitted(self.best.effects, self.best, far=False)
-        best = replace(self.best, fitted=fitted or self.best.fitted)
-        return BySpring.of(search, best)
+        search, fitted = _in_own_noise(self.search, self.best.fitted, self.best)
+        return BySpring.of(search, replace(self.best, fitted=fitted))
 
     @cached_property
     def strongest(self) -> list[tuple[str, Modulation]]:
@@ -137,8 +133,9 @@ class BySpring:
 
 
 def variation(seen: BySpring, files: int) -> Variation | None:
-    """The stiffness that varies; None where noise could do that. files : recordings, each of which
-    may have a stiffness of its own."""
+    """The stiffness that varies; None where noise could do that, or where it leaves the nominal
+    parameters at unlikely values. files : recordings, each of which may have a stiffness of its
+    own."""
     if not seen.strongest:
         return None
     seen = seen.in_own_noise()
@@ -166,7 +163,7 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     some = [one for one in tried if one.evidence >= least] or tried[:1]
     tried = sorted((one.settled(best) for one in some), key=lambda one: -one.evidence)
     taken = tried[0]
-    if taken.evidence <= nothing:
+    if taken.evidence <= nothing or unlikely(taken.fitted):
         return None
     before = taken.residuals(search.levels, best.fitted)
     after = taken.residuals(taken.search.levels, taken.fitted)
@@ -192,7 +189,6 @@ def variation(seen: BySpring, files: int) -> Variation | None:
         gap=gap_of(before[1], after[1], np.ones(after[1].size)),
         inside=bool(np.mean(after[0]) < threshold(taken.search.spread)),
         again=taken.again and not (slow or remembered or lawful),
-        likely=not unlikely(taken.fitted),
     )
 
 
@@ -388,8 +384,15 @@ def of_its_own(search: ForceSearch, explanation: Explanation) -> float:
     fitted = search.refitted(explanation.effects, explanation, far=False)
     if fitted is None:
         return -math.inf
+    return likelihood(*_in_own_noise(search, fitted, explanation))
+
+
+def _in_own_noise(
+    search: ForceSearch, fitted: Fitted, explanation: Explanation
+) -> tuple[ForceSearch, Fitted]:
+    """A search with the noise that a fit of an explanation leaves, and the fit there."""
     own = search.on(search.levels, fitted)
-    return likelihood(own, own.refitted(explanation.effects, explanation, far=False) or fitted)
+    return own, own.refitted(explanation.effects, explanation, far=False) or fitted
 
 
 def _repeats_differ(pieces: Sequence[PieceModulation], hz: float) -> bool | None:

@@ -313,7 +313,7 @@ def _constant(
     least = rival if physical else max(rival, VARIES)
     # What leaves more than noise has had that for noise: each is held against its own.
     linear = _without_force(judged) and (differ or (physical and judged.partly))
-    found = _varying(seen, files) if seen and (linear or seen.evidence > least) else None
+    found = variation(seen, files) if seen and (linear or seen.evidence > least) else None
     if found is not None and linear:
         ahead = found.likelihood - of_its_own(forces, judged.best)
         least = rival = min(rival, found.evidence - ahead)
@@ -322,16 +322,10 @@ def _constant(
         return _Looked(varies, found.before[1], found.after[1], found.gap, looked.remarks)
     more = judged.evidence.left > threshold(forces.spread)
     if more and judged.best.effects and judged.best.key != base.key:
-        beside = _varying(BySpring.of(forces, judged.best), files)
+        beside = variation(BySpring.of(forces, judged.best), files)
         if beside is not None and beside.closed >= verdict.PARTLY:
             return replace(looked, remarks=(*looked.remarks, beside.describe()))
     return looked
-
-
-def _varying(seen: BySpring, files: int) -> Variation | None:
-    """As `variation`; none of a rig that it leaves far from its file."""
-    found = variation(seen, files)
-    return found if found is None or found.likely else None
 
 
 def _even(forces: ForceSearch | None, search: RecordSearch, looked: _Looked) -> _Looked:
