@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -232,5 +233,7 @@ class _Reader:
         if not line:
             self._process.wait()
             return {"error": f"ended without an answer (within {LONGEST:g} s one is expected)"}
-        said: dict[str, Any] = json.loads(line)
+        # Names of files alone: what is kept of a trial is the same wherever it was made.
+        where = json.dumps(f"{folder}{os.sep}")[1:-1]
+        said: dict[str, Any] = json.loads(line.replace(where, ""))
         return said
