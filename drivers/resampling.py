@@ -6,7 +6,7 @@ import numpy as np
 
 from samii_rig.types import Channel, Flags, Float, Int, Quality, SampleBlock
 
-KEPT = 4096  # samples: seconds, more than anything waits
+PAST_KEPT = 4096  # samples: seconds, more than anything waits
 AROUND = 4  # samples through which the cubic goes
 # s between two samples beyond which nothing is known between them: of a motion below 15 Hz the
 # cubic then misses 2 % at most, and a host that is late by 12 ms, as one in ten thousand is,
@@ -43,9 +43,9 @@ class Track:
             return
         self.heard = now
         clipped = (block.quality[good] & Quality.CLIPPED) != 0
-        self._time = np.concatenate([self._time, times[good]])[-KEPT:]
-        self._values = np.concatenate([self._values, block.values[good]])[-KEPT:]
-        self._clipped = np.concatenate([self._clipped, clipped])[-KEPT:]
+        self._time = np.concatenate([self._time, times[good]])[-PAST_KEPT:]
+        self._values = np.concatenate([self._values, block.values[good]])[-PAST_KEPT:]
+        self._clipped = np.concatenate([self._clipped, clipped])[-PAST_KEPT:]
         self._usual = float(np.median(np.diff(self._time[-64:]))) if len(self._time) > 1 else 0.0
 
     @property

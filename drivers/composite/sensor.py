@@ -16,7 +16,7 @@ from samii_rig.types import Float, Int, SampleBlock
 
 MAIN = "main"
 # s that a sample waits for the others beyond the longest gap that is bridged: two samples.
-WAIT = 0.005
+LOOK_AGAIN = 0.005
 GRACE = 0.03  # s past a channel's age limit after which silence ends the run, if no gate did
 TELL = 30.0  # s between events that say how the clocks stand
 
@@ -133,7 +133,7 @@ class CompositeSensor:
         self.listen()
         if len(block):
             self._held.append((now, block))
-        longest = max((s.track.gap + WAIT for s in self._sides if not s.trouble), default=0.0)
+        longest = max((s.track.gap + LOOK_AGAIN for s in self._sides if not s.trouble), default=0.0)
         late = now - round(longest * 1e9)
         known = min((s.track.known for s in self._sides if not s.trouble), default=2**62)
         out: list[SampleBlock] = []

@@ -19,7 +19,7 @@ NETWORK = Path("/sys/class/net")
 # s; far longer than a busy machine may keep this thread waiting, as silence is seen without it.
 SEND_WITHIN = 0.25
 ENDS = b"\r\a"  # of a line of slcan: done, and refused
-LONGEST = 64  # bytes of a line; an extended frame with a time stamp has 30
+LONGEST_LINE = 64  # bytes of a line; an extended frame with a time stamp has 30
 
 
 class Slcan(can.interfaces.slcan.slcanBus):
@@ -34,7 +34,7 @@ class Slcan(can.interfaces.slcan.slcanBus):
                     line = self._buffer[: i + 1].decode("ascii", "replace")
                     del self._buffer[: i + 1]
                     return line
-            if len(self._buffer) > LONGEST:
+            if len(self._buffer) > LONGEST_LINE:
                 self._buffer.clear()
             came = self.serialPortOrig.read(max(1, self.serialPortOrig.in_waiting))
             self._buffer += came

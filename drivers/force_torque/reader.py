@@ -24,7 +24,7 @@ GIVE_UP = 20_000_000  # ns after which a request has no reply any more
 SYNC = "SerialNumber"  # what is asked after a lost reply: what comes before its answer is late
 HANG = 1.0  # s without a turn of the thread after which it hangs
 QUIET = 4  # of a period goes by after a reply before the next request
-KEPT = 65_536  # samples that wait for read()
+SAMPLES_KEPT = 65_536  # samples that wait for read()
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Reader:
     """
 
     def __init__(self, bus: can.BusABC, frames: Frames, period: int) -> None:
-        self.samples: deque[Reading] = deque(maxlen=KEPT)
+        self.samples: deque[Reading] = deque(maxlen=SAMPLES_KEPT)
         self.counts = Counts()
         self.trouble = ""
         self.slowest = GIVE_UP

@@ -19,7 +19,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.types import Channel, Flags, Float, Int, Quality, SampleBlock
 
 LOOK = 0.002  # s between looks at the board's buffer
-KEPT = 4096  # looks that wait for read()
+LOOKS_KEPT = 4096  # looks that wait for read()
 WITHIN = 10.0  # s that one call of the driver may take
 
 
@@ -66,8 +66,8 @@ class Board:
         self._count = 0
         self._held: Float | None = None  # a sample whose read-back comes with the next one
         self._trouble = ""
-        self._came: deque[tuple[int, Float, Flags, int]] = deque(maxlen=KEPT)
-        self._arrivals: deque[tuple[int, int]] = deque(maxlen=KEPT)
+        self._came: deque[tuple[int, Float, Flags, int]] = deque(maxlen=LOOKS_KEPT)
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=LOOKS_KEPT)
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="reader of the board", daemon=True)
         self._thread.start()

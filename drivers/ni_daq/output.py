@@ -31,7 +31,7 @@ BUFFER = 10.0  # s of samples that the board's buffer holds
 # the deadman; well under the 0.1 s by which a first reference comes ahead.
 REST = 0.04
 PART = 0.9  # of the deadman's time, after which its end is made here, before the watchdog's
-TRIES = 50  # to start between two samples
+START_TRIES = 50  # to start between two samples
 WRITE = 0.02  # s that a write may wait for room
 TAKEN = 0.05  # s that zero() waits for a look that is under way
 
@@ -193,7 +193,7 @@ class Playout:
         """Play out, beginning with a sample that is known: NI's count of the inputs must be the
         same before and after the start."""
         n = math.ceil(REST * self._rate)
-        for _ in range(TRIES):
+        for _ in range(START_TRIES):
             task = self._made()
             try:
                 task.out_stream.regen_mode = (

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 OFTEN = 5  # resets in its time, while the output rests
-WAIT = 0.02  # s that an edge may wait to be written
+EDGE_WAIT = 0.02  # s that an edge may wait to be written
 
 
 class Watchdog:
@@ -77,7 +77,7 @@ class SquareWave:
         self._task = ni.Task()
         try:
             self._task.do_channels.add_do_chan(line)
-            self._task.write(self._level, auto_start=True, timeout=WAIT)
+            self._task.write(self._level, auto_start=True, timeout=EDGE_WAIT)
         except BaseException:
             self._task.close()
             raise
@@ -85,7 +85,7 @@ class SquareWave:
     def edge(self) -> None:
         """What NI-DAQmx says when it refuses one."""
         self._level = not self._level
-        self._task.write(self._level, auto_start=True, timeout=WAIT)
+        self._task.write(self._level, auto_start=True, timeout=EDGE_WAIT)
 
     def close(self) -> None:
         """May be called twice."""

@@ -30,7 +30,7 @@ from samii_rig.types import Channel, Int, Quality, SampleBlock
 HELLO_WITHIN = 3.0  # s; a board that resets when its port opens needs two to boot
 ASK_EVERY = 0.25  # s
 ROUND_TRIPS = 4
-KEPT = 65_536  # samples that wait for read()
+SAMPLES_KEPT = 65_536  # samples that wait for read()
 # How far its clock may be from its own count of samples before one of them was reset.
 SLACK = 2.0  # samples
 DRIFT = 0.01  # of the time between two frames
@@ -76,8 +76,8 @@ class Quadrature:
         self.trouble = ""
         self._told: Told | None = None
         self._boot: int | None = None
-        self._samples: deque[Sample] = deque(maxlen=KEPT)
-        self._arrivals: deque[tuple[int, int]] = deque(maxlen=KEPT)
+        self._samples: deque[Sample] = deque(maxlen=SAMPLES_KEPT)
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=SAMPLES_KEPT)
         self._bad: deque[tuple[float, int]] = deque([(time.monotonic(), 0)])
         self._last: tuple[int, int] | None = None  # newest sample's number and clock, us
         self._jumped = False

@@ -15,7 +15,7 @@ HEAD = struct.Struct("<BBHI")  # version, type, boot, seq
 TOLD = struct.Struct("<IB16s16s")  # period_us, counters, firmware, serial
 SAMPLE = struct.Struct("<IB")  # clock_us, bit i: counter i has missed an edge
 CRC = struct.Struct("<I")
-LONGEST = 128  # bytes of a frame before COBS
+LONGEST_FRAME = 128  # bytes of a frame before COBS
 WORD, HALF = 1 << 32, 1 << 31
 
 
@@ -65,11 +65,11 @@ class Decoder:
                     self.corrupt += 1
                 else:
                     yield message
-        self._rx += rest[: LONGEST + 2 - len(self._rx)]
+        self._rx += rest[: LONGEST_FRAME + 2 - len(self._rx)]
 
     def _message(self, stuffed: bytes) -> Told | Sample | None:
         try:
-            p: bytes = cobs.decode(stuffed) if len(stuffed) <= LONGEST + 1 else b""
+            p: bytes = cobs.decode(stuffed) if len(stuffed) <= LONGEST_FRAME + 1 else b""
         except cobs.DecodeError:
             return None
         if len(p) < HEAD.size + CRC.size or p[-4:] != CRC.pack(zlib.crc32(p[:-4])):

@@ -31,7 +31,7 @@ ASK_EVERY = 0.25  # s
 ANSWER_WITHIN = 0.25  # s
 TRIES = 3  # of a request whose answer did not come
 ROUND_TRIPS = 4  # of which the shortest says how long a frame is on its way at most
-KEPT = 8192  # SAMPLES frames that wait for read(); over a minute, what is older is lost
+FRAMES_KEPT = 8192  # SAMPLES frames that wait for read(); over a minute, what is older is lost
 
 
 class Link:
@@ -46,8 +46,8 @@ class Link:
     def __init__(self, port: str, baud: int) -> None:
         self.name = port
         self.decoder = Decoder()
-        self.samples: deque[tuple[int, Samples]] = deque(maxlen=KEPT)
-        self.events: deque[Event] = deque(maxlen=KEPT)
+        self.samples: deque[tuple[int, Samples]] = deque(maxlen=FRAMES_KEPT)
+        self.events: deque[Event] = deque(maxlen=FRAMES_KEPT)
         self._last: Event | None = None
         self.trouble = ""
         self.refused = 0

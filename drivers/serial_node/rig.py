@@ -11,7 +11,7 @@ import numpy as np
 
 from drivers.sensing import taken
 from drivers.serial_node.continuity import Continuity
-from drivers.serial_node.link import KEPT, Link
+from drivers.serial_node.link import FRAMES_KEPT, Link
 from drivers.serial_node.outputs import OneOutput, Outputs
 from drivers.serial_node.settings import SerialSettings, check_node, read_settings
 from drivers.serial_node.wire import Event, Flag, Hello, State, Type, reason_text
@@ -51,7 +51,7 @@ class SerialNode:
         self._line = Continuity(link, hello.period_ns, settings.max_bad_frames)
         self._told: dict[str, str | int | float] = {}
         self._tell_at = 0.0
-        self._arrivals: deque[tuple[int, int]] = deque(maxlen=KEPT)
+        self._arrivals: deque[tuple[int, int]] = deque(maxlen=FRAMES_KEPT)
         # The way back is at most the whole round.
         self.latency = (0.0, link.round_trip)
 

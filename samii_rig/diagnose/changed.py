@@ -33,7 +33,8 @@ from samii_rig.types import FrequencyResponse, Recording
 
 WHERE = (" after", " before")  # which recordings are not of one state
 COMMON = "common_"  # of the names of what both states have beside the rig file
-FREE = 1.0  # tolerance of what the state before was found to have: a factor of e, as good as none
+# Tolerance of what the state before was found to have: a factor of e, as good as none
+FREE_EFFECT = 1.0
 
 Band = tuple[float, float]
 
@@ -174,7 +175,7 @@ def common_rig(rig: Rig, found: Rig) -> Rig:
         old = parameters(own[element.name]) if element.name in own else {}
         update: dict[str, Any] = {
             symbol: p.model_copy(
-                update={"tolerance": old[symbol].tolerance if symbol in old else FREE}
+                update={"tolerance": old[symbol].tolerance if symbol in old else FREE_EFFECT}
             )
             for symbol, p in parameters(element).items()
         }

@@ -36,7 +36,7 @@ from samii_rig.types import Complex, Float, Int
 Use = Literal["residues", "shapes", "poles"]
 CIRCLE = 0.005  # of |a|, radius around a pole: modes 1 % apart are still two
 ANGLES = 16
-SAME = 1e-6  # of |a|, distance of two followed poles that have become one
+SAME_POLE = 1e-6  # of |a|, distance of two followed poles that have become one
 SUBSTEPS = 64  # into which a step is cut at most, where poles move too far to be followed
 UNDIVIDED = "nothing divided out"
 TESTS = 1e-9  # part of one number's chi-square that the parameters leave, from which it tests them
@@ -312,7 +312,7 @@ class _Problem:
             own = out[first : first + block.at.size]
             first += block.at.size
             apart = np.abs(own[:, None] - own) + np.where(np.eye(own.size), np.inf, 0.0)
-            if np.any(apart < SAME * np.abs(own)):
+            if np.any(apart < SAME_POLE * np.abs(own)):
                 raise InputError("poles", "", "one for two modes", "one of each")
         return out
 

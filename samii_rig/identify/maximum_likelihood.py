@@ -38,7 +38,7 @@ STARTS = 8
 SPREAD = 0.3  # half width of the starts around the first, relative
 COARSE = 1e-3  # relative change of the cost at which the first stage hands over
 # Half of chi-square: two ends that differ by less are one optimum, by a hundredth of a sigma.
-SAME = 1e-4
+SAME_OPTIMUM = 1e-4
 ROUNDS = 4  # of aliases taken anew; two are usual
 
 
@@ -64,7 +64,7 @@ class Problem:
             before = found.x
             found = minimise(noise_misfit, self.data, self.space, self.predictor, before)
             scale = np.linalg.norm(found.jacobian @ (found.x - before))
-            if scale**2 < SAME:
+            if scale**2 < SAME_OPTIMUM:
                 break
         return found
 
@@ -160,7 +160,7 @@ def solve(
         ends.append(posed.from_start(np.clip(x, posed.space.lower, posed.space.upper)))
     best = min(ends, key=lambda end: end.cost)
     progress("best of them")
-    reached = sum(1 for end in ends if end.cost <= best.cost * (1 + SAME) + SAME)
+    reached = sum(1 for end in ends if end.cost <= best.cost * (1 + SAME_OPTIMUM) + SAME_OPTIMUM)
     return _result(posed, posed.polished(best), starts, reached)
 
 

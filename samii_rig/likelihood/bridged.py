@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from samii_rig.types import Float, Int, Recording
 
 ORDER = 32  # coefficients: of a band that is a tenth of the rate wide it takes half of them
-BESIDE = 16 * ORDER  # samples to either side of which they are fitted
+FITTED_BESIDE = 16 * ORDER  # samples to either side of which they are fitted
 RIDGE = 1e-12  # of the power of what is fitted: a sine alone needs two coefficients
 
 # s of lost samples that a piece goes on across, their motion a nuisance: one for each half period
@@ -102,7 +102,7 @@ def bridged(x: Float, first: int, behind: int) -> tuple[Float, Float]:
     """(g,) the most likely values of x (n,) from sample `first` to before `behind`, and the
     standard deviation of each. Straight from side to side, and as far off as x is large, where
     too few samples are beside the gap."""
-    low, high = max(first - BESIDE, 0), min(behind + BESIDE, len(x))
+    low, high = max(first - FITTED_BESIDE, 0), min(behind + FITTED_BESIDE, len(x))
     before, after = x[low:first], x[behind:high]
     rows = [sliding_window_view(one, ORDER + 1) for one in (before, after) if len(one) > ORDER]
     if not rows or sum(len(one) for one in rows) < 2 * ORDER:

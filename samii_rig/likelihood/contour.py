@@ -20,7 +20,7 @@ from scipy import fft
 
 from samii_rig.types import Complex, Float
 
-SPARE = 2.0  # length of the padded record over that of the longest record, at least
+PADDED = 2.0  # length of the padded record over that of the longest record, at least
 # -log of what is left of a response that wraps around. Rounding, and what is not exact along the
 # contour, grows to the end of a record by half of it.
 EXACT = 24.0  # of a prediction: 4e-11 wraps around, rounding grows to 4e-11
@@ -41,7 +41,7 @@ class Contour:
     @classmethod
     def over(cls, longest: int, rate_hz: float, damping: float) -> Contour:
         """The contour for records of up to `longest` samples."""
-        return cls(int(fft.next_fast_len(int(SPARE * longest), real=True)), rate_hz, damping)
+        return cls(int(fft.next_fast_len(int(PADDED * longest), real=True)), rate_hz, damping)
 
     @property
     def sigma(self) -> float:

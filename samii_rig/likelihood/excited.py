@@ -17,7 +17,7 @@ from samii_rig.types import Float
 
 # Of the largest, an input's energy in a third of an octave that excites: steps through frequencies,
 # of as many periods each, and steps of the input have that over 2.5 decades.
-EXCITED, PARTS = 0.003, 3
+EXCITED, OCTAVE_PARTS = 0.003, 3
 # The same, from which on an input moves a rig by more than its noise: a thousandth in amplitude. A
 # square wave does so far above its band.
 DRIVES = 1e-6
@@ -118,8 +118,8 @@ def _energy(r: Float, rate_hz: float) -> tuple[Float, Float, Float]:
     power = np.abs(np.fft.rfft(r)) ** 2 / r.size
     f = np.arange(power.size) * (rate_hz / r.size)
     # The offset's line, and the one that it leaks to, are no excitation.
-    part = np.floor(PARTS * np.log2(f[2:] / f[2])).astype(np.int64)
-    edges = f[2] * 2 ** (np.arange(part[-1] + 2) / PARTS)
+    part = np.floor(OCTAVE_PARTS * np.log2(f[2:] / f[2])).astype(np.int64)
+    edges = f[2] * 2 ** (np.arange(part[-1] + 2) / OCTAVE_PARTS)
     energy = np.asarray(np.bincount(part, power[2:]), np.float64)
     return np.asarray(edges), energy, np.asarray(np.bincount(part), np.float64)
 

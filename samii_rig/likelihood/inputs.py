@@ -24,36 +24,36 @@ from samii_rig.types import Float, Recording
 NOISE = 0.5  # of what was measured, sd, that may be the meter's: of more the law says nothing
 # Samples further out than so many sd are none of its noise, but edges within a sample; of all
 # samples they may be this part.
-FAR, EDGES = 7.0, 1e-3
+BEYOND_METER, EDGES = 7.0, 1e-3
 LOUDER = 2.0  # noise among the lines of the command, over that of all lines: no noise above
 BUSY = 0.01  # of the command's largest line, in power, above which a line is the command's
 LOWEST = 1 / 8  # of all lines; a rig that is recorded well moves in these
-NEIGHBOURS = np.arange(-3.0, 4.0)  # samples: of a twentieth of the rate they are exact to 1e-7
-ORDER = np.arange(NEIGHBOURS.size, dtype=np.float64)
-ROUNDS, STEP = 4, 1e-3  # of Gauss and Newton, and samples for a slope
+BETWEEN_TAPS = np.arange(-3.0, 4.0)  # samples: of a twentieth of the rate they are exact to 1e-7
+ORDER = np.arange(BETWEEN_TAPS.size, dtype=np.float64)
+FIT_ROUNDS, STEP = 4, 1e-3  # of Gauss and Newton, and samples for a slope
 LATEST = 0.5  # samples: of a loop that runs at the record's rate
 WHOLE = 0.02  # samples, from the delay of a loop that runs a whole number of times as fast
 LEAST = 3e-4  # samples, deviation of a delay at least: loops of up to 16 times are told apart
 # Of what is neither the command's converter's nor excitation, the power over that of its steps from
 # which it is a meter's noise; of the largest line, the power that it stays below; the part of the
 # lines, the upper ones, that show it.
-METER, QUIET, UPPER = 9.0, 1e-3, 0.5
+METER_STANDS, BELOW_LARGEST, UPPER = 9.0, 1e-3, 0.5
 # Of a meter's noise, the part of its power that second differences show at least, to which an input
 # adds.
 EVERY = 0.5
 # Lines of a record that are taken for the input's though they are a meter's noise, in the mean. And
 # lines among which another is judged: of so many the median is known to 10 %. And how many times
 # the noise these must have: of less than half input the rest would move a rig more than that does.
-ONCE, BESIDE, HALF = 0.01, 201, 2.0
+ONCE, JUDGED_AMONG, HALF = 0.01, 201, 2.0
 # Samples by which a record's going on is foretold, and until it is at rest.
 FORETOLD, AFTER = 64, 512
 # Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a
 # smaller one that came half a sample earlier is below a hundredth of what the rest makes.
-JUMP, REST = 0.01, 4
+JUMP, REST_AFTER = 0.01, 4
 # An input that is smooth on both sides of a jump or a turn bends there this many times as much as
 # anywhere within so many samples.
-BENT, SMOOTH = 8.0, 16
-SURE = 6.0  # standard deviations of what noise bends: of 1e8 samples none are beyond
+BENT, SMOOTH_OVER = 8.0, 16
+BENT_BY_NOISE = 6.0  # standard deviations of what noise bends: of 1e8 samples none are beyond
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +112,7 @@ def times_of(found: Sequence[Meter | None]) -> int:
         return 0
     weight = np.array([max(meter.sd, LEAST) ** -2 for meter in known])
     late = float(weight @ [meter.late for meter in known] / np.sum(weight))
-    off = SURE / math.sqrt(float(np.sum(weight)))
+    off = BENT_BY_NOISE / math.sqrt(float(np.sum(weight)))
     times = round(1 / (2 * late)) if late > 0 else 0
     if times < 1 or abs(late - 1 / (2 * times)) > off:
         return 0
@@ -168,7 +168,7 @@ def calibrated(r: Float, step: float) -> tuple[Float, MeterNoise]:
     way = np.concatenate([_on(x[::-1])[::-1], x, _on(x)])
     spectrum = np.fft.rfft(way)
     power = np.abs(spectrum) ** 2 / r.size
-    around = ndimage.median_filter(power, min(BESIDE, power.size), mode="nearest") / np.log(2)
+    around = ndimage.median_filter(power, min(JUDGED_AMONG, power.size), mode="nearest") / np.log(2)
     clear = math.log(power.size / ONCE) * floor
     loud = around > HALF * floor
     expected = np.where(power > clear, power, np.where(loud, around, 0.0))
@@ -218,7 +218,7 @@ def meter_noise(r: Float, step: float) -> float:
     # An input that is held for some samples has a wide spectrum, too, but noise is in every sample.
     bends = TO_SD * float(np.median(np.abs(np.diff(r, 2)))) / math.sqrt(6)
     white = white and bends**2 > EVERY * floor
-    shown = white and METER * step**2 / 12 <= floor <= QUIET * np.max(power)
+    shown = white and METER_STANDS * step**2 / 12 <= floor <= BELOW_LARGEST * np.max(power)
     return float(np.sqrt(floor)) if shown else 0.0
 
 
@@ -236,16 +236,20 @@ def jumps(recording: Recording, command: int, kp: float, theta: Float | None) ->
         u = np.asarray(recording.values[:, command], np.float64)
         if theta is not None:
             u, still = u + kp * theta, recording.channels[command].resolution
-    if u.size <= 2 * REST:
+    if u.size <= 2 * REST_AFTER:
         return found
     d = np.diff(u)
     quiet = np.abs(d) <= still
-    rests = np.convolve(quiet, np.ones(REST), "full")[: d.size] == REST  # the REST last ones
+    rests = (
+        np.convolve(quiet, np.ones(REST_AFTER), "full")[: d.size] == REST_AFTER
+    )  # the REST_AFTER last ones
     after = np.append(False, rests[:-1])  # a rest ended just before
-    before = np.append(rests[REST:], np.zeros(REST, np.bool_))  # a rest begins just behind
+    before = np.append(
+        rests[REST_AFTER:], np.zeros(REST_AFTER, np.bool_)
+    )  # a rest begins just behind
     least = JUMP * np.nanmax(np.abs(u))
     edge = ~quiet & (np.abs(d) > least) & (after | before)
-    edge |= _bends(u, least) & ~ndimage.binary_dilation(edge, iterations=REST)
+    edge |= _bends(u, least) & ~ndimage.binary_dilation(edge, iterations=REST_AFTER)
     found[1:] |= edge
     found[:-1] |= edge
     return found
@@ -254,27 +258,29 @@ def jumps(recording: Recording, command: int, kp: float, theta: Float | None) ->
 def _bends(u: Float, least: float, noise: float = 0.0) -> NDArray[np.bool_]:
     """(n - 1,) of an input u (n,) the steps d = diff(u) at which it does not go on as it came: by
     more than `least`, and than white noise on u of a standard deviation may, d leaves the
-    oscillation d[i + 1] + d[i - 1] = 2 cos(w) d[i], whose w is that of `SMOOTH` samples before,
+    oscillation d[i + 1] + d[i - 1] = 2 cos(w) d[i], w that of `SMOOTH_OVER` samples before,
     behind, or on both sides: there a sweep's own change of w cancels.
     """
     d = np.diff(u)
     out = np.zeros(d.size, np.bool_)
-    if d.size <= 2 * (SMOOTH + REST):
+    if d.size <= 2 * (SMOOTH_OVER + REST_AFTER):
         return out
     both, mid = d[2:] + d[:-2], d[1:-1]
     bent = np.full(mid.size, np.inf)
     for before, behind in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0)):
-        sides = np.zeros(2 * (SMOOTH + REST) + 1)
-        sides[:SMOOTH], sides[-SMOOTH:] = behind, before  # a convolution turns them round
+        sides = np.zeros(2 * (SMOOTH_OVER + REST_AFTER) + 1)
+        sides[:SMOOTH_OVER], sides[-SMOOTH_OVER:] = behind, before  # a convolution turns them round
         turn, power = (np.convolve(x, sides, "same") for x in (mid * both, 2 * mid**2))
         cosine = np.divide(turn, power, out=np.ones_like(power), where=power > 0)
         twice = 2 * np.clip(cosine, -1.0, 1.0)
-        by_noise = SURE * noise * np.sqrt(2 + 2 * (1 + twice) ** 2)
+        by_noise = BENT_BY_NOISE * noise * np.sqrt(2 + 2 * (1 + twice) ** 2)
         bent = np.minimum(bent, np.maximum(np.abs(both - twice * mid) - by_noise, 0.0))
-    around = np.ones(2 * SMOOTH + 1, np.bool_)
-    around[SMOOTH - REST : SMOOTH + REST + 1] = False  # what the same jump bends
+    around = np.ones(2 * SMOOTH_OVER + 1, np.bool_)
+    around[SMOOTH_OVER - REST_AFTER : SMOOTH_OVER + REST_AFTER + 1] = (
+        False  # what the same jump bends
+    )
     beside = ndimage.maximum_filter(bent, footprint=around)
-    highest = bent == ndimage.maximum_filter1d(bent, 2 * REST + 1)
+    highest = bent == ndimage.maximum_filter1d(bent, 2 * REST_AFTER + 1)
     out[1:-1] = highest & (bent > BENT * beside) & (bent > least)
     return out
 
@@ -289,14 +295,14 @@ def _shown(recording: Recording, v: Float, law: Float) -> tuple[float, float, Fl
     """How many samples late a meter shows a law as v, the standard deviation of that, and what that
     leaves of v."""
     late, sd = 0.0, math.inf
-    for _ in range(ROUNDS):
+    for _ in range(FIT_ROUNDS):
         off = v - _filtered(recording, law, _mean(late))
         slope = _filtered(recording, law, (_mean(late + STEP) - _mean(late - STEP)) / (2 * STEP))
         known = np.isfinite(off) & np.isfinite(slope)
         if not known.any() or not np.any(slope[known]):
             break
         # Edges say nothing of a delay: they pass within a sample.
-        known &= np.abs(off) <= FAR * _sd(off)
+        known &= np.abs(off) <= BEYOND_METER * _sd(off)
         turns = float(slope[known] @ slope[known])
         if turns == 0:  # at rest for most of the record, and recorded as it was sent
             break
@@ -325,7 +331,7 @@ def _held(late: float) -> Float:
 
 def _weights(moments: Float) -> Float:
     """Exact for polynomials up to the order of the neighbours."""
-    return np.linalg.solve(np.vander(NEIGHBOURS, increasing=True).T, moments)
+    return np.linalg.solve(np.vander(BETWEEN_TAPS, increasing=True).T, moments)
 
 
 def _filtered(recording: Recording, x: Float, weights: Float) -> Float:
@@ -345,7 +351,7 @@ def _sd(off: Float) -> float:
 
 
 def _far(off: Float) -> NDArray[np.bool_]:
-    return np.asarray(np.abs(off) > FAR * _sd(off))
+    return np.asarray(np.abs(off) > BEYOND_METER * _sd(off))
 
 
 def _noise(off: Float, moves: Float, far: NDArray[np.bool_], step: float) -> bool:

@@ -11,7 +11,7 @@ SPACING = 0.2  # nodes, times the distance over which the reference's response t
 WIDEST = 0.1  # nodes, apart over frequency at most
 # Nodes over lines of the contour, at most, of a change that is free where noise is estimated: at
 # the lowest lines one a line would leave no noise to be seen.
-SPARE = 0.1
+FREE_NODES = 0.1
 BELOW = 2**0.5  # the same, below the band: a change of 1/s is linear between them to 3 %
 
 
@@ -28,7 +28,9 @@ def nodes_of(
     turning = np.linalg.norm(np.gradient(H, axis=0), axis=1) / np.linalg.norm(H, axis=1)
     each = 1 / np.maximum(np.arange(f.size), 1)
     if spare:
-        density = np.maximum(turning - 2 * each, 0.0) / SPACING + np.minimum(each / WIDEST, SPARE)
+        density = np.maximum(turning - 2 * each, 0.0) / SPACING + np.minimum(
+            each / WIDEST, FREE_NODES
+        )
     else:
         density = turning / SPACING + each / WIDEST
     place = np.cumsum(np.where(inside, np.minimum(density, 1.0), 0.0))

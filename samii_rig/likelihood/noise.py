@@ -34,7 +34,7 @@ FREEDOM = 12.0
 NARROWEST = 0.1
 # Corners of the colours, times the one before: a sum of them is within 5 % of any power of the
 # frequency from 0 to -2 (log-spaced relaxations; van der Ziel 1950, Physica 16).
-APART = 4.0
+CORNERS_APART = 4.0
 SMALL = 0.02  # of a bin's frequency, its width: over it no colour changes by more than 4 %
 TURN = 0.15  # nepers or rad, by which what a disturbance makes may change within a bin
 # Of the largest, what a disturbance makes that is rounding: a force at a place that is held. What
@@ -196,13 +196,13 @@ def _cholesky(C: Complex) -> Complex:
 
 def _corners(f: Float) -> Float:
     """Hz, from below the lowest line to above the highest, then white."""
-    count = int(np.ceil(np.log(f[-1] / f[0]) / np.log(APART))) + 1
-    return np.append(f[0] / APART * APART ** np.arange(count), np.inf)
+    count = int(np.ceil(np.log(f[-1] / f[0]) / np.log(CORNERS_APART))) + 1
+    return np.append(f[0] / CORNERS_APART * CORNERS_APART ** np.arange(count), np.inf)
 
 
 def _colours(f: Float, corners: Float) -> Float:
     """(n, c) of power, 1 at its largest over the band."""
-    lowest = corners[0] * APART
+    lowest = corners[0] * CORNERS_APART
     return np.asarray((1 + (lowest / corners) ** 2) / (1 + (f[:, None] / corners) ** 2))
 
 

@@ -22,7 +22,7 @@ WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
 # multiples that a rectifier or a motor drive makes of them.
 MAINS, STRAY, MULTIPLES = (50.0, 60.0), 0.01, (1, 2, 3)
 # Over the median of its neighbours, power of a line that stands out: noise does so at one in 4,000.
-STANDS, NEIGHBOURS = 12.0, 20
+STANDS, HUM_BESIDE = 12.0, 20
 
 # Of the rate, up to where records are used: aliases of both sides meet above.
 HIGHEST = 0.45
@@ -32,7 +32,7 @@ WITHIN, TAPS, LINES = 7, 24, 64
 
 # Power, of that of the shape which the lines show most, of one in lost samples that is looked at:
 # of what the reference leaves beside a straight line, 100 times the noise where much is amiss.
-SHOWN = 1e-5
+SHAPE_SHOWN = 1e-5
 
 
 def wander(n: int, k: Int, q: int) -> Complex:
@@ -152,7 +152,7 @@ def _shown(g: int, n: int, first: int, count: int) -> Float:
     turn = 2 * np.pi / n * np.outer(np.arange(g), first + np.arange(count))
     lines = np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
     values, shapes = np.linalg.eigh(lines @ lines.T)
-    kept = values > SHOWN * values[-1]
+    kept = values > SHAPE_SHOWN * values[-1]
     return np.asarray(shapes[:, kept])
 
 
@@ -184,7 +184,7 @@ def _tones(left: Complex, k: Int, step: float) -> list[float]:
         # Beyond an octave above the band what leaks into it is smooth and small.
         if first >= last or first > 2 * k[-1] or last < k[0]:
             continue
-        beside = np.r_[max(first - NEIGHBOURS, 1) : first, last + 1 : last + 1 + NEIGHBOURS]
+        beside = np.r_[max(first - HUM_BESIDE, 1) : first, last + 1 : last + 1 + HUM_BESIDE]
         floor = np.median(power[beside[beside < len(power)]], axis=0)
         over = power[first : last + 1] / np.where(floor > 0, floor, np.inf)
         at, sensor = np.unravel_index(int(np.argmax(over)), over.shape)

@@ -34,8 +34,8 @@ BEGINS = 256  # samples that are looked at first
 NEW = 1e-5  # of the largest, a direction in which past inputs still differ
 # Of chi-square, motion from before a piece whose change shows: 10 noise units, of which a tenth
 # makes one.
-SHOWN = 100.0
-ROUNDS = 100.0  # over rounding alone, what a response on the contour is off; a mode's 35
+PAST_SHOWN = 100.0
+OVER_ROUNDING = 100.0  # over rounding alone, what a response on the contour is off; a mode's 35
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +71,7 @@ class Past:
         largest = [np.max(np.abs(one[: contour.samples // 2]), axis=0) for one in each]
         spectra, at = [], []
         for lag in lags:
-            off = ROUNDS / NEW * contour.rounding(int(lag) + known)
+            off = OVER_ROUNDING / NEW * contour.rounding(int(lag) + known)
             for j, (one, most) in enumerate(zip(each, largest, strict=True)):
                 y = one[lag + piece.history : lag + known]
                 # Of what has died out rounding alone would be left, in directions that nothing
@@ -160,7 +160,7 @@ def shown(square: Float, head: Float, m: int) -> Float | None:
     own = square[:m, :m] - across @ across.T
     pull = head[:m] - across @ (others.T @ head[m:])
     found = np.linalg.solve(own + np.eye(m), pull)
-    return np.asarray(found) if float(found @ pull) > SHOWN else None
+    return np.asarray(found) if float(found @ pull) > PAST_SHOWN else None
 
 
 def _independent(shapes: Complex) -> tuple[Float, Float]:

@@ -25,7 +25,7 @@ LEAST_SAMPLES = 256  # fewer say nothing of a structure
 # Samples of a piece: a longer stretch is several, so that work grows as its length does. A minute
 # at 1 kHz, in which all that rings comes to rest or is well determined.
 LONGEST = 2**16
-SHORT = 4096  # samples of a piece whose DFT takes a millisecond at most
+SHORT_DFT = 4096  # samples of a piece whose DFT takes a millisecond at most
 # Samples: across a longer gap whose input is a guess there are more nuisances than where a piece
 # begins, and no more is known of the motion behind it.
 GUESSED = 64
@@ -377,7 +377,7 @@ def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float)
 def _soon_transformed(low: int, high: int, lost: Int) -> int:
     """Where a stretch ends whose DFT takes no longer than it has to, at most 2 % earlier: that of
     a length with a large prime factor takes twelve times as long. Not within a gap (gaps, 2)."""
-    if high - low < SHORT:
+    if high - low < SHORT_DFT:
         return high
     end = low + int(fft.prev_fast_len(high - low, real=False))
     within = np.any((lost[:, 0] <= end) & (end <= lost[:, 1]))

@@ -19,7 +19,7 @@ STEPS = 200  # at most: without progress they end before
 PROGRESS = 0.02  # of the logarithm of the likelihood, gained by a step, that goes on
 # Power of a multiplicative step that never lowers the likelihood, and by how much longer the next
 # is: 55 steps lead as far as 200 that are all sure, and one in 15 comes back.
-SURE, LONGER = 0.5, 1.2
+SURE_STEP, LONGER = 0.5, 1.2
 LOUD = 1e-6  # of all, power of a component that counts
 REGULAR = 1e-9  # of each sensor's own power, that keeps C regular
 
@@ -36,14 +36,14 @@ def most_likely(u: Complex, S: Complex, w: Float, g: Float, known: Float) -> Flo
     power = np.repeat(q / np.where(mean > 0, mean, np.inf)[:, None], g.shape[1], axis=1)
     power /= K * g.shape[1] * np.mean(g, axis=0)
     A = _products(u)
-    before, far = -np.inf, SURE
+    before, far = -np.inf, SURE_STEP
     last, change = power, np.ones_like(power)
     for _ in range(STEPS):
         p = g @ power.T
         p[:, :q] += known
         log, a, b = _pulls(A, S, w, p)
         if log < before:  # too far: from the same place, a step that is sure
-            far = SURE if far > SURE else far / 2
+            far = SURE_STEP if far > SURE_STEP else far / 2
             power = last * change**far
             continue
         if log - before < PROGRESS:

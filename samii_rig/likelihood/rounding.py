@@ -28,7 +28,7 @@ HARMONIC = np.arange(1.0, 200.0)  # of a sawtooth: all but 0.3 % of its power
 # is within 10 % of 1 from here on.
 FEW = 3.0
 STILL = 1e-3  # steps, rms of a motion that has no factor worth estimating
-SHORT = 0.5  # s in which a motion that crosses no step is not read: some periods of the band
+UNREAD_FOR = 0.5  # s in which a motion that crosses no step is not read: some periods of the band
 ALIKE = 0.05  # of a rounding error, that repeats itself: repeats do not show it
 UNREAD = 6  # parts in which what is hardly read has a factor of its own
 # Of a step, noise sd from which a rounding error is white: the first harmonic of a sawtooth is the
@@ -37,10 +37,10 @@ DITHERED = 0.5
 UNSEEN = 0.05  # of a staircase's error, what dithering leaves of it that nobody sees
 # Times by which what rounding adds may differ between pieces of one group, and how many groups are
 # distinguished at most: each has bins of its own.
-APART, GROUPS = 1.5, 8
+GROUPS_APART, GROUPS = 1.5, 8
 # s for which what wanders, below the band, rests in its step: some periods of the band, from which
 # its place is determined.
-REST = 1.0
+RESTS_IN_STEP = 1.0
 OFFSETS = 16  # places of a motion in its step, at which its rounding is tried: within 25 % a line
 LIKELY = 4  # of these, that are nearest to what is read
 
@@ -91,7 +91,7 @@ class Added:
         level = np.stack([_at(f, x) for x in each])
         largest = np.max(level, axis=(0, 1))
         level = np.log(np.maximum(level, 1e-3 * np.where(largest > 0, largest, 1.0)))
-        apart = math.log(APART)
+        apart = math.log(GROUPS_APART)
         while True:
             first: list[int] = []
             group = []
@@ -156,7 +156,7 @@ class Rounding:
             shares = np.array([c.part for c in piece.commands] or [1.0])
             moved = y[:, i] / step[i]
             if shares.size == 1 and not piece.repeats and not piece.contrasts:
-                width = max(int(REST * rate_hz), 3)
+                width = max(int(RESTS_IN_STEP * rate_hz), 3)
                 moved = moved + _wandering(moved, piece.z[:, i] / step[i], width)
             errors = _errors(moved, shares, parts, sd / step[i])
             spectra = np.fft.rfft(step[i] / math.sqrt(n) * errors, axis=1)
@@ -211,7 +211,7 @@ def _parts(piece: Piece, y: Float, step: float, sd: float, rate_hz: float) -> Fl
     proportion, less its mean: each stretch its own, as a part may rest at another place after it
     was moved. In parts of equal power: the factor depends on the amplitude. sd : of the noise."""
     times = math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
-    width = max(int(SHORT * rate_hz), 3)
+    width = max(int(UNREAD_FOR * rate_hz), 3)
     high, low = ndimage.maximum_filter1d(y, width), ndimage.minimum_filter1d(y, width)
     still = high - low < FEW * step * times
     labels, count = ndimage.label(still)

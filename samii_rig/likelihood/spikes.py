@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from samii_rig.types import Float
 
-FAR = 8.0  # robust standard deviations; of Gaussian noise one sample in 1e15 is as far off
+SPIKE = 8.0  # robust standard deviations; of Gaussian noise one sample in 1e15 is as far off
 QUIET = 5.0  # the same, of a sample that is as its neighbours are
 REACH = 2  # samples on either side, through which the cubic runs
 BLOCK = 256  # samples, over which the scale of what is missed is one number
@@ -70,7 +70,7 @@ def as_predicted(e: Float, spikes: Sequence[Spike], step: Float) -> list[Spike]:
 def _alone(z: Float, off: Float, scale: Float, others: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Samples that are far off, without which their neighbours are not."""
     high = np.abs(off)
-    far = np.flatnonzero((high > FAR * scale) & ~others)
+    far = np.flatnonzero((high > SPIKE * scale) & ~others)
     far = far[(far > 2 * REACH) & (far < z.size - 2 * REACH - 1)]
     far = np.array([i for i in far if high[i] == high[i - REACH : i + REACH + 1].max()], np.int64)
     kept = []

@@ -16,7 +16,7 @@ from samii_rig.types import Complex, Float, Int
 
 # Parts of the lines in each of which what is added does as much, and what it may be off by in one:
 # the laws of both plants are by less than this part of what they do.
-PARTS, INEXACT = 8, 0.1
+EVEN_PARTS, INEXACT = 8, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +117,8 @@ def evenly(
         f.append(a.k / n)
     order = np.argsort(np.concatenate(f))
     gain, p = (np.concatenate(x)[order] for x in (fall, square))
-    ends = np.searchsorted(np.cumsum(p), np.sum(p) * np.arange(1, PARTS) / PARTS)
+    ends = np.searchsorted(np.cumsum(p), np.sum(p) * np.arange(1, EVEN_PARTS) / EVEN_PARTS)
     gain, p = (np.add.reduceat(x, np.unique(np.append(0, ends))) for x in (gain, p))
     variance = 4 * p * max(times, 1.0) + (INEXACT * p) ** 2
     off = float(np.sum((gain - p)[p > 0] ** 2 / variance[p > 0]))
-    return float(stats.chi2.sf(off, PARTS))
+    return float(stats.chi2.sf(off, EVEN_PARTS))

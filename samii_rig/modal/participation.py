@@ -16,7 +16,7 @@ import numpy as np
 from samii_rig.modal.rational import Rational
 from samii_rig.types import Complex, Float
 
-STEPS = 20  # of Gauss-Newton; three are usual
+NEWTON_STEPS = 20  # of Gauss-Newton; three are usual
 SETTLED = 1e-10  # relative step at which it ends
 
 
@@ -51,7 +51,7 @@ def factored(model: Rational, pairs: Sequence[int], n_in: int) -> tuple[Factored
     starts = [_start(R[:, m].reshape(-1, n_in), size[2 + k * (2 + 2 * p) :][: 2 * p])
               for k, m in enumerate(pairs)]  # fmt: skip
     y = [(complex(model.pairs[m]), *start) for m, start in zip(pairs, starts, strict=True)]
-    for _ in range(STEPS if n_in > 1 else 0):
+    for _ in range(NEWTON_STEPS if n_in > 1 else 0):
         J, now = _map(y)
         N = J.T @ metric @ J
         step = np.linalg.solve(N, J.T @ metric @ (x - now))

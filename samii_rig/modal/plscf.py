@@ -23,7 +23,8 @@ Coefficients = Literal["real", "complex"]
 
 ROOM = 1.05  # the polynomials' own band over the data's: its two ends are one point
 NEAR_REAL = 0.05  # Im/|s| below which a pole is a real one, which no resonance curve shows
-RIDGE = 1e-12  # relative, of the numerators' normal equations: powers beyond what a band determines
+# Relative, of the numerators' normal equations: powers beyond what a band determines
+NUMERATOR_RIDGE = 1e-12
 
 
 def poles_by_order(
@@ -89,12 +90,12 @@ def _denominator(sums: tuple[Complex, Complex, Complex], order: int) -> Complex:
     M = np.zeros((size * n_in, size * n_in), dtype=np.complex128)
     for o in range(w.shape[0]):
         R = toeplitz(w[o, zero - np.arange(size)], w[o, zero : zero + size])
-        R = R + RIDGE * size * np.eye(size) * w[o, zero]
+        R = R + NUMERATOR_RIDGE * size * np.eye(size) * w[o, zero]
         S = wh[o, lag].reshape(size, size * n_in)
         T = whh[o, lag].transpose(0, 2, 1, 3).reshape(size * n_in, size * n_in)
         M += T - S.conj().T @ np.linalg.solve(R, S)
     inner = M[n_in:, n_in:]
-    ridge = RIDGE * np.trace(inner).real / max(order * n_in, 1) * np.eye(order * n_in)
+    ridge = NUMERATOR_RIDGE * np.trace(inner).real / max(order * n_in, 1) * np.eye(order * n_in)
     alpha = np.linalg.solve(inner + ridge, -M[n_in:, :n_in])
     return np.asarray(alpha.reshape(order, n_in, n_in))
 

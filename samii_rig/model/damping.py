@@ -25,7 +25,7 @@ from samii_rig.types import Complex, Float
 
 PER_DECADE = 2.0  # relaxations
 OUTSIDE = 2.2  # factor by which the relaxations reach beyond the band on each side
-POINTS = 200  # frequencies of the fit
+LOSS_POINTS = 200  # frequencies of the fit
 ALONE = 0.05  # half width around a zero without relaxation to its left (a viscous beam's)
 EI, ETA, TAU, GA = 0, 3, 4, 5  # places among the beams' parameters; a Beam has 0 for GA
 
@@ -84,12 +84,12 @@ def fit_loss(eta: float, tau: float, low_hz: float, high_hz: float) -> Relaxatio
     decades = np.log10(high_hz / low_hz * OUTSIDE**2)
     n = max(2, int(np.ceil(PER_DECADE * decades)) + 1)
     b = 2 * np.pi * np.geomspace(low_hz / OUTSIDE, high_hz * OUTSIDE, n)
-    w = 2 * np.pi * np.geomspace(low_hz, high_hz, POINTS)
+    w = 2 * np.pi * np.geomspace(low_hz, high_hz, LOSS_POINTS)
     terms = 1j * w[:, None] / (1j * w[:, None] + b)
     # Loss factor = Im/Re; the real part is not known before a, so repeat: it converges at once.
-    real = np.ones(POINTS)
+    real = np.ones(LOSS_POINTS)
     for _ in range(4):
-        a = nnls(terms.imag / (eta * real)[:, None], np.ones(POINTS))[0]
+        a = nnls(terms.imag / (eta * real)[:, None], np.ones(LOSS_POINTS))[0]
         real = 1 + terms.real @ a
     kept = a > 0
     a, b, terms = a[kept], b[kept], terms[:, kept]

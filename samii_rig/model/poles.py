@@ -38,7 +38,8 @@ CUTS = (0.5, 0.47, 0.54, 0.41, 0.61, 0.35)  # where to cut a box if the middle m
 CLUSTER = 1e-5  # rad/s, zeros closer than this are one with a multiplicity
 MULLER_STEPS = 60
 NEWTON_STEPS = 12
-WIDTH, SETTLED = 1e-7, 1e-10  # of a place: of the difference for a step, and of a step that is none
+# Of a place: of the difference for a step, and of a step that is none
+STEP_WIDTH, SETTLED = 1e-7, 1e-10
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +262,7 @@ def _newton(D: Characteristic, s: Complex) -> Complex:
     settled = np.zeros(s.size, dtype=bool)
     for _ in range(NEWTON_STEPS):
         size = np.maximum(np.abs(s), 1.0)
-        slope, mantissa, _ = _log_derivative(D, s, WIDTH * size)
+        slope, mantissa, _ = _log_derivative(D, s, STEP_WIDTH * size)
         step = np.where(mantissa == 0, 0.0, 1 / np.where(slope == 0, 1 / size, slope))
         step *= np.minimum(1.0, size / np.maximum(np.abs(step), size))
         s = s - np.where(real, step.real, step)

@@ -51,8 +51,8 @@ BAND_OVER_RATE = 4.0  # default band of the pole search over the sample rate
 STRIP = 1.0  # rad/s, half height of the strip along the real axis
 HOLE = 0.02  # half width of a hole over the rate 1/tau that it stands around
 RIGHT = 0.02  # right edge of the region over its top: an undamped pole must lie inside
-CIRCLE = 0.4  # radius of a residue's circle over the distance to the next pole
-BEYOND = (1.5, 4.0)  # relaxations beyond the region, over its left edge
+POLE_CIRCLE = 0.4  # radius of a residue's circle over the distance to the next pole
+RELAXED_BEYOND = (1.5, 4.0)  # relaxations beyond the region, over its left edge
 LOSS_LOW = 2e-4  # lowest frequency at which a loss factor is kept, over the rate
 ERROR_LOW = 1e-4  # lowest frequency at which the error is given, over the rate
 APART = 1e-6  # smallest distance of a filter's pole from one of the chain, over its modulus
@@ -118,7 +118,7 @@ def _relaxations(region: Region) -> Complex:
     """Poles on the real axis for what lies in the region's holes and left of it, rad/s."""
     # Two in each hole: the poles gathered there lie left of where the modulus vanishes.
     holes = [x for low, high in region.holes for x in (low, (low + high) / 2)]
-    return np.array([*holes, *(region.left * x for x in BEYOND)], dtype=np.complex128)
+    return np.array([*holes, *(region.left * x for x in RELAXED_BEYOND)], dtype=np.complex128)
 
 
 def realise(rig: Rig, band_hz: float | None = None, near: Complex | None = None) -> Realisation:
@@ -271,7 +271,7 @@ def _radii(poles: Complex, region: Region) -> Float:
         y = np.clip(poles.imag, 0, (high - low) / 2)
         nearest = np.minimum(nearest, np.abs(poles - (x + 1j * y)))
     nearest = np.where(np.isfinite(nearest), nearest, 1.0 + np.abs(poles))
-    return np.asarray(CIRCLE * nearest)
+    return np.asarray(POLE_CIRCLE * nearest)
 
 
 def _refuse_double(rig: Rig, poles: Complex, R: Complex, second: Complex, radius: Float) -> None:

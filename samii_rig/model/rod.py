@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from samii_rig.model.timoshenko import LONG, ROWS, SORT, TERMS
+from samii_rig.model.timoshenko import LONG_BEAM, ROWS, SORT, TERMS
 from samii_rig.types import Complex, Float
 
 EA, MU, LENGTH, TAU = range(4)  # places among the parameters
@@ -26,7 +26,7 @@ def _waves(s: Complex, p: Float) -> tuple[Complex, Complex, Complex, np.ndarray]
     G = np.asarray(p[EA] * (1 + s * p[TAU]))
     m = np.asarray(p[MU] * s**2)
     lam = np.sqrt(m / np.where(G == 0, 1.0, G))
-    return G, m, lam, np.asarray(np.abs(lam) * p[LENGTH] > LONG)
+    return G, m, lam, np.asarray(np.abs(lam) * p[LENGTH] > LONG_BEAM)
 
 
 def matrix(s: Complex, p: Float) -> Complex:

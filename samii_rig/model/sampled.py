@@ -23,7 +23,7 @@ from samii_rig.types import Complex, Float
 ALIAS_TOLERANCE = 1e-5  # of each response, change by the last doubling of the aliases
 FIRST_ALIASES = 16  # aliases on each side to begin with
 # Ratio of a doubling's sum to the last, below which the rest is extrapolated: 1/f^2 has 0.5.
-SETTLED = 0.7
+SETTLED_RATIO = 0.7
 BLOCK = 128  # frequencies at once, so that memory stays bounded
 MAX_ALIASES = 4096  # on each side; the terms fall at least as 1/f^2 from there
 
@@ -203,7 +203,7 @@ def _aliased(rig: Rig, chain: Chain, f: Float, tolerance: float) -> Complex:
         part = end + both(np.arange(reached + 1, upto)) + half
         total += part
         ratio = np.divide(part, last, out=np.zeros_like(part), where=np.abs(part) < np.abs(last))
-        rest = np.where(np.abs(ratio) < SETTLED, part * ratio / (1 - ratio), half)
+        rest = np.where(np.abs(ratio) < SETTLED_RATIO, part * ratio / (1 - ratio), half)
         off = np.minimum(np.abs(part), np.abs(total + rest - estimate))
         estimate, last, end = total + rest, part, half
         if upto >= MAX_ALIASES or np.all(off <= tolerance * np.abs(total)):

@@ -21,7 +21,7 @@ import numpy as np
 
 from samii_rig.types import Complex, Float
 
-LONG = 1.5  # |lambda_1| L from which the waves are used: they lose (lambda L)^-3 at most
+LONG_BEAM = 1.5  # |lambda_1| L from which the waves are used: they lose (lambda L)^-3 at most
 TERMS = 26  # of the power series: 1.5^26/26! < 1e-22
 # The same of a beam with tension, which its waves do not know to change: the series costs two
 # digits at |lambda_1| L = 5, and 5^48/48! < 1e-27.
@@ -29,7 +29,7 @@ TENSE_LONG, TENSE_TERMS = 5.0, 48
 EI, MU, LENGTH, ETA, TAU, GA, J, TENSION, SLOPE = range(9)  # places among the parameters
 # Of a sum, terms that add nothing to it, and how many of them one after another end it: those of
 # one state come every fourth time.
-TINY, SMALL = 1e-17, 4
+NO_TERM, SMALL = 1e-17, 4
 RIGID_IN_SHEAR = 1e150  # N, GA of a beam without shear: its reciprocal adds to no other number
 ROWS = 34  # P (16), Q (16), E1, E2
 SORT = np.zeros((4, 4))  # (w, theta, M, V) to (theta, w, M, V): theta leads, as in the sweep
@@ -73,7 +73,7 @@ def waves(s: Complex, p: Float) -> Waves:
     B, G = p[EI] * g, p[GA] * g
     m, j = p[MU] * s**2, p[J] * s**2 + p[TENSION]
     numbers, vectors, dual = _waves(m, j, B, G)
-    reach = TENSE_LONG if _tense(p) else LONG
+    reach = TENSE_LONG if _tense(p) else LONG_BEAM
     long = np.max(np.abs(numbers), axis=0) * p[LENGTH] > reach
     return Waves(g, numbers[0], numbers[1], np.asarray(long), vectors, dual)
 
@@ -156,7 +156,7 @@ def _across(s: Complex, p: Float) -> Complex:
 
 @numba.njit(inline="always")
 def _adds(term: complex, total: complex) -> bool:
-    return abs(term.real) + abs(term.imag) > TINY * (abs(total.real) + abs(total.imag))
+    return abs(term.real) + abs(term.imag) > NO_TERM * (abs(total.real) + abs(total.imag))
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -18,7 +18,7 @@ PUBLISHED = "#8a5a00"  # what the paper says: spans and dashed lines
 SMALL = 7.5  # points
 WIDE = 2000.0  # greatest over least x from which only powers of ten are written out
 SHOWN = 140  # points of a dense curve
-FEW = 40  # points; more are drawn without error bars of their own
+FEW_POINTS = 40  # points; more are drawn without error bars of their own
 
 
 def draw(picture: Picture) -> Figure:
@@ -104,7 +104,7 @@ def _curve(axes: Axes, c: Curve) -> None:
             if c.low is not None and c.high is not None:
                 axes.fill_between(c.x, c.low, c.high, color=colour, alpha=0.25, lw=0)
         case "points":
-            few = c.x.size <= FEW
+            few = c.x.size <= FEW_POINTS
             if few and c.low is not None and c.high is not None:
                 bars = np.array([c.y - c.low, c.high - c.y])
                 axes.errorbar(

@@ -47,7 +47,7 @@ BELOW = 5.0  # Hz, below which the perfect source must do
 BAND = (0.5, 38.0)  # Hz
 GRID = np.geomspace(*BAND, 1600)
 LINES = 400  # of the response that the actuator is fitted to
-AWAY = 1.3  # times the rig's, where c, k and p start
+START_AWAY = 1.3  # times the rig's, where c, k and p start
 FASTEST = 2 * np.pi * 200.0  # rad/s, a valve that is faster is not seen below 40 Hz
 ABOUT = 90.0  # degrees, the dip of Fig. 12
 DAMPED = (1e-3, 8e-3)  # s, C over K: from dips of 155 to 60 degrees
@@ -311,7 +311,7 @@ def _fitted() -> tuple[Number, ...]:
     names = actuated_joint(rig, ENCODER)
     values = {f"{e.name}.{s}": p.value for e in rig.element for s, p in parameters(e).items()}
     split = [n.partition(".") for n in names]
-    free = [Free(e, s, start=values[f"{e}.{s}"] * AWAY) for e, _, s in split]
+    free = [Free(e, s, start=values[f"{e}.{s}"] * START_AWAY) for e, _, s in split]
     found = fit_actuator([few], rig, ENCODER, free, band=BAND)
     return tuple(
         between(f"{n} fitted on the Bode diagram, over the rig's", v / values[n], "", 0.95, 1.05)

@@ -15,7 +15,7 @@ from samii_rig.types import Float
 
 BAND = (0.3, 60.0)  # Hz in which the frequencies of the tables lie
 ELEMENTS = 15  # of the beam, paper 1, section III-C
-KEPT = 4  # flexible modes beside the two rigid ones, paper 1, section III-C
+FLEXIBLE_KEPT = 4  # flexible modes beside the two rigid ones, paper 1, section III-C
 OURS = 0.002  # relative, of a published frequency
 BOTH = 5e-4  # relative, of the finite elements against the transfer matrices
 ROUNDING = 1e-7  # relative, below the transfer matrices to which a consistent mass may fall
@@ -31,8 +31,8 @@ def tmm_hz(rig: Rig) -> Float:
 
 def reduced_hz(mesh: Fem) -> Float:
     """Natural frequencies, Hz, of the reduced equations of motion (eq. 14) with the two active
-    joints held: rigid modes theta_2 and theta_3, `KEPT` flexible ones."""
-    few = reduce(mesh, flexible=KEPT, torque=["joint_3"])
+    joints held: rigid modes theta_2 and theta_3, `FLEXIBLE_KEPT` flexible ones."""
+    few = reduce(mesh, flexible=FLEXIBLE_KEPT, torque=["joint_3"])
     held = slice(few.n_rigid, None)
     return np.sqrt(eigh(few.K[held, held], few.M[held, held], eigvals_only=True)) / (2 * np.pi)
 
@@ -58,7 +58,13 @@ def table_1() -> Result:
         numbers += [
             beside(f"mode {i + 1}, TMM", tmm[i], by_tmm, "Hz", OURS),
             beside(f"mode {i + 1}, FEM, {ELEMENTS} elements", fem[i], by_fem, "Hz", OURS),
-            beside(f"mode {i + 1}, FEM reduced to 2 + {KEPT} modes", few[i], by_fem, "Hz", OURS),
+            beside(
+                f"mode {i + 1}, FEM reduced to 2 + {FLEXIBLE_KEPT} modes",
+                few[i],
+                by_fem,
+                "Hz",
+                OURS,
+            ),
         ]
     theirs = ("-4.3e-4", "-2.3e-4")
     for i in range(2):

@@ -28,7 +28,7 @@ from samii_rig.record.uff.channels import recording_sets, require_even
 from samii_rig.record.uff.file import write_uff
 from samii_rig.types import Recording
 
-_ROWS = 10_000  # of a CSV file that are made at a time
+_ROWS_AT_ONCE = 10_000  # of a CSV file that are made at a time
 _MAX_IDENTIFIER = 63  # characters of a variable's name in MATLAB
 _MAX_WAV = 1 << 32  # bytes: its lengths have 32 bits
 _RESERVED = ("time_s", "sequence", "quality", "channels", "units", "rate_hz", "start", "metadata")
@@ -84,8 +84,8 @@ def _write_csv(path: Path, r: Recording) -> None:
     with path.open("w", encoding="utf-8", newline="") as stream:
         stream.writelines(f"# {key}: {text}\n" for key, text in _about(r).items())
         stream.write(",".join(f'"{" ".join(label.split())}"' for label in labels) + "\n")
-        for at in range(0, len(r), _ROWS):
-            rows = slice(at, at + _ROWS)
+        for at in range(0, len(r), _ROWS_AT_ONCE):
+            rows = slice(at, at + _ROWS_AT_ONCE)
             columns = [time[rows].tolist(), r.sequence[rows].tolist()]
             columns += [column.tolist() for column in r.values[rows].T]
             columns += [r.quality[rows, i].tolist() for i in marked]

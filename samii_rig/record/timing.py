@@ -12,7 +12,7 @@ from samii_rig.types import Float
 
 # A step of a time column may be off a whole number of periods by this much, as the import has it.
 _JITTER = 0.25
-_EVEN = 0.98  # of all steps, which are whole periods in a column of time
+_EVEN_PART = 0.98  # of all steps, which are whole periods in a column of time
 _TIMES = re.compile(r"^(t|time|zeit|temps|tid|timestamp|seconds|sec|x)([ _(].*)?$", re.IGNORECASE)
 _COUNTS = re.compile(r"^(n|i|k|no|nr|index|sample|samples|count|counter|seq|sequence)$", re.I)
 _PER_SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
@@ -86,7 +86,7 @@ def _rises(data: Float) -> bool:
     if not (steps > 0).all():
         return False
     periods = steps / float(np.median(steps))
-    return bool(np.mean(np.abs(periods - np.rint(periods)) <= _JITTER) >= _EVEN)
+    return bool(np.mean(np.abs(periods - np.rint(periods)) <= _JITTER) >= _EVEN_PART)
 
 
 def _is_count(name: str, data: Float) -> bool:

@@ -56,7 +56,7 @@ _MARGIN = 64.0
 _AXIS = 118.0  # height of the chain's line
 _LABEL_ROWS = (176.0, 222.0)  # names stand in two rows by turns, so that none touch
 _SENSOR_ROWS = (22.0, 52.0)
-_HEIGHT = 262.0
+_DRAWN_HEIGHT = 262.0
 _HALF = 13.0  # half height of a link
 _HALO = 25.0  # half height of the field behind a suspect
 
@@ -96,7 +96,7 @@ def draw(rig: Rig, suspects: Mapping[str, Suspect] | None = None) -> str:
         marked = (f"{name} {suspect.label}" for name, suspect in suspects.items())
         title += f". Suspect: {', '.join(marked)}"
     return (
-        f'<svg class="chain" viewBox="0 0 {width:.0f} {_HEIGHT:.0f}" role="img" '
+        f'<svg class="chain" viewBox="0 0 {width:.0f} {_DRAWN_HEIGHT:.0f}" role="img" '
         f'style="max-width:{1.35 * width:.0f}px">'
         f"<title>{escape(title)}</title>{''.join(shapes)}</svg>"
     )

@@ -22,7 +22,7 @@ _SIGNS = {
     Stability.SHAPE: ("shape, too", "circle", "@level0", "o", "#0072B2"),
 }
 _INCH = (7.0, 4.2)  # two columns of a page
-_PIXELS = 460
+_PANEL_PIXELS = 460
 _SHAPE_PIXELS = 300
 
 
@@ -38,7 +38,7 @@ def stabilisation(response: FrequencyResponse, found: ModalModel) -> Figure:
     f, total = response.frequency, response_sum(response)
     use = (f >= found.frequency[0]) & (f <= found.frequency[-1]) & (total > 0)
     f, total = f[use], total[use]
-    layout = base_layout(_PIXELS)
+    layout = base_layout(_PANEL_PIXELS)
     d = found.diagram
     layout["xaxis"] = axis("frequency [Hz]") | {"hoverformat": ".4g"}
     log_scale(layout["xaxis"])

@@ -28,7 +28,7 @@ from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_wi
 from samii_rig.types import Channel, Float, FrequencyResponse, Int
 from samii_rig.units import pretty
 
-_BINS = 280  # of log-frequency, two points each: the pixels of the panel
+_PANEL_BINS = 280  # of log-frequency, two points each: the pixels of the panel
 _NOISE_PART = 0.004  # of the lines may lie outside a gain axis
 _LEAST_PHASE = 40.0  # degrees of phase shown, so that a constant looks like one
 DEGREES = "%{y:.1f}\u00b0"
@@ -314,7 +314,7 @@ def label(r: FrequencyResponse) -> str:
     return f"{r.level:g} {r.level_unit}" if np.isfinite(r.level) else "measured"
 
 
-def lines_of(r: FrequencyResponse, i: int, j: int, bins_: int = _BINS) -> Int:
+def lines_of(r: FrequencyResponse, i: int, j: int, bins_: int = _PANEL_BINS) -> Int:
     """Indices of the lines to draw: all, or the extremes in each of `bins_` of log-frequency."""
     f, gain = r.frequency, np.abs(r.H[:, i, j])
     usable = np.flatnonzero((f > 0) & np.isfinite(gain))

@@ -31,7 +31,7 @@ from samii_rig.safety.limits import gate_limits
 from samii_rig.units import pretty
 
 LISTEN = 2.0  # s
-LATE = 0.01  # s that a sleep may end too late at worst
+SLEEP_LATE = 0.01  # s that a sleep may end too late at worst
 LATENCY_TIMER = 1  # ms; adapters come with 16, longer than a tick
 DISK = 16 << 20  # bytes written to learn how fast the disk is
 SLOWEST = 5e6  # bytes/s; a rig of 8 channels at 1 kHz writes 0.1e6
@@ -77,7 +77,7 @@ def _machine() -> Check:
     with prioritised() as granted:
         pass
     found = f"sleeps end {1e3 * np.median(late):.2f} ms late, {1e3 * late.max():.1f} ms at worst"
-    if late.max() > LATE:
+    if late.max() > SLEEP_LATE:
         return Check("clock", "bad", found, "end other programs, or take a quieter machine")
     if not granted:
         remedy = "allow it: a line `USER - rtprio 1` in /etc/security/limits.conf, log in again"

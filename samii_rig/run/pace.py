@@ -26,7 +26,7 @@ PART = 0.3  # of what the deadman leaves beside LATE
 LEAST_PART = 0.08
 LEAST_AHEAD = 0.05  # s of reference that the device still has when the next is sent
 # On real time also for a host that is LATE, and for samples that come in blocks of up to 10 ms.
-AHEAD = 0.1
+SENT_AHEAD = 0.1
 # A tick that is asked for may take this part of the deadman's time, so that one late tick does
 # not trip it. Simulated time is never late and may use more of it, which saves ticks.
 DEADMAN_PART = 0.5
@@ -73,7 +73,7 @@ def choose_tick(settings: LoopSettings, device: OpenRig, rate_hz: float, simulat
 def choose_ahead(settings: LoopSettings, simulated: bool) -> float:
     """The lead of the reference, s; InputError if the one asked for is none to run on."""
     if settings.ahead is None:
-        return LEAST_AHEAD if simulated else AHEAD
+        return LEAST_AHEAD if simulated else SENT_AHEAD
     if not LEAST_AHEAD <= settings.ahead <= MAX_AHEAD / 2:
         expected = f"{LEAST_AHEAD:g} to {MAX_AHEAD / 2:g} s"
         raise InputError("loop", "ahead", settings.ahead, expected)

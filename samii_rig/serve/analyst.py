@@ -42,7 +42,7 @@ from samii_rig.workers import ends_with_its_parent
 if TYPE_CHECKING:
     from samii_rig.diagnose.result import Diagnosis
 
-EVERY = 1.0  # s between looks
+LOOK_EVERY = 1.0  # s between looks
 MEMORY = 8 << 30  # bytes of address space
 NICE = 5  # steps behind the loop and the service
 SITES = 4  # that are told
@@ -75,7 +75,7 @@ class Analyst:
             self._diagnose()
             took = time.monotonic() - begun
             # Of a long recording each look takes its time: half a processor at most.
-            time.sleep(max(EVERY - took, took))
+            time.sleep(max(LOOK_EVERY - took, took))
         # It may have ended while a look was taken.
         with suppress(RecordingError, MemoryError):
             self.look(last=True)

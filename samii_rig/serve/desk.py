@@ -23,7 +23,7 @@ from samii_rig.serve.places import Places
 from samii_rig.workers import ends_with_its_parent
 
 WORKERS = 2  # processes for whoever looks
-EACH = 8  # pieces of work of one asker at once: a page that opens a recording asks for four
+ONE_ASKER = 8  # pieces of work of one asker at once: a page that opens a recording asks for four
 WAITS = 20.0  # s for a place: longer than a report takes, and a person looks elsewhere by then
 WITHIN = 120.0  # s that a piece of work may take
 MEMORY = 8 << 30  # bytes of address space of one of them
@@ -69,7 +69,7 @@ class _Workers:
     """So many processes. Each is a pool of its own: one that breaks takes no other with it."""
 
     def __init__(self, many: int, waits: float) -> None:
-        self._places = Places(many, EACH, waits)
+        self._places = Places(many, ONE_ASKER, waits)
         self._all = [_pool() for _ in range(many)]
         self._idle = list(self._all)
 

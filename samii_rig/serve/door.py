@@ -18,7 +18,7 @@ from contextlib import suppress
 
 HEAD_WITHIN = 10.0  # s that a head may take: a phone's line at its worst needs two
 LOOK = 0.5  # s between looks at who owes a head
-AGAIN = 0.05  # s until the next try where the system has no descriptor to accept with
+ACCEPT_AGAIN = 0.05  # s until the next try where the system has no descriptor to accept with
 BACKLOG = 1024  # connections that wait in the system: those of an attack, all at once
 # A page holds up to 6 connections and a WebSocket; 64 viewers are let in (see `viewers`).
 MOST = 512
@@ -110,7 +110,7 @@ class Door:
                 except OSError:
                     # No descriptor is left, or who knocked is gone.
                     self._forget()
-                    await asyncio.sleep(AGAIN)
+                    await asyncio.sleep(ACCEPT_AGAIN)
                     continue
                 self._admit(connection, str(peer[0]) if peer else "")
                 # Those who are inside are heard between any two who come.

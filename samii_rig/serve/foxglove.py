@@ -32,8 +32,8 @@ from samii_rig.types import Channel, Quality, Role
 
 HOST = "127.0.0.1"
 BODE = "/bode"
-AGAIN = 5.0  # s after which /bode is sent once more, for who came meanwhile
-BACKLOG = 8192  # messages that wait for one viewer; a slow one loses the oldest
+SENT_AGAIN = 5.0  # s after which /bode is sent once more, for who came meanwhile
+VIEWER_BACKLOG = 8192  # messages that wait for one viewer; a slow one loses the oldest
 _ARRAY = {"type": "array", "items": {"type": "number"}}
 _BODE_SCHEMA = {
     "title": "samii_rig.Bode",
@@ -126,7 +126,7 @@ class Foxglove:
             port=self.port,
             capabilities=[],
             context=context,
-            message_backlog_size=BACKLOG,
+            message_backlog_size=VIEWER_BACKLOG,
         )
         self.port = self._server.port
 
@@ -168,7 +168,7 @@ class Foxglove:
                 return
             told = json.loads(path.read_text(encoding="utf-8"))["responses"]
             self._bode.log({"responses": [_plottable(r) for r in told]})
-            self._seen, self._due = written, now + AGAIN
+            self._seen, self._due = written, now + SENT_AGAIN
 
 
 def usual_channels(rig: Rig) -> tuple[Channel, ...]:

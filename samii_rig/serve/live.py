@@ -28,7 +28,7 @@ from samii_rig.types import Channel, Float, Int, SampleBlock
 MAGIC = b"SAMIILV1"
 SECONDS = 8.0  # of samples in the ring: what a viewer sees who comes late
 LEAST_ROWS = 1024
-MOST = 2**62  # of a count, so that what is reckoned with it fits numpy's integers
+LARGEST_COUNT = 2**62  # of a count, so that what is reckoned with it fits numpy's integers
 PAGE = 16384  # bytes for the description and for the progress, each
 # Header: magic, channels, rows, rate; then counts of rows that are whole and that are begun, the
 # service's sign of life in ns of the system's monotonic clock, and whether it knows enough.
@@ -64,7 +64,7 @@ class _Map:
 
     def count(self, at: int) -> int:
         """One of the header's counts; more than any run has is what was damaged."""
-        return min(int(_COUNT.unpack_from(self._data, at)[0]), MOST)
+        return min(int(_COUNT.unpack_from(self._data, at)[0]), LARGEST_COUNT)
 
     def put_count(self, at: int, value: int) -> None:
         """Write one of them, in one store."""

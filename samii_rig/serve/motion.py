@@ -26,7 +26,7 @@ from samii_rig.rig.schema import (
 from samii_rig.rig.schema.elements import BEAMS, RigidLink
 from samii_rig.types import Complex, Float
 
-LOWEST, HIGHEST, POINTS = 0.3, 0.1, 240  # Hz, of the sample rate, and frequencies between
+LOWEST, HIGHEST, MOTION_POINTS = 0.3, 0.1, 240  # Hz, of the sample rate, and frequencies between
 FIRST = 0.5  # Hz about which the first matrix is taken; the others an octave apart
 OCTAVES = 0.4  # standard deviation of the frequencies that one counts
 BENDS = 16  # points along a beam
@@ -62,7 +62,7 @@ def motion(rig: Rig) -> Motion | None:
     used = [rig.sensor[i] for i in at]
     beams = [e for e in rig.element if isinstance(e, BEAMS)]
     positions = {e.name: np.linspace(0, e.L.value, BENDS + 1).tolist() for e in beams}
-    f = np.geomspace(LOWEST, HIGHEST * rig.rate_hz, POINTS)
+    f = np.geomspace(LOWEST, HIGHEST * rig.rate_hz, MOTION_POINTS)
     try:
         chain = Chain(rig)
         W = chain.field(f, positions=positions)[..., 0]

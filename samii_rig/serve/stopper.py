@@ -39,8 +39,8 @@ from samii_rig.serve.job import ask_all_to_stop, moving
 if TYPE_CHECKING:
     from samii_rig.serve.settings import Settings  # loads much that is not needed here
 
-MOST = 64  # connections at once: stops, of which one is enough
-LOOK = 0.1  # s between looks at whether it is still needed
+STOPS_AT_ONCE = 64  # connections at once: stops, of which one is enough
+STILL_NEEDED = 0.1  # s between looks at whether it is still needed
 AGAIN = 0.5  # s between looks at whether it still runs
 LEAVES_WITHIN = 1.0  # s in which it ends after the service, where there is no run to stay for
 REASONS = {200: "OK", 204: "No Content", 400: "Bad Request", 404: "Not Found", 431: "Too Large"}
@@ -193,7 +193,7 @@ async def _serve(arguments: argparse.Namespace) -> None:
         return Tokens(arguments.tokens) if arguments.tokens else None
 
     listening = socket.socket(fileno=arguments.listening)
-    door = Door(listening, lambda g: Stopper(g, arguments.jobs, tokens), MOST, tls=tls)
+    door = Door(listening, lambda g: Stopper(g, arguments.jobs, tokens), STOPS_AT_ONCE, tls=tls)
     opened = asyncio.create_task(door.open())
     await _needed(arguments.jobs, arguments.lock)
     opened.cancel()
@@ -207,7 +207,7 @@ async def _needed(jobs: Path, lock: Path) -> None:
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(ended), sys.stdin)
     await ended.read()
     while moving(jobs) and _text(lock) == served_by:
-        await asyncio.sleep(LOOK)
+        await asyncio.sleep(STILL_NEEDED)
 
 
 def _text(path: Path) -> str:

@@ -14,10 +14,10 @@ from typing import Any
 
 from samii_rig.errors import RecordingError
 
-MEMORY = 2 << 30  # bytes of address space; numpy and its libraries take 0.7 of them
+UPLOAD_MEMORY = 2 << 30  # bytes of address space; numpy and its libraries take 0.7 of them
 CPU = 60  # s
 COMMAND = ("-m", "samii_rig.serve.upload")  # of this Python
-WITHIN = 90.0  # s on the clock
+UPLOAD_WITHIN = 90.0  # s on the clock
 
 
 async def checked(path: Path) -> dict[str, Any]:
@@ -31,18 +31,18 @@ async def checked(path: Path) -> dict[str, Any]:
         stderr=asyncio.subprocess.DEVNULL,
     )
     try:
-        out, _ = await asyncio.wait_for(process.communicate(), WITHIN)
+        out, _ = await asyncio.wait_for(process.communicate(), UPLOAD_WITHIN)
     except TimeoutError as error:
         process.kill()
         await process.wait()
-        raise RecordingError(f"it could not be checked in {WITHIN:g} s") from error
+        raise RecordingError(f"it could not be checked in {UPLOAD_WITHIN:g} s") from error
     except asyncio.CancelledError:
         process.kill()
         raise
     try:
         found: dict[str, Any] = json.loads(out)
     except ValueError as error:
-        limits = f"{CPU} s and {MEMORY >> 30} GB"
+        limits = f"{CPU} s and {UPLOAD_MEMORY >> 30} GB"
         raise RecordingError(f"it could not be checked within {limits}") from error
     if found["status"] != "whole":
         raise RecordingError(f"it is not whole: {found['problem']}")
@@ -51,7 +51,7 @@ async def checked(path: Path) -> dict[str, Any]:
 
 def main() -> None:
     """Entry point of the process."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_AS, (UPLOAD_MEMORY, UPLOAD_MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (CPU, CPU))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))

@@ -20,7 +20,7 @@ from samii_rig.types import Complex, Float
 
 HALF = 4  # lines on each side; a mode of 2 lines half-power width is fitted to 1e-3
 DEGREE = 2  # of the numerators; the common denominator has 1
-WINDOW = 2 * HALF + 1
+SMOOTHED_OVER = 2 * HALF + 1
 ROUNDS = 60  # of expectation and maximisation; 20 to 30 are usual
 SETTLED = 1e-3  # relative change of S and N at which they end
 # Least N over an output's noise: none is left without any of its own (a Heywood case).
@@ -32,7 +32,7 @@ def from_neighbours(H: Complex) -> Complex:
 
     H (1 + d x) = b_0 + b_1 x + b_2 x^2 by linear least squares, d common to the outputs, x the
     number of lines from the middle. At the ends of the band the windows lie to one side.
-    Needs n_freq >= `WINDOW`.
+    Needs n_freq >= `SMOOTHED_OVER`.
     """
     n = len(H)
     middle = np.clip(np.arange(n), HALF, n - 1 - HALF)

@@ -47,7 +47,7 @@ DISTINCT = 0.5
 # Lines that can be told from a transient below which a response is estimated by Welch's windows:
 # with fewer nothing is diagnosed. Windows for each output, so that with those that overlap the
 # covariance of all outputs' noise is known; and samples of one, below which it has hardly a line.
-LEAST_CLEAR, WINDOWS, SHORTEST = 12, 4, 64
+LEAST_CLEAR, WINDOWS, SHORTEST_WINDOW = 12, 4, 64
 # Of an input's largest line, power up to which windows are of use: a step has that at 300 lines.
 REACH = 1e-5
 
@@ -369,7 +369,7 @@ def _local_or_windows(
     except _UnclearError as error:
         shortest, p = min(len(piece.z) for piece in group.pieces), len(group.selection.outputs)
         samples = shortest // (WINDOWS * p)
-        if chosen or samples < SHORTEST:
+        if chosen or samples < SHORTEST_WINDOW:
             raise
         return _welch(group, "h1", samples, error.band, str(error))
 

@@ -67,7 +67,7 @@ def pooled(e: Complex, dof_per_line: float, lines: int, H: Complex | None = None
     columns = () if H is None else H.reshape(n_freq, p, -1).transpose(2, 0, 1)
     data, paid = dof_per_line * n_freq, 0.0
     taken = np.asarray(np.eye(p), complex)
-    for column in columns if lively and n_freq >= disturbance.WINDOW else ():
+    for column in columns if lively and n_freq >= disturbance.SMOOTHED_OVER else ():
         near = disturbance.from_neighbours(column) / rms
         if through_input:  # what another input's disturbance left is what this one may explain
             near = np.asarray(np.linalg.solve(taken, near[:, :, None])[:, :, 0], complex)

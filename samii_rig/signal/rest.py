@@ -29,7 +29,8 @@ TAIL_LOUD = 0.03
 # What a burst still knows of the start from rest may reach this many standard deviations of the
 # tail's strongest line: spread over the whole burst it is then below the noise of the estimate.
 FORGOTTEN = 5.0
-AROUND = 5  # lines over which a tail's scatter is estimated at the least: two repeats have one each
+# Lines over which a tail's scatter is estimated at the least: two repeats have one each
+LINES_AROUND = 5
 # Of the power of the tail's strongest line: noise that bursts without any are taken to have.
 NOISELESS = 1e-24
 NEVER = 1_000_000
@@ -100,7 +101,7 @@ def _settled_after(ends: Float, highest: float, n: int) -> int:
     own = np.stack([_hann(x) for x in ends])[:, 1 : max(2, int(highest * tail) + 1)]
     ring, half = own.mean(axis=0), tail // 2
     noise = np.mean(np.abs(own - ring) ** 2, axis=0) / max(count - 1, 1)
-    near = uniform_filter1d(noise, AROUND, axis=0, mode="constant")
+    near = uniform_filter1d(noise, LINES_AROUND, axis=0, mode="constant")
     size = np.maximum(near, noise.mean(axis=0))
     weight = 1 / (size + NOISELESS * np.max(np.abs(ring) ** 2, axis=0) + 1e-300)
     power = np.sum(weight * np.abs(ring) ** 2, axis=1)

@@ -26,7 +26,7 @@ EXCITED = 1e-3
 CHANCE = 10.0
 # Lines times the square of their mean cosine about a shift, from which a band is none where frames
 # are few that hold a line: 8 of 100 bands of noise reach it, 1 in 10 of them near the shift.
-ALIKE = 2.5
+BAND_ALIKE = 2.5
 SHORTEST, LONGEST = 32, 2048  # samples of a window: 13 lines, and those that resolve a resonance
 SKIPPED = 2  # lines from 0 on, where the window leaks what was taken out with the mean
 # Bands of equal information that each show the same shift: what turns the phase about a resonance
@@ -121,7 +121,7 @@ def shift_between(first: Phases, other: Phases) -> int:
         late = tried[np.argmin(off[part].sum(axis=(0, 1)))]
         near = np.cos(turned + shift * first.omega)[part][weight[part] > 0]
         far = abs(late - shift) > WHOLE + 2 / np.sqrt(told[part].sum())
-        if far or near.size * near.mean() ** 2 < ALIKE:
+        if far or near.size * near.mean() ** 2 < BAND_ALIKE:
             return 0
     return shift if abs(shift) <= FARTHEST else 0
 

@@ -25,7 +25,7 @@ from samii_rig.types import Complex, Float, FrequencyResponse
 
 # A local quadratic fit over m lines has 9/(4 m) of a line's variance, and neighbours share
 # their data: 9/4 of the m estimates are independent.
-INDEPENDENT = 2.25
+NEIGHBOURS_SHARE = 2.25
 LOCAL_PARAMETERS = 6  # complex numbers of a local model at least: H and a transient, quadratic
 REFUSED = 0.01  # p-value below which a model is said not to fit
 
@@ -113,7 +113,7 @@ def shared_lines(response: FrequencyResponse) -> tuple[float, float]:
     dof, n = float(np.median(response.dof)), response.n_averages
     if response.estimator == "local":
         window = (dof + LOCAL_PARAMETERS) / max(n, 1)
-        return max(1.0, window), max(1.0, window / INDEPENDENT)
+        return max(1.0, window), max(1.0, window / NEIGHBOURS_SHARE)
     return max(1.0, dof / max(n - 1, 1)), 1.0
 
 

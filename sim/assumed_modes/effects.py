@@ -27,7 +27,7 @@ from sim.assumed_modes.parts import (
 
 Rng = np.random.Generator
 Numbers = dict[str, float]
-NEAR = 0.02  # of a link's length within which a place counts as its end
+NEAR_END = 0.02  # of a link's length within which a place counts as its end
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,9 +127,9 @@ def _at_end(setup: Setup, on: str, x: float) -> tuple[str, ...]:
     if part.kind not in EXTENDED:
         return _port_names(setup, on, jump=False)
     before = [p.name for p in setup.parts][: [p.name for p in setup.parts].index(on)]
-    if x >= (1 - NEAR) * part.values["L"]:
+    if x >= (1 - NEAR_END) * part.values["L"]:
         return _port_names(setup, on)
-    if x <= NEAR * part.values["L"]:
+    if x <= NEAR_END * part.values["L"]:
         return _port_names(setup, before[-1] if before else None)
     return (on,)
 

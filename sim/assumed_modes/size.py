@@ -13,7 +13,7 @@ from sim.assumed_modes.sigma import Bench, Left, Records, Refit
 from sim.assumed_modes.simulate import Control, clean
 
 LEAST, MOST = 3.0, 300.0  # sigma of an effect, drawn evenly in the logarithm between them
-CLOSE = 1.25  # ratio to the drawn sigma that is near enough; the truth says what it is
+SIZE_CLOSE = 1.25  # ratio to the drawn sigma that is near enough; the truth says what it is
 NEAR = 1.0  # tolerance; a refit that moves nothing by more has one minimum
 UNLIKELY = 3.0  # tolerances; a refit that moves one by more may have been led astray
 GROWN = 16  # steps in which an effect grows; with 8 a joint six tolerances stiffer is not followed
@@ -60,7 +60,7 @@ def solve(
     draft: Draft,
     of: Callable[[float], Records],
     target: float,
-    close: float = CLOSE,
+    close: float = SIZE_CLOSE,
 ) -> tuple[float, Left] | None:
     """The strength that leaves about `target` sigma, with what it leaves; None if none does.
 
@@ -97,7 +97,7 @@ def solve(
         x = min(x * float(np.clip(ratio ** (-1 / power), 1 / JUMP, JUMP)), draft.most)
         if not low < x < high:
             x = float(np.sqrt(low * high)) if low > 0 and np.isfinite(high) else draft.most
-    if best is None or not LEAST * 0.8 <= best[1].sigma <= MOST * CLOSE:
+    if best is None or not LEAST * 0.8 <= best[1].sigma <= MOST * SIZE_CLOSE:
         return None
     strength, left = best
     if _farthest(left) < NEAR:

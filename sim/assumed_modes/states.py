@@ -28,9 +28,9 @@ from sim.assumed_modes.trial import Concealed, Rng, Scene, file_of, nominal_refi
 
 SIZES = (3.0, 30.0)  # sigma of a change, drawn evenly in the logarithm between them
 COMMON = 60.0  # sigma of what is in both states: plainly to be seen
-CLOSE = 1.1  # ratio to the sigma drawn that is near enough
-TRIES, DRAWS = 14, 40  # strengths tried for one effect; effects drawn until one has a size
-JUMP = 30.0  # largest ratio of two strengths tried one after the other
+STATE_CLOSE = 1.1  # ratio to the sigma drawn that is near enough
+STATE_TRIES, DRAWS = 14, 40  # strengths tried for one effect; effects drawn until one has a size
+STATE_JUMP = 30.0  # largest ratio of two strengths tried one after the other
 
 
 def make_states(
@@ -104,17 +104,17 @@ def _solved(
 ) -> Concealed | None:
     before = scene.bench.linear(setup)
     x = draft.start
-    for _ in range(TRIES):
+    for _ in range(STATE_TRIES):
         try:
             rows = records(scene.bench, scene.control, draft.put(setup, x))
         except UnphysicalError:
             return None
         sigma = refit.between(rows, before)
         ratio = target / max(sigma, 1e-12)
-        if 1 / CLOSE < ratio < CLOSE:
+        if 1 / STATE_CLOSE < ratio < STATE_CLOSE:
             alone = refit.left(rows) if setup is scene.setup else refit.tangent(rows)
             return Concealed(draft, x, sigma, alone)
-        x = min(x * float(np.clip(ratio, 1 / JUMP, JUMP)), draft.most)
+        x = min(x * float(np.clip(ratio, 1 / STATE_JUMP, STATE_JUMP)), draft.most)
     return None
 
 

@@ -37,7 +37,7 @@ from sim.assumed_modes.ritz import first_hz
 from sim.assumed_modes.sampled import Loop, closed, discrete, impulse, timeline
 from sim.assumed_modes.sigma import FURTHEST, STEP, Bench, Left, Records, Refit, Waveform, convolved
 from sim.assumed_modes.simulate import Control, recorded
-from sim.assumed_modes.size import CLOSE, LEAST, MOST, records, records_by_run, solve
+from sim.assumed_modes.size import LEAST, MOST, SIZE_CLOSE, records, records_by_run, solve
 from sim.assumed_modes.styles import Style
 from sim.assumed_modes.varying import BETWEEN, VARYING
 
@@ -150,7 +150,7 @@ def conceal(
     style: tuple[str, ...] = (),
     *,
     seconds: float = np.inf,
-    close: float = CLOSE,
+    close: float = SIZE_CLOSE,
 ) -> Conceals:
     """Draw a trial of a rig. seconds : of records, at most; close : ratio of a size to the drawn
     one that is near enough.

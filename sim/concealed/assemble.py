@@ -17,7 +17,7 @@ from samii_rig.errors import InputError
 from samii_rig.types import Float
 from sim.concealed.parts import Description, Part
 
-MOST = 200  # coordinates; 2 a beam element, 1 a spring
+MOST_COORDINATES = 200  # coordinates; 2 a beam element, 1 a spring
 # Phase of a bending wave over one beam element at half the sample rate. The natural
 # frequencies of cubic elements are too high by (phase^4)/1440 of themselves: 4e-5 here, and
 # falling with the square of the frequency.
@@ -111,8 +111,8 @@ class Assembly:
         self.n = 0
         self.like = like
         self.highest = 2 * math.pi * highest_hz
-        self.M, self.C, self.K = (np.zeros((MOST, MOST)) for _ in range(3))
-        self.w, self.theta = np.zeros(MOST), np.zeros(MOST)
+        self.M, self.C, self.K = (np.zeros((MOST_COORDINATES, MOST_COORDINATES)) for _ in range(3))
+        self.w, self.theta = np.zeros(MOST_COORDINATES), np.zeros(MOST_COORDINATES)
         self.joints: dict[str, list[int]] = {}
         self.inside: dict[str, list[tuple[float, float, Float]]] = {}
         self.relaxations: list[Relaxation] = []
@@ -124,15 +124,15 @@ class Assembly:
 
     def coordinate(self) -> int:
         """A new coordinate."""
-        if self.n == MOST:
-            raise InputError("plant", "coordinates", self.n, f"at most {MOST}")
+        if self.n == MOST_COORDINATES:
+            raise InputError("plant", "coordinates", self.n, f"at most {MOST_COORDINATES}")
         self.n += 1
         return self.n - 1
 
     @staticmethod
     def unit(i: int) -> Float:
         """The row that is 1 at coordinate i."""
-        row = np.zeros(MOST)
+        row = np.zeros(MOST_COORDINATES)
         row[i] = 1.0
         return row
 

@@ -28,7 +28,7 @@ from sim.concealed.stated import Stated, as_stated, row_of
 Kind = Literal["nothing", "one", "two", "outside", "joints", "stated", "varying"]
 KINDS: tuple[Kind, ...] = ("nothing", "one", "two", "outside", "joints", "stated", "varying")
 DRAWN = tuple(kind for kind in KINDS if kind != "stated")
-SMALLEST, LARGEST = 1.0, 1000.0  # sigma aimed at
+SMALLEST_SIGMA, LARGEST = 1.0, 1000.0  # sigma aimed at
 LEAST_OF_TWO = 5.0  # of each of two, and of what lies outside
 INNOCENT = 0.3  # of the trials have a joint that is as rigid or undamped as the rig file says
 WIDEST = 2.5  # standard deviations that a parameter may lie off
@@ -107,7 +107,7 @@ def draw(
     values.update({f"{name}.{symbol}": v for (name, symbol), (v, _) in innocent.items()})
     rig = parse(Rig, rig_toml, "rig file")
     seeds = [int(x) for x in rng.integers(0, 2**31, max(2, len(chosen)))]
-    least = SMALLEST if kind == "one" else LEAST_OF_TWO
+    least = SMALLEST_SIGMA if kind == "one" else LEAST_OF_TWO
     span = math.log(least), math.log(LARGEST)
     targets = [math.exp(rng.uniform(*span)) for _ in seeds]
     clean = poles_of(base)

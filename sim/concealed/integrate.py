@@ -21,7 +21,7 @@ from sim.concealed.modes import Poles, phi
 from sim.concealed.parts import Description
 
 INNER = 8  # inner steps a sample where a law acts
-CLOSE = 1e-9  # of a sample: instants nearer than this are one
+ONE_INSTANT = 1e-9  # of a sample: instants nearer than this are one
 REORDERED = {"reassoc", "contract"}  # sums may be taken in any order, which is twice as fast
 MOST_SLIDING = 3  # sweeps through the laws of one step, so that they see each other
 
@@ -89,7 +89,7 @@ def tabulate(poles: Poles, plant: Description, inner: int = INNER) -> Tables:
         cuts.update(k / inner for k in range(inner))
     edges = [0.0]
     for x in sorted(cuts):
-        if x - edges[-1] > CLOSE:
+        if x - edges[-1] > ONE_INSTANT:
             edges.append(x)
     h = np.diff(edges) * T
     p = poles.pole
@@ -104,8 +104,10 @@ def tabulate(poles: Poles, plant: Description, inner: int = INNER) -> Tables:
         _parts(decay),
         _parts(drive),
         h,
-        (np.array(edges[:-1])[:, None] >= change - CLOSE).astype(np.int64),
-        np.array([[abs(e - x) <= 2 * CLOSE for x in instants] for e in ends]).astype(np.int64),
+        (np.array(edges[:-1])[:, None] >= change - ONE_INSTANT).astype(np.int64),
+        np.array([[abs(e - x) <= 2 * ONE_INSTANT for x in instants] for e in ends]).astype(
+            np.int64
+        ),
         np.array(behind, dtype=np.int64),
         np.array([whole for whole, _ in waited], dtype=np.int64),
         _parts(poles.b.T),
@@ -126,9 +128,9 @@ def _parts(z: Complex) -> Float:
 
 
 def _whole(periods: float) -> tuple[int, float]:
-    whole = math.floor(periods + CLOSE)
+    whole = math.floor(periods + ONE_INSTANT)
     rest = periods - whole
-    return whole, (rest if rest > CLOSE else 0.0)
+    return whole, (rest if rest > ONE_INSTANT else 0.0)
 
 
 def run(

@@ -30,7 +30,7 @@ KINDS = (
     "one_sided",
 )  # fmt: skip
 COULOMB, DRIVE_FRICTION, CUBIC, BACKLASH, DRIFT, SLIP, FLOW, DRAG, ONE_SIDED = range(len(KINDS))
-MOST_STEPS = 30  # Newton steps; three are usual
+NEWTON_STEPS = 30  # Newton steps; three are usual
 WHOLE = 1e-10  # relative change of the force at which the solution stands
 VALUES = 16  # numbers a law may have
 
@@ -108,7 +108,7 @@ def solve(
     a0 = share * free[0] + (1.0 - share) * before[0]
     b0 = share * free[1] + (1.0 - share) * before[1]
     f = guess
-    for _ in range(MOST_STEPS):
+    for _ in range(NEWTON_STEPS):
         a, b = a0 + share * gain[0] * f, b0 + share * gain[1] * f
         here = force(kind, q, memory, t, a, b)
         wrong = f - here

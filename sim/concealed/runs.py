@@ -20,7 +20,7 @@ from samii_rig.types import Float, Segment
 
 # SAMII's own schedule: less drive around mode 2, where the tip moves most.
 SCHEDULE = ((4.0, 1.0), (6.0, 0.35), (9.0, 0.35), (12.0, 1.0))
-STEP = 0.04  # of set point at the highest level, in the centring sensor's unit
+STEP_SIZE = 0.04  # of set point at the highest level, in the centring sensor's unit
 STEP_HOLD = 5.0  # s between steps
 
 
@@ -112,7 +112,7 @@ def runs(design: Design, rig: Rig, seed: int) -> tuple[Run, ...]:
             out.append(Run(name, u * sign, np.zeros_like(u), (segment,), level))
     for i, level in enumerate(design.levels):
         hold = round(STEP_HOLD * rate_hz)
-        size = STEP * level / max(design.levels)
+        size = STEP_SIZE * level / max(design.levels)
         # Down and up again around the centre, and at rest before the first.
         ref = np.repeat([0.0, *(size * (k % 2 == 0) for k in range(design.steps))], hold)
         for one in each:

@@ -39,7 +39,7 @@ from sim.wire.rig import WireRig
 BASE = 0x20  # the sensor's base identifier
 AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 MOMENTS = ("Tz", "Ty", "Tx")  # axes in the order of the rig's moments
-MOST = 1000.0  # N m, of a sensor without an end of range
+NO_END = 1000.0  # N m, of a sensor without an end of range
 MARGIN = 2.0  # of the sensor's range over that of the rig file
 
 
@@ -59,7 +59,7 @@ class CanWireRig(WireRig):
         self._rms = np.array([s.noise_rms if settings.noise else 0.0 for s in self._moments])
         self._before = self._after = np.zeros(len(self._moments))
         ends = [max(abs(s.low), abs(s.high)) for s in self._moments]
-        most = max((e for e in ends if np.isfinite(e)), default=MOST)
+        most = max((e for e in ends if np.isfinite(e)), default=NO_END)
         self.sensor = Sensor(BASE, self._loads, MARGIN * most)
         self.adapter = Adapter(self.sensor, np.random.default_rng(line), can_link)
         self.adapter.plug()

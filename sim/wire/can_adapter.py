@@ -18,7 +18,7 @@ from sim.wire.can_sensor import Frame, Sensor
 BITRATES = (10, 20, 50, 100, 125, 250, 500, 750, 1000)  # kbit/s of S0 to S8
 READ = 4096  # bytes
 DONE, REFUSED = b"\r", b"\a"
-OTHER = 0x123  # an identifier that is not the sensor's
+FOREIGN = 0x123  # an identifier that is not the sensor's
 
 
 @dataclass(slots=True)
@@ -127,7 +127,7 @@ class Adapter:
         fake = 16 * self.sensor.base, bytes(8)
         for name, rate, frame in (
             ("foreign", self.foreign, fake),
-            ("other", self.other, (OTHER, b"hello")),
+            ("other", self.other, (FOREIGN, b"hello")),
         ):
             if rate and now >= self._sent.get(name, 0.0) + 1.0 / rate:
                 self._sent[name] = now

@@ -38,7 +38,7 @@ N_ENCODER, N_ADC = 4, 8  # of node.h
 TOLD = struct.Struct(f"<IHBBBBxx{'hhhHHxxi' * MAX_OUTPUTS}16s16sIHxx")
 INPUTS = struct.Struct(f"<II{N_ENCODER}i{N_ADC}hBBxx")
 OUTPUTS = struct.Struct(f"<II{MAX_OUTPUTS}hHBBxx")
-READ = 1 << 16  # bytes
+READ_AT_ONCE = 1 << 16  # bytes
 # What the image is told to do to itself: board_qemu.c.
 WRONG = {"reset": 1, "hang": 2, "fault": 3, "supply": 4, "stack": 5}
 LSI_HZ = 17_000  # slowest of the watchdog's own clock, by the chip's datasheet
@@ -177,7 +177,7 @@ class Emulator:
         c = config
         self.watchdog, self.sent, self.came = Watchdog(), 0, 0
         while select.select([self.wire], [], [], 0.0)[0]:
-            self.wire.recv(READ)  # of the boot before
+            self.wire.recv(READ_AT_ONCE)  # of the boot before
         self._arrived = b""
         self._outputs = len(c.outputs)
         numbers = c.period_ns, c.deadman_ms, self._outputs, c.n_encoder, c.n_adc, c.batch
@@ -194,7 +194,7 @@ class Emulator:
         for command in commands:
             self._control.sendall(json.dumps({"execute": command}).encode())
         while answered.count(b'"return"') < len(commands):
-            answered += self._control.recv(READ)
+            answered += self._control.recv(READ_AT_ONCE)
         self._listen()
 
     def send(self, data: bytes) -> None:
@@ -206,7 +206,7 @@ class Emulator:
         """Bytes from it, up to the last of `went` since its start."""
         n = (went - self.came) % WORD
         while len(self._arrived) < n:
-            self._arrived += self.wire.recv(READ)
+            self._arrived += self.wire.recv(READ_AT_ONCE)
         data, self._arrived = self._arrived[:n], self._arrived[n:]
         self.came = went
         return data
@@ -230,7 +230,7 @@ class Emulator:
         while self._from not in ready:
             ready, _, _ = select.select([self._from, wire], [], [], within)
             # It sends byte by byte, and waits where nobody reads: a socket holds 280 such bytes.
-            data = self.wire.recv(READ) if wire in ready else b""
+            data = self.wire.recv(READ_AT_ONCE) if wire in ready else b""
             self._arrived += data
             if not data and self._from not in ready:
                 return None
@@ -245,7 +245,7 @@ class Emulator:
     def _listen(self) -> None:
         """Hand to the watchdog what was written to it."""
         with contextlib.suppress(BlockingIOError):
-            while data := os.read(self._log, READ):
+            while data := os.read(self._log, READ_AT_ONCE):
                 *lines, self._line = (self._line + data).split(b"\n")
                 for line in lines:
                     if line.startswith(IWDG):

@@ -11,7 +11,7 @@ from samii_rig.rig.settings import wrong
 from sim.faults import Fault, parsed
 from sim.wire.plant import Board
 
-JUMP = 0.1  # rad by which the first encoder jumps, twice what a node takes in one sample
+ENCODER_JUMP = 0.1  # rad by which the first encoder jumps, twice what a node takes in one sample
 DRIFT = 0.1  # of an input's range every second
 STRAY = 0.05  # of the output's limit that the converter holds by itself
 STALL = 0.3  # s for which nothing passes, six times the deadman of the shipped rigs
@@ -21,7 +21,7 @@ CLOCK = 3_000_000  # us by which the node's clock is set on
 
 def _jump(_rig: Rig, board: Board, _f: Fault) -> str:
     first = next(iter(board.encoder.values()))
-    return f"jump {round(JUMP * abs(first.counts_per_unit))}"
+    return f"jump {round(ENCODER_JUMP * abs(first.counts_per_unit))}"
 
 
 def _drift(rig: Rig, board: Board, f: Fault) -> str:

@@ -7,7 +7,7 @@ bytes out.
 from __future__ import annotations
 
 from samii_rig.errors import DeviceError
-from sim.wire.emulator import READ, SILENT, WITHIN, Emulator
+from sim.wire.emulator import READ_AT_ONCE, SILENT, WITHIN, Emulator
 from sim.wire.node import Node
 from sim.wire.protocol import NodeConfig
 
@@ -46,7 +46,7 @@ class ImageNode(Node):
             super().receive(data)
             self._emulator.send(data)
 
-    def transmit(self, room: int = READ) -> bytes:
+    def transmit(self, room: int = READ_AT_ONCE) -> bytes:
         """At most `room` bytes to the host."""
         out = bytes(self._out[:room])
         del self._out[:room]

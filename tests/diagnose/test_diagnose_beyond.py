@@ -12,7 +12,7 @@ from identify_kit import noiseless, samii
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.between_runs import between_runs
-from samii_rig.diagnose.fit.classes import RIVAL, Class
+from samii_rig.diagnose.fit.classes import RIVAL_NAME, Class
 from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.moebius import place_of
 from samii_rig.diagnose.fit.search import Search
@@ -125,7 +125,7 @@ def test_two_compliances_are_two():
     assert search.ranked()[0] is best
 
 
-@pytest.mark.parametrize(("behind", "told"), [(RIVAL - 1, 2), (RIVAL + 1, 1)])
+@pytest.mark.parametrize(("behind", "told"), [(RIVAL_NAME - 1, 2), (RIVAL_NAME + 1, 1)])
 def test_a_name_is_one_that_the_data_leave_as_probable(behind, told):
     pendulum, brace = (
         next(e for e in ALL if e.name == (physics, "joint_3") and "w" not in e.variant[-1])

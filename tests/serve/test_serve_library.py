@@ -207,7 +207,9 @@ def test_a_check_that_takes_too_much_memory_ends_in_a_line(
     rooms: Rooms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Less than numpy needs to start: the process dies, the service does not.
-    program = "import resource; from samii_rig.serve import upload; upload.MEMORY = 50 << 20; "
+    program = (
+        "import resource; from samii_rig.serve import upload; upload.UPLOAD_MEMORY = 50 << 20; "
+    )
     file = tmp_path / "check.py"
     file.write_text(program + "upload.main()")
     monkeypatch.setattr(upload, "COMMAND", (str(file),))

@@ -577,7 +577,7 @@ def test_the_truth_explains_the_record_and_the_rig_file_does_not(tmp_path: Path)
     folder = make("one", seed, tmp_path, _samii(), STYLE)
     rngs = [np.random.default_rng([seed, trial.KINDS.index("one"), k]) for k in range(3)]
     scene = trial.scene_of(rngs[0], rngs[1], parse(Rig, _samii(), "samii"), STYLE)
-    wanted = trial.Wanted("one", "", size.CLOSE)
+    wanted = trial.Wanted("one", "", size.SIZE_CLOSE)
     (hidden,) = trial._concealed(rngs[2], wanted, scene, trial.nominal_refit(scene))
     run = read_recording(folder / "run_01.mcap")
     y = run.values[:, -4:] - scene.noise.offset
@@ -721,7 +721,7 @@ def test_every_force_finds_its_size(name: str) -> None:
     scene = trial.scene_of(rngs[0], rngs[1], rig, ("clean", "cut"), runs=runs)
     pools = {**forces.FORCES, **outside.OUTSIDE, **varying.VARYING}
     draft = pools[name](rngs[2], scene.setup, trial._swing(scene))
-    found = trial._solved(scene, trial.nominal_refit(scene), draft, 30.0, size.CLOSE)
+    found = trial._solved(scene, trial.nominal_refit(scene), draft, 30.0, size.SIZE_CLOSE)
     assert found is not None
     assert found.alone.sigma == pytest.approx(30.0, rel=0.3)
 
@@ -739,7 +739,7 @@ def test_what_is_late_by_little_has_rivals_and_by_much_has_none() -> None:
     draft = effects.lag(rngs[2], scene.setup)
     left = {}
     for target in (5.0, 100.0):
-        found = trial._solved(scene, refit, draft, target, size.CLOSE)
+        found = trial._solved(scene, refit, draft, target, size.SIZE_CLOSE)
         assert found is not None
         rivals = trial._rivals(scene, refit, found)
         assert {r["physics"] for r in rivals} == {"valve_dynamics", "transport_delay"}

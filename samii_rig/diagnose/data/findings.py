@@ -24,9 +24,9 @@ from samii_rig.rig.schema import Rig, parameters
 from samii_rig.types import Finding, FrequencyResponse
 
 LOST_GAIN = 0.02  # relative change of one channel's gain between levels that is told
-FLAT = 2.0  # chi-square per degree of freedom up to which a change is a constant
+A_CONSTANT = 2.0  # chi-square per degree of freedom up to which a change is a constant
 ELSE = 5.0  # chi-square per degree of freedom from which two levels differ
-APART = 4.0  # standard deviations by which another channel's gain is not the changed one
+NOT_CHANGED = 4.0  # standard deviations by which another channel's gain is not the changed one
 FEW_REPEATS = 3
 SAID_PER_KIND = 3  # findings of one kind that are told; the rest is counted
 
@@ -336,8 +336,8 @@ def _changed(levels: Sequence[FrequencyResponse]) -> list[tuple[int, str]]:
         others = np.arange(n) != k
         # A command that was clipped changes all of them, which noise may hide in the others.
         off = np.abs(gain - gain[k])[others]
-        alone = np.all(off > np.abs(gain - 1)[others]) and np.any(off > APART * sd[others])
-        if flat[k] < FLAT and max(same[others]) < FLAT and alone:
+        alone = np.all(off > np.abs(gain - 1)[others]) and np.any(off > NOT_CHANGED * sd[others])
+        if flat[k] < A_CONSTANT and max(same[others]) < A_CONSTANT and alone:
             found.setdefault(
                 k,
                 f"{a.outputs[k].name} reads {gain[k]:.4g} times as much {named(b)} as "
@@ -379,6 +379,6 @@ def _foreign(levels: Sequence[FrequencyResponse]) -> int | None:
     for i in range(1, n - 1):
         rest = [j for j in range(n) if j != i]
         agree = max(distance[j, k] for j, k in combinations(rest, 2))
-        if agree < FLAT and min(distance[i, j] for j in rest) > ELSE:
+        if agree < A_CONSTANT and min(distance[i, j] for j in rest) > ELSE:
             return i
     return None

@@ -25,7 +25,7 @@ MOST_BINS = 400
 SPLIT = 6.0  # standard deviations of chi-square inside a bin above which it is divided
 COARSE = 0.01  # of a model's misfit, over noise, that may be lost in a bin
 SHAPE = 0.6  # weight of the response's own arc (logarithm, radians) against log frequency
-TURN = 5  # the last of so many lines is a test line
+TEST_LINE = 5  # the last of so many lines is a test line
 PERIODIC = ("periodic", "stepped")  # methods of excitations that repeat themselves
 # Methods of which a line is a whole number of cycles a record (or a period).
 WHOLE = ("burst", "settled", "periodic")
@@ -145,7 +145,7 @@ class Measured:
             if shown.any():
                 return self.take(fitted), self.take(decides), self.take(shown)
             return self.take(~repeats), None, self.take(repeats)
-        shown = turn % TURN == TURN - 1
+        shown = turn % TEST_LINE == TEST_LINE - 1
         if not shown.any():  # a few frequencies, one by one
             shown = np.arange(self.n) == self.n // 2
         return self.take(~shown), None, self.take(shown)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from samii_rig.diagnose.data.wiring import MISFIT, POINTS, SWAPPED, misfit
+from samii_rig.diagnose.data.wiring import LINES_LOOKED_AT, MISFIT, SWAPPED, misfit
 from samii_rig.errors import InputError
 from samii_rig.model.sampled import sampled_response
 from samii_rig.model.tmm import Chain
@@ -32,7 +32,7 @@ def paced(responses: Sequence[FrequencyResponse], rig: Rig) -> None:
 
 def _pace(r: FrequencyResponse, chain: Chain) -> float:
     rig = chain.rig
-    pick = np.unique(np.linspace(0, r.frequency.size - 1, POINTS).astype(int))
+    pick = np.unique(np.linspace(0, r.frequency.size - 1, LINES_LOOKED_AT).astype(int))
     on = [[s.name for s in rig.sensor].index(c.name) for c in r.outputs]
     by = [[a.name for a in rig.actuator].index(c.name) for c in r.inputs]
 

@@ -19,9 +19,9 @@ from samii_rig.rig.schema import SOURCES, Rig, parameters
 from samii_rig.signal.several.undriven import as_measured
 from samii_rig.types import Complex, Float, FrequencyResponse, Recording
 
-POINTS = 300  # lines of a response that are looked at
+LINES_LOOKED_AT = 300  # lines of a response that are looked at
 UNIT_WITHIN = 1.25  # factor between a channel's gain and a unit; what a rig file may be off by
-ALIKE = 1.6  # half of a channel's lines lie within this factor of their median
+HALF_WITHIN = 1.6  # half of a channel's lines lie within this factor of their median
 OPPOSITE = -0.7  # cosine of the median phase error from which a sign is wrong
 SWAPPED = 0.15  # of the misfit of two channels that is left when they are exchanged
 MISFIT = 0.5  # least misfit (squared logarithm a line) for which they are
@@ -29,7 +29,7 @@ MOST_MISFIT = 4.0  # of one line: what is far off in any case
 FEW_LINES = 12  # below which nothing can be told from noise
 # Standard deviations of an estimate from which a line says what it is to the model: noise alone is
 # as large in one line of 3,000. A sensor that shows next to nothing but noise is no unit off.
-SHOWN = 4.0
+SHOWN_LINE = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +101,13 @@ def _columns(
 def _mended(
     r: FrequencyResponse, rig: Rig
 ) -> tuple[FrequencyResponse, list[str], list[int], Float]:
-    pick = np.unique(np.linspace(0, r.frequency.size - 1, POINTS).astype(int))
+    pick = np.unique(np.linspace(0, r.frequency.size - 1, LINES_LOOKED_AT).astype(int))
     names = [s.name for s in rig.sensor]
     on = [names.index(c.name) for c in r.outputs]
     acting = [a.name for a in rig.actuator]
     model = sampled_response(rig, r.frequency[pick])[:, on]
     model = as_measured(lines_of(r, pick), model, acting)
-    hidden = np.abs(r.H[pick]) < SHOWN * np.sqrt(r.variance()[pick])
+    hidden = np.abs(r.H[pick]) < SHOWN_LINE * np.sqrt(r.variance()[pick])
     H, remarks = np.where(hidden, 0.0, r.H[pick]), []
     order = list(range(len(on)))
     for a, b in _swaps(H, model):
@@ -193,7 +193,7 @@ def _unit(log: Complex, tolerance: float) -> float:
     if size.size < FEW_LINES:
         return 1.0
     low, middle, high = np.quantile(size, [0.25, 0.5, 0.75])
-    if high - low > 2 * math.log(ALIKE):
+    if high - low > 2 * math.log(HALF_WITHIN):
         return 1.0
     _, best = nearest(math.exp(float(middle)))
     within = math.log(UNIT_WITHIN) + 2 * tolerance

@@ -36,7 +36,7 @@ from samii_rig.signal.estimate import estimate
 from samii_rig.types import Finding, Float, FrequencyResponse, Recording
 
 REPEAT = "repeat"  # kind of finding that tells a repeat which is unlike the others
-SURE = 5.0  # standard deviations of chi-square beyond which two recordings differ
+SURELY_DIFFER = 5.0  # standard deviations of chi-square beyond which two recordings differ
 
 Band = tuple[float, float]
 Saved = tuple[str, Sequence[FrequencyResponse]]  # a file and the responses that it kept
@@ -177,7 +177,7 @@ def _grouped(n: int, difference: Callable[[int, int], tuple[float, float, float]
     for i in range(n):
         for group in groups:
             chi2, mean, sd = difference(group[0], i)
-            if not chi2 > max(DIFFER * mean, mean + SURE * sd):
+            if not chi2 > max(DIFFER * mean, mean + SURELY_DIFFER * sd):
                 group.append(i)
                 break
             worst, excess = max(worst, chi2 / mean), max(excess, chi2 - mean)

@@ -28,9 +28,9 @@ from samii_rig.types import Float
 VARIATION = "stiffness_variation"  # its name in the table
 STIFFNESS = "k"  # symbol of the parameters that may change
 WIDTH = 0.5  # of the logarithm of a stiffness, before the data, from one series to the next
-LARGEST = 3.0  # of that logarithm
-KNOWN = 1e-4  # relative, of a stiffness for which the rig file has no tolerance
-BINS = 100  # of each series
+LARGEST_CHANGE = 3.0  # of that logarithm
+KNOWN_STIFFNESS = 1e-4  # relative, of a stiffness for which the rig file has no tolerance
+SERIES_BINS = 100  # of each series
 ROUNDS = 4  # of Gauss and Newton
 MOSTLY = 0.5  # of what one stiffness for all leaves over the noise, that must be explained
 
@@ -113,7 +113,7 @@ def _every_joint(search: Search, base: Fitted) -> Fitted:
 
     def freed(p: Parameter) -> Parameter:
         known = p.tolerance > 0 or p.value == 0
-        return p if known else p.model_copy(update={"tolerance": KNOWN})
+        return p if known else p.model_copy(update={"tolerance": KNOWN_STIFFNESS})
 
     elements = tuple(
         e.model_copy(update={STIFFNESS: freed(parameters(e)[STIFFNESS])})
@@ -132,7 +132,7 @@ def _series(search: Search, base: Fitted, decide: Measured) -> list[tuple[int, P
         for level in np.unique(lines.level[lines.level >= 0]):
             some = lines.take(lines.level == level)
             shape = base.model.response(base.x, search.grid.at(some.frequency, some.level))
-            out.append((int(level), Problem.of(binned(some, shape, BINS), search.grid)))
+            out.append((int(level), Problem.of(binned(some, shape, SERIES_BINS), search.grid)))
     return out
 
 
@@ -168,5 +168,5 @@ def _fitted(
         if best is not None and cost >= best[0]:
             return best
         best = cost, y[n:].copy(), cov[n:, n:]
-        y = y - np.clip(cov @ g, -LARGEST, LARGEST)
+        y = y - np.clip(cov @ g, -LARGEST_CHANGE, LARGEST_CHANGE)
     return best

@@ -17,10 +17,10 @@ from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig
 
 SAME = 3.0  # noise units below which two explanations are one
-RIVAL = 4.0  # of the logarithm of evidence, below the first, up to which a member is a name
+RIVAL_NAME = 4.0  # of the logarithm of evidence, below the first, up to which a member is a name
 TRUSTED = 0.5  # of the logarithm of evidence between members
 AS_PROBABLE = 2.0  # of the logarithm of evidence: a member with less freedom goes first
-LEAST = 1e-3  # probability of an explanation that may begin a class of its own
+LEAST_LIKELY = 1e-3  # probability of an explanation that may begin a class of its own
 LOOKED_AT = 24  # explanations for which distances are computed
 EQUIVALENT = 1e-7  # relative difference of responses below which two effects are one by structure
 
@@ -46,7 +46,7 @@ class Class:
     def rivals(self) -> tuple[Explanation, ...]:
         """Members beside the first that the data leave about as probable: one that is near, but
         on the wrong side of the data or for more freedom than they call for, is no other name."""
-        return tuple(m for m in self.members[1:] if m.weight > self.first.weight - RIVAL)
+        return tuple(m for m in self.members[1:] if m.weight > self.first.weight - RIVAL_NAME)
 
     def parts(self) -> list[tuple[Explanation, float]]:
         """The first and its rivals, each with its part of the class's probability. Their
@@ -123,7 +123,7 @@ def classes(
     out: list[Class] = []
     while left and len(out) < LOOKED_AT:
         first, p = left.pop(0)
-        if out and p < LEAST:
+        if out and p < LEAST_LIKELY:
             break
         members, far, total, rest = [first], [0.0], p, []
         for other, q in left[:LOOKED_AT]:

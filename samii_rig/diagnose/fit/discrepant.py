@@ -29,8 +29,8 @@ from samii_rig.errors import EstimateError
 from samii_rig.likelihood.form import Reduced
 from samii_rig.types import Int
 
-ROUNDS = 3  # of scale and search; two do where the first round finds what is missing
-STILL = 0.15  # nepers of the scale that are no change: a seventh of an interval of 90 %
+SCALE_ROUNDS = 3  # of scale and search; two do where the first round finds what is missing
+SCALE_STILL = 0.15  # nepers of the scale that are no change: a seventh of an interval of 90 %
 KEPT = 12  # explanations that are refitted beside another discrepancy
 WORSE = 9.0  # of chi-square, three noise units: a level or sensor that is explained worse
 
@@ -70,7 +70,7 @@ class DiscrepantSearch(RecordSearch):
     def settle(self) -> None:
         """Scale, length and what is missing, in turn, until they stand still."""
         self._learn()
-        for _ in range(ROUNDS):
+        for _ in range(SCALE_ROUNDS):
             self.run(briefly=True)
             if self._learn():
                 return
@@ -83,7 +83,9 @@ class DiscrepantSearch(RecordSearch):
         there = replace(fit, jacobian=(J := self.plain.whiten(dh)), information=J.T @ J)
         self._shape = h
         new = weighed(self.plain.reduced, h, there, self.plain.residual(h)).discrepancy
-        still = new.length == old.length and abs(math.log(new.scale / (old.scale or 1.0))) < STILL
+        still = (
+            new.length == old.length and abs(math.log(new.scale / (old.scale or 1.0))) < SCALE_STILL
+        )
         self.discrepancy = new
         self._with_discrepancy()
         ranked = self.ranked()

@@ -26,7 +26,8 @@ from samii_rig.rig.schema import Rig, parameters
 from samii_rig.rig.schema.elements import Branch, flattened
 
 LENGTH = "L"  # symbol of what is measured with a rule, and taken for exact
-FREE = 0.5  # tolerance of a length whose value nobody trusts: a factor of e lies two of them away
+# Tolerance of a length whose value nobody trusts: a factor of e lies two of them away
+FREE_LENGTH = 0.5
 # Of what the nominal model leaves of the lines: one that leaves more is held against no record.
 LEAVES = 0.1
 HELPING = 3  # lengths that explain most by themselves, each of which is freed with every other
@@ -129,7 +130,7 @@ def _freed(rig: Rig, names: Collection[str]) -> Rig:
     def element(e: Any) -> Any:
         update: dict[str, Any] = {}
         if e.name in names:
-            free = {"tolerance": FREE}
+            free = {"tolerance": FREE_LENGTH}
             update[LENGTH] = parameters(e)[LENGTH].model_copy(update=free)
         if isinstance(e, Branch):
             update["element"] = tuple(map(element, e.element))

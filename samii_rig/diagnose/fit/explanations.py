@@ -31,9 +31,9 @@ from samii_rig.types import Complex, Float
 PRIOR = (0.5, 0.4, 0.02)  # before the data: of nothing, one, two effects missing
 FEWER = 0.05  # of each further effect
 FAULTY = 0.4  # before the data, of each that is in how the records were made
-NEAR = 25.0  # of the logarithm of evidence: explanations further below the best are let go
+NEAR_BEST = 25.0  # of the logarithm of evidence: explanations further below the best are let go
 FIVE = 5.0  # standard deviations of chi-square beyond which what is left is more than noise
-ALIKE, MOST_ALIKE = 0.1, 40  # correlation that counts; bins or nodes over which it is sought
+CORRELATED, MOST_ALIKE = 0.1, 40  # correlation that counts; bins or nodes over which it is sought
 UNEXPLAINED = 3e-4  # chance that noise alone leaves more than the threshold
 AT_END = 1e-3  # of a nominal parameter's range, from its end
 EXACT = 4e-4  # of the mismatch: what beams, sensors and integrators are modelled to
@@ -59,12 +59,12 @@ def threshold(spread: float) -> float:
 
 def alike(r: Float | Complex) -> float:
     """The integrated autocorrelation of what a model leaves, r (n, p) by frequency in units of the
-    noise: 1 and twice the sum of its correlations, up to the first below `ALIKE`."""
+    noise: 1 and twice the sum of its correlations, up to the first below `CORRELATED`."""
     power = float(np.sum(np.abs(r) ** 2))
     found = 1.0
     for lag in range(1, min(MOST_ALIKE, len(r) - 1)):
         rho = float(np.sum(r[lag:] * r[:-lag].conj()).real) / power
-        if rho < ALIKE:
+        if rho < CORRELATED:
             break
         found += 2 * rho
     return found

@@ -16,11 +16,12 @@ from samii_rig.diagnose.physics.effect import Unknown
 from samii_rig.levenberg import ByFactor, step
 from samii_rig.types import Complex, Float
 
-LONGEST = 3.0  # a step of a logarithm
-ROUNDS = 6  # of a descent, at most
-DAMPING = ByFactor(1e-2, shrink=0.1, grow=30.0)  # of the diagonal: few rounds, so it changes fast
-SETTLED = 0.05  # of chi-square, gained in one of them: less and they end
-STEP = 1e-4  # of a logarithm, for derivatives of a law
+LONGEST_STEP = 3.0  # a step of a logarithm
+DESCENT_ROUNDS = 6  # of a descent, at most
+# Of the diagonal: few rounds, so it changes fast
+FORM_DAMPING = ByFactor(1e-2, shrink=0.1, grow=30.0)
+DESCENT_ENDS = 0.05  # of chi-square, gained in one of them: less and they end
+LAW_STEP = 1e-4  # of a logarithm, for derivatives of a law
 
 
 class Form(Protocol):
@@ -125,32 +126,32 @@ def descend(
     """Chi-square and logarithms (m, k) after a few damped Gauss-Newton steps from y."""
     low, high = np.log([(u.low, u.high) for u in unknowns]).T
     m, k = y.shape
-    damping = np.full(m, DAMPING.value)
-    for turn in range(ROUNDS):
-        ahead = (y[:, None, :] + STEP * np.eye(k)).reshape(-1, k)
+    damping = np.full(m, FORM_DAMPING.value)
+    for turn in range(DESCENT_ROUNDS):
+        ahead = (y[:, None, :] + LAW_STEP * np.eye(k)).reshape(-1, k)
         every = phi_of(np.exp(np.concatenate([y, ahead])))
         phi = every[:m]
-        d = (every[m:].reshape(m, k, -1) - phi[:, None, :]) / STEP
+        d = (every[m:].reshape(m, k, -1) - phi[:, None, :]) / LAW_STEP
         g, H = form.normal(phi, d)
         if not (np.all(np.isfinite(H)) and np.all(np.isfinite(g))):
             break
         new = np.clip(y + bounded_step(H, g, damping[:, None]), low, high)
         there = form.cost(phi_of(np.exp(new)))
         better = there < cost
-        settled = turn > 0 and not np.any(cost - there > SETTLED)
+        settled = turn > 0 and not np.any(cost - there > DESCENT_ENDS)
         y = np.where(better[:, None], new, y)
         cost = np.where(better, there, cost)
-        damping *= np.where(better, DAMPING.shrink, DAMPING.grow)
+        damping *= np.where(better, FORM_DAMPING.shrink, FORM_DAMPING.grow)
         if settled:
             break
     return cost, y
 
 
 def bounded_step(A: Float, g: Float, damping: float | Float) -> Float:
-    """(..., k) damped step of logarithms, none longer than `LONGEST`.
+    """(..., k) damped step of logarithms, none longer than `LONGEST_STEP`.
 
     A : (..., k, k). g : (..., k). damping : of the diagonal, one or (..., 1).
     """
     size = np.abs(np.einsum("...kk->...k", A))
     floor = 1e-9 * np.max(size, axis=-1, initial=1e-30, keepdims=True)
-    return np.asarray(np.clip(step(A, g, damping * size + floor), -LONGEST, LONGEST))
+    return np.asarray(np.clip(step(A, g, damping * size + floor), -LONGEST_STEP, LONGEST_STEP))

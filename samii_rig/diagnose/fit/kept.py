@@ -13,7 +13,8 @@ from samii_rig.types import Complex
 
 T = TypeVar("T")
 FITS = 16  # of which the sums over aliases are kept
-NUMBERS = 2**24  # of answers on contours that are kept: 256 MB, 16 of eight entries at full length
+# Of answers on contours that are kept: 256 MB, 16 of eight entries at full length
+NUMBERS_KEPT = 2**24
 
 
 @dataclass(frozen=True)
@@ -43,4 +44,4 @@ class Computed:
     """Of the latest fits: sums over aliases, and answers on contours."""
 
     aliases: Latest[Aliases] = field(default_factory=lambda: Latest(FITS))
-    answers: Latest[Complex] = field(default_factory=lambda: Latest(NUMBERS))
+    answers: Latest[Complex] = field(default_factory=lambda: Latest(NUMBERS_KEPT))

@@ -42,7 +42,7 @@ FIRST_LINES = 8000
 MOST_MADE = 6  # times that the likelihood is made about the nominal model
 # Noise units by which a change from the reference may be off between nodes, where it is taken for
 # linear, for the likelihood to stand: less than noise makes of one unknown.
-BETWEEN = 0.5
+OFF_BETWEEN = 0.5
 ALARM = 2e-3  # chance that noise alone makes the best of all effects look missing
 HIGHEST_CRITICAL = 1e3  # of chi-square, beyond what any table asks for
 
@@ -260,7 +260,7 @@ class RecordSearch(Search):
         between, reference = self._between
         there = fitted.model.response(fitted.x, self.problem.at)
         middle = fitted.model.response(fitted.x, between) - reference
-        most = BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
+        most = OFF_BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
         bends = self.reduced.interpolation_error(there - self.reduced.reference, middle)
         # What folds back from above is that of the fit about which the likelihood was made, or of
         # each model itself once that shows.

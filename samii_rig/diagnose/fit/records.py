@@ -35,7 +35,7 @@ from samii_rig.signal.columns import aligned
 from samii_rig.signal.groups import segments_of
 from samii_rig.types import Complex, Finding, Float, Int, Recording
 
-TURN = 10  # one line in so many is a test line
+TEST_TURN = 10  # one line in so many is a test line
 # Test lines: by turns of this part, so that of every second, fifth or tenth line, where a
 # multisine has its own, one in ten is a test line too (Weyl 1916, Math. Ann. 77).
 GOLDEN = (5**0.5 - 1) / 2
@@ -50,7 +50,7 @@ MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
 # Of half the rate, width over which samples between those that were recorded are told from these:
 # at `HIGHEST` they are to 1e-6, after 130 samples of either side nothing is left. And how many
 # widths count: 1e-12 behind them.
-PASSING, FAR = 0.03, 5.0
+PASSING, FAR_OFF = 0.03, 5.0
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ class Whole:
         grow along the contour.
         """
         half = self.records.rate_hz / 2
-        on = np.flatnonzero(f > half * (1 - FAR * PASSING))
+        on = np.flatnonzero(f > half * (1 - FAR_OFF * PASSING))
         beyond = self.grid(2 * half - f[on][::-1], sigma, fitted)
         folded = fitted.model.response(fitted.x, beyond)[::-1].conj()
         passed = special.erfc((f[on] / half - 1) / PASSING)[:, None] / 2
@@ -326,4 +326,4 @@ def fitted_lines(k: Int) -> NDArray[np.bool_]:
 
 
 def _shown(k: Int) -> NDArray[np.bool_]:
-    return np.asarray((k * GOLDEN) % 1.0 < 1 / TURN)
+    return np.asarray((k * GOLDEN) % 1.0 < 1 / TEST_TURN)

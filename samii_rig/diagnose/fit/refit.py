@@ -25,18 +25,18 @@ from samii_rig.types import Complex, Float
 
 STEPS = 40
 LOG_STEPS = 20
-FAR = 20.0  # chi-square per degree of freedom above which the logarithm is fitted first
-LONGEST = 1.2  # a step of an effect's logarithm at most
+LOGARITHM_FIRST = 20.0  # chi-square per degree of freedom above which the logarithm is fitted first
+LONGEST_LOGARITHM = 1.2  # a step of an effect's logarithm at most
 # Of chi-square, for a step of the largest allowed size.
 DAMPING = ByFactor(10.0, shrink=0.3, grow=5.0, least=1e-2)
 LOG_DAMPING = ByFactor(1e-2, shrink=1.0, grow=1.0)
 LOG_SETTLED = 1e-3  # of the logarithm's cost, gained by a step: less and they end
-TRIES = 7  # dampings of one step
+DAMPINGS = 7  # dampings of one step
 CORRECTIONS = 4  # of a step that left the valley
 RETURNS = 0.9  # of the cost before, at which a correction leads nowhere
-NOTHING = 1e-7  # of a logarithm: no step
-SETTLED = 0.02  # of chi-square, improvement of a step at which a refit ends
-HOPELESS = 0.05  # of the way to a chi-square that matters, gained by a step
+NO_STEP = 1e-7  # of a logarithm: no step
+REFIT_ENDS = 0.02  # of chi-square, improvement of a step at which a refit ends
+HOPELESS_STEP = 0.05  # of the way to a chi-square that matters, gained by a step
 PATIENT = 3  # steps before that is asked
 SPAN = math.sqrt(12.0)  # of a uniform distribution in its standard deviations
 
@@ -205,12 +205,12 @@ def refit(
         rows = problem.residual(problem.data.H).size
         return Fitted(model, fixed, chi2, 0.0, np.zeros((rows, 0)), np.zeros((0, 0)))
     first = _Point.of(model, problem, np.clip(start, model.lower, model.upper))
-    if far and first.cost > FAR * problem.expected:
+    if far and first.cost > LOGARITHM_FIRST * problem.expected:
         first = _logarithm(model, problem, first)
 
     def settled(p: Progress) -> bool:
-        hopeless = p.steps > PATIENT and p.gain < HOPELESS * (p.cost - give_up)
-        return p.gain > 0 and (p.gain < SETTLED + 1e-9 * p.cost or hopeless or p.steps >= steps)
+        hopeless = p.steps > PATIENT and p.gain < HOPELESS_STEP * (p.cost - give_up)
+        return p.gain > 0 and (p.gain < REFIT_ENDS + 1e-9 * p.cost or hopeless or p.steps >= steps)
 
     end = descend(
         first,
@@ -218,8 +218,8 @@ def refit(
         lambda at, by, damping: _trial(model, problem, at, by, damping),
         settled,
         DAMPING,
-        trials=TRIES * steps,
-        tries=TRIES,
+        trials=DAMPINGS * steps,
+        tries=DAMPINGS,
     )
     x, J, penalty = end.at.x, end.normal.J, _penalty(model, end.at.x)
     return Fitted(model, x, end.at.cost - penalty, penalty, J, J.T @ J)
@@ -324,7 +324,7 @@ def _trial(
         new, before = back, new.cost
         if new.cost > RETURNS * before and new.cost >= at.cost:
             break
-    nothing = new.cost >= at.cost and np.max(np.abs(new.x - at.x)) < NOTHING
+    nothing = new.cost >= at.cost and np.max(np.abs(new.x - at.x)) < NO_STEP
     return at if nothing else new
 
 
@@ -365,7 +365,7 @@ def move(
     on = on[on < model.n_nominal] if nominal else on
     if on.size == 0:
         return None
-    limit = np.where(on < model.n_nominal, 4 * np.minimum(model.prior[on], 1e3), LONGEST)
+    limit = np.where(on < model.n_nominal, 4 * np.minimum(model.prior[on], 1e3), LONGEST_LOGARITHM)
     # Damped by what a parameter may move, not by what the data say of it: parameters that
     # the data hardly distinguish would otherwise creep along their ill-conditioned direction.
     try:

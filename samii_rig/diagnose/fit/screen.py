@@ -20,7 +20,14 @@ from itertools import product
 import numpy as np
 
 from samii_rig.diagnose.fit import forms
-from samii_rig.diagnose.fit.forms import DAMPING, LONGEST, ROUNDS, SETTLED, Form, bounded_step
+from samii_rig.diagnose.fit.forms import (
+    DESCENT_ENDS,
+    DESCENT_ROUNDS,
+    FORM_DAMPING,
+    LONGEST_STEP,
+    Form,
+    bounded_step,
+)
 from samii_rig.diagnose.fit.moebius import Place
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.physics.effect import Effect, Unknown
@@ -31,9 +38,9 @@ from samii_rig.types import Complex, Float
 
 DISTINCT_STARTS = 2.5  # of logarithms: two starts from which different optima may be reached
 LOOSE = 1e-3  # precision of an unknown without a prior, which keeps the projection regular
-OTHERS = 10  # starts behind the best among which a second is looked for
-FINER = 4  # times as many trials as starts where they cost next to nothing
-WIDER = (1 / 12, 1.0, 8.0)  # trials about an only start
+OTHER_STARTS = 10  # starts behind the best among which a second is looked for
+CHEAP_TRIALS = 4  # times as many trials as starts where they cost next to nothing
+TRIALS_ABOUT = (1 / 12, 1.0, 8.0)  # trials about an only start
 MANY = 20  # starts that are already fine
 MINIMA = 2  # trials that are brought to their optimum
 DISTINCT_MINIMA = 0.7  # of a logarithm: trials near different minima
@@ -142,7 +149,7 @@ class Screen:
     ) -> Found | None:
         """All of a fine grid over the unknowns, and the optima that its best lead to."""
         form = self.form(b)
-        finer = FINER if len(unknowns) < 3 else 1
+        finer = CHEAP_TRIALS if len(unknowns) < 3 else 1
         trials = np.array(list(product(*(_fine(u, finer) for u in unknowns))))
         with np.errstate(all="ignore"):
             cost = form.cost(phi(trials))
@@ -215,7 +222,7 @@ class Screen:
         if len(effect.unknowns) > 1:
             tried.insert(0, self._descended(model, known, effect, tried[0]))
         starts = [tried[0][1]]
-        other = next((t[1] for t in tried[1:OTHERS] if _distinct(t[1], starts[0])), None)
+        other = next((t[1] for t in tried[1:OTHER_STARTS] if _distinct(t[1], starts[0])), None)
         if other is not None:
             starts.append(other)
         return max(gain, self.base.cost - tried[0][0]), starts
@@ -262,11 +269,11 @@ class Screen:
             return _Point(x, new[0], new[2])
 
         def settled(p: Progress) -> bool:
-            return 0 < p.gain < SETTLED
+            return 0 < p.gain < DESCENT_ENDS
 
         start = _Point(np.log(best[1]), best[0], best[2])
         with suppress(SamiiRigError):  # no derivative there: the best so far is it
-            descend(start, normal, trial, settled, DAMPING, trials=ROUNDS)
+            descend(start, normal, trial, settled, FORM_DAMPING, trials=DESCENT_ROUNDS)
         return best
 
     def _stepped(
@@ -285,7 +292,7 @@ class Screen:
             return [], 0.0
         step = -float(slope @ left) / power
         unknown, value = effect.unknowns[0], start[0]
-        ways = [value * math.exp(min(max(step, -LONGEST), LONGEST))]
+        ways = [value * math.exp(min(max(step, -LONGEST_STEP), LONGEST_STEP))]
         # Weak effects are linear in a strength or in its inverse.
         ways += [value * (1 + step)] if step > -1 else []
         ways += [value / (1 - step)] if step < 1 else []
@@ -298,7 +305,7 @@ def _fine(unknown: Unknown, finer: int) -> Float:
     """Values at which an effect is tried where a try costs next to nothing."""
     starts = np.array(unknown.starts)
     if starts.size == 1:
-        return np.asarray(np.clip(starts * WIDER, unknown.low, unknown.high))
+        return np.asarray(np.clip(starts * TRIALS_ABOUT, unknown.low, unknown.high))
     if starts.size >= MANY:
         return starts
     return np.append(np.geomspace(unknown.low, unknown.high, finer * starts.size), starts[-1])

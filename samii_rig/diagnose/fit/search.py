@@ -15,7 +15,13 @@ from itertools import product
 
 import numpy as np
 
-from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, named, threshold
+from samii_rig.diagnose.fit.explanations import (
+    NEAR_BEST,
+    Explanation,
+    Explanations,
+    named,
+    threshold,
+)
 from samii_rig.diagnose.fit.ranking import moved, ranking
 from samii_rig.diagnose.fit.refit import Fitted, far_off, profiled, refit
 from samii_rig.diagnose.fit.screen import Screen, Start
@@ -32,11 +38,12 @@ ENOUGH = 1.15  # chi-square over its mean below which growth looks at one explan
 SATURATED = "torsional_compliance"  # joints that give: what is missing in many places at once
 MOST_SATURATED = 12  # of these places
 TENTHS = (2, 5, 8)  # tenths of their range at which several unknowns start together
-WEAK = (4, 5, 6)  # tenths of the range at which they start
+WEAK_STARTS = (4, 5, 6)  # tenths of the range at which they start
 BEAM = 2  # explanations to which further effects are added
 HOPELESS = 20.0  # times the best chi-square, above which an explanation is let go
-APART = 3.0  # times the cost that an explanation seemed to have, above which it was no such one
-AGAIN, STILL = 4, 0.3  # times that bins are made anew at most, and a move that is none
+# Times the cost that an explanation seemed to have, above which it was no such one
+OVER_SEEMING = 3.0
+BINNED_AGAIN, BINS_STILL = 4, 0.3  # times that bins are made anew at most, and a move that is none
 SWAPS = 2  # rounds of them, the second about what won the first
 ANYHOW = 2  # of the most promising in another's place are refitted whatever the screen says
 SHARE = 0.3  # of the best candidate's gain: one that promises less is not refitted
@@ -46,7 +53,7 @@ LARGE_MISMATCH = (
 )
 AHEAD, FINALISTS = 5, 5  # steps of a round of that, and how many go on after it
 FALLING = 0.5  # of its cost, after a leg, below which one is still on its way and runs another
-OTHERS = 3  # of other physics than theirs, that go on too
+OTHER_PHYSICS = 3  # of other physics than theirs, that go on too
 SWITCHED = 12  # effects without unknowns that compete so: the nearest as the rig file has the rest
 PROFILED, MOST_PROFILED = 12, 2  # values of each unknown over its range, of so many at most
 BROAD = 4  # single effects of different physics that are extended where none is enough
@@ -174,7 +181,7 @@ class Search(Explanations):
         """Single effects of several unknowns that may still compete, refitted from weak to strong:
         one that stopped in a local minimum beside its own loses to others by that alone."""
         best = self.ranked()[0]
-        near = [e for e in self.ranked() if best.effects and e.weight > best.weight - NEAR]
+        near = [e for e in self.ranked() if best.effects and e.weight > best.weight - NEAR_BEST]
         several = [e for e in near if len(e.effects) == 1 and len(e.effects[0].unknowns) > 1]
         for e in self.each(several, lambda e: named(e.effects)):
             unknowns = e.effects[0].unknowns
@@ -217,7 +224,7 @@ class Search(Explanations):
         best = self.ranked()[0]
         meant = self.meant(best.effects) or self.nominal
         rival = next((e for e in self.ranked() if not meant.key <= e.key), None)
-        sure = rival is None or rival.weight < best.weight - 4 * NEAR
+        sure = rival is None or rival.weight < best.weight - 4 * NEAR_BEST
         return meant if sure else self.nominal
 
     def _forward_straight(self, base: Explanation) -> None:
@@ -271,7 +278,7 @@ class Search(Explanations):
             if end is not None:
                 self.keep(effects, end)
                 reached = min(reached, end.cost)
-                best = min(best, end.cost + 2 * NEAR)
+                best = min(best, end.cost + 2 * NEAR_BEST)
 
     def _switches(self, base: Explanation) -> list[Candidate]:
         """Effects that are there or not, from the nominal parameters as the rig file has them:
@@ -322,7 +329,7 @@ class Search(Explanations):
         for other in rest:
             if (physics := other[1][-1].physics) not in seen:
                 others.setdefault(physics, other)
-        return first + list(others.values())[:OTHERS]
+        return first + list(others.values())[:OTHER_PHYSICS]
 
     def _run(self, effects: tuple[Effect, ...], x: Float) -> Fitted | None:
         """A refit for as long as it falls fast: who starts far away is not behind for that."""
@@ -353,7 +360,7 @@ class Search(Explanations):
         if not 2 <= len(effects) <= MOST_SATURATED:
             return
         ends = []
-        for tenth in self.each(WEAK, lambda _: named(effects[:1]) + " and everywhere else"):
+        for tenth in self.each(WEAK_STARTS, lambda _: named(effects[:1]) + " and everywhere else"):
             start = [
                 math.log(u.starts[tenth * len(u.starts) // 10]) for e in effects for u in e.unknowns
             ]
@@ -392,7 +399,7 @@ class Search(Explanations):
     def exchange(self, whole: Explanation) -> None:
         """Every effect of `whole` taken out, and every other tried in its place, about where
         `whole` left the rest."""
-        enough = whole.fitted.cost + 4 * NEAR * self.overdispersion
+        enough = whole.fitted.cost + 4 * NEAR_BEST * self.overdispersion
         for i in self.each(range(len(whole.effects)), _without(whole)):
             gone = whole.effects[i]
             base = self.without_refit(whole, i)
@@ -450,7 +457,7 @@ class Search(Explanations):
         kept = near[:1] if self._enough(best) else near[:BEAM]
         if size > MIXED:  # many places of one physics may stand for two of different physics
             one = [e for e in ranked if len(e.effects) == 1]
-            kept += [e for e in one if e.weight > best.weight - 4 * NEAR][:1]
+            kept += [e for e in one if e.weight > best.weight - 4 * NEAR_BEST][:1]
         return kept
 
     def _enough(self, explanation: Explanation) -> bool:
@@ -460,20 +467,20 @@ class Search(Explanations):
     def rebin_and_refit(self, best: Explanation) -> None:
         """Bins anew about the best explanation until it stands still, for bins about a model that
         is off lead to one that is; and what may still compete refitted on them."""
-        near = [e for e in self.ranked()[:FIRST] if e.weight > best.weight - 4 * NEAR]
+        near = [e for e in self.ranked()[:FIRST] if e.weight > best.weight - 4 * NEAR_BEST]
         broad = list(_each_physics(self.ranked()))[:BROAD]
         keep = [e for e in (*near, *broad) if e.fitted.cost < HOPELESS * best.fitted.cost]
         nominal, seemed = self.nominal, best.fitted.cost
-        for _ in range(AGAIN):
+        for _ in range(BINNED_AGAIN):
             self.rebin(best.fitted)
             end = self.refitted(best.effects, best)
             if end is None:
                 break
-            still = best.fitted.away(end) < STILL
+            still = best.fitted.away(end) < BINS_STILL
             best = replace(best, fitted=end)
             if still:
                 break
-        if best.effects and best.fitted.cost > APART * max(seemed, self.problem.expected):
+        if best.effects and best.fitted.cost > OVER_SEEMING * max(seemed, self.problem.expected):
             # About itself it does nothing of what it seemed to from where it was looked for.
             self.rebin(nominal.fitted)
             keep = [e for e in keep if e.key != best.key]

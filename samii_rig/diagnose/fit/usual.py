@@ -19,13 +19,13 @@ RECORDS_TAKE = (0.08, 0.7)
 LINES_TAKE = (0.25, 9.5)
 STATES_TAKE = (0.2, 0.75)
 POSES_TAKE = (0.16, 1.1)
-LEAST = 0.5  # s: the work that every diagnosis has
+LEAST_WORK = 0.5  # s: the work that every diagnosis has
 
 
 def takes(each: tuple[float, float], n: int) -> tuple[float, float]:
     """s from its start to the end of a diagnosis of n samples or lines."""
-    low, high = (max(LEAST, 1e-3 * n * s) for s in each)
-    return low, max(high, 2 * LEAST)
+    low, high = (max(LEAST_WORK, 1e-3 * n * s) for s in each)
+    return low, max(high, 2 * LEAST_WORK)
 
 
 # Of 33 concealed trials of two plants and thirteen rigs, 11 s in the median.

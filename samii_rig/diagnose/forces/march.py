@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, types
 
-from samii_rig.diagnose.forces.steps import NUMBERS, OUT, SIGNATURE, Step
+from samii_rig.diagnose.forces.steps import LAW_NUMBERS, OUT, SIGNATURE, Step
 from samii_rig.types import Float, Int
 
 _law = types.FunctionType(SIGNATURE)
@@ -78,7 +78,7 @@ def march(
         for i in range(1, 1 + m):
             along = out[1] * before[i] + out[2] * y[i] + out[4] * memory[i]
             keeps = out[5] * before[i] + out[6] * y[i] + out[7] * memory[i]
-            for j in range(NUMBERS):
+            for j in range(LAW_NUMBERS):
                 along += out[8 + 2 * j] * seeds[i - 1, j]
                 keeps += out[9 + 2 * j] * seeds[i - 1, j]
             f[i, step] = held[i] = along

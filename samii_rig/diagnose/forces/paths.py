@@ -27,7 +27,8 @@ from samii_rig.types import Complex, Float, Int
 OVER = 4.0  # rate over the highest line: third harmonics fold beside the band, not into it
 # Of the samples, of a command that rests: one that swings passes 0 in a hundredth of them.
 RESTS = 0.05
-DAMPING = 5.0  # of the contour: 0.7 % wraps around, what is cut above the rate grows 12 times
+# Of the contour: 0.7 % wraps around, what is cut above the rate grows 12 times
+CONTOUR_DAMPING = 5.0
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Span:
         low = int(fft.next_fast_len(needed, real=True))  # more than n where that is quicker
         turns = 2 if history == 0 else 4
         M, m = turns * n, turns * low
-        sigma = DAMPING * rate_hz / M
+        sigma = CONTOUR_DAMPING * rate_hz / M
         v, times = mean_command(piece)
         f = np.arange(m // 2 + 1) * (rate_hz / M)
         s = np.asarray(sigma + 2j * np.pi * f, np.complex128)

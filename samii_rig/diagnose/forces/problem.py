@@ -36,7 +36,7 @@ from samii_rig.types import Complex, Float
 STRAY, REACH = 1e-5, 32
 # Instants of a command that was measured, not held, for each that was recorded: a law bends it
 # between them. Sixteen move a limit by no more than a twentieth of what one did.
-FINER = 8
+STEPS_A_SAMPLE = 8
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Moved:
             pieces = self.whole.records.pieces
             name = model.force.place.command(model.built)
             on = wired.column(name)
-            every = self.whole.every * (FINER if model.metered(name) else 1)
+            every = self.whole.every * (STEPS_A_SAMPLE if model.metered(name) else 1)
             return [_lines_of_command(piece, model, p, seeds, every, on) for piece in pieces]
         way = self.ways.at(model, x)
         contour = self.whole.records.exact()

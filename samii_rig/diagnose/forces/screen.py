@@ -36,10 +36,10 @@ GAPS = (3e-4, 2e-3, 1e-2, 4e-2, 0.15, 0.5)
 # Limits over the largest amplitude: one just below it cuts only a little.
 LIMITS = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 SLIPS = (0.03, 0.15, 0.6)  # motion at which a part slips over the largest motion
-WEAK = 1e-3  # of the upper end of a supply's range
+WEAK_START = 1e-3  # of the upper end of a supply's range
 CAP = 1.5  # power of its height, that what a limit cuts off a sine grows with
 AT_ONCE = 8  # changes of all lines that are whitened together
-STRONG = 0.03  # of the motion that drives it, that a force may change to count as weak
+WEAK_BELOW = 0.03  # of the motion that drives it, that a force may change to count as weak
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,13 +112,13 @@ def trial_strengths(effect: Effect, paths: TransferPaths) -> list[Float]:
     if law in (OVERLAP, PLAY):
         return [np.array([high / 2 * x]) for x in GAPS]
     if law is ORIFICE:
-        return [np.array([high * WEAK])]
+        return [np.array([high * WEAK_START])]
     if law is HYSTERESIS:
         motion = paths.motion(effect.force.place, of_speed=False)
         top = max(float(np.max(np.abs(y))) for y in motion)
-        k = effect.unknowns[1].high * WEAK
+        k = effect.unknowns[1].high * WEAK_START
         return [np.array([k * top * x, k]) for x in SLIPS]
-    return [np.array([high * WEAK])]
+    return [np.array([high * WEAK_START])]
 
 
 def scaled(law: Law, strengths: Float, times: float, largest: float) -> Float:
@@ -153,7 +153,7 @@ def first_order(
     gains = screen.first_order(shapes)
     for (effect, strengths), share, (own, may, times) in zip(which, changed, gains, strict=True):
         at = int(np.argmax(may))
-        weak = share * max(float(times[at]), 0.0) < STRONG
+        weak = share * max(float(times[at]), 0.0) < WEAK_BELOW
         score = Score(effect, strengths, own, may, float(times[at]), weak)
         old = best.get(effect.key)
         if old is None or may[at] > np.max(old.may):

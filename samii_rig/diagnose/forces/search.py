@@ -14,7 +14,13 @@ from copy import copy
 
 import numpy as np
 
-from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, named, threshold
+from samii_rig.diagnose.fit.explanations import (
+    NEAR_BEST,
+    Explanation,
+    Explanations,
+    named,
+    threshold,
+)
 from samii_rig.diagnose.fit.ranking import moved, ranking
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
@@ -47,8 +53,8 @@ MARCHED = 12  # forces that are computed in time
 MOST_MARCHED = 20_000_000
 LESS = 0.08  # of the largest bound, below which a force is not
 PROMISING = 0.25  # of what the best force gains, at least
-AGAIN = 3  # times that the likelihood is made anew about the best explanation
-STILL = 0.5  # standard deviations, a move from one to the next that is none
+FORMED_AGAIN = 3  # times that the likelihood is made anew about the best explanation
+REFERENCE_STILL = 0.5  # standard deviations, a move from one to the next that is none
 NO_MOVE = 1e-3  # of a logarithm: a refit of few steps has ended
 RENEWED = 6  # times that the chain through which a force acts is renewed in between
 RIVALS = 4  # linear explanations that forces are held against
@@ -84,7 +90,7 @@ class ForceSearch(RecordSearch):
         self.use(self.table)
         ranked = self.linear.ranked()
         self._about(ranked[0].fitted)
-        kept = [e for e in ranked[:RIVALS] if e.weight > ranked[0].weight - NEAR]
+        kept = [e for e in ranked[:RIVALS] if e.weight > ranked[0].weight - NEAR_BEST]
         # Beside what is wrong with the data a force is held against what the rig lacks otherwise.
         self._only((self.linear.nominal, _of_data(self.linear), *kept))
 
@@ -153,17 +159,19 @@ class ForceSearch(RecordSearch):
         if first is not None:
             self._try(self.scores([first]) if faulty else scores, first, -1)
         self.take_overdispersion()
-        for _ in range(AGAIN):
+        for _ in range(FORMED_AGAIN):
             best = self.ranked()[0]
             if not isinstance(best.fitted.model, ForceModel):
                 return
             self._about(best.fitted)
-            near = [e for e in self.ranked() if e.weight > best.weight - NEAR]
+            near = [e for e in self.ranked() if e.weight > best.weight - NEAR_BEST]
             self._only((*near, self.nominal))
             self._through(self.ranked()[0])
             self.take_overdispersion()
             after = self.ranked()[0]
-            if self.exhausted or (after.key == best.key and after.fitted.away(best.fitted) < STILL):
+            if self.exhausted or (
+                after.key == best.key and after.fitted.away(best.fitted) < REFERENCE_STILL
+            ):
                 break
         self._either_way(self.ranked()[0])
         self.pair()
@@ -245,7 +253,7 @@ class ForceSearch(RecordSearch):
             for _, effect, starts in self.each(some, lambda r: named([r[1]])):
                 effects = (*less.effects, effect)
                 end = plain.refitted(effects, less, np.log(starts[0]).tolist())
-                if end is not None and end.cost < rest.fitted.cost + 2 * NEAR:
+                if end is not None and end.cost < rest.fitted.cost + 2 * NEAR_BEST:
                     self._beside_force((*effects, *forces), end, best)
 
     def _beside_force(self, effects: tuple[Effect, ...], plain: Fitted, best: Explanation) -> None:
@@ -257,7 +265,7 @@ class ForceSearch(RecordSearch):
         forces = [i for i, e in enumerate(best.effects) if e.force is not None]
         strengths = [best.fitted.x[k] for i in forces for k in best.fitted.model.own(i)]
         start = np.concatenate([linear, strengths])
-        for _ in range(AGAIN):
+        for _ in range(FORMED_AGAIN):
             self._ways.clear()
             end = self.refitted_from(effects, start)
             if end is None:
@@ -295,7 +303,7 @@ class ForceSearch(RecordSearch):
                 return
             del self.found[best.key]
             self.keep(best.effects, end)
-            still, best = best.fitted.away(end) < STILL, self.found[best.key]
+            still, best = best.fitted.away(end) < REFERENCE_STILL, self.found[best.key]
             if still:
                 return
 

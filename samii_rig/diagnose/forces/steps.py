@@ -19,9 +19,9 @@ from numba import njit, types
 
 from samii_rig.types import Float
 
-OUT, NUMBERS = 12, 2  # entries of `out`, and numbers of a law at most
+OUT, LAW_NUMBERS = 12, 2  # entries of `out`, and numbers of a law at most
 NEWTON = 5  # steps at most to the root of a law that is monotonous
-SETTLED = 1e-8  # of the root: Newton's next step would be of the square of it, a rounding error
+ROOT_FOUND = 1e-8  # of the root: Newton's next step would be of the square of it, a rounding error
 _f8, _row = types.float64, types.Array(types.float64, 1, "C")
 SIGNATURE = types.void(_f8, _f8, _f8, _f8, _row, _f8, _row)
 
@@ -55,7 +55,7 @@ def cubic(
     for _ in range(NEWTON):
         off = (x - middle - slope * x * x * x) / (1.0 - 3.0 * slope * x * x)
         x -= off
-        if abs(off) <= SETTLED * abs(x):
+        if abs(off) <= ROOT_FOUND * abs(x):
             break
     out[0] = k * x * x * x
     # f = k (middle + g f/2)^3, differentiated.
@@ -138,7 +138,7 @@ def hysteresis(
         h, slope, _, _, _ = advanced(memory, dx, p[0], p[1])
         off = (dx - (free - before) + 0.5 * g * (memory + h)) / (1.0 + 0.5 * g * slope)
         dx -= off
-        if abs(off) <= SETTLED * abs(dx):
+        if abs(off) <= ROOT_FOUND * abs(dx):
             break
     h, slope, by_h, by_top, by_k = advanced(memory, dx, p[0], p[1])
     held = 1.0 + 0.5 * g * slope

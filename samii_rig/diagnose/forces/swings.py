@@ -19,10 +19,10 @@ from samii_rig.diagnose.forces.varying import ONE_PHASE, PieceModulation
 from samii_rig.types import Float
 
 # Angles that are added up: so many for each standard deviation of the best known one, within.
-ANGLES, BETWEEN = 16.0, (64, 4096)
+ANGLES, ANGLES_BETWEEN = 16.0, (64, 4096)
 # Radii that are added up: at first to so many times the mean, then twice more where they are likely
 # by more than a part of the most likely one.
-RADII, FARTHEST, FINER, NOTHING = 400, 10.0, 3, 1e-5
+RADII, FARTHEST_RADIUS, FINER, NOTHING = 400, 10.0, 3, 1e-5
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,10 +128,10 @@ def _radius(x: Float, known: Float) -> tuple[float, float, float]:
         return 0.0, 0.0, 0.0
     middle = math.sqrt(float(square.sum()) / total) or 1.0 / math.sqrt(total)
     sharp = math.sqrt(float(np.max(square)))
-    n = int(np.clip(ANGLES * sharp, *BETWEEN))
+    n = int(np.clip(ANGLES * sharp, *ANGLES_BETWEEN))
     turned = np.exp(2j * np.pi * np.arange(n) / n)
     u = np.stack([turned.real, turned.imag])
-    low, high = 0.0, FARTHEST * middle
+    low, high = 0.0, FARTHEST_RADIUS * middle
     for _ in range(FINER):
         r = np.linspace(low, high, RADII)
         likely = np.zeros(RADII)

@@ -37,8 +37,9 @@ from samii_rig.rig.schema import (
 
 Spring = TorsionalSpring | TranslationalSpring | TorsionalGroundSpring | TranslationalGroundSpring
 
-STARTS = 14  # of a strength over its range
-RANGE = (1e-9, 30.0)  # of a strength over the one that doubles or halves the motion at its place
+STRENGTH_STARTS = 14  # of a strength over its range
+# Of a strength over the one that doubles or halves the motion at its place
+STRENGTH_RANGE = (1e-9, 30.0)
 SOFTEST = 1.0  # the same of a stiffness that falls: beyond, a spring would push
 WIDTHS = (1e-6, 2.0)  # of a gap or limit over the largest amplitude that meets it
 BEYOND = 3.0  # standard deviations of a meter's noise, which is beyond in 0.3 % of the samples
@@ -85,26 +86,30 @@ def _between(paths: TransferPaths, place: Place, spring: Spring) -> Iterator[Eff
     if speed <= 0 or ports is None:
         return
     force = np.pi / 4 * speed / float(np.median(ports.y1))
-    T_c = _log("T_c", of_force, RANGE[0] * force, RANGE[1] * force)
+    T_c = _log("T_c", of_force, STRENGTH_RANGE[0] * force, STRENGTH_RANGE[1] * force)
     yield effect(FRICTION, place, name, other, (T_c,))
     moved = paths.ports(place, of_speed=False)
     if other or moved is None:
         return
     # The sine in c2 |speed| speed is two thirds of that in friction of T_c = c2 speed^2.
     c2 = 3 / 2 * force / speed**2
-    unknown = _log("c2", f"{of_force} s^2/{of_way}^2", RANGE[0] * c2, RANGE[1] * c2)
+    unknown = _log(
+        "c2", f"{of_force} s^2/{of_way}^2", STRENGTH_RANGE[0] * c2, STRENGTH_RANGE[1] * c2
+    )
     yield effect(QUADRATIC, place, name, "", (unknown,))
     top = _largest(paths, place, of_speed=False)
     doubles = 1 / float(np.median(moved.y1))  # force a way
     k3 = 4 / 3 * doubles / top**2
-    for law, most in ((HARDENING, RANGE[1]), (SOFTENING, SOFTEST)):
-        unknown = _log("k3", f"{of_force}/{of_way}^3", RANGE[0] * k3, most * k3)
+    for law, most in ((HARDENING, STRENGTH_RANGE[1]), (SOFTENING, SOFTEST)):
+        unknown = _log("k3", f"{of_force}/{of_way}^3", STRENGTH_RANGE[0] * k3, most * k3)
         yield effect(law, place, name, "", (unknown,))
     if spring.k.value > 0:
         width = _log("width", of_way, WIDTHS[0] * top, WIDTHS[1] * top)
         yield effect(PLAY, place, name, "", (width,), (name, "k"))
-    T_y = _log("T_y", of_force, RANGE[0] * doubles * top, RANGE[1] * doubles * top)
-    k = _log("k", f"{of_force}/{of_way}", RANGE[0] * doubles, RANGE[1] * doubles)
+    T_y = _log(
+        "T_y", of_force, STRENGTH_RANGE[0] * doubles * top, STRENGTH_RANGE[1] * doubles * top
+    )
+    k = _log("k", f"{of_force}/{of_way}", STRENGTH_RANGE[0] * doubles, STRENGTH_RANGE[1] * doubles)
     yield effect(HYSTERESIS, place, name, "", (T_y, k))
 
 
@@ -152,7 +157,7 @@ def _largest(paths: TransferPaths, place: Place, *, of_speed: bool) -> float:
 
 
 def _log(symbol: str, unit: str, low: float, high: float) -> Unknown:
-    return Unknown(symbol, unit, low, high, spread(low, high, STARTS))
+    return Unknown(symbol, unit, low, high, spread(low, high, STRENGTH_STARTS))
 
 
 def effect(

@@ -42,13 +42,14 @@ from samii_rig.likelihood.records import CYCLES
 from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.types import Float
 
-STILL = 0.25  # of chi-square of each number that a step promises: half its standard deviation
-ROUNDS = 8  # times that the likelihood is made anew at most: 3 or 4 were usual
+# Of chi-square of each number that a step promises: half its standard deviation
+SWINGS_STILL = 0.25
+SETTLE_ROUNDS = 8  # times that the likelihood is made anew at most: 3 or 4 were usual
 # Of the evidence that the first gains in one round, from which on another spring may be the one.
-RIVAL = 0.5
+RIVAL_SPRING = 0.5
 # Of what it explains, above which a force that does as much makes a law of the amplitude as likely.
 LAWFUL = 0.5
-AGAIN = 1e-3  # chance of noise to make repeats differ as much, below which they do
+REPEATS_DIFFER = 1e-3  # chance of noise to make repeats differ as much, below which they do
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +160,7 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     if not tried:
         return None
     # A first round that is far off the frequency may gain nothing yet.
-    least = nothing + RIVAL * max(tried[0].evidence - nothing, 0.0)
+    least = nothing + RIVAL_SPRING * max(tried[0].evidence - nothing, 0.0)
     some = [one for one in tried if one.evidence >= least] or tried[:1]
     tried = sorted((one.settled(best) for one in some), key=lambda one: -one.evidence)
     taken = tried[0]
@@ -247,8 +248,8 @@ class _Taken:
 
     def settled(self, best: Explanation) -> _Taken:
         """The same, once nothing is left that varies and what was found stands still."""
-        for _ in range(ROUNDS):
-            if not self.closer(best) and self.swings.left < STILL:
+        for _ in range(SETTLE_ROUNDS):
+            if not self.closer(best) and self.swings.left < SWINGS_STILL:
                 break
         return self
 
@@ -399,7 +400,7 @@ def _repeats_differ(pieces: Sequence[PieceModulation], hz: float) -> bool | None
     """Whether repeats of one input differ by a modulation, whose phase is another in each, more
     than noise does; None where nothing was repeated."""
     chi2, free = (sum(x) for x in zip(*(one.differing(hz) for one in pieces), strict=True))
-    return bool(stats.chi2.sf(chi2, free) < AGAIN) if free else None
+    return bool(stats.chi2.sf(chi2, free) < REPEATS_DIFFER) if free else None
 
 
 def _some(left: Sequence[Unexplained]) -> list[Unexplained]:

@@ -39,11 +39,11 @@ FASTEST = 0.2  # of the highest frequency in the records: what varies faster is 
 FINE = 4  # frequencies for each that the longest record resolves
 ALARM = 2e-3  # chance that noise alone makes any stiffness vary
 ONE_PHASE = 1e-3  # of V: less variance is that of a phase which the motion does not show
-FLAT = 1e-2  # of the distance between frequencies that are tried: nearer, chi-square is flat
+FLAT_OVER = 1e-2  # of the distance between frequencies that are tried: nearer, chi-square is flat
 # Powers of the motion that a spring's force has which is not the same to both sides: of one that is
 # stiffer to one side, and of the first that a curve has.
 SIDES = (1, 2)
-OWN = 1e-3  # of a force, to which what it does to itself is solved
+SELF_SOLVED = 1e-3  # of a force, to which what it does to itself is solved
 ROUNDED = 1e-6  # of the largest variance: less is rounding
 VARIANCES = (
     400  # that are tried: 40 to a decade where records differ by ten, as likelihoods are flat there
@@ -261,7 +261,7 @@ class PieceModulation:
         if not first.any():
             return first
         whole = linalg.LinearOperator((M, M), matvec=rest, dtype=first.dtype)
-        return np.asarray(linalg.gmres(whole, first, rtol=OWN, maxiter=1)[0])
+        return np.asarray(linalg.gmres(whole, first, rtol=SELF_SOLVED, maxiter=1)[0])
 
     def _waves(self, each: Sequence[float], *, slopes: bool = False) -> list[Float]:
         """(M,) a constant, then cosine and sine of each frequency; then both times t (s). Time runs
@@ -364,7 +364,7 @@ class Modulation:
 
         ends = (self.hz - step, self.hz + step)
         found = optimize.minimize_scalar(
-            lost, bounds=ends, method="bounded", options={"xatol": FLAT * step}
+            lost, bounds=ends, method="bounded", options={"xatol": FLAT_OVER * step}
         )
         return self._at(pieces, float(found.x), self.trials, self.louder)
 

@@ -16,7 +16,7 @@ from samii_rig.types import Complex, Float, Int
 ALIAS_POINTS = 120  # frequencies at which the aliases are summed; they are smooth between
 # Aliases that are computed at every frequency, as a mode in one may be sharp, and that a factor on
 # a channel changes.
-NEAR = (-1, 1, -2, 2)
+NEAR_ALIASES = (-1, 1, -2, 2)
 # Aliases beyond those, at a few frequencies, as a factor changes each otherwise: what it leaves of
 # them beside its phase at the frequency itself is smooth between. `ALONE` are by themselves, then
 # blocks of `BLOCKS` an octave, in which a factor grows by one ratio from order to order. Terms are
@@ -153,7 +153,7 @@ class Aliases:
     def of(cls, rig: Rig, chain: Chain, few: Float, sensor: Int, actuator: Int) -> Aliases:
         """Of a chain of the rig."""
         s = np.asarray(2j * np.pi * few, np.complex128)
-        near = each_alias(rig, chain, s, (0, *NEAR), sensor, actuator)
+        near = each_alias(rig, chain, s, (0, *NEAR_ALIASES), sensor, actuator)
         rest = sampled_response(rig, few, chain)[:, sensor, actuator] - near.sum(axis=0)
         far = Far.of(rig, chain, few, sensor, actuator)
         return cls(few, rest / _held(s, rig.rate_hz), far)

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from samii_rig.diagnose.physics.fractional import Joint
 
 Values = Mapping[Key, float]
-LEAST = 1e-6  # of the logarithm of a ratio: no record of a structure shows a part in a million
+# Of the logarithm of a ratio: no record of a structure shows a part in a million
+LEAST_RATIO = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +53,7 @@ class Unknown:
         if not self.ratio:
             return 0.0
         most = max(math.log(self.high), -math.log(self.low))
-        return math.log(most / (math.log(most / LEAST) * min(max(abs(x), LEAST), most)))
+        return math.log(most / (math.log(most / LEAST_RATIO) * min(max(abs(x), LEAST_RATIO), most)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from samii_rig.diagnose.physics.aliases import (
-    NEAR,
+    NEAR_ALIASES,
     Aliases,
     Far,
     alias_points,
@@ -21,13 +21,14 @@ from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, Int
 
-OWN = 2  # of `NEAR`, those of each model itself where that shows: modes are seldom above 1.5 rates
+# Of `NEAR_ALIASES`, those of each model itself where that shows: modes are seldom above 1.5 rates.
+OWN_ALIASES = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Folded:
-    """What of a model folds back. near : (order, n, q) of the orders `NEAR`. times : (q,) by how
-    much all beyond the model's own are larger than those of the grid; None where none is its own.
+    """What of a model folds back. near : (order, n, q) of the orders `NEAR_ALIASES`. times : (q,)
+    by how much all beyond the model's own are larger than those of the grid; None where none is.
     """
 
     near: Complex
@@ -47,10 +48,9 @@ class Grid:
     """Frequencies (n,), at s = sigma + 2 pi j f, with what does not change between models there.
 
     factor : (n, q) hold, filters and delays. aliases : (n, q) what the sum over aliases adds.
-    folded : (order, n, q) of these the ones of `NEAR`, or none. far : of these those beyond.
-    own_aliases : (`OWN`, n, q) hold, filters and delays of the first of `folded`, if every model
-    has its own there; None where those of one chain are near enough.
-    rate_hz : of the samples.
+    folded : (order, n, q) of these the ones of `NEAR_ALIASES`, or none. far : those beyond.
+    own_aliases : (`OWN_ALIASES`, n, q) hold, filters and delays of the first of `folded`, if every
+    model has its own there; None where those of one chain are near enough. rate_hz : of samples.
     sensor, actuator : (q,) entries. loop : closed around them, if responses are to the references.
     sigma : of all, or (n,) of each.
     """
@@ -100,12 +100,12 @@ class Grid:
 
     def asked(self) -> Complex:
         """s at which a model's chain is asked: of the grid, and of its own aliases behind."""
-        own = () if self.own_aliases is None else NEAR[:OWN]
+        own = () if self.own_aliases is None else NEAR_ALIASES[:OWN_ALIASES]
         return np.concatenate([self.s, *(upper(self.s, k, self.rate_hz) for k in own)])
 
     def by_alias(self, answers: Complex) -> list[Complex]:
         """Answers there, as rows, of the grid and of each of these aliases."""
-        return np.split(answers, 1 if self.own_aliases is None else 1 + OWN)
+        return np.split(answers, 1 if self.own_aliases is None else 1 + OWN_ALIASES)
 
     def response_and_folded(self, answers: Complex) -> tuple[Complex, Folded]:
         """Answers (n ..., q) there as those of the grid (n, q), and what folds back: of the chain
@@ -113,14 +113,14 @@ class Grid:
         G, *terms = self.by_alias(answers)
         if self.own_aliases is None:
             return G, Folded(self.folded)
-        each = zip(terms, NEAR, self.own_aliases, strict=False)
+        each = zip(terms, NEAR_ALIASES, self.own_aliases, strict=False)
         own = np.stack([lower(t, k) * f for t, k, f in each])
-        times = _larger(own, self.folded[:OWN])
-        return G, Folded(np.concatenate([own, times * self.folded[OWN:]]), times)
+        times = _larger(own, self.folded[:OWN_ALIASES])
+        return G, Folded(np.concatenate([own, times * self.folded[OWN_ALIASES:]]), times)
 
     def orders(self) -> list[Complex]:
         """s (n,) of each order of `folded`."""
-        known = NEAR[: len(self.folded)]
+        known = NEAR_ALIASES[: len(self.folded)]
         return [self.s + 2j * np.pi * k * self.rate_hz for k in known]
 
 
@@ -143,9 +143,9 @@ def grid(
     if aliases is None:
         aliases = Aliases.of(rig, chain, alias_points(f[f > 0][0], f[-1], f.size), sensor, actuator)
     s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
-    folded = each_alias(rig, chain, s, NEAR, sensor, actuator)
+    folded = each_alias(rig, chain, s, NEAR_ALIASES, sensor, actuator)
     every = aliases.spread(s, rig.rate_hz) + folded.sum(axis=0)
-    orders = (0, *NEAR[:OWN]) if own_aliases else (0,)
+    orders = (0, *NEAR_ALIASES[:OWN_ALIASES]) if own_aliases else (0,)
     factor, *own = around(rig, s, orders, sensor, actuator)
     return Grid(
         f, factor, every, folded, rig.rate_hz, sensor, actuator,

@@ -8,18 +8,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samii_rig.diagnose.physics.aliases import NEAR, lower, over
+from samii_rig.diagnose.physics.aliases import NEAR_ALIASES, lower, over
 from samii_rig.diagnose.physics.causal import CausalChain
 from samii_rig.diagnose.physics.effect import Effect, Key
 from samii_rig.diagnose.physics.fractional import ChainLike, FractionalChain
-from samii_rig.diagnose.physics.grid import OWN, Folded, Grid
+from samii_rig.diagnose.physics.grid import OWN_ALIASES, Folded, Grid
 from samii_rig.diagnose.physics.poses import turned
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.rig.schema.elements import flattened
 from samii_rig.types import Complex, Float, Int
 
-STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
+LOGARITHM_STEP = 1e-6  # of a logarithm, for the derivative of parameters by unknowns
 FARTHEST = 6.0  # tolerances that a refit moves a nominal parameter at most
 
 
@@ -161,10 +161,10 @@ class Model:
         own, *folds = at.by_alias(slopes[:, at.sensor, at.actuator])
         dG = own * factor[:, :, None]
         far, larger = aliases, np.zeros(dG.shape[1:])
-        for i, (k, d) in enumerate(zip(NEAR, folds, strict=False)):
+        for i, (k, d) in enumerate(zip(NEAR_ALIASES, folds, strict=False)):
             assert at.own_aliases is not None
             by, d, alias = at.own_aliases[i], lower(d, k), folded.near[i]
-            part = over(by, alias) / (OWN * len(alias))
+            part = over(by, alias) / (OWN_ALIASES * len(alias))
             larger += np.matmul(part.T[:, None, :], d.swapaxes(0, 1))[:, 0].real
             if near is not None:
                 by, alias = by * near.F[1 + i], alias * near.F[1 + i]
@@ -180,9 +180,9 @@ class Model:
             map_ = np.zeros((len(keys), len(read)))
             for i, j in enumerate(read):
                 ahead = x.copy()
-                ahead[j] += STEP
+                ahead[j] += LOGARITHM_STEP
                 there = self.values(ahead)
-                map_[:, i] = [(there[k] - values[k]) / STEP for k in keys]
+                map_[:, i] = [(there[k] - values[k]) / LOGARITHM_STEP for k in keys]
             dH[:, :, read] = dG @ map_
         if near is not None:
             terms = np.concatenate([(G * at.factor)[None], folded.near])

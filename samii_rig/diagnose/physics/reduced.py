@@ -32,11 +32,12 @@ from samii_rig.rig.schema import (
 )
 from samii_rig.types import Complex, Float
 
-LARGEST = 0.6  # of a link's mass: what is left still is a body, whatever its tolerance says
+LARGEST_PART = 0.6  # of a link's mass: what is left still is a body, whatever its tolerance says
 SURELY = 2.0  # tolerances above the rig file's value, up to which all of a part may be gone
 ALMOST = 0.99  # of a part, a start of a search: the refit goes on to all of it
-RATIO = (0.02, 50.0)  # of a joint's stiffness to what it was: from all but broken to all but rigid
-RATIOS = (0.3, 0.6, 0.9, 1.1, 1.6, 3.0)  # at which a search starts
+# Of a joint's stiffness to what it was: from all but broken to all but rigid
+JOINT_RATIO = (0.02, 50.0)
+JOINT_RATIOS = (0.3, 0.6, 0.9, 1.1, 1.6, 3.0)  # at which a search starts
 FASTER = 1e4  # times, of a corner: from there on a lag is none in any band
 # What a source's own parameter is a lag or a delay by.
 CORNERS = {"p": "actuator_lag", "omega": "valve_dynamics"}
@@ -108,10 +109,10 @@ def _off_a_link(rig: Rig, link: RigidLink, *, between: bool) -> Iterator[Effect]
     """A mass taken off a link, at a place along it."""
     keys = tuple((link.name, s) for s in ("m", "r", "I"))
     whole, least = link.m.value, _least(link.m, between=between)
-    if least >= LARGEST:
+    if least >= LARGEST_PART:
         return
     (along,) = stretches(rig, link)
-    bounds = least * whole, LARGEST * whole
+    bounds = least * whole, LARGEST_PART * whole
 
     def values(x: Float, nominal: Values, along: Along = along) -> dict[Key, float]:
         m, r, inertia = (nominal[k] for k in keys)
@@ -151,7 +152,7 @@ def _stiffness(spring: TorsionalSpring | TranslationalSpring) -> Effect:
     return Effect(
         physics="joint_stiffness",
         site=spring.name,
-        unknowns=(Unknown("k ratio", "1", *RATIO, RATIOS, ratio=True),),
+        unknowns=(Unknown("k ratio", "1", *JOINT_RATIO, JOINT_RATIOS, ratio=True),),
         parameters=_times(key),
         touches=(key,),
         jump=Jump(f"beside {spring.name}", x_of),
@@ -174,7 +175,7 @@ def _faster(name: str, symbol: str, corner: Parameter, *, between: bool) -> Effe
 
 def faster(low: float) -> tuple[float, ...]:
     """Ratios of a corner to the file's at which a search for a shorter lag starts."""
-    return spread(low, math.sqrt(FASTER), len(RATIOS))
+    return spread(low, math.sqrt(FASTER), len(JOINT_RATIOS))
 
 
 def _times(key: Key) -> Callable[[Float, Values], dict[Key, float]]:

@@ -18,7 +18,7 @@ from samii_rig.types import Complex, Float
 
 PAIRS: tuple[tuple[State, State], ...] = (("theta", "M"), ("w", "V"), ("V", "w"), ("M", "theta"))
 STATES: tuple[State, ...] = ("w", "theta", "M", "V")
-POINTS = 60
+BAND_POINTS = 60
 # Of a stiffness or damping over the chain's own, from gross to invisible: a force sensor in line
 # with a cylinder shows a spring to ground of 6e-6 of the cylinder's stiffness. And where on that a
 # search begins: 0.6 decades apart the next start is near enough for a refit. An odd number has the
@@ -54,7 +54,7 @@ class Places:
 def places(rig: Rig, low_hz: float, high_hz: float) -> Places:
     """All ports of the rig in a band."""
     chain = Chain(rig)
-    f = np.geomspace(low_hz, high_hz, POINTS)
+    f = np.geomspace(low_hz, high_hz, BAND_POINTS)
     at = chain.places()
     elements = [e.name for e in rig.element]
     last = {name: max(i for i, (n, _) in enumerate(at) if n == name and i > 0) for name in elements}

@@ -22,8 +22,8 @@ from samii_rig.diagnose.verdict.judge import MOST_NAMES, Judgement
 from samii_rig.signal.statistics import octaves
 from samii_rig.types import Complex
 
-SHOWN = 0.01  # probability of an alternative from which it is listed
-UNIT_WITHIN = 0.03  # relative, of a fitted gain: what a sensor's calibration may be off by
+LISTED = 0.01  # probability of an alternative from which it is listed
+CALIBRATED = 0.03  # relative, of a fitted gain: what a sensor's calibration may be off by
 
 
 def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> tuple[Cause, ...]:
@@ -63,7 +63,7 @@ def unit_of(effect: Effect, found: dict[str, Value]) -> str:
         return ""
     gain = found["gain"].value
     unit, factor = nearest(gain)
-    return unit.name if abs(gain / factor - 1) < UNIT_WITHIN else ""
+    return unit.name if abs(gain / factor - 1) < CALIBRATED else ""
 
 
 def moved(fitted: Fitted) -> tuple[Moved, ...]:
@@ -122,7 +122,7 @@ def sites(judged: Judgement) -> list[tuple[str, float]]:
     """Probability of each site over all explanations and what they are not distinguished from, the
     most probable first. Sites of what was chosen are there however improbable."""
     if judged.varies is not None:
-        return [(s, p) for s, p in judged.varies.sites if p >= SHOWN]
+        return [(s, p) for s, p in judged.varies.sites if p >= LISTED]
     total: dict[str, float] = defaultdict(float)
     for c, share in zip(judged.classes, judged.placed, strict=True):
         for member, part in c.parts():
@@ -130,7 +130,7 @@ def sites(judged: Judgement) -> list[tuple[str, float]]:
                 total[site] += share * part
     chosen = {e.site for e in judged.best.effects}
     ranked = sorted(total.items(), key=lambda item: -item[1])
-    return [(s, min(p, 1.0)) for s, p in ranked if p >= SHOWN or s in chosen]
+    return [(s, min(p, 1.0)) for s, p in ranked if p >= LISTED or s in chosen]
 
 
 def bands(search: Search, fitted: Fitted) -> tuple[Band, ...]:

@@ -12,7 +12,7 @@ from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
 from samii_rig.diagnose.fit.explanations import FIVE, Explanation, threshold
 from samii_rig.diagnose.fit.record_search import RecordSearch
-from samii_rig.diagnose.fit.records import TURN, Whole
+from samii_rig.diagnose.fit.records import TEST_TURN, Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.variation import (
@@ -196,7 +196,7 @@ def _looked(search: RecordSearch) -> _Looked:
     if not _without_force(judged) and gap.low > 0:
         # Computed in time, and seen on lines that it was not fitted to.
         judged = verdict.confirmed(judged)
-    judged = verdict.shown(judged, gap, judged.evidence.drop / (TURN - 1))
+    judged = verdict.shown(judged, gap, judged.evidence.drop / (TEST_TURN - 1))
     return _Looked(judged, plain, after, gap)
 
 

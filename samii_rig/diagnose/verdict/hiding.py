@@ -20,7 +20,7 @@ from samii_rig.types import Float
 
 FOUND = 0.9  # probability with which an effect of the size that is told would have been found
 Screens = tuple[Screen, Screen]  # without directions projected out, and with
-TRIES = 20  # strengths over the range of an effect, log-spaced, for one that is weak
+STRENGTHS = 20  # strengths over the range of an effect, log-spaced, for one that is weak
 
 
 def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
@@ -45,9 +45,9 @@ def _smallest(
     """Where noise units reach what is needed. What a refit leaves grows with a weak strength, or
     with its inverse, in proportion: so far as a refit bends, this is exact for what is weak."""
     first, others = effect.unknowns[0], effect.unknowns[1:]
-    strength = np.geomspace(first.low, first.high, TRIES)
+    strength = np.geomspace(first.low, first.high, STRENGTHS)
     middle = [u.middle for u in others]
-    values = np.column_stack([strength, np.tile(middle, (TRIES, 1))])
+    values = np.column_stack([strength, np.tile(middle, (STRENGTHS, 1))])
     with np.errstate(all="ignore"):
         changed = _changed(search, best, screens, effect, values)
     if changed is None:

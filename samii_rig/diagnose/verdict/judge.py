@@ -11,15 +11,15 @@ import numpy as np
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.between_runs import Changing, between_runs
 from samii_rig.diagnose.fit.classes import Class, classes
-from samii_rig.diagnose.fit.explanations import NEAR, Explanation, Explanations, threshold
-from samii_rig.diagnose.fit.records import TURN
+from samii_rig.diagnose.fit.explanations import NEAR_BEST, Explanation, Explanations, threshold
+from samii_rig.diagnose.fit.records import TEST_TURN
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.stated import IN_DATA, PLACE, TINY, Evidence, probability
 from samii_rig.diagnose.forces.variation import Variation
 from samii_rig.diagnose.result import Gap, Verdict
 
-NOTHING = 0.2  # probability of nothing missing below which it is called missing
+NOTHING_FROM = 0.2  # probability of nothing missing below which it is called missing
 SURE = 0.8  # probability of an answer from which it is named
 DOUBT = 0.3  # probability of an answer below which none is given
 MOSTLY = 0.5  # of the mismatch; one cause that explains it is told whatever else is missing
@@ -175,7 +175,7 @@ def varying(judged: Judgement, base: Explanation, found: Variation, rival: float
         varies=found,
         partly=partly,
     )
-    return shown(made, found.gap, evidence.drop / (TURN - 1))
+    return shown(made, found.gap, evidence.drop / (TEST_TURN - 1))
 
 
 def _evidence(
@@ -318,7 +318,7 @@ def _insignificant(search: Search) -> set[frozenset[str]]:
     out: set[frozenset[str]] = set()
     while True:
         ranked = [e for e in search.ranked() if e.key not in out]
-        near = [e for e in ranked if e.weight > ranked[0].weight - NEAR]
+        near = [e for e in ranked if e.weight > ranked[0].weight - NEAR_BEST]
         if not (insignificant := {e.key for e in near if _is_insignificant(search, e)}):
             return out
         out |= insignificant
@@ -368,7 +368,7 @@ def _off(search: Search, e: Explanation) -> float:
 def _decided(search: Search, lines: Measured, ranked: list[Explanation]) -> list[Explanation]:
     """Those of `ranked` that may still compete, and that nothing is missing, weighed anew by how
     likely each makes lines that were not fitted; the most probable first."""
-    rivals = [e for e in ranked if e.weight > ranked[0].weight - NEAR or not e.effects]
+    rivals = [e for e in ranked if e.weight > ranked[0].weight - NEAR_BEST or not e.effects]
     predicted = {e.key: _predicted(search, lines, e.fitted) for e in rivals}
     nominal_chi2, _ = predicted[search.nominal.key]
     reweighted = []
@@ -402,5 +402,5 @@ def _predicted(search: Search, lines: Measured, fitted: Fitted) -> tuple[float, 
 
 def _chosen_first(grouped: Sequence[Class], nothing: float) -> list[Class]:
     """Nothing missing last, unless that is the answer."""
-    alarmed = nothing < NOTHING
+    alarmed = nothing < NOTHING_FROM
     return sorted(grouped, key=lambda c: (bool(c.first.effects) != alarmed, -c.probability))

@@ -29,7 +29,7 @@ from samii_rig.errors import SamiiRigError
 from samii_rig.types import Complex, Float
 
 ROUNDS = 4  # of nominal parameters and x in turn
-SHOWN = 3  # places whose x(w) is kept
+PLACES_KEPT = 3  # places whose x(w) is kept
 
 PROBES = ("torsional_compliance", "translational_compliance", "added_mass", "added_inertia")
 # Jumps that a part makes downwards: z+ = z- - e_j x e_i'z- for its x.
@@ -146,7 +146,7 @@ def traces(search: Search, judged: Judgement) -> tuple[Trace, ...]:
             with suppress(SamiiRigError):
                 found.append(locate(fitted, probe, problem))
         shown += sorted(found, key=lambda item: item.chi2)
-    return tuple(_trace(item, search) for item in shown[:SHOWN])
+    return tuple(_trace(item, search) for item in shown[:PLACES_KEPT])
 
 
 def at_lines(fitted: Fitted, search: Search) -> Fitted:

@@ -30,11 +30,11 @@ from samii_rig.types import Complex, Float
 Change = Callable[[Rig], Rig]
 
 TELLING = 5.0  # noise units from which an experiment is worth its time
-POINTS = 80
-WIDER = 2.0  # how far a band is widened at either end
+PLAN_POINTS = 80
+BAND_WIDER = 2.0  # how far a band is widened at either end
 STIFF = 1e9  # N m/rad and N/m: a brace that does not give
-KNOWN = 0.1  # of the chain's own mass, a mass that is added
-LIKELY = 0.05  # probability from which another class is to be distinguished
+KNOWN_MASS = 0.1  # of the chain's own mass, a mass that is added
+RIVAL_FROM = 0.05  # probability from which another class is to be distinguished
 
 
 def next_experiment(search: Search, judged: Judgement) -> tuple[str, str, float | None]:
@@ -94,7 +94,7 @@ def _rivals(judged: Judgement) -> tuple[Explanation, Explanation] | None:
         if rivals(member):
             return top.first, member
     for other in judged.classes[1:]:
-        if other.probability > LIKELY and (rivals(other.first) or not names):
+        if other.probability > RIVAL_FROM and (rivals(other.first) or not names):
             return top.first, other.first
     return None
 
@@ -108,14 +108,14 @@ def _in_words(explanation: Explanation) -> str:
 def _experiments(search: Search) -> Iterator[tuple[str, Change, Float]]:
     rig, f = search.rig, search.problem.data.frequency
     low, high = float(f[0]), float(f[-1])
-    inside = np.geomspace(low, high, POINTS)
-    top = min(WIDER * high, 0.45 * rig.rate_hz)
+    inside = np.geomspace(low, high, PLAN_POINTS)
+    top = min(BAND_WIDER * high, 0.45 * rig.rate_hz)
     if top > 1.2 * high:
-        yield (f"widen the band to {top:.3g} Hz", lambda r: r, np.geomspace(high, top, POINTS))
+        yield (f"widen the band to {top:.3g} Hz", lambda r: r, np.geomspace(high, top, PLAN_POINTS))
     yield (
-        f"start the sweep at {low / WIDER:.3g} Hz",
+        f"start the sweep at {low / BAND_WIDER:.3g} Hz",
         lambda r: r,
-        np.geomspace(low / WIDER, low, POINTS // 2),
+        np.geomspace(low / BAND_WIDER, low, PLAN_POINTS // 2),
     )
     if rig.gravity:
         degrees = 90.0 if rig.pull > 0.5 * rig.gravity else 0.0
@@ -130,8 +130,8 @@ def _experiments(search: Search) -> Iterator[tuple[str, Change, Float]]:
         if isinstance(e, RigidLink) and e.L.value > 0:
             yield (f"brace the rig behind {e.name}", _braced(e.name), inside)
     yield (
-        f"add a known mass of {KNOWN * mass:.2g} kg at {tip}",
-        _loaded(tip, KNOWN * mass),
+        f"add a known mass of {KNOWN_MASS * mass:.2g} kg at {tip}",
+        _loaded(tip, KNOWN_MASS * mass),
         inside,
     )
     worn = {s.on for s in rig.sensor if isinstance(s, Acceleration)}
@@ -227,5 +227,5 @@ def _noise(problem: Problem, y: Complex) -> Float:
     level = np.sqrt(np.mean(np.abs(y) ** 2, axis=0))
     share = np.full(y.shape[1], float(np.median(relative)))
     share[: relative.size] = relative[: y.shape[1]]
-    bins = problem.data.n / POINTS
+    bins = problem.data.n / PLAN_POINTS
     return np.asarray(share * (np.abs(y) + 0.1 * level) * math.sqrt(max(1.0, 1 / bins)))

@@ -110,7 +110,7 @@ def _alternatives(
     return tuple(
         (answer.causes_of(c, judged, share), share)
         for c, share in ranked[:ALTERNATIVES]
-        if share >= answer.SHOWN
+        if share >= answer.LISTED
     )
 
 

@@ -25,7 +25,7 @@ from samii_rig.types import Complex, Float, Int
 
 DEGREE = 2  # of G_k and of T
 FREE = 16  # complex degrees of freedom of a window's residual at least, 4 for each output
-CHUNK = 256  # windows at a time: some MB of matrices
+INPUTS_CHUNK = 256  # windows at a time: some MB of matrices
 # Ratio of singular values of the regressors below which two references do the same in a window.
 LEAST_LEFT = 1e-4
 
@@ -67,7 +67,10 @@ def fit(spectra: Sequence[Spectrum], at: Int, n_in: int, *, at_rest: bool) -> Fi
             "record would do"
         )
     Z = np.stack([s.Z for s in spectra])
-    parts = [_windows(Z, at[k : k + CHUNK], width, n_in, at_rest) for k in range(0, at.size, CHUNK)]
+    parts = [
+        _windows(Z, at[k : k + INPUTS_CHUNK], width, n_in, at_rest)
+        for k in range(0, at.size, INPUTS_CHUNK)
+    ]
     joined = [np.concatenate([p[k] for p in parts]) for k in range(5)]
     dof = float(pieces * width - unknown)
     H, covariance, noise, output, apart = joined
