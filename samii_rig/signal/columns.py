@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
 
 from samii_rig.errors import InputError
 from samii_rig.rig.load import tables
@@ -29,6 +31,9 @@ TAPS = 1  # rows to each side of which what a voltmeter shows of a command is ma
 # Rows of that filter's delay: a voltmeter between two commands has half a row, another shift one.
 CENTRED = 0.75
 ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same
+# Of the largest command, up to where no limit has clipped it, and log likelihood by which a shift
+# is seen there too: beside a meter's noise another shift explains some of a clipped top, up to 250.
+UNCLIPPED, CONFIRMED = 0.7, 5.0
 LOOKED_AT = 1 << 14  # samples about the largest reference: thousands show a shift, millions cost
 QUIETER = 0.5  # of a command's fourth differences, those without what a loop would have added
 SENT = ("reference", "command")  # roles of columns that are sent, not measured
@@ -67,10 +72,13 @@ def shift_of(recording: Recording) -> int:
     does not show it."""
     laws, rounded = _laws(recording)
     best = _best(laws)
-    if best is None:
+    if best is None or laws[FARTHEST].apart(laws[best], rounded) <= SEEN:
         return 0
-    plain = laws[FARTHEST]
-    return best - FARTHEST if plain.apart(laws[best], rounded) > SEEN else 0
+    if laws[best].left > rounded:
+        below, _ = _laws(recording, unclipped=True)
+        if not below or below[FARTHEST].apart(below[best], rounded) <= CONFIRMED:
+            return 0
+    return best - FARTHEST
 
 
 def is_aligned(recordings: Iterable[Recording]) -> bool:
@@ -80,7 +88,9 @@ def is_aligned(recordings: Iterable[Recording]) -> bool:
         laws, rounded = _laws(recording)
         best = _best(laws)
         others = (law for k, law in enumerate(laws) if k != best)
-        if best is not None and all(law.apart(laws[best], rounded) > SEEN for law in others):
+        if best is None or any(law.apart(laws[best], rounded) <= SEEN for law in others):
+            continue
+        if best - FARTHEST == shift_of(recording):
             return True
     return False
 
@@ -92,9 +102,9 @@ def _best(laws: Sequence[_Law]) -> int | None:
     return best if left and laws[best].holds else None
 
 
-def _laws(recording: Recording) -> tuple[list[_Law], float]:
+def _laws(recording: Recording, *, unclipped: bool = False) -> tuple[list[_Law], float]:
     """That of the loop of every shift, none where they are not known, and the square of what the
-    command's rounding leaves."""
+    command's rounding leaves. unclipped : of rows alone whose command no limit has clipped."""
     centring = centring_of(recording)
     first = next(iter(recording.names("command")), "")
     recording = of_input(recording, first)
@@ -110,8 +120,9 @@ def _laws(recording: Recording) -> tuple[list[_Law], float]:
     theta, v = (recording.values_of(name)[around] for name in (sensor, command[0]))
     sent = _beside(asked(recording, command[0], kp, around))
     v = v[FARTHEST + TAPS : v.size - FARTHEST - TAPS]
+    on = _unclipped(v) if unclipped else slice(None)
     shifts = range(-FARTHEST, FARTHEST + 1)
-    laws = [_Law.of(v, sent, _beside(-kp * np.roll(theta, -m))) for m in shifts]
+    laws = [_Law.of(v[on], sent[:, on], _beside(-kp * np.roll(theta, -m))[:, on]) for m in shifts]
     rounded = (ROUNDED * names[command[0]].resolution) ** 2
     return (laws, rounded) if all(law.known for law in laws) else ([], 0.0)
 
@@ -178,6 +189,14 @@ class _Law:
         """What it leaves is little, or a meter's noise; another loop leaves what moves slowly."""
         rest = self.part < LEFT**2 or abs(self.alike) < LEFT
         return rest and self.centred and abs(self.fed - 1) < LEFT and abs(self.gain - 1) < LEFT
+
+
+def _unclipped(v: Float) -> NDArray[np.bool_]:
+    """(n,) whether a command v (n,), and those that a voltmeter shows with it, are below a limit
+    wherever that is."""
+    size = np.abs(np.nan_to_num(v))
+    high = size > UNCLIPPED * np.max(size, initial=0.0)
+    return np.asarray(~ndimage.binary_dilation(high, iterations=TAPS + 1))
 
 
 def _beside(x: Float) -> Float:

@@ -220,6 +220,27 @@ def test_a_law_that_does_not_hold_moves_nothing():
     assert shift_of(late(replace(run, values=values), 2)) == 0
 
 
+@pytest.mark.parametrize(
+    ("limit", "rate", "highest"), [(0.7, 0.02, 8.0), (0.9, 0.002, 8.0), (0.9, 0.02, 30.0)]
+)
+def test_a_clipped_command_under_a_voltmeter_is_no_shift(limit: float, rate: float, highest: float):
+    """What a limit takes off the tops, another shift explains some of."""
+    between = 10  # steps of the loop for each row
+    t = np.arange(N * between) / (RATE * between)
+    u = np.sin(2 * np.pi * (0.3 + highest / 2 / t[-1] * t) * t)
+    theta, v, turned = np.zeros(t.size), np.zeros(t.size), 0.0
+    for k in range(t.size):
+        theta[k] = turned
+        v[k] = np.clip(u[k] - KP * turned, -limit, limit)
+        turned += rate / between * v[k]
+    shown = (v + np.roll(v, 1))[::between] / 2
+    rng = np.random.default_rng(1)
+    shown = np.rint((shown + 4e-3 * rng.standard_normal(N)) / STEP) * STEP
+    whole = loop()
+    values = np.column_stack([u[::between], shown, theta[::between], whole.values[:, 3]])
+    assert shift_of(replace(whole, values=values)) == 0
+
+
 def test_the_estimate_is_that_of_the_columns_in_order_and_says_so():
     (right,) = estimate([loop()])
     (found,) = estimate([late(loop(), 2)])
