@@ -54,10 +54,11 @@ def render(trials: Sequence[Trial], title: str, failed: int = 0) -> str:
 
 
 def acceptable(trial: Trial) -> bool:
-    """Right; or, of what lies outside the vocabulary, not named with confidence."""
-    if trial.truth.kind == "outside":
-        return trial.answer.verdict != "named" or trial.confidence <= SURE
-    return trial.right
+    """Right; or, of what lies outside the vocabulary, not named with confidence. What older trials
+    had no word for may have a row of the table now."""
+    if trial.right or trial.truth.kind != "outside":
+        return trial.right
+    return trial.answer.verdict != "named" or trial.confidence <= SURE
 
 
 # Beginnings of the figures that are no frequencies.

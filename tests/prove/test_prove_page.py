@@ -7,7 +7,7 @@ from pathlib import Path
 
 from prove_kit import MASS, NOTHING, SPRING, UNKNOWN, diagnosis, trial
 
-from samii_rig.prove.page import render, write_page
+from samii_rig.prove.page import acceptable, render, write_page
 from samii_rig.prove.trial import Trial
 
 
@@ -37,3 +37,11 @@ def test_a_page_without_failures_says_so() -> None:
     text = render([trial("nothing", NOTHING)] * 5, "x")
     assert "<p>Nothing.</p>" in text
     assert "no trial tells" in text
+
+
+def test_what_was_outside_the_table_and_is_named_by_its_name_did_not_fail() -> None:
+    name, other = ("hysteresis", "joint_1"), ("hysteresis", "joint_2")
+    own = trial("outside", diagnosis("named", (*name, 0.99)), name)
+    another = trial("outside", diagnosis("named", (*other, 0.99)), name)
+    assert acceptable(own)
+    assert not acceptable(another)
