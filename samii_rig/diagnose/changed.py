@@ -33,7 +33,7 @@ from samii_rig.types import FrequencyResponse, Recording
 
 WHERE = (" after", " before")  # which recordings are not of one state
 COMMON = "common_"  # of the names of what both states have beside the rig file
-# Tolerance of what the state before was found to have: a factor of e, as good as none
+# Tolerance of what the state before was found to have: a factor of e, as good as none.
 FREE_EFFECT = 1.0
 
 Band = tuple[float, float]

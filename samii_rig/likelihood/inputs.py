@@ -49,7 +49,7 @@ ONCE, JUDGED_AMONG, HALF = 0.01, 201, 2.0
 FORETOLD, AFTER = 64, 512
 # Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a
 # smaller one that came half a sample earlier is below a hundredth of what the rest makes.
-JUMP, REST_AFTER = 0.01, 4
+JUMP, AT_REST = 0.01, 4
 # An input that is smooth on both sides of a jump or a turn bends there this many times as much as
 # anywhere within so many samples.
 BENT, SMOOTH_OVER = 8.0, 16
@@ -236,20 +236,17 @@ def jumps(recording: Recording, command: int, kp: float, theta: Float | None) ->
         u = np.asarray(recording.values[:, command], np.float64)
         if theta is not None:
             u, still = u + kp * theta, recording.channels[command].resolution
-    if u.size <= 2 * REST_AFTER:
+    if u.size <= 2 * AT_REST:
         return found
     d = np.diff(u)
     quiet = np.abs(d) <= still
-    rests = (
-        np.convolve(quiet, np.ones(REST_AFTER), "full")[: d.size] == REST_AFTER
-    )  # the REST_AFTER last ones
-    after = np.append(False, rests[:-1])  # a rest ended just before
-    before = np.append(
-        rests[REST_AFTER:], np.zeros(REST_AFTER, np.bool_)
-    )  # a rest begins just behind
+    # Whether it was at rest for the last samples; a rest ended just before, or begins just behind.
+    rests = np.convolve(quiet, np.ones(AT_REST), "full")[: d.size] == AT_REST
+    after = np.append(False, rests[:-1])
+    before = np.append(rests[AT_REST:], np.zeros(AT_REST, np.bool_))
     least = JUMP * np.nanmax(np.abs(u))
     edge = ~quiet & (np.abs(d) > least) & (after | before)
-    edge |= _bends(u, least) & ~ndimage.binary_dilation(edge, iterations=REST_AFTER)
+    edge |= _bends(u, least) & ~ndimage.binary_dilation(edge, iterations=AT_REST)
     found[1:] |= edge
     found[:-1] |= edge
     return found
@@ -263,12 +260,12 @@ def _bends(u: Float, least: float, noise: float = 0.0) -> NDArray[np.bool_]:
     """
     d = np.diff(u)
     out = np.zeros(d.size, np.bool_)
-    if d.size <= 2 * (SMOOTH_OVER + REST_AFTER):
+    if d.size <= 2 * (SMOOTH_OVER + AT_REST):
         return out
     both, mid = d[2:] + d[:-2], d[1:-1]
     bent = np.full(mid.size, np.inf)
     for before, behind in ((1.0, 1.0), (1.0, 0.0), (0.0, 1.0)):
-        sides = np.zeros(2 * (SMOOTH_OVER + REST_AFTER) + 1)
+        sides = np.zeros(2 * (SMOOTH_OVER + AT_REST) + 1)
         sides[:SMOOTH_OVER], sides[-SMOOTH_OVER:] = behind, before  # a convolution turns them round
         turn, power = (np.convolve(x, sides, "same") for x in (mid * both, 2 * mid**2))
         cosine = np.divide(turn, power, out=np.ones_like(power), where=power > 0)
@@ -276,11 +273,10 @@ def _bends(u: Float, least: float, noise: float = 0.0) -> NDArray[np.bool_]:
         by_noise = BENT_BY_NOISE * noise * np.sqrt(2 + 2 * (1 + twice) ** 2)
         bent = np.minimum(bent, np.maximum(np.abs(both - twice * mid) - by_noise, 0.0))
     around = np.ones(2 * SMOOTH_OVER + 1, np.bool_)
-    around[SMOOTH_OVER - REST_AFTER : SMOOTH_OVER + REST_AFTER + 1] = (
-        False  # what the same jump bends
-    )
+    # What the same jump bends.
+    around[SMOOTH_OVER - AT_REST : SMOOTH_OVER + AT_REST + 1] = False
     beside = ndimage.maximum_filter(bent, footprint=around)
-    highest = bent == ndimage.maximum_filter1d(bent, 2 * REST_AFTER + 1)
+    highest = bent == ndimage.maximum_filter1d(bent, 2 * AT_REST + 1)
     out[1:-1] = highest & (bent > BENT * beside) & (bent > least)
     return out
 

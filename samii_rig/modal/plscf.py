@@ -23,7 +23,7 @@ Coefficients = Literal["real", "complex"]
 
 ROOM = 1.05  # the polynomials' own band over the data's: its two ends are one point
 NEAR_REAL = 0.05  # Im/|s| below which a pole is a real one, which no resonance curve shows
-# Relative, of the numerators' normal equations: powers beyond what a band determines
+# Relative, of the numerators' normal equations: powers beyond what a band determines.
 NUMERATOR_RIDGE = 1e-12
 
 

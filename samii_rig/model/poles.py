@@ -38,7 +38,7 @@ CUTS = (0.5, 0.47, 0.54, 0.41, 0.61, 0.35)  # where to cut a box if the middle m
 CLUSTER = 1e-5  # rad/s, zeros closer than this are one with a multiplicity
 MULLER_STEPS = 60
 NEWTON_STEPS = 12
-# Of a place: of the difference for a step, and of a step that is none
+# Of a place: of the difference for a step, and of a step that is none.
 STEP_WIDTH, SETTLED = 1e-7, 1e-10
 
 

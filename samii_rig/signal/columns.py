@@ -72,12 +72,8 @@ def shift_of(recording: Recording) -> int:
     does not show it."""
     laws, rounded = _laws(recording)
     best = _best(laws)
-    if best is None or laws[FARTHEST].apart(laws[best], rounded) <= SEEN:
+    if best is None or not _is_seen(recording, laws, best, rounded):
         return 0
-    if laws[best].left > rounded:
-        below, _ = _laws(recording, unclipped=True)
-        if not below or below[FARTHEST].apart(below[best], rounded) <= CONFIRMED:
-            return 0
     return best - FARTHEST
 
 
@@ -90,9 +86,20 @@ def is_aligned(recordings: Iterable[Recording]) -> bool:
         others = (law for k, law in enumerate(laws) if k != best)
         if best is None or any(law.apart(laws[best], rounded) <= SEEN for law in others):
             continue
-        if best - FARTHEST == shift_of(recording):
+        if best == FARTHEST or _is_seen(recording, laws, best, rounded):
             return True
     return False
+
+
+def _is_seen(recording: Recording, laws: Sequence[_Law], best: int, rounded: float) -> bool:
+    """Whether the law of one shift, the best, is likelier than that of none: beside a meter's noise
+    also by rows that no limit has clipped. rounded : as of `_laws`."""
+    if laws[FARTHEST].apart(laws[best], rounded) <= SEEN:
+        return False
+    if laws[best].left <= rounded:
+        return True
+    below, _ = _laws(recording, unclipped=True)
+    return bool(below) and below[FARTHEST].apart(below[best], rounded) > CONFIRMED
 
 
 def _best(laws: Sequence[_Law]) -> int | None:

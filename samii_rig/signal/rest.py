@@ -29,7 +29,7 @@ TAIL_LOUD = 0.03
 # What a burst still knows of the start from rest may reach this many standard deviations of the
 # tail's strongest line: spread over the whole burst it is then below the noise of the estimate.
 FORGOTTEN = 5.0
-# Lines over which a tail's scatter is estimated at the least: two repeats have one each
+# Lines over which a tail's scatter is estimated at the least: two repeats have one each.
 LINES_AROUND = 5
 # Of the power of the tail's strongest line: noise that bursts without any are taken to have.
 NOISELESS = 1e-24

@@ -26,7 +26,7 @@ from samii_rig.rig.schema import Rig, parameters
 from samii_rig.rig.schema.elements import Branch, flattened
 
 LENGTH = "L"  # symbol of what is measured with a rule, and taken for exact
-# Tolerance of a length whose value nobody trusts: a factor of e lies two of them away
+# Tolerance of a length whose value nobody trusts: a factor of e lies two of them away.
 FREE_LENGTH = 0.5
 # Of what the nominal model leaves of the lines: one that leaves more is held against no record.
 LEAVES = 0.1

@@ -18,7 +18,7 @@ from samii_rig.types import Complex, Float
 
 LONGEST_STEP = 3.0  # a step of a logarithm
 DESCENT_ROUNDS = 6  # of a descent, at most
-# Of the diagonal: few rounds, so it changes fast
+# Of the diagonal: few rounds, so it changes fast.
 FORM_DAMPING = ByFactor(1e-2, shrink=0.1, grow=30.0)
 DESCENT_ENDS = 0.05  # of chi-square, gained in one of them: less and they end
 LAW_STEP = 1e-4  # of a logarithm, for derivatives of a law

@@ -13,7 +13,7 @@ from samii_rig.types import Complex
 
 T = TypeVar("T")
 FITS = 16  # of which the sums over aliases are kept
-# Of answers on contours that are kept: 256 MB, 16 of eight entries at full length
+# Of answers on contours that are kept: 256 MB, 16 of eight entries at full length.
 NUMBERS_KEPT = 2**24
 
 

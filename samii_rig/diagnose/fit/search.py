@@ -41,7 +41,7 @@ TENTHS = (2, 5, 8)  # tenths of their range at which several unknowns start toge
 WEAK_STARTS = (4, 5, 6)  # tenths of the range at which they start
 BEAM = 2  # explanations to which further effects are added
 HOPELESS = 20.0  # times the best chi-square, above which an explanation is let go
-# Times the cost that an explanation seemed to have, above which it was no such one
+# Times the cost that an explanation seemed to have, above which it was no such one.
 OVER_SEEMING = 3.0
 BINNED_AGAIN, BINS_STILL = 4, 0.3  # times that bins are made anew at most, and a move that is none
 SWAPS = 2  # rounds of them, the second about what won the first

@@ -27,7 +27,7 @@ from samii_rig.types import Complex, Float, Int
 OVER = 4.0  # rate over the highest line: third harmonics fold beside the band, not into it
 # Of the samples, of a command that rests: one that swings passes 0 in a hundredth of them.
 RESTS = 0.05
-# Of the contour: 0.7 % wraps around, what is cut above the rate grows 12 times
+# Of the contour: 0.7 % wraps around, what is cut above the rate grows 12 times.
 CONTOUR_DAMPING = 5.0
 
 

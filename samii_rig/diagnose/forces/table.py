@@ -38,7 +38,7 @@ from samii_rig.rig.schema import (
 Spring = TorsionalSpring | TranslationalSpring | TorsionalGroundSpring | TranslationalGroundSpring
 
 STRENGTH_STARTS = 14  # of a strength over its range
-# Of a strength over the one that doubles or halves the motion at its place
+# Of a strength over the one that doubles or halves the motion at its place.
 STRENGTH_RANGE = (1e-9, 30.0)
 SOFTEST = 1.0  # the same of a stiffness that falls: beyond, a spring would push
 WIDTHS = (1e-6, 2.0)  # of a gap or limit over the largest amplitude that meets it

@@ -42,7 +42,7 @@ from samii_rig.likelihood.records import CYCLES
 from samii_rig.likelihood.unexplained import Unexplained
 from samii_rig.types import Float
 
-# Of chi-square of each number that a step promises: half its standard deviation
+# Of chi-square of each number that a step promises: half its standard deviation.
 SWINGS_STILL = 0.25
 SETTLE_ROUNDS = 8  # times that the likelihood is made anew at most: 3 or 4 were usual
 # Of the evidence that the first gains in one round, from which on another spring may be the one.

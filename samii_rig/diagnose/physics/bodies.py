@@ -32,7 +32,7 @@ POWERS = (0.2, 0.35, 0.5, 0.7)
 COMPLIANCES = (1e-4, 0.01, 1.0)  # of a line's oil over the chain's own, at which a search starts
 # No material's loss is the same at all frequencies: relaxation makes it wander by some per cent.
 LOSS_WANDERS = 0.05
-# Of a beam's stiffness or density to the file's; farther off it is another beam
+# Of a beam's stiffness or density to the file's; farther off it is another beam.
 BEAM_RATIO = (0.2, 5.0)
 # At which a search starts: not 1 in the middle, where all ratios are one effect, none.
 BEAM_RATIOS = (0.5, 0.75, 1.35, 1.0, 2.0)

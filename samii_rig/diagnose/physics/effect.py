@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from samii_rig.diagnose.physics.fractional import Joint
 
 Values = Mapping[Key, float]
-# Of the logarithm of a ratio: no record of a structure shows a part in a million
+# Of the logarithm of a ratio: no record of a structure shows a part in a million.
 LEAST_RATIO = 1e-6
 
 

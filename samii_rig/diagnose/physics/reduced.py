@@ -35,7 +35,7 @@ from samii_rig.types import Complex, Float
 LARGEST_PART = 0.6  # of a link's mass: what is left still is a body, whatever its tolerance says
 SURELY = 2.0  # tolerances above the rig file's value, up to which all of a part may be gone
 ALMOST = 0.99  # of a part, a start of a search: the refit goes on to all of it
-# Of a joint's stiffness to what it was: from all but broken to all but rigid
+# Of a joint's stiffness to what it was: from all but broken to all but rigid.
 JOINT_RATIO = (0.02, 50.0)
 JOINT_RATIOS = (0.3, 0.6, 0.9, 1.1, 1.6, 3.0)  # at which a search starts
 FASTER = 1e4  # times, of a corner: from there on a lag is none in any band
