@@ -50,6 +50,25 @@ def test_it_is_told_and_no_physics_is_named():
     assert not found.causes
 
 
+def test_oil_behind_a_source_is_seen_by_an_encoder_at_the_source_whichever_comes_first() -> None:
+    """An encoder at the vane shows what the oil gives: it had shown the flow alone, and a true pair
+    of both left 55 sigma."""
+    every = table_of(load_rig("samii_joint_3")[0], 0.5, 40.0)
+    at_vane = next(e for e in every if e.name == ("noncollocated_encoder", "theta_3"))
+    oil = next(
+        e
+        for e in every
+        if e.name == ("hydraulic_compressibility", "joint_3_source") and e.variant == "line"
+    )
+    assert at_vane.variant == "joint_3_source"
+    rig = load_rig("samii_joint_3")[0]
+    one, other = (a.build(b.build(rig)) for a, b in ((oil, at_vane), (at_vane, oil)))
+    assert one.sensor == other.sensor
+    assert other.element == one.element
+    (angle,) = (s for s in other.sensor if s.name == "theta_3")
+    assert len(angle.across) == 2  # the source and its oil; not the joint's spring
+
+
 def test_a_soft_spring_that_a_force_sensor_in_line_shows_is_in_the_table() -> None:
     """25 N/m beside a cylinder of some 1e6 N/m: it shows where nothing else holds the mass."""
     every = table_of(load_rig("cylinder")[0], 0.9, 30.0)

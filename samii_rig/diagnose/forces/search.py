@@ -176,7 +176,10 @@ class ForceSearch(RecordSearch):
         self._either_way(self.ranked()[0])
         self.pair()
         self._alone()
+        best = self.ranked()[0]
         self._rivals()
+        if self.ranked()[0].key != best.key:
+            self._alone()
         self._forget_inconsistent()
         self.take_overdispersion()
 
@@ -231,10 +234,9 @@ class ForceSearch(RecordSearch):
             return
         for i, gone in enumerate(best.effects):
             if gone.force is None:
-                old = self.found.pop(best.key - {gone.key}, None)
-                self.without(best, i)
-                if old is not None:
-                    self.keep(old.effects, old.fitted)
+                fewer = best.effects[:i] + best.effects[i + 1 :]
+                own = list(best.fitted.model.own(i))
+                self._renewed(fewer, np.delete(best.fitted.x, own))
 
     def _rivals(self) -> None:
         """The forces of the best explanation beside what does as well as each linear effect there
@@ -242,8 +244,10 @@ class ForceSearch(RecordSearch):
         best = self.ranked()[0]
         forces = tuple(e for e in best.effects if e.force is not None)
         plain, rest = self.linear_part(best)
+        if not forces:
+            return
         for i, gone in enumerate(rest.effects):
-            less = plain.without_refit(rest, i) if forces else None
+            less = plain.without_refit(rest, i)
             if less is None:
                 continue
             screen = Screen.of(plain.problem, less.fitted)
@@ -255,6 +259,21 @@ class ForceSearch(RecordSearch):
                 end = plain.refitted(effects, less, np.log(starts[0]).tolist())
                 if end is not None and end.cost < rest.fitted.cost + 2 * NEAR_BEST:
                     self._beside_force((*effects, *forces), end, best)
+        for e in self.each(self._alike(rest), lambda e: named(e.effects)):
+            end = plain.refitted(e.effects, e)
+            if end is not None and end.cost < rest.fitted.cost + 2 * NEAR_BEST:
+                self._beside_force((*e.effects, *forces), end, best)
+
+    def _alike(self, rest: Explanation) -> list[Explanation]:
+        """What the linear search could not tell from some linear effects: it refitted them from
+        where each would be, and not about where the nominal parameters are beside another."""
+        same = self.linear.found.get(rest.key)
+        if same is None:
+            return []
+        near = [e for e in self.linear.ranked() if abs(e.weight - same.weight) < NEAR_BEST]
+        return [e for e in near if e.key != rest.key and len(e.effects) == len(rest.effects)][
+            :BESIDE
+        ]
 
     def _beside_force(self, effects: tuple[Effect, ...], plain: Fitted, best: Explanation) -> None:
         """Refit the forces of `best` beside other linear effects, from where these fit what it
@@ -264,16 +283,23 @@ class ForceSearch(RecordSearch):
         linear = moved(plain.model, plain.x, model)
         forces = [i for i, e in enumerate(best.effects) if e.force is not None]
         strengths = [best.fitted.x[k] for i in forces for k in best.fitted.model.own(i)]
-        start = np.concatenate([linear, strengths])
+        self._renewed(effects, np.concatenate([linear, strengths]))
+
+    def _renewed(self, effects: tuple[Effect, ...], start: Float) -> None:
+        """Refit some effects and keep where that ends, the chain through which a force acts renewed
+        where each refit ended: through another chain it may seem to leave less."""
+        last = None
         for _ in range(FORMED_AGAIN):
             self._ways.clear()
             end = self.refitted_from(effects, start)
             if end is None:
-                return
-            self.keep(effects, end)
-            if float(np.max(np.abs(end.x - start))) < NO_MOVE:
-                return
-            start = end.x
+                break
+            still = float(np.max(np.abs(end.x - start))) < NO_MOVE
+            last, start = end, end.x
+            if still:
+                break
+        if last is not None:
+            self.keep(effects, last)
 
     def _try(self, scores: Sequence[Score], base: Explanation, at: int) -> None:
         """Refit the forces that may be the best beside `base`, by its gains there."""

@@ -278,7 +278,7 @@ def _encoders(rig: Rig, sensor: RelativeAngle) -> Iterator[Effect]:
         yield Effect(
             physics="noncollocated_encoder",
             site=sensor.name,
-            build=partial(insert.sensor_changed, name=sensor.name, across=span),
+            build=partial(insert.measured_across, name=sensor.name, span=span),
             weight=1 / max(1, len(spans) - 1),
             variant=" ".join(span),
         )

@@ -110,6 +110,22 @@ def sensor_changed(rig: Rig, name: str, **update: object) -> Rig:
     return rig.model_copy(update={"sensor": sensors})
 
 
+def measured_across(rig: Rig, name: str, span: Sequence[str]) -> Rig:
+    """The rig with one relative angle measured from the first to the last element of `span`.
+
+    What was put in among these, or right behind them where the sensor measures across it, is seen
+    all the same: oil belongs to its source.
+    """
+    order = [e.name for e in rig.element]
+    first, last = order.index(span[0]), order.index(span[-1])
+    old: Sequence[str] = next(
+        s.across for s in rig.sensor if isinstance(s, RelativeAngle) and s.name == name
+    )
+    while last + 1 < len(order) and _put_in(rig.element[last + 1]) and order[last + 1] in old:
+        last += 1
+    return sensor_changed(rig, name, across=tuple(order[first : last + 1]))
+
+
 def replaced(rig: Rig, sensor: Any) -> Rig:
     """The rig with another sensor in place of the one that has its name."""
     sensors = tuple(sensor if s.name == sensor.name else s for s in rig.sensor)
