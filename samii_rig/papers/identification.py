@@ -39,8 +39,8 @@ from samii_rig.rig.schema import parameters
 G_V_OF = {2: G_V, 3: 150.0}  # N m s/rad, Table II, g_v2 and g_v3
 RIG_OF = {2: "samii", 3: "samii_joint_3"}
 WITHIN = 0.02  # relative, of the stiffnesses of Table II
-DRAWS = 25  # of ten parameters each; docs/method/identify.md has 200
-COVER = (85.0, 95.0)  # %, of 250 intervals; docs/method/identify.md: 87 to 93 of 2000
+DRAWS = 25  # of ten parameters each; docs/evidence/identify.md has 200
+COVER = (85.0, 95.0)  # %, of 250 intervals; docs/evidence/identify.md: 87 to 93 of 2000
 STARTS = (0.6, 2.0)  # over the truth, of method 1
 REACH = 3.0  # how far the valley is followed
 FAR = 10.0  # chi-square per degree of freedom from which a model is refused without doubt

@@ -56,7 +56,7 @@ class Refit:
 
 @cache
 def refit(rig_name: str) -> Refit:
-    """The ten parameters of docs/method/identify.md from the loudest level of the shipped sweep,
+    """The ten parameters of docs/evidence/identify.md from the loudest level of the shipped sweep,
     all channels, started `AWAY` from the truth, up and down by turns."""
     rig = load_rig(rig_name)[0]
     loud = recorded(rig_name, "swept_sine")

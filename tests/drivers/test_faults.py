@@ -1,6 +1,6 @@
 """Every fault, in each state where it can come, on the wire: the output at null, FAULT, no re-arm.
 
-The table is in docs/guide/safety.md. Times are counted in the node's own samples (2 ms each).
+The table is in docs/reference/faults.md. Times are counted in the node's own samples (2 ms each).
 """
 
 from __future__ import annotations

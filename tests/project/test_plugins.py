@@ -238,9 +238,8 @@ def test_no_number_in_an_experiment_file_is_too_large_or_too_small_for_a_line(na
 def test_the_kind_of_the_page_runs_by_the_file_of_the_page(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    page = (ROOT / "docs" / "guide" / "experiments.md").read_text("utf-8")
-    own = page.split("## A kind of your own")[1]
-    code, _, file = re.findall(r"```(?:python|toml)\n(.*?)```", own, re.S)
+    page = (ROOT / "docs" / "guide" / "add-experiment.md").read_text("utf-8")
+    code, _, file = re.findall(r"```(?:python|toml)\n(.*?)```", page, re.S)
     package = ModuleType("my_lab.chirps")
     monkeypatch.setitem(sys.modules, "my_lab", ModuleType("my_lab"))
     monkeypatch.setitem(sys.modules, "my_lab.chirps", package)

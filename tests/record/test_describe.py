@@ -267,7 +267,8 @@ def test_no_text_breaks_the_description(tmp_path, text):
 
 
 def test_every_key_of_a_map_is_in_its_docs():
-    text = (Path(__file__).resolve().parents[2] / "docs" / "guide" / "import.md").read_text("utf-8")
+    docs = Path(__file__).resolve().parents[2] / "docs"
+    text = (docs / "reference" / "import-map.md").read_text("utf-8")
     tables = (
         *(maps.ImportMap, maps.TimeBase, maps.ColumnMap, maps.SegmentMap, maps.PartMap),
         *(maps.TextFormat, maps.CsvFormat, maps.MatFormat, maps.JsonFormat),
