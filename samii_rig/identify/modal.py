@@ -122,8 +122,8 @@ def estimate_modes(
     """Modes of `response`; hold, filters and delays of the rig file are divided out.
 
     n_pairs : pairs of poles of the rational model, those of the background included; None
-        for the number that Akaike's criterion prefers: a model too small biases its modes, one
-        too large has poles with residues that are noise, which are no modes here.
+        for the number with the least chi-square and `PENALTY` a parameter: a model too small
+        biases its modes, one too large has poles with residues that are noise, no modes here.
     band : Hz, a part of the response with the modes of interest and some room around them.
 
     Raises InputError as `identify` does, or for n_pairs that the data do not allow;

@@ -11,7 +11,7 @@ from samii_rig.rig.schema.loops import Centring
 
 
 class ActuatorSpec(Strict):
-    """The input of the rig: the converter that drives an angular velocity source.
+    """The input of the rig: the converter that drives a source.
 
     The converter holds each sample until the next (zero-order hold); `delay` s pass
     between a sample's time stamp and the moment the output changes. `deadman` s after the
