@@ -369,7 +369,7 @@ class ForceSearch(RecordSearch):
             if end is not None and all(
                 e is None or e.fitted.chi2 - end.chi2 > self.critical_value for e in alone
             ):
-                self.keep(effects, end)
+                self._renewed(effects, end.x)
 
     @property
     def exhausted(self) -> bool:
