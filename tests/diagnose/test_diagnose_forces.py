@@ -322,22 +322,36 @@ def test_a_force_that_stopped_elsewhere_is_refitted_from_where_it_stands_beside_
     beside = Effect("attached_oscillator", "mass")
     ends = iter((-4_420.0, -4_433.8, -4_433.8))
 
-    def fit(weight: float, x: float) -> SimpleNamespace:
+    # An oscillator takes the place of a parameter of the rig file, which is back without it.
+    keys = {force.key: (("mass", "m"), ("spring", "k")), beside.key: (("spring", "k"),)}
+
+    def model_of(effects: tuple[Effect, ...]) -> ForceModel:
         model = object.__new__(ForceModel)
-        model.own = lambda i: range(i, i + 1)  # type: ignore[method-assign]
-        return SimpleNamespace(model=model, weight=weight, x=np.full(2, x))
+        model.keys = keys[effects[0].key]
+        model.n_nominal = len(model.keys)
+        model.own = lambda i: range(model.n_nominal + i, model.n_nominal + i + 1)  # type: ignore[method-assign]
+        return model
+
+    def fit(weight: float, x: float, *effects: Effect) -> SimpleNamespace:
+        model = model_of(effects)
+        size = model.n_nominal + len(effects)
+        return SimpleNamespace(model=model, weight=weight, x=np.full(size, x))
 
     def ended(weight: float, *effects: Effect) -> Explanation:
-        return Explanation(effects, fit(weight, 0.0), weight)  # type: ignore[arg-type]
+        return Explanation(effects, fit(weight, 0.0, *effects), weight)  # type: ignore[arg-type]
 
     class Kept(ForceSearch):
         exhausted = False  # type: ignore[assignment]
 
         def refitted_from(self, effects, start, *_, **__):  # type: ignore[no-untyped-def, override]
             assert effects == (force,)
+            assert len(start) == 3
             assert not self._ways  # the chain through which it acts is made anew
             self._ways[b""] = None
-            return fit(next(ends), float(start[0]) + 1.0)
+            return fit(next(ends), float(start[0]) + 1.0, force)
+
+        def model(self, effects: tuple[Effect, ...]) -> ForceModel:
+            return model_of(effects)
 
         def weigh(self, effects: tuple[Effect, ...], fitted: Fitted) -> float:
             return float(fitted.weight)  # type: ignore[attr-defined]

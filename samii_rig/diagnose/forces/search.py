@@ -234,9 +234,10 @@ class ForceSearch(RecordSearch):
             return
         for i, gone in enumerate(best.effects):
             if gone.force is None:
-                fewer = best.effects[:i] + best.effects[i + 1 :]
-                own = list(best.fitted.model.own(i))
-                self._renewed(fewer, np.delete(best.fitted.x, own))
+                fewer, old = best.effects[:i] + best.effects[i + 1 :], best.fitted
+                x = np.delete(old.x, list(old.model.own(i)))
+                if (model := self.model(fewer)) is not None:
+                    self._renewed(fewer, moved(old.model, x, model))
 
     def _rivals(self) -> None:
         """The forces of the best explanation beside what does as well as each linear effect there
