@@ -271,7 +271,7 @@ class FrequencyResponse:
         inputs nu counts all columns of H together; one entry alone has `entry_dof`.
     coherence : (n_freq, n_out) multiple coherence: with one input the ordinary one.
     level : amplitude of the reference in `level_unit`; NaN when mixed.
-    input_rms : (n_freq, n_in) amplitude of the input at each line, in the input's unit,
+    input_rms : (n_freq, n_in) rms of the input at each line, in the input's unit,
         NaN when unknown: what a describing function is read against.
     even, odd : (n_freq, n_out) relative distortion levels, or None where the excitation
         does not show them.

@@ -97,7 +97,7 @@ def pooling_lines(n: int, p: int) -> int:
     """How many lines to pool for n repeats of p outputs.
 
     30 degrees of freedom make the 90 % point of F 6 % larger than that of a known
-    covariance; 6 for each output keep the joint form as near. An odd number keeps the
+    covariance; 12 for each output keep the joint form as near. An odd number keeps the
     window centred.
     """
     lines = -(-wanted_dof(p) // (n - 1))
