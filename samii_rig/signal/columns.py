@@ -20,6 +20,7 @@ from scipy import ndimage
 from samii_rig.errors import InputError
 from samii_rig.rig.load import tables
 from samii_rig.signal.shifts import FARTHEST, compared, driving
+from samii_rig.signal.steps import LEAST_STEPS, steps_moved
 from samii_rig.types import Finding, Float, Int, Recording
 
 LEFT = 0.2  # part of what is fed back, or of a command's size, by which a law that holds is off
@@ -93,11 +94,16 @@ def is_aligned(recordings: Iterable[Recording]) -> bool:
 
 def _is_seen(recording: Recording, laws: Sequence[_Law], best: int, rounded: float) -> bool:
     """Whether the law of one shift, the best, is likelier than that of none: beside a meter's noise
-    also by rows that no limit has clipped. rounded : as of `_laws`."""
+    also by rows that no limit has clipped, and by no sensor whose rounding hides its motion: it
+    steps in few rows, and these alone would tell. rounded : as of `_laws`."""
     if laws[FARTHEST].apart(laws[best], rounded) <= SEEN:
         return False
     if laws[best].left <= rounded:
         return True
+    sensor = recording.column((centring_of(recording) or ("", 0.0))[0])
+    theta = recording.values[:, sensor]
+    if steps_moved(recording.channels[sensor], theta[np.isfinite(theta)]) < LEAST_STEPS:
+        return False
     below, _ = _laws(recording, unclipped=True)
     return bool(below) and below[FARTHEST].apart(below[best], rounded) > CONFIRMED
 

@@ -11,9 +11,9 @@ from scipy.ndimage import uniform_filter1d
 
 from samii_rig.signal.groups import Piece
 from samii_rig.signal.noise import pooled
-from samii_rig.signal.quantisation import step_of
 from samii_rig.signal.spectra import rests
 from samii_rig.signal.statistics import hotelling, hotelling_p
+from samii_rig.signal.steps import step_of
 from samii_rig.types import Channel, Complex, Finding, Float
 
 # A burst still rings when its tail, common to the repeats, is this improbable as noise; over

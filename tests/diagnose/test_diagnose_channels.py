@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from identify_kit import noiseless, samii
 from table_kit import Effects, table_of
 
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.physics.grid import grid
+from samii_rig.diagnose.physics.insert import exchanged
 from samii_rig.diagnose.physics.model import Model
+from samii_rig.errors import InputError
 from samii_rig.identify.bootstrap import redraw
 from samii_rig.model.sampled import sensors_at
 from samii_rig.model.tmm import Chain
@@ -67,6 +70,9 @@ def test_oil_behind_a_source_is_seen_by_an_encoder_at_the_source_whichever_comes
     assert other.element == one.element
     (angle,) = (s for s in other.sensor if s.name == "theta_3")
     assert len(angle.across) == 2  # the source and its oil; not the joint's spring
+    swapped = exchanged(rig, "theta_3", "a_2")
+    with pytest.raises(InputError, match=r"theta_3.*no angle"):
+        at_vane.build(swapped)
 
 
 def test_a_soft_spring_that_a_force_sensor_in_line_shows_is_in_the_table() -> None:

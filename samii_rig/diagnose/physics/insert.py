@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, get_args
 
+from samii_rig.errors import InputError
 from samii_rig.rig.schema import (
     AngularVelocitySource,
     AngularVelocitySource2,
@@ -113,14 +114,17 @@ def sensor_changed(rig: Rig, name: str, **update: object) -> Rig:
 def measured_across(rig: Rig, name: str, span: Sequence[str]) -> Rig:
     """The rig with one relative angle measured from the first to the last element of `span`.
 
+    Raises InputError where it is none, as of a sensor whose column was exchanged with another's.
     What was put in among these, or right behind them where the sensor measures across it, is seen
     all the same: oil belongs to its source.
     """
     order = [e.name for e in rig.element]
     first, last = order.index(span[0]), order.index(span[-1])
-    old: Sequence[str] = next(
-        s.across for s in rig.sensor if isinstance(s, RelativeAngle) and s.name == name
+    old: Sequence[str] | None = next(
+        (s.across for s in rig.sensor if isinstance(s, RelativeAngle) and s.name == name), None
     )
+    if old is None:
+        raise InputError(rig.name, f"sensor.{name}", "no angle", "one across elements")
     while last + 1 < len(order) and _put_in(rig.element[last + 1]) and order[last + 1] in old:
         last += 1
     return sensor_changed(rig, name, across=tuple(order[first : last + 1]))
