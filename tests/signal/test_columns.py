@@ -257,8 +257,8 @@ def coarse(seed: int, step: float, noise: float, times: int = 10) -> Recording:
 
 
 def test_a_sensor_that_moves_by_less_than_its_step_shows_no_shift_beside_a_voltmeter():
-    """It steps in few rows. Another shift explained these better by 14 to 127 of the logarithm, in
-    4 of 12: a motor of SFLR was told to have a delay of 17 ms with 0.995."""
+    """It steps in few rows. Another shift explained these better in 4 of the 12. So a motor was
+    told to have a delay of 17 ms, with 0.995."""
     assert {shift_of(coarse(seed, step=0.1, noise=0.03)) for seed in range(12)} == {0}
 
 
