@@ -21,7 +21,7 @@ from samii_rig.errors import InputError
 from samii_rig.rig.load import tables
 from samii_rig.signal.shifts import FARTHEST, compared, driving
 from samii_rig.signal.steps import LEAST_STEPS, steps_moved
-from samii_rig.types import Finding, Float, Int, Recording
+from samii_rig.types import Channel, Finding, Float, Int, Recording
 
 LEFT = 0.2  # part of what is fed back, or of a command's size, by which a law that holds is off
 # Of a law that holds, log likelihood by which a shift is seen: 1e-5 by chance among eleven.
@@ -94,18 +94,13 @@ def is_aligned(recordings: Iterable[Recording]) -> bool:
 
 def _is_seen(recording: Recording, laws: Sequence[_Law], best: int, rounded: float) -> bool:
     """Whether the law of one shift, the best, is likelier than that of none: beside a meter's noise
-    also by rows that no limit has clipped, and by no sensor whose rounding hides its motion: it
-    steps in few rows, and these alone would tell. rounded : as of `_laws`."""
+    also by rows that show one there. rounded : as of `_laws`."""
     if laws[FARTHEST].apart(laws[best], rounded) <= SEEN:
         return False
     if laws[best].left <= rounded:
         return True
-    sensor = recording.column((centring_of(recording) or ("", 0.0))[0])
-    theta = recording.values[:, sensor]
-    if steps_moved(recording.channels[sensor], theta[np.isfinite(theta)]) < LEAST_STEPS:
-        return False
-    below, _ = _laws(recording, unclipped=True)
-    return bool(below) and below[FARTHEST].apart(below[best], rounded) > CONFIRMED
+    some, _ = _laws(recording, noisy=True)
+    return bool(some) and some[FARTHEST].apart(some[best], rounded) > CONFIRMED
 
 
 def _best(laws: Sequence[_Law]) -> int | None:
@@ -115,9 +110,11 @@ def _best(laws: Sequence[_Law]) -> int | None:
     return best if left and laws[best].holds else None
 
 
-def _laws(recording: Recording, *, unclipped: bool = False) -> tuple[list[_Law], float]:
+def _laws(recording: Recording, *, noisy: bool = False) -> tuple[list[_Law], float]:
     """That of the loop of every shift, none where they are not known, and the square of what the
-    command's rounding leaves. unclipped : of rows alone whose command no limit has clipped."""
+    command's rounding leaves. noisy : of what shows a shift beside a meter's noise alone. Those are
+    rows whose command no limit has clipped; none of a sensor whose rounding hides its motion, as it
+    steps in few rows, and these alone would tell."""
     centring = centring_of(recording)
     first = next(iter(recording.names("command")), "")
     recording = of_input(recording, first)
@@ -126,6 +123,8 @@ def _laws(recording: Recording, *, unclipped: bool = False) -> tuple[list[_Law],
     if centring is None or centring[0] not in names or len(command) != 1 or not references:
         return [], 0.0
     sensor, kp = centring
+    if noisy and _hidden(names[sensor], recording.values_of(sensor)):
+        return [], 0.0
     around = _about_the_largest(recording, references)
     if around.stop - around.start <= 2 * FARTHEST:
         return [], 0.0
@@ -133,7 +132,7 @@ def _laws(recording: Recording, *, unclipped: bool = False) -> tuple[list[_Law],
     theta, v = (recording.values_of(name)[around] for name in (sensor, command[0]))
     sent = _beside(asked(recording, command[0], kp, around))
     v = v[FARTHEST + TAPS : v.size - FARTHEST - TAPS]
-    on = _unclipped(v) if unclipped else slice(None)
+    on = _unclipped(v) if noisy else slice(None)
     shifts = range(-FARTHEST, FARTHEST + 1)
     laws = [_Law.of(v[on], sent[:, on], _beside(-kp * np.roll(theta, -m))[:, on]) for m in shifts]
     rounded = (ROUNDED * names[command[0]].resolution) ** 2
@@ -202,6 +201,11 @@ class _Law:
         """What it leaves is little, or a meter's noise; another loop leaves what moves slowly."""
         rest = self.part < LEFT**2 or abs(self.alike) < LEFT
         return rest and self.centred and abs(self.fed - 1) < LEFT and abs(self.gain - 1) < LEFT
+
+
+def _hidden(channel: Channel, x: Float) -> bool:
+    """Whether a channel with values x (n,) moves by less than its step."""
+    return steps_moved(channel, x[np.isfinite(x)]) < LEAST_STEPS
 
 
 def _unclipped(v: Float) -> NDArray[np.bool_]:

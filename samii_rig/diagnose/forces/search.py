@@ -9,7 +9,7 @@ what is left beside one linear effect too, and linear effects against what a for
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 
 import numpy as np
@@ -244,9 +244,18 @@ class ForceSearch(RecordSearch):
         does while these are as they are: which of them fit best without the forces says little."""
         best = self.ranked()[0]
         forces = tuple(e for e in best.effects if e.force is not None)
-        plain, rest = self.linear_part(best)
         if not forces:
             return
+        plain, rest = self.linear_part(best)
+        for effects, end in self._instead(plain, rest):
+            if end is not None and end.cost < rest.fitted.cost + 2 * NEAR_BEST:
+                self._beside_force((*effects, *forces), end, best)
+
+    def _instead(
+        self, plain: Explanations, rest: Explanation
+    ) -> Iterator[tuple[tuple[Effect, ...], Fitted | None]]:
+        """Linear effects that may do what those of `rest` do, refitted as `linear_part` has them:
+        by a screen where each stands, and what the linear search could not tell from them."""
         for i, gone in enumerate(rest.effects):
             less = plain.without_refit(rest, i)
             if less is None:
@@ -257,13 +266,9 @@ class ForceSearch(RecordSearch):
             some = [*others[:BESIDE], *(r for r in others[BESIDE:] if r[1].within(gone))]
             for _, effect, starts in self.each(some, lambda r: named([r[1]])):
                 effects = (*less.effects, effect)
-                end = plain.refitted(effects, less, np.log(starts[0]).tolist())
-                if end is not None and end.cost < rest.fitted.cost + 2 * NEAR_BEST:
-                    self._beside_force((*effects, *forces), end, best)
+                yield effects, plain.refitted(effects, less, np.log(starts[0]).tolist())
         for e in self.each(self._alike(rest), lambda e: named(e.effects)):
-            end = plain.refitted(e.effects, e)
-            if end is not None and end.cost < rest.fitted.cost + 2 * NEAR_BEST:
-                self._beside_force((*e.effects, *forces), end, best)
+            yield e.effects, plain.refitted(e.effects, e)
 
     def _alike(self, rest: Explanation) -> list[Explanation]:
         """What the linear search could not tell from some linear effects: it refitted them from
@@ -271,10 +276,9 @@ class ForceSearch(RecordSearch):
         same = self.linear.found.get(rest.key)
         if same is None:
             return []
-        near = [e for e in self.linear.ranked() if abs(e.weight - same.weight) < NEAR_BEST]
-        return [e for e in near if e.key != rest.key and len(e.effects) == len(rest.effects)][
-            :BESIDE
-        ]
+        others = (e for e in self.linear.ranked() if e.key != rest.key)
+        as_many = (e for e in others if len(e.effects) == len(rest.effects))
+        return [e for e in as_many if abs(e.weight - same.weight) < NEAR_BEST][:BESIDE]
 
     def _beside_force(self, effects: tuple[Effect, ...], plain: Fitted, best: Explanation) -> None:
         """Refit the forces of `best` beside other linear effects, from where these fit what it
