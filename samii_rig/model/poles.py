@@ -257,7 +257,10 @@ def _log_derivative(
 
 
 def _newton(D: Characteristic, s: Complex) -> Complex:
-    """(m,) zeros of D, all apart, that Newton's steps from s lead to; those that settle."""
+    """(m,) zeros of D, all apart, that Newton's steps from s lead to; those that settle.
+
+    One that is real but for rounding is: taken for one of a pair it would stand for two.
+    """
     real = s.imag == 0
     settled = np.zeros(s.size, dtype=bool)
     for _ in range(NEWTON_STEPS):
@@ -268,7 +271,7 @@ def _newton(D: Characteristic, s: Complex) -> Complex:
         s = s - np.where(real, step.real, step)
         settled = np.abs(step) <= SETTLED * size
     out: list[complex] = []
-    for root in s[settled].tolist():
+    for root in np.where(np.abs(s.imag) <= CLUSTER, s.real, s)[settled].tolist():
         if all(abs(root - x) > CLUSTER for x in out):
             out.append(root)
     return np.array(out, dtype=complex)
