@@ -24,6 +24,7 @@ from samii_rig.diagnose.diagnose import case_of, diagnose, table
 from samii_rig.diagnose.fit.agreeing import Given, SeveralStates, several_states
 from samii_rig.diagnose.posed import in_poses
 from samii_rig.diagnose.result import Diagnosis
+from samii_rig.diagnose.verdict import by_record
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.errors import InputError
 from samii_rig.identify.poses import at_pose
@@ -86,6 +87,17 @@ def test_a_spring_that_differs_between_two_recordings_is_told_at_its_place(runs)
     assert spread.low < 0.3 / 2**0.5  # of 12 and 15.6 N/m
     assert spread.high is None or spread.high > 0.3 / 2**0.5
     assert "spread" in found.lines()[0]
+
+
+def test_forces_that_could_not_be_searched_for_are_told(runs, monkeypatch):
+    def double(*_):
+        raise InputError(RIG.name, "element", "double pole at -42 rad/s", "simple poles")
+
+    monkeypatch.setattr(by_record, "compete_on_records", double)
+    one = [runs["one"]]
+    found = diagnose(estimate(one), RIG, runs=one, effects=table_of(RIG, 0.8, 35.0, "added_mass"))
+    (told,) = [line for line in found.not_physics if "forces that depend on amplitude" in line]
+    assert "double pole at -42 rad/s" in told
 
 
 def test_recordings_of_one_rig_agree_as_well_as_their_own_noise_lets_them(runs):

@@ -90,6 +90,13 @@ def test_places_near_the_zeros_change_the_way_and_not_what_is_found(given):
         assert np.min(np.abs(found.poles - z)) < 1e-8 * (1 + abs(z))
 
 
+@pytest.mark.parametrize("near", [-45 + 9j, -46 + 3j, -52 + 1j, -60 + 0.2j])
+def test_two_real_zeros_are_found_from_a_pair_that_stood_between_them(near):
+    D = product([-30, -70])
+    found = find_poles(D, REGION, np.array([near]))
+    np.testing.assert_allclose(np.sort_complex(found.poles), [-70, -30], rtol=1e-9)
+
+
 def test_poles_of_a_chain_that_has_moved_a_little_are_found_in_a_quarter_of_the_time():
     rig = load_rig("samii")[0]
     chain = Chain(rig)

@@ -77,7 +77,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     if (wrong := wrong_lengths(search)) is not None:
         return _of_lengths(case, search, first, bands, *wrong)
     search.begin("amplitude levels")
-    forces = forces_on(search)
+    forces, untried = forces_on(search)
     forced = _winning(forces)
     if forced is None or _may_be_linear(
         forced, level_dependent=case.search.lines.depends_on_level()
@@ -90,7 +90,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         more = search.ratio(best.fitted) > threshold(search.spread)
         if best.key != single and (forced is not None or more):
             # What a force did beside a single effect competes with what it does beside pairs.
-            forces = forces_on(search, forced.ranked()[:1] if forced else ()) or forces
+            beside, untried = forces_on(search, forced.ranked()[:1] if forced else ())
+            forces = beside or forces
             forced = _winning(forces)
     search.begin("what cannot be distinguished")
     if forced is None:
@@ -115,6 +116,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         looked = _consistent(discrepant, _looked(discrepant))
         if looked.judged.verdict == "no_mismatch":  # beside what no law describes
             looked = _unknown(looked)
+    looked = replace(looked, remarks=(*looked.remarks, *untried))
     return _agreeing(case, last, first, bands, looked, [given], several=several)
 
 
@@ -269,13 +271,15 @@ def _of_lengths(
     )
 
 
-def forces_on(search: RecordSearch, known: Sequence[Explanation] = ()) -> ForceSearch | None:
+def forces_on(
+    search: RecordSearch, known: Sequence[Explanation] = ()
+) -> tuple[ForceSearch | None, tuple[str, ...]]:
     """The search among forces; None where the rig has no partial fractions in which they could be
-    computed. known : as of `compete_on_records`."""
+    computed, and that in words. known : as of `compete_on_records`."""
     try:
-        return compete_on_records(search, known)
-    except SamiiRigError:
-        return None
+        return compete_on_records(search, known), ()
+    except SamiiRigError as error:
+        return None, (f"not all forces that depend on amplitude were searched for: {error}",)
 
 
 def _may_be_linear(forced: ForceSearch, *, level_dependent: bool) -> bool:
