@@ -186,3 +186,22 @@ def test_of_sensors_that_are_all_early_it_is_the_input_that_is_late():
     assert search.ranked()[0].effects == early
     search._behind_the_input()
     assert set(search.ranked()[0].effects) == {not_held, late}
+
+
+def test_a_shift_told_one_sample_too_far_is_found_with_the_dead_time_that_it_stood_for():
+    """The input late by 0.9 samples, its columns two samples early: one early fits nearly as
+    well, the nominal parameters bent, and with less of a dead time beside it."""
+    one, two = (
+        effect("columns_shifted", "v_2", f"is not of the sensors' sample: their columns stand {n}")
+        for n in ("1 sample earlier", "2 samples earlier")
+    )
+    dead = effect("transport_delay", "joint_2_source")
+    here = measured([concealing((two, []), (dead, [0.9 / samii().rate_hz]))], samii())
+    at = grid(samii(), here.frequency, here.sensor, here.actuator)
+    search = Search(samii(), here, at, [one, two, dead])
+    end = search.refitted((one, dead), search.nominal, [np.log(1e-4)])
+    search.keep((one, dead), end)
+    search._beside_next_shifts()
+    best = search.ranked()[0]
+    assert set(best.effects) == {two, dead}
+    assert np.exp(best.fitted.x[-1]) == pytest.approx(0.9 / samii().rate_hz, rel=0.05)

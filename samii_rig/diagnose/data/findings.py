@@ -18,6 +18,7 @@ from samii_rig.diagnose.data.measured import repeated, whole_part
 from samii_rig.diagnose.data.pace import paced
 from samii_rig.diagnose.data.wiring import FEW_LINES, Mend, lines_of, named, outputs_of, wired
 from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.faults import SHIFTED
 from samii_rig.diagnose.result import Verdict
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.rig.schema import Rig, parameters
@@ -84,7 +85,7 @@ class Checked:
         ]
 
     def _refuted(self, effect: Effect) -> bool:
-        if effect.physics == "columns_shifted":
+        if effect.physics == SHIFTED:
             return self.aligned
         on = effect.factor
         return on is not None and on.kind == "sensor" and on.channel in self.hidden

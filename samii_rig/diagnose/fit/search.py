@@ -27,6 +27,7 @@ from samii_rig.diagnose.fit.refit import Fitted, far_off, profiled, refit
 from samii_rig.diagnose.fit.screen import Screen, Start
 from samii_rig.diagnose.fit.usual import LINES
 from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.faults import SHIFTED
 from samii_rig.types import Float
 
 MOST = 5  # effects in one explanation, if all are of one physics
@@ -56,6 +57,7 @@ FALLING = 0.5  # of its cost, after a leg, below which one is still on its way a
 OTHER_PHYSICS = 3  # of other physics than theirs, that go on too
 SWITCHED = 12  # effects without unknowns that compete so: the nearest as the rig file has the rest
 PROFILED, MOST_PROFILED = 12, 2  # values of each unknown over its range, of so many at most
+NEXT = 2  # shifts of columns beside the best: one to either side
 BROAD = 4  # single effects of different physics that are extended where none is enough
 
 Candidate = tuple[float, tuple[Effect, ...], list[Float]]  # chi-square hoped for, and starts
@@ -123,6 +125,7 @@ class Search(Explanations):
             self.take_overdispersion()
         self._beside_what_was_meant()
         self._behind_the_input()
+        self._beside_next_shifts()
         self._from_everywhere()
         self._plainer()
         return self.ranked()
@@ -154,6 +157,39 @@ class Search(Explanations):
             bases.append(Explanation((effect,), there, 0.0))
         for base in sorted(bases, key=lambda e: e.fitted.cost)[:BROAD]:
             self.forward(base, LATER, again=True)
+        self.take_overdispersion()
+        self.backward()
+
+    def _beside_next_shifts(self) -> None:
+        """What stands beside a shift of whole samples beside the next shifts, too: a dead time of
+        nearly a sample has the shift told one too far, and no exchange of one for the other leads
+        back. From the rig as its file has it: the nominal parameters are bent towards the best."""
+        best = self.ranked()[0]
+        shift = next((e for e in best.effects if e.physics == SHIFTED), None)
+        if shift is None:
+            return
+        beside: dict[str, tuple[Effect, Float]] = {}
+        for e in self.ranked():
+            if len(e.effects) == 2 and shift in e.effects:
+                i = 1 - e.effects.index(shift)
+                own = e.fitted.x[e.fitted.model.own(i)]
+                beside.setdefault(e.effects[i].physics, (e.effects[i], own))
+        off: list[tuple[float, Effect]] = []
+        for other in self.table:
+            model = self.model((other,)) if (other.physics, other.site) == shift.name else None
+            if model is not None and other is not shift:
+                x = moved(best.fitted.model, best.fitted.x, model)[: model.n]
+                off.append((far_off(model, self.problem, x), other))
+        for _, other in sorted(off, key=lambda one: one[0])[:NEXT]:
+            for effect, own in list(beside.values())[:BROAD]:
+                effects = (other, effect)
+                model = self.model(effects)
+                if model is None:
+                    continue
+                x = np.append(np.zeros(model.n - own.size), own)
+                end = self.refitted_from(effects, x)
+                if end is not None:
+                    self.keep(effects, end)
         self.take_overdispersion()
         self.backward()
 

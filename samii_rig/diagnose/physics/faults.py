@@ -29,6 +29,7 @@ from samii_rig.rig.schema import (
 )
 from samii_rig.types import Complex, Float
 
+SHIFTED = "columns_shifted"  # of an input against the sensors, by a logger
 MOST_SHIFTED = 5  # samples, by which a logger's columns are apart; as `signal.columns` looks for
 MEASURED = 0.3  # of loggers that shift columns, those that measure the command
 ORDERS = ("a displacement", "a velocity", "an acceleration")  # by how often it was derived
@@ -65,7 +66,7 @@ def derived(s: Complex, times: int) -> Complex:
 def effects(rig: Rig, recorded_hz: float) -> Iterator[Effect]:
     """Every fault that this rig's columns allow, of so many rows a second."""
     for actuator in rig.actuator:
-        shifts = list(_shifts("columns_shifted", recorded_hz))
+        shifts = list(_shifts(SHIFTED, recorded_hz))
         for m in (*_of_any(), *shifts, *_measured_too(shifts, rig.rate_hz)):
             yield _on("input", actuator.name, m)
     for sensor in rig.sensor:
@@ -100,7 +101,7 @@ def _shifts(physics: str, rate_hz: float) -> Iterator[Fault]:
     for n in (n for n in range(-MOST_SHIFTED, MOST_SHIFTED + 1) if n != 0):
         many = f"{abs(n)} sample{'s' * (abs(n) > 1)} {'later' if n > 0 else 'earlier'}"
         description = f"stands {many} than the other columns: a logger's, or a delay of as much"
-        if physics == "columns_shifted":
+        if physics == SHIFTED:
             description = (
                 f"is not of the sensors' sample: their columns stand {many} (a logger's shift)"
             )
