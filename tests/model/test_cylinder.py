@@ -96,6 +96,11 @@ def test_gradients_are_those_of_differences() -> None:
             'after = "mass"\nchamber = 1',
             "mass is of kind 'mass'; expected a cylinder, which has chambers",
         ),
+        (
+            'after = "cylinder"\nchamber = 1',
+            'after = "mass"\narea = 5e-4',
+            "mass is of kind 'mass'; expected a cylinder, or the velocity source that stands for",
+        ),
     ],
 )
 def test_a_pressure_of_no_chamber_is_refused_in_a_line(old: str, new: str, said: str) -> None:

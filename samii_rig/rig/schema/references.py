@@ -19,6 +19,7 @@ from samii_rig.rig.schema.elements import (
     LumpedMass,
     RigidLink,
     Source,
+    VelocitySource,
     flattened,
     input_unit,
 )
@@ -108,6 +109,9 @@ def _check_sensors(rig: Rig) -> None:
             _check_gauge(s, rig)
         if isinstance(s, Pressure) and s.chamber is not None:
             _check_kind(s, s.after, rig, (Cylinder,), "a cylinder, which has chambers")
+        if isinstance(s, Pressure) and s.area is not None:
+            drives = "a cylinder, or the velocity source that stands for one"
+            _check_kind(s, s.after, rig, (Cylinder, VelocitySource), drives)
         if isinstance(s, Current):
             _check_kind(s, s.of, rig, SOURCES, "a source")
 
