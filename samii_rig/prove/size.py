@@ -18,8 +18,9 @@ import numpy as np
 
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.diagnose import table
+from samii_rig.diagnose.fit.around import FIRST
 from samii_rig.diagnose.fit.explanations import Explanation
-from samii_rig.diagnose.fit.search import FIRST, Search
+from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.grid import grid
 from samii_rig.rig.schema import Rig

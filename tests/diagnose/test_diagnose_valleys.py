@@ -13,10 +13,11 @@ from table_kit import table_of
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose, table
 from samii_rig.diagnose.fit.classes import Class
+from samii_rig.diagnose.fit.growing import PENALISED
 from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.refit import profiled, refit
-from samii_rig.diagnose.fit.search import PENALISED, Search
+from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.physics import channels
 from samii_rig.diagnose.physics.channels import METERED

@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 
 from samii_rig.diagnose.fit.explanations import threshold
+from samii_rig.diagnose.fit.growing import LARGE_MISMATCH
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
-from samii_rig.diagnose.fit.search import LARGE_MISMATCH, Search
+from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.result import Exact, Value
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig, parameters
