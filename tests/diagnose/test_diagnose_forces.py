@@ -23,7 +23,7 @@ from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.fit.stated import IN_DATA
-from samii_rig.diagnose.forces import search as force_search
+from samii_rig.diagnose.forces import beside as beside_force
 from samii_rig.diagnose.forces.laws import CLIPPED
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.problem import ForceProblem
@@ -410,9 +410,9 @@ def test_beside_a_force_all_compete_that_do_there_as_well_as_what_was_found_with
             assert plain.effects == effects[:1]
             tried.append(effects)
 
-    monkeypatch.setattr(force_search.Screen, "of", lambda *_: None)
+    monkeypatch.setattr(beside_force.Screen, "of", lambda *_: None)
     found = [(100.0, e, [()]) for e in (lag, shift, other)]
-    monkeypatch.setattr(force_search, "ranking", lambda *_: found)
+    monkeypatch.setattr(beside_force, "ranking", lambda *_: found)
     search = object.__new__(Kept)
     before = [explained(lag), explained(delay, weight=-1.0), explained(other, weight=-900.0)]
     search.linear = SimpleNamespace(  # type: ignore[assignment]

@@ -1,0 +1,168 @@
+"""The complete likelihood of whole records, for explanations with a force and without.
+
+Linear explanations and those with a force stand on the very same lines with the same weights, about
+the best of them. A force is computed in time under the recorded commands.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import copy
+from typing import Self
+
+import numpy as np
+
+from samii_rig.diagnose.fit.explanations import (
+    NEAR_BEST,
+    Explanation,
+    Explanations,
+    named,
+    threshold,
+)
+from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.records import Whole
+from samii_rig.diagnose.fit.refit import STEPS, Fitted
+from samii_rig.diagnose.forces.model import ForceModel, model_of
+from samii_rig.diagnose.forces.paths import TransferPaths
+from samii_rig.diagnose.forces.problem import ForceProblem, Moved
+from samii_rig.diagnose.forces.table import forces
+from samii_rig.diagnose.forces.way import Ways
+from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.model import Model
+from samii_rig.likelihood.reduce import LineResiduals
+from samii_rig.likelihood.unexplained import Unexplained, unexplained
+from samii_rig.types import Float
+
+FEW = 6  # steps of a refit of a force: what may win is refitted again, from where it ended
+# Samples under which forces are computed, those of slopes too: 15 s of a core. The most promising
+# come first.
+MOST_MARCHED = 20_000_000
+RIVALS = 4  # linear explanations that forces are held against
+
+
+class ForceFits(RecordSearch):
+    """Explanations with and without a force, on the complete likelihood, every level by itself."""
+
+    def __init__(self, linear: RecordSearch, known: Sequence[Explanation] = ()) -> None:
+        assert isinstance(linear.whole, Whole)  # of one state
+        self.levels = whole = linear.whole.by_level().with_harmonics()
+        self._ways = Ways(acting=tuple(whole.acting.tolist()))
+        self.linear = linear
+        moved = of_data(linear).fitted
+        self.paths = TransferPaths(whole, moved.model, moved.x)
+        self.forces = tuple(forces(whole.rig, self.paths))
+        super().__init__(whole, linear.by_line)
+        self.use((*linear.table, *self.forces))
+        self._again(known)
+
+    def __post_init__(self) -> None:
+        self.stage = self.linear.stage
+        self.use(self.table)
+        ranked = self.linear.ranked()
+        self._about(ranked[0].fitted)
+        kept = [e for e in ranked[:RIVALS] if e.weight > ranked[0].weight - NEAR_BEST]
+        # Beside what is wrong with the data a force is held against what the rig lacks otherwise.
+        self._only((self.linear.nominal, of_data(self.linear), *kept))
+
+    def _only(self, some: Sequence[Explanation]) -> None:
+        """Refit some explanations, and forget all others."""
+        self.found = {}
+        self._again(list({e.key: e for e in some}.values()))
+
+    def _again(self, some: Sequence[Explanation]) -> None:
+        """Refit some explanations, each from where it ended."""
+        for e in self.each(some, lambda e: named(e.effects)):
+            end = self.refitted(e.effects, e, far=False)
+            if end is not None:
+                self.keep(e.effects, end)
+
+    def _about(self, fitted: Fitted) -> None:
+        self._ways.clear()
+        self.problem = ForceProblem.near(self.levels, fitted, self.by_line.problem, self._ways)
+        between = self.levels.between(self.reduced, fitted)
+        self._between = between, fitted.model.response(fitted.x, between)
+
+    def on(self, levels: Whole, fitted: Fitted) -> Self:
+        """The same on other records of these inputs, the likelihood about a fit of them."""
+        other = copy(self)
+        other.levels = other.whole = levels
+        other.found = {}
+        other._about(fitted)
+        return other
+
+    def made(self, effects: tuple[Effect, ...]) -> Model:
+        """As of `Explanations`; of a force and linear effects beside it, or of those alone."""
+        return model_of(self.rig, effects)
+
+    def refitted_from(
+        self,
+        effects: tuple[Effect, ...],
+        start: Float,
+        give_up: float = math.inf,
+        steps: int = STEPS,
+        *,
+        far: bool = True,
+    ) -> Fitted | None:
+        """As of `Explanations`; a force is computed in time at every step, and its slopes too."""
+        if not isinstance(self.model(effects), ForceModel):
+            return super().refitted_from(effects, start, give_up, steps, far=far)
+        # Every refit of a force is done anew with the likelihood: it goes on from where it ended.
+        return super().refitted_from(effects, start, give_up, min(steps, FEW), far=False)
+
+    @property
+    def won(self) -> bool:
+        """Whether the best explanation has a force."""
+        return isinstance(self.ranked()[0].fitted.model, ForceModel)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether as many forces were computed as a person waits for."""
+        return self._ways.marched > MOST_MARCHED
+
+    def is_enough(self) -> bool:
+        """Whether the best explanation leaves no more than noise."""
+        return self.ratio(self.ranked()[0].fitted) < threshold(self.spread)
+
+    def residuals(self, fitted: Fitted, *, shown: bool = False) -> LineResiduals:
+        """As of `RecordSearch`."""
+        return self._rest(fitted).residuals(fitted, self.reduced, shown=shown)
+
+    def unexplained(self, fitted: Fitted, *, rounded: bool = False) -> list[Unexplained]:
+        """What a fit leaves of each piece. rounded : as of `unexplained`."""
+        rest, loops = self._rest(fitted), self.levels.wired.loops
+        return unexplained(
+            rest.records, rest.response(fitted), self.reduced, loops, rounded=rounded
+        )
+
+    def _rest(self, fitted: Fitted) -> Whole:
+        """The records as those of the linear part of a fit."""
+        if not isinstance(fitted.model, ForceModel):
+            return self.levels
+        return Moved(self.levels, self._ways).without(fitted)
+
+    def linear_part(self, best: Explanation) -> tuple[Explanations, Explanation]:
+        """As of `Explanations`: the records without the force of `best`, about which the likelihood
+        stands."""
+        linear = tuple(e for e in best.effects if e.force is None)
+        model = Model(self.rig, linear)
+        plain = copy(self)
+        plain.problem = self._force_problem.without_force()
+        old = best.fitted
+        gone = list(old.model.unknowns) if isinstance(old.model, ForceModel) else []
+        x = np.delete(old.x, gone)
+        h, dh = model.gradient(x, plain.problem.at)
+        J, r = plain.problem.whiten(dh), plain.problem.residual(h)
+        fitted = Fitted(model, x, float(r @ r), old.penalty, J, J.T @ J)
+        return plain, Explanation(linear, fitted, 0.0)
+
+    @property
+    def _force_problem(self) -> ForceProblem:
+        assert isinstance(self.problem, ForceProblem)
+        return self.problem
+
+
+def of_data(search: Explanations) -> Explanation:
+    """What is wrong with the data by the most probable explanation, without what is missing of the
+    rig: the nominal model where that is nothing."""
+    return search.meant(search.ranked()[0].effects) or search.nominal
