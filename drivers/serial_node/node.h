@@ -1,9 +1,10 @@
 /* Serial I/O node: the portable part of the firmware. A node with one output speaks protocol version
  * 1, a node with several version 2.
  *
- * The protocol is docs/reference/serial-node.md of samii-rig. This part holds everything that decides about
- * the outputs; what is left to the board is a timer, the converters, a serial port and one word of
- * memory that survives a reset:
+ * The protocol is docs/reference/serial-node-frames.md of samii-rig, what a node does at each sample
+ * docs/reference/serial-node-states.md. This part holds everything that decides about the outputs;
+ * what is left to the board is a timer, the converters, a serial port and one word of memory that
+ * survives a reset:
  *
  *     node_init(&node, &config, ++boot_counter);      then put the null_counts of each output out
  *     for each byte block that came:  node_rx(&node, bytes, n);

@@ -1,7 +1,7 @@
 """Frames and messages of the serial I/O node, protocol versions 1 and 2.
 
-The protocol is docs/reference/serial-node.md. A node with one output speaks version 1, a node
-with several version 2.
+The protocol is docs/reference/serial-node-frames.md. A node with one output speaks version
+1, a node with several version 2.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """A serial I/O node in Python: the same integers and the same bytes as the portable C core.
 
-It is written from the protocol's page (docs/reference/serial-node.md), not from the C core, and
-held to it by differential fuzzing: the same bytes and samples in, the same counts and bytes out.
+It is written from the protocol's page (docs/reference/serial-node-frames.md), not from the C core,
+and held to it by differential fuzzing: the same bytes and samples in, the same counts and bytes
+out.
 """
 
 from __future__ import annotations

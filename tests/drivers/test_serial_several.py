@@ -405,7 +405,7 @@ def test_a_simulated_node_says_how_many_outputs_it_has():
 
 
 def test_samples_of_three_outputs_and_all_inputs_fit_a_frame_and_of_four_do_not():
-    """As docs/reference/serial-node.md reckons it."""
+    """As docs/reference/serial-node-outputs.md reckons it."""
     assert [26 + 8 * (REPORTED * k + 4 * 4 + 2 * 8) for k in (3, 4)] == [498, 570]
     assert OVERHEAD == 26
     assert 498 <= MAX_PAYLOAD < 570

@@ -1,4 +1,4 @@
-"""docs/reference/words.md has every name that an answer uses, each term once, in one line."""
+"""docs/reference/answer.md has every name that an answer uses, words.md each term, in one line."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from samii_rig.diagnose.result import (
     Verdict,
 )
 
-PAGE = (ROOT / "docs" / "reference" / "words.md").read_text("utf-8")
-SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", PAGE, re.M | re.S))
+PAGES = [(ROOT / "docs" / "reference" / p).read_text("utf-8") for p in ("words.md", "answer.md")]
+SECTIONS = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", "\n".join(PAGES), re.M | re.S))
 HEADS = r"term|name|field|`verdict` \| meaning|`physics` \| in|---"
 ROW = re.compile(rf"^\| (?!{HEADS})(.+?) \| (.+) \|$", re.M)
 
