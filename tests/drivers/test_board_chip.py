@@ -1,6 +1,6 @@
 """The firmware on its chip, register by register: every path of the output ends at null.
 
-The chip is a model (chip_kit.py); what it cannot show is on docs/guide/board.md.
+The chip is a model (chip_kit.py); what it cannot show is on docs/evidence/board.md.
 """
 
 from __future__ import annotations
@@ -197,7 +197,8 @@ def test_its_pins_are_those_of_the_wiring_table(boots):
         (GPIOC, (5,), 0),
     ):
         assert {chip.mode(port, p) for p in pins} == {mode}
-    page = (Path(__file__).resolve().parents[2] / "docs" / "guide" / "board.md").read_text()
+    docs = Path(__file__).resolve().parents[2] / "docs"
+    page = (docs / "reference" / "serial-board.md").read_text()
     assert chip.mode(GPIOB, DAC_1_SELECT) == 0, "left alone by a board with one output"
     for name in ("PA2", "PA3", "PA15", "PB0", "PB1", "PB3", "PB5", "PB12", "PB13", "PB14", "PB15"):
         assert f"| {name} |" in page

@@ -140,7 +140,7 @@ class Chip:
         self.keys: list[int] = []
         self.writes: list[tuple[int, int]] = []
         self.dacs, self.adc = {DAC_SELECT: Dac(), DAC_1_SELECT: Dac()}, Adc()
-        # In reset all pins float, and resistors pull these down: docs/guide/board.md.
+        # In reset all pins float, and resistors pull these down: docs/reference/serial-board.md.
         self.pins = {SUPPLY: 0, DAC_RESET: 0, DAC_SELECT: 1, DAC_1_SELECT: 1, ADC_SELECT: 1}
         self.frame, self.emergency, self.sent = b"", False, bytearray()
         self.arrived = bytearray()

@@ -3,7 +3,7 @@
  * Outputs: an AD5761R for each, 16 bit, +-10 V. Their RESET is pulled to ground by one resistor, and the
  * supply line by another: while the chip is in reset, they hold their outputs at ground and the supply
  * is off.
- * Inputs: ADS8688, 8 of 16 bit, +-10.24 V. Both on SPI2. docs/guide/board.md has the wiring.
+ * Inputs: ADS8688, 8 of 16 bit, +-10.24 V. Both on SPI2. docs/reference/serial-board.md has the wiring.
  */
 #include "config.h"
 #include "port.h"
