@@ -23,7 +23,7 @@ from samii_rig.types import Float
 
 FIRST, LATER = 30, 6  # candidates that are refitted in the first round, and in later ones
 TENTHS = (2, 5, 8)  # tenths of their range at which several unknowns start together
-SWAPS = 2  # rounds of them, the second about what won the first
+SWAPS = 2  # rounds of exchanges, the second about what won the first
 ANYHOW = 2  # of the most promising in another's place are refitted whatever the screen says
 PROFILED, MOST_PROFILED = 12, 2  # values of each unknown over its range, of so many at most
 NEXT = 2  # shifts of columns beside the best: one to either side

@@ -21,10 +21,10 @@ from samii_rig.types import Float
 
 MOST = 5  # effects in one explanation, if all are of one physics
 MIXED = 2  # effects of different physics: with more, sums of them mimic what is in no table
-STRAIGHT = 15  # of them, from the nominal parameters as the rig file has them
+STRAIGHT = 15  # candidates that are refitted from the nominal parameters as the rig file has them
 WORTH = 8.0  # of chi-square, gain in the screen below which a candidate is not refitted
-MOST_SATURATED = 12  # of these places
-WEAK_STARTS = (4, 5, 6)  # tenths of the range at which they start
+MOST_SATURATED = 12  # places that one physics is put in at once, at most
+WEAK_STARTS = (4, 5, 6)  # tenths of its range at which it starts there
 SHARE = 0.3  # of the best candidate's gain: one that promises less is not refitted
 PENALISED = 3.0  # of a nominal parameter's penalty, above which the refit hides what is missing
 LARGE_MISMATCH = (
@@ -33,7 +33,7 @@ LARGE_MISMATCH = (
 AHEAD, FINALISTS = 5, 5  # steps of a round of that, and how many go on after it
 FALLING = 0.5  # of its cost, after a leg, below which one is still on its way and runs another
 OTHER_PHYSICS = 3  # of other physics than theirs, that go on too
-SWITCHED = 12  # effects without unknowns that compete so: the nearest as the rig file has the rest
+SWITCHED = 12  # effects without unknowns among those: the nearest as the rig file has the rest
 
 Candidate = tuple[float, tuple[Effect, ...], list[Float]]  # chi-square hoped for, and starts
 
