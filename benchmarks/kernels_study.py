@@ -22,6 +22,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from samii_rig.prove.outcomes import collected
+
 SAME = 1e-3  # of a stated probability: what is shown of it
 
 
@@ -62,10 +64,10 @@ def main() -> None:
     parser.add_argument("--kernels", nargs=2, default=["Haswell", "SkylakeX"])
     parser.add_argument("--most", type=int, default=130, help="recordings")
     given = parser.parse_args()
-    outcomes = [json.loads(f.read_text("utf-8")) for f in (given.trials / "outcomes").glob("*")]
-    kept = [o for o in outcomes if (given.trials / "recordings" / str(o.get("trial"))).is_dir()]
-    kept.sort(key=lambda o: o["seconds"].get("diagnosis", 0.0))
-    folders = [given.trials / "recordings" / o["trial"] for o in kept[: given.most]]
+    recordings, (_, outcomes) = given.trials / "recordings", collected(given.trials)
+    kept = [o for o in outcomes if "error" not in o and (recordings / o["trial"]).is_dir()]
+    kept.sort(key=lambda o: float(o["seconds"]["diagnosis"]))
+    folders = [recordings / o["trial"] for o in kept[: given.most]]
     with ThreadPoolExecutor(2) as pool:
         each = pool.map(lambda kernel: answers(kernel, folders), given.kernels)
     same, most = 0, 0.0

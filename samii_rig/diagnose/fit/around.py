@@ -53,8 +53,7 @@ class Around(Growing):
                 if done or (rank >= ANYHOW and not there and base.fitted.cost - drop > enough):
                     continue
                 end = self.refitted(effects, base, np.log(starts[0]).tolist(), enough)
-                if end is not None:
-                    self.keep(effects, end)
+                self.keep(effects, end)
 
     def _elsewhere(self, whole: Explanation, i: int, base: Explanation, enough: float) -> None:
         """Effect i of `whole` at every other place, from the values that it has at its own: several
@@ -119,20 +118,16 @@ class Around(Growing):
                 beside.setdefault(e.effects[i].physics, (e.effects[i], own))
         off: list[tuple[float, Effect]] = []
         for other in self.table:
-            model = self.model((other,)) if (other.physics, other.site) == shift.name else None
+            model = self.model((other,)) if other.name == shift.name else None
             if model is not None and other is not shift:
                 x = moved(best.fitted.model, best.fitted.x, model)[: model.n]
                 off.append((far_off(model, self.problem, x), other))
-        for _, other in sorted(off, key=lambda one: one[0])[:NEXT]:
-            for effect, own in list(beside.values())[:BROAD]:
-                effects = (other, effect)
-                model = self.model(effects)
-                if model is None:
-                    continue
+        nearest = [other for _, other in sorted(off, key=lambda one: one[0])[:NEXT]]
+        for other, (effect, own) in product(nearest, list(beside.values())[:BROAD]):
+            effects = (other, effect)
+            if (model := self.model(effects)) is not None:
                 x = np.append(np.zeros(model.n - own.size), own)
-                end = self.refitted_from(effects, x)
-                if end is not None:
-                    self.keep(effects, end)
+                self.keep(effects, self.refitted_from(effects, x))
         self.take_overdispersion()
         self.backward()
 
@@ -150,8 +145,7 @@ class Around(Growing):
                 for _drop, effect, starts in ranking(screen, some, base.effects, self.model):
                     effects = (*base.effects, effect)
                     end = self.refitted(effects, base, np.log(starts[0]).tolist())
-                    if end is not None:
-                        self.keep(effects, end)
+                    self.keep(effects, end)
             self.take_overdispersion()
             if self.ranked()[0].key == best.key:
                 return
@@ -167,8 +161,7 @@ class Around(Growing):
             for tenth in TENTHS:
                 start = [math.log(u.starts[tenth * len(u.starts) // 10]) for u in unknowns]
                 end = self.refitted(e.effects, self.nominal, start, e.fitted.cost)
-                if end is not None:
-                    self.keep(e.effects, end)
+                self.keep(e.effects, end)
         self.take_overdispersion()
 
     def _along_valleys(self) -> None:
@@ -188,8 +181,7 @@ class Around(Growing):
             found = profiled(model, self.problem, self.nominal.fitted, starts)
             if found and found[0].cost < e.fitted.cost:
                 end = self.refitted_from(e.effects, found[0].x)
-                if end is not None:
-                    self.keep(e.effects, end)
+                self.keep(e.effects, end)
         self.take_overdispersion()
 
 

@@ -93,8 +93,7 @@ class DiscrepantSearch(RecordSearch):
         some = [*ranked[:KEPT], *(e for e in ranked[KEPT:] if not e.effects)]
         for e in self.each(some, lambda e: named(e.effects)):
             end = self.refitted(e.effects, e, far=False)
-            if end is not None:
-                self.keep(e.effects, end)
+            self.keep(e.effects, end)
         return still
 
     def _about(self, fitted: Fitted) -> None:

@@ -293,8 +293,11 @@ class Explanations:
         except (SamiiRigError, np.linalg.LinAlgError):
             return None
 
-    def keep(self, effects: tuple[Effect, ...], fitted: Fitted) -> None:
-        """Weigh it, and keep it unless the same effects were refitted to more weight."""
+    def keep(self, effects: tuple[Effect, ...], fitted: Fitted | None) -> None:
+        """Weigh it, and keep it unless the same effects were refitted to more weight. fitted : None
+        where a refit ended in none, of which nothing is kept."""
+        if fitted is None:
+            return
         if not effects:
             self._nominal_chi2 = fitted.chi2
         made = Explanation(effects, fitted, self.weigh(effects, fitted))

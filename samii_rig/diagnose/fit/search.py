@@ -151,8 +151,7 @@ class Search(Around):
         again = list({e.key: e for e in (*keep, best, nominal)}.values())
         for e in self.each(again, lambda e: named(e.effects)):
             end = self.refitted(e.effects, e)
-            if end is not None:
-                self.keep(e.effects, end)
+            self.keep(e.effects, end)
 
 
 def faulty(effects: Sequence[Effect]) -> bool:

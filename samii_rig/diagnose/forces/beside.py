@@ -61,8 +61,7 @@ class BesideForce(ForceFits):
             last, start = end, end.x
             if still:
                 break
-        if last is not None:
-            self.keep(effects, last)
+        self.keep(effects, last)
 
     def _alone(self) -> None:
         """The force of the best explanation without each linear effect beside it, from where both

@@ -74,8 +74,7 @@ class ForceFits(RecordSearch):
         """Refit some explanations, each from where it ended."""
         for e in self.each(some, lambda e: named(e.effects)):
             end = self.refitted(e.effects, e, far=False)
-            if end is not None:
-                self.keep(e.effects, end)
+            self.keep(e.effects, end)
 
     def _about(self, fitted: Fitted) -> None:
         self._ways.clear()
