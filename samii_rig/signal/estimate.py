@@ -237,10 +237,12 @@ def _raised(
 ) -> Iterable[Finding]:
     """What is said of outputs whose repeats scatter less than their converter rounds.
 
-    scatter : (n_freq, p) variances over the repeats. floor : (p,). findings : by output.
+    scatter : (n_freq, p) variances over the repeats. floor : (p,) or (n_freq, p). findings : by
+    output.
     """
+    floor = np.broadcast_to(floor, scatter.shape)
     for i, message in findings.items():
-        part = float(np.mean(scatter[:, i] < floor[i]))
+        part = float(np.mean(scatter[:, i] < floor[:, i]))
         if part > 0:
             text = f"{message} in {part:.0%} of the lines; what is missing was added"
             name = group.selection.outputs[i].name
@@ -422,18 +424,36 @@ def _local(
         raise EstimateError(f"{dof.min():.2g} degrees of freedom for {p} outputs; more data would")
     # Of the piece in which the sweep passes the frequency.
     power = np.max([np.interp(f0, s.frequency, np.abs(s.R) ** 2) for s in spectra], axis=0)
+    gain, noise = pick("gain"), pick("noise")
+    hidden = _hidden(group, noise, dof)
+    seen = np.maximum(np.abs(gain) ** 2 * power, NO_POWER * np.max(power))
     found = _ByLine(
         frequency=f0,
         H=pick("H"),
-        covariance=pick("covariance"),
+        covariance=pick("covariance") + hidden / seen[:, None, None],
         dof=dof,
-        coherence=_coherence(pick("H"), pick("gain"), power, pick("noise")),
-        input_rms=np.abs(pick("gain")) * _peak(group.pieces) / np.sqrt(2),
+        coherence=_coherence(pick("H"), gain, power, noise + hidden),
+        input_rms=np.abs(gain) * _peak(group.pieces) / np.sqrt(2),
     )
     done = f"local (LPM, LRM at {rational:.0%} of the lines, through {group.through})"
     ends = f"{len(transients)} transients" if transients else "at rest at both ends: no transient"
     why = f"{why}; windows of {width:.3g} Hz, {ends}"
     return _response(group, found, len(group.pieces), done, why)
+
+
+def _hidden(group: Group, noise: Complex, dof: Float) -> Float:
+    """(n, p, p) what the rounding of the outputs adds to a model's residual that does not hold it:
+    a loop that feeds back an encoder at rest moves its command with each step exactly.
+
+    noise : (n, p, p) covariance of the residual. dof : (n,). What a residual with rounding in it
+    has by chance, down to 3 of its standard deviations, is not touched.
+    """
+    floor, findings = floor_of(group, group.pieces)
+    by_chance = np.maximum(1 - 3 / np.sqrt(dof), 0.0)
+    least = by_chance[:, None] * floor
+    scatter = np.diagonal(noise, axis1=1, axis2=2).real
+    group.findings += _raised(group, scatter, least, findings)
+    return np.eye(floor.size) * np.maximum(least - scatter, 0.0)[:, None, :]
 
 
 def _reach(of: Spectrum, lines: Int) -> tuple[float, float]:

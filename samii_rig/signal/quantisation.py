@@ -28,7 +28,7 @@ def floor_of(group: Group, pieces: Sequence[Piece]) -> tuple[Float, dict[int, st
         part = (moving[-1] - moving[0] + 1) / x.size
         floor[i] = step**2 / 12 * part
         messages[i] = (
-            f"{channel.name} scatters between repeats by less than its step of {step:g} "
+            f"{channel.name} scatters by less than its step of {step:g} "
             f"{channel.unit} makes (step^2/12)"
         )
     return floor, messages

@@ -5,10 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal as filters
 
 from samii_rig.signal import local
+from samii_rig.signal.estimate import estimate
 from samii_rig.signal.groups import Piece
 from samii_rig.signal.spectra import spectrum
+from samii_rig.types import Channel, Recording
 
 STUDY = Path(__file__).resolve().parents[2] / "benchmarks" / "coverage_study.py"
 SPEC = importlib.util.spec_from_file_location("coverage_study", STUDY)
@@ -80,3 +83,26 @@ def test_intervals_of_a_single_sweep_hold_on_average(kind):
     both = (found.inside["real"].mean() + found.inside["imag"].mean()) / 2
     assert 0.83 < both < 0.95
     assert np.median(found.ratio) < 1.3
+
+
+def test_an_encoder_that_its_loop_feeds_back_step_by_step_is_known_to_its_rounding_only():
+    rng = np.random.default_rng(4)
+    step, n, rate = 0.01, 4000, 500.0
+    steps = np.cumsum(np.where(np.arange(n) % 400 == 0, rng.choice([-1.0, 1.0], n), 0.0))
+    a = filters.lfilter([0.2], [1, -1.6, 0.8], steps) + 0.01 * rng.normal(size=n)
+    channels = (
+        Channel("u", "V", "command"),
+        Channel("theta", "rad", resolution=step),
+        Channel("a", "m/s^2"),
+    )
+    values = np.column_stack([-steps, step * steps, a])
+    at = np.arange(n)
+    recording = Recording(channels, rate, at * 2_000_000, at, values, np.zeros((n, 3), np.uint8))
+    found = estimate([recording], method="local")[0]
+    variance = found.variance()[:, 0, 0]
+    assert np.all(variance > 0)
+    driven = np.abs(np.fft.rfft(-steps)) ** 2 / n
+    per_line = np.interp(found.frequency, np.arange(n // 2 + 1) * rate / n, driven)
+    assert np.median(variance * per_line) < step**2 / 12
+    assert np.median(variance * per_line) > step**2 / 120
+    assert any("step^2/12" in f.message for f in found.findings)
