@@ -201,9 +201,8 @@ def refit(
     """
     if model.n == 0:  # a rig file without tolerances: nothing to fit
         fixed = np.zeros(0)
-        chi2 = _cost(model, problem, fixed, model.response(fixed, problem.at))
-        rows = problem.residual(problem.data.H).size
-        return Fitted(model, fixed, chi2, 0.0, np.zeros((rows, 0)), np.zeros((0, 0)))
+        r = problem.residual(model.response(fixed, problem.at))
+        return Fitted(model, fixed, float(r @ r), 0.0, np.zeros((r.size, 0)), np.zeros((0, 0)))
     first = _Point.of(model, problem, np.clip(start, model.lower, model.upper))
     if far and first.cost > LOGARITHM_FIRST * problem.expected:
         first = _logarithm(model, problem, first)
@@ -241,10 +240,9 @@ def profiled(
     out = []
     for x in starts:
         try:
-            h = model.response(x, problem.at)
+            at = _Point.at(model, problem, x, model.response(x, problem.at))
         except SamiiRigError:
             continue
-        at = _Point(x, _cost(model, problem, x, h), h)
         for _ in range(CORRECTIONS if model.n_nominal else 0):
             new = _back(model, problem, at, by)
             if new is None or not new.cost < at.cost:
@@ -257,18 +255,27 @@ def profiled(
 
 @dataclass(frozen=True, slots=True)
 class _Point:
-    """x, the cost there, the response h and its derivative dh, where both were computed."""
+    """x, the cost there, the response h, the residuals r, and the derivative dh of the response,
+    where it was computed."""
 
     x: Float
     cost: float
     h: Complex
+    r: Float
     dh: Complex | None = None
+
+    @classmethod
+    def at(
+        cls, model: Model, problem: Problem, x: Float, h: Complex, dh: Complex | None = None
+    ) -> _Point:
+        """Where the response is h."""
+        r = problem.residual(h)
+        return cls(x, float(r @ r) + _penalty(model, x), h, r, dh)
 
     @classmethod
     def of(cls, model: Model, problem: Problem, x: Float) -> _Point:
         """With the derivative."""
-        h, dh = model.gradient(x, problem.at)
-        return cls(x, _cost(model, problem, x, h), h, dh)
+        return cls.at(model, problem, x, *model.gradient(x, problem.at))
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,17 +302,12 @@ def _gradient(model: Model, x: Float, J: Float, r: Float) -> Float:
 
 def _normal(model: Model, problem: Problem, at: _Point) -> _Normal:
     dh = model.gradient(at.x, problem.at)[1] if at.dh is None else at.dh
-    return _Normal.of(model, at.x, problem.whiten(dh), problem.residual(at.h))
+    return _Normal.of(model, at.x, problem.whiten(dh), at.r)
 
 
 def _penalty(model: Model, x: Float) -> float:
     n = model.n_nominal
     return float(np.sum((x[:n] / model.prior[:n]) ** 2))
-
-
-def _cost(model: Model, problem: Problem, x: Float, h: Complex) -> float:
-    r = problem.residual(h)
-    return float(r @ r) + _penalty(model, x)
 
 
 def _trial(
@@ -331,7 +333,7 @@ def _trial(
 def _back(model: Model, problem: Problem, at: _Point, by: _Normal) -> _Point | None:
     """The point to which the derivatives of another lead back from one that left its curved
     valley: by the nominal parameters alone where there are others. None as of `_moved`."""
-    g = _gradient(model, at.x, by.J, problem.residual(at.h))
+    g = _gradient(model, at.x, by.J, at.r)
     nominal = 0 < model.n_nominal < model.n
     return _moved(model, problem, at.x, replace(by, g=g), DAMPING.least, nominal=nominal)
 
@@ -345,10 +347,9 @@ def _moved(
     if new is None:
         return None
     try:
-        h = model.response(new, problem.at)
+        return _Point.at(model, problem, new, model.response(new, problem.at))
     except SamiiRigError:
         return None
-    return _Point(new, _cost(model, problem, new, h), h)
 
 
 def move(
@@ -389,13 +390,13 @@ def _logarithm(model: Model, problem: Problem, first: _Point) -> _Point:
 
     def point(x: Float, h: Complex, dh: Complex | None) -> _Point:
         r = residual(h)
-        return _Point(x, float(r @ r) + _penalty(model, x), h, dh)
+        return _Point(x, float(r @ r) + _penalty(model, x), h, r, dh)
 
     def normal(now: _Point) -> _Normal:
         dh = model.gradient(now.x, lines.at)[1] if now.dh is None else now.dh
         slope = (lines.log_weight / now.h)[:, :, None] * dh
         J = np.concatenate([slope.real.reshape(-1, model.n), slope.imag.reshape(-1, model.n)])
-        return _Normal.of(model, now.x, J, residual(now.h))
+        return _Normal.of(model, now.x, J, now.r)
 
     def trial(now: _Point, by: _Normal, damping: float) -> _Point | None:
         nonlocal best
@@ -407,9 +408,9 @@ def _logarithm(model: Model, problem: Problem, first: _Point) -> _Point:
             at = h if same else model.response(x, problem.at)
         except SamiiRigError:
             return None
-        cost = _cost(model, problem, x, at)
-        if cost < best.cost:
-            best = _Point(x, cost, at, dh if same else None)
+        there = _Point.at(model, problem, x, at, dh if same else None)
+        if there.cost < best.cost:
+            best = there
         return point(x, h, dh)
 
     def settled(p: Progress) -> bool:
