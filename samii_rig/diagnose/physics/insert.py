@@ -11,11 +11,13 @@ from samii_rig.rig.schema import (
     AngularVelocitySource2,
     Branch,
     Element,
+    Inertia,
     LumpedLine,
     LumpedMass,
     Parameter,
     RelativeAngle,
     Rig,
+    TorsionalSpring,
     TranslationalSpring,
 )
 from samii_rig.rig.schema.elements import quantities
@@ -31,11 +33,10 @@ def parameter(value: float, unit: str) -> Parameter:
     return Parameter(value=value, unit=unit, source=SOURCE)
 
 
-def element_of(kind: type[Any], name: str, units: dict[str, str]) -> Element:
+def element_of(kind: type[Any], name: str, units: dict[str, str]) -> Any:
     """An element of `kind` with every parameter of `units` at 1, by symbol."""
     values = {symbol: parameter(1.0, unit) for symbol, unit in units.items()}
-    made: Element = kind(kind=tag(kind), name=name, **values)
-    return made
+    return kind(kind=tag(kind), name=name, **values)
 
 
 def tag(kind: type[Any]) -> str:
@@ -44,16 +45,20 @@ def tag(kind: type[Any]) -> str:
     return name
 
 
-def oscillator(name: str) -> Branch:
-    """A mass on a spring and damper across the chain, elements `name`_spring and `name`_mass."""
-    spring = TranslationalSpring(
-        kind="translational_spring",
-        name=f"{name}_spring",
-        k=parameter(1.0, "N/m"),
-        c=parameter(1.0, "N s/m"),
+def oscillator(name: str, *, turning: bool = False) -> Branch:
+    """A mass on a spring and damper across the chain, elements `name`_spring and `name`_mass.
+    turning : about it: an inertia on a torsional spring."""
+    spring = element_of(
+        TorsionalSpring if turning else TranslationalSpring,
+        f"{name}_spring",
+        {"k": "N m/rad", "c": "N m s/rad"} if turning else {"k": "N/m", "c": "N s/m"},
     )
-    mass = LumpedMass(kind="lumped_mass", name=f"{name}_mass", m=parameter(1.0, "kg"))
-    return Branch(kind="branch", name=name, element=(spring, mass))
+    body = element_of(
+        Inertia if turning else LumpedMass,
+        f"{name}_mass",
+        {"I": "kg m^2"} if turning else {"m": "kg"},
+    )
+    return Branch(kind="branch", name=name, element=(spring, body))
 
 
 def line(rig: Rig, source: str, name: str) -> Rig:

@@ -26,6 +26,7 @@ from samii_rig.rig.schema import (
     Branch,
     Element,
     GravityStiffness,
+    Inertia,
     LumpedMass,
     RelativeAngle,
     Rig,
@@ -364,81 +365,125 @@ def _standing(
     )
 
 
-HANGING = Point("attached_oscillator", "V", "w", "mass", "m", "", LumpedMass, "oscillator_")
+@dataclass(frozen=True, slots=True)
+class Hanging:
+    """Something that hangs on and resonates.
+
+    point : its jump, and the symbol of its mass or inertia. units : of m or J, k, c.
+    """
+
+    point: Point
+    units: tuple[str, str, str]
+
+    @property
+    def turning(self) -> bool:
+        """Whether it turns about the chain, and does not shift across it."""
+        return self.point.jump == "M"
+
+    def names(self, name: str) -> tuple[Key, Key, Key]:
+        """Its parameters in the rig file, in the order of `units`."""
+        return (f"{name}_mass", self.point.strong), (f"{name}_spring", "k"), (f"{name}_spring", "c")
+
+    def values(self, name: str, x: Float) -> dict[Key, float]:
+        """Parameters of the elements of an oscillator of this name."""
+        return dict(zip(self.names(name), map(float, _oscillating(x[:3])), strict=True))
 
 
-def _swinging(rig: Rig, where: Places, x: float) -> tuple[Unknown, ...]:
-    """Mass, natural frequency and damping ratio of what hangs on; told as m, k, c. Empty where
-    nothing moves, or hardly anything, so that no mass matters."""
+ACROSS = Hanging(
+    Point("attached_oscillator", "V", "w", "mass", "m", "", LumpedMass, "oscillator_"),
+    ("kg", "N/m", "N s/m"),
+)
+TURNING = Hanging(
+    Point("attached_oscillator", "M", "theta", "mass", "I", "", Inertia, "oscillator_", "J"),
+    ("kg m^2", "N m/rad", "N m s/rad"),
+)
+
+
+def _hanging_on(where: Places) -> Hanging:
+    """What may hang on: a mass, or an inertia where nothing of the rig shifts."""
+    shifts = (where.strength(ACROSS.point.pair, port) for port in range(len(where.names)))
+    return ACROSS if any(0 < x < math.inf for x in shifts) else TURNING
+
+
+def _swinging(rig: Rig, where: Places, hanging: Hanging, x: float) -> tuple[Unknown, ...]:
+    """Mass or inertia, natural frequency and damping ratio of what hangs on; told as m or J, k, c.
+    Empty where nothing moves, or hardly anything, so that no mass matters."""
     if not 0 < x < math.inf:
         return ()
     low_w, high_w = (2 * math.pi * float(where.frequency[i]) for i in (0, -1))
     scale = x / middle(where) ** 2
     # At its own frequency a mass does 1/(2 zeta) times what it does elsewhere.
     least = 2 * LEAST_DAMPED * SMALLEST
-    low, high = least * scale, min(3 * scale, MOST_HUNG * _mass(rig) or math.inf)
+    low, high = least * scale, min(3 * scale, MOST_HUNG * _sum(rig, hanging) or math.inf)
     if low >= high:
         return ()
     starts = tuple(m for m in spread(SMALLEST * scale, 3 * scale, 7) if m < high)
+    symbol = hanging.point.reported or hanging.point.strong
+    inertia, spring, damper = hanging.units
     return (
-        Unknown("m", "kg", low, high, starts or (math.sqrt(low * high),)),
-        Unknown("k", "N/m", low_w, 2 * high_w, spread(low_w, high_w, 48)),
-        Unknown("c", "N s/m", LEAST_DAMPED, MOST_DAMPED, (0.05,)),
+        Unknown(symbol, inertia, low, high, starts or (math.sqrt(low * high),)),
+        Unknown("k", spring, low_w, 2 * high_w, spread(low_w, high_w, 48)),
+        Unknown("c", damper, LEAST_DAMPED, MOST_DAMPED, (0.05,)),
     )
 
 
-def _mass(rig: Rig) -> float:
-    """kg of all bodies of a rig file."""
+def _sum(rig: Rig, hanging: Hanging) -> float:
+    """kg of all bodies of a rig file, or kg m^2."""
+    symbol = hanging.point.strong
     each = (
-        (p["mu"], p["L"]) if "mu" in p else (p["m"],)
+        (p["mu"], p["L"]) if symbol == "m" and "mu" in p else (p[symbol],)
         for p in (parameters(e) for e in rig.element)
-        if "mu" in p or "m" in p
+        if symbol in p or (symbol == "m" and "mu" in p)
     )
     return sum(math.prod(x.value for x in one) for one in each)
 
 
 def _hanging_at(rig: Rig, where: Places, port: int) -> Iterator[Effect]:
-    unknowns = _swinging(rig, where, where.strength(HANGING.pair, port))
+    hanging = _hanging_on(where)
+    point = hanging.point
+    unknowns = _swinging(rig, where, hanging, where.strength(point.pair, port))
     if not unknowns:
         return
     names = where.names[port]
-    name = f"{insert.PREFIX}{HANGING.tag}{port}"
+    name = f"{insert.PREFIX}{point.tag}{port}"
     after = names[0] if port > 0 else None
-    site, others, position = _site(rig, HANGING, names, port)
+    site, others, position = _site(rig, point, names, port)
+    part = insert.oscillator(name, turning=hanging.turning)
+    tail = "" if hanging.turning else "w"
     yield Effect(
-        physics=HANGING.physics,
+        physics=point.physics,
         site=site,
         unknowns=unknowns,
-        build=lambda r: insert.inserted(r, after, insert.oscillator(name)),
-        parameters=lambda x, _: _hung(name, x),
-        aliases=tuple((HANGING.physics, o) for o in others),
+        build=lambda r: insert.inserted(r, after, part),
+        parameters=lambda x, _: hanging.values(name, x),
+        aliases=tuple((point.physics, o) for o in others),
         report=_oscillating,
-        jump=Jump(f"V by w at port {port}w", _hanging, ("V", "w")),
+        jump=Jump(
+            f"{point.jump} by {point.by} at port {port}{tail}", _hanging, (point.jump, point.by)
+        ),
         variant=name,
         position=position,
     )
 
 
 def _hanging_along(rig: Rig, where: Places, at: int, stretch: Along) -> Iterator[Effect]:
-    unknowns = _swinging(rig, where, _strength(where, HANGING.pair, at))
+    hanging = _hanging_on(where)
+    if hanging.turning:  # then no body has a length
+        return
+    unknowns = _swinging(rig, where, hanging, _strength(where, hanging.point.pair, at))
     if not unknowns:
         return
-    name = f"{insert.PREFIX}{HANGING.tag}{at}_{stretch.number}"
+    name = f"{insert.PREFIX}{hanging.point.tag}{at}_{stretch.number}"
     yield _standing(
         rig,
-        HANGING,
+        hanging.point,
         stretch,
         unknowns,
         (name, insert.oscillator(name)),
-        lambda x: _hung(name, x),
+        lambda x: hanging.values(name, x),
         lambda x: _oscillating(x[:3]),
         _hanging,
     )
-
-
-def _hung(name: str, x: Float) -> dict[Key, float]:
-    m, k, c = (float(v) for v in _oscillating(x[:3]))
-    return {(f"{name}_spring", "k"): k, (f"{name}_spring", "c"): c, (f"{name}_mass", "m"): m}
 
 
 def _hanging(s: Complex, x: Float) -> Complex:

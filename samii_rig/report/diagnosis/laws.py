@@ -43,7 +43,7 @@ def _oil(s: Complex, p: Numbers) -> Complex:
 
 
 def _oscillator(s: Complex, p: Numbers) -> Complex:
-    inertia, spring = p["m"] * s**2, _spring(s, p)
+    inertia, spring = p.get("J", p.get("m", 0.0)) * s**2, _spring(s, p)
     return inertia * spring / (inertia + spring)
 
 
@@ -53,10 +53,10 @@ JUMPS: dict[str, tuple[tuple[Jump, Law], ...]] = {
     "velocity_feedback": ((TURN, lambda s, p: 1 / (p["g_v"] * s)),),
     "hydraulic_compressibility": ((TURN, _oil),),
     "added_mass": ((FORCE, lambda s, p: p["m"] * s**2),),
-    "attached_oscillator": ((FORCE, _oscillator),),
     "added_inertia": ((TORQUE, lambda s, p: p["J"] * s**2),),
     "gravity_stiffness": ((TORQUE, _spring),),
-    # To ground in rotation or in translation: the unit tells.
+    # In rotation or in translation: the unit tells.
+    "attached_oscillator": ((TORQUE, _oscillator), (FORCE, _oscillator)),
     "ground_spring": ((TORQUE, _spring), (FORCE, _spring)),
     "viscous_damping": ((TORQUE, _spring), (FORCE, _spring)),
 }

@@ -7,14 +7,17 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from samii_rig.rig.schema.elements import (
     AXIAL,
+    BEAMS,
     MOTION_SOURCES,
     TURNING,
     Branch,
     Cylinder,
     ForceSource,
     LumpedMass,
+    RigidLink,
     Rod,
     Spindle,
+    TranslationalGroundSpring,
     TranslationalSpring,
 )
 from samii_rig.rig.schema.sensors import AbsoluteAngle, Current, Moment, RelativeAngle, places
@@ -44,6 +47,11 @@ def check_motion(rig: Rig) -> None:
                     f"element {e.name}: kind {e.kind!r} moves along the chain; "
                     'expected motion = "axial" of the rig'
                 )
+        if rig.base == rig.tip == "free" and not any(map(_shifts, rig.element)):
+            raise ValueError(
+                "base: 'free' of a chain that only turns, so that nothing says where it shifts to; "
+                "expected 'pinned', which lets it turn and holds it in place"
+            )
         return  # of a beam everything gives way
     _check_ends(rig)
     turns = turning(rig)
@@ -63,6 +71,14 @@ def check_motion(rig: Rig) -> None:
     for s in rig.sensor:
         _check_sensor(s, {e.name for e in turns}, rig)
     _check_fights(rig, len(turns))
+
+
+def _shifts(e: Element) -> bool:
+    """Whether an element has a say in where a lateral chain shifts to: by its mass, or by the
+    ground."""
+    if isinstance(e, LumpedMass):
+        return e.m.value > 0
+    return isinstance(e, (*BEAMS, RigidLink, Branch, TranslationalGroundSpring))
 
 
 def _check_ends(rig: Rig) -> None:
