@@ -134,6 +134,8 @@ def diagnosis_of(
     if not causes:
         judged = verdict.without_causes(judged)
     missing = judged.verdict != "no_mismatch"
+    if not missing:  # an effect that no more than spares a nominal parameter its move is none
+        best = verdict.as_meant(search, best)
     if not missing and best.effects and not own:
         # The model is held against what was meant to be recorded.
         shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
