@@ -10,7 +10,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from samii_rig.diagnose.fit.explanations import NEAR_BEST, Explanation, Explanations, named
+from samii_rig.diagnose.fit.explanations import (
+    NEAR_BEST,
+    Explanation,
+    Explanations,
+    named,
+    unlikely,
+)
 from samii_rig.diagnose.fit.ranking import moved, ranking
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.refit import Fitted
@@ -25,7 +31,7 @@ from samii_rig.types import Float
 FORMED_AGAIN = 3  # times that the likelihood is made anew about the best explanation
 REFERENCE_STILL = 0.5  # standard deviations, a move from one to the next that is none
 NO_MOVE = 1e-3  # of a logarithm: a refit of few steps has ended
-RENEWED = 6  # times that the chain through which a force acts is renewed in between
+RENEWED = 3  # times that the chain through which a force acts is renewed in between
 BESIDE = 6  # linear effects that are refitted beside the best force, and the other way round
 
 
@@ -47,6 +53,24 @@ class BesideForce(ForceFits):
             still, best = best.fitted.away(end) < REFERENCE_STILL, self.found[best.key]
             if still:
                 return
+        if sum(e.physical for e in best.effects) == 1:
+            self._exactly(best)
+
+    def _exactly(self, best: Explanation) -> None:
+        """Refit a force alone with the slopes that the chain's parameters give the force itself: of
+        a strong one they are not of second order. Where that ends at unlikely values, from those of
+        the rig file too: what a linear fit bent to do the force's work may lie in another valley.
+        """
+        model, start = best.fitted.model, best.fitted.x
+        end = self.refitted_exactly(model, start)
+        if end is None or unlikely(end):
+            nominal = np.concatenate([np.zeros(model.n_nominal), start[model.n_nominal :]])
+            ends = (end, self.refitted_exactly(model, nominal))
+            end = min(filter(None, ends), key=lambda fitted: fitted.cost, default=None)
+        if end is not None and end.cost < best.fitted.cost:
+            del self.found[best.key]
+            self.keep(best.effects, end)
+        self._ways.clear()
 
     def _renewed(self, effects: tuple[Effect, ...], start: Float) -> None:
         """Refit some effects and keep where that ends, the chain through which a force acts renewed

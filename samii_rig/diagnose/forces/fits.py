@@ -30,10 +30,15 @@ from samii_rig.diagnose.forces.table import forces
 from samii_rig.diagnose.forces.way import Ways
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Model
+from samii_rig.errors import SamiiRigError
+from samii_rig.levenberg import minimise
 from samii_rig.likelihood.reduce import LineResiduals
 from samii_rig.likelihood.unexplained import Unexplained, unexplained
 from samii_rig.types import Float
 
+SLOPE_STEP = 1e-4  # of a logarithm, for a slope by a difference: rounding and bend are below 1e-3
+EXACT = 1e-5  # relative, at which a refit with such slopes ends: 0.1 of a chi-square of 10,000
+NOWHERE = 1e6  # noise units of every line, more than any rig is off by
 FEW = 6  # steps of a refit of a force: what may win is refitted again, from where it ended
 # Samples under which forces are computed, those of slopes too: 15 s of a core. The most promising
 # come first.
@@ -108,6 +113,33 @@ class ForceFits(RecordSearch):
             return super().refitted_from(effects, start, give_up, steps, far=far)
         # Every refit of a force is done anew with the likelihood: it goes on from where it ended.
         return super().refitted_from(effects, start, give_up, min(steps, FEW), far=False)
+
+    def refitted_exactly(self, model: Model, start: Float) -> Fitted | None:
+        """As `refitted_from`, the chain through which the force acts that of every step, and every
+        slope by a difference; None where the rig has no partial fractions or is not stable."""
+        problem, prior = self._force_problem, model.prior[: model.n_nominal]
+
+        def left(x: Float) -> Float:
+            self._ways.clear()
+            r = problem.residual(model.response(x, problem.at))
+            return np.concatenate([r, x[: model.n_nominal] / prior])
+
+        def evaluated(x: Float) -> tuple[Float, Float]:
+            # Away from the bound that it stands at, if it does.
+            steps = np.where(x + SLOPE_STEP > model.upper, -SLOPE_STEP, SLOPE_STEP)
+            try:
+                r = left(x)
+                return r, np.stack([(left(x + e) - r) / e.sum() for e in np.diag(steps)], axis=1)
+            except SamiiRigError:  # a step to where no rig is: refused
+                rows = problem.goal.size + prior.size
+                return np.full(rows, NOWHERE), np.zeros((rows, x.size))
+
+        end = minimise(evaluated, start, model.lower, model.upper, tolerance=EXACT)
+        if 2 * end.cost >= NOWHERE**2:
+            return None
+        penalty = float(np.sum((end.x[: model.n_nominal] / prior) ** 2))
+        J = end.jacobian[: len(end.jacobian) - model.n_nominal]
+        return Fitted(model, end.x, 2 * end.cost - penalty, penalty, J, J.T @ J)
 
     @property
     def won(self) -> bool:
