@@ -57,9 +57,20 @@ def _smallest(
     weak = np.nanargmin(np.abs(np.log(np.maximum(before, 1e-12))))
     rate = needed / max(float(left[weak]), 1e-12)
     value = values[weak].copy()
-    value[0] *= rate if before[-1] > before[0] else 1 / rate
-    within = first.low <= value[0] <= first.high
-    size = float(effect.report(value)[0]) if within else None
+    grows = before[-1] > before[0]
+    value[0] *= rate if grows else 1 / rate
+    least, most = (first.low, first.high) if grows else (first.high, first.low)
+    if min(least, most) <= value[0] <= max(least, most):
+        size: float | None = abs(float(effect.report(value)[0]))
+    elif (value[0] < least) == grows:
+        # What would be seen is less than the range begins with, up to which it is a nominal
+        # parameter's own tolerances.
+        if np.any(np.sign(np.diff(left)) != (1 if grows else -1)):
+            return None  # a ratio, of either side of 1: no size of it is small
+        value[0] = least
+        size = abs(float(effect.report(value)[0]))
+    else:
+        size = None
     return Hiding(effect.physics, effect.site, first.symbol, size, first.unit)
 
 
