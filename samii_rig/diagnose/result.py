@@ -22,6 +22,9 @@ Verdict = Literal["no_mismatch", "named", "ambiguous", "unknown"]
 HIDING = {row.name: row.hidden for row in PHYSICS.values() if row.hidden}
 SOFT = tuple(row.name for row in PHYSICS.values() if row.soft)  # the larger, the less of it
 LIKELY = 0.5  # probability of a site from which it is told as the place
+PROBABLE = 0.3  # probability of causes below which they are told for a part of the mismatch only
+REMARKS = 2  # on the console, of what is no physics
+FAR_MOVED = 3.0  # tolerances from which a part is worth a look: 0.3 % of good parts are so far off
 
 
 @dataclass(frozen=True, slots=True)
@@ -415,7 +418,15 @@ class Diagnosis:
         what = "Changed" if two else "Left out"
         if self.verdict == "named":
             return f"{what}: {named}."
+        if self._in_part:
+            return f"Much of what is missing goes as this would: {named}; more is missing."
         return f"Most likely {what.lower()}: {named}; the data do not settle it."
+
+    @property
+    def _in_part(self) -> bool:
+        """Whether the causes are told for the part of the mismatch that they explain, and as the
+        whole of it are improbable."""
+        return min((c.probability for c in self.causes), default=1.0) < PROBABLE
 
     def _how_well(self) -> str:
         before, after = self.nominal[1], self.with_causes[1]
@@ -437,13 +448,21 @@ class Diagnosis:
             has = f"the refitted model has {before:.3g} of the noise's power{counted}."
             return f"{sentence(on)[:-1]} {has}"
         sure = min(c.probability for c in self.causes)
+        how = f"As the whole it is improbable ({percent(sure)})"
+        if not self._in_part:
+            how = f"Probability {percent(sure)}"
         return (
-            f"Probability {percent(sure)}; {on} chi-square per degree of freedom "
+            f"{how}; {on} chi-square per degree of freedom "
             f"falls from {before:.3g} to {after:.3g} (noise alone: 1); {self.gap.words()}."
         )
 
     def _next(self) -> str:
-        parts = [sentence(remark) for remark in self.not_physics[:1]]
+        parts = [sentence(remark) for remark in self.not_physics[:REMARKS]]
+        if self.verdict == "no_mismatch" and self.moved and abs(self.moved[0].sigmas) > FAR_MOVED:
+            far = self.moved[0]
+            parts.insert(
+                0, f"The fit moved {far.parameter} by {far.sigmas:.1f} of its tolerances: check it."
+            )
         if self.experiment:
             parts.append(f"Next: {self.experiment} ({self.why}).")
         if not self.experiment and self.could_hide:

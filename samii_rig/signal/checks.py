@@ -281,6 +281,8 @@ def _flat_tops(x: Float) -> NDArray[np.bool_]:
     if finite.size == 0 or np.unique(finite).size < COARSE:
         return flat
     for extreme in (finite.min(), finite.max()):
+        if extreme == finite[0]:  # it began there: at rest, as one that turns one way only
+            continue
         tops = [run for run in runs(x == extreme) if run[1] - run[0] >= FLAT_RUN]
         if len(tops) >= FLAT_RUNS:
             for start, stop in tops:

@@ -109,7 +109,9 @@ def checked(
     Raises InputError where recordings, rig and band (Hz) do not belong together, EstimateError
     where nothing is left.
     """
-    remarks = estimated(responses)
+    # That a reference would have served is what recordings lack: the last to be said.
+    unreferenced = estimated(responses, ("closed_loop",))
+    remarks = [words for words in estimated(responses) if words not in unreferenced]
     for r in responses:
         _belongs(r, rig)
     if responses:
@@ -128,7 +130,7 @@ def checked(
     return Checked(
         tuple(steady),
         tuple(remarks + lost + found.remarks + changed + [_direct(n) for n in sorted(hidden)]),
-        lacks(steady, rig),
+        (*lacks(steady, rig), *unreferenced),
         refusal,
         found.units,
         mended=bool(lost or changed or (found.remarks and found.mend is None)),

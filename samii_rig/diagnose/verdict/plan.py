@@ -37,13 +37,21 @@ KNOWN_MASS = 0.1  # of the chain's own mass, a mass that is added
 RIVAL_FROM = 0.05  # probability from which another class is to be distinguished
 
 
-def next_experiment(search: Search, judged: Judgement) -> tuple[str, str, float | None]:
+def next_experiment(
+    search: Search, judged: Judgement, levels: int = 1
+) -> tuple[str, str, float | None]:
     """(why, experiment) in words, both empty where nothing is to be distinguished; and by how many
-    noise units the experiment would tell, if that is known."""
+    noise units the experiment would tell, if that is known. levels : that were recorded."""
     rivals = _rivals(judged)
     if not rivals and judged.verdict != "no_mismatch" and (alone := _alone(search)):
         return *alone, None
     if judged.verdict == "unknown" and not rivals:
+        if levels > 1:
+            return (
+                "no explanation passes: what is missing is in no row, or changes by itself",
+                "repeat one excitation three times, each from rest",
+                None,
+            )
         return (
             "no explanation passes: what is missing may depend on amplitude",
             "repeat the sweep at half and at twice the amplitude",

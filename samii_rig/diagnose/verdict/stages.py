@@ -92,14 +92,15 @@ def of_states(found: Diagnosis, several: Sequence[SeveralStates]) -> Diagnosis:
 
 
 def _next(
-    search: Search, judged: Judgement, refusal: Refusal | None
+    search: Search, judged: Judgement, refusal: Refusal | None, levels: int
 ) -> tuple[str, str, float | None]:
-    """Why no more may be said, the experiment that would tell, and what it would gain."""
+    """Why no more may be said, the experiment that would tell, and what it would gain. levels :
+    that were recorded."""
     if refusal:
         return refusal.why, refusal.experiment, None
     if judged.varies is not None:
         return ("", "", None) if judged.verdict == "named" else (*REPEAT, None)
-    return next_levels(judged) or next_experiment(search, judged)
+    return next_levels(judged) or next_experiment(search, judged, levels)
 
 
 def _alternatives(
@@ -139,11 +140,10 @@ def diagnosis_of(
     if not missing and best.effects and not own:
         # The model is held against what was meant to be recorded.
         shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
-    words = list(clean.remarks)
-    if missing or best.effects:
-        words += answer.not_physics_of(judged)
-    words += (*remarks, *clean.lacks)
-    why, experiment, gain = _next(search, judged, refusal if missing else None)
+    own_words = answer.not_physics_of(judged) if missing or best.effects else []
+    words = (*own_words, *remarks, *clean.remarks, *clean.lacks)
+    levels = len({r.level for r in case.responses})
+    why, experiment, gain = _next(search, judged, refusal if missing else None, levels)
     untold = judged.varies.describe() if judged.varies is not None and not causes else ""
     return Diagnosis(
         verdict=judged.verdict,

@@ -43,7 +43,7 @@ def _oil(s: Complex, p: Numbers) -> Complex:
 
 
 def _oscillator(s: Complex, p: Numbers) -> Complex:
-    inertia, spring = p.get("J", p.get("m", 0.0)) * s**2, _spring(s, p)
+    inertia, spring = p["J" if "J" in p else "m"] * s**2, _spring(s, p)
     return inertia * spring / (inertia + spring)
 
 

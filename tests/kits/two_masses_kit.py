@@ -1,0 +1,87 @@
+"""The two masses of the shipped rig file, integrated by themselves: Runge-Kutta on substeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.result import Diagnosis
+from samii_rig.rig.load import load_rig
+from samii_rig.signal.estimate import estimate
+from samii_rig.types import Channel, Float, Recording, Segment
+
+RIG, TEXT = load_rig("two_masses")
+RATE, SUBSTEPS = 500.0, 20
+# True values over those of the rig file, each within its tolerance.
+K1, C1, M1 = 12e3 * 1.02, 8.0 * 1.1, 1.5
+K2, C2, M2 = 8e3 * 0.98, 5.0 * 0.9, 0.8
+GAIN, CORNER = 6.0 * 1.01, 2 * np.pi * 120.0
+
+
+def recorded(
+    v: Float,
+    seed: int,
+    *,
+    k3: float = 0.0,
+    gain: Callable[[float], float] = lambda t: 1.0,
+) -> Recording:
+    """A record from rest under a held command v (n,) V, with the noise that the rig file states.
+
+    k3 : N/m^3 of the first spring. gain : of the coil, over time in s.
+    """
+    h = 1 / (RATE * SUBSTEPS)
+    z = np.zeros(5)  # x_1, its speed, x_2, its speed, the coil's force
+    out = np.zeros((v.size, 2))  # m, m/s^2
+
+    def rate_of(z: Float, force: float) -> Float:
+        x1, v1, x2, v2, f = z
+        inner = K2 * (x2 - x1) + C2 * (v2 - v1)
+        a1 = (f + inner - K1 * x1 - C1 * v1 - k3 * x1**3) / M1
+        return np.array([v1, a1, v2, -inner / M2, CORNER * (force - f)])
+
+    for i, command in enumerate(v):
+        out[i] = z[0], rate_of(z, 0.0)[3]
+        for j in range(SUBSTEPS):
+            force = GAIN * gain((i + j / SUBSTEPS) / RATE) * float(command)
+            a = rate_of(z, force)
+            b = rate_of(z + h / 2 * a, force)
+            c = rate_of(z + h / 2 * b, force)
+            d = rate_of(z + h * c, force)
+            z = z + h / 6 * (a + 2 * b + 2 * c + d)
+    rng = np.random.default_rng(seed)
+    noisy = out + rng.standard_normal(out.shape) * [1e-6, 0.02]
+    noisy[:, 0] = np.round(noisy[:, 0] / 0.5e-6) * 0.5e-6
+    channels = (
+        Channel("v", "V", "command", low=-10.0, high=10.0),
+        Channel("x_1", "m", resolution=0.5e-6),
+        Channel("a_2", "m/s^2"),
+    )
+    at = np.arange(v.size)
+    values = np.column_stack([v, noisy])
+    return Recording(
+        channels,
+        RATE,
+        at * 2_000_000,
+        at,
+        values,
+        np.zeros(values.shape, np.uint8),
+        (Segment("random", "single", 0, v.size, float(np.max(np.abs(v))), "V"),),
+        rig_toml=TEXT,
+        source=f"two_masses_{seed}.mcap",
+    )
+
+
+def random_command(n: int, rms: float, seed: int) -> Float:
+    """(n,) V, random to 40 Hz, in the steps of the converter."""
+    f = np.fft.rfftfreq(n, 1 / RATE)
+    rng = np.random.default_rng(seed)
+    shape = np.where((f > 0.5) & (f < 40.0), np.exp(2j * np.pi * rng.random(f.size)), 0.0)
+    v = np.fft.irfft(shape, n)
+    return np.round(v * rms / np.std(v) / 0.3e-3) * 0.3e-3
+
+
+def diagnosed(*runs: Recording) -> Diagnosis:
+    """With the whole table."""
+    return diagnose(estimate(runs, gaps="auto"), RIG, runs=runs)
