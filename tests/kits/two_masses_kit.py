@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.rig.load import load_rig
 from samii_rig.signal.estimate import estimate
@@ -82,6 +83,6 @@ def random_command(n: int, rms: float, seed: int) -> Float:
     return np.round(v * rms / np.std(v) / 0.3e-3) * 0.3e-3
 
 
-def diagnosed(*runs: Recording) -> Diagnosis:
-    """With the whole table."""
-    return diagnose(estimate(runs, gaps="auto"), RIG, runs=runs)
+def diagnosed(*runs: Recording, effects: Sequence[Effect] | None = None) -> Diagnosis:
+    """effects : the linear ones to try, the whole table if None; all forces are."""
+    return diagnose(estimate(runs, gaps="auto"), RIG, runs=runs, effects=effects)

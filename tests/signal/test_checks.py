@@ -162,6 +162,16 @@ def test_flat_tops_are_clipping_even_without_a_flag():
     assert r.n_averages == 3
 
 
+def test_a_sensor_that_starts_at_its_extreme_is_at_rest():
+    """One that turns one way only goes back to where it began, and stands there."""
+    recording = sweeps(3)
+    theta = np.abs(recording.values[:, 2])
+    theta[np.abs(recording.values[:, 0]) < 1e-9] = 0.0
+    values = np.column_stack([recording.values[:, :2], theta, recording.values[:, 3]])
+    found = estimate([replace(recording, values=values)])[0].findings
+    assert not any(f.kind == "clipping" for f in found)
+
+
 def test_a_saturated_command_is_a_warning_because_what_went_out_is_known():
     recording = sweeps()
     quality = recording.quality.copy()

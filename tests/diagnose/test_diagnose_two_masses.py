@@ -1,0 +1,86 @@
+"""Two masses integrated by themselves: strong forces, and what passes for noise in one record."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from table_kit import table_of
+from two_masses_kit import RIG, diagnosed, random_command, recorded
+
+from samii_rig.diagnose.result import Cause, Diagnosis, Moved
+
+V = random_command(3000, 1.0, 1)
+K3 = 1.5e9  # N/m^3: at 3.4 mm as much as the spring itself
+
+
+@pytest.fixture(scope="module")
+def nothing() -> Diagnosis:
+    return diagnosed(recorded(V, 1))
+
+
+def noisy(found: Diagnosis) -> list[str]:
+    return [words for words in found.not_physics if "times the noise" in words]
+
+
+def test_nothing_is_missing_and_the_noise_is_the_sensors_own(nothing: Diagnosis) -> None:
+    assert nothing.verdict == "no_mismatch"
+    assert noisy(nothing) == []
+
+
+def test_that_no_reference_was_recorded_is_the_last_to_be_said(nothing: Diagnosis) -> None:
+    assert nothing.not_physics[-1].startswith("no reference was recorded")
+
+
+def test_what_could_hide_in_a_weighed_mass_is_six_of_its_tolerances(nothing: Diagnosis) -> None:
+    sizes = {h.site: h.size for h in nothing.could_hide if h.physics == "added_mass"}
+    masses = {e.name: e.m for e in RIG.element if e.kind == "mass"}
+    for name, mass in masses.items():
+        size = sizes[name]
+        assert size is not None
+        assert size >= 6 * mass.tolerance * mass.value * (1 - 1e-9)
+        assert size < 0.2 * mass.value
+
+
+def test_a_spring_that_hardens_as_much_as_it_is_stiff_has_its_value() -> None:
+    """Its force depends on the chain's parameters as much as the linear motion does."""
+    few = table_of(RIG, 0.5, 40.0, "added_mass", "ground_spring")
+    found = diagnosed(recorded(2 * V, 2, k3=K3), recorded(V, 3, k3=K3), effects=few)
+    assert found.verdict == "named"
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("cubic_stiffness", "spring_1")
+    k3 = cause.parameters["k3"]
+    assert k3.value == pytest.approx(K3, rel=0.005)
+    assert k3.low is not None
+    assert k3.high is not None
+    assert k3.low < K3 < k3.high
+
+
+@pytest.mark.parametrize("part", [0.2, 0.04])
+def test_a_gain_that_sags_in_one_record_is_never_taken_for_noise_in_silence(part: float) -> None:
+    end = len(V) / RIG.rate_hz
+    found = diagnosed(recorded(V, 3, gain=lambda t: 1 - part * t / end))
+    (words,) = noisy(found)
+    assert words.startswith("x_1 has ")
+    assert found.verdict == ("unknown" if part > 0.1 else "no_mismatch")
+
+
+def test_a_swinging_gain_fits_too_well_to_be_noise() -> None:
+    found = diagnosed(recorded(V, 4, gain=lambda t: 1 + 0.1 * np.sin(2 * np.pi * 1.3 * t)))
+    assert found.verdict == "unknown"
+    assert found.chi2_per_dof < 1
+    assert noisy(found)
+
+
+def test_far_moved_parameters_and_partial_causes_are_said_in_words(nothing: Diagnosis) -> None:
+    far = replace(nothing, moved=(Moved("spring_2.k", -4.2), Moved("mass_1.m", 1.1)))
+    assert far.lines()[2].startswith("The fit moved spring_2.k by -4.2 of its tolerances: check it")
+    near = replace(nothing, moved=(Moved("spring_2.k", -2.2),))
+    assert "The fit moved" not in near.lines()[2]
+    swing = Cause("stiffness_variation", "spring_1", 0.0004, (), {})
+    partly = replace(nothing, verdict="ambiguous", causes=(swing,))
+    assert partly.lines()[0].startswith("Much of what is missing goes as this would: ")
+    assert partly.lines()[1].startswith("As the whole it is improbable (under 0.1 %); ")
+    likely = replace(partly, causes=(replace(swing, probability=0.5),))
+    assert likely.lines()[0].startswith("Most likely left out: ")
