@@ -142,6 +142,10 @@ def test_places_are_found_by_name_and_role():
     assert Places.among(ECHOING[:1], "v", "theta") == Places(0, None, None, None)
     third = (*ECHOING, Channel("more", "1", "reference"))
     assert Places.among(third, "v", "theta") == ECHO
+    two = (*ECHOING, *(Channel(f"ref_{i}", "1", "reference") for i in range(4)))
+    n = len(ECHOING)
+    for place, echo in ((0, ECHO), (1, replace(ECHO, u=n, theta_ref=n + 1))):
+        assert Places.among(two, "v", "theta", place) == echo
     one = (Channel("ref", "V", "reference"), *ECHOING[:2])
     assert Places.among(one, "v", "theta") == Places(1, 2, None, None)
     with pytest.raises(ValueError, match="w"):

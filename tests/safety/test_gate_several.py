@@ -357,6 +357,12 @@ def test_a_gate_holds_no_output_that_it_does_not_judge(device, limits):
         Gate(device, limits, channels, lambda _: None)
 
 
+def test_an_only_output_may_have_another_name_on_its_device():
+    device = FakeDevice()
+    assert device.name != LIMITS[0].output.channel
+    Gate(device, LIMITS[0], FakePair.channels, lambda _: None)
+
+
 def test_one_output_is_judged_as_it_is_alone():
     """What is decided of one output does not depend on how many there are."""
     latest, block = Latest.nothing(3), CommandBlock(5, np.zeros(3), np.zeros(3))
