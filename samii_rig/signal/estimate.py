@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, get_args
@@ -424,21 +424,29 @@ def _local(
         raise EstimateError(f"{dof.min():.2g} degrees of freedom for {p} outputs; more data would")
     # Of the piece in which the sweep passes the frequency.
     power = np.max([np.interp(f0, s.frequency, np.abs(s.R) ** 2) for s in spectra], axis=0)
+    found = _with_rounding(group, f0, pick, dof, power)
+    done = f"local (LPM, LRM at {rational:.0%} of the lines, through {group.through})"
+    ends = f"{len(transients)} transients" if transients else "at rest at both ends: no transient"
+    why = f"{why}; windows of {width:.3g} Hz, {ends}"
+    return _response(group, found, len(group.pieces), done, why)
+
+
+def _with_rounding(
+    group: Group, f: Float, pick: Callable[[str], Complex], dof: Float, power: Float
+) -> _ByLine:
+    """Of local models what each line has, with the rounding that no residual shows. pick : of the
+    models' results, by name. power : (n,) of the reference."""
     gain, noise = pick("gain"), pick("noise")
     hidden = _hidden(group, noise, dof)
     seen = np.maximum(np.abs(gain) ** 2 * power, NO_POWER * np.max(power))
-    found = _ByLine(
-        frequency=f0,
+    return _ByLine(
+        frequency=f,
         H=pick("H"),
         covariance=pick("covariance") + hidden / seen[:, None, None],
         dof=dof,
         coherence=_coherence(pick("H"), gain, power, noise + hidden),
         input_rms=np.abs(gain) * _peak(group.pieces) / np.sqrt(2),
     )
-    done = f"local (LPM, LRM at {rational:.0%} of the lines, through {group.through})"
-    ends = f"{len(transients)} transients" if transients else "at rest at both ends: no transient"
-    why = f"{why}; windows of {width:.3g} Hz, {ends}"
-    return _response(group, found, len(group.pieces), done, why)
 
 
 def _hidden(group: Group, noise: Complex, dof: Float) -> Float:

@@ -37,7 +37,7 @@ from samii_rig.likelihood.unexplained import Unexplained, unexplained
 from samii_rig.types import Float
 
 SLOPE_STEP = 1e-4  # of a logarithm, for a slope by a difference: rounding and bend are below 1e-3
-EXACT = 1e-5  # relative, at which a refit with such slopes ends: 0.1 of a chi-square of 10,000
+EXACT_ENDS = 1e-5  # relative, at which a refit with such slopes ends: 0.1 of a chi-square of 10,000
 NOWHERE = 1e6  # noise units of every line, more than any rig is off by
 FEW = 6  # steps of a refit of a force: what may win is refitted again, from where it ended
 # Samples under which forces are computed, those of slopes too: 15 s of a core. The most promising
@@ -134,7 +134,7 @@ class ForceFits(RecordSearch):
                 rows = problem.goal.size + prior.size
                 return np.full(rows, NOWHERE), np.zeros((rows, x.size))
 
-        end = minimise(evaluated, start, model.lower, model.upper, tolerance=EXACT)
+        end = minimise(evaluated, start, model.lower, model.upper, tolerance=EXACT_ENDS)
         if 2 * end.cost >= NOWHERE**2:
             return None
         penalty = float(np.sum((end.x[: model.n_nominal] / prior) ** 2))
