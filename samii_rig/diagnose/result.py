@@ -22,7 +22,7 @@ Verdict = Literal["no_mismatch", "named", "ambiguous", "unknown"]
 HIDING = {row.name: row.hidden for row in PHYSICS.values() if row.hidden}
 SOFT = tuple(row.name for row in PHYSICS.values() if row.soft)  # the larger, the less of it
 LIKELY = 0.5  # probability of a site from which it is told as the place
-PROBABLE = 0.3  # probability of causes below which they are told for a part of the mismatch only
+PROBABLE = 0.3  # probability of causes below which they are told for a part of a mismatch at most
 REMARKS = 2  # on the console, of what is no physics
 FAR_MOVED = 3.0  # tolerances from which a part is worth a look: 0.3 % of good parts are so far off
 

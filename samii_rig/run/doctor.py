@@ -177,7 +177,7 @@ def _samples(rig: Rig, device: OpenRig) -> Iterator[Check]:
             yield Check(s.name, "bad", "gives no number", "check its plug and its supply")
             continue
         noise = float(np.std(x - np.polyval(np.polyfit(n, x, 1), n)))
-        expected = float(np.hypot(s.noise_rms, s.resolution / np.sqrt(12.0)))
+        expected = s.own_noise
         unit = pretty(s.unit)
         found = f"at {np.mean(x):.3g} {unit}, noise {noise:.2g} {unit}"
         found += f", by the rig file {expected:.2g} {unit}"

@@ -71,8 +71,7 @@ def expected_errors(
             if not inside.any():
                 continue
             for i, sensor in enumerate(rig.sensor):
-                sigma = math.hypot(sensor.noise_rms, sensor.resolution / math.sqrt(12))
-                std = sigma * math.sqrt(n / len(members)) / V[inside]
+                std = sensor.own_noise * math.sqrt(n / len(members)) / V[inside]
                 H = np.interp(f[inside], hz, size[:, i])
                 if not H.all():
                     continue  # this input does not move it at all
@@ -110,8 +109,7 @@ def _stepped(
             if not inside.any():
                 continue
             for i, sensor in enumerate(rig.sensor):
-                sigma = math.hypot(sensor.noise_rms, sensor.resolution / math.sqrt(12))
-                std = sigma * np.sqrt(length[inside]) / drive[inside]
+                std = sensor.own_noise * np.sqrt(length[inside]) / drive[inside]
                 H = np.interp(at[inside], hz, size[:, i])
                 if not H.all():
                     continue

@@ -68,7 +68,7 @@ class Checked:
         """Outputs that half of the responses hold, or more: it costs less to leave out the records
         of the others; and those that a loop of the rig is closed around, but for `hidden`."""
         held = Counter(c.name for r in self.responses for c in r.outputs)
-        closed = _closed_around(rig)
+        closed = rig.centred
         often = [n for n, k in held.items() if n in closed or 2 * k >= len(self.responses)]
         return tuple(n for n in often if n not in self.hidden)
 
@@ -123,7 +123,7 @@ def checked(
     found = wired(finite, rig)
     steady, changed = _steady(found.responses)
     rounded = {f.channel for r in given for f in r.findings if f.kind == "resolution"}
-    hidden = frozenset(n for n in _closed_around(rig) & rounded if _is_hidden(n, steady))
+    hidden = frozenset(n for n in rig.centred & rounded if _is_hidden(n, steady))
     guessed = None
     if not any(repeated(r) for r in steady):
         guessed = Refusal(NO_REPEATS, "repeat each run three times, each from rest", "ambiguous")
@@ -160,12 +160,6 @@ def _direct(sensor: str) -> str:
         f"{sensor} is left out: its rounding hides most of its motion; what its loop made of that "
         "stands in the command, which is taken as it was recorded"
     )
-
-
-def _closed_around(rig: Rig) -> set[str]:
-    """Sensors that loops are closed around."""
-    loops = (rig.centring_of(a.name) for a in rig.actuator)
-    return {loop.sensor for loop in loops if loop is not None}
 
 
 def estimated(

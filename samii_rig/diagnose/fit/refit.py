@@ -220,7 +220,7 @@ def refit(
         trials=DAMPINGS * steps,
         tries=DAMPINGS,
     )
-    x, J, penalty = end.at.x, end.normal.J, _penalty(model, end.at.x)
+    x, J, penalty = end.at.x, end.normal.J, penalty_of(model, end.at.x)
     return Fitted(model, x, end.at.cost - penalty, penalty, J, J.T @ J)
 
 
@@ -270,7 +270,7 @@ class _Point:
     ) -> _Point:
         """Where the response is h."""
         r = problem.residual(h)
-        return cls(x, float(r @ r) + _penalty(model, x), h, r, dh)
+        return cls(x, float(r @ r) + penalty_of(model, x), h, r, dh)
 
     @classmethod
     def of(cls, model: Model, problem: Problem, x: Float) -> _Point:
@@ -305,7 +305,8 @@ def _normal(model: Model, problem: Problem, at: _Point) -> _Normal:
     return _Normal.of(model, at.x, problem.whiten(dh), at.r)
 
 
-def _penalty(model: Model, x: Float) -> float:
+def penalty_of(model: Model, x: Float) -> float:
+    """What the tolerances charge for the nominal parameters of x."""
     n = model.n_nominal
     return float(np.sum((x[:n] / model.prior[:n]) ** 2))
 
@@ -390,7 +391,7 @@ def _logarithm(model: Model, problem: Problem, first: _Point) -> _Point:
 
     def point(x: Float, h: Complex, dh: Complex | None) -> _Point:
         r = residual(h)
-        return _Point(x, float(r @ r) + _penalty(model, x), h, r, dh)
+        return _Point(x, float(r @ r) + penalty_of(model, x), h, r, dh)
 
     def normal(now: _Point) -> _Normal:
         dh = model.gradient(now.x, lines.at)[1] if now.dh is None else now.dh

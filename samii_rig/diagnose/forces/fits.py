@@ -22,7 +22,7 @@ from samii_rig.diagnose.fit.explanations import (
 )
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
-from samii_rig.diagnose.fit.refit import STEPS, Fitted
+from samii_rig.diagnose.fit.refit import STEPS, Fitted, penalty_of
 from samii_rig.diagnose.forces.model import ForceModel, model_of
 from samii_rig.diagnose.forces.paths import TransferPaths
 from samii_rig.diagnose.forces.problem import ForceProblem, Moved
@@ -137,7 +137,7 @@ class ForceFits(RecordSearch):
         end = minimise(evaluated, start, model.lower, model.upper, tolerance=EXACT_ENDS)
         if 2 * end.cost >= NOWHERE**2:
             return None
-        penalty = float(np.sum((end.x[: model.n_nominal] / prior) ** 2))
+        penalty = penalty_of(model, end.x)
         J = end.jacobian[: len(end.jacobian) - model.n_nominal]
         return Fitted(model, end.x, 2 * end.cost - penalty, penalty, J, J.T @ J)
 

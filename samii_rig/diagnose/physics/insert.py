@@ -39,6 +39,12 @@ def element_of(kind: type[Any], name: str, units: dict[str, str]) -> Any:
     return kind(kind=tag(kind), name=name, **values)
 
 
+def units_of(kind: type[Any], *symbols: str) -> dict[str, str]:
+    """Units of some parameters of an element of `kind`, of all that have one if none is said."""
+    every = quantities(kind)  # type: ignore[arg-type]
+    return {symbol: every[symbol].unit for symbol in symbols or every}
+
+
 def tag(kind: type[Any]) -> str:
     """What a rig file calls an element of `kind`."""
     name: str = get_args(kind.model_fields["kind"].annotation)[0]
@@ -48,23 +54,18 @@ def tag(kind: type[Any]) -> str:
 def oscillator(name: str, *, turning: bool = False) -> Branch:
     """A mass on a spring and damper across the chain, elements `name`_spring and `name`_mass.
     turning : about it: an inertia on a torsional spring."""
-    spring = element_of(
-        TorsionalSpring if turning else TranslationalSpring,
-        f"{name}_spring",
-        {"k": "N m/rad", "c": "N m s/rad"} if turning else {"k": "N/m", "c": "N s/m"},
+    spring = TorsionalSpring if turning else TranslationalSpring
+    body, symbol = (Inertia, "I") if turning else (LumpedMass, "m")
+    parts = (
+        element_of(spring, f"{name}_spring", units_of(spring, "k", "c")),
+        element_of(body, f"{name}_mass", units_of(body, symbol)),
     )
-    body = element_of(
-        Inertia if turning else LumpedMass,
-        f"{name}_mass",
-        {"I": "kg m^2"} if turning else {"m": "kg"},
-    )
-    return Branch(kind="branch", name=name, element=(spring, body))
+    return Branch(kind="branch", name=name, element=parts)
 
 
 def line(rig: Rig, source: str, name: str) -> Rig:
     """The rig with a line in one lump right behind a source, seen by all that sees the source."""
-    units = {symbol: q.unit for symbol, q in quantities(LumpedLine).items()}
-    values = {symbol: parameter(1.0, unit) for symbol, unit in units.items()}
+    values = {symbol: parameter(1.0, unit) for symbol, unit in units_of(LumpedLine).items()}
     made = LumpedLine(kind="lumped_line", name=name, source=source, **values)
     order = [e.name for e in rig.element]
     at = order.index(source) + 1

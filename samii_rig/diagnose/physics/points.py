@@ -37,7 +37,6 @@ from samii_rig.rig.schema import (
     TranslationalSpring,
     parameters,
 )
-from samii_rig.rig.schema.elements import quantities
 from samii_rig.types import Complex, Float
 
 Law = Literal["spring", "softness", "column", "damper", "slip", "mass"]
@@ -85,7 +84,7 @@ class Point:
     @property
     def units(self) -> dict[str, str]:
         """Units of the element's parameters, by symbol."""
-        return {symbol: q.unit for symbol, q in quantities(self.kind).items()}  # type: ignore[arg-type]
+        return insert.units_of(self.kind)
 
     @property
     def pair(self) -> int:
@@ -195,13 +194,15 @@ def effects(rig: Rig, where: Places) -> Iterator[Effect]:
     for row in POINTS:
         for port in range(len(where.names)):
             yield from _at_port(rig, where, row, port)
+    hanging = _hanging_on(where)
     for port in range(len(where.names)):
-        yield from _hanging_at(rig, where, port)
+        yield from _hanging_at(rig, where, hanging, port)
     for at, element in enumerate(rig.element):
         for stretch in stretches(rig, element):
             for row in POINTS:
                 yield from _along(rig, where, row, at, stretch)
-            yield from _hanging_along(rig, where, at, stretch)
+            if not hanging.turning:  # then no body has a length
+                yield from _hanging_along(rig, where, hanging, at, stretch)
 
 
 def _at_port(rig: Rig, where: Places, row: Point, port: int) -> Iterator[Effect]:
@@ -367,35 +368,31 @@ def _standing(
 
 @dataclass(frozen=True, slots=True)
 class Hanging:
-    """Something that hangs on and resonates.
-
-    point : its jump, and the symbol of its mass or inertia. units : of m or J, k, c.
-    """
+    """Something that hangs on and resonates. point : its jump, and its mass or inertia. spring :
+    the kind of element that it hangs by."""
 
     point: Point
-    units: tuple[str, str, str]
+    spring: type[Any]
 
     @property
     def turning(self) -> bool:
         """Whether it turns about the chain, and does not shift across it."""
         return self.point.jump == "M"
 
-    def names(self, name: str) -> tuple[Key, Key, Key]:
-        """Its parameters in the rig file, in the order of `units`."""
-        return (f"{name}_mass", self.point.strong), (f"{name}_spring", "k"), (f"{name}_spring", "c")
-
     def values(self, name: str, x: Float) -> dict[Key, float]:
         """Parameters of the elements of an oscillator of this name."""
-        return dict(zip(self.names(name), map(float, _oscillating(x[:3])), strict=True))
+        m, k, c = (float(v) for v in _oscillating(x[:3]))
+        spring = f"{name}_spring"
+        return {(f"{name}_mass", self.point.strong): m, (spring, "k"): k, (spring, "c"): c}
 
 
 ACROSS = Hanging(
     Point("attached_oscillator", "V", "w", "mass", "m", "", LumpedMass, "oscillator_"),
-    ("kg", "N/m", "N s/m"),
+    TranslationalSpring,
 )
 TURNING = Hanging(
     Point("attached_oscillator", "M", "theta", "mass", "I", "", Inertia, "oscillator_", "J"),
-    ("kg m^2", "N m/rad", "N m s/rad"),
+    TorsionalSpring,
 )
 
 
@@ -418,28 +415,27 @@ def _swinging(rig: Rig, where: Places, hanging: Hanging, x: float) -> tuple[Unkn
     if low >= high:
         return ()
     starts = tuple(m for m in spread(SMALLEST * scale, 3 * scale, 7) if m < high)
-    symbol = hanging.point.reported or hanging.point.strong
-    inertia, spring, damper = hanging.units
+    point, units = hanging.point, insert.units_of(hanging.spring)
+    symbol, unit = point.reported or point.strong, point.units[point.strong]
     return (
-        Unknown(symbol, inertia, low, high, starts or (math.sqrt(low * high),)),
-        Unknown("k", spring, low_w, 2 * high_w, spread(low_w, high_w, 48)),
-        Unknown("c", damper, LEAST_DAMPED, MOST_DAMPED, (0.05,)),
+        Unknown(symbol, unit, low, high, starts or (math.sqrt(low * high),)),
+        Unknown("k", units["k"], low_w, 2 * high_w, spread(low_w, high_w, 48)),
+        Unknown("c", units["c"], LEAST_DAMPED, MOST_DAMPED, (0.05,)),
     )
 
 
 def _sum(rig: Rig, hanging: Hanging) -> float:
     """kg of all bodies of a rig file, or kg m^2."""
-    symbol = hanging.point.strong
-    each = (
-        (p["mu"], p["L"]) if symbol == "m" and "mu" in p else (p[symbol],)
-        for p in (parameters(e) for e in rig.element)
-        if symbol in p or (symbol == "m" and "mu" in p)
-    )
-    return sum(math.prod(x.value for x in one) for one in each)
+    symbol, total = hanging.point.strong, 0.0
+    for p in map(parameters, rig.element):
+        if symbol == "m" and "mu" in p:
+            total += p["mu"].value * p["L"].value
+        elif symbol in p:
+            total += p[symbol].value
+    return total
 
 
-def _hanging_at(rig: Rig, where: Places, port: int) -> Iterator[Effect]:
-    hanging = _hanging_on(where)
+def _hanging_at(rig: Rig, where: Places, hanging: Hanging, port: int) -> Iterator[Effect]:
     point = hanging.point
     unknowns = _swinging(rig, where, hanging, where.strength(point.pair, port))
     if not unknowns:
@@ -466,10 +462,9 @@ def _hanging_at(rig: Rig, where: Places, port: int) -> Iterator[Effect]:
     )
 
 
-def _hanging_along(rig: Rig, where: Places, at: int, stretch: Along) -> Iterator[Effect]:
-    hanging = _hanging_on(where)
-    if hanging.turning:  # then no body has a length
-        return
+def _hanging_along(
+    rig: Rig, where: Places, hanging: Hanging, at: int, stretch: Along
+) -> Iterator[Effect]:
     unknowns = _swinging(rig, where, hanging, _strength(where, hanging.point.pair, at))
     if not unknowns:
         return

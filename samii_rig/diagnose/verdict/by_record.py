@@ -232,20 +232,20 @@ def _answer(
     if isinstance(varies := looked.judged.varies, Variation):
         shown = replace(shown, with_causes=varies.after)
     if noise := more_noise(search):
-        looked = _in_noise(looked, noise, first, shown)
+        looked = _in_noise(looked, noise, shown)
     of_lines = case.clean.of_lines
     clean = replace(case.clean, remarks=tuple(w for w in case.clean.remarks if w not in of_lines))
     return diagnosis_of(replace(case, clean=clean), search, looked.judged, shown, looked.remarks)
 
 
-def _in_noise(looked: _Looked, noise: MoreNoise, first: float, shown: Shown) -> _Looked:
+def _in_noise(looked: _Looked, noise: MoreNoise, shown: Shown) -> _Looked:
     """The same, with a remark on noise that is more than the sensors'. Where it may be anything
     nothing is said to be missing or not, and no cause is sure."""
     looked = replace(looked, remarks=(*looked.remarks, noise.describe()))
     if isinstance(looked.judged.varies, Variation):
         return looked
     nothing = looked.judged.verdict == "no_mismatch"
-    if fits_too_well(first, shown.threshold) or (nothing and noise.far_more):
+    if fits_too_well(shown.first, shown.threshold) or (nothing and noise.far_more):
         return _unknown(looked)
     if noise.far_more:
         return replace(looked, judged=verdict.limited(looked.judged, "ambiguous"))

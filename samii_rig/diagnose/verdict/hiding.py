@@ -60,17 +60,15 @@ def _smallest(
     grows = before[-1] > before[0]
     value[0] *= rate if grows else 1 / rate
     least, most = (first.low, first.high) if grows else (first.high, first.low)
-    if min(least, most) <= value[0] <= max(least, most):
-        size: float | None = abs(float(effect.report(value)[0]))
-    elif (value[0] < least) == grows:
+    toward = 1 if grows else -1
+    if toward * (value[0] - least) < 0:
         # What would be seen is less than the range begins with, up to which it is a nominal
         # parameter's own tolerances.
-        if np.any(np.sign(np.diff(left)) != (1 if grows else -1)):
+        if np.any(np.sign(np.diff(left)) != toward):
             return None  # a ratio, of either side of 1: no size of it is small
         value[0] = least
-        size = abs(float(effect.report(value)[0]))
-    else:
-        size = None
+    within = toward * (value[0] - most) <= 0
+    size = abs(float(effect.report(value)[0])) if within else None
     return Hiding(effect.physics, effect.site, first.symbol, size, first.unit)
 
 

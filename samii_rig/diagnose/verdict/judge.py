@@ -17,11 +17,10 @@ from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.stated import IN_DATA, PLACE, TINY, Evidence, probability
 from samii_rig.diagnose.forces.variation import Variation
-from samii_rig.diagnose.result import Gap, Verdict
+from samii_rig.diagnose.result import PROBABLE, Gap, Verdict
 
 NOTHING_FROM = 0.2  # probability of nothing missing below which it is called missing
 SURE = 0.8  # probability of an answer from which it is named
-DOUBT = 0.3  # probability of an answer below which none is given
 MOSTLY = 0.5  # of the mismatch; one cause that explains it is told whatever else is missing
 MOST_NAMES = 4  # of a class; more is no answer
 MUST_SHOW = 900.0  # of chi-square, that an effect explains of the data: 30 noise units
@@ -261,7 +260,7 @@ def _unexplained(evidence: Evidence, search: Search, decide: Measured | None) ->
 
 def _by_probability(evidence: Evidence) -> Verdict:
     right = probability(evidence)
-    if right >= DOUBT:
+    if right >= PROBABLE:
         return "named" if right >= SURE else "ambiguous"
     one = evidence.effects == 1 and evidence.closed > MOSTLY
     return "ambiguous" if one else "unknown"

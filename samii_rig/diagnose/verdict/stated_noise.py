@@ -7,7 +7,6 @@ and it is unlike noise in what it does to the response.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +74,7 @@ def more_noise(search: RecordSearch) -> MoreNoise | None:
     each = []
     for name, rms in zip(whole.wired.sensors, found, strict=True):
         sensor = stated[name]
-        own = math.hypot(sensor.noise_rms, sensor.resolution / math.sqrt(12))
+        own = sensor.own_noise
         if sensor.noise_rms > 0 and rms > MORE_NOISE * own:
             each.append(MoreNoise(name, sensor.unit, float(rms) / own, float(rms)))
     return max(each, key=lambda one: one.times, default=None)
@@ -83,8 +82,7 @@ def more_noise(search: RecordSearch) -> MoreNoise | None:
 
 def _steps_drive(whole: Whole) -> bool:
     """Whether a loop feeds back a sensor that hardly moves by its steps."""
-    loops = (whole.rig.centring_of(a.name) for a in whole.rig.actuator)
-    closed = {loop.sensor for loop in loops if loop} | {f.sensor for f in whole.rig.feedback}
+    closed = whole.rig.centred | {f.sensor for f in whole.rig.feedback}
     steps = {s.name: s.resolution for s in whole.rig.sensor}
     for j, name in enumerate(whole.wired.sensors):
         moved = max(float(np.std(piece.z[:, j])) for piece in whole.records.pieces)

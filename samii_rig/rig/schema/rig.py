@@ -71,6 +71,12 @@ class Rig(Strict):
         return next((a.centring for a in others if a.name == actuator), None)
 
     @property
+    def centred(self) -> frozenset[str]:
+        """Sensors that centring loops are closed around."""
+        loops = (self.centring_of(a.name) for a in self.actuator)
+        return frozenset(loop.sensor for loop in loops if loop is not None)
+
+    @property
     def pull(self) -> float:
         """Gravity along the chain, base to tip, m/s^2: negative where it stands."""
         return pull(self.gravity, self.pose)

@@ -48,6 +48,11 @@ class SensorBase(Strict):
     stale_after: Positive = 0.05
     calibration: str = Field(default="", description="how unit and scale are known")
 
+    @property
+    def own_noise(self) -> float:
+        """Root mean square of noise and rounding together, in `unit`."""
+        return math.hypot(self.noise_rms, self.resolution / math.sqrt(12))
+
     @field_validator("unit")
     @classmethod
     def _of_its_kind(cls, unit: str) -> str:
