@@ -46,13 +46,22 @@ def records_of(
             (b[0], min(b[1], top)) if b and b[0] < top else None
             for b, top in zip(bands_of, tops, strict=True)
         ]
-    driven = [(p, b) for p, b in zip(pieces, bands_of, strict=True) if b]
+    driven = [
+        (p, (b[0], min(b[1], _follows(p))))
+        for p, b in zip(pieces, bands_of, strict=True)
+        if b and b[0] + CYCLES * rate_hz / len(p.z) < _follows(p)
+    ]
     if not driven:
         raise EstimateError("nothing drives the rig for five cycles of any line")
     bands = tuple(band or b for _, b in driven)
     some = tuple(p for p, _ in driven)
-    driven_hz = _above_meter(some, rate_hz)
+    driven_hz = min(_above_meter(some, rate_hz), max(_follows(p) for p in some))
     return Records(some, rate_hz, bands, step, driven=driven_hz, every=every)
+
+
+def _follows(piece: Piece) -> float:
+    """Hz up to which a command of a piece follows what moves it from outside."""
+    return max(told.follows for told in piece.commands)
 
 
 def _above_meter(pieces: Sequence[Piece], rate_hz: float) -> float:

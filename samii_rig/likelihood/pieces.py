@@ -14,6 +14,7 @@ from scipy import fft
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood import inputs, spikes
 from samii_rig.likelihood.bridged import MOST_GAPS, Bridged, bridge
+from samii_rig.likelihood.outside import followed, outside
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import is_open, of_input, proportional
 from samii_rig.signal.groups import segments_of
@@ -51,12 +52,14 @@ class Command:
     """What one of the records behind a piece told the rig, and its part in the piece.
 
     v : as recorded, of the shape of r. part : the piece's r and z have so many times this record's.
-    meter : of each input, what is left is in v and r.
+    meter : of each input, what is left is in v and r. follows : Hz up to which it follows what
+    moves it from outside, not what a loop makes of noise.
     """
 
     v: Float
     part: float
     meter: tuple[inputs.MeterNoise, ...]
+    follows: float = np.inf
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +243,7 @@ def pieces_of(
             continue
         whole = Bridged.of(recording, known, _driving_columns(recording, wired))
         slower = round(rig.rate_hz / recording.rate_hz) > 1
-        samples = _Samples.of(whole, wired, slower=slower, times=times)
+        samples = _Samples.of(whole, rig, wired, slower=slower, times=times)
         for segment in segments_of(recording):
             if recording.place(segment) in without:
                 continue
@@ -274,13 +277,21 @@ def _driving_columns(recording: Recording, wired: Wiring) -> set[str]:
 
 
 def _driving(
-    whole: Bridged, x: Input, values: Float, sensors: Sequence[str], *, slower: bool, times: int
+    whole: Bridged,
+    x: Input,
+    values: Float,
+    sensors: Sequence[str],
+    *,
+    as_sent: bool,
+    slower: bool,
+    times: int,
 ) -> tuple[Float, Float, NDArray[np.bool_], inputs.MeterNoise]:
     """(n,) of an input: the command, what drives its loop, and where it has edges; and a meter's
     noise, as of `Command`.
 
-    values : (n, q) of the sensors. slower : whether not every sample of the rig was recorded.
-    times : as of `faster`.
+    values : (n, q) of the sensors. as_sent : whether the command follows from what was read, so
+    that no meter recorded it. slower : whether not every sample of the rig was recorded. times : as
+    of `faster`.
     """
     recording = whole.recording
     if not _has(recording, x.command):
@@ -295,7 +306,7 @@ def _driving(
     r, meter = v.copy(), inputs.MeterNoise()
     if theta is not None:
         r += x.kp * theta
-    if not recording.names("reference"):
+    if not as_sent and not recording.names("reference"):
         noisy = r
         r, meter = inputs.calibrated(noisy, recording.channels[column].resolution)
         v = v + (r - noisy)
@@ -319,6 +330,8 @@ class _Samples:
     v, r : (n,) or (n, m) of the inputs, edges : of their jumps. values : (n, q) of the sensors.
     meter : of each input, as of `Command`.
     unknown : (gaps,) whether the input there is a guess. slower : as of `_driving`.
+    outside : of each input, what moves it from outside a loop that is not closed; None where no
+    such loop is known of.
     """
 
     whole: Bridged
@@ -329,22 +342,35 @@ class _Samples:
     meter: tuple[inputs.MeterNoise, ...]
     unknown: NDArray[np.bool_]
     slower: bool
+    outside: tuple[Float | None, ...]
 
     @classmethod
-    def of(cls, whole: Bridged, wired: Wiring, *, slower: bool, times: int) -> _Samples:
+    def of(cls, whole: Bridged, rig: Rig, wired: Wiring, *, slower: bool, times: int) -> _Samples:
         """Of a recording, as `whole`. times : as of `faster`."""
         values = whole.recording.columns(wired.sensors)
+        read = wired.sensors
+        own = tuple(None if x.kp else outside(whole, rig, x.command, read) for x in wired.inputs)
         each = [
-            _driving(whole, x, values, wired.sensors, slower=slower, times=times)
-            for x in wired.inputs
-        ]
+            _driving(
+                whole, x, values, read,
+                as_sent=out is not None, slower=slower, times=times,
+            )
+            for x, out in zip(wired.inputs, own, strict=True)
+        ]  # fmt: skip
         unknown = np.zeros(len(whole.lost), np.bool_)
         v, r, edges, meter = zip(*each, strict=True)
         for one in r:
             unknown |= bridge(one, whole.lost) > KNOWN * np.sqrt(np.mean(one**2))
         return cls(
-            whole, _beside(v), _beside(r), _beside(edges), values, meter, unknown, slower
+            whole, _beside(v), _beside(r), _beside(edges), values, meter, unknown, slower, own
         )  # fmt: skip
+
+    def follows(self, first: int, behind: int) -> float:
+        """As of `Command`, of samples from `first` to before `behind`."""
+        rate = self.whole.recording.rate_hz
+        v = self.v.reshape(len(self.v), -1)[first:behind].T
+        each = zip(v, self.outside, strict=True)
+        return max(followed(v, x[first:behind], rate) if x is not None else np.inf for v, x in each)
 
 
 def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float) -> list[Piece]:
@@ -358,7 +384,8 @@ def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float)
         first = low - history
         # Whatever came before the history may still ring.
         moving = low > history
-        told = Command(samples.v[first:high], 1.0, samples.meter)
+        follows = samples.follows(low, high)
+        told = Command(samples.v[first:high], 1.0, samples.meter, follows)
         z, struck = spikes.mended(samples.values[low:high], step)
         piece = Piece(name, samples.r[first:high], z, history, (level,), moving, commands=(told,))
         own = samples.edges[first:high].reshape(high - first, -1)
@@ -506,7 +533,7 @@ def _turned(group: list[Piece], scale: Float | None, *, levels: bool) -> Piece:
         tuple(s for p in group for s in p.repeats) + (() if levels else others),
         tuple(s for p in group for s in p.contrasts) + (others if levels else ()),
         tuple(
-            Command(told.v, float(part) * told.part, told.meter)
+            replace(told, part=float(part) * told.part)
             for part, p in zip(U[0], group, strict=True)
             for told in p.commands
         ),

@@ -27,12 +27,18 @@ def recorded(
     *,
     k3: float = 0.0,
     gain: Callable[[float], float] = lambda t: 1.0,
+    more: float = 0.0,
+    pd: tuple[float, float] | None = None,
 ) -> Recording:
     """A record from rest under a held command v (n,) V, with the noise that the rig file states.
 
-    k3 : N/m^3 of the first spring. gain : of the coil, over time in s.
+    k3 : N/m^3 of the first spring. gain : of the coil, over time in s. more : kg on the second
+    mass. pd : V/m and V s/m of a loop around what x_1 reads, whose reference is v then, and is not
+    recorded; what goes out is rounded to the converter's steps.
     """
-    h = 1 / (RATE * SUBSTEPS)
+    h, v, m2 = 1 / (RATE * SUBSTEPS), v.copy(), M2 + more
+    noise = np.random.default_rng(seed).standard_normal((v.size, 2)) * [1e-6, 0.02]
+    read = np.zeros(v.size)
     z = np.zeros(5)  # x_1, its speed, x_2, its speed, the coil's force
     out = np.zeros((v.size, 2))  # m, m/s^2
 
@@ -40,10 +46,15 @@ def recorded(
         x1, v1, x2, v2, f = z
         inner = K2 * (x2 - x1) + C2 * (v2 - v1)
         a1 = (f + inner - K1 * x1 - C1 * v1 - k3 * x1**3) / M1
-        return np.array([v1, a1, v2, -inner / M2, CORNER * (force - f)])
+        return np.array([v1, a1, v2, -inner / m2, CORNER * (force - f)])
 
-    for i, command in enumerate(v):
+    for i, asked in enumerate(v):
         out[i] = z[0], rate_of(z, 0.0)[3]
+        read[i] = np.round((z[0] + noise[i, 0]) / 0.5e-6) * 0.5e-6
+        command = asked
+        if pd is not None:
+            back = pd[0] * read[i] + pd[1] * RATE * (read[i] - (read[i - 1] if i else 0.0))
+            v[i] = command = np.round((asked - back) / 0.3e-3) * 0.3e-3
         for j in range(SUBSTEPS):
             force = GAIN * gain((i + j / SUBSTEPS) / RATE) * float(command)
             a = rate_of(z, force)
@@ -51,9 +62,7 @@ def recorded(
             c = rate_of(z + h / 2 * b, force)
             d = rate_of(z + h * c, force)
             z = z + h / 6 * (a + 2 * b + 2 * c + d)
-    rng = np.random.default_rng(seed)
-    noisy = out + rng.standard_normal(out.shape) * [1e-6, 0.02]
-    noisy[:, 0] = np.round(noisy[:, 0] / 0.5e-6) * 0.5e-6
+    noisy = np.column_stack([read, out[:, 1] + noise[:, 1]])
     channels = (
         Channel("v", "V", "command", low=-10.0, high=10.0),
         Channel("x_1", "m", resolution=0.5e-6),

@@ -112,7 +112,7 @@ class Whole:
         )
         rests = tuple(j for j, x in enumerate(wired.inputs) if not x.driven)
         all_, of_levels = (replace(one, undriven=rests) for one in (all_, of_levels))
-        without |= _sensors_out(runs, rig, wired, findings)
+        without |= _sensors_out(runs, rig, wired, findings) | _answering(all_)
         left_out, asked = tuple(without.items()), band is not None
         return cls(
             rig, all_, wired, left_out, of_levels, asked, hidden=tuple(hidden), runs=tuple(runs)
@@ -295,6 +295,13 @@ class Whole:
     def _latest(self) -> list[tuple[Fitted, Noise, list[LineResiduals]]]:
         """What the latest fit leaves: both parts of the lines are asked for."""
         return []
+
+
+def _answering(records: Records) -> dict[str, str]:
+    """Of pieces whose command answers noise above a frequency, why they are not used there."""
+    each = {p.name: max(told.follows for told in p.commands) for p in records.pieces}
+    why = "above {:.3g} Hz its command is what a loop makes of the sensor's noise"
+    return {name: why.format(hz) for name, hz in each.items() if np.isfinite(hz)}
 
 
 def _sensors_out(
