@@ -28,7 +28,7 @@ from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.errors import SamiiRigError
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import load_rig, parse
-from samii_rig.rig.schema import Rig
+from samii_rig.rig.schema import Rig, SensorBase
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Float, Recording
 from samii_rig.units import STANDARD_GRAVITY
@@ -90,11 +90,11 @@ class Bench:
 
 
 def taken_for_another(b: Bench) -> Bench:
-    """The rig file says of a sensor that it measures something else."""
-    old = next(s for s in b.rig.sensor if s.name == b.sensor)
-    shared = ("name", "noise_rms", "resolution", "low", "high", "unit")
-    new = {k: getattr(old, k) for k in shared} | TAKEN_FOR[b.name, b.sensor]
+    """The rig file says of a sensor that it measures something else; its filter stays."""
     plain = b.rig.model_dump(exclude_none=True)
+    (old,) = (s for s in plain["sensor"] if s["name"] == b.sensor)
+    shared = {k: v for k, v in old.items() if k in SensorBase.model_fields}
+    new = shared | TAKEN_FOR[b.name, b.sensor]
     plain["sensor"] = [new if s["name"] == b.sensor else s for s in plain["sensor"]]
     plain["limit"] = [x for x in plain["limit"] if x["channel"] != b.sensor]
     return replace(b, rig=Rig.model_validate(plain))

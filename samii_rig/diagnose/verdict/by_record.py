@@ -233,6 +233,9 @@ def _answer(
         shown = replace(shown, with_causes=varies.after)
     if noise := more_noise(search):
         looked = _in_noise(looked, noise, shown)
+    if any(e.physics == "kind_error" for e in looked.judged.best.effects):
+        # Its other fields were written for another sensor: its place, its filter.
+        looked = replace(looked, judged=verdict.limited(looked.judged, "ambiguous"))
     of_lines = case.clean.of_lines
     clean = replace(case.clean, remarks=tuple(w for w in case.clean.remarks if w not in of_lines))
     return diagnosis_of(replace(case, clean=clean), search, looked.judged, shown, looked.remarks)
