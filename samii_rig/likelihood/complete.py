@@ -60,7 +60,10 @@ class Complete:
         root = np.sqrt(2) * np.linalg.inv(found.noise.root(rows.f, rows.piece))
         nuisances = tuple((on, _columns(root[on] @ N)) for on, N in rows.each())
         m = found.factor.shape[0]
-        columns, rows = as_real(rows.X), replace(rows, X=rows.X[:, :0].copy(), N=())
+        columns = np.empty((2 * rows.f.size, rows.X[0].shape[1]))
+        for on, X in rows.changes():
+            columns[on], columns[rows.f.size + on] = X.real, X.imag
+        rows = replace(rows, X=(), N=())
         return cls(found, rows, columns, root, nuisances, found.factor.reshape(m, m))
 
     @property

@@ -94,7 +94,11 @@ def quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
     b, q = reference.shape  # q : of each input by itself, where there are several
     W = weights(rows, noise)
     We = (W @ rows.e[:, :, None])[:, :, 0]
-    M, g = products(rows.X, W, We)
+    M, g = np.zeros((q * 2 * b, q * 2 * b)), np.zeros(q * 2 * b)
+    for on, X in rows.changes():
+        own, head = products(X, W[on], We[on])
+        M += own
+        g += head
     cross, own_head = _nuisances(rows, W, We)
     # Where nothing was excited nothing is known: there the diagonal keeps the factor regular, and
     # takes the directions' place. What nuisances leave is as exact as what they were taken from.
@@ -126,8 +130,7 @@ def _nuisances(rows: Rows, W: Complex, We: Complex) -> tuple[Float, Float]:
     """The directions of all nuisances, of length 1: their products with the changes of all nodes
     (q 2 b, m), and with what the reference leaves (m,)."""
     found = []
-    for on, N in rows.each():
-        X = rows.X[on]
+    for (on, N), (_, X) in zip(rows.each(), rows.changes(), strict=True):
         q, m = N.shape[1:]
         flat = N.reshape(-1, m)
         WN = W[on] @ N

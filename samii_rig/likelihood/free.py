@@ -42,7 +42,7 @@ class Free:
         """changes : of each piece, as `changes_of`. spare : (b, m) the change that is free, on the
         nodes."""
         b, n = len(spare), len(rows.e)
-        parts = range(0, rows.X.shape[1], b)
+        parts = range(0, rows.X[0].shape[1], b)
         each = []
         for change in changes:
             real = as_real(change)

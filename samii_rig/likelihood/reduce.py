@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samii_rig.likelihood import rounding
-from samii_rig.likelihood.algebra import as_complex, as_real, orthonormal
+from samii_rig.likelihood.algebra import SAME, as_complex, as_real, lengths, orthonormal
 from samii_rig.likelihood.before import with_past
 from samii_rig.likelihood.form import Reduced, quadratic
 from samii_rig.likelihood.free import Free, differing, residual_of, with_repeats
@@ -28,7 +28,7 @@ from samii_rig.likelihood.pieces import Loops
 from samii_rig.likelihood.records import Records, Response
 from samii_rig.likelihood.rows import Rows, changes_of, rows_of
 from samii_rig.likelihood.seen import Seen
-from samii_rig.types import Float, Int
+from samii_rig.types import Complex, Float, Int
 
 Part = Callable[[Int], NDArray[np.bool_]]
 """Which lines of a piece, by their number."""
@@ -54,7 +54,7 @@ def residuals_by_line(
     some parts, nuisances at their best there; of all lines where none is said."""
     H = response(records.exact().s)
     records = records.without_spikes(H)
-    every = rows_of(records, None, records.seen(H, loop, response))
+    every = rows_of(records, (), records.seen(H, loop, response))
     out = []
     for part in parts or (lambda k: np.ones(k.size, bool),):
         rows = every.take(part(every.k))
@@ -171,10 +171,25 @@ def _as_changes(rows: Rows, seen: Sequence[Seen], noise: Noise) -> Float:
         errors = np.asarray(np.concatenate(draws)[rows.order] * scale, np.complex128)
         beyond = np.sum(np.abs(rows.e[:, c, None] * scale - errors) ** 2, axis=0)
         errors = errors[:, np.argsort(beyond)[: rounding.LIKELY]]
-        Q = orthonormal(as_real(rows.X * scale))
-        power = np.mean(np.abs(errors) ** 2, axis=1) / 2  # of the real part, and of the other
-        independent = float(np.sum(np.tile(power, 2) * np.sum(Q**2, axis=1)))
+        along, independent = _along(rows, scale, errors)
         if independent > 0:
-            shows = float(np.sum((Q.T @ as_real(errors)) ** 2)) / rounding.LIKELY
-            out[c] = max(shows / independent, 1.0)
+            out[c] = max(float(np.sum(along**2)) / rounding.LIKELY / independent, 1.0)
     return out
+
+
+def _along(rows: Rows, scale: Float, errors: Complex) -> tuple[Float, float]:
+    """(m, k) errors (n, k) along the directions of all changes of lines times scale (n, 1), and the
+    power that independent ones of their size have there."""
+    each = [(on, as_real(X * scale[on])) for on, X in rows.changes()]
+    size = np.sqrt(sum(np.sum(X**2, axis=0) for _, X in each))
+    size = np.where(size > 0, size, 1.0)
+    values, turn = np.linalg.eigh(sum(X.T @ X for _, X in each) / np.outer(size, size))
+    kept = values > SAME * np.max(values, initial=0.0)
+    root = turn[:, kept] / np.sqrt(values[kept]) / size[:, None]
+    along, independent = np.zeros((root.shape[1], errors.shape[1])), 0.0
+    power = np.mean(np.abs(errors) ** 2, axis=1) / 2  # of the real part, and of the other
+    for on, X in each:
+        Q = X @ root
+        along += Q.T @ as_real(errors[on])
+        independent += float(np.tile(power[on], 2) @ lengths(Q))
+    return along, independent

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,14 +20,14 @@ from samii_rig.types import Complex, Float, Int
 class Rows:
     """Lines of all pieces by frequency, each in units of the root of its record's power.
 
-    X : (n, 2 b) what a change on the nodes does, (n, 2 b m) of m inputs. e : (n, q) what the
-    reference leaves.
+    X : of each piece (n_i, 2 b) what a change on the nodes does in its lines, (n_i, 2 b m) of m
+    inputs; none where none is asked for. e : (n, q) what the reference leaves.
     N : of each piece (n_i, q, m_i) the nuisances of its lines.
     f : (n,) Hz. k : (n,) numbers of the lines. piece : (n,) which.
     order : (n,) of the lines of all pieces, one after the other, which these are.
     """
 
-    X: Complex
+    X: Sequence[Complex]
     e: Complex
     N: Sequence[Complex]
     f: Float
@@ -37,9 +37,13 @@ class Rows:
 
     def take(self, which: NDArray[np.bool_]) -> Rows:
         """Some of the lines."""
-        N = [one[which[self.piece == i]] for i, one in enumerate(self.N)]
+        if which.all():
+            return self
+        X, N = (
+            [one[which[self.piece == i]] for i, one in enumerate(each)] for each in (self.X, self.N)
+        )
         return Rows(
-            self.X[which], self.e[which], N, self.f[which], self.k[which],
+            X, self.e[which], N, self.f[which], self.k[which],
             self.piece[which], self.order[which],
         )  # fmt: skip
 
@@ -48,23 +52,25 @@ class Rows:
         every = ((np.flatnonzero(self.piece == i), N) for i, N in enumerate(self.N))
         return [(on, N) for on, N in every if on.size]
 
+    def changes(self) -> Iterator[tuple[Int, Complex]]:
+        """Of each piece its lines, and what changes do in them."""
+        every = ((np.flatnonzero(self.piece == i), X) for i, X in enumerate(self.X))
+        return ((on, X) for on, X in every if on.size)
 
-def rows_of(records: Records, changes: Sequence[Complex] | None, seen: Sequence[Seen]) -> Rows:
-    """changes : of each piece what one on the nodes does; None where none is asked for."""
+
+def rows_of(records: Records, changes: Sequence[Complex], seen: Sequence[Seen]) -> Rows:
+    """changes : of each piece what one on the nodes does; none where none is asked for."""
     lines = [records.lines(p) for p in records.pieces]
     size = [x.k.size for x in lines]
     order = np.argsort(np.concatenate([x.frequency for x in lines]), kind="stable")
     # Where each line of each piece stands.
     place = np.split(np.argsort(order), np.cumsum(size)[:-1])
     n, q = order.size, seen[0].e.shape[1]
-    X = np.empty((n, changes[0].shape[1] if changes else 0), complex)
     e, f = np.zeros((n, q), complex), np.zeros(n)
     k, which = np.zeros(n, np.int64), np.zeros(n, np.int64)
     for i, on in enumerate(place):
-        if changes:
-            X[on] = changes[i]
         e[on], f[on], k[on], which[on] = seen[i].e, lines[i].frequency, lines[i].k, i
-    return Rows(X, e, [s.N for s in seen], f, k, which, order)
+    return Rows(changes, e, [s.N for s in seen], f, k, which, order)
 
 
 def changes_of(records: Records, contour: Contour, nodes: Int) -> list[Complex]:

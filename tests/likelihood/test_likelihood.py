@@ -190,12 +190,13 @@ def test_the_residual_of_pieces_that_share_a_change_is_what_no_change_and_nuisan
     piece = np.repeat(np.arange(len(lines)), lines)
     k = np.arange(n)
     N = [drawn(own, q, m) for own in lines]
-    rows = Rows(drawn(n, b), drawn(n, q), N, k + 1.0, k, piece, k)
-    left, free = _of_pieces(rows.e, rows.each(), as_real(rows.X))
+    X = drawn(n, b)
+    rows = Rows((), drawn(n, q), N, k + 1.0, k, piece, k)
+    left, free = _of_pieces(rows.e, rows.each(), as_real(X))
     freedom = 0.0
     for c in range(q):
         own = linalg.block_diag(*(one[:, c] for one in N))
-        A = as_real(np.concatenate([rows.X, own], axis=1))
+        A = as_real(np.concatenate([X, own], axis=1))
         Q = np.linalg.qr(A)[0]
         e = as_real(rows.e[:, c])
         np.testing.assert_allclose(as_real(left[:, c]), e - Q @ (Q.T @ e), atol=1e-9)
@@ -778,3 +779,20 @@ def test_one_line_in_ten_is_kept_apart_of_any_comb(every: int):
     k = np.arange(every, 400 * every, every)
     assert np.mean(_shown(k)) == pytest.approx(0.1, abs=0.03)
     assert np.array_equal(fitted_lines(k), ~_shown(k))
+
+
+def test_what_is_far_from_a_block_of_lines_is_known_from_a_few_points() -> None:
+    """A change in each node as its own response: the record of each, transformed."""
+    n, history, lines = 9000, 400, np.arange(20, 3000)
+    contour = Contour.over(n + history, RATE, SMOOTH)
+    r = np.random.default_rng(5).normal(size=n + history)
+    nodes = np.unique(np.geomspace(30, 6300 * contour.samples / (2 * n), 40).astype(np.int64))
+    nodes = nodes[nodes <= contour.samples // 2]
+    got = columns(contour, contour.damped(r)[None], nodes, history, n, lines)[0]
+    for j in (0, 7, nodes.size - 2):
+        H = np.zeros((contour.samples // 2 + 1, 1), complex)
+        at = np.arange(nodes[0], nodes[-1] + 1)
+        H[at, 0] = np.interp(at, nodes, np.eye(nodes.size)[j])
+        y = contour.predicted(H, r)[history:]
+        want = np.fft.rfft(y, axis=0)[lines, 0]
+        assert np.max(np.abs(got[:, j] - want)) < 1e-8 * np.max(np.abs(want))
