@@ -48,10 +48,18 @@ def closed() -> Recording:
 def test_a_law_that_nobody_stated_is_found_in_the_record(closed: Recording) -> None:
     found = outside(whole(closed), RIG, "v", READ)
     assert found is not None
-    # But for slow parts, which second differences hardly show.
+    # But for slow parts, which differences hardly show.
     off = np.diff(found - stairs(), 2)
     assert np.median(np.abs(off)) < 2 * STEP
     assert np.median(np.abs(np.diff(closed.values_of("v"), 2))) > 100 * STEP
+
+
+def test_so_under_a_sweep() -> None:
+    t = np.arange(4000) / RATE
+    sweep = np.sin(2 * np.pi * (0.5 + 2 * t) * t)
+    found = outside(whole(recorded(sweep, 5, pd=(KP, KD))), RIG, "v", READ)
+    assert found is not None
+    assert np.median(np.abs(np.diff(found - sweep, 2))) < 2 * STEP
 
 
 def test_an_open_loop_has_none() -> None:
