@@ -59,7 +59,7 @@ def modes(n: Names) -> bool:
 
 
 def concealed(n: Names) -> bool:
-    """Twenty sigma: the name is found, or stands among what the data do not tell from it."""
+    """Fourteen sigma: the name is found, or stands among what the data do not tell from it."""
     (hidden,) = n["truth"]["effects"]
     causes = [(c.physics, c.site) for c in n["found"].causes]
     named = [*causes, *(e for c in n["found"].causes for e in c.equivalents)]

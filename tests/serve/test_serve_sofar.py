@@ -273,12 +273,12 @@ def test_without_an_answer_no_chance_is_told(right: Diagnosis) -> None:
 
 
 def test_the_diagnosis_of_the_command_line_is_kept_beside_the_recording(
-    swept: tuple[Plan, Recording, int],
+    of_periods: tuple[Plan, Recording, int],
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     only(monkeypatch, ("torsional_compliance", "joint_1"))
-    path = Path(swept[1].source)
+    path = Path(of_periods[1].source)
     with (
         patch("sys.argv", ["samii-rig", "diagnose", str(path)]),
         pytest.raises(SystemExit) as ended,
