@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from diagnose_kit import ALL, FEW, LINES, concealing, effect
 from identify_kit import noiseless, samii
+from table_kit import Effects
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.diagnose import diagnose
@@ -29,12 +30,14 @@ STRONG = Evidence(
     odds=8.0, left=1.0, held=1.0, effects=1, forced=False, confirmed=False, gain=50.0,
     drop=1e4, names=3, pair=False, closed=1.0,
 )  # fmt: skip
-TABLE = [
-    e
-    for e in ALL
-    if e.physics == "torsional_compliance"
-    or (e.physics == "viscous_damping" and e.variant == "beside the spring")
-]
+TABLE = Effects(
+    lambda: [
+        e
+        for e in ALL
+        if e.physics == "torsional_compliance"
+        or (e.physics == "viscous_damping" and e.variant == "beside the spring")
+    ]
+)
 
 
 def softened(name, share):

@@ -2,7 +2,6 @@
 
 import time
 
-import control
 import numpy as np
 import pytest
 from fem_kit import SOURCE, chain, samii
@@ -107,6 +106,8 @@ def test_a_torque_turns_its_joint_by_the_inertia_behind_it() -> None:
 
 
 def test_python_control_gets_the_same_model() -> None:
+    import control  # here: a fifth of a second for each process that collects the tests
+
     reduced = reduce(Fem(samii()))
     system = reduced.to_statespace()
     assert isinstance(system, control.StateSpace)

@@ -2,7 +2,6 @@
 
 import csv
 
-import control
 import numpy as np
 import pytest
 import pyuff
@@ -84,6 +83,8 @@ def test_uff_is_read_by_pyuff(tmp_path, even):
 
 
 def test_python_control_evaluates_it():
+    import control  # here: a fifth of a second for each process that collects the tests
+
     r = measured()
     system = r.to_control()
     assert system.output_labels == ["theta_2", "a_0"]

@@ -21,8 +21,6 @@ from samii_rig.prove import campaign, jobs
 from samii_rig.rig.load import load_rig
 from samii_rig.workers import workers
 
-distributed = pytest.importorskip("distributed")
-
 SWEEP = """
 experiment = "swept_sine"
 name = "sweep"
@@ -41,6 +39,8 @@ repeats = 3
 
 @pytest.fixture(scope="module")
 def scheduler() -> Iterator[str]:
+    # Here: a fifth of a second for each process that collects the tests.
+    distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
     ) as cluster:

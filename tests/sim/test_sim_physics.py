@@ -1,6 +1,5 @@
 """The simulated rig against what physics and the transfer matrices say, through its samples."""
 
-import control
 import numpy as np
 import pytest
 from sim_physics_kit import LINES, PERIOD, last_period, multisine
@@ -67,6 +66,8 @@ def test_without_noise_inner_steps_change_nothing():
 
 
 def test_a_step_is_the_hold_equivalent_of_python_control():
+    import control  # here: a fifth of a second for each process that collects the tests
+
     rig = fine(load_rig("samii")[0])
     made = realise(rig, 200.0)
     A, B, C, D = made.state_space()
