@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -572,13 +573,19 @@ def test_a_trial_says_what_it_conceals_and_is_the_same_again(tmp_path: Path) -> 
     assert np.abs(v - (u - 2.0 * theta)).max() <= 0.51 * 20.0 / 2**16
 
 
-def test_the_truth_explains_the_record_and_the_rig_file_does_not(tmp_path: Path) -> None:
-    seed = 3
-    folder = make("one", seed, tmp_path, _samii(), STYLE)
-    rngs = [np.random.default_rng([seed, trial.KINDS.index("one"), k]) for k in range(3)]
-    scene = trial.scene_of(rngs[0], rngs[1], parse(Rig, _samii(), "samii"), STYLE)
-    wanted = trial.Wanted("one", "", size.SIZE_CLOSE)
-    (hidden,) = trial._concealed(rngs[2], wanted, scene, trial.nominal_refit(scene))
+def test_the_truth_explains_the_record_and_the_rig_file_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conceal, drawn = trial.conceal, []
+
+    def kept(*order: Any) -> trial.Conceals:
+        drawn.append(conceal(*order))
+        return drawn[-1]
+
+    monkeypatch.setattr(trial, "conceal", kept)
+    folder = make("one", 3, tmp_path, _samii(), STYLE)
+    (made,) = drawn
+    scene, (hidden,) = made.scene, made.found
     run = read_recording(folder / "run_01.mcap")
     y = run.values[:, -4:] - scene.noise.offset
     r = run.values[:, [run.column("v_2")]] + y @ scene.control.feedback.T
