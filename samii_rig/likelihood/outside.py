@@ -18,7 +18,7 @@ from samii_rig.likelihood.bridged import Bridged
 from samii_rig.model.feedback import sections
 from samii_rig.rig.schema import Feedback, Rig
 from samii_rig.signal import local
-from samii_rig.signal.columns import asked
+from samii_rig.signal.columns import asked, of_input
 from samii_rig.signal.groups import Piece
 from samii_rig.signal.spectra import spectrum
 from samii_rig.types import Float, Recording
@@ -49,7 +49,11 @@ def outside(whole: Bridged, rig: Rig, command: str, read: Collection[str]) -> Fl
     """(n,) what moved a command from outside; None where the command itself is the best that is
     known: no loop ran, neither its law nor its reference is, or the noise of none of the sensors
     that are `read` goes round it."""
-    recording = whole.recording
+    if not any(c.name == command for c in whole.recording.channels):
+        return None
+    recording = of_input(whole.recording, command)
+    if len(recording) < FEWEST:
+        return None
     laws = [loop for loop in rig.feedback if loop.actuator == command]
     centring = rig.centring_of(command)
     around = {loop.sensor for loop in laws} | ({centring.sensor} if centring else set())
@@ -104,7 +108,7 @@ def _left_of(v: Float, z: Float) -> Float:
     read = [dz[ORDER - i : n - i] for i in range(ORDER + 1)]
     X, goal = np.stack([*before, *read], axis=1), dv[ORDER:]
     size = np.sqrt(np.mean(X**2, axis=0))
-    if goal.size < FEWEST or not np.all(size > 0):
+    if not np.all(size > 0):
         return v
     X, weight = X / size, np.ones(goal.size)
     least = np.mean(np.abs(goal)) / goal.size
@@ -133,10 +137,8 @@ def _asked(recording: Recording, rig: Rig, command: str) -> Float | None:
         return None
     n = max(v.size // STRETCHES, FEWEST)
     power = signal.welch(v, nperseg=n)[1]
-    explained = signal.coherence(v, r, nperseg=n)[1]
-    return (
-        r if float(np.sum(power * np.nan_to_num(explained)) / np.sum(power)) > EXPLAINED else None
-    )
+    each = np.nan_to_num(signal.coherence(v, r, nperseg=n)[1])
+    return r if float(power @ each) > EXPLAINED * float(np.sum(power)) else None
 
 
 def _misfit(v: Float, r: Float) -> float:

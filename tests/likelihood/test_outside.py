@@ -71,6 +71,15 @@ def test_an_open_loop_has_none() -> None:
         assert outside(whole(recorded(v, 6)), RIG, "v", READ) is None
 
 
+def test_what_was_not_recorded_or_for_a_moment_only_has_none(closed: Recording) -> None:
+    assert outside(whole(closed), RIG, "v_2", READ) is None
+    few = replace(
+        closed, time=closed.time[:40], sequence=closed.sequence[:40], values=closed.values[:40],
+        quality=closed.quality[:40], segments=(),
+    )  # fmt: skip
+    assert outside(whole(few), RIG, "v", READ) is None
+
+
 def test_a_stated_law_that_ran_leaves_what_moved_it() -> None:
     rig = RIG.model_copy(update={"feedback": (PD,)})
     run = recorded(stairs(), 5)
