@@ -52,7 +52,7 @@ def columns(contour: Contour, X: Complex, nodes: Int, history: int, n: int, line
         points = np.cos((np.arange(POINTS) + 0.5) * (np.pi / POINTS))
         at = (middle[:, None] + half[:, None] * points).ravel()
         few = summed(at, np.repeat(np.arange(middle.size), POINTS), far)
-        for i in range(middle.size):
+        for i in np.flatnonzero(far.any(axis=1)):  # a block of one line has none
             on = slice(i * BLOCK, (i + 1) * BLOCK)
             own = few[:, i * POINTS : (i + 1) * POINTS]
             out[:, on] += _through(points, (turn[on] - middle[i]) / half[i]) @ own

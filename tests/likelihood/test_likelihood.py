@@ -781,9 +781,10 @@ def test_one_line_in_ten_is_kept_apart_of_any_comb(every: int):
     assert np.array_equal(fitted_lines(k), ~_shown(k))
 
 
-def test_what_is_far_from_a_block_of_lines_is_known_from_a_few_points() -> None:
+@pytest.mark.parametrize("last", [3000, 20 + 256 * 10 + 1])  # and a block of one line
+def test_what_is_far_from_a_block_of_lines_is_known_from_a_few_points(last: int) -> None:
     """A change in each node as its own response: the record of each, transformed."""
-    n, history, lines = 9000, 400, np.arange(20, 3000)
+    n, history, lines = 9000, 400, np.arange(20, last)
     contour = Contour.over(n + history, RATE, SMOOTH)
     r = np.random.default_rng(5).normal(size=n + history)
     nodes = np.unique(np.geomspace(30, 6300 * contour.samples / (2 * n), 40).astype(np.int64))
