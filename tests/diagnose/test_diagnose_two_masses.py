@@ -29,6 +29,10 @@ def test_nothing_is_missing_and_the_noise_is_the_sensors_own(nothing: Diagnosis)
     assert noisy(nothing) == []
 
 
+def test_so_where_nothing_is_looked_for() -> None:
+    assert diagnosed(recorded(V[:1500], 1), effects=()).verdict == "no_mismatch"
+
+
 def test_that_no_reference_was_recorded_is_the_last_to_be_said(nothing: Diagnosis) -> None:
     assert nothing.not_physics[-1].startswith("no reference was recorded")
 

@@ -285,6 +285,8 @@ class RecordSearch(Search):
     @property
     def critical_value(self) -> float:
         """As of `Explanations`: with `ALARM`, noise reaches it in the best of the whole table."""
+        if not self.table:
+            return float(stats.chi2.isf(ALARM, 1))
         unknowns = np.array([max(len(e.unknowns), 1) for e in self.table])
         trials = np.ones(unknowns.size)
         # What resonates is looked for at every line: as many trials of its mass and phase, alike at
