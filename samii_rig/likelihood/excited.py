@@ -46,14 +46,14 @@ def records_of(
             (b[0], min(b[1], top)) if b and b[0] < top else None
             for b, top in zip(bands_of, tops, strict=True)
         ]
-    driven = [
-        (p, (b[0], min(b[1], _follows(p))))
-        for p, b in zip(pieces, bands_of, strict=True)
-        if b and b[0] + CYCLES * rate_hz / len(p.z) < _follows(p)
-    ]
+    driven = [(p, b) for p, b in zip(pieces, bands_of, strict=True) if b]
     if not driven:
         raise EstimateError("nothing drives the rig for five cycles of any line")
-    bands = tuple(band or b for _, b in driven)
+    each = [(p, _followed(p, band or b, rate_hz)) for p, b in driven]
+    driven = [(p, b) for p, b in each if b]
+    if not driven:
+        raise EstimateError("in this band the command is only what a loop makes of noise")
+    bands = tuple(b for _, b in driven)
     some = tuple(p for p, _ in driven)
     driven_hz = min(_above_meter(some, rate_hz), max(_follows(p) for p in some))
     return Records(some, rate_hz, bands, step, driven=driven_hz, every=every)
@@ -62,6 +62,17 @@ def records_of(
 def _follows(piece: Piece) -> float:
     """Hz up to which a command of a piece follows what moves it from outside."""
     return max(told.follows for told in piece.commands)
+
+
+def _followed(
+    piece: Piece, band: tuple[float, float], rate_hz: float
+) -> tuple[float, float] | None:
+    """The band up to there; None where that is none of five lines."""
+    low, high = band
+    follows = _follows(piece)
+    if follows >= high:
+        return band
+    return (low, follows) if follows - low > CYCLES * rate_hz / len(piece.z) else None
 
 
 def _above_meter(pieces: Sequence[Piece], rate_hz: float) -> float:

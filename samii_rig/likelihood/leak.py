@@ -33,6 +33,8 @@ def columns(contour: Contour, X: Complex, nodes: Int, history: int, n: int, line
     X : (m, M//2 + 1) damped inputs. nodes : (n_nodes,) lines of the contour, increasing.
     history, n : of the records. lines : (n_lines,) of their DFT, increasing.
     """
+    if not lines.size:
+        return np.zeros((X.shape[0], 0, 2 * nodes.size), complex)
     step, by = contour.sigma / contour.rate_hz, np.ascontiguousarray(X)
     turn = np.asarray(lines * (2 * np.pi / n), np.float64)
 

@@ -25,12 +25,11 @@ from samii_rig.types import Float, Recording
 
 # Differences that noise has and an excitation hardly has: of a sine at a tenth of the rate 0.06, of
 # white noise 30. Of a command's noise, by these, what is left without what a loop made of a
-# sensor's: one that did not run would add to it. And of a law that nobody stated, which may fit by
-# chance: of open loops at least 0.8 was left, of PD loops at most 0.08.
-ROUGH = 6
-QUIETER, SHOWN = 0.9, 0.2
-# Coefficients of a law that nobody stated, of sensor and command each: a PD controller has one, a
-# PID one two. Rounds to its least absolute residual, and samples that show it to a thousandth.
+# sensor's: a law that did not run would add to it, and one that nobody stated may fit by chance. Of
+# open loops at least 0.8 was left, of PD loops at most 0.08.
+ROUGH, SHOWN = 6, 0.2
+# Poles and zeros of a law that nobody stated: a PD controller with its filter has one of each.
+# Rounds to its least absolute residual, and samples that show it to a thousandth.
 ORDER, ROUNDS, LOOKED_AT = 2, 30, 1 << 15
 # Of a command's energy at least, what the reference explains line by line: what moves the rig
 # besides is recorded nowhere, and must not be taken for the loop's answer to noise. And the part
@@ -59,7 +58,7 @@ def outside(whole: Bridged, rig: Rig, command: str, read: Collection[str]) -> Fl
     around = {loop.sensor for loop in laws} | ({centring.sensor} if centring else set())
     if around and not around & set(read):
         return None
-    found = _without(recording, rig, command, laws) if laws else None
+    found = _without(recording, rig, command, laws) if around else None
     if found is None:
         found = _asked(recording, rig, command)
     if found is None:
@@ -82,7 +81,7 @@ def _without(recording: Recording, rig: Rig, command: str, laws: list[Feedback])
         sos = np.insert(rows, 3, 1.0, axis=1)
         y = np.asarray(signal.sosfilt(sos, recording.values_of(loop.sensor)), np.float64)
         made += np.clip(y, -loop.max, loop.max)
-    return v - made if _rough(v - made) < QUIETER * _rough(v) else None
+    return v - made if _rough(v - made) < SHOWN * _rough(v) else None
 
 
 def _less_a_law(recording: Recording, command: str, read: Collection[str]) -> Float | None:
@@ -131,7 +130,7 @@ def _asked(recording: Recording, rig: Rig, command: str) -> Float | None:
     centring = rig.centring_of(command)
     r = asked(recording, command, centring.kp if centring else 0.0)
     size = float(np.sum((v - np.mean(v)) ** 2))
-    if not np.any(r) or not np.all(np.isfinite(r)) or size == 0:
+    if not np.all(np.isfinite(r)) or not np.ptp(r) or size == 0:
         return None
     if _misfit(v, r) < ALIKE:
         return None
@@ -142,7 +141,8 @@ def _asked(recording: Recording, rig: Rig, command: str) -> Float | None:
 
 
 def _misfit(v: Float, r: Float) -> float:
-    """Part of v's energy that is not proportional to r."""
+    """Part of v's energy, its mean aside, that is not proportional to r."""
+    v, r = v - np.mean(v), r - np.mean(r)
     return 1 - float(v @ r) ** 2 / float((v @ v) * (r @ r))
 
 
@@ -152,9 +152,11 @@ def _rough(x: Float) -> float:
 
 
 def followed(v: Float, from_outside: Float, rate_hz: float) -> float:
-    """Hz up to which an input follows what moves it from outside, inf where it does everywhere: the
-    highest third of an octave in which the loop's answer to noise is a small part of its power.
-    v, from_outside : (n,)."""
+    """Hz up to which an input follows what moves it from outside: the highest third of an octave in
+    which the loop's answer to noise is a small part of its power. inf where it does everywhere, or
+    nowhere: then nothing tells what it follows. v, from_outside : (n,)."""
+    if not np.ptp(from_outside):
+        return np.inf
     piece = Piece("input", from_outside, np.stack([from_outside, v], axis=1))
     lines = spectrum(piece, rate_hz)
     at = np.unique(np.geomspace(1, lines.frequency.size, MOST_LINES).astype(np.int64)) - 1

@@ -368,9 +368,12 @@ class _Samples:
     def follows(self, first: int, behind: int) -> float:
         """As of `Command`, of samples from `first` to before `behind`."""
         rate = self.whole.recording.rate_hz
-        v = self.v.reshape(len(self.v), -1)[first:behind].T
-        each = zip(v, self.outside, strict=True)
-        return max(followed(v, x[first:behind], rate) if x is not None else np.inf for v, x in each)
+        each = zip(self.v.reshape(len(self.v), -1)[first:behind].T, self.outside, strict=True)
+        moving = [(v, x) for v, x in each if np.ptp(v)]
+        return min(
+            (np.inf if x is None else followed(v, x[first:behind], rate) for v, x in moving),
+            default=np.inf,
+        )
 
 
 def _cut(recording: Recording, segment: Segment, samples: _Samples, step: Float) -> list[Piece]:

@@ -24,6 +24,9 @@ SURE = 0.8  # probability of an answer from which it is named
 MOSTLY = 0.5  # of the mismatch; one cause that explains it is told whatever else is missing
 MOST_NAMES = 4  # of a class; more is no answer
 MUST_SHOW = 900.0  # of chi-square, that an effect explains of the data: 30 noise units
+# Of the mismatch, above which what two states have in common is told: where one of them has it
+# alone, an effect of both explains half, give or take the noise.
+COMMON = 0.6
 PARTLY = 0.9  # of the mismatch: effects that leave more of it, and more than noise, are not named
 WITH_CAUSES = ("named", "ambiguous")  # verdicts that come with causes
 
@@ -294,7 +297,8 @@ def of_several_states(judged: Judgement, part: float) -> Judgement:
     evidence = replace(judged.evidence, closed=min(judged.evidence.closed, 1 - part))
     if evidence.closed >= PARTLY:
         return judged
-    return replace(judged, verdict=_most(judged.verdict, evidence))
+    known = evidence.closed > COMMON
+    return replace(judged, verdict=_most(judged.verdict, evidence) if known else "unknown")
 
 
 def shown(judged: Judgement, gap: Gap, due: float) -> Judgement:
