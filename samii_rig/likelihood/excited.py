@@ -11,13 +11,14 @@ from scipy import ndimage, signal
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.algebra import by_input
 from samii_rig.likelihood.nuisance import HIGHEST
+from samii_rig.likelihood.outside import OCTAVE_PARTS
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.likelihood.records import CYCLES, Records
 from samii_rig.types import Float
 
 # Of the largest, an input's energy in a third of an octave that excites: steps through frequencies,
 # of as many periods each, and steps of the input have that over 2.5 decades.
-EXCITED, OCTAVE_PARTS = 0.003, 3
+EXCITED = 0.003
 # The same, from which on an input moves a rig by more than its noise: a thousandth in amplitude. A
 # square wave does so far above its band.
 DRIVES = 1e-6
@@ -55,24 +56,20 @@ def records_of(
         raise EstimateError("in this band the command is only what a loop makes of noise")
     bands = tuple(b for _, b in driven)
     some = tuple(p for p, _ in driven)
-    driven_hz = min(_above_meter(some, rate_hz), max(_follows(p) for p in some))
+    driven_hz = min(_above_meter(some, rate_hz), max(p.follows for p in some))
     return Records(some, rate_hz, bands, step, driven=driven_hz, every=every)
-
-
-def _follows(piece: Piece) -> float:
-    """Hz up to which a command of a piece follows what moves it from outside."""
-    return max(told.follows for told in piece.commands)
 
 
 def _followed(
     piece: Piece, band: tuple[float, float], rate_hz: float
 ) -> tuple[float, float] | None:
-    """The band up to there; None where that is none of five lines."""
+    """The band up to where a command follows what moves it from outside; None where that is none of
+    five lines."""
     low, high = band
-    follows = _follows(piece)
-    if follows >= high:
+    if piece.follows >= high:
         return band
-    return (low, follows) if follows - low > CYCLES * rate_hz / len(piece.z) else None
+    wide = piece.follows - low > CYCLES * rate_hz / len(piece.z)
+    return (low, piece.follows) if wide else None
 
 
 def _above_meter(pieces: Sequence[Piece], rate_hz: float) -> float:

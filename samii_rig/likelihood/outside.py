@@ -30,11 +30,11 @@ from samii_rig.types import Float, Recording
 ROUGH, SHOWN = 6, 0.2
 # Poles and zeros of a law that nobody stated: a PD controller with its filter has one of each.
 # Rounds to its least absolute residual, and samples that show it to a thousandth.
-ORDER, ROUNDS, LOOKED_AT = 2, 30, 1 << 15
+LAW_ORDER, ROUNDS, LOOKED_AT = 2, 30, 1 << 15
 # Of a command's energy at least, what the reference explains line by line: what moves the rig
 # besides is recorded nowhere, and must not be taken for the loop's answer to noise. And the part
 # that is not proportional to it, below which it is the command.
-EXPLAINED, ALIKE = 0.5, 1e-3
+EXPLAINED, IS_COMMAND = 0.5, 1e-3
 STRETCHES, FEWEST = 8, 64  # of a record, by which that is judged, and samples of each at least
 DEGREE = 2  # of the local models' denominators: a mode within a window
 # Of an input's power in a third of an octave, the loop's answer to noise up to which it follows
@@ -53,12 +53,11 @@ def outside(whole: Bridged, rig: Rig, command: str, read: Collection[str]) -> Fl
     recording = of_input(whole.recording, command)
     if len(recording) < FEWEST:
         return None
-    laws = [loop for loop in rig.feedback if loop.actuator == command]
-    centring = rig.centring_of(command)
-    around = {loop.sensor for loop in laws} | ({centring.sensor} if centring else set())
+    loops = (*_laws(rig, command), rig.centring_of(command))
+    around = {loop.sensor for loop in loops if loop is not None}
     if around and not around & set(read):
         return None
-    found = _without(recording, rig, command, laws) if around else None
+    found = _without(recording, rig, command, around) if around else None
     if found is None:
         found = _asked(recording, rig, command)
     if found is None:
@@ -66,17 +65,19 @@ def outside(whole: Bridged, rig: Rig, command: str, read: Collection[str]) -> Fl
     return found
 
 
-def _without(recording: Recording, rig: Rig, command: str, laws: list[Feedback]) -> Float | None:
-    """A command less what the rig file's loops made of the sensors; None where one of these was not
-    recorded as the loop saw it, or the loops did not run."""
-    centring = rig.centring_of(command)
-    read = {loop.sensor for loop in laws} | ({centring.sensor} if centring else set())
+def _laws(rig: Rig, command: str) -> list[Feedback]:
+    return [loop for loop in rig.feedback if loop.actuator == command]
+
+
+def _without(recording: Recording, rig: Rig, command: str, around: Collection[str]) -> Float | None:
+    """A command less what the rig file's loops made of the sensors that they are `around`; None
+    where one of these was not recorded as the loop saw it, or the loops did not run."""
     at_rate = abs(recording.rate_hz / rig.rate_hz - 1) < 1e-6
-    if not at_rate or not read <= {c.name for c in recording.channels}:
+    if not at_rate or not set(around) <= {c.name for c in recording.channels}:
         return None
-    v = recording.values_of(command)
+    v, centring = recording.values_of(command), rig.centring_of(command)
     made = -centring.kp * recording.values_of(centring.sensor) if centring else np.zeros(v.size)
-    for loop in laws:
+    for loop in _laws(rig, command):
         rows = sections(loop, rig.rate_hz)
         sos = np.insert(rows, 3, 1.0, axis=1)
         y = np.asarray(signal.sosfilt(sos, recording.values_of(loop.sensor)), np.float64)
@@ -100,12 +101,12 @@ def _less_a_law(recording: Recording, command: str, read: Collection[str]) -> Fl
 
 
 def _left_of(v: Float, z: Float) -> Float:
-    """v (n,) less what the likeliest law of `ORDER` makes of z (n,); v where none is stable."""
+    """v (n,) less what the likeliest law of `LAW_ORDER` makes of z (n,); v where none is stable."""
     dv, dz = np.diff(v[:LOOKED_AT], ROUGH), np.diff(z[:LOOKED_AT], ROUGH)
     n = dv.size
-    before = [dv[ORDER - i : n - i] for i in range(1, ORDER + 1)]
-    read = [dz[ORDER - i : n - i] for i in range(ORDER + 1)]
-    X, goal = np.stack([*before, *read], axis=1), dv[ORDER:]
+    before = [dv[LAW_ORDER - i : n - i] for i in range(1, LAW_ORDER + 1)]
+    read = [dz[LAW_ORDER - i : n - i] for i in range(LAW_ORDER + 1)]
+    X, goal = np.stack([*before, *read], axis=1), dv[LAW_ORDER:]
     size = np.sqrt(np.mean(X**2, axis=0))
     if not np.all(size > 0):
         return v
@@ -115,10 +116,10 @@ def _left_of(v: Float, z: Float) -> Float:
         law = np.linalg.lstsq(X * weight[:, None], goal * weight, rcond=None)[0]
         weight = 1 / np.sqrt(np.maximum(np.abs(goal - X @ law), least))
     law = law / size
-    poles = np.append(1.0, -law[:ORDER])
+    poles = np.append(1.0, -law[:LAW_ORDER])
     if np.max(np.abs(np.roots(poles))) >= 1:
         return v
-    return np.asarray(v - signal.lfilter(law[ORDER:], poles, z), np.float64)
+    return np.asarray(v - signal.lfilter(law[LAW_ORDER:], poles, z), np.float64)
 
 
 def _asked(recording: Recording, rig: Rig, command: str) -> Float | None:
@@ -132,7 +133,7 @@ def _asked(recording: Recording, rig: Rig, command: str) -> Float | None:
     size = float(np.sum((v - np.mean(v)) ** 2))
     if not np.all(np.isfinite(r)) or not np.ptp(r) or size == 0:
         return None
-    if _misfit(v, r) < ALIKE:
+    if _misfit(v, r) < IS_COMMAND:
         return None
     n = max(v.size // STRETCHES, FEWEST)
     power = signal.welch(v, nperseg=n)[1]

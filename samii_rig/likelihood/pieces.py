@@ -97,6 +97,11 @@ class Piece:
     unknown: tuple[tuple[int, int], ...] = ()
 
     @property
+    def follows(self) -> float:
+        """As of `Command`, of the one that follows furthest."""
+        return max(told.follows for told in self.commands)
+
+    @property
     def inputs(self) -> int:
         """How many inputs the rig has."""
         return 1 if self.r.ndim == 1 else self.r.shape[1]

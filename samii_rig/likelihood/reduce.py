@@ -18,7 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samii_rig.likelihood import rounding
-from samii_rig.likelihood.algebra import SAME, as_complex, as_real, lengths, orthonormal
+from samii_rig.likelihood.algebra import (
+    SAME,
+    as_complex,
+    as_real,
+    directions,
+    lengths,
+    orthonormal,
+)
 from samii_rig.likelihood.before import with_past
 from samii_rig.likelihood.form import Reduced, quadratic
 from samii_rig.likelihood.free import Free, differing, residual_of, with_repeats
@@ -181,11 +188,9 @@ def _along(rows: Rows, scale: Float, errors: Complex) -> tuple[Float, float]:
     """(m, k) errors (n, k) along the directions of all changes of lines times scale (n, 1), and the
     power that independent ones of their size have there."""
     each = [(on, as_real(X * scale[on])) for on, X in rows.changes()]
-    size = np.sqrt(sum(np.sum(X**2, axis=0) for _, X in each))
-    size = np.where(size > 0, size, 1.0)
-    values, turn = np.linalg.eigh(sum(X.T @ X for _, X in each) / np.outer(size, size))
+    values, turn = directions(np.asarray(sum(X.T @ X for _, X in each)))
     kept = values > SAME * np.max(values, initial=0.0)
-    root = turn[:, kept] / np.sqrt(values[kept]) / size[:, None]
+    root = turn[:, kept] / np.sqrt(values[kept])
     along, independent = np.zeros((root.shape[1], errors.shape[1])), 0.0
     power = np.mean(np.abs(errors) ** 2, axis=1) / 2  # of the real part, and of the other
     for on, X in each:

@@ -10,6 +10,7 @@ from two_masses_kit import RATE, RIG, recorded
 
 from samii_rig.likelihood.bridged import Bridged
 from samii_rig.likelihood.outside import followed, outside
+from samii_rig.model.feedback import state_space
 from samii_rig.rig.schema import Feedback, Rig
 from samii_rig.types import Channel, Float, Recording
 
@@ -93,8 +94,6 @@ def test_a_stated_law_that_ran_leaves_what_moved_it() -> None:
 
 def _in_loop(rig: Rig, run: Recording) -> Recording:
     """A record whose command has what the loop of a rig file makes of what x_1 reads."""
-    from samii_rig.model.feedback import state_space
-
     A, B, C, D = state_space(rig.feedback[0], RATE)
     noisy = run.values_of("x_1") + 1e-5 * np.random.default_rng(2).standard_normal(len(run))
     w, made = np.zeros(len(A)), np.zeros(len(run))

@@ -301,7 +301,7 @@ def _answering(records: Records) -> dict[str, str]:
     """Of pieces whose command answers noise above a frequency, why they are not used there."""
     each: dict[str, float] = {}
     for p in records.pieces:
-        each[p.name] = min(each.get(p.name, np.inf), max(told.follows for told in p.commands))
+        each[p.name] = min(each.get(p.name, np.inf), p.follows)
     why = "above {:.3g} Hz its command is what a loop makes of the sensor's noise"
     return {name: why.format(hz) for name, hz in each.items() if np.isfinite(hz)}
 
