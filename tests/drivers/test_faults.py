@@ -15,7 +15,7 @@ import pytest
 from board_kit import NODES, options
 from fault_host import plan_of
 from faults_kit import PATIENCE, STATES, Held, held, null_of
-from wire_kit import Wire
+from wire_kit import Wire, slow_deadman
 
 from samii_rig.devices.protocols import CommandBlock
 from samii_rig.errors import DeviceError, GateError
@@ -27,8 +27,9 @@ BOTH = ("armed", "running")
 
 
 @pytest.fixture(scope="module", params=NODES)
-def shared(request: pytest.FixtureRequest) -> Iterator[Wire]:
-    w = Wire("--seed", "7", *options(request.param))
+def shared(request: pytest.FixtureRequest, tmp_path_factory) -> Iterator[Wire]:
+    file = slow_deadman(tmp_path_factory.mktemp("rig"))
+    w = Wire("--seed", "7", *options(request.param), rig=str(file))
     yield w
     w.close()
 

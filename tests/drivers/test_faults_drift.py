@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import pytest
 from faults_kit import PATIENCE, held, null_of
-from gate_agreement_kit import ONE, SAMII, TWO
-from wire_kit import Wire
+from gate_agreement_kit import ONE, TWO
+from wire_kit import Wire, slow_deadman
 
 from samii_rig.errors import GateError
 from samii_rig.safety.judgement import State
@@ -20,8 +20,8 @@ CASES = {"pot_2": (TWO, 800, 326), "v_2": (ONE, 4000, 103)}
 @pytest.fixture(scope="module", params=CASES)
 def case(request, tmp_path_factory) -> Iterator[tuple[Wire, str, int, int]]:
     agreement, counts, samples = CASES[request.param]
-    path = tmp_path_factory.mktemp("rig") / "agreeing.toml"
-    path.write_text(SAMII + agreement)
+    path = slow_deadman(tmp_path_factory.mktemp("rig"))
+    path.write_text(path.read_text() + agreement)
     w = Wire("--seed", "7", rig=str(path))
     yield w, request.param, counts, samples
     w.close()

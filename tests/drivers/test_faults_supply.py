@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from faults_kit import STATES, held, null_of
-from wire_kit import Wire, until
+from wire_kit import Wire, slow_deadman, until
 
 from samii_rig.run.session import listen
 from samii_rig.safety.judgement import State
@@ -17,8 +17,9 @@ STRAY = "stray 500"  # counts: 0.15 V, which turn the joint at 0.076 rad/s
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["supply", "none"])
-def wire(request) -> Iterator[Wire]:
-    w = Wire("--seed", "7", *(["--supply"] if request.param else []))
+def wire(request, tmp_path_factory) -> Iterator[Wire]:
+    file = slow_deadman(tmp_path_factory.mktemp("rig"))
+    w = Wire("--seed", "7", *(["--supply"] if request.param else []), rig=str(file))
     yield w
     w.close()
 

@@ -23,7 +23,8 @@ from samii_rig.run.plan import Plan
 from samii_rig.safety.judgement import State
 
 STATES = ("safe", "armed", "running")
-PATIENCE = 25  # samples in the deadman's 50 ms
+PATIENCE = 60  # samples in the deadman's 0.12 s: wire_kit.slow_deadman
+TICK = 0.003  # s, which a deadman of 50 ms asks for
 
 
 class Held:
@@ -33,7 +34,7 @@ class Held:
         self.wire, self.device = wire, wire.open(**settings)
         self.sink = Memory()
         plan = plan or plan_of(wire.rig, 20.0)
-        self.job = _Run(plan, wire.rig, self.device, self.sink, NOBODY, LoopSettings())
+        self.job = _Run(plan, wire.rig, self.device, self.sink, NOBODY, LoopSettings(TICK))
         self.stop, self.signals = Event(), Interrupts()
         self.state = "safe"
         self.ended: tuple[str, str] | None = None
