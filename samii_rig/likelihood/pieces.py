@@ -315,6 +315,8 @@ def _driving(
         noisy = r
         r, meter = inputs.calibrated(noisy, recording.channels[column].resolution)
         v = v + (r - noisy)
+        if meter.shown > 0:
+            edges = edges | inputs.stepped(noisy, meter)
     return v, r, edges, meter
 
 

@@ -10,6 +10,7 @@ from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.rig.load import load_rig
+from samii_rig.rig.schema import Rig
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Channel, Float, Recording, Segment
 
@@ -29,12 +30,16 @@ def recorded(
     gain: Callable[[float], float] = lambda t: 1.0,
     more: float = 0.0,
     pd: tuple[float, float] | None = None,
+    every: int = 1,
+    meter: float = 0.0,
 ) -> Recording:
     """A record from rest under a held command v (n,) V, with the noise that the rig file states.
 
     k3 : N/m^3 of the first spring. gain : of the coil, over time in s. more : kg on the second
     mass. pd : V/m and V s/m of a loop around what x_1 reads, whose reference is v then, and is not
-    recorded; what goes out is rounded to the converter's steps.
+    recorded; what goes out is rounded to the converter's steps. every : samples of the command for
+    one that is recorded. meter : V, noise of what showed the command, the mean of both sides of its
+    edges; 0 where it was recorded as it was sent.
     """
     h, v, m2 = 1 / (RATE * SUBSTEPS), v.copy(), M2 + more
     noise = np.random.default_rng(seed).standard_normal((v.size, 2)) * [1e-6, 0.02]
@@ -68,16 +73,19 @@ def recorded(
         Channel("x_1", "m", resolution=0.5e-6),
         Channel("a_2", "m/s^2"),
     )
-    at = np.arange(v.size)
-    values = np.column_stack([v, noisy])
+    if meter:
+        v = (v + np.append(0.0, v[:-1])) / 2
+        v += meter * np.random.default_rng([seed, 1]).standard_normal(v.size)
+    values = np.column_stack([v, noisy])[::every]
+    at = np.arange(len(values))
     return Recording(
         channels,
-        RATE,
-        at * 2_000_000,
+        RATE / every,
+        at * 2_000_000 * every,
         at,
         values,
         np.zeros(values.shape, np.uint8),
-        (Segment("random", "single", 0, v.size, float(np.max(np.abs(v))), "V"),),
+        (Segment("random", "single", 0, at.size, float(np.max(np.abs(v))), "V"),),
         rig_toml=TEXT,
         source=f"two_masses_{seed}.mcap",
     )
@@ -92,6 +100,8 @@ def random_command(n: int, rms: float, seed: int) -> Float:
     return np.round(v * rms / np.std(v) / 0.3e-3) * 0.3e-3
 
 
-def diagnosed(*runs: Recording, effects: Sequence[Effect] | None = None) -> Diagnosis:
+def diagnosed(
+    *runs: Recording, effects: Sequence[Effect] | None = None, rig: Rig = RIG
+) -> Diagnosis:
     """effects : the linear ones to try, the whole table if None; all forces are."""
-    return diagnose(estimate(runs, gaps="auto"), RIG, runs=runs, effects=effects)
+    return diagnose(estimate(runs, gaps="auto"), rig, runs=runs, effects=effects)

@@ -7,6 +7,7 @@ import pytest
 from scipy import signal, special
 
 from samii_rig.likelihood import nuisance
+from samii_rig.likelihood.inputs import BESIDE_TURN
 from samii_rig.likelihood.pieces import Piece, _cut_off
 from samii_rig.types import Complex, Float, Int
 
@@ -49,37 +50,62 @@ def test_an_edge_between_two_samples_is_known_but_for_its_size_and_instant(kind:
     assert left < fraction_of(response(s[k]) * beyond, impulses(piece, k, impulse)) / 2
 
 
-@pytest.mark.parametrize("late", [0, 1, 4])
-def test_what_an_edge_excites_above_half_the_rate_folds_back(late: int) -> None:
-    """Of a rig with a mode there, of which every fifth sample was recorded."""
-    every, many, k = 5, 8 * N, np.arange(5, int(0.44 * N))
+EVERY, LINES = 5, np.arange(5, int(0.44 * N))
+
+
+def left_by(u: Float) -> tuple[Float, Complex, Float, tuple[Float, ...]]:
+    """Of a rig with a mode above half the rate, of which every fifth sample was recorded, under an
+    input u (n EVERY,): what was recorded of u, the lines that a response up to half the rate leaves
+    of what the rig does, its answer to an impulse, and `nuisance.folding`."""
+    many = 8 * N
     modes = [(0.12, 0.01), (0.8, 0.003)]  # of the record's rate, damping
     A = np.zeros((4, 4))
     for i, (f, zeta) in enumerate(modes):
-        w = 2 * np.pi * f / every
+        w = 2 * np.pi * f / EVERY
         A[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [[0.0, w], [-w, -2 * zeta * w]]
     B = np.array([[0.0], [1.0], [0.0], [1.0]])
     C = np.array([[1.0, 0.0, 0.3, 0.0]])
     rig = signal.cont2discrete((A, B, C, np.zeros((1, 1))), 1.0)
-    u = np.zeros(N * every)
-    u[AT * every + late :] = 1.0
-    once = np.zeros(N * every)
+    once = np.zeros(N * EVERY)
     once[0] = 1.0
     z, fine = (signal.dlsim(rig, x)[1][:, 0] for x in (u, once))
-    r = u[::every]
+    r = u[::EVERY]
     # In the band, of a record that is long enough, beyond it nothing.
     f = np.arange(many // 2 + 1) / many
-    turn = np.exp(2j * np.pi * f / every)
+    turn = np.exp(2j * np.pi * f / EVERY)
     H = np.array([(rig[2] @ np.linalg.solve(x * np.eye(4) - rig[0], rig[1]))[0, 0] for x in turn])
     H *= special.erfc((2 * f - 1) / 0.03) / 2
     impulse = np.fft.irfft(H)[:, None]
-    e = np.fft.rfft(z[::every] - np.fft.irfft(H * np.fft.rfft(r, many))[:N])[k]
-    piece = Piece("steps", r, np.zeros((N, 1)), 0, (), edges=((AT - 1, 0), (AT, 0), (AT + 1, 0)))
-    edges = nuisance.edges(piece, k, impulse)
-    folded = nuisance.folding(impulse, fine[:, None], every)
-    both = nuisance.edges(piece, k, impulse, folded)
-    assert fraction_of(e, both) < 0.01
-    assert fraction_of(e, edges) > 10 * fraction_of(e, both)
+    e = np.fft.rfft(z[::EVERY] - np.fft.irfft(H * np.fft.rfft(r, many))[:N])[LINES]
+    return r, e, impulse, nuisance.folding(impulse, fine[:, None], EVERY)
+
+
+def shapes_of(r: Float, at: range, impulse: Float, folded: tuple[Float, ...] = ()) -> Complex:
+    """Of edges around some samples."""
+    edges = tuple((i, 0) for i in at)
+    piece = Piece("steps", r, np.zeros((N, 1)), 0, (), edges=edges)
+    return nuisance.edges(piece, LINES, impulse, folded)
+
+
+@pytest.mark.parametrize("late", [0, 1, 4])
+def test_what_an_edge_excites_above_half_the_rate_folds_back(late: int) -> None:
+    u = np.zeros(N * EVERY)
+    u[AT * EVERY + late :] = 1.0
+    r, e, impulse, folded = left_by(u)
+    around = range(AT - 1, AT + 2)
+    both = fraction_of(e, shapes_of(r, around, impulse, folded))
+    assert both < 0.01
+    assert fraction_of(e, shapes_of(r, around, impulse)) > 10 * both
+
+
+@pytest.mark.parametrize("late", [-0.5, 2.0])
+def test_of_a_sweep_that_turns_near_half_the_rate_more_folds_back(late: float) -> None:
+    n = np.abs(np.arange(N * EVERY) - AT * EVERY - late)
+    u = np.sin(2 * np.pi * 0.37 / EVERY * n + 0.9) * np.exp(-((n / (EVERY * N / 10)) ** 2))
+    r, e, impulse, folded = left_by(u)
+    two = fraction_of(e, shapes_of(r, range(AT, AT + 2), impulse, folded))
+    beside = range(AT - BESIDE_TURN, AT + 2 + BESIDE_TURN)
+    assert fraction_of(e, shapes_of(r, beside, impulse, folded)) < two / 5
 
 
 def impulses(piece: Piece, k: Int, impulse: Float) -> Complex:
