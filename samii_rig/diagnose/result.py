@@ -129,8 +129,9 @@ class Moved:
 
 @dataclass(frozen=True, slots=True)
 class Exact:
-    """A number that the rig file takes for exact, and is not: with another it explains the
-    recordings to their noise. stated : its value there, in the unit of `value`."""
+    """A number of the rig file that is wrong, though stated as exact or with a small tolerance:
+    with another it explains the recordings to their noise. stated : its value there, in the unit of
+    `value`."""
 
     parameter: str
     stated: float
@@ -438,6 +439,8 @@ class Diagnosis:
                 else "test lines of the state after"
             )
             on = f"on {what}"
+        if self.exact and self.chi2_per_dof <= self.threshold:
+            return f"{sentence(on)[:-1]} the model with it has {after:.3g} of the noise's power."
         if self.exact:
             return (
                 f"{sentence(on)[:-1]} chi-square per degree of freedom falls from {before:.3g} to "

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from table_kit import table_of
-from two_masses_kit import RIG, diagnosed, random_command, recorded
+from two_masses_kit import K2, RIG, diagnosed, random_command, recorded
 
 from samii_rig.diagnose.result import Cause, Diagnosis, Moved
+from samii_rig.rig.schema import Rig, parameters
 
 V = random_command(3000, 1.0, 1)
 K3 = 1.5e9  # N/m^3: at 3.4 mm as much as the spring itself
@@ -45,6 +46,35 @@ def test_what_could_hide_in_a_weighed_mass_is_six_of_its_tolerances(nothing: Dia
         assert size is not None
         assert size >= 6 * mass.tolerance * mass.value * (1 - 1e-9)
         assert size < 0.2 * mass.value
+
+
+def surer(rig: Rig, **tolerances: float) -> Rig:
+    """With smaller tolerances of elements' first parameters."""
+    every = []
+    for e in rig.element:
+        if e.name in tolerances:
+            symbol, p = next(iter(parameters(e).items()))
+            p = p.model_copy(update={"tolerance": tolerances[e.name]})
+            e = e.model_copy(update={symbol: p})
+        every.append(e)
+    return rig.model_copy(update={"element": tuple(every)})
+
+
+@pytest.mark.parametrize(("tolerance", "told"), [(0.006, False), (0.0035, True)])
+def test_a_number_of_the_rig_file_is_wrong_from_five_tolerances_on(tolerance, told) -> None:
+    """The second spring is 2 % softer than stated: 3.4 tolerances, or 5.8."""
+    rig = surer(RIG, mass_1=1e-3, mass_2=1e-3, spring_2=tolerance)
+    found = diagnosed(recorded(V, 5), effects=(), rig=rig)
+    assert found.verdict == ("unknown" if told else "no_mismatch")
+    assert [one.parameter for one in found.exact] == (["spring_2.k"] if told else [])
+    for one in found.exact:
+        assert one.value.low is not None
+        assert one.value.high is not None
+        assert one.value.low < K2 < one.value.high < one.stated
+        what, how_well, next_ = found.lines()
+        assert what.startswith("A number of the rig file is wrong: spring_2.k = ")
+        assert "the model with it has" in how_well
+        assert "measure spring_2.k" in next_
 
 
 def test_a_spring_that_hardens_as_much_as_it_is_stiff_has_its_value() -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from samii_rig.diagnose.data.findings import Checked, Refusal
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.agreeing import Saved, SeveralStates
+from samii_rig.diagnose.fit.exact import far_off
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.search import Search
@@ -144,6 +145,10 @@ def diagnosis_of(
     words = (*own_words, *remarks, *clean.remarks, *clean.lacks)
     levels = len({r.level for r in case.responses})
     why, experiment, gain = _next(search, judged, refusal if missing else None, levels)
+    if exact := () if missing else far_off(search.rig, best.fitted):
+        judged = replace(judged, verdict="unknown")
+        why = "with it the model explains the recordings; what adds to it there would do the same"
+        experiment = f"measure {exact[0].parameter}, correct the rig file and diagnose again"
     untold = judged.varies.describe() if judged.varies is not None and not causes else ""
     return Diagnosis(
         verdict=judged.verdict,
@@ -166,6 +171,7 @@ def diagnosis_of(
         moved=answer.moved(best.fitted),
         could_hide=could_hide(*search.linear_part(best)),
         used=shown.used,
+        exact=exact,
         sigma=math.sqrt(max(judged.evidence.drop, 0.0)) if best.effects or judged.varies else 0.0,
         gain=gain,
         evidence={
