@@ -45,6 +45,12 @@ EVERY = 0.5
 # lines among which another is judged: of so many the median is known to 10 %. And how many times
 # the noise these must have: of less than half input the rest would move a rig more than that does.
 ONCE, JUDGED_AMONG, HALF = 0.01, 201, 2.0
+# Of an input of pulses, as a hammer's: standard deviations of what is between them beyond which one
+# begins, by which it stands out, and down to which it lasts, with so many samples to each side; of
+# all samples the part that they may be, whose noise stays; of the rate, from where on what is there
+# has folded as much as it folds back.
+BEGINS, PULSE, LASTS, BESIDE_PULSE, SPARSE = 6.0, 30.0, 2.5, 2, 0.2
+FOLDED = 0.47
 # Samples by which a record's going on is foretold, and until it is at rest.
 FORETOLD, AFTER = 64, 512
 # Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a
@@ -149,10 +155,12 @@ def sent(
 
 class MeterNoise(NamedTuple):
     """Standard deviation of what a meter put on a command: in its record, and left of that where
-    it was taken out as far as the record shows it."""
+    it was taken out as far as the record shows it. folds : of pulses, what they have at half the
+    rate over the most that they have at any frequency: as much of them folded back."""
 
     shown: float = 0.0
     left: float = 0.0
+    folds: float = 0.0
 
 
 def calibrated(r: Float, step: float) -> tuple[Float, MeterNoise]:
@@ -164,6 +172,13 @@ def calibrated(r: Float, step: float) -> tuple[Float, MeterNoise]:
 
     step : of the command's converter, whose rounding is the input's own.
     """
+    if (between := _between_pulses(r, step)) is not None:
+        rest = float(np.mean(r[between]))
+        left = float(np.std(r[between])) * math.sqrt(float(np.mean(~between)))
+        pulses = np.where(between, rest, r)
+        size = np.abs(np.fft.rfft(pulses - rest))
+        folds = float(np.mean(size[int(2 * FOLDED * size.size) :]) / np.max(size))
+        return pulses, MeterNoise(left, left, folds)
     floor = meter_noise(r, step) ** 2
     if floor == 0:
         return r, MeterNoise()
@@ -181,6 +196,21 @@ def calibrated(r: Float, step: float) -> tuple[Float, MeterNoise]:
     more = (way.size - r.size) // 2
     own: Float = known + np.fft.irfft(spectrum, way.size)[more : more + r.size]
     return own, MeterNoise(math.sqrt(floor), math.sqrt(floor * float(np.mean(part))))
+
+
+def _between_pulses(r: Float, step: float) -> NDArray[np.bool_] | None:
+    """(n,) where an input r (n,) of few pulses rests, so that what is there is its meter's noise;
+    None for an input of another kind, or without noise. step : as of `calibrated`."""
+    if not np.isfinite(r).all():
+        return None
+    off = np.abs(r - np.median(r))
+    sd = TO_SD * float(np.median(off))
+    if sd <= step or np.max(off) < PULSE * sd:
+        return None
+    lasts = ndimage.binary_dilation(off > LASTS * sd)
+    pulses = ndimage.binary_propagation(off > BEGINS * sd, mask=lasts)
+    pulses = ndimage.binary_dilation(pulses, iterations=BESIDE_PULSE)
+    return np.asarray(~pulses) if np.mean(pulses) < SPARSE else None
 
 
 def _stairs(r: Float, noise: float) -> Float:
@@ -255,9 +285,12 @@ def jumps(recording: Recording, command: int, kp: float, theta: Float | None) ->
     return np.asarray(_of_both(edge) | turned)
 
 
-def stepped(r: Float, meter: MeterNoise) -> NDArray[np.bool_]:
+def stepped(r: Float, step: float, meter: MeterNoise) -> NDArray[np.bool_]:
     """(n,) where an input r (n,) jumps that a meter showed, and the sample before: as `jumps`, of
-    what nobody knows how the loop sent it."""
+    what nobody knows how the loop sent it. None of a pulse, which is as smooth as the filter before
+    the converter. step : as of `calibrated`."""
+    if meter.shown == 0 or _between_pulses(r, step) is not None:
+        return np.zeros(r.size, np.bool_)
     return _of_both(_bends(r, 0.0, meter.shown))
 
 

@@ -25,7 +25,8 @@ def nodes_of(
     """
     f = contour.frequency
     inside = (f >= band[0]) & (f <= band[1])
-    turning = np.linalg.norm(np.gradient(H, axis=0), axis=1) / np.linalg.norm(H, axis=1)
+    size, turn = np.linalg.norm(H, axis=1), np.linalg.norm(np.gradient(H, axis=0), axis=1)
+    turning = np.divide(turn, size, out=np.zeros_like(turn), where=size > 0)
     each = 1 / np.maximum(np.arange(f.size), 1)
     if spare:
         density = np.maximum(turning - 2 * each, 0.0) / SPACING + np.minimum(

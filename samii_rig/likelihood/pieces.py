@@ -313,10 +313,10 @@ def _driving(
         r += x.kp * theta
     if not as_sent and not recording.names("reference"):
         noisy = r
-        r, meter = inputs.calibrated(noisy, recording.channels[column].resolution)
+        step = recording.channels[column].resolution
+        r, meter = inputs.calibrated(noisy, step)
         v = v + (r - noisy)
-        if meter.shown > 0:
-            edges = edges | inputs.stepped(noisy, meter)
+        edges = edges | inputs.stepped(noisy, step, meter)
     return v, r, edges, meter
 
 

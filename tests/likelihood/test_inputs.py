@@ -180,7 +180,7 @@ def test_of_a_meters_noise_lines_lose_the_part_that_is_none_of_the_input() -> No
     f = np.arange(2.0, 40.0)
     r = np.cos(2 * np.pi * f * t[:, None] + f) @ np.geomspace(1, 5e-3, f.size)
     shown = r + meter * rng.standard_normal(n)
-    made, (noise, left) = calibrated(shown, STEP)
+    made, (noise, left, _) = calibrated(shown, STEP)
     assert np.std(made - r) == pytest.approx(left, rel=0.5)
     assert left < 0.45 * meter
     assert noise == meter_noise(shown, STEP) == pytest.approx(meter, rel=0.05)
@@ -206,7 +206,7 @@ def test_a_meters_noise_is_none_of_an_input_that_is_cut(kind: str) -> None:
     else:
         t = np.arange(n) / RATE
         r = np.sin(2 * np.pi * (1.0 + 25.0 * t / t[-1]) * t + 1.0)
-    made, (noise, left) = calibrated(r + meter * rng.standard_normal(n), STEP)
+    made, (noise, left, _) = calibrated(r + meter * rng.standard_normal(n), STEP)
     assert noise == pytest.approx(meter, rel=0.05)
     off = made - r
     assert np.std(off) == pytest.approx(left, rel=0.5)
@@ -227,7 +227,7 @@ def test_the_jumps_of_steps_stay_as_sharp_as_they_are(behind: float) -> None:
     for at, size in ((2000, 0.4), (5000, -0.7), (9000, 0.3)):
         r[at:] += size
         r[at] -= (1 - behind) * size
-    made, (noise, left) = calibrated(r + meter * rng.standard_normal(n), STEP)
+    made, (noise, left, _) = calibrated(r + meter * rng.standard_normal(n), STEP)
     assert noise == pytest.approx(meter, rel=0.1)
     off = made - r
     assert np.max(np.abs(off)) < 5 * meter

@@ -9,6 +9,7 @@ few that help most.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
@@ -38,6 +39,7 @@ CLEARLY = 2.0  # times what the best pair leaves of the lines: another that leav
 # 6e-7: of 467 answers "nothing is missing" three stood farther, all with something concealed, and
 # of those with nothing concealed none beyond 4.1.
 FAR_OFF = 5.0
+FAINT = 1e-3  # of what is known of a number, the part that recordings add at least
 NINETY = 1.645  # standard deviations of a 90 % interval
 
 
@@ -112,7 +114,7 @@ def _explaining(
         fitted = found.nominal.fitted
         if found.ratio(fitted) <= threshold(found.spread):
             rig = search.by_line.rig
-            return tuple(_exact_of(rig, (name, LENGTH), fitted) for name in names), found
+            return tuple(_of_length(rig, name, fitted) for name in names), found
     return None
 
 
@@ -153,14 +155,24 @@ def far_off(rig: Rig, fitted: Fitted) -> tuple[Exact, ...]:
     away = np.abs(fitted.x[:n] / fitted.model.prior[:n])
     if not n or np.max(away) < FAR_OFF:
         return ()
-    return (_exact_of(rig, fitted.model.keys[int(np.argmax(away))], fitted),)
+    at = int(np.argmax(away))
+    # By the recordings alone: what the tolerance adds is what turned out to be wrong.
+    known, stated = 1 / float(fitted.covariance()[at, at]), float(fitted.model.prior[at]) ** -2
+    alone = max(known - stated, FAINT * known)
+    more = float(fitted.x[at]) * stated / alone
+    return (_exact_of(rig, fitted.model.keys[at], fitted, more, 1 / math.sqrt(alone)),)
 
 
-def _exact_of(rig: Rig, key: tuple[str, str], fitted: Fitted) -> Exact:
-    name, symbol = key
+def _of_length(rig: Rig, name: str, fitted: Fitted) -> Exact:
+    key = (name, LENGTH)
     at = fitted.model.keys.index(key)
-    sd = float(np.sqrt(fitted.covariance()[at, at]))
-    value = fitted.model.values(fitted.x)[key]
-    low, high = (value * float(np.exp(way * NINETY * sd)) for way in (-1, 1))
+    return _exact_of(rig, key, fitted, 0.0, float(np.sqrt(fitted.covariance()[at, at])))
+
+
+def _exact_of(rig: Rig, key: tuple[str, str], fitted: Fitted, more: float, sd: float) -> Exact:
+    """more, sd : of its logarithm, what there is beside the fit's, and the standard deviation."""
+    name, symbol = key
+    value = fitted.model.values(fitted.x)[key] * math.exp(more)
+    low, high = (value * math.exp(way * NINETY * sd) for way in (-1, 1))
     stated = next(parameters(e)[symbol] for e in flattened(rig.element) if e.name == name)
     return Exact(".".join(key), stated.value, Value(value, stated.unit, low, high))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from samii_rig.model.sampled import sampled_response, sensors_at
 from samii_rig.model.tmm import Chain
@@ -105,7 +106,8 @@ class Far:
         own_few, first, behind = self._apart(passed)
         mean, turn = _mean(first, over(behind, first)), _turn(own)
         left = np.sum(self.terms * (mean * _turn(own_few).conj() - 1), axis=(0, 1))
-        return np.asarray(at.rest * (turn - 1) + self._between(at, left) * turn)
+        more = at.rest * (turn - 1) + self._between(at, left) * turn
+        return np.where(_smooth(first), -at.rest, more)
 
     def slope(
         self, at: Sampled, own: Complex, passed: Complex, d_own: Complex, d_passed: Complex
@@ -121,7 +123,7 @@ class Far:
         left = np.sum(self.terms * (mean * back - 1), axis=(0, 1))
         d_left = np.sum(self.terms * (d_mean * back + mean * d_back), axis=(0, 1))
         between = (at.rest + self._between(at, left)) * d_turn
-        return np.asarray(between + self._between(at, d_left) * turn)
+        return np.where(_smooth(first), 0.0, between + self._between(at, d_left) * turn)
 
     def _apart(self, each: Complex) -> tuple[Complex, Complex, Complex]:
         """At these frequencies (m, q), at each block's first order (2, n, m, q), and behind it."""
@@ -216,6 +218,12 @@ def _slope_of_mean(first: Complex, ratio: Complex, d_ratio: Complex) -> tuple[Co
 def over(a: Complex, b: Complex) -> Complex:
     """a/b, 0 where b is: what is not held has no alias."""
     return np.divide(a, b, out=np.zeros_like(a), where=b != 0)
+
+
+def _smooth(first: Complex) -> NDArray[np.bool_]:
+    """(q,) whether nothing folds back, as of an input that is smooth between its samples: no jump
+    of it either, which `rest` has half of."""
+    return np.asarray(np.all(first == 0, axis=(0, 1, 2)))
 
 
 def _turn(factor: Complex) -> Complex:

@@ -26,7 +26,12 @@ from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.diagnose.verdict.stages import Case, Shown, diagnosis_of, of_states
-from samii_rig.diagnose.verdict.stated_noise import MoreNoise, fits_too_well, more_noise
+from samii_rig.diagnose.verdict.stated_noise import (
+    MoreNoise,
+    fits_too_well,
+    more_noise,
+    unfiltered,
+)
 from samii_rig.errors import EstimateError, SamiiRigError
 from samii_rig.rig.schema import Rig
 from samii_rig.signal import welch
@@ -233,6 +238,11 @@ def _answer(
         shown = replace(shown, with_causes=varies.after)
     if noise := more_noise(search):
         looked = _in_noise(looked, noise, shown)
+    if why := unfiltered(search):
+        own = replace(looked.judged, verdict="unknown")
+        told = looked.judged.verdict in verdict.WITH_CAUSES
+        looked = replace(looked, judged=own if told else looked.judged)
+        looked = replace(looked, remarks=(why, *looked.remarks))
     if any(e.physics == "kind_error" for e in looked.judged.best.effects):
         # Its other fields were written for another sensor: its place, its filter.
         looked = replace(looked, judged=verdict.limited(looked.judged, "ambiguous"))

@@ -27,6 +27,10 @@ FEW_STEPS = 4.0
 # Times as far below 1 as the threshold is above, from which chi-square is no steady noise's: 2 of
 # 685 recordings in which nothing was hidden lie below, gains that sag and cogging do by as much.
 TOO_WELL = 2.0
+# Part of what pulses have at any frequency that they have at half the rate, from which what folds
+# back is told as physics: half-sines of 4 ms at 1,000 samples/s have 17 %, through a Butterworth
+# filter of order 6 at 0.35 of the rate 1.6 %, which left 1.04 times the noise.
+UNFILTERED = 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +54,25 @@ class MoreNoise:
     def far_more(self) -> bool:
         """Whether what passes for noise may be anything."""
         return self.times > FAR_MORE
+
+
+def unfiltered(search: RecordSearch) -> str:
+    """That pulses were recorded without a filter before the converter, so that what they are
+    between samples is not in the record, in words; "" where they were not."""
+    whole = search.whole
+    if not isinstance(whole, Whole):
+        return ""
+    each = zip(*(c.meter for p in whole.records.pieces for c in p.commands), strict=True)
+    for x, noise in zip(whole.wired.inputs, each, strict=True):
+        folds = max(one.folds for one in noise)
+        if folds > UNFILTERED:
+            return (
+                f"the pulses of {x.command} have {100 * folds:.0f} % of their amplitude at half "
+                "the rate: they were recorded without an anti-aliasing filter, and nobody knows "
+                f"what they are between samples; record {x.command} and the sensors through one, "
+                "or at a higher rate"
+            )
+    return ""
 
 
 def fits_too_well(ratio: float, threshold: float) -> bool:

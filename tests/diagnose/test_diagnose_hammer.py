@@ -1,0 +1,47 @@
+"""A hammer whose force was measured, and an accelerometer where it strikes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hammer_kit import RIG, diagnosed, struck
+from table_kit import Effects, table_of
+
+from samii_rig.likelihood.inputs import calibrated
+
+FEW = Effects(lambda: table_of(RIG, 1.0, 450.0, "input_not_held", "ground_spring", "added_mass"))
+
+
+def test_nothing_is_missing_with_a_sensor_at_the_drive_point() -> None:
+    """Held between samples, the force acts in no sample of its own: 7e4 times the noise."""
+    found = diagnosed(struck(1))
+    assert found.verdict == "no_mismatch"
+    assert 0.85 < found.chi2_per_dof < found.threshold
+    assert found.not_physics[0].startswith("F was not held between samples")
+
+
+def test_a_spring_to_the_ground_has_its_value() -> None:
+    found = diagnosed(struck(2, kg=3000.0), FEW)
+    (cause,) = found.causes
+    assert (found.verdict, cause.physics, cause.site) == ("named", "ground_spring", "floor_2")
+    k = cause.parameters["k"]
+    assert k.value == pytest.approx(3000.0, rel=0.02)
+
+
+def test_without_a_filter_nothing_is_named_and_that_is_told() -> None:
+    whole_samples = [(0.3, 80.0, 4e-3), (1.151, 120.0, 4e-3)]
+    found = diagnosed(struck(4, hits=whole_samples, filtered=False), FEW)
+    assert found.causes == ()
+    assert any("without an anti-aliasing filter" in words for words in found.not_physics)
+
+
+def test_what_a_hammer_shows_between_hits_drives_nothing() -> None:
+    run = struck(5)
+    F = run.values[:, 0]
+    own, meter = calibrated(F, 0.0)
+    between = own == np.median(own)
+    assert np.mean(between) > 0.95
+    assert np.max(np.abs(F[between])) < 0.12  # N, six times its noise
+    np.testing.assert_array_equal(own[~between], F[~between])
+    assert meter.left == pytest.approx(0.02 * np.sqrt(np.mean(~between)), rel=0.1)
+    assert meter.folds < 0.01
