@@ -75,7 +75,7 @@ def _followed(
 def _above_meter(pieces: Sequence[Piece], rate_hz: float) -> float:
     """Hz up to which an input has more than a meter's noise, where one was on any: beyond, a change
     of the response would be that of a rig that does not follow its meter. inf where none was."""
-    each = [[noise.shown for noise in c.meter] for p in pieces for c in p.commands]
+    each = [[noise.on_lines for noise in c.meter] for p in pieces for c in p.commands]
     meter = np.max(each, axis=0)
     if not np.any(meter):
         return np.inf

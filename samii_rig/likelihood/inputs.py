@@ -46,11 +46,15 @@ EVERY = 0.5
 # the noise these must have: of less than half input the rest would move a rig more than that does.
 ONCE, JUDGED_AMONG, HALF = 0.01, 201, 2.0
 # Of an input of pulses, as a hammer's: standard deviations of what is between them beyond which one
-# begins, by which it stands out, and down to which it lasts, with so many samples to each side; of
-# all samples the part that they may be, whose noise stays; of the rate, from where on what is there
-# has folded as much as it folds back.
-BEGINS, PULSE, LASTS, BESIDE_PULSE, SPARSE = 6.0, 30.0, 2.5, 2, 0.2
-FOLDED = 0.47
+# begins, which noise does once in 5e8 samples; by which the largest stands out, as no wide input
+# does; and down to which one lasts, with so many samples to each side. Of all samples the part that
+# they may be, whose noise stays, and the part that one may be.
+BEGINS, PULSE, LASTS, BESIDE_PULSE, SPARSE, SHORT = 6.0, 30.0, 2.5, 2, 0.2, 0.05
+# Of what is between them, the part of its deviation that its second differences show at least:
+# white noise has all of it, what a band of an input has less.
+WHITE = 0.8
+# Of the rate, from where on what a pulse has there folds back as much; lines of its spectrum.
+FOLDED, PULSE_LINES = 0.47, 1024
 # Samples by which a record's going on is foretold, and until it is at rest.
 FORETOLD, AFTER = 64, 512
 # Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a
@@ -155,12 +159,23 @@ def sent(
 
 class MeterNoise(NamedTuple):
     """Standard deviation of what a meter put on a command: in its record, and left of that where
-    it was taken out as far as the record shows it. folds : of pulses, what they have at half the
-    rate over the most that they have at any frequency: as much of them folded back."""
+    it was taken out as far as the record shows it. folds : of pulses, between which it was taken
+    out, what the middle one has just below half the rate over the most that it has at any
+    frequency, as much of which folded back; nan of an input of another kind."""
 
     shown: float = 0.0
     left: float = 0.0
-    folds: float = 0.0
+    folds: float = math.nan
+
+    @property
+    def on_lines(self) -> float:
+        """Of what is left at the lines that the input has."""
+        return self.shown if math.isnan(self.folds) else self.left
+
+    @property
+    def on_samples(self) -> float:
+        """Of what is left where the input is largest."""
+        return self.left if math.isnan(self.folds) else self.shown
 
 
 def calibrated(r: Float, step: float) -> tuple[Float, MeterNoise]:
@@ -173,12 +188,10 @@ def calibrated(r: Float, step: float) -> tuple[Float, MeterNoise]:
     step : of the command's converter, whose rounding is the input's own.
     """
     if (between := _between_pulses(r, step)) is not None:
-        rest = float(np.mean(r[between]))
-        left = float(np.std(r[between])) * math.sqrt(float(np.mean(~between)))
+        rest, sd = float(np.mean(r[between])), float(np.std(r[between]))
         pulses = np.where(between, rest, r)
-        size = np.abs(np.fft.rfft(pulses - rest))
-        folds = float(np.mean(size[int(2 * FOLDED * size.size) :]) / np.max(size))
-        return pulses, MeterNoise(left, left, folds)
+        left = sd * math.sqrt(float(np.mean(~between)))
+        return pulses, MeterNoise(sd, left, _folds(pulses - rest, ~between))
     floor = meter_noise(r, step) ** 2
     if floor == 0:
         return r, MeterNoise()
@@ -210,7 +223,26 @@ def _between_pulses(r: Float, step: float) -> NDArray[np.bool_] | None:
     lasts = ndimage.binary_dilation(off > LASTS * sd)
     pulses = ndimage.binary_propagation(off > BEGINS * sd, mask=lasts)
     pulses = ndimage.binary_dilation(pulses, iterations=BESIDE_PULSE)
-    return np.asarray(~pulses) if np.mean(pulses) < SPARSE else None
+    longest = max(one.stop - one.start for (one,) in ndimage.find_objects(ndimage.label(pulses)[0]))
+    if np.mean(pulses) > SPARSE or longest > SHORT * r.size:
+        return None
+    rest = r[~pulses]
+    return np.asarray(~pulses) if _by_bends(rest) > WHITE * np.std(rest) else None
+
+
+def _by_bends(r: Float) -> float:
+    """Standard deviation of white noise by the second differences of r (n,), which few jumps and
+    whatever is slow hardly change."""
+    return TO_SD * float(np.median(np.abs(np.diff(r, 2)))) / math.sqrt(6)
+
+
+def _folds(x: Float, pulses: NDArray[np.bool_]) -> float:
+    """As of `MeterNoise`, of x (n,) that is 0 but for its pulses (n,)."""
+    each = []
+    for (one,) in ndimage.find_objects(ndimage.label(pulses)[0]):
+        size = np.abs(np.fft.rfft(x[one], max(PULSE_LINES, one.stop - one.start)))
+        each.append(np.max(size[int(2 * FOLDED * size.size) :]) / np.max(size))
+    return float(np.median(each))
 
 
 def _stairs(r: Float, noise: float) -> Float:
@@ -250,8 +282,7 @@ def meter_noise(r: Float, step: float) -> float:
     floor = float(np.median(upper)) / np.log(2)
     white = float(np.mean(upper)) < LOUDER * floor
     # An input that is held for some samples has a wide spectrum, too, but noise is in every sample.
-    bends = TO_SD * float(np.median(np.abs(np.diff(r, 2)))) / math.sqrt(6)
-    white = white and bends**2 > EVERY * floor
+    white = white and _by_bends(r) ** 2 > EVERY * floor
     shown = white and METER_STANDS * step**2 / 12 <= floor <= BELOW_LARGEST * np.max(power)
     return float(np.sqrt(floor)) if shown else 0.0
 
@@ -285,13 +316,13 @@ def jumps(recording: Recording, command: int, kp: float, theta: Float | None) ->
     return np.asarray(_of_both(edge) | turned)
 
 
-def stepped(r: Float, step: float, meter: MeterNoise) -> NDArray[np.bool_]:
+def stepped(r: Float, meter: MeterNoise) -> NDArray[np.bool_]:
     """(n,) where an input r (n,) jumps that a meter showed, and the sample before: as `jumps`, of
     what nobody knows how the loop sent it. None of a pulse, which is as smooth as the filter before
-    the converter. step : as of `calibrated`."""
-    if meter.shown == 0 or _between_pulses(r, step) is not None:
+    the converter."""
+    if meter.shown == 0 or not math.isnan(meter.folds):
         return np.zeros(r.size, np.bool_)
-    return _of_both(_bends(r, 0.0, meter.shown))
+    return _of_both(_bends(r, 0.0, min(meter.shown, _by_bends(r))))
 
 
 def _of_both(step: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -316,7 +316,7 @@ def _driving(
         step = recording.channels[column].resolution
         r, meter = inputs.calibrated(noisy, step)
         v = v + (r - noisy)
-        edges = edges | inputs.stepped(noisy, step, meter)
+        edges = edges | inputs.stepped(noisy, meter)
     return v, r, edges, meter
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hammer_kit import RIG, diagnosed, struck
 from table_kit import Effects, table_of
+from two_masses_kit import random_command
 
 from samii_rig.likelihood.inputs import calibrated
 
@@ -29,8 +30,7 @@ def test_a_spring_to_the_ground_has_its_value() -> None:
 
 
 def test_without_a_filter_nothing_is_named_and_that_is_told() -> None:
-    whole_samples = [(0.3, 80.0, 4e-3), (1.151, 120.0, 4e-3)]
-    found = diagnosed(struck(4, hits=whole_samples, filtered=False), FEW)
+    found = diagnosed(struck(4, filtered=False), FEW)
     assert found.causes == ()
     assert any("without an anti-aliasing filter" in words for words in found.not_physics)
 
@@ -43,5 +43,15 @@ def test_what_a_hammer_shows_between_hits_drives_nothing() -> None:
     assert np.mean(between) > 0.95
     assert np.max(np.abs(F[between])) < 0.12  # N, six times its noise
     np.testing.assert_array_equal(own[~between], F[~between])
+    assert meter.shown == meter.on_samples == pytest.approx(0.02, rel=0.1)
     assert meter.left == pytest.approx(0.02 * np.sqrt(np.mean(~between)), rel=0.1)
     assert meter.folds < 0.01
+
+
+def test_a_lower_level_between_two_of_a_higher_is_no_rest() -> None:
+    step = 0.3e-3
+    v = random_command(20_000, 0.1, 4)
+    v[9000:10_500] *= 10.0
+    own, meter = calibrated(v, step)
+    assert np.isnan(meter.folds)
+    assert np.std((own - v)[:8900]) < 0.05 * np.std(v[:8900])

@@ -68,16 +68,14 @@ HITS = ((0.3003, 80.0, 4.1e-3), (1.1508, 120.0, 5.2e-3), (1.9001, 50.0, 3.4e-3))
 def struck(
     seed: int,
     *,
-    hits: Sequence[tuple[float, float, float]] = HITS,
     kg: float = 0.0,
     filtered: bool = True,
 ) -> Recording:
-    """Half-sines on the second mass. hits : s, N and s of each. kg : N/m of a spring from there to
-    the ground."""
+    """`HITS` on the second mass. kg : N/m of a spring from there to the ground."""
     n = 3000
     t = np.arange(n * FINE) / (RATE * FINE)
     F = np.zeros(t.size)
-    for at, height, width in hits:
+    for at, height, width in HITS:
         on = (t >= at) & (t < at + width)
         F[on] += height * np.sin(np.pi * (t[on] - at) / width)
     A = np.zeros((4, 4))

@@ -39,7 +39,6 @@ CLEARLY = 2.0  # times what the best pair leaves of the lines: another that leav
 # 6e-7: of 467 answers "nothing is missing" three stood farther, all with something concealed, and
 # of those with nothing concealed none beyond 4.1.
 FAR_OFF = 5.0
-FAINT = 1e-3  # of what is known of a number, the part that recordings add at least
 NINETY = 1.645  # standard deviations of a 90 % interval
 
 
@@ -148,19 +147,20 @@ def _freed(rig: Rig, names: Collection[str]) -> Rig:
     return rig.model_copy(update={"element": tuple(map(element, rig.element))})
 
 
-def far_off(rig: Rig, fitted: Fitted) -> tuple[Exact, ...]:
+def wrong_number(rig: Rig, fitted: Fitted) -> tuple[Exact, ...]:
     """The nominal parameter that a fit needs farthest from where the rig file states it, if that is
     more than its tolerance lets it be: that number is wrong, or something adds to it."""
-    n = fitted.model.n_nominal
-    away = np.abs(fitted.x[:n] / fitted.model.prior[:n])
+    model, n = fitted.model, fitted.model.n_nominal
+    away = np.abs(fitted.x[:n] / model.prior[:n])
     if not n or np.max(away) < FAR_OFF:
         return ()
     at = int(np.argmax(away))
-    # By the recordings alone: what the tolerance adds is what turned out to be wrong.
-    known, stated = 1 / float(fitted.covariance()[at, at]), float(fitted.model.prior[at]) ** -2
-    alone = max(known - stated, FAINT * known)
+    # By the recordings alone: what the tolerance adds is what turned out to be wrong. Where they
+    # know no more than it says, no farther than as far again.
+    known, stated = 1 / float(fitted.covariance()[at, at]), float(model.prior[at]) ** -2
+    alone = max(known - stated, stated)
     more = float(fitted.x[at]) * stated / alone
-    return (_exact_of(rig, fitted.model.keys[at], fitted, more, 1 / math.sqrt(alone)),)
+    return (_exact_of(rig, model.keys[at], fitted, more, 1 / math.sqrt(alone)),)
 
 
 def _of_length(rig: Rig, name: str, fitted: Fitted) -> Exact:

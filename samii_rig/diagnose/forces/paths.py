@@ -155,7 +155,7 @@ class TransferPaths:
         recorded as it was sent: then its noise drives the rig. step : of the command's converter.
         """
         on, pieces = self.column(place), self.whole.records.pieces
-        if left := max(c.meter[on].left for p in pieces for c in p.commands):
+        if left := max(c.meter[on].on_samples for p in pieces for c in p.commands):
             return left
         if not any(e.metered for e in self.model.effects):
             return 0.0

@@ -238,7 +238,7 @@ def _answer(
         shown = replace(shown, with_causes=varies.after)
     if noise := more_noise(search):
         looked = _in_noise(looked, noise, shown)
-    if why := unfiltered(search):
+    if why := unfiltered(search, looked.judged.best):
         own = replace(looked.judged, verdict="unknown")
         told = looked.judged.verdict in verdict.WITH_CAUSES
         looked = replace(looked, judged=own if told else looked.judged)

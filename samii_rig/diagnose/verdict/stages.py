@@ -9,10 +9,12 @@ from dataclasses import dataclass, replace
 from samii_rig.diagnose.data.findings import Checked, Refusal
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.agreeing import Saved, SeveralStates
-from samii_rig.diagnose.fit.exact import far_off
+from samii_rig.diagnose.fit.exact import wrong_number
+from samii_rig.diagnose.fit.poses import Posed
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.fit.states import States
 from samii_rig.diagnose.result import Band, Cause, Diagnosis, Gap, Used
 from samii_rig.diagnose.verdict import answer
 from samii_rig.diagnose.verdict import judge as verdict
@@ -145,8 +147,10 @@ def diagnosis_of(
     words = (*own_words, *remarks, *clean.remarks, *clean.lacks)
     levels = len({r.level for r in case.responses})
     why, experiment, gain = _next(search, judged, refusal if missing else None, levels)
-    if exact := () if missing else far_off(search.rig, best.fitted):
-        judged = replace(judged, verdict="unknown")
+    # Between two states, or in several poses, what is wrong in all of them cancels.
+    several = isinstance(best.fitted.model, States | Posed)
+    if exact := () if missing or several else wrong_number(search.rig, best.fitted):
+        judged, gain = replace(judged, verdict="unknown"), None
         why = "with it the model explains the recordings; what adds to it there would do the same"
         experiment = f"measure {exact[0].parameter}, correct the rig file and diagnose again"
     untold = judged.varies.describe() if judged.varies is not None and not causes else ""
@@ -166,7 +170,7 @@ def diagnosis_of(
         why=why,
         experiment=experiment,
         outside=judged.outside,
-        rig=explained(best.fitted) if best.effects else None,
+        rig=explained(best.fitted) if best.effects or exact else None,
         traces=traces(search, judged) if missing and judged.varies is None else (),
         moved=answer.moved(best.fitted),
         could_hide=could_hide(*search.linear_part(best)),

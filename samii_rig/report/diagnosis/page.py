@@ -158,6 +158,8 @@ def _port(rig: Rig, site: str) -> set[str]:
 def _chain_caption(found: Diagnosis, marked: dict[str, Suspect]) -> str:
     if found.verdict == "no_mismatch":
         return "No part of the chain is suspect."
+    if found.exact:
+        return "What is wrong is a number of the rig file."
     if not marked:
         return "The data do not tell which part is suspect."
     what = "changed" if found.before else "is missing"
