@@ -49,10 +49,10 @@ ONCE, JUDGED_AMONG, HALF = 0.01, 201, 2.0
 # begins, which noise does once in 5e8 samples; by which the largest stands out, as no wide input
 # does; and down to which one lasts, with so many samples to each side. Of all samples the part that
 # they may be, whose noise stays, and the part that one may be.
-BEGINS, PULSE, LASTS, BESIDE_PULSE, SPARSE, SHORT = 6.0, 30.0, 2.5, 2, 0.2, 0.05
+PULSE_BEGINS, PULSE, LASTS, BESIDE_PULSE, SPARSE, SHORT = 6.0, 30.0, 2.5, 2, 0.2, 0.05
 # Of what is between them, the part of its deviation that its second differences show at least:
 # white noise has all of it, what a band of an input has less.
-WHITE = 0.8
+WHITE_BETWEEN = 0.8
 # Of the rate, from where on what a pulse has there folds back as much; lines of its spectrum.
 FOLDED, PULSE_LINES = 0.47, 1024
 # Samples by which a record's going on is foretold, and until it is at rest.
@@ -221,13 +221,13 @@ def _between_pulses(r: Float, step: float) -> NDArray[np.bool_] | None:
     if sd <= step or np.max(off) < PULSE * sd:
         return None
     lasts = ndimage.binary_dilation(off > LASTS * sd)
-    pulses = ndimage.binary_propagation(off > BEGINS * sd, mask=lasts)
+    pulses = ndimage.binary_propagation(off > PULSE_BEGINS * sd, mask=lasts)
     pulses = ndimage.binary_dilation(pulses, iterations=BESIDE_PULSE)
     longest = max(one.stop - one.start for (one,) in ndimage.find_objects(ndimage.label(pulses)[0]))
     if np.mean(pulses) > SPARSE or longest > SHORT * r.size:
         return None
     rest = r[~pulses]
-    return np.asarray(~pulses) if _by_bends(rest) > WHITE * np.std(rest) else None
+    return np.asarray(~pulses) if _by_bends(rest) > WHITE_BETWEEN * np.std(rest) else None
 
 
 def _by_bends(r: Float) -> float:

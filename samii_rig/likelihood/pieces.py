@@ -313,8 +313,7 @@ def _driving(
         r += x.kp * theta
     if not as_sent and not recording.names("reference"):
         noisy = r
-        step = recording.channels[column].resolution
-        r, meter = inputs.calibrated(noisy, step)
+        r, meter = inputs.calibrated(noisy, recording.channels[column].resolution)
         v = v + (r - noisy)
         edges = edges | inputs.stepped(noisy, meter)
     return v, r, edges, meter

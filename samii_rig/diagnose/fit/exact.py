@@ -38,7 +38,7 @@ CLEARLY = 2.0  # times what the best pair leaves of the lines: another that leav
 # Tolerances, standard deviations of a rig file, by which a number of it is off with a chance of
 # 6e-7: of 467 answers "nothing is missing" three stood farther, all with something concealed, and
 # of those with nothing concealed none beyond 4.1.
-FAR_OFF = 5.0
+OFF_THE_FILE = 5.0
 NINETY = 1.645  # standard deviations of a 90 % interval
 
 
@@ -152,7 +152,7 @@ def wrong_number(rig: Rig, fitted: Fitted) -> tuple[Exact, ...]:
     more than its tolerance lets it be: that number is wrong, or something adds to it."""
     model, n = fitted.model, fitted.model.n_nominal
     away = np.abs(fitted.x[:n] / model.prior[:n])
-    if not n or np.max(away) < FAR_OFF:
+    if not n or np.max(away) < OFF_THE_FILE:
         return ()
     at = int(np.argmax(away))
     # By the recordings alone: what the tolerance adds is what turned out to be wrong. Where they

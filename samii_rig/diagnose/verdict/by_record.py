@@ -239,10 +239,8 @@ def _answer(
     if noise := more_noise(search):
         looked = _in_noise(looked, noise, shown)
     if why := unfiltered(search, looked.judged.best):
-        own = replace(looked.judged, verdict="unknown")
-        told = looked.judged.verdict in verdict.WITH_CAUSES
-        looked = replace(looked, judged=own if told else looked.judged)
-        looked = replace(looked, remarks=(why, *looked.remarks))
+        judged = verdict.limited(looked.judged, "unknown")
+        looked = replace(looked, judged=judged, remarks=(why, *looked.remarks))
     if any(e.physics == "kind_error" for e in looked.judged.best.effects):
         # Its other fields were written for another sensor: its place, its filter.
         looked = replace(looked, judged=verdict.limited(looked.judged, "ambiguous"))

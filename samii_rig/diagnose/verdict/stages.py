@@ -12,10 +12,11 @@ from samii_rig.diagnose.fit.agreeing import Saved, SeveralStates
 from samii_rig.diagnose.fit.exact import wrong_number
 from samii_rig.diagnose.fit.poses import Posed
 from samii_rig.diagnose.fit.records import Whole
+from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.states import States
-from samii_rig.diagnose.result import Band, Cause, Diagnosis, Gap, Used
+from samii_rig.diagnose.result import Band, Cause, Diagnosis, Exact, Gap, Used
 from samii_rig.diagnose.verdict import answer
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.force_words import next_levels
@@ -118,6 +119,14 @@ def _alternatives(
     )
 
 
+def _wrong(search: Search, fitted: Fitted) -> tuple[Exact, ...]:
+    """As `wrong_number`; none between two states or in several poses, where what is wrong in all of
+    them cancels."""
+    if isinstance(fitted.model, States | Posed):
+        return ()
+    return wrong_number(search.rig, fitted)
+
+
 def diagnosis_of(
     case: Case,
     search: Search,
@@ -147,9 +156,7 @@ def diagnosis_of(
     words = (*own_words, *remarks, *clean.remarks, *clean.lacks)
     levels = len({r.level for r in case.responses})
     why, experiment, gain = _next(search, judged, refusal if missing else None, levels)
-    # Between two states, or in several poses, what is wrong in all of them cancels.
-    several = isinstance(best.fitted.model, States | Posed)
-    if exact := () if missing or several else wrong_number(search.rig, best.fitted):
+    if exact := () if missing else _wrong(search, best.fitted):
         judged, gain = replace(judged, verdict="unknown"), None
         why = "with it the model explains the recordings; what adds to it there would do the same"
         experiment = f"measure {exact[0].parameter}, correct the rig file and diagnose again"
