@@ -55,6 +55,11 @@ class Case:
     whole: Whole | None = None
 
     @property
+    def levels(self) -> int:
+        """How many levels the responses are of."""
+        return len({r.level for r in self.responses})
+
+    @property
     def sensors(self) -> tuple[str, ...]:
         """As of `Checked`."""
         return self.clean.sensors(self.search.rig)
@@ -96,10 +101,17 @@ def of_states(found: Diagnosis, several: Sequence[SeveralStates]) -> Diagnosis:
 
 
 def _next(
-    search: Search, judged: Judgement, refusal: Refusal | None, levels: int
+    search: Search,
+    judged: Judgement,
+    refusal: Refusal | None,
+    levels: int,
+    exact: tuple[Exact, ...],
 ) -> tuple[str, str, float | None]:
     """Why no more may be said, the experiment that would tell, and what it would gain. levels :
-    that were recorded."""
+    that were recorded. exact : the number of the rig file that is wrong, if one is."""
+    if exact:
+        why = "with it the model explains the recordings; what adds to it there would do the same"
+        return why, f"measure {exact[0].parameter}, correct the rig file and diagnose again", None
     if refusal:
         return refusal.why, refusal.experiment, None
     if judged.varies is not None:
@@ -127,6 +139,16 @@ def _wrong(search: Search, fitted: Fitted) -> tuple[Exact, ...]:
     return wrong_number(search.rig, fitted)
 
 
+def _allowed(case: Case, judged: Judgement, refusal: Refusal | None) -> Judgement:
+    """The same, no more said than the recordings allow."""
+    if refusal:
+        judged = verdict.limited(judged, refusal.most)
+    if len(set(case.lines.outputs)) == 1 and len(judged.best.effects) > 1:
+        # Trials of four channels say nothing of how often one curve distinguishes several places.
+        judged = verdict.limited(judged, "ambiguous")
+    return judged
+
+
 def diagnosis_of(
     case: Case,
     search: Search,
@@ -137,11 +159,7 @@ def diagnosis_of(
 ) -> Diagnosis:
     """The answer. remarks : what else there is to say, in words. refusal : why less may be said."""
     clean, best = case.clean, judged.best
-    if refusal:
-        judged = verdict.limited(judged, refusal.most)
-    if len(set(case.lines.outputs)) == 1 and len(best.effects) > 1:
-        # Trials of four channels say nothing of how often one curve distinguishes several places.
-        judged = verdict.limited(judged, "ambiguous")
+    judged = _allowed(case, judged, refusal)
     own = answer.varying(judged) or answer.causes_of(judged.classes[0], judged)
     causes = own if judged.verdict in verdict.WITH_CAUSES else ()
     if not causes:
@@ -152,14 +170,13 @@ def diagnosis_of(
     if not missing and best.effects and not own:
         # The model is held against what was meant to be recorded.
         shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
-    own_words = answer.not_physics_of(judged) if missing or best.effects else []
-    words = (*own_words, *remarks, *clean.remarks, *clean.lacks)
-    levels = len({r.level for r in case.responses})
-    why, experiment, gain = _next(search, judged, refusal if missing else None, levels)
-    if exact := () if missing else _wrong(search, best.fitted):
-        judged, gain = replace(judged, verdict="unknown"), None
-        why = "with it the model explains the recordings; what adds to it there would do the same"
-        experiment = f"measure {exact[0].parameter}, correct the rig file and diagnose again"
+    found = answer.not_physics_of(judged) if missing or best.effects else []
+    words = (*found, *remarks, *clean.remarks, *clean.lacks)
+    exact = () if missing else _wrong(search, best.fitted)
+    refused = refusal if missing else None
+    why, experiment, gain = _next(search, judged, refused, case.levels, exact)
+    if exact:
+        judged = replace(judged, verdict="unknown")
     untold = judged.varies.describe() if judged.varies is not None and not causes else ""
     return Diagnosis(
         verdict=judged.verdict,
