@@ -66,16 +66,22 @@ def _responses(
     runs: Sequence[Recording],
     estimated: Callable[[Sequence[Recording]], Sequence[FrequencyResponse]],
 ) -> Sequence[FrequencyResponse]:
-    """Of all runs; where these do not repeat each other, of each by itself: what differs from run
-    to run is to be explained, too."""
+    """Of all runs; where these do not repeat each other, of each by itself, or of each record of a
+    run: what differs is to be explained, too."""
     try:
         return estimated(runs)
     except RepeatsDifferError as error:
-        if len(runs) < 2:
+        each = runs if len(runs) > 1 else _by_segment(runs[0])
+        if len(each) < 2:
             raise
-        first, *others = [r for run in runs for r in estimated([run])]
+        first, *others = [r for run in each for r in _responses([run], estimated)]
         told = Finding("repeat", "warning", f"{error}; each was estimated by itself")
         return [replace(first, findings=(*first.findings, told)), *others]
+
+
+def _by_segment(run: Recording) -> list[Recording]:
+    """The recording once for each of its segments, with that alone."""
+    return [replace(run, segments=(segment,)) for segment in run.segments]
 
 
 def of_any_kind(runs: Sequence[Recording]) -> list[Recording]:
