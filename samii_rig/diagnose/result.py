@@ -101,15 +101,22 @@ class Band:
 @dataclass(frozen=True, slots=True)
 class Gap:
     """Part of the gap between refitted nominal model and noise that the causes close, on lines
-    that were used for nothing else, with its 90 % bootstrap interval."""
+    that were used for nothing else, with its 90 % bootstrap interval.
+
+    of_noise : whether the model left no more than noise there: then there is no gap, and these are
+        the fall of chi-square in units of the noise.
+    """
 
     value: float
     low: float
     high: float
+    of_noise: bool = False
 
     def words(self) -> str:
         """How much of what the model left beyond noise the causes account for; an interval where
         it says more than the value."""
+        if self.of_noise:
+            return "there the model had left no more than noise"
         value, low, high = map(percent, (self.value, self.low, self.high))
         between = "" if low == high else f" (90 % interval {low} to {high})"
         return f"they account for {value} of what the model missed{between}"
@@ -404,7 +411,7 @@ class Diagnosis:
                     "all, and no cause is named."
                 )
             case "unknown" if self.exact:
-                what = "A number" if len(self.exact) == 1 else "Two numbers"
+                what = ("A number", "Two numbers", "Three numbers")[len(self.exact) - 1]
                 are = "is" if len(self.exact) == 1 else "are"
                 words = " and ".join(one.describe() for one in self.exact)
                 return f"{what} of the rig file {are} wrong: {words}."

@@ -60,6 +60,9 @@ FORETOLD, AFTER = 64, 512
 # Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a
 # smaller one that came half a sample earlier is below a hundredth of what the rest makes.
 JUMP, AT_REST = 0.01, 4
+# Samples of a record that begins at rest: of a meter's noise their mean has a quarter. Of an
+# input's largest, its standard deviation in them: a sweep that begins at once has ten times that.
+RESTING, RESTS_WITHIN = 16, 0.02
 # Samples to each side of those between which a sweep turns that are as unknown: of an oscillation
 # at 0.37 of the rate that begins at an instant, what folds back lasts so long. One that turns
 # there, nothing hidden: chi-square 5.0, 1.31 and 0.99 with 0, 1 and 2.
@@ -285,6 +288,16 @@ def meter_noise(r: Float, step: float) -> float:
     white = white and _by_bends(r) ** 2 > EVERY * floor
     shown = white and METER_STANDS * step**2 / 12 <= floor <= BELOW_LARGEST * np.max(power)
     return float(np.sqrt(floor)) if shown else 0.0
+
+
+def rest_of(v: Float, noise: float, *, moving: bool) -> float:
+    """What a meter shows of an input v (n,) that rests: its first samples, where the rig rested
+    before them and the input goes on resting, else the middle of all. noise : its standard
+    deviation, 0 where that is not known. moving : whether the rig moved before."""
+    head = v[:RESTING]
+    middle = float(np.median(head))
+    rests = np.std(head) <= max(RESTS_WITHIN * float(np.max(np.abs(v - middle))), 2 * noise)
+    return middle if rests and not moving else float(np.median(v))
 
 
 def jumps(recording: Recording, command: int, kp: float, theta: Float | None) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ from identify_kit import noiseless, samii
 from table_kit import Effects, table_of
 
 from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.rigfile import toml
 from samii_rig.diagnose.physics.grid import grid
 from samii_rig.diagnose.physics.model import Model
@@ -162,3 +163,24 @@ def test_a_plain_compliance_stays_the_simplest_form() -> None:
 )
 def test_a_closed_gap_is_said_once_and_never_as_a_hundred_percent(gap, said):
     assert gap.words() == said
+
+
+def test_where_no_gap_is_left_the_change_itself_is_told():
+    rng = np.random.default_rng(5)
+    floor = np.full(400, 4.0)
+    noise = rng.chisquare(4, 400)
+    before = 0.95 * noise / noise.mean() * 4.0  # what chance leaves on test lines: less than noise
+    better, worse = gap_of(before, 0.9 * before, floor), gap_of(before, 1.1 * before, floor)
+    assert 0 < better.low < better.value < better.high
+    assert worse.low < worse.value < worse.high < 0
+    assert better.value == pytest.approx(0.095)
+    assert better.words() == "there the model had left no more than noise"
+
+
+def test_an_interval_of_a_small_gap_has_the_direction_of_the_change():
+    rng = np.random.default_rng(6)
+    floor = np.full(400, 4.0)
+    before = rng.chisquare(4, 400)
+    before *= 1.01 * 4.0 / before.mean()  # of a hundredth of the noise half the draws see nothing
+    found = gap_of(before, 0.8 * before, floor)
+    assert 0 < found.low <= found.value <= found.high < np.inf

@@ -91,6 +91,22 @@ def test_a_spring_that_hardens_as_much_as_it_is_stiff_has_its_value() -> None:
     assert k3.low < K3 < k3.high
 
 
+def test_what_a_meter_shows_of_an_input_at_rest_bends_no_spring() -> None:
+    """A meter's offset of a third of the input: as a force it would be a preload of the spring."""
+    few = table_of(RIG, 0.5, 40.0, "input_not_held")
+    lead = np.zeros(int(0.2 * RIG.rate_hz))
+    runs = []
+    for seed, level in ((2, 2.0), (3, 1.0)):
+        run = recorded(np.append(lead, level * V[:2000]), seed, k3=K3 / 10, meter=0.004)
+        values = run.values.copy()
+        values[:, 0] += 0.3 * np.std(2 * V)
+        runs.append(replace(run, values=values))
+    found = diagnosed(*runs, effects=few)
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("cubic_stiffness", "spring_1")
+    assert cause.parameters["k3"].value == pytest.approx(K3 / 10, rel=0.05)
+
+
 @pytest.mark.parametrize("part", [0.2, 0.04])
 def test_a_gain_that_sags_in_one_record_is_never_taken_for_noise_in_silence(part: float) -> None:
     end = len(V) / RIG.rate_hz

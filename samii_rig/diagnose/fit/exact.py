@@ -21,16 +21,18 @@ from samii_rig.diagnose.fit.explanations import threshold
 from samii_rig.diagnose.fit.growing import LARGE_MISMATCH
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
-from samii_rig.diagnose.fit.refit import Fitted
+from samii_rig.diagnose.fit.refit import Fitted, refit
 from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.physics.effect import Key
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.result import Exact, Value
 from samii_rig.errors import SamiiRigError
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.rig.schema.elements import Branch, flattened
 
 LENGTH = "L"  # symbol of what is measured with a rule, and taken for exact
-# Tolerance of a length whose value nobody trusts: a factor of e lies two of them away.
-FREE_LENGTH = 0.5
+# Tolerance of a number whose value nobody trusts: a factor of e lies two of them away.
+FREE = 0.5
 # Of what the nominal model leaves of the lines: one that leaves more is held against no record.
 LEAVES = 0.1
 HELPING = 3  # lengths that explain most by themselves, each of which is freed with every other
@@ -39,6 +41,7 @@ CLEARLY = 2.0  # times what the best pair leaves of the lines: another that leav
 # 6e-7: of 467 answers "nothing is missing" three stood farther, all with something concealed, and
 # of those with nothing concealed none beyond 4.1.
 OFF_THE_FILE = 5.0
+MOST_WRONG = 3  # numbers that are told: a file with more is another rig's
 NINETY = 1.645  # standard deviations of a 90 % interval
 
 
@@ -113,7 +116,7 @@ def _explaining(
         fitted = found.nominal.fitted
         if found.ratio(fitted) <= threshold(found.spread):
             rig = search.by_line.rig
-            return tuple(_of_length(rig, name, fitted) for name in names), found
+            return tuple(_exact_of(rig, (name, LENGTH), fitted) for name in names), found
     return None
 
 
@@ -127,19 +130,19 @@ def _exact(rig: Rig) -> Iterator[str]:
 def _on_lines(by_line: Search, names: Collection[str]) -> Iterator[Search]:
     """The same lines with these lengths free, where that is a rig."""
     try:
-        yield Search(_freed(by_line.rig, names), by_line.lines, by_line.grid, by_line.table)
+        rig = _freed(by_line.rig, [(name, LENGTH) for name in names])
+        yield Search(rig, by_line.lines, by_line.grid, by_line.table)
     except (SamiiRigError, np.linalg.LinAlgError):
         return
 
 
-def _freed(rig: Rig, names: Collection[str]) -> Rig:
-    """The rig, nothing known of the lengths of these elements."""
+def _freed(rig: Rig, keys: Collection[Key]) -> Rig:
+    """The rig, nothing known of these parameters."""
 
     def element(e: Any) -> Any:
-        update: dict[str, Any] = {}
-        if e.name in names:
-            free = {"tolerance": FREE_LENGTH}
-            update[LENGTH] = parameters(e)[LENGTH].model_copy(update=free)
+        own = parameters(e)
+        free = {"tolerance": FREE}
+        update: dict[str, Any] = {s: own[s].model_copy(update=free) for n, s in keys if n == e.name}
         if isinstance(e, Branch):
             update["element"] = tuple(map(element, e.element))
         return e.model_copy(update=update)
@@ -147,32 +150,35 @@ def _freed(rig: Rig, names: Collection[str]) -> Rig:
     return rig.model_copy(update={"element": tuple(map(element, rig.element))})
 
 
-def wrong_number(rig: Rig, fitted: Fitted) -> tuple[Exact, ...]:
-    """The nominal parameter that a fit needs farthest from where the rig file states it, if that is
-    more than its tolerance lets it be: that number is wrong, or something adds to it."""
-    model, n = fitted.model, fitted.model.n_nominal
-    away = np.abs(fitted.x[:n] / model.prior[:n])
-    if not n or np.max(away) < OFF_THE_FILE:
-        return ()
-    at = int(np.argmax(away))
-    # By the recordings alone: what the tolerance adds is what turned out to be wrong. Where they
-    # know no more than it says, no farther than as far again.
-    known, stated = 1 / float(fitted.covariance()[at, at]), float(model.prior[at]) ** -2
-    alone = max(known - stated, stated)
-    more = float(fitted.x[at]) * stated / alone
-    return (_exact_of(rig, model.keys[at], fitted, more, 1 / math.sqrt(alone)),)
+def wrong_numbers(search: Search, fitted: Fitted) -> tuple[tuple[Exact, ...], Fitted]:
+    """The nominal parameters that a fit needs farther from where the rig file states them than
+    their tolerances let them be, and the fit in which nothing is known of them: these numbers are
+    wrong, or something adds to them. None of more than are told together."""
+    found: list[Key] = []
+    end = fitted
+    while True:
+        model, n = end.model, end.model.n_nominal
+        away = np.abs(end.x[:n] / model.prior[:n])
+        if not n or np.max(away) < OFF_THE_FILE:
+            break
+        key = model.keys[int(np.argmax(away))]
+        if key in found or len(found) == MOST_WRONG:
+            return (), fitted
+        found.append(key)
+        # The others had come as far as their tolerances let them to spare this one its way.
+        freed = Model(_freed(search.rig, found), fitted.model.effects)
+        try:
+            end = refit(freed, search.problem, end.x)
+        except (SamiiRigError, np.linalg.LinAlgError):
+            return (), fitted
+    return tuple(_exact_of(search.rig, key, end) for key in found), end
 
 
-def _of_length(rig: Rig, name: str, fitted: Fitted) -> Exact:
-    key = (name, LENGTH)
-    at = fitted.model.keys.index(key)
-    return _exact_of(rig, key, fitted, 0.0, float(np.sqrt(fitted.covariance()[at, at])))
-
-
-def _exact_of(rig: Rig, key: tuple[str, str], fitted: Fitted, more: float, sd: float) -> Exact:
-    """more, sd : of its logarithm, what there is beside the fit's, and the standard deviation."""
+def _exact_of(rig: Rig, key: Key, fitted: Fitted) -> Exact:
     name, symbol = key
-    value = fitted.model.values(fitted.x)[key] * math.exp(more)
+    at = fitted.model.keys.index(key)
+    sd = float(np.sqrt(fitted.covariance()[at, at]))
+    value = fitted.model.values(fitted.x)[key]
     low, high = (value * math.exp(way * NINETY * sd) for way in (-1, 1))
     stated = next(parameters(e)[symbol] for e in flattened(rig.element) if e.name == name)
     return Exact(".".join(key), stated.value, Value(value, stated.unit, low, high))

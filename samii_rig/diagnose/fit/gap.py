@@ -16,9 +16,18 @@ def gap_of(before: Float, after: Float, floor: Float) -> Gap:
     a, b = (float(np.sum(x) / np.sum(floor)) for x in (before, after))
     rows = np.random.default_rng(1).integers(0, before.size, (DRAWS, before.size))
     num = (before - after)[rows].sum(axis=1)
+    if a <= 1:  # nothing is left to be closed: only the change itself says anything
+        drawn = num / floor[rows].sum(axis=1)
+        return Gap(a - b, *_within(drawn), of_noise=True)
     den = (before - floor)[rows].sum(axis=1)
-    # Where nothing is left to be closed, only the sign of the change says anything.
-    value = (a - b) / (a - 1) if a > 1 else min(a - b, 0.0)
-    drawn = num / np.where(np.abs(den) > 0, np.abs(den), np.inf)
+    drawn = num / np.where(den > 0, den, np.inf)
+    # Draws in which there was nothing to close: as far as any, in the direction of the change.
+    most = max(float(np.max(np.abs(drawn))), 1.0)
+    drawn = np.where(den > 0, drawn, np.copysign(most, num))
+    return Gap((a - b) / (a - 1), *_within(drawn))
+
+
+def _within(drawn: Float) -> tuple[float, float]:
+    """The 90 % interval of what was drawn."""
     low, high = np.quantile(drawn, [0.05, 0.95])
-    return Gap(float(value), float(low), float(high))
+    return float(low), float(high)

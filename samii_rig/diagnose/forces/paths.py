@@ -7,6 +7,7 @@ third harmonics of it (`samii_rig.likelihood.contour`).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -52,15 +53,17 @@ class Span:
     rate_hz: float
 
     @classmethod
-    def of(cls, piece: Piece, rate_hz: float, highest_hz: float) -> Span:
-        """Of a piece whose lines end at `highest_hz`."""
+    def of(
+        cls, piece: Piece, rate_hz: float, highest_hz: float, metered: Sequence[bool] = ()
+    ) -> Span:
+        """Of a piece whose lines end at `highest_hz`. metered : as of `mean_command`."""
         n, history = len(piece.z), piece.history
         needed = min(max(int(OVER * highest_hz * n / rate_hz), 16), n)
         low = int(fft.next_fast_len(needed, real=True))  # more than n where that is quicker
         turns = 2 if history == 0 else 4
         M, m = turns * n, turns * low
         sigma = CONTOUR_DAMPING * rate_hz / M
-        v, times = mean_command(piece)
+        v, times = mean_command(piece, metered)
         f = np.arange(m // 2 + 1) * (rate_hz / M)
         s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
         at = np.arange(m) * (n / low) + history
@@ -141,8 +144,10 @@ class TransferPaths:
 
     def __post_init__(self) -> None:
         records = self.whole.records
+        shown = {e.factor.channel for e in self.model.effects if e.metered and e.factor is not None}
+        metered = [x.command in shown for x in self.whole.wired.inputs]
         self.spans = [
-            Span.of(piece, records.rate_hz, band[1])
+            Span.of(piece, records.rate_hz, band[1], metered)
             for piece, band in zip(records.pieces, records.bands, strict=True)
         ]
 

@@ -28,6 +28,7 @@ from samii_rig.diagnose.forces.way import Ways
 from samii_rig.diagnose.physics.grid import Grid
 from samii_rig.likelihood.algebra import by_input
 from samii_rig.likelihood.complete import Complete
+from samii_rig.likelihood.inputs import rest_of
 from samii_rig.likelihood.pieces import Piece, Samples
 from samii_rig.types import Complex, Float
 
@@ -63,7 +64,7 @@ class Moved:
         every = self.whole.every
         out = []
         for piece in self.whole.records.pieces:
-            v, times = mean_command(piece)
+            v, times = mean_command(piece, self._metered(model))
             for name, F in channels[0].items() if channels is not None else ():
                 each, j = v.reshape(len(v), -1), wired.column(name)
                 each[:, j] = contour.record(contour.damped(each[:, j]) * F, len(v))
@@ -80,6 +81,10 @@ class Moved:
                 own.append(Samples(r, y[piece.history :]))
             out.append(own)
         return out
+
+    def _metered(self, model: ForceModel) -> Sequence[bool]:
+        """Of each input, whether an effect of a model says that a meter recorded it."""
+        return [model.metered(x.command) for x in self.whole.wired.inputs]
 
     def without(self, fitted: Fitted) -> Whole:
         """The records as those of the linear part of a fit."""
@@ -135,11 +140,24 @@ def _passing(every: int) -> Float:
     return np.asarray(signal.firwin(2 * REACH * every + 1, 1 / every, window=("kaiser", beta)))
 
 
-def mean_command(piece: Piece) -> tuple[Float, float]:
+def mean_command(piece: Piece, metered: Sequence[bool] = ()) -> tuple[Float, float]:
     """The command of a piece's records, which repeat each other, and how many times the piece has
-    what one of them does."""
+    what one of them does. metered : inputs that a meter recorded, beside those that have its noise:
+    where such a meter shows what it rests at is its own, and no line that is fitted has it. A force
+    would."""
     times = sum(c.part for c in piece.commands)
-    return np.asarray(sum(c.part * c.v for c in piece.commands) / times), times
+    shown = [
+        all(c.meter[j].shown > 0 for c in piece.commands)
+        for j in range(len(piece.commands[0].meter))
+    ]
+    each = []
+    for c in piece.commands:
+        v = np.array(c.v, np.float64)
+        for j, column in enumerate(by_input(v)):
+            if shown[j] or (metered and metered[j]):
+                column -= rest_of(column, c.meter[j].shown, moving=piece.moving)
+        each.append(c.part * v)
+    return np.asarray(sum(each) / times), times
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from samii_rig.diagnose.forces.beside import FORMED_AGAIN, REFERENCE_STILL, Besi
 from samii_rig.diagnose.forces.fits import of_data
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.screen import ForceScreen, Score, first_order, scaled
+from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.errors import SamiiRigError
 from samii_rig.likelihood.unexplained import Unexplained, as_rounding, evenly
 
@@ -42,10 +43,12 @@ LINEAR_INCONSISTENT = 1e-10
 class ForceSearch(BesideForce):
     """As `RecordSearch`, with forces.
 
-    most_explained : of chi-square, the most that any force did, consistent or not.
+    most_explained : of chi-square, the most that any force did, consistent or not. uneven : of the
+        forces that were forgotten as inconsistent the one that did most, and its part of that.
     """
 
     most_explained = 0.0
+    uneven: tuple[Effect, float] | None = None
 
     def settle(self) -> None:
         """Refit what promises most, and all that may compete again about the best of it, until
@@ -98,6 +101,9 @@ class ForceSearch(BesideForce):
             if self._to_noise(base, best.fitted) or self._consistent(base, best.fitted):
                 return
             del self.found[best.key]
+            fall = self._fall(base, best.fitted)
+            if fall > max(self.critical_value, self.uneven[1] if self.uneven else 0.0):
+                self.uneven = next(e for e in best.effects if e.force is not None), fall
 
     def _to_noise(self, before: Fitted, after: Fitted) -> bool:
         """Whether a force may be off for its motion, as it began in a gap, and leaves no more than
@@ -108,9 +114,14 @@ class ForceSearch(BesideForce):
     def _consistent(self, before: Fitted, after: Fitted) -> bool:
         """Whether what one fit has more than another shows at all lines as it should, and is more
         than rounding may do along it."""
-        a, b = self.unexplained(before, rounded=True), self.unexplained(after)
-        fall = (before.chi2 - after.chi2) / as_rounding(a, b)
+        a, b = self.unexplained(before), self.unexplained(after)
+        fall = self._fall(before, after)
         return self._even(a, b, after) > INCONSISTENT and fall > self.critical_value
+
+    def _fall(self, before: Fitted, after: Fitted) -> float:
+        """Of chi-square, what one fit has more than another, in units of rounding there."""
+        a, b = self.unexplained(before, rounded=True), self.unexplained(after)
+        return (before.chi2 - after.chi2) / as_rounding(a, b)
 
     def _even(
         self, before: Sequence[Unexplained], after: Sequence[Unexplained], fitted: Fitted

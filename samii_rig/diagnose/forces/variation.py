@@ -195,13 +195,22 @@ def variation(seen: BySpring, files: int) -> Variation | None:
 
 @dataclass(frozen=True, slots=True)
 class Uneven:
-    """A spring that is not the same to both sides. chi2 : what that explains, with one unknown."""
+    """A spring that is not the same to both sides. chi2 : what that explains, with one unknown.
+    bent : whether its chain has a bend: its inertia changes with the angle there."""
 
     site: str
     chi2: float
+    bent: bool = False
 
     def describe(self) -> str:
         """In words."""
+        if self.bent:
+            return (
+                f"motion to one side of {self.site} is not as that to the other, which explains "
+                f"{math.sqrt(self.chi2):.3g} sigma: the inertia of a bent chain changes with its "
+                "angle, which the model takes for constant; a crack, a stop or a preload there "
+                "would look the same (move less to tell: the bend's part falls as the square)"
+            )
         return (
             f"the spring of {self.site} is not the same to both sides: that explains "
             f"{math.sqrt(self.chi2):.3g} sigma, and has no row in the table (a crack, a stop or a "
@@ -212,7 +221,8 @@ class Uneven:
 def uneven_spring(seen: BySpring) -> Uneven | None:
     """The spring that is not the same to both sides: where it explains more than noise, and more
     than one that varies in time, which it would pass for, as it swings with the motion."""
-    found = [Uneven(site, uneven(pieces)) for site, pieces in seen.pieces.items()]
+    bent = seen.search.rig.bent
+    found = [Uneven(site, uneven(pieces), bent) for site, pieces in seen.pieces.items()]
     most = max(found, key=lambda one: one.chi2, default=None)
     tries = len(SIDES) * len(found)
     if most is None or tries * float(stats.chi2.sf(most.chi2, 1)) > ALARM:

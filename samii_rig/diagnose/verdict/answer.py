@@ -14,6 +14,7 @@ from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.intervals import values_of
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.search import Search
+from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS
 from samii_rig.diagnose.physics.along import POSITION
 from samii_rig.diagnose.physics.confusions import nearest
 from samii_rig.diagnose.physics.effect import Effect
@@ -43,7 +44,15 @@ def causes_of(chosen: Class, judged: Judgement, share: float | None = None) -> t
                 for c, q in zip(judged.classes, judged.probabilities, strict=True)
                 if any(n in same for e in c.first.effects for n in e.names)
             )
-        equivalents = tuple(n for n in chosen.equivalents(effect))
+        equivalents = tuple(chosen.equivalents(effect))
+        dry = FRICTION.physics, effect.site
+        # What sticks on a spring of no upper limit, and then slips, is dry friction.
+        if (
+            effect.physics == HYSTERESIS.physics
+            and found["k"].high is None
+            and dry not in equivalents
+        ):
+            equivalents += (dry,)
         place = found[POSITION].value if POSITION in found else effect.position
         out.append(Cause(*effect.name, min(p, 1.0), equivalents, found, place))
     return tuple(out)

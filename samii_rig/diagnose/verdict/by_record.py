@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -114,6 +115,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
             several = _several(search, [given], None)
         search.begin("whether stiffnesses are constant")
         looked = _constant(forces, forced or search, looked, len(case.runs), differ=bool(several))
+        looked = _or_uneven(forces, looked)
     last = forced or search
     if _not_explained(looked.judged, forced, search):
         search.begin("what is missing, beside a discrepancy")
@@ -323,6 +325,20 @@ def _winning(forces: ForceSearch | None) -> ForceSearch | None:
     return forces if forces is not None and forces.won else None
 
 
+def _or_uneven(forces: ForceSearch, looked: _Looked) -> _Looked:
+    """The same, but nothing is missing alone where no force explains some lines and not others: one
+    that does is another than any in the table, or acts beside what moved the rig unrecorded."""
+    if forces.uneven is None or looked.judged.verdict != "no_mismatch":
+        return looked
+    effect, fall = forces.uneven
+    name = f"{effect.physics.replace('_', ' ')} at {effect.site}"
+    why = (
+        f"{name} explains {math.sqrt(fall):.3g} sigma, but not of all lines alike as it would: "
+        "a force that no row has, or one beside what disturbed the rig"
+    )
+    return replace(_unknown(looked), remarks=(why, *looked.remarks))
+
+
 def _constant(
     forces: ForceSearch, search: RecordSearch, looked: _Looked, files: int, *, differ: bool
 ) -> _Looked:
@@ -340,7 +356,9 @@ def _constant(
     sides = uneven_spring(seen) if seen else None
     # What is in no row is not told of less than what is.
     if sides is not None and sides.chi2 > max(2 * rival, judged.evidence.worth):
-        return replace(_unknown(looked), remarks=(*looked.remarks, sides.describe()))
+        looked = replace(looked, remarks=(*looked.remarks, sides.describe()))
+        if not sides.bent:
+            return _unknown(looked)
     physical = any(e.physical for e in judged.best.effects)
     least = rival if physical else max(rival, VARIES)
     # What leaves more than noise has had that for noise: each is held against its own.

@@ -53,11 +53,9 @@ def _smallest(
     if changed is None:
         return None
     before, left = (np.sqrt(np.maximum(x, 0.0)) for x in changed)
-    # Where it moves the records by about their noise: neither rounding nor curvature matters.
-    weak = np.nanargmin(np.abs(np.log(np.maximum(before, 1e-12))))
-    rate = needed / max(float(left[weak]), 1e-12)
-    value = values[weak].copy()
-    grows = before[-1] > before[0]
+    grows = bool(before[-1] > before[0])
+    value, shows = _weak(search, best, screens, effect, values, before, left)
+    rate = needed / max(shows, 1e-12)
     value[0] *= rate if grows else 1 / rate
     least, most = (first.low, first.high) if grows else (first.high, first.low)
     toward = 1 if grows else -1
@@ -70,6 +68,33 @@ def _smallest(
     within = toward * (value[0] - most) <= 0
     size = abs(float(effect.report(value)[0])) if within else None
     return Hiding(effect.physics, effect.site, first.symbol, size, first.unit)
+
+
+def _weak(
+    search: Explanations,
+    best: Explanation,
+    screens: Screens,
+    effect: Effect,
+    values: Float,
+    before: Float,
+    left: Float,
+) -> tuple[Float, float]:
+    """Values (k,) of an effect with which it moves the records by about their noise, so that
+    neither rounding nor curvature matters, and the noise units that a refit leaves of it.
+
+    values, before, left : (m, k), (m,) and (m,) over its range. That may begin where a part moves
+    the records by far more, of which a refit that bends leaves more than in proportion.
+    """
+    weak = int(np.nanargmin(np.abs(np.log(np.maximum(before, 1e-12)))))
+    value, shows = values[weak].copy(), float(left[weak])
+    if weak in (0, len(values) - 1) and before[weak] > 1:
+        less = value.copy()
+        less[0] *= before[weak] if weak else 1 / before[weak]
+        with np.errstate(all="ignore"):
+            changed = _changed(search, best, screens, effect, less[None])
+        if changed is not None and np.isfinite(changed[1][0]):
+            return less, math.sqrt(max(float(changed[1][0]), 0.0))
+    return value, shows
 
 
 def _changed(

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from samii_rig.diagnose.data.findings import Checked, Refusal
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.agreeing import Saved, SeveralStates
-from samii_rig.diagnose.fit.exact import wrong_number
+from samii_rig.diagnose.fit.exact import wrong_numbers
 from samii_rig.diagnose.fit.poses import Posed
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
@@ -110,8 +110,10 @@ def _next(
     """Why no more may be said, the experiment that would tell, and what it would gain. levels :
     that were recorded. exact : the number of the rig file that is wrong, if one is."""
     if exact:
-        why = "with it the model explains the recordings; what adds to it there would do the same"
-        return why, f"measure {exact[0].parameter}, correct the rig file and diagnose again", None
+        them = "it" if len(exact) == 1 else "them"
+        why = f"with {them} the model explains the recordings; what adds there would do the same"
+        names = " and ".join(one.parameter for one in exact)
+        return why, f"measure {names}, correct the rig file and diagnose again", None
     if refusal:
         return refusal.why, refusal.experiment, None
     if judged.varies is not None:
@@ -131,12 +133,12 @@ def _alternatives(
     )
 
 
-def _wrong(search: Search, fitted: Fitted) -> tuple[Exact, ...]:
-    """As `wrong_number`; none between two states or in several poses, where what is wrong in all of
-    them cancels."""
+def _wrong(search: Search, fitted: Fitted) -> tuple[tuple[Exact, ...], Fitted]:
+    """As `wrong_numbers`; none between two states or in several poses, where what is wrong in all
+    of them cancels."""
     if isinstance(fitted.model, States | Posed):
-        return ()
-    return wrong_number(search.rig, fitted)
+        return (), fitted
+    return wrong_numbers(search, fitted)
 
 
 def _allowed(case: Case, judged: Judgement, refusal: Refusal | None) -> Judgement:
@@ -172,7 +174,7 @@ def diagnosis_of(
         shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
     found = answer.not_physics_of(judged) if missing or best.effects else []
     words = (*found, *remarks, *clean.remarks, *clean.lacks)
-    exact = () if missing else _wrong(search, best.fitted)
+    exact, told = ((), best.fitted) if missing else _wrong(search, best.fitted)
     refused = refusal if missing else None
     why, experiment, gain = _next(search, judged, refused, case.levels, exact)
     if exact:
@@ -194,9 +196,9 @@ def diagnosis_of(
         why=why,
         experiment=experiment,
         outside=judged.outside,
-        rig=explained(best.fitted) if best.effects or exact else None,
+        rig=explained(told) if best.effects or exact else None,
         traces=traces(search, judged) if missing and judged.varies is None else (),
-        moved=answer.moved(best.fitted),
+        moved=answer.moved(told),
         could_hide=could_hide(*search.linear_part(best)),
         used=shown.used,
         exact=exact,

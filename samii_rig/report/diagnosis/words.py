@@ -255,17 +255,16 @@ def _facts(found: Diagnosis) -> list[tuple[str, str, str]]:
     sure = min(c.probability for c in found.causes)
     value, low, high = map(percent, (found.gap.value, found.gap.low, found.gap.high))
     between = "" if low == high else f"{low} to {high}, "
+    closed = ("Gap closed", value, f"{between}on test lines")
+    if found.gap.of_noise:
+        closed = ("Gap closed", "\u2013", "on test lines the model had left no more than noise")
     return [
         (
             "Probability",
             percent(sure),
             f"that this is what {'changed' if found.before else 'is missing'}",
         ),
-        (
-            "Gap closed",
-            value,
-            f"{between}on test lines",
-        ),
+        closed,
         (
             "Chi-square per degree of freedom",
             f"{ratio(before)} \u2192 {ratio(after)}",
