@@ -14,7 +14,7 @@ from samii_rig.control.margins import Margins, margins
 from samii_rig.errors import InputError
 from samii_rig.model.loops import Loops, Sampled, closed_poles, sampled_system
 from samii_rig.model.realise import Realisation, realise
-from samii_rig.model.sampled import sampled_response
+from samii_rig.model.sampled import as_sent, sampled_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Key, Rig, parameters
 from samii_rig.types import Complex, Float
@@ -101,7 +101,7 @@ def plant(name: str, rig: Rig, loops: Loops, near: Complex | None = None) -> Pla
         name,
         rig,
         f,
-        sampled_response(rig, f, chain),
+        sampled_response(as_sent(rig), f, chain),
         sampled_system(rig, made, loops.actuator),
         complex(pairs[0]),
         split,

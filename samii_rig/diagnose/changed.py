@@ -85,6 +85,7 @@ def changed(
     )
     put_in = found.verdict != "no_mismatch" and found.rig is not None
     common = common_rig(first_rig, found.rig) if put_in and found.rig else first_rig
+    common, inputs = _as_recorded(common, found.rig or first_rig, first_rig)
     progress(Begun("both states", STATES["both states"]))
     first = case_of(before.responses, common, band, effects, before.runs, progress=progress)
     # What is known of the state before alone is as the rig file has it after.
@@ -105,7 +106,22 @@ def changed(
     causes = found.causes if put_in else ()
     names = _named(before), _named(after)
     rig_of_both = explained(search.nominal.fitted)
-    return _beside(answer, Before(found.verdict, causes, both.alike, names, rig_of_both))
+    before_ = Before(found.verdict, causes, both.alike, names, rig_of_both, inputs)
+    return _beside(answer, before_)
+
+
+def _as_recorded(common: Rig, found: Rig, stated: Rig) -> tuple[Rig, tuple[str, ...]]:
+    """The rig of both states with its inputs held, or measured, as the state before was found to
+    have them, and what that is where the rig file states it otherwise, in words."""
+    held = {a.name: a.held for a in found.actuator}
+    words = tuple(
+        f"{a.name} was {'' if held[a.name] else 'not '}held between samples in the state before: "
+        f"both states are taken so, as held = {str(held[a.name]).lower()} in the rig file states it"
+        for a in stated.actuator
+        if held[a.name] != a.held
+    )
+    each = tuple(a.model_copy(update={"held": held[a.name]}) for a in common.actuator)
+    return common.model_copy(update={"actuator": each}), words
 
 
 def _given(search: StatesSearch, second: Case, first: Case) -> list[Given]:

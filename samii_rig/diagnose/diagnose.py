@@ -18,6 +18,7 @@ from samii_rig.diagnose.fit.classes import merge_equivalent
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.usual import LINES_TAKE, RECORDS_TAKE, takes
+from samii_rig.diagnose.physics.channels import is_stated
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.grid import grid
 from samii_rig.diagnose.physics.poses import weighty
@@ -113,7 +114,8 @@ def case_of(
         if whole is not None:  # whole records reach to where no response could be estimated
             low, high = min(low, whole.records.band[0]), max(high, whole.records.band[1])
         effects = table(rig, low, high, signed=signed, recorded_hz=trusted[0].rate_hz)
-    by_line = Search(rig, seen, at, clean.competing(effects), progress=progress)
+    effects = [e for e in clean.competing(effects) if not is_stated(e, rig)]
+    by_line = Search(rig, seen, at, effects, progress=progress)
     return Case(clean, trusted, runs, lines, by_line, decide, show, whole=whole)
 
 

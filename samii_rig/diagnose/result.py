@@ -200,6 +200,8 @@ class Used:
 class Before:
     """What is in both of two states, by the state before.
 
+    inputs : what the state before showed of how inputs were recorded, and both were taken to have,
+    in words.
     verdict, causes : of its own diagnosis. discrepancy : whether it holds what the table does not
     explain; the state after was then taken to hold the same.
     recordings : of each state, before and after. rig : with the parameters that serve both states
@@ -211,6 +213,7 @@ class Before:
     discrepancy: bool = False
     recordings: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
     rig: Rig | None = None
+    inputs: tuple[str, ...] = ()
 
     def plain(self) -> dict[str, Any]:
         """As plain data."""
@@ -224,6 +227,9 @@ class Before:
 
     def describe(self) -> tuple[str, ...]:
         """In words."""
+        return (*self.inputs, *self._in_both())
+
+    def _in_both(self) -> tuple[str, ...]:
         if self.discrepancy:
             return (
                 "the state before holds something that the table does not name: it is taken to be "

@@ -22,7 +22,7 @@ from samii_rig.modal.modes import Value
 from samii_rig.modal.rational import EXTRAS, Rational, functions
 from samii_rig.modal.selection import wald
 from samii_rig.modal.vector_fitting import fit_rational
-from samii_rig.model.sampled import hold_response, sensor_response
+from samii_rig.model.sampled import given_response, sensor_response
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.whitening import Fit, goodness
 from samii_rig.types import Complex, Float, FrequencyResponse
@@ -201,7 +201,7 @@ def _seen(rig: Rig, d: Lines) -> Complex:
     """(n, p) hold, filters and delays of each entry."""
     rate = d.response.rate_hz
     filters = sensor_response(rig.sensor, d.frequency)[:, d.sensor]
-    holds = {i: hold_response(d.frequency, rate, rig.actuator[i].delay) for i in set(d.actuator)}
+    holds = {i: given_response(rig.actuator[i], d.frequency, rate) for i in set(d.actuator)}
     return np.asarray(filters * np.stack([holds[i] for i in d.actuator], axis=1))
 
 

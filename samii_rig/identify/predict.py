@@ -15,7 +15,7 @@ import numpy as np
 from samii_rig.identify.data import Data
 from samii_rig.identify.parameters import Space
 from samii_rig.identify.poses import at_pose
-from samii_rig.model.sampled import hold_response, sampled_response, sensor_response
+from samii_rig.model.sampled import given_response, sampled_response, sensor_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.pose import Angle
@@ -47,7 +47,7 @@ class Predictor:
         self._chains = tuple(Chain(at_pose(rig, pose)) for pose in apart)
         self._chain_of = [apart.index(pose) for pose in at]
         f = data.frequency
-        hold = [hold_response(f, rig.rate_hz, a.delay) for a in rig.actuator]
+        hold = [given_response(a, f, rig.rate_hz) for a in rig.actuator]
         self._factor = (
             sensor_response(rig.sensor, f)[:, :, None] * np.stack(hold, axis=1)[:, None, :]
         )

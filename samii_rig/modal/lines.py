@@ -147,17 +147,19 @@ def _seen(
     seen = np.ones((f.size, len(outputs), n_in), dtype=np.complex128)
     if rig is None:
         return seen.reshape(f.size, -1), "nothing divided out: no rig file"
-    from samii_rig.model.sampled import hold_response, sensor_response  # loads the compiler
+    from samii_rig.model.sampled import given_response, sensor_response  # loads the compiler
 
     sensors = {s.name: s for s in rig.sensor}
     actuators = {a.name: a for a in rig.actuator}
     said = []
     for j, channel in enumerate(response.inputs):
         if channel.name in actuators:
-            seen[:, :, j] *= hold_response(f, response.rate_hz, actuators[channel.name].delay)[
-                :, None
-            ]
-            said.append(f"the hold of {channel.name}")
+            actuator = actuators[channel.name]
+            seen[:, :, j] *= given_response(actuator, f, response.rate_hz)[:, None]
+            if actuator.held:
+                said.append(f"the hold of {channel.name}")
+            elif actuator.delay:
+                said.append(f"the delay of {channel.name}")
     known = [name for name in outputs if name in sensors]
     for i, name in enumerate(outputs):
         if name in sensors:

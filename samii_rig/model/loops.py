@@ -22,7 +22,7 @@ from scipy.linalg import block_diag, expm
 from samii_rig.errors import InputError, SamiiRigError
 from samii_rig.model.feedback import analogue, digital, state_space
 from samii_rig.model.realise import Realisation, realise
-from samii_rig.model.sampled import sampled_response, sensor_response
+from samii_rig.model.sampled import as_sent, sampled_response, sensor_response
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Feedback, Rig
 from samii_rig.types import Complex, Float
@@ -92,7 +92,8 @@ def loop_gain(
     long as L keeps away from -1 (negative feedback)."""
     loops = loops_of(rig) if loops is None else loops
     f = np.asarray(frequency_hz, dtype=np.float64)
-    return loops.gain(sampled_response(rig, f, chain), loops.filters(_z(rig, f), rig.rate_hz))
+    H = sampled_response(as_sent(rig), f, chain)
+    return loops.gain(H, loops.filters(_z(rig, f), rig.rate_hz))
 
 
 def closed_response(
@@ -102,7 +103,7 @@ def closed_response(
     with the loops closed; the columns of other actuators with their own loops open."""
     loops = loops_of(rig) if loops is None else loops
     f = np.asarray(frequency_hz, dtype=np.float64)
-    H = sampled_response(rig, f, chain)
+    H = sampled_response(as_sent(rig), f, chain)
     return _close(H, loops, loops.filters(_z(rig, f), rig.rate_hz))
 
 

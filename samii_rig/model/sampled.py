@@ -7,6 +7,9 @@ sequence it reads to the sequence it writes,
 
 with the zero-order hold of the output and the filter F of each sensor. A lag is a negative
 phase: the hold alone is -18 degrees at 50 Hz and 500 samples/s.
+
+An input that a sensor measured (`held = false` of its actuator) is band limited: the rig followed
+it between samples, too, so that it has neither hold nor aliases.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import numpy as np
 
 from samii_rig.errors import InputError
 from samii_rig.model.tmm import Chain
-from samii_rig.rig.schema import SOURCES, Parameter, Rig, SensorBase
+from samii_rig.rig.schema import SOURCES, ActuatorSpec, Parameter, Rig, SensorBase
 from samii_rig.types import Complex, Float
 
 ALIAS_TOLERANCE = 1e-5  # of each response, change by the last doubling of the aliases
@@ -40,6 +43,32 @@ def hold_at(s: Complex, rate_hz: float, delay: float = 0.0) -> Complex:
     s = np.asarray(s, dtype=np.complex128)
     held = -np.expm1(-s / rate_hz) * rate_hz / s
     return np.asarray(held * np.exp(-s * delay) if delay else held)
+
+
+def unheld_at(s: Complex, rate_hz: float) -> Complex:
+    """s T/(1 - exp(-s T)), the inverse of `hold_at`, at complex s of any shape, rad/s; 0 from half
+    the rate on: what was measured at the samples is smooth between them and has no images there."""
+    sT = np.asarray(s, dtype=np.complex128) / rate_hz
+    inside = np.abs(sT.imag) < np.pi
+    below = -np.expm1(-sT)
+    ratio = np.divide(sT, below, out=np.ones_like(sT), where=below != 0)
+    return np.where(inside, ratio, 0.0)
+
+
+def given_response(actuator: ActuatorSpec, frequency_hz: Float, rate_hz: float) -> Complex:
+    """(n,) what comes of an actuator's samples at real frequencies, Hz: held, or as it was
+    measured, after its delay."""
+    held = hold_response(frequency_hz, rate_hz, actuator.delay)
+    s = 2j * np.pi * np.asarray(frequency_hz, dtype=np.complex128)
+    return held if actuator.held else held * unheld_at(s, rate_hz)
+
+
+def as_sent(rig: Rig) -> Rig:
+    """The rig as a converter drives it: whatever its recordings have, what is sent out is held."""
+    if all(a.held for a in rig.actuator):
+        return rig
+    held = tuple(a.model_copy(update={"held": True}) for a in rig.actuator)
+    return rig.model_copy(update={"actuator": held})
 
 
 def lowpass_poles(sensor: SensorBase) -> Complex:
@@ -168,7 +197,8 @@ def sampled_response(
 
     frequency_hz : (n_freq,), above 0 and at most half the rate. tolerance : of each response,
     change by the last doubling of the aliases.
-    Returns (n_freq, n_sensor, n_input) complex, rig-file order. The sensors are read just
+    Returns (n_freq, n_sensor, n_input) complex, rig-file order; of an actuator that is not `held`
+    the response to what was measured. The sensors are read just
     before the output changes, so that a jump of the output is not in the sample taken with it.
     Uses the transfer matrices alone, not the state space of `samii_rig.model.realise`.
 
@@ -217,19 +247,21 @@ def _terms(rig: Rig, chain: Chain, f: Float, k: np.ndarray) -> Complex:
     # The response to a real input at -f is the conjugate of that at f.
     G = chain.response(np.abs(at).ravel())
     np.conjugate(G, out=G, where=(at < 0).ravel()[:, None, None])
-    filters = _filters_at(rig.sensor, np.asarray(2j * np.pi * at, np.complex128))
+    s = np.asarray(2j * np.pi * at, np.complex128)
+    filters = _filters_at(rig.sensor, s)
     # Of hold and delays e^{-j w late} is a factor of f times one of k; so is the hold's sine.
     held = (np.sin(np.pi / rig.rate_hz * f)[:, None] * (1 - 2 * (k % 2))) / (
         np.pi / rig.rate_hz * at
     )
+    given = [held if a.held else held * unheld_at(s, rig.rate_hz) for a in rig.actuator]
     G = G.reshape(f.size, k.size, *G.shape[1:])
     out = np.empty((f.size, *G.shape[2:]), np.complex128)
     for i, (x, F) in enumerate(zip(rig.sensor, filters, strict=True)):
-        passed = F * held
         for j, actuator in enumerate(rig.actuator):
             late = 0.5 / rig.rate_hz + actuator.delay + x.delay
             turned = np.exp(-2j * np.pi * k * (late * rig.rate_hz))
-            out[:, i, j] = np.exp(-2j * np.pi * f * late) * ((G[:, :, i, j] * passed) @ turned)
+            passed = G[:, :, i, j] * (F * given[j])
+            out[:, i, j] = np.exp(-2j * np.pi * f * late) * (passed @ turned)
     return out
 
 
@@ -243,6 +275,8 @@ def _half_jumps(rig: Rig, chain: Chain, f: Float) -> Complex:
     out = np.zeros((f.size, len(rig.sensor), len(rig.actuator)), dtype=np.complex128)
     for i, sensor in enumerate(rig.sensor):
         for j, actuator in enumerate(rig.actuator):
+            if not actuator.held:
+                continue  # what was measured does not jump
             periods = (actuator.delay + late[j] + sensor.delay) * rig.rate_hz
             if lowpass_poles(sensor).size == 0 and abs(periods - round(periods)) < 1e-9:
                 lag = np.exp(-2j * np.pi * f * round(periods) / rig.rate_hz)

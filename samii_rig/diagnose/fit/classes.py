@@ -182,13 +182,11 @@ def _at_start(rig: Rig, effect: Effect, frequency: np.ndarray) -> np.ndarray:
     x = np.zeros(trial.n)
     x[trial.n_nominal :] = [math.log(u.middle) for u in effect.unknowns]
     h = trial.chain.with_values(trial.values(x)).response(frequency)
-    if effect.factor is not None:
-        F = effect.factor.value(2j * np.pi * frequency, trial.parts(x)[0])[0]
-        names = [c.name for c in (rig.actuator if effect.factor.kind == "input" else rig.sensor)]
-        on = names.index(effect.factor.channel)
-        part = (
-            (slice(None), slice(None), on) if effect.factor.kind == "input" else (slice(None), on)
-        )
+    for factor, theta, _ in trial.passing(x):
+        F = factor.value(2j * np.pi * frequency, theta)[0]
+        names = [c.name for c in (rig.actuator if factor.kind == "input" else rig.sensor)]
+        on = names.index(factor.channel)
+        part = (slice(None), slice(None), on) if factor.kind == "input" else (slice(None), on)
         h[part] *= F[:, None]
     return np.asarray(h)
 

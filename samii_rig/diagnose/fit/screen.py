@@ -129,7 +129,7 @@ class Screen:
         factor = effect.factor
         assert factor is not None
         model, at = self.base.model, self.problem.at
-        on = model.entries(effect, at)
+        on = model.entries(factor, at)
         plain = self.base.model.response(self.base.x, at.without_aliases())
         b = np.zeros_like(plain)
         rows = at.changed

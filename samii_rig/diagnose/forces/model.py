@@ -70,24 +70,15 @@ class ForceModel(Model):
         rows = [own[self.unknowns.index(j)] if j in self.unknowns else by_scale for j in moving]
         return np.ascontiguousarray(rows, np.float64).reshape(-1, 2)
 
-    def metered(self, command: str) -> bool:
-        """Whether a meter recorded a command, which its rig followed between samples, too."""
-        each = (e.factor for e in self.effects if e.metered)
-        return any(factor is not None and factor.channel == command for factor in each)
-
     def channels(
         self, x: Float, s: Complex
     ) -> tuple[dict[str, Complex], dict[str, Complex]] | None:
-        """(n,) at s what the effects on channels do to each command, and to each sensor, by name;
-        None where no effect is on a channel."""
-        some = [
-            (e.factor, theta)
-            for e, theta in zip(self.effects, self.parts(x), strict=True)
-            if e.factor is not None
-        ]
+        """(n,) at s what factors do to each command, and to each sensor, by name; None where there
+        are none."""
+        some = self.passing(x)
         given: dict[str, Complex] = {}
         seen: dict[str, Complex] = {}
-        for factor, theta in some:
+        for factor, theta, _ in some:
             F = factor.value(s, theta)[0]
             known = given if factor.kind == "input" else seen
             known[factor.channel] = known.get(factor.channel, np.ones_like(F)) * F

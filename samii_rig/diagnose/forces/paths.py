@@ -162,7 +162,7 @@ class TransferPaths:
         on, pieces = self.column(place), self.whole.records.pieces
         if left := max(c.meter[on].on_samples for p in pieces for c in p.commands):
             return left
-        if not any(e.metered for e in self.model.effects):
+        if not any(self.model.metered(x.command) for x in self.whole.wired.inputs):
             return 0.0
         return max(meter_noise(v, step) for v in self._recorded(place))
 
@@ -204,9 +204,8 @@ class TransferPaths:
         more = np.broadcast_to(late, len(rig.actuator))
         each = [hold_at(s, rig.rate_hz, rig.actuator[a].delay + more[a]) for a in self.whole.acting]
         out = np.stack(each, axis=1)
-        for effect, theta in zip(self.model.effects, self.model.parts(self.x), strict=True):
-            factor = effect.factor
-            if factor is not None and factor.kind == "input" and factor.channel in names:
+        for factor, theta, _ in self.model.passing(self.x):
+            if factor.kind == "input" and factor.channel in names:
                 out[:, names.index(factor.channel)] *= factor.value(s, theta)[0]
         return out
 

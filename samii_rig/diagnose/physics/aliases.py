@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from samii_rig.model.sampled import sampled_response, sensors_at
+from samii_rig.model.sampled import as_sent, sampled_response, sensors_at
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, Int
@@ -156,7 +156,9 @@ class Aliases:
         """Of a chain of the rig."""
         s = np.asarray(2j * np.pi * few, np.complex128)
         near = each_alias(rig, chain, s, (0, *NEAR_ALIASES), sensor, actuator)
-        rest = sampled_response(rig, few, chain)[:, sensor, actuator] - near.sum(axis=0)
+        # Of held inputs, as `near` is: what was measured is made of that by a factor.
+        every = sampled_response(as_sent(rig), few, chain)[:, sensor, actuator]
+        rest = every - near.sum(axis=0)
         far = Far.of(rig, chain, few, sensor, actuator)
         return cls(few, rest / _held(s, rig.rate_hz), far)
 

@@ -14,6 +14,7 @@ from samii_rig.diagnose.physics.effect import Effect, Factor, Key, Unknown, Valu
 from samii_rig.diagnose.physics.reduced import FASTER
 from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.diagnose.physics.scales import SMALLEST
+from samii_rig.diagnose.physics.unheld import measured
 from samii_rig.rig.schema import (
     ANGLE_SOURCES,
     SOURCES,
@@ -75,14 +76,6 @@ def highpass(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
 def gain(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
     """A constant."""
     return np.full(s.shape, x[0], complex), [np.ones(s.shape, complex)]
-
-
-def not_held(s: Complex, _x: Float, rate_hz: float) -> tuple[Complex, list[Complex]]:
-    """s T/(1 - exp(-s T)), the inverse of the converter's hold: the input was measured at the
-    samples, a smooth signal between them that has no images above half the rate."""
-    T = 1 / rate_hz
-    inside = np.abs(s.imag) < math.pi / T
-    return np.where(inside, s * T / -np.expm1(-s * T), 0.0), []
 
 
 def second_order(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
@@ -182,9 +175,28 @@ def _input(rig: Rig, name: str, low_hz: float, high_hz: float) -> Iterator[Effec
         unknowns=(_gains(),),
         factor=Factor("input", name, gain),
     )
-    unheld = partial(not_held, rate_hz=rig.rate_hz)
-    factor = Factor("input", name, unheld)
-    yield Effect(physics="input_not_held", site=name, factor=factor, rough=METERED)
+    yield _as_recorded(rig, name)
+
+
+def is_stated(effect: Effect, rig: Rig) -> bool:
+    """Whether the rig file says of an input what the effect does."""
+    said = {a.name: "input_held" if a.held else "input_not_held" for a in rig.actuator}
+    return effect.physics == said.get(effect.site)
+
+
+def _as_recorded(rig: Rig, name: str) -> Effect:
+    """That the recorded input is not what the rig file states: measured in the place of held, or
+    held in the place of measured."""
+    if next(a.held for a in rig.actuator if a.name == name):
+        return Effect(
+            physics="input_not_held",
+            site=name,
+            factor=measured(rig, name),
+            write=lambda rig, _x: insert.actuator_changed(rig, name, lambda _: {"held": False}),
+            rough=METERED,
+        )
+    held = partial(insert.actuator_changed, name=name, change=lambda _: {"held": True})
+    return Effect(physics="input_held", site=name, build=held)
 
 
 Update = Callable[[float], dict[str, object]]

@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from samii_rig.diagnose.physics import insert
-from samii_rig.diagnose.physics.channels import METERED, not_held
+from samii_rig.diagnose.physics.channels import METERED
 from samii_rig.diagnose.physics.confusions import UNITS
 from samii_rig.diagnose.physics.effect import Effect, Factor
+from samii_rig.diagnose.physics.unheld import not_held
 from samii_rig.rig.schema import (
     AbsoluteAngle,
     Acceleration,
@@ -67,7 +68,9 @@ def effects(rig: Rig, recorded_hz: float) -> Iterator[Effect]:
     """Every fault that this rig's columns allow, of so many rows a second."""
     for actuator in rig.actuator:
         shifts = list(_shifts(SHIFTED, recorded_hz))
-        for m in (*_of_any(), *shifts, *_measured_too(shifts, rig.rate_hz)):
+        # What the rig file states as measured is so with every fault.
+        both = _measured_too(shifts, rig.rate_hz) if actuator.held else ()
+        for m in (*_of_any(), *shifts, *both):
             yield _on("input", actuator.name, m)
     for sensor in rig.sensor:
         rows = [*_of_any(), *_of_kind(sensor)]

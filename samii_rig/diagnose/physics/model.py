@@ -10,10 +10,11 @@ import numpy as np
 
 from samii_rig.diagnose.physics.aliases import NEAR_ALIASES, lower, over
 from samii_rig.diagnose.physics.causal import CausalChain
-from samii_rig.diagnose.physics.effect import Effect, Key
+from samii_rig.diagnose.physics.effect import Effect, Factor, Key
 from samii_rig.diagnose.physics.fractional import ChainLike, FractionalChain
 from samii_rig.diagnose.physics.grid import OWN_ALIASES, Folded, Grid
 from samii_rig.diagnose.physics.poses import turned
+from samii_rig.diagnose.physics.unheld import stated
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.rig.schema.elements import flattened
@@ -119,6 +120,21 @@ class Model:
             at += len(effect.unknowns)
         return out
 
+    def passing(self, x: Float) -> list[tuple[Factor, Float, int]]:
+        """The factors on channels, the values of their unknowns and where these begin in x: of the
+        effects, and of inputs that the built rig has as measured."""
+        out, first = [], self.n_nominal
+        for effect, theta in zip(self.effects, self.parts(x), strict=True):
+            if effect.factor is not None:
+                out.append((effect.factor, theta, first))
+            first += len(effect.unknowns)
+        return out + [(factor, np.zeros(0), first) for factor in stated(self.built)]
+
+    def metered(self, command: str) -> bool:
+        """Whether a meter recorded a command, which its rig followed between samples, too."""
+        measured = [e.factor for e in self.effects if e.metered] + list(stated(self.built))
+        return any(factor is not None and factor.channel == command for factor in measured)
+
     def own(self, i: int) -> range:
         """Where the unknowns of effect i stand in x."""
         first = self.n_nominal + sum(len(e.unknowns) for e in self.effects[:i])
@@ -209,7 +225,7 @@ class Model:
     def _passed(self, x: Float, at: Grid) -> tuple[_Passed | None, _Passed | None]:
         """What the factors on channels do at the grid's own s and to the aliases of `folded`, and
         to those of `far`; None where there is no factor, or no such aliases."""
-        if not any(e.factor is not None for e in self.effects):
+        if not self.passing(x):
             return None, None
         near = self._passed_at(x, at, np.stack([at.s, *at.orders()]))
         return near, None if at.far is None else self._passed_at(x, at, at.far.s[None])
@@ -218,24 +234,19 @@ class Model:
         """s : (order, n)."""
         total = np.ones((*s.shape, at.sensor.size), complex)
         parts = []
-        first = self.n_nominal
-        for effect, theta in zip(self.effects, self.parts(x), strict=True):
-            if effect.factor is not None:
-                F, dF = effect.factor.value(s.ravel(), theta)
-                on = self.entries(effect, at)
-                total[:, :, on] *= F.reshape(*s.shape, 1)
-                parts += [
-                    (first + j, on, (d * theta[j] / F).reshape(*s.shape, 1))
-                    for j, d in enumerate(dF)
-                ]
-            first += len(effect.unknowns)
+        for factor, theta, first in self.passing(x):
+            F, dF = factor.value(s.ravel(), theta)
+            on = self.entries(factor, at)
+            total[:, :, on] *= F.reshape(*s.shape, 1)
+            parts += [
+                (first + j, on, (d * theta[j] / F).reshape(*s.shape, 1)) for j, d in enumerate(dF)
+            ]
         return _Passed(total, parts)
 
-    def entries(self, effect: Effect, at: Grid) -> Int:
-        """Entries of the grid that an effect's factor is on."""
-        assert effect.factor is not None
-        if effect.factor.kind == "input":
+    def entries(self, factor: Factor, at: Grid) -> Int:
+        """Entries of the grid that a factor is on."""
+        if factor.kind == "input":
             names = [a.name for a in self.rig.actuator]
-            return np.flatnonzero(at.actuator == names.index(effect.factor.channel))
+            return np.flatnonzero(at.actuator == names.index(factor.channel))
         names = [s.name for s in self.rig.sensor]
-        return np.flatnonzero(at.sensor == names.index(effect.factor.channel))
+        return np.flatnonzero(at.sensor == names.index(factor.channel))

@@ -71,6 +71,7 @@ _ROWS = (
     Physics("column_shifted", "a column that stands samples from the others", physical=False),
     Physics("columns_shifted", "columns that stand samples apart", physical=False),
     Physics("input_not_held", "an input that was not held", physical=False),
+    Physics("input_held", "an input that was held, not measured", physical=False),
 )
 PHYSICS = {row.name: row for row in _ROWS}
 RESONANT = frozenset(row.name for row in _ROWS if row.resonant)

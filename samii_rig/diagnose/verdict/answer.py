@@ -110,6 +110,11 @@ def not_physics_of(judged: Judgement) -> list[str]:
                     f"{effect.site} was not held between samples but recorded as a meter sees it, "
                     "half a sample from what the rig file states"
                 )
+            case "input_held":
+                out.append(
+                    f"{effect.site} was held between samples: the rig file states that it was "
+                    "measured (held = false), which is half a sample from what was recorded"
+                )
             case "common_gain":
                 g = found["gain"]
                 out.append(

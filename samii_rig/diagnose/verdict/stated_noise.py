@@ -63,6 +63,7 @@ def unfiltered(search: RecordSearch, best: Explanation) -> str:
     that is told, by which the input was measured."""
     whole = search.whole
     measured = {e.site for e in best.effects if e.physics == "input_not_held"}
+    measured |= {a.name for a in best.fitted.model.built.actuator if not a.held}
     if not isinstance(whole, Whole) or not measured:
         return ""
     each = zip(*(c.meter for p in whole.records.pieces for c in p.commands), strict=True)

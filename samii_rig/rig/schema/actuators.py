@@ -17,6 +17,9 @@ class ActuatorSpec(Strict):
     between a sample's time stamp and the moment the output changes. `deadman` s after the
     last command the device itself drops its output to zero; without it the rig cannot be armed.
 
+    held : what a recording has of this input. False: a sensor measured it, such as a hammer's force
+        or a table's acceleration. It is band limited, and the rig followed it between samples, too.
+        What is sent out is held whatever this says.
     centring : the loop on this output, where it is not the rig's first; that of the first is the
         rig's own [centring].
     """
@@ -27,6 +30,7 @@ class ActuatorSpec(Strict):
     high: Finite
     resolution: NonNegative = 0.0
     delay: NonNegative = 0.0
+    held: bool = True
     deadman: Positive | None = None
     centring: Centring | None = None
 
