@@ -156,10 +156,7 @@ def _seen(
         if channel.name in actuators:
             actuator = actuators[channel.name]
             seen[:, :, j] *= given_response(actuator, f, response.rate_hz)[:, None]
-            if actuator.held:
-                said.append(f"the hold of {channel.name}")
-            elif actuator.delay:
-                said.append(f"the delay of {channel.name}")
+            said.append(f"the {'hold' if actuator.held else 'delay'} of {channel.name}")
     known = [name for name in outputs if name in sensors]
     for i, name in enumerate(outputs):
         if name in sensors:

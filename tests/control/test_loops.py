@@ -147,3 +147,12 @@ def test_centring_alone_puts_a_pole_near_k_kp(kp):
     poles = closed_loop_poles(with_loop(kp=kp), band_hz=BAND)
     real = poles.s[poles.s.imag == 0].real
     assert np.min(np.abs(real + 0.5 * kp)) < 0.05 * kp
+
+
+def test_a_loop_is_closed_around_what_is_sent_out_which_is_held():
+    """Whatever the rig file says of what was recorded."""
+    rig = with_loop(lowpass(0.5))
+    unheld = {"actuator": (rig.actuator[0].model_copy(update={"held": False}),)}
+    f = np.array([0.5, 5.0, 40.0])
+    for of in (loop_gain, closed_response):
+        np.testing.assert_array_equal(of(rig.model_copy(update=unheld), f), of(rig, f))

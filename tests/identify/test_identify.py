@@ -330,3 +330,20 @@ def test_on_the_real_robot_what_one_level_taught_holds_at_the_others(recordings)
         assert np.all(error[1] < 0.85 * error[0])
     # The author's model leaves something out, and the test of the fit says so.
     assert not found.fit.holds
+
+
+def test_a_measured_input_is_predicted_without_hold_and_aliases():
+    """`held = false` of the rig file: half a sample would pass for a pole of the drive."""
+    unheld = {"actuator": (samii().actuator[0].model_copy(update={"held": False}),)}
+    rig = samii().model_copy(update=unheld)
+    response = drawn(rig, n=60)
+    free = start_off(STIFFNESSES, np.ones(4))
+    predicted = Predictor(rig, collect([response], rig), space(rig, free))
+    x = np.zeros(4)
+    (plain,) = predicted.response(x)
+    predicted.update_aliases(x)
+    (whole,) = predicted.response(x)
+    np.testing.assert_allclose(whole, plain, rtol=1e-9)
+    exact_ = sampled_response(rig, response.frequency)[:, :, 0]
+    np.testing.assert_allclose(whole, exact_, rtol=1e-9)
+    assert np.max(np.abs(sampled_response(samii(), response.frequency)[:, :, 0] / exact_ - 1)) > 0.2

@@ -69,9 +69,11 @@ def struck(
     seed: int,
     *,
     kg: float = 0.0,
+    k2: float = K2,
     filtered: bool = True,
 ) -> Recording:
-    """`HITS` on the second mass. kg : N/m of a spring from there to the ground."""
+    """`HITS` on the second mass. kg : N/m of a spring from there to the ground. k2 :
+    N/m of the columns between both."""
     n = 3000
     t = np.arange(n * FINE) / (RATE * FINE)
     F = np.zeros(t.size)
@@ -80,8 +82,8 @@ def struck(
         F[on] += height * np.sin(np.pi * (t[on] - at) / width)
     A = np.zeros((4, 4))
     A[:2, 2:] = np.eye(2)
-    A[2] = np.array([-K1 - K2, K2, -C1 - C2, C2]) / M1
-    A[3] = np.array([K2, -K2 - kg, C2, -C2]) / M2
+    A[2] = np.array([-K1 - k2, k2, -C1 - C2, C2]) / M1
+    A[3] = np.array([k2, -k2 - kg, C2, -C2]) / M2
     B = np.array([[0.0], [0.0], [0.0], [1 / M2]])
     h = t[1]
     whole = linalg.expm(h * np.block([[A, B, 0 * B], [np.zeros((1, 5)), np.eye(1) / h],
@@ -112,6 +114,6 @@ def struck(
     )  # fmt: skip
 
 
-def diagnosed(run: Recording, effects: Sequence[Effect] | None = None) -> Diagnosis:
+def diagnosed(run: Recording, effects: Sequence[Effect] | None = None, rig: Rig = RIG) -> Diagnosis:
     """effects : the linear ones to try, the whole table if None."""
-    return diagnose(estimate([run], gaps="auto"), RIG, runs=[run], effects=effects)
+    return diagnose(estimate([run], gaps="auto"), rig, runs=[run], effects=effects)

@@ -7,10 +7,12 @@ from hypothesis import strategies as st
 
 from samii_rig.errors import InputError
 from samii_rig.model.sampled import (
+    as_sent,
     feedthrough,
     filter_poles,
     filter_residues,
     filter_response,
+    given_response,
     hold_response,
     sampled_response,
 )
@@ -113,6 +115,32 @@ def test_a_delay_lags(delay):
     assert np.all(lag < 0)
     # Aliases bend the line a little; at 17 Hz they are small.
     np.testing.assert_allclose(lag, -2 * np.pi * F[:3] * delay, rtol=0.02, atol=1e-6)
+
+
+def test_what_was_measured_has_neither_hold_nor_aliases_but_its_delay():
+    """The chain's own response, an accelerometer on the source among it, and half the rate too."""
+    delay = 0.3 * T
+    rig = arm([angle(), acceleration()], delay)
+    measured = rig.model_copy(
+        update={"actuator": (rig.actuator[0].model_copy(update={"held": False}),)}
+    )
+    plain = Chain(rig).response(F)[:, :, 0] * np.exp(-2j * np.pi * F * delay)[:, None]
+    np.testing.assert_allclose(sampled_response(measured, F)[:, :, 0], plain, rtol=1e-12)
+    given = given_response(measured.actuator[0], np.append(0.0, F), RATE)
+    np.testing.assert_allclose(given[1:], np.exp(-2j * np.pi * F * delay), rtol=1e-12)
+    assert given[0] == 1.0
+    np.testing.assert_array_equal(
+        given_response(rig.actuator[0], F, RATE), hold_response(F, RATE, delay)
+    )
+
+
+def test_what_is_sent_is_held_whatever_a_recording_has():
+    rig = arm([angle()])
+    measured = rig.model_copy(
+        update={"actuator": (rig.actuator[0].model_copy(update={"held": False}),)}
+    )
+    assert as_sent(rig) is rig
+    assert as_sent(measured) == rig
 
 
 def test_a_whole_period_of_delay_is_one_sample():
