@@ -144,8 +144,7 @@ class TransferPaths:
 
     def __post_init__(self) -> None:
         records = self.whole.records
-        shown = {e.factor.channel for e in self.model.effects if e.metered and e.factor is not None}
-        metered = [x.command in shown for x in self.whole.wired.inputs]
+        metered = [self.model.metered(x.command) for x in self.whole.wired.inputs]
         self.spans = [
             Span.of(piece, records.rate_hz, band[1], metered)
             for piece, band in zip(records.pieces, records.bands, strict=True)
