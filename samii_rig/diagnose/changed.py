@@ -21,7 +21,7 @@ from samii_rig.diagnose.fit.states import Both, StatesSearch
 from samii_rig.diagnose.fit.usual import STATES, STATES_TAKE, takes
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.insert import PREFIX
-from samii_rig.diagnose.result import Before, Diagnosis
+from samii_rig.diagnose.result import Before, Cause, Diagnosis
 from samii_rig.diagnose.verdict.by_record import by_samples
 from samii_rig.diagnose.verdict.stages import Case
 from samii_rig.errors import EstimateError
@@ -83,9 +83,7 @@ def changed(
     found = diagnose(
         before.responses, first_rig, band=band, effects=effects, runs=before.runs, progress=say
     )
-    put_in = found.verdict != "no_mismatch" and found.rig is not None
-    common = common_rig(first_rig, found.rig) if put_in and found.rig else first_rig
-    common, inputs = _as_recorded(common, found.rig or first_rig, first_rig)
+    common, causes, inputs = _in_both(first_rig, found)
     progress(Begun("both states", STATES["both states"]))
     first = case_of(before.responses, common, band, effects, before.runs, progress=progress)
     # What is known of the state before alone is as the rig file has it after.
@@ -103,25 +101,29 @@ def changed(
     left = max(nominal.chi2 - search.problem.expected, 0.0) if both.alike else None
     given = _given(search, second, first)
     answer = by_samples(second, search, at_first, bands, given, left)
-    causes = found.causes if put_in else ()
     names = _named(before), _named(after)
     rig_of_both = explained(search.nominal.fitted)
     before_ = Before(found.verdict, causes, both.alike, names, rig_of_both, inputs)
     return _beside(answer, before_)
 
 
-def _as_recorded(common: Rig, found: Rig, stated: Rig) -> tuple[Rig, tuple[str, ...]]:
-    """The rig of both states with its inputs held, or measured, as the state before was found to
-    have them, and what that is where the rig file states it otherwise, in words."""
-    held = {a.name: a.held for a in found.actuator}
-    words = tuple(
+def _in_both(rig: Rig, found: Diagnosis) -> tuple[Rig, tuple[Cause, ...], tuple[str, ...]]:
+    """The rig of both states by what was found before, which causes are in it, and which inputs
+    were not recorded as the rig file states, in words."""
+    if found.rig is None:
+        return rig, (), ()
+    held = {a.name: a.held for a in found.rig.actuator}
+    inputs = tuple(
         f"{a.name} was {'' if held[a.name] else 'not '}held between samples in the state before: "
         f"both states are taken so, as held = {str(held[a.name]).lower()} in the rig file states it"
-        for a in stated.actuator
+        for a in rig.actuator
         if held[a.name] != a.held
     )
-    each = tuple(a.model_copy(update={"held": held[a.name]}) for a in common.actuator)
-    return common.model_copy(update={"actuator": each}), words
+    if found.verdict != "no_mismatch":
+        return common_rig(rig, found.rig), found.causes, inputs
+    # How an input was recorded is no physics: it is found where nothing is missing, too.
+    each = tuple(a.model_copy(update={"held": held[a.name]}) for a in rig.actuator)
+    return rig.model_copy(update={"actuator": each}), (), inputs
 
 
 def _given(search: StatesSearch, second: Case, first: Case) -> list[Given]:
