@@ -87,10 +87,13 @@ def law(e: Source) -> Law:
             omega = e.omega.value
             falling = (1.0, 2 * e.zeta.value * omega, omega**2, 0.0)
             return Law(e.K.value * omega**2, falling, e.tau.value)
-        case DisplacementSource() | AccelerationSource():
+        case DisplacementSource():
             omega = e.omega.value
-            gain = e.K.value * (omega**2 if isinstance(e, DisplacementSource) else 1.0)
-            return Law(gain, (1.0, 2 * e.zeta.value * omega, omega**2), e.tau.value)
+            second = (1.0, 2 * e.zeta.value * omega, omega**2)
+            return Law(e.K.value * omega**2, second, e.tau.value)
+        case AccelerationSource():
+            omega, zeta = e.suspension
+            return Law(e.K.value, (1.0, 2 * zeta * omega, omega**2), e.tau.value)
         case _ if e.p is None:
             return Law(e.K.value, (1.0,), e.tau.value)
         case _:

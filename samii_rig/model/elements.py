@@ -21,6 +21,7 @@ from samii_rig.model.transformer import plain
 from samii_rig.rig.schema import (
     MOTION_SOURCES,
     SOURCES,
+    AccelerationSource,
     Beam,
     Bend,
     Branch,
@@ -218,6 +219,8 @@ def matrix(element: Element, s: Complex) -> Complex:
     values = [*p.values()]
     if isinstance(element, TorqueSource | ForceSource) and element.p is None:
         values.insert(1, np.inf)
+    if isinstance(element, AccelerationSource) and element.omega is None:
+        values[1:1] = element.suspension
     jump = SOURCE_LAWS[element.kind].value(s.ravel(), np.array(values)).reshape(s.shape)
     row, sign = {"torque_source": (2, -1.0), "force_source": (3, 1.0)}.get(element.kind, (1, 1.0))
     row = 0 if isinstance(element, MOTION_SOURCES) else row

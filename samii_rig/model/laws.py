@@ -428,7 +428,7 @@ def _second_at_rest_relative(s: Complex, p: Float) -> Complex:
 
 
 def _table(s: Complex, p: Float) -> Complex:
-    """1/(s^2 + 2 zeta omega s + omega^2): p = K, omega, zeta, tau."""
+    """1/(s^2 + 2 zeta omega s + omega^2): p = K, omega, zeta (both 0 for no suspension), tau."""
     return np.asarray(_inverse(s**2 + 2 * p[2] * p[1] * s + p[1] ** 2) * _late(s, p[3]))
 
 

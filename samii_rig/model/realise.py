@@ -228,8 +228,10 @@ def source_poles(rig: Rig) -> list[complex]:
                 out += [0j, complex(-e.p.value)]
             case AngularVelocitySource2():
                 out += [0j, *_second_order(e.omega.value, e.zeta.value)]
-            case DisplacementSource() | AccelerationSource():
+            case DisplacementSource():
                 out += _second_order(e.omega.value, e.zeta.value)
+            case AccelerationSource():
+                out += _second_order(*e.suspension)
             case TorqueSource() | ForceSource():
                 out += [complex(-e.p.value)] if e.p else []
     return out
@@ -278,7 +280,14 @@ def _refuse_double(rig: Rig, poles: Complex, R: Complex, second: Complex, radius
     strength = np.max(np.abs(R) * radius[:, None, None] + 1e-300, axis=0)
     double = np.abs(second) > 1e-6 * np.max(strength) * radius[:, None, None]
     if double.any():
-        where = poles[np.argwhere(double)[0][0]]
+        where, sensor = poles[np.argwhere(double)[0][0]], rig.sensor[np.argwhere(double)[0][1]]
+        tables = (e for e in rig.element if isinstance(e, AccelerationSource) and not e.omega)
+        if abs(where) <= CLUSTER and (table := next(tables, None)):
+            raise InputError.saying(
+                rig.name, f"element[{table.name}].omega",
+                "missing; expected omega and zeta where the table is simulated in time: without "
+                f"a suspension what {sensor.name} reads drifts away",
+            )  # fmt: skip
         raise InputError(
             rig.name, "element", f"double pole at {where:.6g} rad/s", "a chain with simple poles"
         )

@@ -18,7 +18,7 @@ from samii_rig.errors import InputError, one_of
 from samii_rig.files import open_file, reason
 from samii_rig.rig.plausible import remarks
 from samii_rig.rig.schema import Rig
-from samii_rig.rig.schema.base import Parameter
+from samii_rig.rig.schema.base import INTERNAL, Parameter
 from samii_rig.rig.shipped import FOLDER
 from samii_rig.rig.shipped import names_in as names_in
 from samii_rig.rig.shipped import shipped as shipped
@@ -29,6 +29,12 @@ _reported: set[tuple[str, str]] = set()
 Model = TypeVar("Model", bound=BaseModel)
 MAX_BYTES = 4_000_000  # a rig file is a few kB; more is not one
 MAX_PARTS = 16  # of a dotted key; ours have three, and the time to parse one grows with the square
+# What a text should be, by pydantic's word for what it is not: names alone have a pattern.
+_TEXTS = {
+    "string_pattern_mismatch": "letters, digits and _, with a letter first",
+    "string_too_short": "a text that is not empty",
+    "string_too_long": "{max_length} characters at most",
+}
 # Every character belongs to one of these and is passed once, whatever the text.
 _TOKEN = re.compile(
     r"""(?P<part>[\w-]++|"(?:[^"\\\n]|\\.)*+"?|'[^'\n]*+'?)|(?P<dot>\.)|[ \t]++"""
@@ -165,7 +171,8 @@ def _one_line(
             missing = (e["loc"] for e in found if e["type"] == "missing")
             lacking = [str(loc[-1]) for loc in missing if loc[:-1] == beside]
             known = [k for k in _fields_at(model, beside) if k not in _given(data, beside)]
-            near = one_of(first["loc"][-1], known) if known else "no more than there is"
+            near = one_of(first["loc"][-1], known) if len(known) > 1 else "no more than there is"
+            near = known[0] if len(known) == 1 else near
             if model is Rig and field == "experiment":
                 said = "is an experiment's file; expected a rig file"
                 return InputError.saying(where, "", said)
@@ -175,6 +182,11 @@ def _one_line(
             whole = first["ctx"]["class_name"] == Parameter.__name__
             table = '{ value = ..., unit = "...", source = "..." }' if whole else "a table, { ... }"
             return InputError(where, field, first["input"], table)
+        case "dict_type":
+            return InputError(where, field, first["input"], "a table, { ... }")
+        case "string_pattern_mismatch" | "string_too_short" | "string_too_long":
+            said = _TEXTS[first["type"]].format(**first["ctx"])
+            return InputError(where, field, first["input"], said)
         case "tuple_type" | "list_type":
             return InputError(where, field, first["input"], "a list, in brackets: [ ... ]")
         case "union_tag_not_found":
@@ -223,7 +235,8 @@ def _fields_at(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
         # A key that is no field is the tag of a union, which picks one of its kinds.
         tagged = [t for t in there if any(key in _words(f) for f in t.model_fields.values())]
         there = inside or tagged or there
-    return list(dict.fromkeys(name for t in there for name in t.model_fields))
+    fields = ((name, field) for t in there for name, field in t.model_fields.items())
+    return list(dict.fromkeys(name for name, field in fields if INTERNAL not in field.metadata))
 
 
 def _models(field: FieldInfo) -> list[type[BaseModel]]:

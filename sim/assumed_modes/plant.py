@@ -250,7 +250,12 @@ def _source(
     which is returned."""
     values, (Q, dQ, ddQ) = part.values, motion
     if part.kind in ("displacement_source", "acceleration_source"):
-        at, w = mech.sources[part.name], values["omega"]
+        at, w = mech.sources[part.name], values.get("omega", 0.0)
+        if w == 0.0:
+            place = sig.states(2).start
+            sig.rate[place], sig.rate[place + 1] = sig.unit(place + 1), values["K"] * drive
+            Q[at], dQ[at], ddQ[at] = sig.unit(place), sig.unit(place + 1), sig.rate[place + 1]
+            return None
         first = sig._used  # the states of a second-order filter: its output, and its rate over w
         static = values["K"] / (w**2 if part.kind == "acceleration_source" else 1.0)
         Q[at] = sig.filtered(static * drive, [_second(w, values["zeta"])])

@@ -39,6 +39,40 @@ def test_shipped_rigs_load_and_say_where_every_number_comes_from() -> None:
                 assert parameter.source.startswith(("[", "absent")), (element.name, symbol)
 
 
+PUSHED = """
+name = "measured"
+base = "clamped"
+tip = "free"
+rate_hz = 500.0
+actuator = [{ name = "M", unit = "N m", low = -1.0, high = 1.0 }]
+sensor = [{ name = "theta", kind = "absolute_angle", after = "disc", unit = "rad" }]
+element = [
+    {name = "shaft", kind = "torsional_spring", k = {value = 9, unit = "N m/rad", source = "-"}},
+    { name = "disc", kind = "inertia", I = { value = 1, unit = "kg m^2", source = "-" } },
+    {name = "push", kind = "torque_source", input = "M", K = {value = 2, unit = "U", source = "-"}},
+]
+"""
+
+
+@pytest.mark.parametrize("unit", ["N m/(N m)", "N m/N m", "1"])
+def test_the_gain_of_a_source_is_per_unit_of_its_input_whole(unit: str) -> None:
+    push = parse(Rig, PUSHED.replace('"U"', f'"{unit}"'), "measured.toml").element[2]
+    assert (push.K.value, push.K.unit) == (2.0, "N m/(N m)")
+
+
+def test_a_bend_says_where_its_angle_came_from_as_any_parameter_does() -> None:
+    elbow = (
+        '[[element]]\nname = "elbow"\nkind = "bend"\nangle = { value = 30, unit = "deg"SOURCE }\n'
+    )
+    said = 'pose = { value = 0, unit = "deg", source = "hangs" }\n'
+    text = SAMII.replace("[[sensor]]", elbow + "\n[[sensor]]", 1)
+    text = text.replace("[[element]]", said + "gravity = 9.81\n\n[[element]]", 1)
+    plain = parse(Rig, text.replace("SOURCE", ""), "bent.toml")
+    assert parse(Rig, text.replace("SOURCE", ', source = "spirit level"'), "bent.toml") == plain
+    line = rejected(text.replace("SOURCE", ", tolerance = 0.1"), "bent.toml")
+    assert line.endswith("element[elbow].angle.tolerance: no such field; expected source")
+
+
 def test_samii_carries_table_ii_of_paper_1() -> None:
     rig, _ = load_rig("samii")
     stiffness = {e.name: e.k.value for e in rig.element if isinstance(e, TorsionalSpring)}
@@ -77,6 +111,14 @@ def test_samii_carries_table_ii_of_paper_1() -> None:
         ("position = 0.1969", "position = 0.2", r"a_1.*0.2 m lies beyond link_1.*0.1969"),
         ('"joint_2_source", "joint_2"]', '"joint_2", "joint_2_source"]', r"not neighbours"),
         ('input = "v_2"', 'input = "v_3"', r"input 'v_3' is no actuator.*v_2"),
+        (
+            'name = "beam"',
+            'name = "a beam"',
+            "name is 'a beam'; expected letters, digits and _, with",
+        ),
+        ('name = "SAMII"', 'name = ""', "my.toml: name is ''; expected a text that is not empty"),
+        ('name = "beam"', f'name = "{"b" * 41}"', "name is 'b+'; expected 40 characters at most"),
+        ("tolerance = 0.1,", "tol = 0.1,", r"tol: no such field; expected tolerance$"),
         ('unit = "rad/(s V)"', 'unit = "rad/s"', r"K has unit 'rad/s'; expected 'rad/\(s V\)'"),
         (
             'kind = "relative_angle"',

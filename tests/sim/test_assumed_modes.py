@@ -127,6 +127,18 @@ def test_benches_that_slide_turn_and_shake_are_those_of_the_transfer_matrices(na
     np.testing.assert_allclose(kept, expected, rtol=1e-12)
 
 
+def test_a_table_whose_acceleration_was_measured_is_that_of_the_transfer_matrices() -> None:
+    rig, _ = load_rig("beam_on_shaker")
+    table, *others = rig.element
+    measured = table.model_copy(update={"omega": None, "zeta": None})
+    rig = rig.model_copy(update={"element": (measured, *others)})
+    f = np.geomspace(0.2, 60.0, 60)
+    expected = sampled_response(rig, f)[:, :, 0]
+    found = response(loop_of(setup_of(rig, {}), rig), f, rig.rate_hz)
+    assert np.max(np.abs(found / expected - 1)) < 1e-5
+    assert parse(Rig, rigfile.text(rig), "again").element[0] == measured
+
+
 @pytest.mark.parametrize(("rig", "effect"), [
     ("two_masses", "added_mass"), ("two_masses", "ground_spring"),
     ("carriage", "translational_compliance"), ("spindle_drive", "torsional_compliance"),

@@ -22,6 +22,10 @@ Key = tuple[str, str]
 """(element, symbol) of a parameter."""
 
 
+INTERNAL = "not of the file"
+"""Marks a field that a table holds and no person writes: no message offers it."""
+
+
 class Strict(BaseModel):
     """A table of the rig file: unknown keys are errors, values cannot be changed."""
 
@@ -40,7 +44,7 @@ class Parameter(Strict):
     unit: str
     tolerance: NonNegative = 0.0
     source: str = Field(min_length=1)
-    written: str = ""
+    written: Annotated[str, INTERNAL] = ""
 
     def shown(self) -> tuple[float, str]:
         """Value and unit as the file has them."""
@@ -158,6 +162,18 @@ def parameters(element: BaseModel) -> dict[str, Parameter]:
 def some_stiffness(v: Mapping[str, float]) -> str | None:
     """The rule of a spring in the chain."""
     return "k and c are both 0; expected one above 0" if v["k"] == 0 and v["c"] == 0 else None
+
+
+def both_or_neither(one: str, other: str) -> Rule:
+    """The rule of two numbers of one lag."""
+
+    def rule(v: Mapping[str, float]) -> str | None:
+        if (one in v) == (other in v):
+            return None
+        given, lacking = (one, other) if one in v else (other, one)
+        return f"{given} without {lacking}; expected both, or neither for no lag"
+
+    return rule
 
 
 def not_zero(symbol: str) -> Rule:

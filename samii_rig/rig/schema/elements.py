@@ -24,6 +24,7 @@ from samii_rig.rig.schema.base import (
     Quantity,
     Rule,
     Strict,
+    both_or_neither,
     contradiction,
     converted,
     not_negative,
@@ -370,16 +371,26 @@ class AccelerationSource(ElementBase):
     """A shaker's table, its acceleration K v above its suspension's natural frequency:
     w+ = w- + K v exp(-s tau)/(s^2 + 2 zeta omega s + omega^2).
 
-    No table keeps an acceleration for ever, so omega and zeta are its own. The unit of K is
-    "m/(s^2 V)" for volts.
+    No table keeps an acceleration for ever, so omega and zeta are its own. Where the acceleration
+    of the table was measured and is the input, it has neither: w+ = w- + K v exp(-s tau)/s^2. The
+    unit of K is "m/(s^2 V)" for volts.
     """
+
+    rule: ClassVar[Rule | None] = both_or_neither("omega", "zeta")
 
     kind: Literal["acceleration_source"]
     input: Name
     K: Parameter
-    omega: Annotated[Parameter, positive("rad/s")]
-    zeta: Annotated[Parameter, positive("1")]
+    omega: Annotated[Parameter | None, positive("rad/s")] = None
+    zeta: Annotated[Parameter | None, positive("1")] = None
     tau: Annotated[Parameter, not_negative("s")] = zero("s")
+
+    @property
+    def suspension(self) -> tuple[float, float]:
+        """omega, rad/s, and zeta; 0 and 0 for none."""
+        if self.omega is None or self.zeta is None:
+            return 0.0, 0.0
+        return self.omega.value, self.zeta.value
 
 
 Passive = Annotated[
@@ -485,13 +496,15 @@ TURNING = (
 
 def input_unit(kind: str, unit: str) -> str:
     """Unit of K of a source of this kind with an input in `unit`."""
+    # A `/` is for the next factor alone: of an input in N m the bracket makes it one of both.
+    whole = f"({unit})" if set(unit) & set(" /*") else unit
     match kind:
         case "torque_source":
-            return f"N m/{unit}"
+            return f"N m/{whole}"
         case "force_source":
-            return f"N/{unit}"
+            return f"N/{whole}"
         case "displacement_source":
-            return f"m/{unit}"
+            return f"m/{whole}"
         case "velocity_source":
             return f"m/(s {unit})"
         case "acceleration_source":

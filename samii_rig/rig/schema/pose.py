@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Annotated
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator
 
-from samii_rig.rig.schema.base import Finite, Strict
+from samii_rig.rig.schema.base import INTERNAL, Finite, Strict
 from samii_rig.rig.schema.sensors import Displacement, Velocity
 from samii_rig.units import convert
 
@@ -21,11 +21,16 @@ LEVEL = 1e-12  # |cos(pose)| below which a chain is level: 90 deg in rad is roun
 
 
 class Angle(Strict):
-    """An angle in rad; written : the unit that the file gives it in, if that is another."""
+    """An angle in rad.
+
+    source : where the number came from; the file alone keeps it. written : the unit that the file
+    gives it in, if that is another.
+    """
 
     value: Finite
     unit: str
-    written: str = Field(default="", description="unit that the value was given in")
+    source: str = ""
+    written: Annotated[str, INTERNAL] = ""
 
 
 class Pose(Angle):
@@ -38,9 +43,8 @@ def _in_rad(angle: Angle) -> Angle:
     value = convert(angle.value, angle.unit, "rad")
     if value is None:
         raise ValueError(f"unit {angle.unit!r}; expected 'rad' or 'deg'")
-    if angle.unit == "rad":
-        return angle
-    return Angle(value=value, unit="rad", written=angle.unit)
+    # Without its source: the same angle is one pose, whoever measured it.
+    return Angle(value=value, unit="rad", written="" if angle.unit == "rad" else angle.unit)
 
 
 PoseAngle = Annotated[Angle, AfterValidator(_in_rad)]
