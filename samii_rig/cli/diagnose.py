@@ -113,6 +113,9 @@ class DiagnoseOptions:
     ] = False
     workers: WorkersOption = None
     scheduler: SchedulerOption = ""
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Do not say what is being tried, the answer alone.")
+    ] = False
     json: JsonOption = False
 
 
@@ -294,7 +297,7 @@ def _together(o: DiagnoseOptions, logs: list[Path], earlier: list[Path]) -> None
 
     asked = _asked(o, logs, earlier)
     console = Console(highlight=False)
-    with working(console, "diagnosis", quiet=o.json) as say:
+    with working(Console(stderr=True), "diagnosis", quiet=o.json or o.quiet) as say:
         found, responses = _found(o, asked, say)
     if asked.kept:
         keep_diagnosis(logs, found)

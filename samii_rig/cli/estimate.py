@@ -159,7 +159,8 @@ def frf(o: FrfOptions) -> None:
     if o.save:
         check_target("--save", o.save, (".mcap",), o.logs)
         if o.save.exists():
-            raise InputError("--save", "", str(o.save), "no recording of that name yet")
+            said = f"{o.save} is there already; delete it, or name another file"
+            raise InputError.saying("--save", "", said)
 
     from rich.console import Console
 
@@ -265,7 +266,7 @@ def report(o: ReportOptions) -> None:
     from samii_rig.report.summary import summary, working
 
     console = Console(highlight=False)
-    with working(console, "report", quiet=o.json) as say:
+    with working(Console(stderr=True), "report", quiet=o.json) as say:
         say("recordings")
         recordings = read_all(o.logs)
         held = rig_of(recordings, o.rig)

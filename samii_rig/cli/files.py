@@ -86,7 +86,11 @@ def _targets(files: list[Path], layout: str, out: Path) -> list[Path]:
     targets = [out / f"{path.stem}.mcap" for path in files]
     for path, target in zip(files, targets, strict=True):
         if target.exists():
-            raise InputError(str(path), "", str(target), "no recording of that name yet")
+            said = (
+                f"there is a recording of that name already, {target}; delete it, or name another "
+                "folder with --out"
+            )
+            raise InputError.saying(str(path), "", said)
     if len(set(targets)) < len(targets):
         raise InputError("FILES", "", [p.name for p in files], "files of different names")
     return targets

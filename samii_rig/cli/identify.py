@@ -156,7 +156,7 @@ def _by_paper(
         expected = "recordings in one pose, or --method likelihood"
         raise InputError("--method", "", o.method, expected)
     responses = Estimating(gaps=o.gaps, band=o.band).of(recordings)
-    with working(Console(highlight=False), "identifying", quiet=o.json):
+    with working(Console(stderr=True), "identifying", quiet=o.json):
         found = methods.from_responses(
             cast("methods.Method", o.method), responses, at_pose(rig, at[0]), o.free or (),
             outputs=o.output, band=o.band,
@@ -178,7 +178,7 @@ def _by_likelihood(
     # Recordings of one pose are pooled.
     estimating = Estimating(output=o.output, gaps=o.gaps, band=o.band)
     in_pose = [(r, pose) for pose, alike in by_pose(recordings, at) for r in estimating.of(alike)]
-    with working(Console(highlight=False), "identifying", quiet=o.json) as say:
+    with working(Console(stderr=True), "identifying", quiet=o.json) as say:
         posed = problem(
             [response for response, _ in in_pose], rig, o.free or uncertain(rig),
             prior=not o.free, band=o.band, poses=[one for _, one in in_pose],
@@ -212,7 +212,7 @@ def _of_modes(o: IdentifyOptions, files: list[Path]) -> Identified:
             raise InputError("--modes", "", str(path), "each file once, or its noise counts twice")
     saved = [level for path in files for level in saved_modes(path)]
     own = load_rig(o.rig)[0]
-    with working(Console(highlight=False), "identifying", quiet=o.json):
+    with working(Console(stderr=True), "identifying", quiet=o.json):
         found = identify_modes(
             saved, own, o.free or uncertain(own), prior=not o.free,
             use=cast("Use", o.use or "residues"),

@@ -92,7 +92,7 @@ def modes(o: ModesOptions) -> None:
     from samii_rig.report.modes import modes_table
 
     console = Console(highlight=False)
-    found, lost = _found(o, wanted, console)
+    found, lost = _found(o, wanted)
     written = [str(p) for p in (o.out, o.figure, o.save) if p]
     if o.json:
         say_json({"modes": [m.plain() for m in found], "without": list(lost), "written": written})
@@ -101,11 +101,11 @@ def modes(o: ModesOptions) -> None:
     say_written(console, written)
 
 
-def _found(
-    o: ModesOptions, wanted: Sequence[float], console: Console
-) -> tuple[Sequence[Modes], Sequence[str]]:
+def _found(o: ModesOptions, wanted: Sequence[float]) -> tuple[Sequence[Modes], Sequence[str]]:
     """The modes, written where it is asked for, and what has none in words."""
     from json import dumps
+
+    from rich.console import Console
 
     from samii_rig.record.export import replacing
     from samii_rig.report.figures import save_figure
@@ -121,7 +121,7 @@ def _found(
         )
         recordings, compared = read_all(o.logs), read_all(o.against or [])
         held = rig_of(recordings, o.rig)
-        with working(console, "modes", quiet=o.json) as say:
+        with working(Console(stderr=True), "modes", quiet=o.json) as say:
             say("frequency responses")
             found, lost = modes_of(
                 _ordered(o.of(recordings)),

@@ -266,7 +266,7 @@ def _scale(where: str, channel: ColumnMap, sensor: Sensor, stated: str) -> float
             expected = f"a number, as the column is in {raw} and the channel in {channel.unit}"
             raise InputError(where, f"{field}: sensitivity", "missing", expected)
         return already * sensor.sign
-    if channel.scale != 1.0:
+    if channel.scale not in (1.0, already):  # from one unit to the other a map may convert
         expected = "no scale in the map where the table gives a sensitivity"
         raise InputError(where, f"{field}: scale in the map", channel.scale, expected)
     signal, _, measured = sensor.sensitivity_unit.partition("/")

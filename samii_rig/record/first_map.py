@@ -9,7 +9,9 @@ from pathlib import Path
 from samii_rig.errors import InputError
 from samii_rig.record.describe import Column, Description
 from samii_rig.record.maps import Format
+from samii_rig.rig.schema.conversion import SENSOR_UNITS
 from samii_rig.types import Role
+from samii_rig.units import factor, quantity
 
 _MAX_NAME = 40  # characters of a channel's name, as the map's schema has it
 # Names that people give to what was chosen and to what went out, in lower case.
@@ -104,22 +106,40 @@ def _channel(column: Column, role: Role, taken: set[str], driven: bool) -> list[
     taken.add(name)
     lines = [f"column = {_quoted(column.name)}", f'name = "{name}"']
     asked = "" if column.unit else "  # the file does not say: which is it?"
-    lines.append(f"unit = {_quoted(column.unit or '1')}{asked}")
+    unit, scale = _in_si(column, role)
+    lines.append(f"unit = {_quoted(unit or '1')}{asked}")
+    if unit != column.unit:
+        lines.append(f"raw_unit = {_quoted(column.unit)}")
+        if scale != 1.0:
+            lines.append(f"scale = {scale!r}  # {_plain(unit)} in 1 {_plain(column.unit)}")
     if role == "sensor":
         asked = "" if driven else '  # one must be "command", what drives the rig: is it?'
         lines.append(f'role = "sensor"{asked}')
     else:
         lines.append(f'role = "{role}"  # by its name: is it?')
     if column.step:
-        lines.append(f"resolution = {column.step!r}")
+        # Rounded, so that a step of 0.001 g is not one of 0.009806650000000001 m/s^2.
+        lines.append(f"resolution = {float(f'{column.step * scale:.12g}')!r}")
     return lines
+
+
+def _in_si(column: Column, role: Role) -> tuple[str, float]:
+    """Unit of its channel, and the scale to it: a sensor in g, mm or deg becomes one in the SI unit
+    that a rig file reckons in. What goes out keeps its unit, which is the actuator's own."""
+    if role == "sensor":
+        for unit in sorted({*SENSOR_UNITS.values()}):
+            scale = factor(column.unit, unit)
+            if scale is not None and quantity(column.unit) == quantity(unit):
+                return unit, scale
+    return column.unit, 1.0
 
 
 def _segment(
     path: Path, channels: list[Column], dividing: list[Column], roles: dict[str, Role]
 ) -> list[str]:
     driven = next((c for c in channels if roles[c.name] != "sensor"), next(iter(channels), None))
-    unit = (driven.unit if driven else "") or "1"
+    unit, scale = _in_si(driven, roles[driven.name]) if driven else ("", 1.0)
+    unit = unit or "1"
     lines = ['kind = "single"  # or burst, periodic, transient: what was done?']
     levels = next((c for c in dividing if c.name.lower() in _LEVELS and min(c.levels) >= 0), None)
     numbers = next((c for c in dividing if c.name.lower() in _NUMBERS), None)
@@ -130,8 +150,10 @@ def _segment(
     if levels:
         lines.append(f"level_column = {_quoted(levels.name)}")
     else:
-        peak = max(abs(driven.low), abs(driven.high)) if driven else 0.0
+        peak = scale * max(abs(driven.low), abs(driven.high)) if driven else 0.0
         asked = f"  # peak of {_plain(driven.name)}: is it the level?" if driven else ""
+        lines.append("# A level says which files were driven alike. Where it means nothing, as for")
+        lines.append("# noise or an earthquake, write 1.0: one number for all files.")
         lines.append(f"level = {float(f'{peak:.6g}')!r}{asked}")
         hint = _IN_NAME.search(path.name)
         if hint and not numbers:

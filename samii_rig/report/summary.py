@@ -34,7 +34,6 @@ _WORDS = {"good": "good", "found": "found", "note": "note", "warning": "look", "
 _WHERE = 20  # characters of a segment's name that fit beside the rest; what tells is its end
 _MARGIN_CLOSE = 0.2  # of a limit left: shown as close
 _BAR = 30  # characters
-ON = 5.0  # s between lines of a stage that goes on
 KERNELS = logging.getLogger("samii_rig.model.kernels")
 
 
@@ -151,9 +150,8 @@ class LiveProgress:
 def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Callable[[str], None]]:
     """Say what is being done and for how long; what is given says what comes next.
 
-    Without a terminal it is one line each, so that who reads a log later, or waits for a pipe,
-    sees that it goes on; what is counted (`samii_rig.progress.Counted`), not more often than every
-    `ON` s, with the time left.
+    Without a terminal it is one line for each stage that begins, whatever is counted in it: a log
+    is read for the answer below.
     quiet : say nothing.
     """
     pace = Pace()
@@ -168,18 +166,16 @@ def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Cal
             ) as say:
                 yield say
     else:
-        begun = due = time.monotonic()
-        last = ""
+        begun, last = time.monotonic(), ""
 
         def say_line(stage: str) -> None:
-            nonlocal due, last
+            nonlocal last
             now, words = time.monotonic(), pace.words(stage)
             name = stage.stage if isinstance(stage, Counted) else stage.partition(",")[0]
-            if name != last or now >= due:
-                last, due = name, now + ON
-                console.print(
-                    f"{what}: {words} ... (after {duration(now - begun)})", highlight=False
-                )
+            if name != last:
+                last = name
+                line = f"{what}: {words} ... (after {duration(now - begun)})"
+                console.print(line, highlight=False, soft_wrap=True)
 
         console.print(f"{what} ...", highlight=False)
         with _compiling(say_line) as say:

@@ -239,7 +239,7 @@ def test_saved_results_are_not_replaced_and_nothing_else_is_written(
     saved.write_bytes(b"earlier")
     code, said = call("frf", log, "--save", saved, "--export", tmp_path / "frf.csv")
     assert code == 2
-    assert "no recording of that name yet" in said
+    assert "frf.mcap is there already; delete it, or name another file" in said
     assert [p.name for p in tmp_path.iterdir()] == ["frf.mcap"]
 
 

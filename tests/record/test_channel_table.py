@@ -93,6 +93,9 @@ def test_sensitivity_and_direction_are_applied_and_kept_with_their_date(tmp_path
 def test_a_column_that_is_scaled_already_is_converted_alone(tmp_path):
     recording = read(tmp_path, TABLE.replace("-X", "+X"), lab('raw_unit = "g"'))
     np.testing.assert_allclose(recording.values[:, 1], 0.1 * np.arange(5) * 9.80665)
+    # A first map converts such a column itself, which is no other sensitivity.
+    again = read(tmp_path, TABLE.replace("-X", "+X"), lab('raw_unit = "g"\nscale = 9.80665'))
+    np.testing.assert_array_equal(again.values, recording.values)
 
 
 def test_the_unit_of_the_column_may_stand_in_the_file(tmp_path):
@@ -176,6 +179,13 @@ def test_from_the_command_line(tmp_path):
     again = CliRunner().invoke(app, arguments)
     assert isinstance(again.exception, InputError)
     assert not (tmp_path / "other").exists()
+    arguments[-1] = str(tmp_path / "runs")
+    with pytest.raises(
+        InputError,
+        match=r"run.csv: there is a recording of that name already, .*"
+        r"run.mcap; delete it, or name another folder with --out$",
+    ):
+        CliRunner().invoke(app, arguments, catch_exceptions=False)
 
 
 @pytest.mark.parametrize(

@@ -89,6 +89,19 @@ def test_units_gaps_levels_steps_and_missing_values_are_told(tmp_path):
         assert word in said
 
 
+def test_a_sensor_in_g_mm_or_deg_becomes_one_in_the_unit_of_a_rig_file(tmp_path):
+    path = write(
+        tmp_path, "t [s],u [mV],a [g],x [mm],q [deg],b [m/s2]\n" + rows("{t},1,{y},1,1,1\n")
+    )
+    text = first_map(describe(path))
+    assert 'unit = "m/s^2"\nraw_unit = "g"\nscale = 9.80665  # m/s^2 in 1 g' in text
+    assert "write 1.0: one number for all files" in text
+    recording = imported(path)
+    assert [c.unit for c in recording.channels] == ["mV", "m/s^2", "m", "rad", "m/s^2"]
+    np.testing.assert_allclose(recording.values[:, 1], [-9.80665 * i / 8 for i in range(N)])
+    np.testing.assert_allclose(recording.values[0, 2:], [1e-3, np.pi / 180, 1.0])
+
+
 def test_a_column_of_levels_becomes_segments(tmp_path):
     path = write(
         tmp_path,

@@ -382,7 +382,7 @@ def test_progress_lives_on_a_terminal_and_is_one_line_a_segment_elsewhere():
 
 
 def test_who_waits_sees_what_is_tried_and_that_kernels_are_compiled():
-    said = Console(file=io.StringIO(), width=100)
+    said = Console(file=io.StringIO(), width=40)  # a log's lines are not wrapped
     with working(said, "diagnosis") as say:
         say("what is missing")
         for tried in range(50):
@@ -394,6 +394,7 @@ def test_who_waits_sees_what_is_tried_and_that_kernels_are_compiled():
     assert stages == [
         "diagnosis ...",
         "diagnosis: what is missing ...",
-        "diagnosis: compiling the model's kernels, once a machine ...",
+        "diagnosis: compiling the model's kernels, once a machine: one minute or two that no time "
+        "to the end counts ...",
         "diagnosis: what cannot be distinguished ...",
     ]

@@ -42,7 +42,11 @@ class _Compiling(event.Listener):
     """Reports a compilation: it takes a minute, where the cache on the disk has nothing yet."""
 
     def on_start(self, event: event.Event) -> None:
-        log.info("compiling the model's kernels, once a machine")
+        # Whoever estimates the time that is left does not know of it before it begins.
+        log.info(
+            "compiling the model's kernels, once a machine: one minute or two that no time to the "
+            "end counts"
+        )
 
     def on_end(self, event: event.Event) -> None:
         pass
