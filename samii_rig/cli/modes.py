@@ -18,8 +18,6 @@ from samii_rig.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from rich.console import Console
-
     from samii_rig.report.modes import Modes
     from samii_rig.types import FrequencyResponse
 
