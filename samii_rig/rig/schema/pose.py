@@ -44,7 +44,8 @@ def _in_rad(angle: Angle) -> Angle:
     if value is None:
         raise ValueError(f"unit {angle.unit!r}; expected 'rad' or 'deg'")
     # Without its source: the same angle is one pose, whoever measured it.
-    return Angle(value=value, unit="rad", written="" if angle.unit == "rad" else angle.unit)
+    written = angle.written if angle.unit == "rad" else angle.unit
+    return Angle(value=value, unit="rad", written=written)
 
 
 PoseAngle = Annotated[Angle, AfterValidator(_in_rad)]
