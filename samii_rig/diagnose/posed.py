@@ -74,7 +74,10 @@ def _responses(
         each = runs if len(runs) > 1 else _by_segment(runs[0])
         if len(each) < 2:
             raise
-        first, *others = [r for run in each for r in _responses([run], estimated)]
+        try:
+            first, *others = [r for run in each for r in _responses([run], estimated)]
+        except EstimateError:  # of one alone nothing can be said
+            raise error from None
         told = Finding("repeat", "warning", f"{error}; each was estimated by itself")
         return [replace(first, findings=(*first.findings, told)), *others]
 

@@ -335,6 +335,7 @@ class Diagnosis:
                     "value": self.gap.value,
                     "low": self.gap.low,
                     "high": self.gap.high,
+                    "of_noise": self.gap.of_noise,
                 },
             },
             "moved": [m.plain() for m in self.moved],

@@ -60,9 +60,11 @@ FORETOLD, AFTER = 64, 512
 # Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a
 # smaller one that came half a sample earlier is below a hundredth of what the rest makes.
 JUMP, AT_REST = 0.01, 4
-# Samples of a record that begins at rest: of a meter's noise their mean has a quarter. Of an
-# input's largest, its standard deviation in them: a sweep that begins at once has ten times that.
-RESTING, RESTS_WITHIN = 16, 0.02
+# Of a record that begins at rest, samples at least, whose mean has a quarter of a meter's noise,
+# and the part of it. Of an input's largest, its standard deviation in them: a sweep that begins at
+# once has ten times that. Of its deviation, how far the mean and the middle of one that swings to
+# both sides alike lie apart at most: of noise with 100 independent samples.
+RESTING, RESTS_FOR, RESTS_WITHIN, SWINGS_ALIKE = 16, 0.01, 0.02, 0.1
 # Samples to each side of those between which a sweep turns that are as unknown: of an oscillation
 # at 0.37 of the rate that begins at an instant, what folds back lasts so long. One that turns
 # there, nothing hidden: chi-square 5.0, 1.31 and 0.99 with 0, 1 and 2.
@@ -291,13 +293,16 @@ def meter_noise(r: Float, step: float) -> float:
 
 
 def rest_of(v: Float, noise: float, *, moving: bool) -> float:
-    """What a meter shows of an input v (n,) that rests: its first samples, where the rig rested
-    before them and the input goes on resting, else the middle of all. noise : its standard
-    deviation, 0 where that is not known. moving : whether the rig moved before."""
-    head = v[:RESTING]
-    middle = float(np.median(head))
-    rests = np.std(head) <= max(RESTS_WITHIN * float(np.max(np.abs(v - middle))), 2 * noise)
-    return middle if rests and not moving else float(np.median(v))
+    """What a meter shows of an input v (n,) that rests: its first part, where the rig rested before
+    it and the input goes on resting; else the mean of one that swings to both sides alike; 0 of
+    another, as that may be the input's own. noise : the meter's standard deviation, 0 where that is
+    not known. moving : whether the rig moved before."""
+    head = v[: max(RESTING, round(RESTS_FOR * v.size))]
+    level, mean = float(np.median(head)), float(np.mean(v))
+    within = max(RESTS_WITHIN * float(np.max(np.abs(v - level))), 2 * noise)
+    if not moving and np.std(head) <= within:
+        return level
+    return mean if abs(mean - np.median(v)) < SWINGS_ALIKE * np.std(v) else 0.0
 
 
 def jumps(recording: Recording, command: int, kp: float, theta: Float | None) -> NDArray[np.bool_]:

@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from samii_rig.errors import DeviceError, EstimateError
-from samii_rig.model.sampled import given_response, sensor_response
+from samii_rig.model.sampled import hold_response, sensor_response
 from samii_rig.rig.load import load_rig
 from samii_rig.rig.schema import Rig
 from samii_rig.run.campaign import carry_out
@@ -82,6 +82,6 @@ def continuous(response: FrequencyResponse, rig: Rig) -> Complex:
     seen = sensor_response(rig.sensor, f)[:, [names.index(y.name) for y in response.outputs]]
     inputs = {a.name: a for a in rig.actuator}
     holds = np.stack(
-        [given_response(inputs[u.name], f, response.rate_hz) for u in response.inputs], axis=1
+        [hold_response(f, response.rate_hz, inputs[u.name].delay) for u in response.inputs], axis=1
     )
     return np.asarray(response.H / (seen[:, :, None] * holds[:, None, :]))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from samii_rig.model.sampled import sampled_response
+from samii_rig.model.sampled import as_sent, sampled_response
 from samii_rig.rig.schema import Rig
 from samii_rig.run.plan import Plan
 from samii_rig.serve.sofar import driven, first
@@ -30,7 +30,7 @@ class Drawn:
     @cached_property
     def _model(self) -> dict[str, Any]:
         f = _grid(self._plan)
-        return _curves_of_model(self._rig, self._plan, f, sampled_response(self._rig, f))
+        return _curves_of_model(self._rig, self._plan, f, sampled_response(as_sent(self._rig), f))
 
     def told(
         self,

@@ -75,7 +75,7 @@ def test_the_contract_is_plain_json_with_all_its_keys():
     assert set(plain["could_hide"][0]) == {"physics", "site", "parameter", "size", "unit"}
     assert set(plain["next_experiment"]) == {"why", "experiment", "gain"}
     assert plain["causes"][0]["parameters"]["gain"]["value"] == pytest.approx(1.3, rel=0.02)
-    assert {"value", "low", "high"} == set(plain["fit"]["gap_closed"])
+    assert {"value", "low", "high", "of_noise"} == set(plain["fit"]["gap_closed"])
     assert {b["channel"] for b in plain["mismatch"]["bands"]} == {s.name for s in samii().sensor}
 
 

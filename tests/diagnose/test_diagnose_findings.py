@@ -245,6 +245,12 @@ def test_of_two_repeats_that_differ_neither_is_trusted(sound):
     (wrong,) = faulty([two], within("a_1", 1, lambda x: 1.3 * x))
     with pytest.raises(EstimateError, match="a third repeat would tell"):
         estimate([wrong])
+    said = sorted_by_pose([wrong], [0.0], estimate)[0].responses
+    assert len(said) == 2
+    (told,) = [
+        f.message for f in said[0].findings if f.kind == "repeat" and "by itself" in f.message
+    ]
+    assert told.endswith("each was estimated by itself")
 
 
 # Bad input, on drawn responses

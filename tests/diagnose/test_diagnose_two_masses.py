@@ -7,9 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from table_kit import table_of
-from two_masses_kit import K2, RIG, diagnosed, random_command, recorded
+from two_masses_kit import K1, K2, RIG, diagnosed, random_command, recorded
 
+from samii_rig.diagnose.forces.search import ForceSearch
+from samii_rig.diagnose.forces.variation import Uneven
+from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Cause, Diagnosis, Moved
+from samii_rig.diagnose.verdict import by_record
 from samii_rig.rig.schema import Rig, parameters
 
 V = random_command(3000, 1.0, 1)
@@ -75,6 +79,42 @@ def test_a_number_of_the_rig_file_is_wrong_from_five_tolerances_on(tolerance, to
         assert what.startswith("A number of the rig file is wrong: spring_2.k = ")
         assert "the model with it has" in how_well
         assert "measure spring_2.k" in next_
+
+
+def test_numbers_that_are_wrong_are_fitted_without_what_the_file_says() -> None:
+    """Both springs are 2 % off, 5.7 and 5.8 tolerances."""
+    rig = surer(RIG, mass_1=1e-3, mass_2=1e-3, spring_1=0.0035, spring_2=0.0035)
+    found = diagnosed(recorded(V, 5), effects=(), rig=rig)
+    assert found.verdict == "unknown"
+    values = {one.parameter: one.value for one in found.exact}
+    assert set(values) == {"spring_1.k", "spring_2.k"}
+    for name, true in {"spring_1.k": K1, "spring_2.k": K2}.items():
+        assert values[name].value == pytest.approx(true, rel=2e-3)
+        assert abs(next(m.sigmas for m in found.moved if m.parameter == name)) > 5
+    what, _, next_ = found.lines()
+    assert what.startswith("Two numbers of the rig file are wrong: ")
+    assert "measure spring_" in next_
+
+
+@pytest.mark.parametrize("bent", [False, True])
+def test_an_uneven_spring_is_no_answer_but_for_the_geometry_of_a_bend(
+    bent: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(by_record, "uneven_spring", lambda _: Uneven("spring_1", 100.0, bent))
+    found = diagnosed(recorded(V[:1500], 1), effects=())
+    assert found.verdict == ("no_mismatch" if bent else "unknown")
+    (words,) = [w for w in found.not_physics if "10 sigma" in w]
+    assert ("bent chain" in words) == bent
+
+
+def test_nothing_is_missing_is_not_said_where_a_force_explains_some_lines(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    force = Effect("coulomb_friction", "spring_1")
+    monkeypatch.setattr(ForceSearch, "uneven", (force, 400.0))
+    found = diagnosed(recorded(V[:1500], 1), effects=())
+    assert found.verdict == "unknown"
+    assert any("explains 20 sigma, but not of all lines alike" in w for w in found.not_physics)
 
 
 def test_a_spring_that_hardens_as_much_as_it_is_stiff_has_its_value() -> None:

@@ -14,6 +14,7 @@ from samii_rig.likelihood.inputs import (
     calibrated,
     jumps,
     meter_noise,
+    rest_of,
     sent,
     times_of,
 )
@@ -296,3 +297,25 @@ def test_without_a_reference_a_closed_loop_rests_within_a_step_of_its_command() 
     )  # fmt: skip
     found = np.flatnonzero(jumps(alone, 0, KP, theta))
     assert found.tolist() == [999, 1000, 2999, 3000]
+
+
+def test_the_level_at_rest_is_a_meters_and_that_of_a_drive_is_its_own() -> None:
+    rng = np.random.default_rng(3)
+    noise = METER * rng.standard_normal(N)
+    offset, t = 0.3, np.arange(N) / RATE
+    sweep = np.where(t < 0.5, 0.0, signal(t - 0.5))
+    steps = np.where((t > 1.0) & (t % 4.0 < 3.0), 1.0, 0.0)
+    for v in (sweep, steps):  # both begin at rest, the steps stand up most of the time
+        assert rest_of(v + offset + noise, METER, moving=False) == pytest.approx(offset, abs=METER)
+    # Cut in motion, it swings to both sides alike; steps do not, and may be biased.
+    drawn = rng.standard_normal(N) + offset + noise
+    assert rest_of(drawn, METER, moving=True) == pytest.approx(offset, abs=0.05)
+    assert rest_of(steps + offset + noise, METER, moving=True) == 0.0
+
+
+@pytest.mark.parametrize("rate", [500.0, 5000.0, 50000.0])
+def test_a_slow_swing_at_a_high_rate_does_not_rest(rate: float) -> None:
+    """In 16 samples of 5 kHz a sine of 2 Hz hardly moves: its first value is no rest."""
+    t = np.arange(int(20 * rate)) / rate
+    found = rest_of(np.cos(2 * np.pi * 2.0 * t), 0.0, moving=False)
+    assert found == pytest.approx(0.0, abs=0.01)

@@ -41,7 +41,7 @@ CLEARLY = 2.0  # times what the best pair leaves of the lines: another that leav
 # 6e-7: of 467 answers "nothing is missing" three stood farther, all with something concealed, and
 # of those with nothing concealed none beyond 4.1.
 OFF_THE_FILE = 5.0
-MOST_WRONG = 3  # numbers that are told: a file with more is another rig's
+MOST_WRONG = 3  # numbers that are told: a file with more is of another rig
 NINETY = 1.645  # standard deviations of a 90 % interval
 
 
@@ -152,26 +152,41 @@ def _freed(rig: Rig, keys: Collection[Key]) -> Rig:
 
 def wrong_numbers(search: Search, fitted: Fitted) -> tuple[tuple[Exact, ...], Fitted]:
     """The nominal parameters that a fit needs farther from where the rig file states them than
-    their tolerances let them be, and the fit in which nothing is known of them: these numbers are
-    wrong, or something adds to them. None of more than are told together."""
+    their tolerances let them be: these numbers are wrong, or something adds to them. And the fit in
+    which nothing is known of them. At most `MOST_WRONG`, the farthest."""
     found: list[Key] = []
     end = fitted
-    while True:
-        model, n = end.model, end.model.n_nominal
-        away = np.abs(end.x[:n] / model.prior[:n])
-        if not n or np.max(away) < OFF_THE_FILE:
-            break
-        key = model.keys[int(np.argmax(away))]
-        if key in found or len(found) == MOST_WRONG:
-            return (), fitted
-        found.append(key)
+    while len(found) < MOST_WRONG:
+        far = [key for key in _far(end, fitted.model) if key not in found]
         # The others had come as far as their tolerances let them to spare this one its way.
-        freed = Model(_freed(search.rig, found), fitted.model.effects)
-        try:
-            end = refit(freed, search.problem, end.x)
-        except (SamiiRigError, np.linalg.LinAlgError):
-            return (), fitted
+        freed = _without(search, fitted, end, [*found, *far[:1]]) if far else None
+        if freed is None:
+            break
+        found, end = [*found, far[0]], freed
+    # One that stood in for another is back where the file has it.
+    stays = [key for key in _far(end, fitted.model) if key in found]
+    if stays != found and (freed := _without(search, fitted, end, stays)) is not None:
+        found, end = stays, freed
+    if not found:  # nothing could be fitted without it
+        found = _far(fitted, fitted.model)[:1]
     return tuple(_exact_of(search.rig, key, end) for key in found), end
+
+
+def _far(fitted: Fitted, stated: Model) -> list[Key]:
+    """The parameters that a fit has beyond the tolerances of a model of the same, the farthest
+    first."""
+    n = stated.n_nominal
+    away = np.abs(fitted.x[:n] / stated.prior[:n])
+    return [stated.keys[i] for i in np.argsort(-away).tolist() if away[i] >= OFF_THE_FILE]
+
+
+def _without(search: Search, fitted: Fitted, start: Fitted, keys: Sequence[Key]) -> Fitted | None:
+    """The same fit, nothing known of some parameters, from where another ended."""
+    try:
+        model = Model(_freed(search.rig, keys), fitted.model.effects)
+        return refit(model, search.problem, start.x)
+    except (SamiiRigError, np.linalg.LinAlgError):
+        return None
 
 
 def _exact_of(rig: Rig, key: Key, fitted: Fitted) -> Exact:

@@ -21,9 +21,8 @@ def gap_of(before: Float, after: Float, floor: Float) -> Gap:
         return Gap(a - b, *_within(drawn), of_noise=True)
     den = (before - floor)[rows].sum(axis=1)
     drawn = num / np.where(den > 0, den, np.inf)
-    # Draws in which there was nothing to close: as far as any, in the direction of the change.
-    most = max(float(np.max(np.abs(drawn))), 1.0)
-    drawn = np.where(den > 0, drawn, np.copysign(most, num))
+    # Draws in which there was nothing to close: all of it, in the direction of the change.
+    drawn = np.where(den > 0, drawn, np.sign(num))
     return Gap((a - b) / (a - 1), *_within(drawn))
 
 

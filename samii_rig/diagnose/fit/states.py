@@ -213,8 +213,8 @@ class StatesSearch(RecordSearch):
         if not self._alike:
             return super().shown(before, after)
         a, b = self.ratio(before), self.ratio(after)
-        closed = (a - b) / (a - 1) if a > 1 else 0.0
-        return a, b, Gap(closed, closed, closed)
+        closed = (a - b) / (a - 1) if a > 1 else a - b
+        return a, b, Gap(closed, closed, closed, of_noise=a <= 1)
 
     def by_state(self) -> list[tuple[Whole, Fitted, Float]]:
         """The records after and before, the nominal model of each, and the nodes of their

@@ -15,13 +15,13 @@ from scipy import fft
 
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.forces.place import Place
-from samii_rig.diagnose.forces.problem import mean_command
+from samii_rig.diagnose.forces.problem import as_driven, mean_command
 from samii_rig.diagnose.physics.effect import Key
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
 from samii_rig.likelihood.algebra import by_input
 from samii_rig.likelihood.inputs import meter_noise
-from samii_rig.likelihood.pieces import Piece
+from samii_rig.likelihood.pieces import Command, Piece
 from samii_rig.model.sampled import dead_time, hold_at, sensors_at
 from samii_rig.types import Complex, Float, Int
 
@@ -53,10 +53,8 @@ class Span:
     rate_hz: float
 
     @classmethod
-    def of(
-        cls, piece: Piece, rate_hz: float, highest_hz: float, metered: Sequence[bool] = ()
-    ) -> Span:
-        """Of a piece whose lines end at `highest_hz`. metered : as of `mean_command`."""
+    def of(cls, piece: Piece, rate_hz: float, highest_hz: float, metered: Sequence[bool]) -> Span:
+        """Of a piece whose lines end at `highest_hz`. metered : as of `as_driven`."""
         n, history = len(piece.z), piece.history
         needed = min(max(int(OVER * highest_hz * n / rate_hz), 16), n)
         low = int(fft.next_fast_len(needed, real=True))  # more than n where that is quicker
@@ -144,9 +142,8 @@ class TransferPaths:
 
     def __post_init__(self) -> None:
         records = self.whole.records
-        metered = [self.model.metered(x.command) for x in self.whole.wired.inputs]
         self.spans = [
-            Span.of(piece, records.rate_hz, band[1], metered)
+            Span.of(piece, records.rate_hz, band[1], self._metered)
             for piece, band in zip(records.pieces, records.bands, strict=True)
         ]
 
@@ -172,7 +169,15 @@ class TransferPaths:
     def _recorded(self, place: Place) -> list[Float]:
         """Of each piece the command that a force is on, as its first record has it."""
         on, pieces = self.column(place), self.whole.records.pieces
-        return [by_input(c.v)[on] for p in pieces for c in p.commands[:1]]
+        return [by_input(self.driven(piece)[0].v)[on] for piece in pieces]
+
+    def driven(self, piece: Piece) -> list[Command]:
+        """As `as_driven`."""
+        return as_driven(piece, self._metered)
+
+    @property
+    def _metered(self) -> list[bool]:
+        return [self.model.metered(x.command) for x in self.whole.wired.inputs]
 
     def column(self, place: Place) -> int:
         """Which input a force is on; the first where it has one of its own."""

@@ -29,7 +29,7 @@ from samii_rig.diagnose.physics.grid import Grid
 from samii_rig.likelihood.algebra import by_input
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.inputs import rest_of
-from samii_rig.likelihood.pieces import Piece, Samples
+from samii_rig.likelihood.pieces import Command, Piece, Samples
 from samii_rig.types import Complex, Float
 
 # Of a command between the samples that were recorded, what its interpolation is off by, and the
@@ -57,7 +57,11 @@ class Moved:
             name = model.force.place.command(model.built)
             on = wired.column(name)
             every = self.whole.every * (STEPS_A_SAMPLE if model.metered(name) else 1)
-            return [_lines_of_command(piece, model, p, seeds, every, on) for piece in pieces]
+            given = [as_driven(piece, self._metered(model)) for piece in pieces]
+            return [
+                _lines_of_command(piece, commands, model, p, seeds, every, on)
+                for piece, commands in zip(pieces, given, strict=True)
+            ]
         way = self.ways.at(model, x)
         contour = self.whole.records.exact()
         channels = model.channels(x, contour.s)
@@ -99,14 +103,20 @@ class Moved:
 
 
 def _lines_of_command(
-    piece: Piece, model: ForceModel, p: Float, seeds: Float, every: int, on: int
+    piece: Piece,
+    commands: Sequence[Command],
+    model: ForceModel,
+    p: Float,
+    seeds: Float,
+    every: int,
+    on: int,
 ) -> list[Samples]:
     """A force on the command of input `on` alone, of every record by itself: a converter's steps
     fall differently each time."""
     of_command = model.force.law.of_command
     assert of_command is not None
     r = np.zeros((1 + len(seeds), *piece.r.shape))
-    for command in piece.commands:
+    for command in commands:
         e, slopes = of_command(between(by_input(command.v)[on], every), p)
         all_ = np.concatenate([e[None], (slopes @ seeds.T).T])
         r.reshape(*r.shape[:2], -1)[:, :, on] += command.part * _recorded(all_, every)
@@ -140,24 +150,26 @@ def _passing(every: int) -> Float:
     return np.asarray(signal.firwin(2 * REACH * every + 1, 1 / every, window=("kaiser", beta)))
 
 
-def mean_command(piece: Piece, metered: Sequence[bool] = ()) -> tuple[Float, float]:
+def mean_command(piece: Piece, metered: Sequence[bool]) -> tuple[Float, float]:
     """The command of a piece's records, which repeat each other, and how many times the piece has
-    what one of them does. metered : inputs that a meter recorded, beside those that have its noise:
-    where such a meter shows what it rests at is its own, and no line that is fitted has it. A force
-    would."""
-    times = sum(c.part for c in piece.commands)
-    shown = [
-        all(c.meter[j].shown > 0 for c in piece.commands)
-        for j in range(len(piece.commands[0].meter))
-    ]
-    each = []
+    what one of them does. metered : as of `as_driven`."""
+    each = as_driven(piece, metered)
+    times = sum(c.part for c in each)
+    return np.asarray(sum(c.part * c.v for c in each) / times), times
+
+
+def as_driven(piece: Piece, metered: Sequence[bool]) -> list[Command]:
+    """The commands of a piece's records without what a meter shows of each input that rests: that
+    is the meter's own, no line that is fitted has it, and a force would. metered : of each input,
+    whether the model has it as recorded by a meter, beside those that show a meter's noise."""
+    out = []
     for c in piece.commands:
         v = np.array(c.v, np.float64)
-        for j, column in enumerate(by_input(v)):
-            if shown[j] or (metered and metered[j]):
-                column -= rest_of(column, c.meter[j].shown, moving=piece.moving)
-        each.append(c.part * v)
-    return np.asarray(sum(each) / times), times
+        for column, meter, shown in zip(by_input(v), c.meter, metered, strict=True):
+            if shown or meter.shown > 0:
+                column -= rest_of(column, meter.shown, moving=piece.moving)
+        out.append(replace(c, v=v))
+    return out
 
 
 @dataclass(frozen=True)

@@ -172,7 +172,7 @@ def _forces(force: Force, p: Float, paths: TransferPaths) -> tuple[list[Complex]
         of_command, on = force.law.of_command, paths.column(force.place)
         each = [
             s.spectrum(
-                _summed([c.part * of_command(by_input(c.v)[on], p)[0] for c in piece.commands])
+                _summed([c.part * of_command(by_input(c.v)[on], p)[0] for c in paths.driven(piece)])
             )
             / s.times
             for s, piece in zip(paths.spans, paths.whole.records.pieces, strict=True)

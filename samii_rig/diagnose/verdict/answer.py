@@ -18,6 +18,7 @@ from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS
 from samii_rig.diagnose.physics.along import POSITION
 from samii_rig.diagnose.physics.confusions import nearest
 from samii_rig.diagnose.physics.effect import Effect
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.result import Band, Cause, Gap, Moved, Value
 from samii_rig.diagnose.verdict.judge import MOST_NAMES, Judgement
 from samii_rig.signal.statistics import octaves
@@ -75,10 +76,11 @@ def unit_of(effect: Effect, found: dict[str, Value]) -> str:
     return unit.name if abs(gain / factor - 1) < CALIBRATED else ""
 
 
-def moved(fitted: Fitted) -> tuple[Moved, ...]:
-    """Nominal parameters that are off by more than their tolerance, the farthest first."""
+def moved(fitted: Fitted, stated: Model) -> tuple[Moved, ...]:
+    """Nominal parameters that are off by more than their tolerance in a model of the same, the
+    farthest first."""
     n = fitted.model.n_nominal
-    away = fitted.x[:n] / fitted.model.prior[:n]
+    away = fitted.x[:n] / stated.prior[:n]
     out = [
         Moved(".".join(key), float(a))
         for key, a in zip(fitted.model.keys, away, strict=True)

@@ -98,6 +98,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         if best.key != single and (forced is not None or more):
             # What a force did beside a single effect competes with what it does beside pairs.
             beside, untried = forces_on(search, forced.ranked()[:1] if forced else ())
+            if beside is not None and forces is not None:
+                beside.uneven = beside.uneven or forces.uneven
             forces = beside or forces
             forced = _winning(forces)
     search.begin("what cannot be distinguished")
@@ -327,8 +329,10 @@ def _winning(forces: ForceSearch | None) -> ForceSearch | None:
 
 def _or_uneven(forces: ForceSearch, looked: _Looked) -> _Looked:
     """The same, but nothing is missing alone where no force explains some lines and not others: one
-    that does is another than any in the table, or acts beside what moved the rig unrecorded."""
-    if forces.uneven is None or looked.judged.verdict != "no_mismatch":
+    that does is another than any in the table, or acts beside what moved the rig unrecorded. Where
+    an input has edges at unknown instants, what is left of them does that."""
+    edges = any(piece.edges for piece in forces.levels.records.pieces)
+    if forces.uneven is None or edges or looked.judged.verdict != "no_mismatch":
         return looked
     effect, fall = forces.uneven
     name = f"{effect.physics.replace('_', ' ')} at {effect.site}"
@@ -357,8 +361,7 @@ def _constant(
     # What is in no row is not told of less than what is.
     if sides is not None and sides.chi2 > max(2 * rival, judged.evidence.worth):
         looked = replace(looked, remarks=(*looked.remarks, sides.describe()))
-        if not sides.bent:
-            return _unknown(looked)
+        return looked if sides.bent else _unknown(looked)
     physical = any(e.physical for e in judged.best.effects)
     least = rival if physical else max(rival, VARIES)
     # What leaves more than noise has had that for noise: each is held against its own.

@@ -20,6 +20,9 @@ from samii_rig.types import Float
 
 FOUND = 0.9  # probability with which an effect of the size that is told would have been found
 Screens = tuple[Screen, Screen]  # without directions projected out, and with
+# Times that a weaker one is tried, and noise units by which one moves the records at most, or one
+# over so many at least, where a refit no longer bends.
+CLOSER, NOISE_MOVES = 3, 2.0
 STRENGTHS = 20  # strengths over the range of an effect, log-spaced, for one that is weak
 
 
@@ -86,14 +89,22 @@ def _weak(
     the records by far more, of which a refit that bends leaves more than in proportion.
     """
     weak = int(np.nanargmin(np.abs(np.log(np.maximum(before, 1e-12)))))
-    value, shows = values[weak].copy(), float(left[weak])
-    if weak in (0, len(values) - 1) and before[weak] > 1:
+    value, shows, moves = values[weak].copy(), float(left[weak]), float(before[weak])
+    step = moves
+    for _ in range(CLOSER if weak in (0, len(values) - 1) else 0):
+        if moves < NOISE_MOVES:
+            break
         less = value.copy()
-        less[0] *= before[weak] if weak else 1 / before[weak]
+        less[0] *= step if weak else 1 / step
         with np.errstate(all="ignore"):
             changed = _changed(search, best, screens, effect, less[None])
-        if changed is not None and np.isfinite(changed[1][0]):
-            return less, math.sqrt(max(float(changed[1][0]), 0.0))
+        if changed is None or not np.isfinite(changed[1][0]):
+            break
+        now, left_now = (math.sqrt(max(float(x[0]), 0.0)) for x in changed)
+        if now < 1 / NOISE_MOVES:  # it grows faster than in proportion
+            step = math.sqrt(step)
+            continue
+        value, shows, moves, step = less, left_now, now, now
     return value, shows
 
 

@@ -111,7 +111,7 @@ def _next(
     that were recorded. exact : the number of the rig file that is wrong, if one is."""
     if exact:
         them = "it" if len(exact) == 1 else "them"
-        why = f"with {them} the model explains the recordings; what adds there would do the same"
+        why = f"with {them} the model explains the recordings; or something there adds to it"
         names = " and ".join(one.parameter for one in exact)
         return why, f"measure {names}, correct the rig file and diagnose again", None
     if refusal:
@@ -198,7 +198,7 @@ def diagnosis_of(
         outside=judged.outside,
         rig=explained(told) if best.effects or exact else None,
         traces=traces(search, judged) if missing and judged.varies is None else (),
-        moved=answer.moved(told),
+        moved=answer.moved(told, best.fitted.model),
         could_hide=could_hide(*search.linear_part(best)),
         used=shown.used,
         exact=exact,

@@ -112,8 +112,9 @@ def _source(table: Table, units: dict[str, str]) -> Table:
     given, wanted = K.get("unit"), input_unit(kind, known)
     if not isinstance(given, str) or given == wanted:
         return table
-    if given == wanted.replace("(", "").replace(")", ""):
-        # Files of before write N m/N m for an input in N m.
+    # Files of before write N m/N m for an input in N m.
+    pushes = kind in ("torque_source", "force_source")
+    if pushes and given == wanted.replace("(", "").replace(")", ""):
         return {**table, "K": {**K, "unit": wanted}}
     value = convert(float(K["value"]), given, wanted)
     if value is None:
