@@ -22,7 +22,7 @@ FOUND = 0.9  # probability with which an effect of the size that is told would h
 Screens = tuple[Screen, Screen]  # without directions projected out, and with
 # Times that a weaker one is tried, and noise units by which one moves the records at most, or one
 # over so many at least, where a refit no longer bends.
-CLOSER, NOISE_MOVES = 3, 2.0
+WEAKER, NOISE_MOVES = 3, 2.0
 STRENGTHS = 20  # strengths over the range of an effect, log-spaced, for one that is weak
 
 
@@ -91,7 +91,7 @@ def _weak(
     weak = int(np.nanargmin(np.abs(np.log(np.maximum(before, 1e-12)))))
     value, shows, moves = values[weak].copy(), float(left[weak]), float(before[weak])
     step = moves
-    for _ in range(CLOSER if weak in (0, len(values) - 1) else 0):
+    for _ in range(WEAKER if weak in (0, len(values) - 1) else 0):
         if moves < NOISE_MOVES:
             break
         less = value.copy()
