@@ -256,7 +256,7 @@ def test_the_motion_that_a_swing_changes_is_that_of_a_spring_that_swings() -> No
     v = rng.standard_normal(1000)
     told = Command(v, 1.0, (MeterNoise(),))
     piece = Piece("held", v, np.zeros((v.size, 1)), 0, (), commands=(told,))
-    span = Span.of(piece, rate, rate / 4, [False])
+    span = Span.of(piece, [told], rate, rate / 4)
 
     def moved(soft: float) -> Float:
         def motion(t: float, y: Float) -> list[float]:

@@ -21,6 +21,7 @@ from samii_rig.diagnose.physics.aliases import Aliases, alias_points
 from samii_rig.diagnose.physics.disturbed import Disturbed
 from samii_rig.diagnose.physics.grid import Grid, grid
 from samii_rig.diagnose.physics.loops import Closed, JointLoops, Loop
+from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.excited import DRIVES, excited, records_of
@@ -160,6 +161,10 @@ class Whole:
         """(m,) indices of the inputs into the rig's actuators."""
         names = [a.name for a in self.rig.actuator]
         return np.array([names.index(x.command) for x in self.wired.inputs], np.int64)
+
+    def metered(self, model: Model) -> list[bool]:
+        """(m,) whether a model has each input as recorded by a meter."""
+        return [model.metered(x.command) for x in self.wired.inputs]
 
     @property
     def loop(self) -> Closed | None:

@@ -53,15 +53,17 @@ class Span:
     rate_hz: float
 
     @classmethod
-    def of(cls, piece: Piece, rate_hz: float, highest_hz: float, metered: Sequence[bool]) -> Span:
-        """Of a piece whose lines end at `highest_hz`. metered : as of `as_driven`."""
+    def of(
+        cls, piece: Piece, commands: Sequence[Command], rate_hz: float, highest_hz: float
+    ) -> Span:
+        """Of a piece whose lines end at `highest_hz`. commands : what drove it, of every record."""
         n, history = len(piece.z), piece.history
         needed = min(max(int(OVER * highest_hz * n / rate_hz), 16), n)
         low = int(fft.next_fast_len(needed, real=True))  # more than n where that is quicker
         turns = 2 if history == 0 else 4
         M, m = turns * n, turns * low
         sigma = CONTOUR_DAMPING * rate_hz / M
-        v, times = mean_command(piece, metered)
+        v, times = mean_command(commands)
         f = np.arange(m // 2 + 1) * (rate_hz / M)
         s = np.asarray(sigma + 2j * np.pi * f, np.complex128)
         at = np.arange(m) * (n / low) + history
@@ -130,11 +132,12 @@ class Ports:
 
 @dataclass
 class TransferPaths:
-    """The linear motion of a rig under all commands."""
+    """The linear motion of a rig under all commands. driven : of each piece, as of `as_driven`."""
 
     whole: Whole
     model: Model
     x: Float
+    driven: list[list[Command]] = field(default_factory=list)
     spans: list[Span] = field(default_factory=list)
     _ports: dict[tuple[Place, bool], Ports | None] = field(default_factory=dict)
     _motion: dict[tuple[Place, bool], list[Float]] = field(default_factory=dict)
@@ -142,9 +145,13 @@ class TransferPaths:
 
     def __post_init__(self) -> None:
         records = self.whole.records
+        metered = self.whole.metered(self.model)
+        self.driven = [as_driven(piece, metered) for piece in records.pieces]
         self.spans = [
-            Span.of(piece, records.rate_hz, band[1], self._metered)
-            for piece, band in zip(records.pieces, records.bands, strict=True)
+            Span.of(piece, commands, records.rate_hz, band[1])
+            for piece, commands, band in zip(
+                records.pieces, self.driven, records.bands, strict=True
+            )
         ]
 
     def largest(self, place: Place) -> float:
@@ -158,7 +165,7 @@ class TransferPaths:
         on, pieces = self.column(place), self.whole.records.pieces
         if left := max(c.meter[on].on_samples for p in pieces for c in p.commands):
             return left
-        if not any(self.model.metered(x.command) for x in self.whole.wired.inputs):
+        if not any(self.whole.metered(self.model)):
             return 0.0
         return max(meter_noise(v, step) for v in self._recorded(place))
 
@@ -168,16 +175,8 @@ class TransferPaths:
 
     def _recorded(self, place: Place) -> list[Float]:
         """Of each piece the command that a force is on, as its first record has it."""
-        on, pieces = self.column(place), self.whole.records.pieces
-        return [by_input(self.driven(piece)[0].v)[on] for piece in pieces]
-
-    def driven(self, piece: Piece) -> list[Command]:
-        """As `as_driven`."""
-        return as_driven(piece, self._metered)
-
-    @property
-    def _metered(self) -> list[bool]:
-        return [self.model.metered(x.command) for x in self.whole.wired.inputs]
+        on = self.column(place)
+        return [by_input(commands[0].v)[on] for commands in self.driven]
 
     def column(self, place: Place) -> int:
         """Which input a force is on; the first where it has one of its own."""

@@ -52,15 +52,15 @@ class Moved:
         the slopes of both by the entries `moving` of x."""
         p, seeds = model.numbers(x), model.seeds(x, moving)
         wired = self.whole.wired
+        metered = self.whole.metered(model)
         if model.force.law.of_command is not None:
             pieces = self.whole.records.pieces
             name = model.force.place.command(model.built)
             on = wired.column(name)
             every = self.whole.every * (STEPS_A_SAMPLE if model.metered(name) else 1)
-            given = [as_driven(piece, self._metered(model)) for piece in pieces]
             return [
-                _lines_of_command(piece, commands, model, p, seeds, every, on)
-                for piece, commands in zip(pieces, given, strict=True)
+                _lines_of_command(piece, as_driven(piece, metered), model, p, seeds, every, on)
+                for piece in pieces
             ]
         way = self.ways.at(model, x)
         contour = self.whole.records.exact()
@@ -68,7 +68,7 @@ class Moved:
         every = self.whole.every
         out = []
         for piece in self.whole.records.pieces:
-            v, times = mean_command(piece, self._metered(model))
+            v, times = mean_command(as_driven(piece, metered))
             for name, F in channels[0].items() if channels is not None else ():
                 each, j = v.reshape(len(v), -1), wired.column(name)
                 each[:, j] = contour.record(contour.damped(each[:, j]) * F, len(v))
@@ -85,10 +85,6 @@ class Moved:
                 own.append(Samples(r, y[piece.history :]))
             out.append(own)
         return out
-
-    def _metered(self, model: ForceModel) -> Sequence[bool]:
-        """Of each input, whether an effect of a model says that a meter recorded it."""
-        return [model.metered(x.command) for x in self.whole.wired.inputs]
 
     def without(self, fitted: Fitted) -> Whole:
         """The records as those of the linear part of a fit."""
@@ -150,26 +146,29 @@ def _passing(every: int) -> Float:
     return np.asarray(signal.firwin(2 * REACH * every + 1, 1 / every, window=("kaiser", beta)))
 
 
-def mean_command(piece: Piece, metered: Sequence[bool]) -> tuple[Float, float]:
+def mean_command(commands: Sequence[Command]) -> tuple[Float, float]:
     """The command of a piece's records, which repeat each other, and how many times the piece has
-    what one of them does. metered : as of `as_driven`."""
-    each = as_driven(piece, metered)
-    times = sum(c.part for c in each)
-    return np.asarray(sum(c.part * c.v for c in each) / times), times
+    what one of them does."""
+    times = sum(c.part for c in commands)
+    return np.asarray(sum(c.part * c.v for c in commands) / times), times
 
 
 def as_driven(piece: Piece, metered: Sequence[bool]) -> list[Command]:
     """The commands of a piece's records without what a meter shows of each input that rests: that
     is the meter's own, no line that is fitted has it, and a force would. metered : of each input,
     whether the model has it as recorded by a meter, beside those that show a meter's noise."""
-    out = []
-    for c in piece.commands:
-        v = np.array(c.v, np.float64)
-        for column, meter, shown in zip(by_input(v), c.meter, metered, strict=True):
-            if shown or meter.shown > 0:
-                column -= rest_of(column, meter.shown, moving=piece.moving)
-        out.append(replace(c, v=v))
-    return out
+    return [_at_rest(c, metered, moving=piece.moving) for c in piece.commands]
+
+
+def _at_rest(c: Command, metered: Sequence[bool], *, moving: bool) -> Command:
+    shown = [on or meter.shown > 0 for on, meter in zip(metered, c.meter, strict=True)]
+    if not any(shown):
+        return c
+    v = np.array(c.v, np.float64)
+    for column, meter, on in zip(by_input(v), c.meter, shown, strict=True):
+        if on:
+            column -= rest_of(column, meter.shown, moving=moving)
+    return replace(c, v=v)
 
 
 @dataclass(frozen=True)

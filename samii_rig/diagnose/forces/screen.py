@@ -171,11 +171,9 @@ def _forces(force: Force, p: Float, paths: TransferPaths) -> tuple[list[Complex]
     if force.law.of_command is not None:
         of_command, on = force.law.of_command, paths.column(force.place)
         each = [
-            s.spectrum(
-                _summed([c.part * of_command(by_input(c.v)[on], p)[0] for c in paths.driven(piece)])
-            )
+            s.spectrum(_summed([c.part * of_command(by_input(c.v)[on], p)[0] for c in commands]))
             / s.times
-            for s, piece in zip(paths.spans, paths.whole.records.pieces, strict=True)
+            for s, commands in zip(paths.spans, paths.driven, strict=True)
         ]
         return each, 0.0
     assert force.law.weak is not None

@@ -98,10 +98,12 @@ class ForceSearch(BesideForce):
             base = self.refitted_from(linear, x)
             if base is None:
                 return
-            if self._to_noise(base, best.fitted) or self._consistent(base, best.fitted):
+            if self._to_noise(base, best.fitted):
+                return
+            fall, even = self._explained(base, best.fitted)
+            if even > INCONSISTENT and fall > self.critical_value:
                 return
             del self.found[best.key]
-            fall = self._fall(base, best.fitted)
             if fall > max(self.critical_value, self.uneven[1] if self.uneven else 0.0):
                 self.uneven = next(e for e in best.effects if e.force is not None), fall
 
@@ -111,17 +113,11 @@ class ForceSearch(BesideForce):
         moving = any(piece.moving for piece in self.levels.records.pieces)
         return moving and self.ratio(after) < threshold(self.spread) < self.ratio(before)
 
-    def _consistent(self, before: Fitted, after: Fitted) -> bool:
-        """Whether what one fit has more than another shows at all lines as it should, and is more
-        than rounding may do along it."""
-        a, b = self.unexplained(before), self.unexplained(after)
-        fall = self._fall(before, after)
-        return self._even(a, b, after) > INCONSISTENT and fall > self.critical_value
-
-    def _fall(self, before: Fitted, after: Fitted) -> float:
-        """Of chi-square, what one fit has more than another, in units of rounding there."""
+    def _explained(self, before: Fitted, after: Fitted) -> tuple[float, float]:
+        """Of chi-square, what one fit has more than another, in units of what rounding may do along
+        it; and the chance that it shows at all lines as unevenly."""
         a, b = self.unexplained(before, rounded=True), self.unexplained(after)
-        return (before.chi2 - after.chi2) / as_rounding(a, b)
+        return (before.chi2 - after.chi2) / as_rounding(a, b), self._even(a, b, after)
 
     def _even(
         self, before: Sequence[Unexplained], after: Sequence[Unexplained], fitted: Fitted

@@ -71,6 +71,7 @@ class Model:
         for effect in effects:
             built = effect.build(built)
         self.built = built
+        self._stated = stated(built)
         self.chain = self.chain_of(built)
         known = {(e.name, s): p for e in flattened(rig.element) for s, p in parameters(e).items()}
         have = set(self.chain.parameters)
@@ -128,11 +129,11 @@ class Model:
             if effect.factor is not None:
                 out.append((effect.factor, theta, first))
             first += len(effect.unknowns)
-        return out + [(factor, np.zeros(0), first) for factor in stated(self.built)]
+        return out + [(factor, np.zeros(0), first) for factor in self._stated]
 
     def metered(self, command: str) -> bool:
         """Whether a meter recorded a command, which its rig followed between samples, too."""
-        measured = [e.factor for e in self.effects if e.metered] + list(stated(self.built))
+        measured = [e.factor for e in self.effects if e.metered] + list(self._stated)
         return any(factor is not None and factor.channel == command for factor in measured)
 
     def own(self, i: int) -> range:
