@@ -268,6 +268,11 @@ def test_in_one_state_less_than_the_file_begins_where_the_refit_ends():
     assert mass.report(np.array([1.0, 1.0]))[0] == -1.0
     lag = less["actuator_lag", "joint_2_source"]
     assert lag.unknowns[0].low == pytest.approx(1.6)  # p is known to 10 %
+    longer = next(
+        e for e in hypotheses(braced, 0.5, 30.0)
+        if e.variant == "more" and e.name == ("actuator_lag", "joint_2_source")
+    )  # fmt: skip
+    assert longer.unknowns[0].high == pytest.approx(1 / 1.6)
     assert ("viscous_damping", "joint_1") not in less  # c is known to a half: the refit has it all
 
 
@@ -291,6 +296,12 @@ def test_a_high_pass_delay_or_lag_of_a_sensor_may_not_be_there():
     for physics, (factor, end) in own.items():
         F, _ = less[physics].factor.value(s, np.array([end]))
         np.testing.assert_allclose(F * factor, 1.0, atol=1e-3)
+    (longer,) = (
+        e for e in hypotheses(rig, 0.5, 30.0)
+        if e.name == ("sensor_lag", "a_0") and e.variant == "more"
+    )  # fmt: skip
+    F, _ = longer.factor.value(s, np.array([0.25]))
+    np.testing.assert_allclose(F * own["sensor_lag"][0], 1 / (1 + s * 20e-3))
 
 
 def test_a_part_that_the_state_before_does_not_have_is_free_after_alone():

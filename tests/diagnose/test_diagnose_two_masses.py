@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from table_kit import table_of
-from two_masses_kit import K1, K2, RIG, diagnosed, random_command, recorded
+from two_masses_kit import CORNER, K1, K2, RIG, diagnosed, random_command, recorded
 
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.variation import Uneven
@@ -62,6 +62,20 @@ def surer(rig: Rig, **tolerances: float) -> Rig:
             e = e.model_copy(update={symbol: p})
         every.append(e)
     return rig.model_copy(update={"element": tuple(every)})
+
+
+def test_a_lag_that_is_longer_than_the_file_says_is_one_cause() -> None:
+    """Of 120 Hz, stated as 480: another in series and none of the file's would do the same."""
+    coil = next(e for e in RIG.element if e.kind == "force_source")
+    stated = coil.model_copy(
+        update={"p": coil.p.model_copy(update={"value": 4 * CORNER, "tolerance": 0.1})}
+    )
+    rig = RIG.model_copy(update={"element": tuple(stated if e is coil else e for e in RIG.element)})
+    found = diagnosed(recorded(V, 1), rig=rig)
+    assert found.verdict == "named"
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("actuator_lag", coil.name)
+    assert cause.parameters["p ratio"].low < 0.25 < cause.parameters["p ratio"].high
 
 
 @pytest.mark.parametrize(("tolerance", "told"), [(0.006, False), (0.0035, True)])

@@ -109,9 +109,12 @@ def checked(
     Raises InputError where recordings, rig and band (Hz) do not belong together, EstimateError
     where nothing is left.
     """
-    # That a reference would have served is what recordings lack: the last to be said.
+    # That a reference would have served is what recordings lack: the last to be said, and not of
+    # an input that a sensor measured, which has none.
     unreferenced = estimated(responses, ("closed_loop",))
     remarks = [words for words in estimated(responses) if words not in unreferenced]
+    if not any(a.held for a in rig.actuator):
+        unreferenced = []
     for r in responses:
         _belongs(r, rig)
     if responses:

@@ -11,7 +11,7 @@ import numpy as np
 
 from samii_rig.diagnose.physics import insert
 from samii_rig.diagnose.physics.effect import Effect, Factor, Key, Unknown, Values
-from samii_rig.diagnose.physics.reduced import FASTER
+from samii_rig.diagnose.physics.reduced import FASTER, faster_than, slower_than
 from samii_rig.diagnose.physics.rows import PHYSICS
 from samii_rig.diagnose.physics.scales import SMALLEST
 from samii_rig.diagnose.physics.unheld import measured
@@ -56,7 +56,7 @@ def lag(s: Complex, x: Float) -> tuple[Complex, list[Complex]]:
     return F, [s / (s + x[0]) ** 2]
 
 
-def quicker(s: Complex, x: Float, p: float) -> tuple[Complex, list[Complex]]:
+def other_lag(s: Complex, x: Float, p: float) -> tuple[Complex, list[Complex]]:
     """r (s + p)/(s + r p): a lag of corner p rad/s that has r times that, or is none."""
     r = x[0]
     return r * (s + p) / (s + r * p), [s * (s + p) / (s + r * p) ** 2]
@@ -238,7 +238,8 @@ def _sensor(sensor: SensorBase, low_hz: float, high_hz: float) -> Iterator[Effec
 
 
 def _less(sensor: SensorBase) -> Iterator[Effect]:
-    """A delay, lag or high-pass of the rig file that a sensor does not have, or has less of."""
+    """A delay, lag or high-pass of the rig file that a sensor does not have, or has less of; and a
+    lag that is longer: one more in series would be another."""
 
     def one(physics: str, law: Law, unknown: Unknown, update: Update) -> Effect:
         return replace(_on(sensor.name, physics, law, unknown, update), variant="less")
@@ -248,9 +249,11 @@ def _less(sensor: SensorBase) -> Iterator[Effect]:
         less = one("sensor_delay", lead, gone, lambda tau: {"delay": sensor.delay - tau})
         yield replace(less, report=lambda x: -x)
     if sensor.lag > 0:
-        ratio = _unknown("p ratio", "1", 1 + SMALLEST, FASTER)
-        law = partial(quicker, p=1 / sensor.lag)
-        yield one("sensor_lag", law, ratio, lambda r: {"lag": sensor.lag / r})
+        law = partial(other_lag, p=1 / sensor.lag)
+        shorter, longer = faster_than(1 + SMALLEST), slower_than(1 - SMALLEST)
+        yield one("sensor_lag", law, shorter, lambda r: {"lag": sensor.lag / r})
+        more = one("sensor_lag", law, longer, lambda r: {"lag": sensor.lag / r})
+        yield replace(more, variant="more")
     if sensor.highpass_hz > 0:
         ratio = _unknown("corner ratio", "1", 1 / FASTER, 1 - SMALLEST)
         law = partial(lower, w=2 * math.pi * sensor.highpass_hz)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -65,7 +66,7 @@ def effects(rig: Rig, *, between: bool) -> Iterator[Effect]:
             case _ if isinstance(e, SOURCES):
                 own = parameters(e)
                 for symbol in CORNERS.keys() & own.keys():
-                    yield _faster(e.name, symbol, own[symbol], between=between)
+                    yield from _corner(e.name, symbol, own[symbol], between=between)
                 tau = {"tau": own["tau"]}
                 yield from _part_of(e.name, "transport_delay", "tau", tau, between=between)
             case _:
@@ -160,22 +161,30 @@ def _stiffness(spring: TorsionalSpring | TranslationalSpring) -> Effect:
     )
 
 
-def _faster(name: str, symbol: str, corner: Parameter, *, between: bool) -> Effect:
-    """A lag of a source that is shorter than in the file, or none: its corner is higher."""
-    low = 1 + _least(corner, between=between)
-    return Effect(
-        physics=CORNERS[symbol],
-        site=name,
-        unknowns=(Unknown(f"{symbol} ratio", "1", low, FASTER, faster(low)),),
-        parameters=_times((name, symbol)),
-        touches=((name, symbol),),
-        variant="less",
-    )
+def _corner(name: str, symbol: str, corner: Parameter, *, between: bool) -> Iterator[Effect]:
+    """A lag of a source that is another than in the file: shorter, or none, and longer."""
+    least = _least(corner, between=between)
+    faster, slower = faster_than(1 + least), slower_than(1 / (1 + least))
+    for unknown, variant in ((faster, "less"), (slower, "more")):
+        yield Effect(
+            physics=CORNERS[symbol],
+            site=name,
+            unknowns=(replace(unknown, symbol=f"{symbol} ratio"),),
+            parameters=_times((name, symbol)),
+            touches=((name, symbol),),
+            variant=variant,
+        )
 
 
-def faster(low: float) -> tuple[float, ...]:
-    """Ratios of a corner to the file's at which a search for a shorter lag starts."""
-    return spread(low, math.sqrt(FASTER), len(JOINT_RATIOS))
+def faster_than(low: float) -> Unknown:
+    """Ratio of a corner to the file's, from `low` on to where a lag is none."""
+    return Unknown("p ratio", "1", low, FASTER, spread(low, math.sqrt(FASTER), len(JOINT_RATIOS)))
+
+
+def slower_than(high: float) -> Unknown:
+    """Ratio of a corner to the file's, up to `high`."""
+    low, first = 1 / FASTER, 1 / math.sqrt(FASTER)
+    return Unknown("p ratio", "1", low, high, spread(first, high, len(JOINT_RATIOS)))
 
 
 def _times(key: Key) -> Callable[[Float, Values], dict[Key, float]]:

@@ -39,8 +39,8 @@ from samii_rig.signal import welch
 from samii_rig.types import Recording
 
 EXHAUSTED = (
-    "not every force that may act was computed to the end, as the records are long; fewer of them "
-    "or a narrower band would let it"
+    "not every force that may act was computed to the end, as the records are long; shorter or "
+    "fewer records, or a narrower band, would let it"
 )
 # Logarithm of the odds of a stiffness that varies, from which that is missing where nothing else
 # is: noise alone reaches it in 0.1 % of recordings. Of 309 in which nothing was hidden three had
