@@ -16,7 +16,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MultipleLocator, NullFo
 from samii_rig.errors import InputError
 from samii_rig.record.export import replacing
 from samii_rig.report.compare import ModelCurve
-from samii_rig.report.plots import Curves, lines_of, unit
+from samii_rig.report.entries import Entry, channels, entries, indices
+from samii_rig.report.plots import Curves, lines_of, showing_curves, unit
 from samii_rig.types import FrequencyResponse
 
 SUFFIXES = (".png", ".svg", ".pdf")
@@ -38,7 +39,8 @@ def bode_figure(responses: Sequence[FrequencyResponse], model: ModelCurve | None
     Levels are told apart by colour, the model is dashed black.
     """
     responses = sorted(responses, key=lambda r: (not np.isfinite(r.level), r.level))
-    outputs, inputs = responses[0].outputs, responses[0].inputs
+    shown = entries(responses)
+    outputs, inputs = (list(dict.fromkeys(names)) for names in zip(*shown, strict=True))
     rows = len(inputs)
     figure = Figure(figsize=(_COLUMN_INCH * len(outputs), _ROW_INCH * rows))
     FigureCanvasAgg(figure)
@@ -57,29 +59,30 @@ def bode_figure(responses: Sequence[FrequencyResponse], model: ModelCurve | None
     )
     curves = [Curves.of(r) for r in responses]
     for i, j in np.ndindex(len(outputs), rows):
-        _entry(axes[2 * j, i], axes[2 * j + 1, i], curves, i, j, model)
+        entry = outputs[i], inputs[j]
+        _entry(axes[2 * j, i], axes[2 * j + 1, i], showing_curves(curves, entry), entry, model)
     axes[0, 0].legend(fontsize=7, frameon=False)
     return figure
 
 
 def _entry(
-    gain: Axes, angle: Axes, curves: Sequence[Curves], i: int, j: int, model: ModelCurve | None
+    gain: Axes, angle: Axes, curves: Sequence[Curves], entry: Entry, model: ModelCurve | None
 ) -> None:
     """One output over one input, and the model's."""
     responses = [c.response for c in curves]
-    y, u = responses[0].outputs[i], responses[0].inputs[j]
     for k, c in enumerate(curves):
-        _draw(gain, angle, c, i, j, _COLOURS[k % len(_COLOURS)])
+        _draw(gain, angle, c, entry, _COLOURS[k % len(_COLOURS)])
     if model is not None:
         f = responses[0].frequency
         f = np.union1d(f, model.frequency[(model.frequency > f[0]) & (model.frequency < f[-1])])
-        H = model.at(f, y.name, u.name)
-        nearest = np.interp(f, responses[-1].frequency, curves[-1].angle[:, i, j])
+        H = model.at(f, *entry)
+        last = responses[-1]
+        nearest = np.interp(f, last.frequency, curves[-1].angle[:, *indices(last, entry)])
         turn = np.rad2deg(np.unwrap(np.angle(np.where(np.isfinite(H), H, 1.0))))
         turn += 360.0 * np.round(np.median(nearest - turn) / 360.0)
         gain.plot(f, np.abs(H), "k--", lw=1.1, label=f"model {model.name}")
         angle.plot(f, np.where(np.isfinite(H), turn, np.nan), "k--", lw=1.1)
-    size = np.abs(np.concatenate([r.H[:, i, j] for r in responses]))
+    size = np.abs(np.concatenate([r.H[:, *indices(r, entry)] for r in responses]))
     size = size[np.isfinite(size) & (size > 0)]
     if size.size:
         low, high = np.quantile(np.log10(size), [_NOISE_PART, 1.0])
@@ -88,7 +91,7 @@ def _entry(
             high = max(high, float(np.log10(np.nanmax(np.abs(H)))))
         room = 0.05 * (high - low) + 0.05
         gain.set_ylim(10 ** (low - room), 10 ** (high + room))
-    _dress(gain, angle, f"{y.name}/{u.name} [{unit(y, u)}]")
+    _dress(gain, angle, f"{'/'.join(entry)} [{unit(*channels(responses[0], entry))}]")
     positive = responses[0].frequency[responses[0].frequency > 0]
     angle.set_xlim(positive[0], positive[-1])
 
@@ -117,8 +120,9 @@ def save_figure(path: Path | str, figure: Figure) -> Path:
     return path
 
 
-def _draw(gain: Axes, angle: Axes, c: Curves, i: int, j: int, colour: str) -> None:
-    r, at = c.response, lines_of(c.response, i, j, _BINS)
+def _draw(gain: Axes, angle: Axes, c: Curves, entry: Entry, colour: str) -> None:
+    r, (i, j) = c.response, indices(c.response, entry)
+    at = lines_of(r, i, j, _BINS)
     f, size = r.frequency[at], np.abs(r.H[at, i, j])
     name = f"{r.level:g} {r.level_unit}" if np.isfinite(r.level) else "measured"
     low = np.maximum(c.low[at, i, j], 0.1 * size)  # zero is nowhere on a logarithmic axis

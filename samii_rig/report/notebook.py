@@ -13,9 +13,10 @@ from samii_rig.report import canvas, plots
 from samii_rig.report.diagnosis import plots as diagnosis_plots
 from samii_rig.report.diagnosis.laws import QUANTITY, seen
 from samii_rig.report.diagnosis.models import curve, refitted_nominal
+from samii_rig.report.entries import Entry, entries, showing
 from samii_rig.report.series import pieces, time_series
 from samii_rig.rig.schema import Rig
-from samii_rig.types import Channel, FrequencyResponse, Recording
+from samii_rig.types import FrequencyResponse, Recording
 
 # The light scheme of the page (assets/page.js).
 COLOURS = {
@@ -69,10 +70,10 @@ def bode(
 
     output, input : names of channels, "" for the first. InputError for a name that there is not.
     """
-    i, j = _entry(responses, output, input)
+    entry = _entry(responses, output, input)
     model = curve(rig, rig.name, responses) if rig else None
-    curves = [plots.Curves.of(r) for r in responses]
-    return figure(plots.bode(curves, i, j, model))
+    curves = [plots.Curves.of(r) for r in showing(responses, entry)]
+    return figure(plots.bode(curves, entry, model))
 
 
 def before_after(
@@ -84,12 +85,12 @@ def before_after(
 ) -> graph_objects.Figure:
     """One entry with the refitted nominal model and with the causes found in it, and how far each
     is from the measurement in units of its noise."""
-    i, j = _entry(responses, output, input)
+    entry = _entry(responses, output, input)
     before = curve(refitted_nominal(rig, responses, None), "refitted nominal model", responses)
     named = found.rig if found.causes else None
     after = curve(named, "with the causes", responses) if named else None
-    curves = [plots.Curves.of(r) for r in responses]
-    return figure(diagnosis_plots.before_after(curves, i, j, before, after))
+    curves = [plots.Curves.of(r) for r in showing(responses, entry)]
+    return figure(diagnosis_plots.before_after(curves, entry, before, after))
 
 
 def place(found: Diagnosis) -> graph_objects.Figure:
@@ -127,15 +128,15 @@ def _coloured(node: Any) -> Any:
     return node
 
 
-def _entry(responses: Sequence[FrequencyResponse], output: str, input: str) -> tuple[int, int]:
+def _entry(responses: Sequence[FrequencyResponse], output: str, input: str) -> Entry:
     if not responses:
         raise InputError("plot", "responses", "none", "at least one")
-    first = responses[0]
-    return _index(first.outputs, "output", output), _index(first.inputs, "input", input)
+    found = entries(responses)
+    outputs, inputs = (list(dict.fromkeys(names)) for names in zip(*found, strict=True))
+    return _named(outputs, "output", output), _named(inputs, "input", input)
 
 
-def _index(channels: Sequence[Channel], what: str, name: str) -> int:
-    names = [c.name for c in channels]
+def _named(names: Sequence[str], what: str, name: str) -> str:
     if name and name not in names:
         raise InputError("plot", what, name, f"one of {', '.join(names)}")
-    return names.index(name) if name else 0
+    return name or names[0]

@@ -15,6 +15,7 @@ from samii_rig.record.events import Event
 from samii_rig.report import facts, plots, series
 from samii_rig.report.compare import Comparison, ModelCurve, compare
 from samii_rig.report.drawing import draw
+from samii_rig.report.entries import entries
 from samii_rig.report.modes import Modes, modes_of_all, rows, sentences
 from samii_rig.report.modes_drawing import motions
 from samii_rig.report.shell import Plot, check_suffix, page_text, put
@@ -144,18 +145,18 @@ def _bode(
     """One panel for all responses: which of them, and how it is shown, are its switches."""
     if not responses:
         return None
-    first, curves = responses[0], [plots.Curves.of(r) for r in responses]
+    drawn = [plots.Curves.of(r) for r in responses]
     compared = {(c.output, c.input) for c in comparisons}
     views = (BODE, RATIO) if compared else (BODE,)
     names, sets = [], []
-    for i, y in enumerate(first.outputs):
-        for j, u in enumerate(first.inputs):
-            names.append(f"{y.name}/{u.name}")
-            figures = [plots.bode(curves, i, j, model, comparisons, modes)]
-            if len(views) > 1:
-                held = model is not None and (y.name, u.name) in compared
-                figures.append(plots.ratio(curves, i, j, model) if held and model else figures[0])
-            sets += [{"name": names[-1], **f} for f in figures]
+    for entry in entries(responses):
+        names.append("/".join(entry))
+        curves = plots.showing_curves(drawn, entry)
+        figures = [plots.bode(curves, entry, model, comparisons, modes)]
+        if len(views) > 1:
+            held = model is not None and entry in compared
+            figures.append(plots.ratio(curves, entry, model) if held and model else figures[0])
+        sets += [{"name": names[-1], **f} for f in figures]
     said = ["the bands hold the true value of each line with 90 % probability"]
     said += ["shaded: the model differs by more than noise"] if compared else []
     said += [d] if (d := plots.distortion_caption(responses)) else []
@@ -189,11 +190,10 @@ def _check(
     if not recordings and not responses:
         raise InputError("report", "", "nothing", "a recording or a response")
     for r in responses:
-        for role in ("inputs", "outputs"):
-            names = [[c.name for c in getattr(x, role)] for x in (r, responses[0])]
-            if names[0] != names[1]:
-                expected = f"{names[1]}, the same in all responses"
-                raise InputError("report", role, names[0], expected)
+        names = [[c.name for c in x.inputs] for x in (r, responses[0])]
+        if names[0] != names[1]:
+            expected = f"{names[1]}, the same in all responses"
+            raise InputError("report", "inputs", names[0], expected)
     for recording in recordings if channel else ():
         names_ = [c.name for c in recording.channels]
         if channel not in names_:

@@ -22,6 +22,7 @@ from samii_rig.report.canvas import (
     unpacked,
 )
 from samii_rig.report.compare import BAND, Comparison, ModelCurve, telling
+from samii_rig.report.entries import Entry, channels, has, indices
 from samii_rig.report.modes import Modes
 from samii_rig.signal.coherence import partial_coherence
 from samii_rig.signal.statistics import magnitude_interval, phase, phase_half_width
@@ -53,13 +54,19 @@ class Curves:
         return cls(response, gain.low, gain.high, phase(response), half)
 
 
+def showing_curves(curves: Sequence[Curves], entry: Entry) -> list[Curves]:
+    """Those whose responses have an entry."""
+    return [c for c in curves if has(c.response, entry)]
+
+
 def _mode_labels(
-    r: FrequencyResponse, output: int, input: int, modes: Sequence[Modes]
+    r: FrequencyResponse, entry: Entry, modes: Sequence[Modes]
 ) -> list[dict[str, Any]]:
     """The natural frequencies of the response's modes, written at its curve."""
     own = next((m for m in modes if m.response is r), None)
     found = sorted(own.found.modes, key=lambda m: -m.sigma)[:_LABELS] if own else []
-    gain = np.abs(r.H[:, output, input])
+    i, j = indices(r, entry)
+    gain = np.abs(r.H[:, i, j])
     out = []
     for mode in found:
         k = int(np.argmin(np.abs(r.frequency - mode.frequency_hz.value)))
@@ -83,8 +90,7 @@ def _mode_labels(
 
 def bode(
     curves: Sequence[Curves],
-    output: int,
-    input: int,
+    entry: Entry,
     model: ModelCurve | None,
     comparisons: Sequence[Comparison] = (),
     modes: Sequence[Modes] = (),
@@ -93,44 +99,44 @@ def bode(
     even and odd distortion where the excitation shows them. Where the model differs by more than
     noise is shaded, and the modes of the last response are named."""
     responses = [c.response for c in curves]
-    y, u = responses[0].outputs[output], responses[0].inputs[input]
+    y, u = channels(responses[0], entry)
     several = len(responses[0].inputs) > 1
     coherences = "coherence: multiple, partial" if several else "coherence"
     titles = [f"gain [{unit(y, u)}]", "phase [\u00b0]", coherences]
     if _shows_distortion(responses):
         titles.append("distortion [%]")
         figure = stacked(4, titles, 920, weights=(0.36, 0.25, 0.14, 0.25))
-        _distortion(figure, responses, output, input)
+        _distortion(figure, responses, entry)
     else:
         figure = stacked(3, titles, 720, weights=(0.46, 0.32, 0.22))
     log_scale(figure["layout"]["yaxis"])
     figure["layout"]["yaxis3"] |= {"range": [0, 1.04], "dtick": 0.5}
     anchor: Float | None = None
     for k, c in enumerate(curves):
-        r = c.response
-        at = lines_of(r, output, input)
+        r, (i, j) = c.response, indices(c.response, entry)
+        at = lines_of(r, i, j)
         f = r.frequency[at]
-        gain_curve(figure, c, k, output, input)
-        anchor = phase_curve(figure, c, k, output, input, anchor)
-        coherence = r.coherence[at, output]
+        gain_curve(figure, c, k, entry)
+        anchor = phase_curve(figure, c, k, entry, anchor)
+        coherence = r.coherence[at, i]
         line(figure, f, coherence, label(r), "y3", k, legend=False, hover="%{y:.3f}")
         if len(r.inputs) > 1:
-            partial = partial_coherence(r)[at, output, input]
+            partial = partial_coherence(r)[at, i, j]
             points(figure, f, partial, f"partial, {label(r)}", "y3", k, full=False)
     curve = np.empty(0)
     if model is not None and anchor is not None:
-        curve = model_gain(figure, responses, model, y.name, u.name)
+        curve = model_gain(figure, responses, model, entry)
         f = common(responses, model)
-        angle = same_turn(f, np.rad2deg(unwrapped(model.at(f, y.name, u.name))), anchor)
+        angle = same_turn(f, np.rad2deg(unwrapped(model.at(f, *entry))), anchor)
         name = f"model {model.name}"
         line(figure, f, angle, name, "y2", MODEL, legend=False, hover=DEGREES)
     frame(figure, responses)
-    fit_gain(figure, responses, output, input, curve)
+    fit_gain(figure, responses, entry, curve)
     fit_phase(figure)
-    worst = telling(comparisons).get((y.name, u.name))
+    worst = telling(comparisons).get(entry)
     if worst is not None:
         figure["layout"]["shapes"] = [shade(span) for span in worst.spans_hz]
-    figure["layout"]["annotations"] = _mode_labels(responses[-1], output, input, modes)
+    figure["layout"]["annotations"] = _mode_labels(responses[-1], entry, modes)
     return figure
 
 
@@ -149,12 +155,13 @@ def _shows_distortion(responses: Sequence[FrequencyResponse]) -> bool:
     return any(x is not None for r in responses for x in (r.even, r.odd, r.noise, r.distortion))
 
 
-def _distortion(figure: Figure, responses: Sequence[FrequencyResponse], i: int, j: int) -> None:
+def _distortion(figure: Figure, responses: Sequence[FrequencyResponse], entry: Entry) -> None:
     """Even and odd distortion as parts of the output, and the response's own relative
     standard deviation, below which they say nothing."""
     log_scale(figure["layout"]["yaxis4"])
     shown: list[Float] = []
     for k, r in enumerate(responses):
+        i, j = indices(r, entry)
         f, level_name = r.frequency, label(r)
         sigma = 100 * np.sqrt(r.variance()[:, i, j]) / np.abs(r.H[:, i, j])
         name = f"standard deviation, {level_name}"
@@ -179,31 +186,29 @@ def _distortion(figure: Figure, responses: Sequence[FrequencyResponse], i: int, 
 
 def ratio(
     curves: Sequence[Curves],
-    output: int,
-    input: int,
+    entry: Entry,
     model: ModelCurve,
 ) -> Figure:
     """Model over measurement: gain and phase, with the measurement's 90 % band around it."""
     responses = [c.response for c in curves]
-    y, u = responses[0].outputs[output], responses[0].inputs[input]
     figure = stacked(2, ["model/measured", "phase [\u00b0]"], 520)
     log_scale(figure["layout"]["yaxis"])
     quotients: list[Float] = []
     for k, c in enumerate(curves):
-        r = c.response
-        at = lines_of(r, output, input)
+        r, (i, j) = c.response, indices(c.response, entry)
+        at = lines_of(r, i, j)
         f = r.frequency[at]
-        H = model.at(f, y.name, u.name)
+        H = model.at(f, *entry)
         size = np.abs(H)
-        low, high = c.low[at, output, input], c.high[at, output, input]
+        low, high = c.low[at, i, j], c.high[at, i, j]
         with np.errstate(divide="ignore", invalid="ignore"):
-            quotient = H / r.H[at, output, input]
+            quotient = H / r.H[at, i, j]
             upper = np.where(low > 0, size / low, np.nan)
             band(figure, f, size / high, upper, "y", k)
         quotients.append(np.abs(quotient))
         line(figure, f, np.abs(quotient), label(r), "y", k, hover="\u00d7 %{y:.3f}")
         angle = np.rad2deg(np.angle(quotient))
-        half = c.half[at, output, input]
+        half = c.half[at, i, j]
         band_half = np.where(half < 180.0, half, np.nan)
         band(figure, f, angle - band_half, angle + band_half, "y2", k)
         line(figure, f, angle, label(r), "y2", k, legend=False, hover="%{y:.1f}\u00b0")
@@ -224,10 +229,10 @@ def unit(output: Channel, input: Channel) -> str:
     return f"({over})/{under}" if "/" in over else f"{over}/{under}"
 
 
-def phase_curve(figure: Figure, c: Curves, k: int, i: int, j: int, anchor: Float | None) -> Float:
+def phase_curve(figure: Figure, c: Curves, k: int, entry: Entry, anchor: Float | None) -> Float:
     """Add the phase of the k-th response with its band to the second panel, in the turns of
     `anchor`, (2, n) frequency and angle of the first; returns the anchor."""
-    r = c.response
+    r, (i, j) = c.response, indices(c.response, entry)
     at = lines_of(r, i, j)
     f, angle = r.frequency[at], c.angle[at, i, j]
     if anchor is None:
@@ -268,10 +273,10 @@ def frame(figure: Figure, responses: Sequence[FrequencyResponse]) -> None:
 
 
 def fit_gain(
-    figure: Figure, responses: Sequence[FrequencyResponse], i: int, j: int, model: Float
+    figure: Figure, responses: Sequence[FrequencyResponse], entry: Entry, model: Float
 ) -> None:
     """Gain axis over the curves; a few lines that are all noise do not stretch it."""
-    parts = [np.abs(r.H[:, i, j]) for r in responses] + [model]
+    parts = [np.abs(r.H[:, *indices(r, entry)]) for r in responses] + [model]
     logs = [np.log10(p[np.isfinite(p) & (p > 0)]) for p in parts]
     logs = [p for p in logs if p.size]
     if not logs:
@@ -283,9 +288,9 @@ def fit_gain(
     figure["layout"]["yaxis"] |= ticked(low - room, high + 4 * room)
 
 
-def gain_curve(figure: Figure, c: Curves, k: int, i: int, j: int) -> None:
+def gain_curve(figure: Figure, c: Curves, k: int, entry: Entry) -> None:
     """Add the gain of the k-th response with its band to the first panel."""
-    r = c.response
+    r, (i, j) = c.response, indices(c.response, entry)
     at = lines_of(r, i, j)
     f = r.frequency[at]
     low, high = c.low[at, i, j], c.high[at, i, j]
@@ -299,12 +304,11 @@ def model_gain(
     figure: Figure,
     responses: Sequence[FrequencyResponse],
     model: ModelCurve,
-    y: str,
-    u: str,
+    entry: Entry,
 ) -> Float:
     """Add a model's gain to the first panel; returns it."""
     f = common(responses, model)
-    gain = np.abs(model.at(f, y, u))
+    gain = np.abs(model.at(f, *entry))
     line(figure, f, gain, f"model {model.name}", "y", MODEL, hover="%{y:.4g}")
     return gain
 

@@ -19,6 +19,7 @@ from rich.text import Text
 
 from samii_rig.progress import Aside, Counted, Pace, duration
 from samii_rig.report.compare import Comparison, ModelCurve, compare, percent
+from samii_rig.report.entries import channels, entries, showing
 from samii_rig.report.facts import names
 from samii_rig.report.modes import Modes, modes_table
 from samii_rig.report.plots import unit
@@ -228,16 +229,15 @@ def _comparisons(
     table = Table(box=None, pad_edge=False, header_style="bold", padding=(0, 2, 0, 0))
     for name in ("response", "level", "model/measured", "lines outside 90 %"):
         table.add_column(name, overflow="fold")
-    for y in responses[0].outputs:
-        for u in responses[0].inputs:
-            for name, own in zip(names(responses), compared, strict=True):
-                c = next((c for c in own if (c.output, c.input) == (y.name, u.name)), None)
-                if c is None:
-                    continue
-                phase = round(c.phase_deg, 1) + 0.0
-                agreement = f"\u00d7 {c.gain:.3f}, {phase:+.1f}\u00b0"
-                row = (f"{y.name}/{u.name} [{unit(y, u)}]", name, agreement)
-                table.add_row(*map(Text, (*row, percent(c.outside))))
+    for entry in entries(responses):
+        shown = f"{'/'.join(entry)} [{unit(*channels(showing(responses, entry)[0], entry))}]"
+        for name, own in zip(names(responses), compared, strict=True):
+            c = next((c for c in own if (c.output, c.input) == entry), None)
+            if c is None:
+                continue
+            phase = round(c.phase_deg, 1) + 0.0
+            agreement = f"\u00d7 {c.gain:.3f}, {phase:+.1f}\u00b0"
+            table.add_row(*map(Text, (shown, name, agreement, percent(c.outside))))
     return table
 
 

@@ -105,12 +105,19 @@ def _measured(
     parts = []
     poor = False
     first = responses[0]
-    for i, y in enumerate(first.outputs):
-        sigma = np.concatenate([_relative_sigma(r)[:, i].ravel() for r in responses])
+    # A level may lack a sensor that was unsound there.
+    for y in dict.fromkeys(c.name for r in responses for c in r.outputs):
+        columns = [
+            _relative_sigma(r)[:, i].ravel()
+            for r in responses
+            for i, c in enumerate(r.outputs)
+            if c.name == y
+        ]
+        sigma = np.concatenate(columns)
         useful = float(np.mean(sigma < _USELESS))
         poor |= useful < 0.5
         parts.append(
-            f"{y.name} to {100 * np.nanmedian(sigma):.2g} %"
+            f"{y} to {100 * np.nanmedian(sigma):.2g} %"
             + ("" if useful > 0.95 else f" (only {percent(useful)} of its lines better than 30 %)")
         )
     low, high = first.frequency[0], first.frequency[-1]

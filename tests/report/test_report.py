@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from report_kit import MODES, Page, measured, model, recorded
 from rich.console import Console
 
+from samii_rig.diagnose.data.wiring import outputs_of
 from samii_rig.errors import InputError
 from samii_rig.model import kernels
 from samii_rig.progress import Counted
@@ -165,13 +166,31 @@ def test_odd_responses_are_shown_all_the_same(tmp_path, case):
     bode_figure([response], model())
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_level_may_lack_a_sensor_that_was_unsound_there(tmp_path, order):
+    whole, less = measured(1.0), outputs_of(measured(2.0, seed=1), [1])
+    both = [whole, less][::order]
+    page = write_report(tmp_path / "r.html", Subject([], both, model=model(0.6)))
+    sets = json.loads(Page(page.read_text(encoding="utf-8")).scripts["data-bode"])["sets"]
+    levels = {s["name"]: {t["name"] for t in s["data"] if "name" in t} for s in sets}
+    assert "2 V" not in levels["theta_2/v_2"]
+    assert {"1 V", "2 V"} <= levels["a_0/v_2"]
+    said = printed(summary([], both, model(0.6)))
+    assert said.count("a_0/v_2 [") == 2
+    assert said.count("theta_2/v_2 [") == 1
+    figure = bode_figure(both, model())
+    drawn = [[line.get_label() for line in axis.lines] for axis in figure.axes[:2]]
+    assert [sum(label.endswith(" V") for label in labels) for labels in drawn] == [1, 2]
+
+
 def test_what_cannot_be_reported(tmp_path):
     path = tmp_path / "r.html"
     with pytest.raises(InputError, match="expected a recording or a response"):
         write_report(path, Subject([], []))
     with pytest.raises(InputError, match="spectrogram channel is 'x'"):
         write_report(path, Subject([recorded()], []), spectrogram_channel="x")
-    other = replace(measured(), outputs=measured().outputs[::-1])
+    (u,) = measured().inputs
+    other = replace(measured(), inputs=(replace(u, name="v_9"),))
     with pytest.raises(InputError, match="the same in all responses"):
         write_report(path, Subject([], [measured(), other]))
     with pytest.raises(InputError, match="expected the shape"):

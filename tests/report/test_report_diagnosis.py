@@ -12,6 +12,7 @@ import pytest
 from identify_kit import noiseless, samii
 from report_kit import Page, recorded
 
+from samii_rig.diagnose.data.wiring import outputs_of
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.physics.channels import NOT_PHYSICS
 from samii_rig.diagnose.physics.grid import grid
@@ -239,7 +240,16 @@ def test_after_is_at_the_noise_and_before_is_not(named, tmp_path):
     (far,) = re.findall(r"theta_2/v_2 ([\d.]+) \u2192 ([\d.]+) times the noise", parsed.text)
     assert float(far[0]) > 5
     assert float(far[1]) == pytest.approx(1.0, abs=0.25)
-    assert np.all(distance([response], curve_of(response), 0, 0)[1] < 0.2)
+    assert np.all(distance([response], curve_of(response), ("theta_2", "v_2"))[1] < 0.2)
+
+
+def test_a_level_that_lacks_a_sensor_has_its_place_on_the_page(named, tmp_path):
+    found, response = named
+    less = outputs_of(replace(response, level=2 * response.level), [1])
+    path = write_diagnosis(tmp_path / "d.html", found, [response, less], samii())
+    sets = json.loads(Page(path.read_text(encoding="utf-8")).scripts["data-fit"])["sets"]
+    drawn = [{t["name"] for t in s["data"] if "name" in t} for s in sets]
+    assert len(drawn[1]) == len(drawn[0]) + 1
 
 
 def curve_of(response):

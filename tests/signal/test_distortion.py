@@ -224,12 +224,13 @@ def test_a_rig_that_has_not_settled_is_hardly_ever_called_nonlinear(transient):
 
 def test_the_page_shows_distortion_where_there_is_some():
     (r,) = estimate([made(5, odd=0.01).recording])
-    figure = plots.bode([plots.Curves.of(r)], 1, 0, None)
+    entry = r.outputs[1].name, r.inputs[0].name
+    figure = plots.bode([plots.Curves.of(r)], entry, None)
     drawn = [trace["name"] for trace in figure["data"] if trace["yaxis"] == "y4"]
     assert drawn == ["standard deviation, 1 V", "even, 1 V", "odd, 1 V"]
     assert "full points odd" in plots.distortion_caption([r])
     none = replace(r, even=None, odd=None)
-    assert "yaxis4" not in plots.bode([plots.Curves.of(none)], 1, 0, None)["layout"]
+    assert "yaxis4" not in plots.bode([plots.Curves.of(none)], entry, None)["layout"]
     assert plots.distortion_caption([none]) == ""
 
 

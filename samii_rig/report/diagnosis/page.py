@@ -21,7 +21,8 @@ from samii_rig.report.diagnosis import words as words
 from samii_rig.report.diagnosis.laws import QUANTITY, jump_of, seen
 from samii_rig.report.diagnosis.models import curve, refitted_nominal, strengths
 from samii_rig.report.drawing import Suspect, draw
-from samii_rig.report.plots import Curves
+from samii_rig.report.entries import Entry, entries
+from samii_rig.report.plots import Curves, showing_curves
 from samii_rig.report.shell import Plot, check_suffix, page_text, put
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.elements import SOURCES, TorsionalSpring, TranslationalSpring
@@ -231,15 +232,15 @@ def _fits(
         before = curve(refitted_nominal(rig, responses, limits), plain, responses)
     causes = words.answer(found)
     after = curve(found.rig, caused, responses) if causes and found.rig else None
-    curves = [Curves.of(r) for r in responses]
+    drawn = [Curves.of(r) for r in responses]
     names, sets, said = [], [], []
-    for i, y in enumerate(responses[0].outputs):
-        for j, u in enumerate(responses[0].inputs):
-            if y.name not in before.outputs or u.name not in before.inputs:
-                continue
-            names.append(f"{y.name}/{u.name}")
-            sets.append({"name": names[-1], **figures.before_after(curves, i, j, before, after)})
-            said.append(f"{names[-1]} {_improved(responses, before, after, i, j)}".strip())
+    for entry in entries(responses):
+        if entry[0] not in before.outputs or entry[1] not in before.inputs:
+            continue
+        names.append("/".join(entry))
+        curves = showing_curves(drawn, entry)
+        sets.append({"name": names[-1], **figures.before_after(curves, entry, before, after)})
+        said.append(f"{names[-1]} {_improved(responses, before, after, entry)}".strip())
     if not sets:
         return ()
     caption = "; ".join(said)
@@ -250,10 +251,9 @@ def _improved(
     responses: Sequence[FrequencyResponse],
     before: ModelCurve,
     after: ModelCurve | None,
-    i: int,
-    j: int,
+    entry: Entry,
 ) -> str:
-    far = [figures.distance(responses, m, i, j)[1] for m in (before, after) if m is not None]
+    far = [figures.distance(responses, m, entry)[1] for m in (before, after) if m is not None]
     typical = [words.ratio(float(np.sqrt(np.mean(x**2)))) for x in far if x.size]
     if not typical:
         return ""

@@ -21,6 +21,7 @@ from samii_rig.report.canvas import (
 )
 from samii_rig.report.compare import ModelCurve
 from samii_rig.report.diagnosis.models import HALF, Strength
+from samii_rig.report.entries import Entry, channels, indices, showing
 from samii_rig.report.plots import (
     DEGREES,
     Curves,
@@ -143,36 +144,39 @@ def _power(value: float) -> str:
 
 
 def before_after(
-    curves: Sequence[Curves], i: int, j: int, before: ModelCurve, after: ModelCurve | None
+    curves: Sequence[Curves], entry: Entry, before: ModelCurve, after: ModelCurve | None
 ) -> Figure:
     """Gain and phase with both models, and how far each is from the measurement in units of
     its noise."""
     responses = [c.response for c in curves]
-    y, u = responses[0].outputs[i], responses[0].inputs[j]
-    titles = [f"gain [{unit(y, u)}]", "phase [\u00b0]", "distance [noise]"]
+    titles = [
+        f"gain [{unit(*channels(responses[0], entry))}]",
+        "phase [\u00b0]",
+        "distance [noise]",
+    ]
     figure = stacked(3, titles, 640, weights=(0.46, 0.27, 0.27))
     log_scale(figure["layout"]["yaxis"])
     log_scale(figure["layout"]["yaxis3"])
     anchor: Float | None = None
     for k, c in enumerate(curves):
-        gain_curve(figure, c, k, i, j)
-        anchor = phase_curve(figure, c, k, i, j, anchor)
+        gain_curve(figure, c, k, entry)
+        anchor = phase_curve(figure, c, k, entry, anchor)
     models = [(before, BEFORE), *([(after, AFTER)] if after else [])]
     shown, distances = [np.empty(0)], [np.array([1.0])]
     for model, stroke in models:
         f = model.frequency
-        H = model.at(f, y.name, u.name)
+        H = model.at(f, *entry)
         name = model.name
         line(figure, f, np.abs(H), name, "y", stroke, hover="%{y:.4g}")
         assert anchor is not None
         angle = same_turn(f, np.rad2deg(unwrapped(H)), anchor)
         line(figure, f, angle, name, "y2", stroke, legend=False, hover=DEGREES)
-        at, far = distance(responses, model, i, j)
+        at, far = distance(responses, model, entry)
         line(figure, at, far, name, "y3", stroke, legend=False, hover="%{y:.2g}")
         shown.append(np.abs(H))
         distances.append(far)
     frame(figure, responses)
-    fit_gain(figure, responses, i, j, np.concatenate(shown))
+    fit_gain(figure, responses, entry, np.concatenate(shown))
     fit_phase(figure)
     high = float(np.log10(np.nanmax(np.concatenate(distances))))
     low = float(np.log10(np.nanmin(np.concatenate(distances))))
@@ -182,14 +186,14 @@ def before_after(
 
 
 def distance(
-    responses: Sequence[FrequencyResponse], model: ModelCurve, i: int, j: int
+    responses: Sequence[FrequencyResponse], model: ModelCurve, entry: Entry
 ) -> tuple[Float, Float]:
     """Frequencies, and the root mean square of |model - measured| over its standard deviation in
     bins about them; 1 is what noise alone leaves."""
-    y, u = responses[0].outputs[i].name, responses[0].inputs[j].name
     fs, squares = [], []
-    for r in responses:
-        e = np.abs(model.at(r.frequency, y, u) - r.H[:, i, j]) ** 2
+    for r in showing(responses, entry):
+        i, j = indices(r, entry)
+        e = np.abs(model.at(r.frequency, *entry) - r.H[:, i, j]) ** 2
         variance = r.variance()[:, i, j]
         use = np.isfinite(e) & (variance > 0) & (r.frequency > 0)
         fs.append(r.frequency[use])
