@@ -31,7 +31,7 @@ from samii_rig.cli.options import takes
 from samii_rig.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from concurrent.futures import Executor
 
     from rich.console import Console
@@ -317,27 +317,14 @@ def _together(o: DiagnoseOptions, logs: list[Path], earlier: list[Path]) -> None
     if o.json:
         say_json(found.plain())
         return
-    for line in _lines(asked, found):
+    for line in found.lines():
         console.print(line, soft_wrap=True)
+    if found.model:
+        console.print(f"written  {found.model}", soft_wrap=True)
     if page:
         console.print(f"page     {page}", soft_wrap=True)
     if asked.plain and not asked.kept:
         console.print("not kept with the recordings: they carry another rig file", soft_wrap=True)
-
-
-def _lines(asked: _Asked, found: Diagnosis) -> Iterator[str]:
-    """What was found, and what would tell more."""
-    from samii_rig.diagnose.fit.exact import lengths
-
-    yield from found.lines()
-    apart = asked.first or found.states or found.exact
-    if found.verdict == "unknown" and not apart and (exact := lengths(asked.own)):
-        yield (
-            f"exact    The rig file gives {', '.join(exact)} no tolerance. If one may be wrong, "
-            f"free it: samii-rig identify with the same recordings, --rig and --free {exact[0]}"
-        )
-    if found.model:
-        yield f"written  {found.model}"
 
 
 def _saved(logs: list[Path], *, two: bool) -> list[SavedResponses]:

@@ -112,7 +112,8 @@ def case_of(
     if effects is None:
         low, high = float(lines.frequency[0]), float(lines.frequency[-1])
         if whole is not None:  # whole records reach to where no response could be estimated
-            low, high = min(low, whole.records.band[0]), max(high, whole.records.band[1])
+            first, last = whole.records.band
+            low, high = min(low, first or low), max(high, last)  # a band may begin at 0 Hz
         effects = table(rig, low, high, signed=signed, recorded_hz=trusted[0].rate_hz)
     effects = [e for e in clean.competing(effects) if not is_stated(e, rig)]
     by_line = Search(rig, seen, at, effects, progress=progress)

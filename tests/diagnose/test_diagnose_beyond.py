@@ -3,6 +3,7 @@ what a class of explanations says of names and places.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,10 +19,19 @@ from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.fit.moebius import place_of
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.stated import Evidence, probability
+from samii_rig.diagnose.forces.laws import OVERLAP, Force
+from samii_rig.diagnose.forces.place import Place
+from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.grid import grid
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.result import Gap
-from samii_rig.diagnose.verdict.judge import Judgement, confirmed, judge, shown
+from samii_rig.diagnose.verdict.judge import (
+    Judgement,
+    _critical_value,
+    confirmed,
+    judge,
+    shown,
+)
 from samii_rig.identify.bootstrap import redraw
 
 COMPLIANCE = "torsional_compliance"
@@ -176,6 +186,29 @@ def test_what_should_show_may_not_make_worse_what_it_was_not_fitted_to():
     small = replace(judged, evidence=replace(STRONG, drop=400.0))
     assert shown(small, worse, due=100.0).verdict == "named"
     assert shown(small, Gap(-0.5, -0.7, -0.1), due=1.0).verdict == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("physics", "left", "needed"),
+    [
+        ("valve_deadband", 1.005, 1e-4 * 4.5e6),
+        ("valve_deadband", 1.3, 30.0),  # it leaves more than noise: something stands beside it
+        ("added_mass", 1.005, 30.0),
+    ],
+)
+def test_what_stands_beside_a_force_must_do_a_hundredth_of_it(physics, left, needed):
+    force = Force(Place("command", ("valve",)), OVERLAP) if physics == "valve_deadband" else None
+    one = Effect(physics, "valve", force=force)
+    fits = {"nominal": 4_536_000.0, "force": 36_000.0}
+    nominal, less = (
+        SimpleNamespace(effects=effects, fitted=SimpleNamespace(chi2=fits[name]))
+        for name, effects in (("nominal", ()), ("force", (one,)))
+    )
+    search = SimpleNamespace(
+        nominal=nominal, critical_value=30.0, overdispersion=1.0, spread=1e-4,
+        ratio=lambda _: left,
+    )  # fmt: skip
+    assert _critical_value(search, less) == pytest.approx(needed)
 
 
 def test_several_effects_that_leave_much_are_no_answer_whatever_a_force_is_confirmed_to_be():

@@ -210,7 +210,9 @@ def test_a_linear_effect_beside_a_force_must_show_in_the_data(gained: float, tol
         found={one.key: one},
         overdispersion=1.0,
         critical_value=IN_DATA,
-        nominal=SimpleNamespace(fitted=fit_of(5000.0)),
+        nominal=SimpleNamespace(effects=(), fitted=fit_of(5000.0)),
+        ratio=lambda _: 1.0,
+        spread=1e-3,
     )
     assert _is_insignificant(search, both) is not told
 

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from table_kit import table_of
 from two_masses_kit import CORNER, K1, K2, RIG, diagnosed, random_command, recorded
 
+from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.fit.classes import Class
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.variation import Uneven
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Cause, Diagnosis, Moved
-from samii_rig.diagnose.verdict import by_record
+from samii_rig.diagnose.verdict import by_record, stages
+from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.rig.schema import Rig, parameters
+from samii_rig.signal.estimate import estimate
 
 V = random_command(3000, 1.0, 1)
 K3 = 1.5e9  # N/m^3: at 3.4 mm as much as the spring itself
@@ -36,6 +41,12 @@ def test_nothing_is_missing_and_the_noise_is_the_sensors_own(nothing: Diagnosis)
 
 def test_so_where_nothing_is_looked_for() -> None:
     assert diagnosed(recorded(V[:1500], 1), effects=()).verdict == "no_mismatch"
+
+
+def test_a_band_may_begin_at_0_hz() -> None:
+    run = recorded(V[:1500], 1)
+    found = diagnose(estimate([run], gaps="auto"), RIG, band=(0.0, 40.0), runs=[run])
+    assert found.verdict == "no_mismatch"
 
 
 def test_that_no_reference_was_recorded_is_the_last_to_be_said(nothing: Diagnosis) -> None:
@@ -76,6 +87,15 @@ def test_a_lag_that_is_longer_than_the_file_says_is_one_cause() -> None:
     (cause,) = found.causes
     assert (cause.physics, cause.site) == ("actuator_lag", coil.name)
     assert cause.parameters["p ratio"].low < 0.25 < cause.parameters["p ratio"].high
+
+
+def test_a_gap_in_which_nothing_acts_is_play() -> None:
+    gap = 4e-4
+    found = diagnosed(recorded(V, 1, gap=gap))
+    (cause,) = found.causes
+    assert (found.verdict, cause.physics, cause.site) == ("named", "backlash", "spring_2")
+    width = cause.parameters["width"]
+    assert width.value == pytest.approx(gap, rel=0.05)
 
 
 @pytest.mark.parametrize(("tolerance", "told"), [(0.006, False), (0.0035, True)])
@@ -129,6 +149,56 @@ def test_nothing_is_missing_is_not_said_where_a_force_explains_some_lines(
     found = diagnosed(recorded(V[:1500], 1), effects=())
     assert found.verdict == "unknown"
     assert any("explains 20 sigma, but not of all lines alike" in w for w in found.not_physics)
+
+
+@pytest.mark.parametrize(("fall", "verdict"), [(400.0, "unknown"), (30.0, "named")])
+def test_a_cause_is_not_told_that_explains_less_than_a_force_at_some_lines(
+    fall: float, verdict: str
+) -> None:
+    judged = SimpleNamespace(
+        verdict="named", varies=None, evidence=SimpleNamespace(drop=43.0),
+        best=SimpleNamespace(effects=(Effect("torsional_compliance", "spring_1"),)),
+    )  # fmt: skip
+    pieces = [SimpleNamespace(edges=())]
+    forces = SimpleNamespace(
+        uneven=(Effect("coulomb_friction", "spring_1"), fall),
+        levels=SimpleNamespace(records=SimpleNamespace(pieces=pieces)),
+    )
+    looked = SimpleNamespace(judged=judged, remarks=())
+    changed = []
+
+    def unknown(one: object) -> SimpleNamespace:
+        changed.append(one)
+        return SimpleNamespace(judged=SimpleNamespace(verdict="unknown"), remarks=())
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(by_record, "_unknown", unknown)
+        patched.setattr(by_record, "replace", lambda one, **kept: one)
+        found = by_record._or_uneven(forces, looked)
+    assert found.judged.verdict == verdict
+    assert bool(changed) == (verdict == "unknown")
+
+
+@pytest.mark.parametrize(
+    ("said", "away", "told"),
+    [
+        ("named", 5.5, "ambiguous"),
+        ("ambiguous", -5.5, "ambiguous"),
+        ("named", 4.5, "named"),
+        ("no_mismatch", 5.5, "no_mismatch"),
+    ],
+)
+def test_a_cause_that_needs_a_number_off_the_file_is_not_sure(said, away, told) -> None:
+    model = SimpleNamespace(
+        n_nominal=2, prior=np.array([0.1, 0.2]), keys=(("spring_1", "k"), ("spring_1", "c"))
+    )
+    fitted = SimpleNamespace(model=model, x=np.array([0.1 * away, 0.2]))
+    best = SimpleNamespace(fitted=fitted, effects=())
+    judged = Judgement(said, (Class((best,), (0.0,), 1.0),), 0.0, 0.9, None, 1.0)
+    less, words = stages._beyond_the_file(judged)
+    assert less.verdict == told
+    off = abs(away) > 5 and said != "no_mismatch"
+    assert [w.split(" is ")[0] for w in words] == ["spring_1.k"] * off
 
 
 def test_a_spring_that_hardens_as_much_as_it_is_stiff_has_its_value() -> None:

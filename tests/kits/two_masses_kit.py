@@ -32,10 +32,12 @@ def recorded(
     pd: tuple[float, float] | None = None,
     every: int = 1,
     meter: float = 0.0,
+    gap: float = 0.0,
 ) -> Recording:
     """A record from rest under a held command v (n,) V, with the noise that the rig file states.
 
-    k3 : N/m^3 of the first spring. gain : of the coil, over time in s. more : kg on the second
+    k3 : N/m^3 of the first spring. gap : m, of the second one, in which neither it nor its damper
+    acts. gain : of the coil, over time in s. more : kg on the second
     mass. pd : V/m and V s/m of a loop around what x_1 reads, whose reference is v then, and is not
     recorded; what goes out is rounded to the converter's steps. every : samples of the command for
     one that is recorded. meter : V, noise of what showed the command, the mean of both sides of its
@@ -49,7 +51,10 @@ def recorded(
 
     def rate_of(z: Float, force: float) -> Float:
         x1, v1, x2, v2, f = z
-        inner = K2 * (x2 - x1) + C2 * (v2 - v1)
+        way = x2 - x1
+        inner = K2 * (way - 0.5 * np.copysign(gap, way)) + C2 * (v2 - v1)
+        if 2 * abs(way) < gap:
+            inner = 0.0
         a1 = (f + inner - K1 * x1 - C1 * v1 - k3 * x1**3) / M1
         return np.array([v1, a1, v2, -inner / m2, CORNER * (force - f)])
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.screen import Screen
-from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS, PLAY, Law
+from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS, PLAY, SLACK, Law
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.screen import ForceScreen, first_order, scaled
 from samii_rig.diagnose.forces.search import ForceSearch
@@ -25,6 +25,7 @@ def weak_ones(search: ForceSearch) -> Iterator[tuple[Law, str, float, float]]:
         law = score.effect.force.law
         if law in (
             PLAY,
+            SLACK,
             HYSTERESIS,
             FRICTION,
         ):  # whose shape depends on the strength, or that stick

@@ -45,11 +45,6 @@ MOST_WRONG = 3  # numbers that are told: a file with more is of another rig
 NINETY = 1.645  # standard deviations of a 90 % interval
 
 
-def lengths(rig: Rig) -> tuple[str, ...]:
-    """Lengths without a tolerance, as "element.L"."""
-    return tuple(f"{name}.{LENGTH}" for name in _exact(rig))
-
-
 def wrong_lengths(search: RecordSearch) -> tuple[tuple[Exact, ...], RecordSearch] | None:
     """The length or the two lengths with which the rig file explains the records to their noise,
     and the search on the rig that has them free; None where the best single effect does, or
@@ -172,12 +167,18 @@ def wrong_numbers(search: Search, fitted: Fitted) -> tuple[tuple[Exact, ...], Fi
     return tuple(_exact_of(search.rig, key, end) for key in found), end
 
 
-def _far(fitted: Fitted, stated: Model) -> list[Key]:
+def off_the_file(fitted: Fitted, stated: Model) -> dict[Key, float]:
     """The parameters that a fit has beyond the tolerances of a model of the same, the farthest
-    first."""
+    first, each with how many of them."""
     n = stated.n_nominal
     away = np.abs(fitted.x[:n] / stated.prior[:n])
-    return [stated.keys[i] for i in np.argsort(-away).tolist() if away[i] >= OFF_THE_FILE]
+    far = [i for i in np.argsort(-away).tolist() if away[i] >= OFF_THE_FILE]
+    return {stated.keys[i]: float(away[i]) for i in far}
+
+
+def _far(fitted: Fitted, stated: Model) -> list[Key]:
+    """As `off_the_file`, the parameters alone."""
+    return list(off_the_file(fitted, stated))
 
 
 def _without(search: Search, fitted: Fitted, start: Fitted, keys: Sequence[Key]) -> Fitted | None:

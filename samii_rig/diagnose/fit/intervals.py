@@ -126,10 +126,11 @@ def _of(effect: Effect, theta: Float, draws: Float) -> dict[str, Drawn]:
     reported = effect.report(theta)
     out = {}
     for k, u in enumerate(effect.unknowns):
-        # A place ends where the body does; any other unknown goes on beyond its bounds.
+        # A place ends where the body does, on both sides; most unknowns go on beyond their bounds.
         ends = (draws[:, k] <= low[k], draws[:, k] >= high[k])
-        if u.symbol == POSITION:
-            ends = (np.zeros(len(draws), bool),) * 2
+        never = np.zeros(len(draws), bool)
+        if u.ends:
+            ends = (never if u.symbol == POSITION else ends[0], never)
         at = [theta.copy(), theta.copy()]
         at[0][k], at[1][k] = u.low, u.high
         below, above = ends if effect.report(at[0])[k] <= effect.report(at[1])[k] else ends[::-1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ from numba import njit
 
 from samii_rig.diagnose.forces import steps
 from samii_rig.diagnose.forces.place import Kind, Place
-from samii_rig.diagnose.forces.steps import Step
+from samii_rig.diagnose.forces.steps import LAW_NUMBERS, Step
 from samii_rig.diagnose.physics.effect import Key
 from samii_rig.types import Float
 
@@ -29,14 +29,14 @@ class Law:
     """A force law.
 
     tag : its own. physics : its name in the table. unknowns : their symbols; how they enter the
-        law's numbers (n_unknown, 2), each number a sum of unknowns, or `fixed` where none does.
+        law's first numbers (n_unknown, 2), each a sum of unknowns, or `fixed` where none does.
     step : in time, driven by a motion. of_command : (command (n,), numbers) -> force (n,) and its
     slopes
         (n, 2), of a law that the command alone drives.
     weak : (motion (n,), command (n,), numbers) -> force (n,) of a motion that it does not change,
         of a law that has a step.
-    of_speed : whether it is driven by the speed of what is read. scaled : whether the last number
-        is a parameter of the rig. rough : relative model error.
+    of_speed : whether it is driven by the speed of what is read. of_part : symbols of a part's
+        parameters that are its numbers behind the first. rough : relative model error.
         words : what it is.
     """
 
@@ -51,19 +51,19 @@ class Law:
     step: Step | None = None
     of_command: Callable[[Float, Float], tuple[Float, Float]] | None = None
     of_speed: bool = False
-    scaled: bool = False
+    of_part: tuple[str, ...] = ()
     rough: float = COMPUTED
 
     def __post_init__(self) -> None:
         if {self.step is None, self.weak is None} != {self.of_command is not None}:
             raise ValueError(f"{self.tag}: a law is driven by a motion or by the command")
 
-    def numbers(self, strengths: Float, scale: float = 1.0) -> Float:
-        """(2,) the law's numbers. scale : the rig's own parameter of a law that has one."""
-        own = np.array(self.fixed) + np.asarray(strengths) @ np.array(self.enter)
-        if self.scaled:
-            own[-1] = scale
-        return np.ascontiguousarray(own)
+    def numbers(self, strengths: Float, of_part: Sequence[float] = ()) -> Float:
+        """(3,) the law's numbers. of_part : values of the part's parameters that it has."""
+        own = np.zeros(LAW_NUMBERS)
+        own[:2] = np.array(self.fixed) + np.asarray(strengths) @ np.array(self.enter)
+        own[1 : 1 + len(of_part)] = of_part
+        return own
 
 
 @njit(cache=True)
@@ -123,8 +123,13 @@ QUADRATIC = Law(
 )  # fmt: skip
 PLAY = Law(
     "play", "backlash", "play", BETWEEN, ("width",), ONE,
-    weak=lambda y, _v, p: p[1] * np.clip(y, -p[0] / 2, p[0] / 2), step=steps.play, scaled=True,
-    rough=TREMBLED,
+    weak=lambda y, _v, p: p[1] * np.clip(y, -p[0] / 2, p[0] / 2), step=steps.play,
+    of_part=("k",), rough=TREMBLED,
+)  # fmt: skip
+# In the gap of a coupling or a gear nothing acts; of a spring between two stops its damper does.
+SLACK = Law(
+    "slack", "backlash", "play", BETWEEN, ("width",), ONE, weak=PLAY.weak, step=steps.slack,
+    of_part=("k", "c"), rough=TREMBLED,
 )  # fmt: skip
 HYSTERESIS = Law(
     "hysteresis", "hysteresis", "a part that sticks, then slips (Bouc-Wen)", BETWEEN,
@@ -144,20 +149,26 @@ CLIPPED = Law(
     of_command=_excess,
 )  # fmt: skip
 LAWS = (
-    FRICTION, UNEVEN, HARDENING, SOFTENING, QUADRATIC, PLAY, HYSTERESIS, ORIFICE, OVERLAP, CLIPPED,
+    FRICTION, UNEVEN, HARDENING, SOFTENING, QUADRATIC, PLAY, SLACK, HYSTERESIS, ORIFICE, OVERLAP,
+    CLIPPED,
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Force:
-    """A law at a place. scale : the rig's parameter that is its last number, if it has one."""
+    """A law at a place. part : whose parameters are among its numbers, "" if none's are."""
 
     place: Place
     law: Law
-    scale: Key | None = None
+    part: str = ""
 
     def __post_init__(self) -> None:
         if self.place.kind not in self.law.kinds:
             raise ValueError(f"{self.law.tag} does not act on a {self.place.kind}")
-        if self.law.scaled != (self.scale is not None):
+        if bool(self.law.of_part) != bool(self.part):
             raise ValueError(f"{self.law.tag} needs a parameter of the rig")
+
+    @property
+    def keys(self) -> tuple[Key, ...]:
+        """The rig's parameters that are among its numbers."""
+        return tuple((self.part, symbol) for symbol in self.law.of_part)

@@ -54,7 +54,7 @@ def march(
     transition, by_v, by_e : (2, n_pole) real and imaginary parts. What drives the force is the sum
     of all real parts, and direct and g per unit of command and of force. others : (n inner,) what
     other commands do to it, as `moved`, or none. late : steps of dead time.
-    seeds : (m, 2) each change of the numbers p (2,).
+    seeds : (m, 3) each change of the numbers p (3,).
     """
     m, n_pole = seeds.shape[0], transition.shape[1]
     tr, ti, er, ei = transition[0], transition[1], by_e[0], by_e[1]

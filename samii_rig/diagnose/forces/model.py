@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from samii_rig.diagnose.forces.laws import Force
+from samii_rig.diagnose.forces.steps import LAW_NUMBERS
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.grid import Grid
 from samii_rig.diagnose.physics.model import Model
@@ -32,8 +33,8 @@ class RecordGrid(Grid):
 class ForceModel(Model):
     """A model one of whose effects is a force; on a plain grid the force is left out.
 
-    force : it. unknowns : where its strengths stand in x. moving : these, and the parameter of the
-    rig that is one of its numbers.
+    force : it. unknowns : where its strengths stand in x. moving : these, and the parameters of the
+    rig that are among its numbers.
     """
 
     def __init__(self, rig: Rig, effects: Sequence[Effect]) -> None:
@@ -46,8 +47,8 @@ class ForceModel(Model):
         self.force: Force = effect.force
         self.chain = self.chain_of(self.force.place.augmented(self.built))
         self.unknowns = tuple(self.own(which))
-        scale = self.force.scale
-        self.moving = (*self.unknowns, *((self.keys.index(scale),) if scale in self.keys else ()))
+        own = (self.keys.index(key) for key in self.force.keys if key in self.keys)
+        self.moving = (*self.unknowns, *own)
 
     def plain(self, x: Float) -> Chain:
         """As of `Model`, without the force's input and sensor."""
@@ -58,17 +59,23 @@ class ForceModel(Model):
         return np.exp(x[list(self.unknowns)])
 
     def numbers(self, x: Float) -> Float:
-        """(2,) the numbers of its law."""
-        scale = self.force.scale
-        known = 1.0 if scale is None else float({**self.nominal, **self.values(x)}[scale])
-        return self.force.law.numbers(self.strengths(x), known)
+        """(3,) the numbers of its law."""
+        known = {**self.nominal, **self.values(x)}
+        return self.force.law.numbers(
+            self.strengths(x), [float(known[key]) for key in self.force.keys]
+        )
 
     def seeds(self, x: Float, moving: Sequence[int]) -> Float:
-        """(m, 2) slopes of `numbers` by entries of x, each a logarithm."""
+        """(m, 3) slopes of `numbers` by entries of x, each a logarithm."""
         own = np.array(self.force.law.enter) * self.strengths(x)[:, None]
-        by_scale = np.array([0.0, self.numbers(x)[1]])
-        rows = [own[self.unknowns.index(j)] if j in self.unknowns else by_scale for j in moving]
-        return np.ascontiguousarray(rows, np.float64).reshape(-1, 2)
+        numbers, rows = self.numbers(x), np.zeros((len(moving), LAW_NUMBERS))
+        for row, j in zip(rows, moving, strict=True):
+            if j in self.unknowns:
+                row[:2] = own[self.unknowns.index(j)]
+            else:
+                at = 1 + self.force.keys.index(self.keys[j])
+                row[at] = numbers[at]
+        return rows
 
     def channels(
         self, x: Float, s: Complex

@@ -184,9 +184,9 @@ class TransferPaths:
             return 0
         return self.whole.wired.column(place.command(self.model.built))
 
-    def scale(self, key: Key | None) -> float:
-        """The rig's parameter that multiplies a force, 1 of none."""
-        return 1.0 if key is None else {**self.model.nominal, **self.model.values(self.x)}[key]
+    def scale(self, key: Key) -> float:
+        """A parameter of the rig."""
+        return {**self.model.nominal, **self.model.values(self.x)}[key]
 
     def commands(self, place: Place) -> list[Float]:
         """(M,) of each piece the command that a force is on, as it is held, after the dead time;

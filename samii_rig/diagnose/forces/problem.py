@@ -114,7 +114,7 @@ def _lines_of_command(
     r = np.zeros((1 + len(seeds), *piece.r.shape))
     for command in commands:
         e, slopes = of_command(between(by_input(command.v)[on], every), p)
-        all_ = np.concatenate([e[None], (slopes @ seeds.T).T])
+        all_ = np.concatenate([e[None], (slopes @ seeds[:, : slopes.shape[1]].T).T])
         r.reshape(*r.shape[:2], -1)[:, :, on] += command.part * _recorded(all_, every)
     still = np.zeros_like(piece.z)
     return [Samples(own, still) for own in r]

@@ -21,6 +21,7 @@ from samii_rig.diagnose.forces.laws import (
     ORIFICE,
     OVERLAP,
     PLAY,
+    SLACK,
     Force,
     Law,
 )
@@ -109,7 +110,7 @@ def trial_strengths(effect: Effect, paths: TransferPaths) -> list[Float]:
     law, high = effect.force.law, effect.unknowns[0].high
     if law is CLIPPED:
         return [np.array([high * x]) for x in LIMITS]
-    if law in (OVERLAP, PLAY):
+    if law in (OVERLAP, PLAY, SLACK):
         return [np.array([high / 2 * x]) for x in GAPS]
     if law is ORIFICE:
         return [np.array([high * WEAK_START])]
@@ -143,7 +144,7 @@ def first_order(
         if ports is None:
             continue
         for strengths in trial_strengths(effect, paths):
-            p = force.law.numbers(strengths, paths.scale(force.scale))
+            p = force.law.numbers(strengths, [paths.scale(key) for key in force.keys])
             spectra, share = _forces(force, p, paths)
             lines = map(Span.lines, paths.spans, spectra, ports.sensors, k)
             shapes.append(np.concatenate(list(lines))[order])

@@ -4,7 +4,7 @@ What drives a force is `free` at the end of a step without the force over it, an
 it. A step fills `out` with
 
     0: f   1: df/dbefore   2: df/dfree   3: memory after it   4: df/dmemory
-    5: dm/dbefore   6: dm/dfree   7: dm/dmemory   8, 10: df/dp   9, 11: dm/dp
+    5: dm/dbefore   6: dm/dfree   7: dm/dmemory   8, 10, 12: df/dp   9, 11, 13: dm/dp
 
 where m is the memory after the step, and p are the law's numbers. Smooth laws act on the middle of
 the step, so that errors fall with the square of its length.
@@ -19,7 +19,7 @@ from numba import njit, types
 
 from samii_rig.types import Float
 
-OUT, LAW_NUMBERS = 12, 2  # entries of `out`, and numbers of a law at most
+OUT, LAW_NUMBERS = 14, 3  # entries of `out`, and numbers of a law at most
 NEWTON = 5  # steps at most to the root of a law that is monotonous
 ROOT_FOUND = 1e-8  # of the root: Newton's next step would be of the square of it, a rounding error
 _f8, _row = types.float64, types.Array(types.float64, 1, "C")
@@ -93,6 +93,30 @@ def play(
     else:
         out[8] = 0.5 * p[1] * np.sign(x)
         out[10] = x
+
+
+@njit(SIGNATURE, cache=True)
+def slack(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """What a gap of width p0 takes from a spring of stiffness p1 and a damper of p2 times the way
+    of the step: inside it nothing acts. At its edge the damper stops what nothing would."""
+    middle, way = 0.5 * (before + free), free - before
+    held = 1.0 - g * (0.5 * p[1] + p[2])
+    f = (p[1] * middle + p[2] * way) / held
+    x = middle + 0.5 * g * f
+    if abs(x) <= 0.5 * p[0]:
+        out[0] = f
+        out[1], out[2] = (0.5 * p[1] - p[2]) / held, (0.5 * p[1] + p[2]) / held
+        out[10], out[12] = x / held, (way + g * f) / held
+        return
+    sign = 1.0 if x > 0.0 else -1.0
+    out[0] = 0.5 * sign * p[0] * p[1]
+    out[8], out[10] = 0.5 * sign * p[1], 0.5 * sign * p[0]
+    if sign * (middle + 0.5 * g * out[0]) < 0.5 * p[0]:
+        out[0] = (sign * p[0] - 2.0 * middle) / g
+        out[1] = out[2] = -1.0 / g
+        out[8], out[10] = sign / g, 0.0
 
 
 @njit(SIGNATURE, cache=True)

@@ -15,6 +15,7 @@ from samii_rig.diagnose.forces.laws import (
     OVERLAP,
     PLAY,
     QUADRATIC,
+    SLACK,
     SOFTENING,
     UNEVEN,
     Force,
@@ -105,7 +106,9 @@ def _between(paths: TransferPaths, place: Place, spring: Spring) -> Iterator[Eff
         yield effect(law, place, name, "", (unknown,))
     if spring.k.value > 0:
         width = _log("width", of_way, WIDTHS[0] * top, WIDTHS[1] * top)
-        yield effect(PLAY, place, name, "", (width,), (name, "k"))
+        yield effect(PLAY, place, name, "", (width,), name)
+        if spring.c.value > 0:
+            yield effect(SLACK, place, name, "", (width,), name)
     T_y = _log(
         "T_y", of_force, STRENGTH_RANGE[0] * doubles * top, STRENGTH_RANGE[1] * doubles * top
     )
@@ -166,15 +169,15 @@ def effect(
     site: str,
     alias: str,
     unknowns: tuple[Unknown, ...],
-    scale: tuple[str, str] | None = None,
+    part: str = "",
 ) -> Effect:
-    """A force as a hypothesis. alias : another name of its site."""
+    """A force as a hypothesis. alias : another name of its site. part : as of `Force`."""
     softens = law is SOFTENING
     return Effect(
         physics=law.physics,
         site=site,
         unknowns=unknowns,
-        force=Force(place, law, scale),
+        force=Force(place, law, part),
         aliases=((law.physics, alias),) if alias else (),
         rough=0.0 if place.kind == "command" else law.rough,
         variant=f"{law.tag} {place.name}",

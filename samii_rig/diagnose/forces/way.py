@@ -10,6 +10,7 @@ import numpy as np
 from samii_rig.diagnose.fit.rigfile import valued
 from samii_rig.diagnose.forces.march import march, moved, read
 from samii_rig.diagnose.forces.model import ForceModel
+from samii_rig.diagnose.forces.steps import LAW_NUMBERS
 from samii_rig.errors import InputError
 from samii_rig.model.realise import Realisation, realise
 from samii_rig.rig.schema import Rig
@@ -105,7 +106,7 @@ class Way:
 
     def force(self, model: ForceModel, v: Float, p: Float, seeds: Float) -> Float:
         """(1 + k, n INNER) a force of numbers p under commands v (n,) or (n, m) that begin when the
-        rig is at rest, and its slopes along `seeds` (k, 2).
+        rig is at rest, and its slopes along `seeds` (k, 3).
 
         Raises InputError where it is no number: the numbers are of no stable rig.
         """
@@ -120,6 +121,10 @@ class Way:
             if j != self.own and command.any():
                 by_v, late = self.by_v[j], int(self.late[j])
                 others += moved(command, self.transition, by_v, float(self.direct[j]), late, INNER)
+        # A damper's force over a step is by the way of that.
+        by_step, of_part = np.ones(LAW_NUMBERS), model.force.law.of_part
+        if "c" in of_part:
+            by_step[1 + of_part.index("c")] = model.built.rate_hz * INNER
         e = march(
             step,
             self.transition,
@@ -131,8 +136,8 @@ class Way:
             others,
             int(self.late[self.own]),
             INNER,
-            p,
-            seeds,
+            p * by_step,
+            seeds * by_step,
         )
         if not np.all(np.isfinite(e[:, -1])):
             raise InputError(model.rig.name, "force", model.force.law.tag, "a stable rig with it")

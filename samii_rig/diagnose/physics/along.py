@@ -52,7 +52,9 @@ class Along:
 
     def unknown(self, parts: tuple[float, ...]) -> Unknown:
         """The unknown u. parts : of the way from `start` to `end`, at which a search begins."""
-        return Unknown(POSITION, "m", 1.0, math.e, tuple(math.exp(p) for p in parts))
+        least = SHORTEST / self.share
+        some = tuple(math.exp(p) for p in parts)
+        return Unknown(POSITION, "m", math.exp(least), math.exp(1 - least), some, ends=True)
 
     def position(self, u: float) -> float:
         """m from the body's upstream end."""
@@ -76,7 +78,8 @@ class Along:
 
     def lengths(self, u: float, L: float) -> dict[Key, float]:
         """Lengths, m, of the pieces on both sides of the part, for a body of length L."""
-        least = SHORTEST * self.whole
+        # Half of the shortest, so that a place at the bound of its unknown still has a slope.
+        least = 0.5 * SHORTEST * self.whole
         at = min(max(self.position(u), self.start + least), self.end - least)
         first, *behind = self.pieces[self.start > 0 :]
         out = {(first, "L"): at - self.start}

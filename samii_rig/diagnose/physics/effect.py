@@ -32,7 +32,8 @@ class Unknown:
     """A positive number to be found, log-uniform between `low` and `high` before the data.
 
     symbol, unit : as reported. starts : values from which a search may begin. ratio : 1 is nothing:
-    then the size of its logarithm is log-uniform, as that of every other effect is.
+    then the size of its logarithm is log-uniform, as that of every other effect is. ends : whether
+    nothing lies beyond `high`, where all of a part is gone or a body ends, not just the search.
     """
 
     symbol: str
@@ -41,6 +42,7 @@ class Unknown:
     high: float
     starts: tuple[float, ...]
     ratio: bool = False
+    ends: bool = False
 
     @property
     def middle(self) -> float:

@@ -34,7 +34,6 @@ from samii_rig.rig.schema import (
 from samii_rig.types import Complex, Float
 
 LARGEST_PART = 0.6  # of a link's mass: what is left still is a body, whatever its tolerance says
-SURELY = 2.0  # tolerances above the rig file's value, up to which all of a part may be gone
 ALMOST = 0.99  # of a part, a start of a search: the refit goes on to all of it
 # Of a joint's stiffness to what it was: from all but broken to all but rigid.
 JOINT_RATIO = (0.02, 50.0)
@@ -87,18 +86,19 @@ def _part_of(
     whole, least = first.value, _least(first, between=between)
     if whole <= 0 or least >= ALMOST:
         return
-    bounds = least * whole, whole * (1 + SURELY * first.tolerance)
+    bounds = least * whole, whole
 
     def values(x: Float, nominal: Values) -> dict[Key, float]:
-        # What is gone already has nothing that could go.
-        have = nominal[keys[0]]
-        left = max(1 - float(x[0]) / have, 0.0) if have > 0 else 0.0
+        # A part of what there is, not an amount: where all is gone it still has a slope.
+        left = 1 - float(x[0]) / whole
         return {key: nominal[key] * left for key in keys}
 
     yield Effect(
         physics=physics,
         site=name,
-        unknowns=(Unknown(symbol, first.unit, *bounds, (*spread(*bounds, 6), ALMOST * whole)),),
+        unknowns=(
+            Unknown(symbol, first.unit, *bounds, (*spread(*bounds, 6), ALMOST * whole), ends=True),
+        ),
         parameters=values,
         touches=keys,
         report=lambda x: -x,

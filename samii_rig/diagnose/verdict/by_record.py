@@ -26,6 +26,7 @@ from samii_rig.diagnose.forces.variation import (
 from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
+from samii_rig.diagnose.verdict.odd_sensor import describe, odd_sensor
 from samii_rig.diagnose.verdict.stages import Case, Shown, diagnosis_of, of_states
 from samii_rig.diagnose.verdict.stated_noise import (
     MoreNoise,
@@ -178,7 +179,11 @@ def _agreeing(
         several = _several(search, given, left)
     for one in several:
         looked = replace(looked, judged=verdict.of_several_states(looked.judged, one.part))
-    return of_states(_answer(case, search, first, bands, looked), several)
+    found = of_states(_answer(case, search, first, bands, looked), several)
+    if found.verdict == "unknown" and not (found.exact or several) and (odd := odd_sensor(case)):
+        why, experiment = describe(odd)
+        found = replace(found, why=why, experiment=experiment, gain=None)
+    return found
 
 
 def _several(
@@ -330,11 +335,16 @@ def _winning(forces: ForceSearch | None) -> ForceSearch | None:
 def _or_uneven(forces: ForceSearch, looked: _Looked) -> _Looked:
     """The same, but nothing is missing alone where no force explains some lines and not others: one
     that does is another than any in the table, or acts beside what moved the rig unrecorded. Where
-    an input has edges at unknown instants, what is left of them does that."""
+    an input has edges at unknown instants, what is left of them does that. Nor is another cause
+    told that explains less than such a force."""
     edges = any(piece.edges for piece in forces.levels.records.pieces)
-    if forces.uneven is None or edges or looked.judged.verdict != "no_mismatch":
+    if forces.uneven is None or edges or not _without_force(looked.judged):
         return looked
     effect, fall = forces.uneven
+    if looked.judged.verdict == "named" and isinstance(looked.judged.varies, Variation):
+        return looked  # it was found again in what it was not fitted to
+    if fall < looked.judged.evidence.drop:
+        return looked
     name = f"{effect.physics.replace('_', ' ')} at {effect.site}"
     why = (
         f"{name} explains {math.sqrt(fall):.3g} sigma, but not of all lines alike as it would: "

@@ -6,12 +6,14 @@ The nominal parameters do what they can against it: an effect counts by what the
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
 
 from samii_rig.diagnose.fit.explanations import Explanation, Explanations
 from samii_rig.diagnose.fit.ranking import moved, place_at
+from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Hiding
@@ -28,7 +30,7 @@ STRENGTHS = 20  # strengths over the range of an effect, log-spaced, for one tha
 
 def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
     """Of each physics and site, beside what was found, the smallest that would have been seen."""
-    screen = Screen.of(search.problem, best.fitted).of_data()
+    screen = Screen.of(search.problem, _pinned(best.fitted)).of_data()
     screens = screen.unprojected(), screen
     needed = math.sqrt(search.critical_value * search.overdispersion) + float(stats.norm.ppf(FOUND))
     found: dict[tuple[str, str], Hiding] = {}
@@ -40,6 +42,17 @@ def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
             if seen is not None:
                 found[effect.name] = seen
     return tuple(found.values())
+
+
+def _pinned(fitted: Fitted) -> Fitted:
+    """The same, what stands where nature ends it held there: beside a part that is all gone,
+    another at its place does not hide as if more than all of it were."""
+    model, J = fitted.model, fitted.jacobian.copy()
+    for i, effect in enumerate(model.effects):
+        for j, unknown in zip(model.own(i), effect.unknowns, strict=True):
+            if unknown.ends and fitted.x[j] >= model.upper[j]:
+                J[:, j] = 0.0
+    return replace(fitted, jacobian=J)
 
 
 def _smallest(

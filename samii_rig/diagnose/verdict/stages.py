@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from samii_rig.diagnose.data.findings import Checked, Refusal
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.agreeing import Saved, SeveralStates
-from samii_rig.diagnose.fit.exact import wrong_numbers
+from samii_rig.diagnose.fit.exact import off_the_file, wrong_numbers
 from samii_rig.diagnose.fit.poses import Posed
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
@@ -141,6 +141,23 @@ def _wrong(search: Search, fitted: Fitted) -> tuple[tuple[Exact, ...], Fitted]:
     return wrong_numbers(search, fitted)
 
 
+def _beyond_the_file(judged: Judgement) -> tuple[Judgement, tuple[str, ...]]:
+    """The same, not sure where the model with the causes needs numbers far from where the rig file
+    states them: it is no whole explanation; and these in words."""
+    fitted = judged.best.fitted
+    if judged.verdict not in verdict.WITH_CAUSES or isinstance(fitted.model, States | Posed):
+        return judged, ()
+    if not (off := off_the_file(fitted, fitted.model)):
+        return judged, ()
+    (key, away), *more = off.items()
+    others = f", and {len(more)} more numbers are off like it" if more else ""
+    words = (
+        f"{'.'.join(key)} is {away:.2g} tolerances off the rig file in the model with the causes"
+        f"{others}: the file or the causes are wrong; measure it"
+    )
+    return verdict.limited(judged, "ambiguous"), (words,)
+
+
 def _allowed(case: Case, judged: Judgement, refusal: Refusal | None) -> Judgement:
     """The same, no more said than the recordings allow."""
     if refusal:
@@ -161,7 +178,7 @@ def diagnosis_of(
 ) -> Diagnosis:
     """The answer. remarks : what else there is to say, in words. refusal : why less may be said."""
     clean, best = case.clean, judged.best
-    judged = _allowed(case, judged, refusal)
+    judged, off = _beyond_the_file(_allowed(case, judged, refusal))
     own = answer.varying(judged) or answer.causes_of(judged.classes[0], judged)
     causes = own if judged.verdict in verdict.WITH_CAUSES else ()
     if not causes:
@@ -172,8 +189,10 @@ def diagnosis_of(
     if not missing and best.effects and not own:
         # The model is held against what was meant to be recorded.
         shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
+    if not missing:  # by the likelihood that the verdict is of, made anew since
+        shown = replace(shown, first=min(shown.first, shown.nominal[0]))
     found = answer.not_physics_of(judged) if missing or best.effects else []
-    words = (*found, *remarks, *clean.remarks, *clean.lacks)
+    words = (*found, *off, *remarks, *clean.remarks, *clean.lacks)
     exact, told = ((), best.fitted) if missing else _wrong(search, best.fitted)
     refused = refusal if missing else None
     why, experiment, gain = _next(search, judged, refused, case.levels, exact)
