@@ -348,13 +348,15 @@ def chosen(file: SavedResponses, output: list[str] | None) -> tuple[FrequencyRes
 
     if output is None:
         return file.responses
+    every = list(dict.fromkeys(c.name for r in file.responses for c in r.outputs))
+    for name in output:
+        if name not in every:
+            raise InputError(file.source, "--output", name, one_of(name, every))
     out = []
-    for r in file.responses:
+    for r in file.responses:  # a level may lack a sensor that was unsound there
         names = [c.name for c in r.outputs]
-        for name in output:
-            if name not in names:
-                raise InputError(file.source, "--output", name, one_of(name, names))
-        out.append(outputs_of(r, [names.index(n) for n in output]))
+        if keep := [names.index(n) for n in output if n in names]:
+            out.append(outputs_of(r, keep))
     return tuple(out)
 
 

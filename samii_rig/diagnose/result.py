@@ -508,7 +508,8 @@ def _hides(every: Sequence[Hiding]) -> list[str]:
 def sentence(text: str) -> str:
     """With a capital and a full stop; the name of a channel stays as it is."""
     text = pretty(text.strip())
-    if text[:1].islower() and " " in text and text.split()[0].isalpha():
+    first = text.partition(" ")[0]
+    if text[:1].islower() and " " in text and first.isalpha() and (len(first) > 1 or first == "a"):
         text = text[0].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) else f"{text}."
 

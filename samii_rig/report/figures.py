@@ -8,6 +8,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -17,7 +18,7 @@ from samii_rig.errors import InputError
 from samii_rig.record.export import replacing
 from samii_rig.report.compare import ModelCurve
 from samii_rig.report.entries import Entry, channels, entries, indices
-from samii_rig.report.plots import Curves, lines_of, showing_curves, unit
+from samii_rig.report.plots import Curves, curves_of, label, lines_of, showing_curves, unit
 from samii_rig.types import FrequencyResponse
 
 SUFFIXES = (".png", ".svg", ".pdf")
@@ -57,11 +58,19 @@ def bode_figure(responses: Sequence[FrequencyResponse], model: ModelCurve | None
         wspace=_LEFT_INCH / (_COLUMN_INCH - _LEFT_INCH),
         hspace=0.1 if rows == 1 else 0.3,
     )
-    curves = [Curves.of(r) for r in responses]
+    curves = curves_of(responses)
+    drawn: dict[str, Artist] = {}
     for i, j in np.ndindex(len(outputs), rows):
-        entry = outputs[i], inputs[j]
-        _entry(axes[2 * j, i], axes[2 * j + 1, i], showing_curves(curves, entry), entry, model)
-    axes[0, 0].legend(fontsize=7, frameon=False)
+        entry, (gain, angle) = (outputs[i], inputs[j]), axes[2 * j : 2 * j + 2, i]
+        if entry not in shown:
+            gain.set_axis_off()
+            angle.set_axis_off()
+            continue
+        _entry(gain, angle, showing_curves(curves, entry), entry, model)
+        drawn |= {str(line.get_label()): line for line in gain.lines}
+    levels = [label(r) for r in responses if label(r) in drawn]
+    names = list(dict.fromkeys((*levels, *drawn)))
+    axes[0, 0].legend([drawn[n] for n in names], names, fontsize=7, frameon=False)
     return figure
 
 
@@ -70,8 +79,8 @@ def _entry(
 ) -> None:
     """One output over one input, and the model's."""
     responses = [c.response for c in curves]
-    for k, c in enumerate(curves):
-        _draw(gain, angle, c, entry, _COLOURS[k % len(_COLOURS)])
+    for c in curves:
+        _draw(gain, angle, c, entry)
     if model is not None:
         f = responses[0].frequency
         f = np.union1d(f, model.frequency[(model.frequency > f[0]) & (model.frequency < f[-1])])
@@ -120,14 +129,13 @@ def save_figure(path: Path | str, figure: Figure) -> Path:
     return path
 
 
-def _draw(gain: Axes, angle: Axes, c: Curves, entry: Entry, colour: str) -> None:
-    r, (i, j) = c.response, indices(c.response, entry)
+def _draw(gain: Axes, angle: Axes, c: Curves, entry: Entry) -> None:
+    r, (i, j), colour = c.response, indices(c.response, entry), _COLOURS[c.order % len(_COLOURS)]
     at = lines_of(r, i, j, _BINS)
     f, size = r.frequency[at], np.abs(r.H[at, i, j])
-    name = f"{r.level:g} {r.level_unit}" if np.isfinite(r.level) else "measured"
     low = np.maximum(c.low[at, i, j], 0.1 * size)  # zero is nowhere on a logarithmic axis
     gain.fill_between(f, low, c.high[at, i, j], color=colour, alpha=0.25, lw=0)
-    gain.plot(f, size, color=colour, lw=0.9, label=name)
+    gain.plot(f, size, color=colour, lw=0.9, label=label(r))
     half = np.where(c.half[at, i, j] < 180.0, c.half[at, i, j], np.nan)
     turn = c.angle[at, i, j]
     angle.fill_between(f, turn - half, turn + half, color=colour, alpha=0.25, lw=0)

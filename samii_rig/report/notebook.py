@@ -13,7 +13,7 @@ from samii_rig.report import canvas, plots
 from samii_rig.report.diagnosis import plots as diagnosis_plots
 from samii_rig.report.diagnosis.laws import QUANTITY, seen
 from samii_rig.report.diagnosis.models import curve, refitted_nominal
-from samii_rig.report.entries import Entry, entries, showing
+from samii_rig.report.entries import Entry, entries
 from samii_rig.report.series import pieces, time_series
 from samii_rig.rig.schema import Rig
 from samii_rig.types import FrequencyResponse, Recording
@@ -72,7 +72,7 @@ def bode(
     """
     entry = _entry(responses, output, input)
     model = curve(rig, rig.name, responses) if rig else None
-    curves = [plots.Curves.of(r) for r in showing(responses, entry)]
+    curves = plots.showing_curves(plots.curves_of(responses), entry)
     return figure(plots.bode(curves, entry, model))
 
 
@@ -89,7 +89,7 @@ def before_after(
     before = curve(refitted_nominal(rig, responses, None), "refitted nominal model", responses)
     named = found.rig if found.causes else None
     after = curve(named, "with the causes", responses) if named else None
-    curves = [plots.Curves.of(r) for r in showing(responses, entry)]
+    curves = plots.showing_curves(plots.curves_of(responses), entry)
     return figure(diagnosis_plots.before_after(curves, entry, before, after))
 
 
@@ -132,11 +132,11 @@ def _entry(responses: Sequence[FrequencyResponse], output: str, input: str) -> E
     if not responses:
         raise InputError("plot", "responses", "none", "at least one")
     found = entries(responses)
-    outputs, inputs = (list(dict.fromkeys(names)) for names in zip(*found, strict=True))
-    return _named(outputs, "output", output), _named(inputs, "input", input)
+    y = _named([y for y, _ in found], "output", output)
+    return y, _named([u for of, u in found if of == y], "input", input)
 
 
 def _named(names: Sequence[str], what: str, name: str) -> str:
     if name and name not in names:
-        raise InputError("plot", what, name, f"one of {', '.join(names)}")
+        raise InputError("plot", what, name, f"one of {', '.join(dict.fromkeys(names))}")
     return name or names[0]

@@ -145,7 +145,7 @@ def _bode(
     """One panel for all responses: which of them, and how it is shown, are its switches."""
     if not responses:
         return None
-    drawn = [plots.Curves.of(r) for r in responses]
+    drawn = plots.curves_of(responses)
     compared = {(c.output, c.input) for c in comparisons}
     views = (BODE, RATIO) if compared else (BODE,)
     names, sets = [], []

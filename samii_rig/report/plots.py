@@ -45,13 +45,20 @@ class Curves:
     high: Float
     angle: Float
     half: Float
+    order: int = 0
 
     @classmethod
-    def of(cls, response: FrequencyResponse) -> Curves:
-        """Bands of 90 % of gain and phase (degrees)."""
+    def of(cls, response: FrequencyResponse, order: int = 0) -> Curves:
+        """Bands of 90 % of gain and phase (degrees). order : among all levels, by which it has its
+        colour in every figure."""
         gain = magnitude_interval(response, BAND)
         half = phase_half_width(response, BAND)
-        return cls(response, gain.low, gain.high, phase(response), half)
+        return cls(response, gain.low, gain.high, phase(response), half, order)
+
+
+def curves_of(responses: Sequence[FrequencyResponse]) -> list[Curves]:
+    """Of every level."""
+    return [Curves.of(r, k) for k, r in enumerate(responses)]
 
 
 def showing_curves(curves: Sequence[Curves], entry: Entry) -> list[Curves]:
@@ -112,12 +119,12 @@ def bode(
     log_scale(figure["layout"]["yaxis"])
     figure["layout"]["yaxis3"] |= {"range": [0, 1.04], "dtick": 0.5}
     anchor: Float | None = None
-    for k, c in enumerate(curves):
-        r, (i, j) = c.response, indices(c.response, entry)
+    for c in curves:
+        k, r, (i, j) = c.order, c.response, indices(c.response, entry)
         at = lines_of(r, i, j)
         f = r.frequency[at]
-        gain_curve(figure, c, k, entry)
-        anchor = phase_curve(figure, c, k, entry, anchor)
+        gain_curve(figure, c, entry)
+        anchor = phase_curve(figure, c, entry, anchor)
         coherence = r.coherence[at, i]
         line(figure, f, coherence, label(r), "y3", k, legend=False, hover="%{y:.3f}")
         if len(r.inputs) > 1:
@@ -194,8 +201,8 @@ def ratio(
     figure = stacked(2, ["model/measured", "phase [\u00b0]"], 520)
     log_scale(figure["layout"]["yaxis"])
     quotients: list[Float] = []
-    for k, c in enumerate(curves):
-        r, (i, j) = c.response, indices(c.response, entry)
+    for c in curves:
+        k, r, (i, j) = c.order, c.response, indices(c.response, entry)
         at = lines_of(r, i, j)
         f = r.frequency[at]
         H = model.at(f, *entry)
@@ -229,10 +236,10 @@ def unit(output: Channel, input: Channel) -> str:
     return f"({over})/{under}" if "/" in over else f"{over}/{under}"
 
 
-def phase_curve(figure: Figure, c: Curves, k: int, entry: Entry, anchor: Float | None) -> Float:
-    """Add the phase of the k-th response with its band to the second panel, in the turns of
+def phase_curve(figure: Figure, c: Curves, entry: Entry, anchor: Float | None) -> Float:
+    """Add the phase of a response with its band to the second panel, in the turns of
     `anchor`, (2, n) frequency and angle of the first; returns the anchor."""
-    r, (i, j) = c.response, indices(c.response, entry)
+    k, r, (i, j) = c.order, c.response, indices(c.response, entry)
     at = lines_of(r, i, j)
     f, angle = r.frequency[at], c.angle[at, i, j]
     if anchor is None:
@@ -288,9 +295,9 @@ def fit_gain(
     figure["layout"]["yaxis"] |= ticked(low - room, high + 4 * room)
 
 
-def gain_curve(figure: Figure, c: Curves, k: int, entry: Entry) -> None:
-    """Add the gain of the k-th response with its band to the first panel."""
-    r, (i, j) = c.response, indices(c.response, entry)
+def gain_curve(figure: Figure, c: Curves, entry: Entry) -> None:
+    """Add the gain of a response with its band to the first panel."""
+    k, r, (i, j) = c.order, c.response, indices(c.response, entry)
     at = lines_of(r, i, j)
     f = r.frequency[at]
     low, high = c.low[at, i, j], c.high[at, i, j]

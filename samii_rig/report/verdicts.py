@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from samii_rig.diagnose.data.wiring import outputs_of
 from samii_rig.progress import duration
 from samii_rig.report.compare import Comparison, percent, telling
 from samii_rig.signal.statistics import difference, octaves
@@ -89,6 +90,12 @@ def _run(recordings: Sequence[Recording]) -> list[Verdict]:
     return [Verdict("warning" if mark == "good" and lost else mark, title, text + ".")]
 
 
+def _outputs(r: FrequencyResponse, names: Collection[str]) -> FrequencyResponse:
+    """The response of these outputs alone, in the order of their names."""
+    at = {c.name: i for i, c in enumerate(r.outputs)}
+    return outputs_of(r, [at[name] for name in sorted(names)])
+
+
 def _jumped(r: Recording) -> int:
     """Samples that the sequence numbers leap over."""
     return int(r.sequence[-1] - r.sequence[0]) + 1 - len(r) if len(r) else 0
@@ -159,9 +166,11 @@ def _levels(responses: Sequence[FrequencyResponse]) -> list[Verdict]:
         return []
     low, high = known[0], known[-1]
     shared = np.intersect1d(low.frequency, high.frequency)
-    names = [c.name for c in low.outputs], [c.name for c in high.outputs]
-    if not shared.size or names[0] != names[1]:
+    # A level may lack a sensor that was unsound there.
+    both = {c.name for c in low.outputs} & {c.name for c in high.outputs}
+    if not shared.size or not both:
         return []
+    low, high = (_outputs(r, both) for r in (low, high))
     found = difference(low, high, octaves(shared))
     unequal = [
         d for d in found if d.p_value * len(found) < _P_DIFFERENT and d.change > _SMALL_CHANGE

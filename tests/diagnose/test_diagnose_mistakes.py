@@ -29,7 +29,7 @@ LINES = np.geomspace(0.5, 40.0, 120)
 SENSORS = np.arange(len(RIG.sensor))
 ALL = list(faults.effects(RIG, RIG.rate_hz))
 TWO, _ = load_rig("two_masses")
-LATE = "is not of the sensors' sample: their columns stand 2 samples later"
+LATE = "is in another row than what it moved: the sensors' stand 2 samples later"
 
 
 def response(rig, *effects, lines=LINES):

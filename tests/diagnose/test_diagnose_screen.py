@@ -24,6 +24,8 @@ LINES = np.geomspace(*BAND, 160)
 ALL = table_of(samii(), *BAND)
 PARTS = [e for e in ALL if e.jump is not None]
 ROWS = {f"{e.physics} {e.jump.states or e.jump.place.split()[0]} {e.jump.fixed}": e for e in PARTS}
+# Of a logger that shifts its columns.
+ROW = "is in another row than what it moved: the sensors' stand"
 
 
 def effect(physics, site, variant=""):
@@ -192,7 +194,7 @@ def test_a_shift_told_one_sample_too_far_is_found_with_the_dead_time_that_it_sto
     """The input late by 0.9 samples, its columns two samples early: one early fits nearly as
     well, the nominal parameters bent, and with less of a dead time beside it."""
     one, two = (
-        effect("columns_shifted", "v_2", f"is not of the sensors' sample: their columns stand {n}")
+        effect("columns_shifted", "v_2", f"{ROW} {n}")
         for n in ("1 sample earlier", "2 samples earlier")
     )
     dead = effect("transport_delay", "joint_2_source")

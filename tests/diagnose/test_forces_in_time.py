@@ -204,6 +204,37 @@ def test_slopes_led_along_with_the_motion_are_differences_of_whole_runs(name: st
         assert np.all(off < 0.02 * rms(want)), (j, off / rms(want))
 
 
+@pytest.mark.parametrize(
+    ("before", "free", "held"),
+    [
+        (0.1, 0.2, "nothing acts"),
+        (0.7, 0.9, "closed"),
+        (0.45, 0.495, "at the edge"),  # with the damper it stays inside, without it goes out
+    ],
+)
+def test_a_gap_in_which_nothing_acts(before: float, free: float, held: str) -> None:
+    """A spring of 2 and a damper of 3 a step, gone within 0.5 to either side; g is 0.05."""
+    g, p, out = 0.05, np.array([1.0, 2.0, 3.0]), np.zeros(OUT)
+    laws.SLACK.step(before, free, 0.0, g, p, 0.0, out)
+    x, way = 0.5 * (before + free + g * out[0]), free + g * out[0] - before
+    if held == "nothing acts":
+        assert out[0] == pytest.approx(p[1] * x + p[2] * way)
+    elif held == "closed":
+        assert out[0] == pytest.approx(0.5 * p[0] * p[1])
+    else:
+        assert x == pytest.approx(0.5 * p[0])
+        assert 0.5 * p[0] * p[1] < out[0] < p[1] * x + p[2] * way
+    for j, at in enumerate((8, 10, 12)):
+        step = np.zeros(3)
+        step[j] = 1e-7
+        ends = []
+        for change in (step, -step):
+            other = np.zeros(OUT)
+            laws.SLACK.step(before, free, 0.0, g, p + change, 0.0, other)
+            ends.append(other[0])
+        assert out[at] == pytest.approx((ends[0] - ends[1]) / 2e-7, abs=1e-5)
+
+
 def test_half_the_step_leaves_a_quarter_of_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     ends = []
     for inner in (INNER, 2 * INNER, 8 * INNER):

@@ -179,8 +179,14 @@ def test_a_level_may_lack_a_sensor_that_was_unsound_there(tmp_path, order):
     assert said.count("a_0/v_2 [") == 2
     assert said.count("theta_2/v_2 [") == 1
     figure = bode_figure(both, model())
-    drawn = [[line.get_label() for line in axis.lines] for axis in figure.axes[:2]]
+    drawn = [
+        {line.get_label(): line.get_color() for line in axis.lines} for axis in figure.axes[:2]
+    ]
     assert [sum(label.endswith(" V") for label in labels) for labels in drawn] == [1, 2]
+    assert drawn[0]["1 V"] == drawn[1]["1 V"] != drawn[1]["2 V"]
+    legend = [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
+    assert legend[:2] == ["1 V", "2 V"]
+    assert "amplitude" in said
 
 
 def test_what_cannot_be_reported(tmp_path):

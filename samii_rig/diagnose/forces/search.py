@@ -19,6 +19,7 @@ from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.beside import FORMED_AGAIN, REFERENCE_STILL, BesideForce
 from samii_rig.diagnose.forces.fits import of_data
+from samii_rig.diagnose.forces.laws import SLACK
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.screen import ForceScreen, Score, first_order, scaled
 from samii_rig.diagnose.physics.effect import Effect
@@ -159,7 +160,7 @@ class ForceSearch(BesideForce):
         scores = first_order(self.forces, self.paths, screen)
         # Beside the first it must do as much as what the last has more did.
         ahead = screens[0].base.cost - min(one.base.cost for one in screens)
-        some = self._matter(scores, ahead)[:MARCHED]
+        some = _first(self._matter(scores, ahead), MARCHED)
         each = self.each(some, lambda h: named([h.effect]))
         found = [self._closer(h, screen, bases[0]) for h in each]
         return [
@@ -222,6 +223,13 @@ def compete_on_records(linear: RecordSearch, known: Sequence[Explanation] = ()) 
     search = ForceSearch(linear, known)
     search.settle()
     return search
+
+
+def _first(scores: Sequence[Score], most: int) -> list[Score]:
+    """The first so many, and play in which nothing acts: to first order it looks like play."""
+    others = [h for h in scores if h.effect.force is None or h.effect.force.law is not SLACK][:most]
+    names = {h.effect.name for h in others}
+    return [h for h in scores if h in others or h.effect.name in names]
 
 
 def _promising(scores: Sequence[Score], critical_value: float, at: int) -> list[Score]:

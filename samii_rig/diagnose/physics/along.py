@@ -31,6 +31,7 @@ from samii_rig.rig.schema import (
 POSITION = "position"  # symbol of the unknown
 PIECE = "_piece_"  # in the names of what a body is cut into, between its own and a number
 SHORTEST = 1e-4  # of a body's length, of a piece: to the data the same as none
+SHORT = 0.25  # of a stretch, that its ends take at most where that is hardly longer than SHORTEST
 BODIES = (RigidLink, *BEAMS, Rod)  # elements with a length, along which something may stand
 
 
@@ -52,7 +53,7 @@ class Along:
 
     def unknown(self, parts: tuple[float, ...]) -> Unknown:
         """The unknown u. parts : of the way from `start` to `end`, at which a search begins."""
-        least = SHORTEST / self.share
+        least = min(SHORTEST / self.share, SHORT)
         some = tuple(math.exp(p) for p in parts)
         return Unknown(POSITION, "m", math.exp(least), math.exp(1 - least), some, ends=True)
 

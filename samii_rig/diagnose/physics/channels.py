@@ -245,7 +245,7 @@ def _less(sensor: SensorBase) -> Iterator[Effect]:
         return replace(_on(sensor.name, physics, law, unknown, update), variant="less")
 
     if sensor.delay > 0:
-        gone = _unknown("tau", "s", SMALLEST * sensor.delay, sensor.delay)
+        gone = replace(_unknown("tau", "s", SMALLEST * sensor.delay, sensor.delay), ends=True)
         less = one("sensor_delay", lead, gone, lambda tau: {"delay": sensor.delay - tau})
         yield replace(less, report=lambda x: -x)
     if sensor.lag > 0:

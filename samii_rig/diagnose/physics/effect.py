@@ -33,7 +33,8 @@ class Unknown:
 
     symbol, unit : as reported. starts : values from which a search may begin. ratio : 1 is nothing:
     then the size of its logarithm is log-uniform, as that of every other effect is. ends : whether
-    nothing lies beyond `high`, where all of a part is gone or a body ends, not just the search.
+    nothing lies beyond `high`, as all of a part is gone there, not just the search ends; of a place
+    along a body beyond `low` neither.
     """
 
     symbol: str

@@ -105,8 +105,10 @@ def _shifts(physics: str, rate_hz: float) -> Iterator[Fault]:
         many = f"{abs(n)} sample{'s' * (abs(n) > 1)} {'later' if n > 0 else 'earlier'}"
         description = f"stands {many} than the other columns: a logger's, or a delay of as much"
         if physics == SHIFTED:
-            who = "a logger's shift, or a dead time of as much" if n > 0 else "a logger's shift"
-            description = f"is not of the sensors' sample: their columns stand {many} ({who})"
+            who = "a logger's shift"
+            if n > 0:
+                who += ", or a dead time of as much: [centring] of the rig file would tell which"
+            description = f"is in another row than what it moved: the sensors' stand {many} ({who})"
         law = partial(behind, seconds=n / rate_hz)
         yield Fault(physics, description, law, 1 / (2 * MOST_SHIFTED))
 

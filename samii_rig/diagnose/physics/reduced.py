@@ -34,6 +34,7 @@ from samii_rig.rig.schema import (
 from samii_rig.types import Complex, Float
 
 LARGEST_PART = 0.6  # of a link's mass: what is left still is a body, whatever its tolerance says
+ALL = 1 - 1e-12  # of a part, that the rounding of its logarithm makes no more than it
 ALMOST = 0.99  # of a part, a start of a search: the refit goes on to all of it
 # Of a joint's stiffness to what it was: from all but broken to all but rigid.
 JOINT_RATIO = (0.02, 50.0)
@@ -86,7 +87,7 @@ def _part_of(
     whole, least = first.value, _least(first, between=between)
     if whole <= 0 or least >= ALMOST:
         return
-    bounds = least * whole, whole
+    bounds = least * whole, ALL * whole
 
     def values(x: Float, nominal: Values) -> dict[Key, float]:
         # A part of what there is, not an amount: where all is gone it still has a slope.

@@ -100,7 +100,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
             # What a force did beside a single effect competes with what it does beside pairs.
             beside, untried = forces_on(search, forced.ranked()[:1] if forced else ())
             if beside is not None and forces is not None:
-                beside.uneven = beside.uneven or forces.uneven
+                both = [u for u in (beside.uneven, forces.uneven) if u is not None]
+                beside.uneven = max(both, key=lambda u: u[1], default=None)
             forces = beside or forces
             forced = _winning(forces)
     search.begin("what cannot be distinguished")
@@ -112,15 +113,16 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         if forced.exhausted:
             looked = replace(looked, remarks=(*looked.remarks, EXHAUSTED))
     given = Given.of(search, case.runs, case.clean.samples)
-    several = None
+    several, doubted = None, False
     if forces is not None:
         if _without_force(looked.judged):
             several = _several(search, [given], None)
         search.begin("whether stiffnesses are constant")
         looked = _constant(forces, forced or search, looked, len(case.runs), differ=bool(several))
-        looked = _or_uneven(forces, looked)
+        judged, looked = looked.judged, _or_uneven(forces, looked)
+        doubted = looked.judged is not judged
     last = forced or search
-    if _not_explained(looked.judged, forced, search):
+    if not doubted and _not_explained(looked.judged, forced, search):
         search.begin("what is missing, beside a discrepancy")
         last = discrepant = DiscrepantSearch(search)
         discrepant.settle()
@@ -128,7 +130,13 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
         if looked.judged.verdict == "no_mismatch":  # beside what no law describes
             looked = _unknown(looked)
     looked = replace(looked, remarks=(*looked.remarks, *untried))
-    return _agreeing(case, last, first, bands, looked, [given], several=several)
+    found = _agreeing(case, last, first, bands, looked, [given], several=several)
+    if found.verdict != "unknown" or found.exact or found.states or doubted:
+        return found
+    if odd := odd_sensor(case):
+        why, experiment = describe(odd)
+        found = replace(found, why=why, experiment=experiment, gain=None)
+    return found
 
 
 def _not_explained(judged: Judgement, forced: ForceSearch | None, search: RecordSearch) -> bool:
@@ -179,11 +187,7 @@ def _agreeing(
         several = _several(search, given, left)
     for one in several:
         looked = replace(looked, judged=verdict.of_several_states(looked.judged, one.part))
-    found = of_states(_answer(case, search, first, bands, looked), several)
-    if found.verdict == "unknown" and not (found.exact or several) and (odd := odd_sensor(case)):
-        why, experiment = describe(odd)
-        found = replace(found, why=why, experiment=experiment, gain=None)
-    return found
+    return of_states(_answer(case, search, first, bands, looked), several)
 
 
 def _several(
@@ -343,7 +347,7 @@ def _or_uneven(forces: ForceSearch, looked: _Looked) -> _Looked:
     effect, fall = forces.uneven
     if looked.judged.verdict == "named" and isinstance(looked.judged.varies, Variation):
         return looked  # it was found again in what it was not fitted to
-    if fall < looked.judged.evidence.drop:
+    if fall < _explained(forces, looked.judged):
         return looked
     name = f"{effect.physics.replace('_', ' ')} at {effect.site}"
     why = (
@@ -351,6 +355,19 @@ def _or_uneven(forces: ForceSearch, looked: _Looked) -> _Looked:
         "a force that no row has, or one beside what disturbed the rig"
     )
     return replace(_unknown(looked), remarks=(why, *looked.remarks))
+
+
+def _explained(forces: ForceSearch, judged: Judgement) -> float:
+    """Of chi-square, what is told explains by the likelihood of the forces, 0 where nothing is."""
+    if judged.verdict not in verdict.WITH_CAUSES:
+        return 0.0
+    if judged.varies is not None:
+        return judged.evidence.drop
+    meant = tuple(e for e in judged.best.effects if not e.physical)
+    ends = [forces.refitted(some, judged.best, far=False) for some in (meant, judged.best.effects)]
+    before, after = (end.chi2 if end is not None else math.nan for end in ends)
+    own = before - after
+    return own if math.isfinite(own) else judged.evidence.drop
 
 
 def _constant(

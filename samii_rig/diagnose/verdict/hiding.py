@@ -15,6 +15,7 @@ from samii_rig.diagnose.fit.explanations import Explanation, Explanations
 from samii_rig.diagnose.fit.ranking import moved, place_at
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.screen import Screen
+from samii_rig.diagnose.physics.along import POSITION
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Hiding
 from samii_rig.errors import SamiiRigError
@@ -50,7 +51,8 @@ def _pinned(fitted: Fitted) -> Fitted:
     model, J = fitted.model, fitted.jacobian.copy()
     for i, effect in enumerate(model.effects):
         for j, unknown in zip(model.own(i), effect.unknowns, strict=True):
-            if unknown.ends and fitted.x[j] >= model.upper[j]:
+            low = unknown.symbol == POSITION and fitted.x[j] <= model.lower[j]
+            if unknown.ends and (low or fitted.x[j] >= model.upper[j]):
                 J[:, j] = 0.0
     return replace(fitted, jacobian=J)
 

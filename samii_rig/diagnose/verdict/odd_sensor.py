@@ -1,5 +1,6 @@
 """A sensor that alone disagrees with the model that explains all others: where it sits, which way
-it points, or what it reads is not as the rig file has it, which no part that is missing explains.
+it points, or what it reads is not as the rig file has it. Or it alone is fine enough to show what
+is missing.
 """
 
 from __future__ import annotations
@@ -23,7 +24,9 @@ def odd_sensor(case: Case) -> str:
     around: that would have moved all."""
     search = case.search
     names = {c.name for r in case.responses for c in r.outputs}
-    if len(names) < FEWEST or search.ratio(search.nominal.fitted) <= threshold(search.spread):
+    explained = search.ratio(search.nominal.fitted) <= threshold(search.spread)
+    # Where a sensor sits depends on no level.
+    if len(names) < FEWEST or explained or search.lines.depends_on_level():
         return ""
     odd = [name for name in sorted(names - search.rig.centred) if _explained(case, name)]
     return odd[0] if len(odd) == 1 else ""
@@ -47,7 +50,8 @@ def _explained(case: Case, without: str) -> bool:
 def describe(sensor: str) -> tuple[str, str]:
     """Why no part is named, and what to do."""
     return (
-        f"without {sensor} the model of the rig file explains all other sensors to their noise",
+        f"without {sensor} the model of the rig file explains all other sensors to their noise: it "
+        "is not as the rig file says, or shows alone what is missing",
         f"check where {sensor} sits, its axis, its unit and its filter, and what the rig file says "
         "of them",
     )

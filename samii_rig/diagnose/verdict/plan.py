@@ -69,7 +69,7 @@ def next_experiment(
         if d > best[1]:
             best = (words, d)
     if best[1] < TELLING:
-        none = "none tried would tell them: they are the same thing to every sensor here"
+        none = "no experiment that was tried distinguishes them: to every sensor they are the same"
         return what, none, best[1]
     return f"{what}; predicted {best[1]:.0f} noise units apart", *best
 

@@ -141,21 +141,24 @@ def _wrong(search: Search, fitted: Fitted) -> tuple[tuple[Exact, ...], Fitted]:
     return wrong_numbers(search, fitted)
 
 
-def _beyond_the_file(judged: Judgement) -> tuple[Judgement, tuple[str, ...]]:
+def _beyond_the_file(judged: Judgement) -> tuple[Judgement, tuple[str, str] | None]:
     """The same, not sure where the model with the causes needs numbers far from where the rig file
-    states them: it is no whole explanation; and these in words."""
+    states them: it is no whole explanation; and why, and what to do, in words. The numbers of a
+    model in which a stiffness that varies does not are bent for that."""
     fitted = judged.best.fitted
-    if judged.verdict not in verdict.WITH_CAUSES or isinstance(fitted.model, States | Posed):
-        return judged, ()
+    told = judged.verdict in verdict.WITH_CAUSES and judged.varies is None
+    if not told or isinstance(fitted.model, States | Posed):
+        return judged, None
     if not (off := off_the_file(fitted, fitted.model)):
-        return judged, ()
+        return judged, None
     (key, away), *more = off.items()
     others = f", and {len(more)} more numbers are off like it" if more else ""
-    words = (
+    why = (
         f"{'.'.join(key)} is {away:.2g} tolerances off the rig file in the model with the causes"
-        f"{others}: the file or the causes are wrong; measure it"
+        f"{others}: the file or the causes are wrong"
     )
-    return verdict.limited(judged, "ambiguous"), (words,)
+    what = f"measure {'.'.join(key)}, correct the rig file and diagnose again"
+    return verdict.limited(judged, "ambiguous"), (why, what)
 
 
 def _allowed(case: Case, judged: Judgement, refusal: Refusal | None) -> Judgement:
@@ -178,8 +181,9 @@ def diagnosis_of(
 ) -> Diagnosis:
     """The answer. remarks : what else there is to say, in words. refusal : why less may be said."""
     clean, best = case.clean, judged.best
-    judged, off = _beyond_the_file(_allowed(case, judged, refusal))
+    judged = _allowed(case, judged, refusal)
     own = answer.varying(judged) or answer.causes_of(judged.classes[0], judged)
+    judged, off = _beyond_the_file(judged) if own else (judged, None)
     causes = own if judged.verdict in verdict.WITH_CAUSES else ()
     if not causes:
         judged = verdict.without_causes(judged)
@@ -192,10 +196,12 @@ def diagnosis_of(
     if not missing:  # by the likelihood that the verdict is of, made anew since
         shown = replace(shown, first=min(shown.first, shown.nominal[0]))
     found = answer.not_physics_of(judged) if missing or best.effects else []
-    words = (*found, *off, *remarks, *clean.remarks, *clean.lacks)
+    words = (*found, *remarks, *clean.remarks, *clean.lacks)
     exact, told = ((), best.fitted) if missing else _wrong(search, best.fitted)
     refused = refusal if missing else None
     why, experiment, gain = _next(search, judged, refused, case.levels, exact)
+    if off is not None:
+        why, experiment, gain = *off, None
     if exact:
         judged = replace(judged, verdict="unknown")
     untold = judged.varies.describe() if judged.varies is not None and not causes else ""

@@ -22,7 +22,7 @@ from samii_rig.report.diagnosis.laws import QUANTITY, jump_of, seen
 from samii_rig.report.diagnosis.models import curve, refitted_nominal, strengths
 from samii_rig.report.drawing import Suspect, draw
 from samii_rig.report.entries import Entry, entries
-from samii_rig.report.plots import Curves, showing_curves
+from samii_rig.report.plots import curves_of, showing_curves
 from samii_rig.report.shell import Plot, check_suffix, page_text, put
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.elements import SOURCES, TorsionalSpring, TranslationalSpring
@@ -232,7 +232,7 @@ def _fits(
         before = curve(refitted_nominal(rig, responses, limits), plain, responses)
     causes = words.answer(found)
     after = curve(found.rig, caused, responses) if causes and found.rig else None
-    drawn = [Curves.of(r) for r in responses]
+    drawn = curves_of(responses)
     names, sets, said = [], [], []
     for entry in entries(responses):
         if entry[0] not in before.outputs or entry[1] not in before.inputs:

@@ -158,9 +158,9 @@ def before_after(
     log_scale(figure["layout"]["yaxis"])
     log_scale(figure["layout"]["yaxis3"])
     anchor: Float | None = None
-    for k, c in enumerate(curves):
-        gain_curve(figure, c, k, entry)
-        anchor = phase_curve(figure, c, k, entry, anchor)
+    for c in curves:
+        gain_curve(figure, c, entry)
+        anchor = phase_curve(figure, c, entry, anchor)
     models = [(before, BEFORE), *([(after, AFTER)] if after else [])]
     shown, distances = [np.empty(0)], [np.array([1.0])]
     for model, stroke in models:
