@@ -162,6 +162,7 @@ def test_a_cause_is_not_told_that_explains_less_than_a_force_at_some_lines(
     pieces = [SimpleNamespace(edges=())]
     ends = iter([SimpleNamespace(chi2=1043.0), SimpleNamespace(chi2=1000.0)])
     forces = SimpleNamespace(
+        nominal=SimpleNamespace(effects=()),
         refitted=lambda *_, **__: next(ends),
         uneven=(Effect("coulomb_friction", "spring_1"), fall),
         levels=SimpleNamespace(records=SimpleNamespace(pieces=pieces)),

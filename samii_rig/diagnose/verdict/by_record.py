@@ -363,8 +363,8 @@ def _explained(forces: ForceSearch, judged: Judgement) -> float:
         return 0.0
     if judged.varies is not None:
         return judged.evidence.drop
-    meant = tuple(e for e in judged.best.effects if not e.physical)
-    ends = [forces.refitted(some, judged.best, far=False) for some in (meant, judged.best.effects)]
+    meant = verdict.as_meant(forces, judged.best)
+    ends = [forces.refitted(e.effects, e, far=False) for e in (meant, judged.best)]
     before, after = (end.chi2 if end is not None else math.nan for end in ends)
     own = before - after
     return own if math.isfinite(own) else judged.evidence.drop
