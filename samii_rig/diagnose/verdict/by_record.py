@@ -119,8 +119,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
             several = _several(search, [given], None)
         search.begin("whether stiffnesses are constant")
         looked = _constant(forces, forced or search, looked, len(case.runs), differ=bool(several))
-        judged, looked = looked.judged, _or_uneven(forces, looked)
-        doubted = looked.judged is not judged
+        said, looked = looked.judged.verdict, _or_uneven(forces, looked)
+        doubted = looked.judged.verdict != said
     last = forced or search
     if not doubted and _not_explained(looked.judged, forced, search):
         search.begin("what is missing, beside a discrepancy")
