@@ -131,12 +131,15 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
             looked = _unknown(looked)
     looked = replace(looked, remarks=(*looked.remarks, *untried))
     found = _agreeing(case, last, first, bands, looked, [given], several=several)
-    if found.verdict != "unknown" or found.exact or found.states or doubted:
+    return found if doubted else _of_sensor(case, found)
+
+
+def _of_sensor(case: Case, found: Diagnosis) -> Diagnosis:
+    """The same, but what is unknown with the one sensor that it may be the fault of."""
+    if found.verdict != "unknown" or found.exact or found.states or not (odd := odd_sensor(case)):
         return found
-    if odd := odd_sensor(case):
-        why, experiment = describe(odd)
-        found = replace(found, why=why, experiment=experiment, gain=None)
-    return found
+    why, experiment = describe(odd)
+    return replace(found, why=why, experiment=experiment, gain=None)
 
 
 def _not_explained(judged: Judgement, forced: ForceSearch | None, search: RecordSearch) -> bool:

@@ -106,9 +106,13 @@ def _next(
     refusal: Refusal | None,
     levels: int,
     exact: tuple[Exact, ...],
+    off: tuple[str, str] | None,
 ) -> tuple[str, str, float | None]:
     """Why no more may be said, the experiment that would tell, and what it would gain. levels :
-    that were recorded. exact : the number of the rig file that is wrong, if one is."""
+    that were recorded. exact : the number of the rig file that is wrong, if one is. off : as of
+    `_beyond_the_file`."""
+    if off is not None:
+        return *off, None
     if exact:
         them = "it" if len(exact) == 1 else "them"
         why = f"with {them} the model explains the recordings; or something there adds to it"
@@ -161,6 +165,15 @@ def _beyond_the_file(judged: Judgement) -> tuple[Judgement, tuple[str, str] | No
     return verdict.limited(judged, "ambiguous"), (why, what)
 
 
+def _of_nothing(shown: Shown, *, mended: bool) -> Shown:
+    """The same where nothing is missing. mended : whether something is wrong with the data: the
+    model is held against what was meant to be recorded."""
+    if mended:
+        return replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
+    # By the likelihood that the verdict is of, made anew since.
+    return replace(shown, first=min(shown.first, shown.nominal[0]))
+
+
 def _allowed(case: Case, judged: Judgement, refusal: Refusal | None) -> Judgement:
     """The same, no more said than the recordings allow."""
     if refusal:
@@ -190,18 +203,12 @@ def diagnosis_of(
     missing = judged.verdict != "no_mismatch"
     if not missing:  # an effect that no more than spares a nominal parameter its move is none
         best = verdict.as_meant(search, best)
-    if not missing and best.effects and not own:
-        # The model is held against what was meant to be recorded.
-        shown = replace(shown, first=shown.with_causes[0], nominal=shown.with_causes)
-    if not missing:  # by the likelihood that the verdict is of, made anew since
-        shown = replace(shown, first=min(shown.first, shown.nominal[0]))
+        shown = _of_nothing(shown, mended=bool(best.effects and not own))
     found = answer.not_physics_of(judged) if missing or best.effects else []
     words = (*found, *remarks, *clean.remarks, *clean.lacks)
     exact, told = ((), best.fitted) if missing else _wrong(search, best.fitted)
     refused = refusal if missing else None
-    why, experiment, gain = _next(search, judged, refused, case.levels, exact)
-    if off is not None:
-        why, experiment, gain = *off, None
+    why, experiment, gain = _next(search, judged, refused, case.levels, exact, off)
     if exact:
         judged = replace(judged, verdict="unknown")
     untold = judged.varies.describe() if judged.varies is not None and not causes else ""
