@@ -54,6 +54,7 @@ def timing(columns: Mapping[str, Float], units: Mapping[str, str], rate_hz: floa
                     f"at sample {off[0] + 1}; the import refuses them"
                 )
             count = np.concatenate([[0.0], np.cumsum(np.maximum(np.rint(steps), 1.0))])
+        rate_hz = _rate(seconds, count)
     if rate_hz is None:
         notes.append("nothing says the rate; the map needs rate_hz or a column of time")
     if count is None:
@@ -62,6 +63,16 @@ def timing(columns: Mapping[str, Float], units: Mapping[str, str], rate_hz: floa
     length = float(count[-1] - count[0]) / rate_hz if rate_hz else float("nan")
     gaps, lost = int(np.count_nonzero(jumps)), int(jumps.sum())
     return Timing(time, unit, guessed, sequence, rate_hz, length, gaps, lost, tuple(notes))
+
+
+def _rate(seconds: Float, count: Float) -> float:
+    """Hz, of stamps (n,) of so many samples since the first: their mean rate, which the last digit
+    of a stamp moves least; the whole number if one is as near as the stamps tell."""
+    length, samples = float(seconds[-1] - seconds[0]), count - count[0]
+    mean = float(samples[-1]) / length
+    off = float(np.max(np.abs(seconds - seconds[0] - samples / mean))) / length * mean
+    whole = round(mean)
+    return float(whole) if abs(mean - whole) <= off else float(f"{mean:.9g}")
 
 
 def _time_column(
