@@ -49,6 +49,24 @@ def spanned(X: Float) -> Float:
     return np.asarray(X @ (vectors[:, kept] / np.sqrt(values[kept])))
 
 
+def shrinking(X: Float, prior: Float) -> Float:
+    """(n, m) Q so that r - Q Q' r is what columns X (n, p) leave of r that have amplitudes as
+    likely as a normal deviation makes them: of 1/sqrt(prior), none where prior (p,) is 0. Its
+    square is that of r in the noise that unit noise and the columns make together."""
+    if not prior.any():
+        return orthonormal(X)
+    size = np.sqrt(lengths(X.T) + prior)
+    X = X / np.where(size > 0, size, 1.0)
+    square = X.T @ X
+    values, turn = np.linalg.eigh(square + np.diag(prior / np.where(size > 0, size, 1.0) ** 2))
+    kept = values > SAME * np.max(values, initial=0.0)
+    root = turn[:, kept] / np.sqrt(values[kept])
+    part, turn = np.linalg.eigh(root.T @ square @ root)
+    kept = part > SAME
+    part = np.minimum(part[kept], 1.0)
+    return np.asarray(X @ (root @ turn[:, kept] * np.sqrt((1 - np.sqrt(1 - part)) / part)))
+
+
 def directions(square: Float) -> tuple[Float, Float]:
     """Values (m,) of a matrix (m, m) of products, increasing, and the directions (m, m) that have
     them."""

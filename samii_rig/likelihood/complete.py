@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from samii_rig.likelihood.algebra import as_complex, as_real, orthonormal
+from samii_rig.likelihood.algebra import as_complex, as_real, shrinking
 from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.noise import Disturbances
 from samii_rig.likelihood.pieces import Loops
@@ -35,8 +35,8 @@ class Complete:
     rows : the lines, without `X` and `N`. columns : (2 n, 2 b) real parts of `X`, then imaginary
     ones.
     root : (n, q, q) so that root e has real and imaginary parts of variance 1. nuisances : of each
-    piece its lines and orthonormal columns over their real, then imaginary parts. factor : (m, m)
-    C.
+    piece its lines and orthonormal columns over their real, then imaginary parts, as of
+    `shrinking`. factor : (m, m) C. likely : whether any has a size that is known.
     """
 
     reduced: Reduced
@@ -45,6 +45,7 @@ class Complete:
     root: Complex
     nuisances: tuple[tuple[Int, Float], ...]
     factor: Float
+    likely: bool
 
     @classmethod
     def about(
@@ -58,13 +59,14 @@ class Complete:
         """As `reduced`."""
         found, rows = formed(records, response, disturbances, loop, part)
         root = np.sqrt(2) * np.linalg.inv(found.noise.root(rows.f, rows.piece))
-        nuisances = tuple((on, _columns(root[on] @ N)) for on, N in rows.each())
+        nuisances = tuple((on, _columns(root[on] @ N, prior)) for on, N, prior in rows.each())
+        likely = any(prior.any() for prior in rows.prior)
         m = found.factor.shape[0]
         columns = np.empty((2 * rows.f.size, rows.X[0].shape[1]))
         for on, X in rows.changes():
             columns[on], columns[rows.f.size + on] = X.real, X.imag
-        rows = replace(rows, X=(), N=())
-        return cls(found, rows, columns, root, nuisances, found.factor.reshape(m, m))
+        rows = replace(rows, X=(), N=(), prior=())
+        return cls(found, rows, columns, root, nuisances, found.factor.reshape(m, m), likely)
 
     @property
     def expected(self) -> float:
@@ -76,7 +78,8 @@ class Complete:
         (n, q, p), (m + 2 n q, p)."""
         g = self.white(e.reshape(*e.shape[:2], -1))
         n, q, p = g.shape
-        back = self.root.conj().swapaxes(1, 2) @ g
+        # What is projected out is gone; what is only shrunk counts as in the noise's inverse.
+        back = self.root.conj().swapaxes(1, 2) @ (self._without(g) if self.likely else g)
         head = self.columns.T @ as_real(back.reshape(n, -1))
         head = head.reshape(-1, q, p).swapaxes(0, 1).reshape(-1, p)
         # The factor's rows stand in memory as the columns of a lower triangle: nothing is copied.
@@ -102,7 +105,11 @@ class Complete:
 
     def white(self, e: Complex) -> Complex:
         """(n, q) or (n, q, p) whitened, without nuisances."""
-        white = self.root @ e.reshape(*e.shape[:2], -1)
+        white = self._without(self.root @ e.reshape(*e.shape[:2], -1))
+        return np.asarray(white.reshape(e.shape), np.complex128)
+
+    def _without(self, white: Complex) -> Complex:
+        """Whitened lines (n, q, p) without nuisances, in place."""
         for on, Q in self.nuisances:
             own = white[on].reshape(-1, white.shape[2])
             goal = np.concatenate([own.real, own.imag])
@@ -110,11 +117,11 @@ class Complete:
             white[on] = (goal[: len(own)] + 1j * goal[len(own) :]).reshape(
                 on.size, *white.shape[1:]
             )
-        return np.asarray(white.reshape(e.shape), np.complex128)
+        return white
 
 
-def _columns(N: Complex) -> Float:
-    """(2 n q, m) directions of one piece's nuisances (n, q, m_all)."""
+def _columns(N: Complex, prior: Float) -> Float:
+    """(2 n q, m) directions of one piece's nuisances (n, q, m_all), as of `shrinking`."""
     flat = N.reshape(-1, N.shape[2])
-    flat = flat[:, np.any(flat != 0, axis=0)]
-    return orthonormal(np.concatenate([flat.real, flat.imag]))
+    some = np.any(flat != 0, axis=0)
+    return shrinking(as_real(flat[:, some]), prior[some])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,7 +100,8 @@ def quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
         own, head = products(X, W[on], We[on])
         M += own
         g += head
-    cross, own_head = _nuisances(rows, W, We)
+    beside = _nuisances(rows, W, We)
+    cross, own_head = beside.cross, beside.head
     # Where nothing was excited nothing is known: there the diagonal keeps the factor regular, and
     # takes the directions' place. What nuisances leave is as exact as what they were taken from.
     diagonal = np.diagonal(M).copy()
@@ -114,9 +116,9 @@ def quadratic(rows: Rows, noise: Noise, reference: Complex) -> _Form:
         factor=np.ascontiguousarray(C).reshape(-1, q, 2, b),
         target=linalg.solve_triangular(C, g, trans="T", check_finite=False),
         total=float(np.sum(rows.e.conj() * We).real) - float(own_head @ own_head),
-        nuisances=own_head.size,
-        log_determinant=-2
-        * float(np.sum(np.linalg.slogdet(W)[1])),  # but for a constant of the lines
+        nuisances=beside.free,
+        # But for a constant of the lines.
+        log_determinant=beside.log_determinant - 2 * float(np.sum(np.linalg.slogdet(W)[1])),
     )
 
 
@@ -126,16 +128,29 @@ def weights(rows: Rows, noise: Noise) -> Complex:
     return np.asarray(2 * (L.conj().swapaxes(1, 2) @ L))
 
 
-def _nuisances(rows: Rows, W: Complex, We: Complex) -> tuple[Float, Float]:
+class _Nuisances(NamedTuple):
     """The directions of all nuisances, of length 1: their products with the changes of all nodes
-    (q 2 b, m), and with what the reference leaves (m,)."""
+    (q 2 b, m), and with what the reference leaves (m,). free : of how many nothing is known.
+    log_determinant : what the others add to that of the noise."""
+
+    cross: Float
+    head: Float
+    free: int
+    log_determinant: float
+
+
+def _nuisances(rows: Rows, W: Complex, We: Complex) -> _Nuisances:
     found = []
-    for (on, N), (_, X) in zip(rows.each(), rows.changes(), strict=True):
+    likely, log_determinant = 0, 0.0
+    for (on, N, prior), (_, X) in zip(rows.each(), rows.changes(), strict=True):
         q, m = N.shape[1:]
         flat = N.reshape(-1, m)
         WN = W[on] @ N
         square = (flat.conj().T @ WN.reshape(-1, m)).real
-        values, turn = directions(square)
+        some = prior > 0
+        log_determinant += np.linalg.slogdet(square[np.ix_(some, some)] + np.eye(some.sum()))[1]
+        likely += int(some.sum())
+        values, turn = directions(square + np.diag(prior))
         cross = as_real(X).T @ as_real(WN.reshape(-1, q * m))
         cross = cross.reshape(-1, q, m).swapaxes(0, 1).reshape(-1, m)
         head = (flat.conj().T @ We[on].ravel()).real
@@ -147,7 +162,8 @@ def _nuisances(rows: Rows, W: Complex, We: Complex) -> tuple[Float, Float]:
         root = turn[:, kept] / np.sqrt(values[kept])
         crosses.append(cross @ root)
         heads.append(root.T @ head)
-    return np.concatenate(crosses, axis=1), np.concatenate(heads)
+    cross, head = np.concatenate(crosses, axis=1), np.concatenate(heads)
+    return _Nuisances(cross, head, head.size - likely, log_determinant)
 
 
 def products(X: Complex, W: Complex, We: Complex) -> tuple[Float, Float]:

@@ -49,7 +49,7 @@ class Free:
             each.append(np.concatenate([real[:, i : i + b] @ spare for i in parts], axis=1))
         if len(parts) > 2:
             _excited(each, len(parts) // 2)
-        pieces = [on for on, _ in rows.each()]
+        pieces = [on for on, *_ in rows.each()]
         if all(len(on) >= ENOUGH * _free(X) for on, X in zip(pieces, each, strict=True)):
             alone = zip(pieces, each, strict=True)
             return cls(rows, [([i], on, X) for i, (on, X) in enumerate(alone)])

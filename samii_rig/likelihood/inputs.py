@@ -53,8 +53,9 @@ PULSE_BEGINS, PULSE, LASTS, BESIDE_PULSE, SPARSE, SHORT = 6.0, 30.0, 2.5, 2, 0.2
 # Of what is between them, the part of its deviation that its second differences show at least:
 # white noise has all of it, what a band of an input has less.
 WHITE_BETWEEN = 0.8
-# Of the rate, from where on what a pulse has there folds back as much; lines of its spectrum.
-FOLDED, PULSE_LINES = 0.47, 1024
+# Of the rate, from where on what a pulse has there folds back as much: a filter of an analyser may
+# pass up to 0.46 of it. Lines of its spectrum.
+FOLDED, PULSE_LINES = 0.495, 1024
 # Samples by which a record's going on is foretold, and until it is at rest.
 FORETOLD, AFTER = 64, 512
 # Of an input's largest, a jump after or before rest for so many samples that counts as an edge: a

@@ -6,13 +6,15 @@ that of the best amplitudes, which for diffuse Gaussian ones is the marginal lik
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre
-from scipy import signal
+from scipy import ndimage, signal
 
+from samii_rig.likelihood.algebra import by_input
 from samii_rig.likelihood.contour import Contour
 from samii_rig.likelihood.pieces import Loops, Piece
 from samii_rig.types import Complex, Float, Int
@@ -130,6 +132,29 @@ def lost(piece: Piece, k: Int, impulse: Float) -> Complex:
             at = np.linspace(first, behind - 1, shapes.shape[1]).astype(np.int64)
             each = ((int(i), j) for i in at for j in range(piece.inputs))
             out.append(_after(piece, k, impulse, [(piece.history + i, j) for i, j in each]))
+    return np.concatenate(out, axis=2)
+
+
+def metered(piece: Piece, k: Int, impulse: Float) -> Complex:
+    """(n_lines, q, m) of a meter's noise on inputs that are pulses, while these last: white, so
+    that shapes that do not overlap have independent amplitudes, each of standard deviation 1.
+
+    impulse : as of `edges`.
+    """
+    n, q = piece.z.shape
+    out = [np.zeros((k.size, q, 0), complex)]
+    for j, r in enumerate(by_input(piece.r)):
+        each = [(told.part, told.meter[j]) for told in piece.commands]
+        if any(math.isnan(noise.folds) for _, noise in each):
+            continue
+        sd = math.sqrt(sum((part * noise.shown) ** 2 for part, noise in each))
+        pulses = r != np.median(r)
+        pulses[: piece.history] = False
+        for (one,) in ndimage.find_objects(ndimage.label(pulses)[0]):
+            shapes = _shown(one.stop - one.start, n, int(k[0]), k.size)
+            for shape in shapes.T:
+                moves = signal.fftconvolve(impulse, sd * shape[:, None], axes=0)
+                out.append(_after(piece, k, moves[: len(impulse)], [(one.start, j)]))
     return np.concatenate(out, axis=2)
 
 

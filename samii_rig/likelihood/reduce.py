@@ -24,7 +24,7 @@ from samii_rig.likelihood.algebra import (
     as_real,
     directions,
     lengths,
-    orthonormal,
+    shrinking,
 )
 from samii_rig.likelihood.before import with_past
 from samii_rig.likelihood.form import Reduced, quadratic
@@ -66,10 +66,10 @@ def residuals_by_line(
     for part in parts or (lambda k: np.ones(k.size, bool),):
         rows = every.take(part(every.k))
         white = np.empty_like(rows.e)
-        for on, N in rows.each():
+        for on, N, prior in rows.each():
             both = np.concatenate([rows.e[on][:, :, None], N], axis=2)
             both = np.sqrt(2) * noise.noise.whitened(rows.f[on], rows.piece[on], both)
-            Q = orthonormal(as_real(both[:, :, 1:].reshape(-1, N.shape[2])))
+            Q = shrinking(as_real(both[:, :, 1:].reshape(-1, N.shape[2])), prior)
             goal = as_real(both[:, :, 0].ravel())
             goal -= Q @ (Q.T @ goal)
             white[on] = as_complex(goal).reshape(on.size, -1)

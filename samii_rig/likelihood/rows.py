@@ -22,7 +22,7 @@ class Rows:
 
     X : of each piece (n_i, 2 b) what a change on the nodes does in its lines, (n_i, 2 b m) of m
     inputs; none where none is asked for. e : (n, q) what the reference leaves.
-    N : of each piece (n_i, q, m_i) the nuisances of its lines.
+    N : of each piece (n_i, q, m_i) the nuisances of its lines; prior : (m_i,) as of `Seen`.
     f : (n,) Hz. k : (n,) numbers of the lines. piece : (n,) which.
     order : (n,) of the lines of all pieces, one after the other, which these are.
     """
@@ -30,6 +30,7 @@ class Rows:
     X: Sequence[Complex]
     e: Complex
     N: Sequence[Complex]
+    prior: Sequence[Float]
     f: Float
     k: Int
     piece: Int
@@ -43,14 +44,17 @@ class Rows:
             [one[which[self.piece == i]] for i, one in enumerate(each)] for each in (self.X, self.N)
         )
         return Rows(
-            X, self.e[which], N, self.f[which], self.k[which],
+            X, self.e[which], N, self.prior, self.f[which], self.k[which],
             self.piece[which], self.order[which],
         )  # fmt: skip
 
-    def each(self) -> list[tuple[Int, Complex]]:
-        """Of each piece its lines, and their nuisances."""
-        every = ((np.flatnonzero(self.piece == i), N) for i, N in enumerate(self.N))
-        return [(on, N) for on, N in every if on.size]
+    def each(self) -> list[tuple[Int, Complex, Float]]:
+        """Of each piece its lines, and their nuisances with `prior`."""
+        every = (
+            (np.flatnonzero(self.piece == i), N, prior)
+            for i, (N, prior) in enumerate(zip(self.N, self.prior, strict=True))
+        )
+        return [one for one in every if one[0].size]
 
     def changes(self) -> Iterator[tuple[Int, Complex]]:
         """Of each piece its lines, and what changes do in them."""
@@ -70,7 +74,8 @@ def rows_of(records: Records, changes: Sequence[Complex], seen: Sequence[Seen]) 
     k, which = np.zeros(n, np.int64), np.zeros(n, np.int64)
     for i, on in enumerate(place):
         e[on], f[on], k[on], which[on] = seen[i].e, lines[i].frequency, lines[i].k, i
-    return Rows(changes, e, [s.N for s in seen], f, k, which, order)
+    N, prior = [s.N for s in seen], [s.prior for s in seen]
+    return Rows(changes, e, N, prior, f, k, which, order)
 
 
 def changes_of(records: Records, contour: Contour, nodes: Int) -> list[Complex]:

@@ -81,13 +81,15 @@ class Seen:
 
     e : (n, q) what the reference leaves, a sample's power. N : (n, q, m) nuisances, of size 1 each;
     the first are the past's. beside : those that are no past: an offset that acts from the first
-    sample on rings as that does.
+    sample on rings as that does. prior : (m,) 1 of the last, of standard normal amplitudes instead;
+    0 of those whose size nobody knows.
     rounding : of the converters. left : (n_samples, q) in time what the reference
     leaves.
     """
 
     e: Complex
     N: Complex
+    prior: Float
     past: Past
     beside: slice
     rounding: Rounding
@@ -111,9 +113,12 @@ class Seen:
         own += [nuisance.lost(piece, k, answers.impulse)]
         beside = _of_size_one(np.concatenate(own, axis=2))
         first = past.shapes.shape[2]
+        metered = nuisance.metered(piece, k, answers.impulse) / np.sqrt(n)
+        N = np.concatenate([past.shapes, beside, steps, metered], axis=2)
         return cls(
             np.asarray(left[k] / np.sqrt(n)),
-            np.concatenate([past.shapes, beside, steps], axis=2),
+            N,
+            np.repeat([0.0, 1.0], [N.shape[2] - metered.shape[2], metered.shape[2]]),
             past,
             slice(first, first + beside.shape[2]),
             rounding,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from samii_rig.likelihood.algebra import as_complex, as_real, orthonormal
+from samii_rig.likelihood.algebra import as_complex, as_real, shrinking
 from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.pieces import Loops
 from samii_rig.likelihood.records import Records, Response
@@ -64,7 +64,7 @@ def unexplained(
             noise.noise.root(lines.frequency, np.full(lines.k.size, i))
         )
         N = (root @ seen.N).reshape(-1, seen.N.shape[2])
-        Q = orthonormal(as_real(N))
+        Q = shrinking(as_real(N), seen.prior)
 
         def white(e: Complex, root: Complex = root, Q: Float = Q) -> Complex:
             """(m, n, q) whitened, nuisances at their best."""

@@ -71,9 +71,10 @@ def struck(
     kg: float = 0.0,
     k2: float = K2,
     filtered: bool = True,
+    of_force: float = 0.02,
 ) -> Recording:
     """`HITS` on the second mass. kg : N/m of a spring from there to the ground. k2 :
-    N/m of the columns between both."""
+    N/m of the columns between both. of_force : its noise, N."""
     n = 3000
     t = np.arange(n * FINE) / (RATE * FINE)
     F = np.zeros(t.size)
@@ -101,7 +102,7 @@ def struck(
         taps = signal.firwin(64 * FINE + 1, 0.45 * RATE, fs=RATE * FINE, window=("kaiser", 9.0))
         every = signal.fftconvolve(every, taps[:, None], mode="same")
     rng = np.random.default_rng(seed)
-    values = every[::FINE] + rng.standard_normal((n, 3)) * [0.02, 0.01, 0.01]
+    values = every[::FINE] + rng.standard_normal((n, 3)) * [of_force, 0.01, 0.01]
     channels = (
         Channel("F", "N", "command", low=-1000.0, high=1000.0),
         Channel("a_1", "m/s^2"),

@@ -10,7 +10,7 @@ from scipy import linalg, signal
 
 from samii_rig.diagnose.fit.records import _shown, fitted_lines
 from samii_rig.likelihood import pieces
-from samii_rig.likelihood.algebra import as_real
+from samii_rig.likelihood.algebra import as_real, shrinking
 from samii_rig.likelihood.before import _beyond, _past_of
 from samii_rig.likelihood.bridged import bridged
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
@@ -191,8 +191,8 @@ def test_the_residual_of_pieces_that_share_a_change_is_what_no_change_and_nuisan
     k = np.arange(n)
     N = [drawn(own, q, m) for own in lines]
     X = drawn(n, b)
-    rows = Rows((), drawn(n, q), N, k + 1.0, k, piece, k)
-    left, free = _of_pieces(rows.e, rows.each(), as_real(X))
+    rows = Rows((), drawn(n, q), N, [np.zeros(m)] * len(N), k + 1.0, k, piece, k)
+    left, free = _of_pieces(rows.e, [(on, one) for on, one, _ in rows.each()], as_real(X))
     freedom = 0.0
     for c in range(q):
         own = linalg.block_diag(*(one[:, c] for one in N))
@@ -202,6 +202,19 @@ def test_the_residual_of_pieces_that_share_a_change_is_what_no_change_and_nuisan
         np.testing.assert_allclose(as_real(left[:, c]), e - Q @ (Q.T @ e), atol=1e-9)
         freedom += 2 * n - A.shape[1]
     np.testing.assert_allclose(np.sum(free) * 2 * q, freedom, rtol=1e-9)
+
+
+@pytest.mark.parametrize("likely", [0, 2, 3])
+def test_columns_of_likely_amplitudes_are_left_as_in_the_noise_of_both(likely: int) -> None:
+    rng = np.random.default_rng(5)
+    X, r = rng.normal(size=(12, 3)) * [1e-3, 1.0, 30.0], rng.normal(size=12)
+    prior = np.repeat([0.0, 1.0], [3 - likely, likely])
+    Q = shrinking(X, prior)
+    left = r - Q @ (Q.T @ r)
+    # Diffuse amplitudes: the limit of ever larger ones.
+    sd = np.where(prior > 0, 1.0, 1e4 / np.linalg.norm(X, axis=0))
+    both = np.eye(12) + (X * sd**2) @ X.T
+    np.testing.assert_allclose(left @ left, r @ np.linalg.solve(both, r), rtol=1e-6)
 
 
 def test_what_moved_the_rig_before_pieces_of_one_change_is_told_without_their_shapes_side_by_side():

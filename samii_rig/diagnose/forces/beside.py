@@ -22,9 +22,9 @@ from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.fits import ForceFits
-from samii_rig.diagnose.forces.laws import FRICTION
+from samii_rig.diagnose.forces.laws import FRICTION, UNEVEN
 from samii_rig.diagnose.forces.model import ForceModel
-from samii_rig.diagnose.forces.table import uneven
+from samii_rig.diagnose.forces.table import presliding, uneven
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.types import Float
 
@@ -32,6 +32,11 @@ FORMED_AGAIN = 3  # times that the likelihood is made anew about the best explan
 REFERENCE_STILL = 0.5  # standard deviations, a move from one to the next that is none
 NO_MOVE = 1e-3  # of a logarithm: a refit of few steps has ended
 RENEWED = 3  # times that the chain through which a force acts is renewed in between
+PRESLID = (
+    1e-4,
+    1e-3,
+    1e-2,
+)  # way before dry friction slides over the largest motion, to begin with
 BESIDE = 6  # linear effects that are refitted beside the best force, and the other way round
 
 
@@ -116,6 +121,31 @@ class BesideForce(ForceFits):
         end = self.refitted_from(effects, start)
         if end is not None and best.fitted.chi2 - end.chi2 > self.critical_value:
             self.keep(effects, end)
+
+    def _presliding(self, best: Explanation) -> bool:
+        """Dry friction with presliding, from where that which does not ended; whether
+        it explains more."""
+        forced = next(e for e in best.effects if e.force is not None)
+        assert forced.force is not None
+        if forced.force.law not in (FRICTION, UNEVEN) or self.exhausted:
+            return False
+        other = presliding(forced, self.paths)
+        if other is None or other.key in {e.key for e in self.table}:
+            return False
+        self.use((*self.table, other))
+        linear, old = tuple(e for e in best.effects if e is not forced), best.fitted
+        own = list(old.model.own(best.effects.index(forced)))
+        T_c, known = float(old.x[own[0]]), np.delete(old.x, own)
+        motion = self.paths.motion(forced.force.place, of_speed=False)
+        top = max(float(np.max(np.abs(y))) for y in motion)
+        # What the chain bent to do the force's work may lie in another valley.
+        stated = np.concatenate([np.zeros(old.model.n_nominal), known[old.model.n_nominal :]])
+        for chain, share in self.each([(c, g) for c in (known, stated) for g in PRESLID]):
+            start = np.concatenate([chain, [T_c, T_c - np.log(share * top)]])
+            least = min(e.fitted.cost for e in self.found.values())
+            self.keep((*linear, other), self.refitted_from((*linear, other), start, least))
+        found = self.found.get(frozenset(e.key for e in (*linear, other)))
+        return found is not None and old.chi2 - found.fitted.chi2 > self.critical_value
 
     def pair(self) -> None:
         """Linear effects beside the best force; each of both must explain what an effect must."""

@@ -7,7 +7,7 @@ the best of them. A force is computed in time under the recorded commands.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Self
 
@@ -124,15 +124,25 @@ class ForceFits(RecordSearch):
             r = problem.residual(model.response(x, problem.at))
             return np.concatenate([r, x[: model.n_nominal] / prior])
 
-        def evaluated(x: Float) -> tuple[Float, Float]:
+        def evaluated(x: Float) -> tuple[Float, Callable[[], Float]]:
             # Away from the bound that it stands at, if it does.
             steps = np.where(x + SLOPE_STEP > model.upper, -SLOPE_STEP, SLOPE_STEP)
+
+            def slope(e: Float) -> Float:
+                try:
+                    change = left(x + e) - r
+                except SamiiRigError:  # no rig is there: the other side
+                    change = r - left(x - e)
+                return np.asarray(change / e.sum())
+
+            def slopes() -> Float:
+                return np.stack([slope(e) for e in np.diag(steps)], axis=1)
+
             try:
                 r = left(x)
-                return r, np.stack([(left(x + e) - r) / e.sum() for e in np.diag(steps)], axis=1)
             except SamiiRigError:  # a step to where no rig is: refused
-                rows = problem.goal.size + prior.size
-                return np.full(rows, NOWHERE), np.zeros((rows, x.size))
+                r = np.full(problem.goal.size + prior.size, NOWHERE)
+            return r, slopes
 
         end = minimise(evaluated, start, model.lower, model.upper, tolerance=EXACT_ENDS)
         if 2 * end.cost >= NOWHERE**2:

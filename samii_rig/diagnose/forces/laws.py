@@ -109,6 +109,12 @@ UNEVEN = Law(
     ("T_c forward", "T_c backward"), ((1.0, 0.0), (0.0, 1.0)), weak=FRICTION.weak,
     step=steps.friction, of_speed=True, rough=RUBBED,
 )  # fmt: skip
+# Of bearings and guides: over microns the asperities bend before they slide (Dahl 1968).
+PRESLIDING = Law(
+    "presliding", "coulomb_friction", "dry friction with presliding", BETWEEN,
+    ("T_c", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=lambda y, _v, p: _hysteresis(y, p),
+    step=steps.hysteresis, rough=RUBBED,
+)  # fmt: skip
 HARDENING = Law(
     "hardening", "cubic_stiffness", "a spring that hardens", BETWEEN, ("k3",), ONE,
     weak=lambda y, _v, p: p[0] * p[1] * y**3, fixed=(0.0, -1.0), step=steps.cubic,
@@ -149,8 +155,8 @@ CLIPPED = Law(
     of_command=_excess,
 )  # fmt: skip
 LAWS = (
-    FRICTION, UNEVEN, HARDENING, SOFTENING, QUADRATIC, PLAY, SLACK, HYSTERESIS, ORIFICE, OVERLAP,
-    CLIPPED,
+    FRICTION, UNEVEN, PRESLIDING, HARDENING, SOFTENING, QUADRATIC, PLAY, SLACK, HYSTERESIS, ORIFICE,
+    OVERLAP, CLIPPED,
 )  # fmt: skip
 
 

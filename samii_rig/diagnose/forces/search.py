@@ -65,21 +65,12 @@ class ForceSearch(BesideForce):
         self._try([h for h in scores if h.own[0] >= STRONG * ahead], self.nominal, 0)
         if first is not None:
             self._try(self.scores([first]) if faulty else scores, first, -1)
+        best = self.ranked()[0]
+        if (does := self._does(best)) is not None and does[1] < INCONSISTENT:
+            self._presliding(best)
         self.take_overdispersion()
-        for _ in range(FORMED_AGAIN):
-            best = self.ranked()[0]
-            if not isinstance(best.fitted.model, ForceModel):
-                return
-            self._about(best.fitted)
-            near = [e for e in self.ranked() if e.weight > best.weight - NEAR_BEST]
-            self._only((*near, self.nominal))
-            self._through(self.ranked()[0])
-            self.take_overdispersion()
-            after = self.ranked()[0]
-            if self.exhausted or (
-                after.key == best.key and after.fitted.away(best.fitted) < REFERENCE_STILL
-            ):
-                break
+        if not self._to_rest():
+            return
         self._either_way(self.ranked()[0])
         self.pair()
         self._alone()
@@ -90,23 +81,52 @@ class ForceSearch(BesideForce):
         self._forget_inconsistent()
         self.take_overdispersion()
 
+    def _to_rest(self) -> bool:
+        """Make the likelihood anew about the best explanation until that stands still; whether it
+        has a force."""
+        for _ in range(FORMED_AGAIN):
+            best = self.ranked()[0]
+            if not isinstance(best.fitted.model, ForceModel):
+                return False
+            self._about(best.fitted)
+            near = [e for e in self.ranked() if e.weight > best.weight - NEAR_BEST]
+            self._only((*near, self.nominal))
+            self._through(self.ranked()[0])
+            self.take_overdispersion()
+            after = self.ranked()[0]
+            if self.exhausted or (
+                after.key == best.key and after.fitted.away(best.fitted) < REFERENCE_STILL
+            ):
+                break
+        return True
+
     def _forget_inconsistent(self) -> None:
         """Without explanations whose force does not explain at all lines what it says that it does:
         what is left of an input's edges, say, is like dry friction at some and not at others."""
-        while isinstance(model := (best := self.ranked()[0]).fitted.model, ForceModel):
-            linear = tuple(e for e in best.effects if e.force is None)
-            x = np.delete(best.fitted.x, list(model.unknowns))
-            base = self.refitted_from(linear, x)
-            if base is None:
+        while isinstance((best := self.ranked()[0]).fitted.model, ForceModel):
+            if (does := self._does(best)) is None:
                 return
-            if self._to_noise(base, best.fitted):
-                return
-            fall, even = self._explained(base, best.fitted)
+            fall, even = does
             if even > INCONSISTENT and fall > self.critical_value:
                 return
+            if self._presliding(best):
+                self._to_rest()
+                self._alone()
+                continue
             del self.found[best.key]
             if fall > max(self.critical_value, self.uneven[1] if self.uneven else 0.0):
                 self.uneven = next(e for e in best.effects if e.force is not None), fall
+
+    def _does(self, best: Explanation) -> tuple[float, float] | None:
+        """As of `_explained`, of the force of an explanation; None where it has none, where the
+        rest cannot be refitted, or where it is right anyway."""
+        if not isinstance(model := best.fitted.model, ForceModel):
+            return None
+        linear = tuple(e for e in best.effects if e.force is None)
+        base = self.refitted_from(linear, np.delete(best.fitted.x, list(model.unknowns)))
+        if base is None or self._to_noise(base, best.fitted):
+            return None
+        return self._explained(base, best.fitted)
 
     def _to_noise(self, before: Fitted, after: Fitted) -> bool:
         """Whether a force may be off for its motion, as it began in a gap, and leaves no more than

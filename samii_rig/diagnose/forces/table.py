@@ -14,6 +14,7 @@ from samii_rig.diagnose.forces.laws import (
     ORIFICE,
     OVERLAP,
     PLAY,
+    PRESLIDING,
     QUADRATIC,
     SLACK,
     SOFTENING,
@@ -34,6 +35,7 @@ from samii_rig.rig.schema import (
     TorsionalSpring,
     TranslationalGroundSpring,
     TranslationalSpring,
+    output_unit,
 )
 
 Spring = TorsionalSpring | TranslationalSpring | TorsionalGroundSpring | TranslationalGroundSpring
@@ -73,6 +75,9 @@ def forces(rig: Rig, paths: TransferPaths) -> Iterator[Effect]:
             (e for e in rig.element if isinstance(e, SOURCES) and e.input == actuator.name), None
         )
         if source is None:
+            continue
+        # What a force cell showed is the force itself: no valve, no drive is left to bend it.
+        if not actuator.held and actuator.unit == output_unit(source.kind):
             continue
         turns = isinstance(source, ANGLE_SOURCES)
         yield from _drive(paths, source.name, actuator, turns=turns)
@@ -151,6 +156,24 @@ def uneven(even: Effect) -> Effect:
     unknowns = tuple(_log(symbol, T_c.unit, T_c.low, T_c.high) for symbol in UNEVEN.symbols)
     alias = even.aliases[0][1] if even.aliases else ""
     return effect(UNEVEN, even.force.place, even.site, alias, unknowns)
+
+
+def presliding(even: Effect, paths: TransferPaths) -> Effect | None:
+    """Dry friction with presliding in the place of one that does not; None where it has
+    no place to give."""
+    assert even.force is not None
+    place = even.force.place
+    ports = paths.ports(place, of_speed=False)
+    if place.kind not in PRESLIDING.kinds or ports is None:
+        return None
+    T_c = even.unknowns[0]
+    of_force, of_way = place.units
+    doubles = 1 / float(np.median(ports.y1))
+    k = _log("k", f"{of_force}/{of_way}", STRENGTH_RANGE[0] * doubles, STRENGTH_RANGE[1] * doubles)
+    unknowns = (_log(T_c.symbol, T_c.unit, T_c.low, T_c.high), k)
+    return effect(
+        PRESLIDING, place, even.site, even.aliases[0][1] if even.aliases else "", unknowns
+    )
 
 
 def _largest(paths: TransferPaths, place: Place, *, of_speed: bool) -> float:

@@ -52,6 +52,7 @@ from samii_rig.rig.schema.elements import (
     TranslationalSpring,
     VelocitySource,
     flattened,
+    output_unit,
 )
 from samii_rig.rig.schema.limits import Agreement, Limit, Monitor
 from samii_rig.rig.schema.loops import Centring, Feedback
@@ -136,5 +137,6 @@ __all__ = [
     "Velocity",
     "VelocitySource",
     "flattened",
+    "output_unit",
     "parameters",
 ]

@@ -494,6 +494,22 @@ TURNING = (
 )
 
 
+def output_unit(kind: str) -> str:
+    """Unit of what a source of this kind gives."""
+    match kind:
+        case "torque_source":
+            return "N m"
+        case "force_source":
+            return "N"
+        case "displacement_source":
+            return "m"
+        case "velocity_source":
+            return "m/s"
+        case "acceleration_source":
+            return "m/s^2"
+    return "rad/s"
+
+
 def input_unit(kind: str, unit: str) -> str:
     """Unit of K of a source of this kind with an input in `unit`."""
     # A `/` is for the next factor alone: of an input in N m the bracket makes it one of both.
