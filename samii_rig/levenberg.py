@@ -204,40 +204,25 @@ def minimise(
     scaled by their largest norms so far (More). Each step moves the parameters that no bound holds
     and ends at the bounds (projection).
 
-    evaluated : residuals (n,) and their Jacobian (n, k) at x; or what computes that, which is asked
-        for at points that are not refused alone.
+    evaluated : residuals (n,) and their Jacobian (n, k) at x, or what computes that, which is
+        asked for where a step was not refused.
     tolerance : of the cost and of x, relative, at which it ends.
     damping : the first one, of the squared norm of a column.
     """
-    norms = np.zeros(start.size)
-    J, about, exact = np.zeros((0, start.size)), None, True
-    anew: Normal | None = None  # the equations where the steps by others were refused
+    norms, J = np.zeros(start.size), np.zeros((0, start.size))  # J where the last step went
 
     def point(x: Float) -> _Evaluated:
         r, J = evaluated(x)
         return _Evaluated(x, float(r @ r), r, J)
 
-    def equations(now: _Evaluated) -> Normal:
+    def normal(now: _Evaluated) -> Normal:
+        nonlocal J
+        J = now.J() if callable(now.J) else now.J
         by = Normal(J.T @ J, J.T @ now.r)
         np.maximum(norms, np.sqrt(np.diagonal(by.A)), out=norms)
         return by
 
-    def exactly(now: _Evaluated) -> Normal:
-        nonlocal J, about, exact
-        J, about, exact = now.J() if callable(now.J) else now.J, now, True
-        return equations(now)
-
-    def normal(now: _Evaluated) -> Normal:
-        nonlocal J, about, exact, anew
-        anew = None
-        if about is None or not callable(now.J):
-            return exactly(now)
-        d = now.x - about.x
-        J = J + np.outer(now.r - about.r - J @ d, d / float(d @ d))
-        about, exact = now, False
-        return equations(now)
-
-    def moved(now: _Evaluated, by: Normal, damping: float) -> _Evaluated | None:
+    def trial(now: _Evaluated, by: Normal, damping: float) -> _Evaluated | None:
         floor = LEAST_SCALE * float(norms.max(initial=0.0)) + np.finfo(float).tiny
         on = np.flatnonzero(~by.held(now.x, lower, upper))
         x, added = now.x.copy(), damping * np.maximum(norms, floor)[on] ** 2
@@ -249,25 +234,14 @@ def minimise(
         # A bound may turn a long step uphill; a short one follows the gradient and goes down.
         return point(x) if by.expected(x - now.x) > 0 else None
 
-    def trial(now: _Evaluated, by: Normal, damping: float) -> _Evaluated | None:
-        nonlocal anew
-        new = moved(now, anew or by, damping)
-        if exact or (new is not None and new.cost < now.cost):
-            return new
-        anew = exactly(now)
-        return moved(now, anew, damping)
-
     def settled(p: Progress) -> bool:
         if p.gain > 0:
             return p.gain < tolerance * (p.cost + p.gain) and p.gain > AGREES * p.expected
         return p.expected < tolerance * p.cost
 
-    at = point(np.clip(start, lower, upper))
-    while True:
-        end = descend(at, normal, trial, settled, ByGain(damping), trials=TRIALS)
-        if exact:
-            return Minimum(end.at.x, end.at.cost / 2, J, end.settled)
-        at, about = end.at, None  # where secants end, the slopes themselves may go on
+    first = point(np.clip(start, lower, upper))
+    end = descend(first, normal, trial, settled, ByGain(damping), trials=TRIALS)
+    return Minimum(end.at.x, end.at.cost / 2, J, end.settled)
 
 
 @dataclass(frozen=True, slots=True)

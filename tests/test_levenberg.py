@@ -53,6 +53,20 @@ def test_known_minima_are_found(problem: Evaluated, start, end, cost: float) -> 
     assert found.jacobian == pytest.approx(problem(found.x)[1])
 
 
+def test_slopes_are_asked_for_where_a_step_was_not_refused_alone() -> None:
+    tried, asked = [], []
+
+    def lazily(x: Float) -> tuple[Float, Callable[[], Float]]:
+        tried.append(x)
+        r, J = rosenbrock(x)
+        return r, lambda: asked.append(x) or J
+
+    found, other = (minimise(f, np.array([-1.2, 1.0]), *FREE) for f in (lazily, rosenbrock))
+    np.testing.assert_array_equal(found.x, other.x)
+    np.testing.assert_array_equal(found.jacobian, other.jacobian)
+    assert len(asked) < len(tried)
+
+
 def test_the_minimum_on_a_bound_is_that_along_the_bound() -> None:
     """Rosenbrock with a <= 1/2: b = a^2 there."""
     found = minimise(rosenbrock, np.array([-1.2, 1.0]), FREE[0], np.array([0.5, np.inf]))

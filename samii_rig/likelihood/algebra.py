@@ -9,6 +9,9 @@ from samii_rig.types import Complex, Float
 SAME = 1e-9  # of the largest, power in a direction that columns do not have
 
 
+UNSEEN = 1e-6  # of the noise's, power of what is known to be so small: a thousandth of it
+
+
 def by_sensor(dh: Complex) -> Float:
     """(q 2 b, p) of derivatives (b, q, p): of each sensor all real parts, then imaginary ones."""
     b, q, p = dh.shape
@@ -53,18 +56,17 @@ def shrinking(X: Float, prior: Float) -> Float:
     """(n, m) Q so that r - Q Q' r is what columns X (n, p) leave of r that have amplitudes as
     likely as a normal deviation makes them: of 1/sqrt(prior), none where prior (p,) is 0. Its
     square is that of r in the noise that unit noise and the columns make together."""
-    if not prior.any():
-        return orthonormal(X)
-    size = np.sqrt(lengths(X.T) + prior)
-    X = X / np.where(size > 0, size, 1.0)
-    square = X.T @ X
-    values, turn = np.linalg.eigh(square + np.diag(prior / np.where(size > 0, size, 1.0) ** 2))
-    kept = values > SAME * np.max(values, initial=0.0)
-    root = turn[:, kept] / np.sqrt(values[kept])
-    part, turn = np.linalg.eigh(root.T @ square @ root)
-    kept = part > SAME
-    part = np.minimum(part[kept], 1.0)
-    return np.asarray(X @ (root @ turn[:, kept] * np.sqrt((1 - np.sqrt(1 - part)) / part)))
+    gone = orthonormal(X[:, prior == 0])
+    X = X[:, prior > 0]
+    if not X.shape[1]:
+        return gone
+    X = X / np.sqrt(prior[prior > 0])
+    X -= gone @ (gone.T @ X)
+    power, turn = np.linalg.eigh(X.T @ X)
+    kept = power > UNSEEN
+    power = power[kept]
+    shrunk = X @ (turn[:, kept] * np.sqrt((1 - 1 / np.sqrt(1 + power)) / power))
+    return np.concatenate([gone, shrunk], axis=1)
 
 
 def directions(square: Float) -> tuple[Float, Float]:

@@ -79,7 +79,7 @@ class Complete:
         g = self.white(e.reshape(*e.shape[:2], -1))
         n, q, p = g.shape
         # What is projected out is gone; what is only shrunk counts as in the noise's inverse.
-        back = self.root.conj().swapaxes(1, 2) @ (self._without(g) if self.likely else g)
+        back = self.root.conj().swapaxes(1, 2) @ (self._without(g.copy()) if self.likely else g)
         head = self.columns.T @ as_real(back.reshape(n, -1))
         head = head.reshape(-1, q, p).swapaxes(0, 1).reshape(-1, p)
         # The factor's rows stand in memory as the columns of a lower triangle: nothing is copied.

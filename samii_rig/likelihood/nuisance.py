@@ -32,6 +32,9 @@ HIGHEST = 0.45
 # make them as well; lines, instants and oscillations, more than they tell apart.
 WITHIN, TAPS, LINES = 7, 24, 64
 
+# Shapes of a meter's noise in one piece: of more pulses each has fewer, those that lines show most.
+METERED = 400
+
 # Power, of that of the shape which the lines show most, of one in lost samples that is looked at:
 # of what the reference leaves beside a straight line, 100 times the noise where much is amiss.
 SHAPE_SHOWN = 1e-5
@@ -124,7 +127,7 @@ def lost(piece: Piece, k: Int, impulse: Float) -> Complex:
     n, q = piece.z.shape
     out = [np.zeros((k.size, q, 0), complex)]
     for first, behind in piece.lost:
-        shapes = _shown(behind - first, n, int(k[0]), k.size)
+        shapes = _shown(behind - first, n, int(k[0]), int(k[-1] - k[0]) + 1)
         inside = np.zeros((n, shapes.shape[1]))
         inside[first:behind] = shapes
         out.append(_by_sensor(inside, k, q))
@@ -145,16 +148,24 @@ def metered(piece: Piece, k: Int, impulse: Float) -> Complex:
     out = [np.zeros((k.size, q, 0), complex)]
     for j, r in enumerate(by_input(piece.r)):
         each = [(told.part, told.meter[j]) for told in piece.commands]
-        if any(math.isnan(noise.folds) for _, noise in each):
+        if not each or any(math.isnan(noise.folds) for _, noise in each):
             continue
         sd = math.sqrt(sum((part * noise.shown) ** 2 for part, noise in each))
-        pulses = r != np.median(r)
-        pulses[: piece.history] = False
-        for (one,) in ndimage.find_objects(ndimage.label(pulses)[0]):
-            shapes = _shown(one.stop - one.start, n, int(k[0]), k.size)
-            for shape in shapes.T:
-                moves = signal.fftconvolve(impulse, sd * shape[:, None], axes=0)
-                out.append(_after(piece, k, moves[: len(impulse)], [(one.start, j)]))
+        lasts = r != np.median(r)
+        for first, behind in piece.lost:
+            lasts[piece.history + first : piece.history + behind] = False
+        pulses = [one for (one,) in ndimage.find_objects(ndimage.label(lasts)[0])]
+        moved: dict[int, list[Float]] = {}
+        for one in pulses:
+            size = one.stop - one.start
+            if size not in moved:
+                shapes = _shown(size, n, int(k[0]), int(k[-1] - k[0]) + 1)
+                shapes = sd * shapes[:, -max(METERED // len(pulses), 1) :, None]
+                moved[size] = [
+                    signal.fftconvolve(impulse, shapes[:, i], axes=0)[: len(impulse)]
+                    for i in range(shapes.shape[1])
+                ]
+            out += [_after(piece, k, y, [(one.start, j)]) for y in moved[size]]
     return np.concatenate(out, axis=2)
 
 

@@ -67,10 +67,14 @@ def timing(columns: Mapping[str, Float], units: Mapping[str, str], rate_hz: floa
 
 def _rate(seconds: Float, count: Float) -> float:
     """Hz, of stamps (n,) of so many samples since the first: their mean rate, which the last digit
-    of a stamp moves least; the whole number if one is as near as the stamps tell."""
+    of a stamp moves least; the whole number if one is as near as the stamps tell. Where a clock
+    jumps or rows are missing that no count tells, that of the middle step."""
     length, samples = float(seconds[-1] - seconds[0]), count - count[0]
     mean = float(samples[-1]) / length
-    off = float(np.max(np.abs(seconds - seconds[0] - samples / mean))) / length * mean
+    away = float(np.max(np.abs(seconds - seconds[0] - samples / mean)))
+    if away * mean > _JITTER:
+        return float(f"{1.0 / float(np.median(np.diff(seconds) / np.diff(count))):.9g}")
+    off = away / length * mean
     whole = round(mean)
     return float(whole) if abs(mean - whole) <= off else float(f"{mean:.9g}")
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hammer_kit import RIG, TOML, diagnosed, struck
+from hammer_kit import RATE, RIG, TOML, diagnosed, struck
+from scipy import signal
 from table_kit import Effects, table_of
 from two_masses_kit import random_command
 
@@ -64,6 +65,20 @@ def test_noise_of_the_force_while_a_pulse_lasts_is_no_cause(seed: int) -> None:
     found = diagnosed(struck(seed, of_force=0.1), effects=(), rig=STATED)
     assert found.verdict == "no_mismatch"
     assert 0.8 < found.chi2_per_dof < found.threshold
+
+
+def test_one_high_pass_of_all_sensors_is_one_cause() -> None:
+    """Couplers of 1 Hz at both accelerometers, which the rig file does not state."""
+    run = struck(9)
+    b, a = signal.bilinear([1.0, 0.0], [1.0, 2 * np.pi], RATE)
+    run.values[:, 1:] = signal.lfilter(b, a, run.values[:, 1:], axis=0)
+    few = Effects(lambda: table_of(STATED, 1.0, 450.0, "sensor_highpass", "ground_spring"))
+    found = diagnosed(run, few, STATED)
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("sensor_highpass", "every sensor")
+    assert cause.parameters["corner"].value == pytest.approx(1.0, rel=0.05)
+    assert found.rig is not None
+    assert [s.highpass_hz for s in found.rig.sensor] == [cause.parameters["corner"].value] * 2
 
 
 def test_a_force_that_a_cell_measured_has_no_valve_before_it() -> None:

@@ -98,6 +98,16 @@ def test_a_gap_in_which_nothing_acts_is_play() -> None:
     assert width.value == pytest.approx(gap, rel=0.05)
 
 
+def test_friction_that_gives_before_it_slides_has_both_its_values() -> None:
+    """By Bouc's and Wen's law, which gives less stiffly backwards, k is 30 % high."""
+    T_c, k = 2.0, 4e4  # slides after 0.05 mm of 2 mm
+    found = diagnosed(recorded(V, 1, dry=(T_c, k)), effects=())
+    (cause,) = found.causes
+    assert (found.verdict, cause.physics, cause.site) == ("named", "coulomb_friction", "spring_1")
+    assert cause.parameters["T_c"].value == pytest.approx(T_c, rel=0.05)
+    assert cause.parameters["k"].low < k < cause.parameters["k"].high < 1.15 * k
+
+
 @pytest.mark.parametrize(("tolerance", "told"), [(0.006, False), (0.0035, True)])
 def test_a_number_of_the_rig_file_is_wrong_from_five_tolerances_on(tolerance, told) -> None:
     """The second spring is 2 % softer than stated: 3.4 tolerances, or 5.8."""

@@ -16,7 +16,7 @@ from samii_rig.diagnose.forces import laws
 from samii_rig.diagnose.forces.laws import Force, Law
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.place import Place
-from samii_rig.diagnose.forces.steps import OUT, advanced
+from samii_rig.diagnose.forces.steps import OUT, advanced, slid
 from samii_rig.diagnose.forces.way import INNER, Way
 from samii_rig.diagnose.physics.effect import Effect, Unknown
 from samii_rig.errors import InputError
@@ -146,6 +146,41 @@ def test_a_step_of_bouc_wen_is_its_differential_equation(top: float, k: float, p
         h = advanced(h, dx, top, k)[0]
         got.append(h)
     assert np.max(np.abs(got - want)) < 2e-3 * top
+
+
+@given(top=st.floats(0.1, 3.0), k=st.floats(0.5, 20.0), phase=st.floats(0.0, 6.0))
+@settings(max_examples=5, deadline=None)
+def test_a_step_of_dahl_is_his_differential_equation(top: float, k: float, phase: float) -> None:
+    """h' = k x' (1 - sign(x') h/top), x of two sines."""
+    t = np.linspace(0, 6, 4001)
+    x = np.sin(t) + 0.5 * np.sin(2.7 * t + phase)
+
+    def rate(now: float, h: Float) -> Float:
+        speed = math.cos(now) + 1.35 * math.cos(2.7 * now + phase)
+        return k * speed * (1 - np.sign(speed) * h / top)
+
+    want = solve_ivp(rate, (0, 6), [0.0], t_eval=t, rtol=1e-8, atol=1e-10, max_step=2e-3).y[0]
+    h, got = 0.0, [0.0]
+    for dx in np.diff(x):
+        h = slid(h, dx, top, k)[0]
+        got.append(h)
+    assert np.max(np.abs(got - want)) < 2e-3 * top
+
+
+@pytest.mark.parametrize("law", [laws.HYSTERESIS, laws.PRESLIDING], ids=lambda law: law.tag)
+@given(way=st.floats(-10.0, 10.0), memory=st.floats(-1.0, 1.0), stiff=st.floats(0.1, 300.0))
+@settings(max_examples=50, deadline=None)
+def test_however_stiff_before_it_slips_a_step_ends_at_its_root(
+    law: Law, way: float, memory: float, stiff: float
+) -> None:
+    """Newton alone goes to and fro across the bend from 5 times the compliance on."""
+    out = np.zeros(OUT)
+    assert law.step is not None
+    law.step(0.0, way, 0.0, stiff, np.array([1.0, 1.0, 0.0]), memory, out)
+    dx = way + stiff * out[0]
+    of = advanced if law is laws.HYSTERESIS else slid
+    assert of(memory, dx, 1.0, 1.0)[0] == pytest.approx(out[3], abs=1e-7)
+    assert out[0] == pytest.approx(-0.5 * (memory + out[3]), abs=1e-12)
 
 
 STEPS = {law.tag: law for law in laws.LAWS if law.step is not None}

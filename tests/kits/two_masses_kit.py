@@ -33,30 +33,33 @@ def recorded(
     every: int = 1,
     meter: float = 0.0,
     gap: float = 0.0,
+    dry: tuple[float, float] = (0.0, 0.0),
 ) -> Recording:
     """A record from rest under a held command v (n,) V, with the noise that the rig file states.
 
     k3 : N/m^3 of the first spring. gap : m, of the second one, in which neither it nor its damper
-    acts. gain : of the coil, over time in s. more : kg on the second
-    mass. pd : V/m and V s/m of a loop around what x_1 reads, whose reference is v then, and is not
-    recorded; what goes out is rounded to the converter's steps. every : samples of the command for
-    one that is recorded. meter : V, noise of what showed the command, the mean of both sides of its
-    edges; 0 where it was recorded as it was sent.
+    acts. dry : N and N/m of friction beside the first, after Dahl. gain : of the coil, over time in
+    s. more : kg on the second mass. pd : V/m and V s/m of a loop around what x_1 reads, whose
+    reference is v then, and is not recorded; what goes out is rounded to the converter's steps.
+    every : samples of the command for one that is recorded. meter : V, noise of what showed the
+    command, the mean of both sides of its edges; 0 where it was recorded as it was sent.
     """
     h, v, m2 = 1 / (RATE * SUBSTEPS), v.copy(), M2 + more
     noise = np.random.default_rng(seed).standard_normal((v.size, 2)) * [1e-6, 0.02]
     read = np.zeros(v.size)
-    z = np.zeros(5)  # x_1, its speed, x_2, its speed, the coil's force
+    z = np.zeros(6)  # x_1, its speed, x_2, its speed, the coil's force, the friction's
+    T_c, bristles = dry
     out = np.zeros((v.size, 2))  # m, m/s^2
 
     def rate_of(z: Float, force: float) -> Float:
-        x1, v1, x2, v2, f = z
+        x1, v1, x2, v2, f, h = z
         way = x2 - x1
         inner = K2 * (way - 0.5 * np.copysign(gap, way)) + C2 * (v2 - v1)
         if 2 * abs(way) < gap:
             inner = 0.0
-        a1 = (f + inner - K1 * x1 - C1 * v1 - k3 * x1**3) / M1
-        return np.array([v1, a1, v2, -inner / m2, CORNER * (force - f)])
+        a1 = (f + inner - K1 * x1 - C1 * v1 - k3 * x1**3 - h) / M1
+        rubs = bristles * (v1 - abs(v1) * h / T_c) if T_c else 0.0
+        return np.array([v1, a1, v2, -inner / m2, CORNER * (force - f), rubs])
 
     for i, asked in enumerate(v):
         out[i] = z[0], rate_of(z, 0.0)[3]

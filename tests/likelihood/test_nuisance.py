@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import signal, special
 
 from samii_rig.likelihood import nuisance
+from samii_rig.likelihood.algebra import as_real, shrinking
+from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.inputs import BESIDE_TURN
 from samii_rig.likelihood.pieces import Piece, _cut_off
+from samii_rig.likelihood.rows import Rows
 from samii_rig.types import Complex, Float, Int
 
 N, AT = 1024, 500
@@ -115,6 +120,41 @@ def impulses(piece: Piece, k: Int, impulse: Float) -> Complex:
         for at, _ in piece.edges
     ]
     return np.concatenate(alone, axis=2)
+
+
+def test_all_lines_count_as_in_the_noise_of_sensors_and_of_a_measured_force() -> None:
+    """Of what `split` gives, the square is that of lines in both noises: also where a part of it is
+    along what the force's noise does."""
+    rng = np.random.default_rng(2)
+    n, q, b = 40, 2, 3
+    X, A, e = (
+        rng.normal(size=s) + 1j * rng.normal(size=s) for s in ((n, 2 * b), (n, q, 4), (n, q))
+    )
+    flat = as_real(A.reshape(-1, 4))
+    whole = Complete(
+        SimpleNamespace(), rows_of_lines(e), as_real(X), np.tile(np.eye(q), (n, 1, 1)),
+        ((np.arange(n), shrinking(flat, np.ones(4))),), factor_of(X, flat, q), likely=True,
+    )  # fmt: skip
+    both = np.eye(2 * n * q) + flat @ flat.T
+    want = as_real(e.ravel()) @ np.linalg.solve(both, as_real(e.ravel()))
+    parts = whole.split(e)
+    assert parts @ parts == pytest.approx(want)
+
+
+def rows_of_lines(e: Complex) -> Rows:
+    at = np.arange(len(e))
+    return Rows((), e, (), (), at + 1.0, at, np.zeros(len(e), int), at)
+
+
+def factor_of(X: Complex, flat: Float, q: int) -> Float:
+    """Of the products of all changes' columns, sensor by sensor, in both noises."""
+    n, size = X.shape
+    columns = np.zeros((n, q, q * size), complex)
+    for c in range(q):
+        columns[:, c, c * size : (c + 1) * size] = X
+    every = as_real(columns.reshape(n * q, -1))
+    left = every - flat @ np.linalg.solve(np.eye(flat.shape[1]) + flat.T @ flat, flat.T @ every)
+    return np.linalg.cholesky(every.T @ left).T
 
 
 def test_between_its_last_samples_an_input_depends_on_those_behind_them():

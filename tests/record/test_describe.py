@@ -20,6 +20,7 @@ from samii_rig.record.first_map import first_map
 from samii_rig.record.importer import import_file
 from samii_rig.record.maps import ImportMap
 from samii_rig.record.reader import read_recording
+from samii_rig.record.timing import timing
 from samii_rig.rig.load import parse
 from samii_rig.types import Recording
 
@@ -67,6 +68,21 @@ def test_how_a_text_is_written_is_found_and_its_first_map_reads_it(tmp_path, cas
     recording = imported(path)
     assert recording.rate_hz == 100.0
     np.testing.assert_array_equal(recording.values, [[i % 7, -i / 8] for i in range(N)])
+
+
+@pytest.mark.parametrize("digits", [4, 7])
+def test_the_rate_is_as_exact_as_all_stamps_together(digits: int) -> None:
+    """A step of 1/2048 s has four digits here, and all of them have the rate to five."""
+    n = np.arange(4096.0)
+    found = timing({"t": np.round(n / 2048.0, digits)}, {"t": "s"}, None)
+    assert found.rate_hz == 2048.0
+
+
+def test_a_clock_that_jumps_beside_a_count_does_not_move_the_rate() -> None:
+    n = np.arange(4000.0)
+    t = n / 2048.0 + np.where(n > 2000, 0.5, 0.0)
+    found = timing({"n": n, "t": t}, {"t": "s"}, None)
+    assert found.rate_hz == pytest.approx(2048.0)
 
 
 def test_units_gaps_levels_steps_and_missing_values_are_told(tmp_path):

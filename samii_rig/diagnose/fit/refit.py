@@ -167,10 +167,12 @@ class Fitted:
         return np.asarray(np.linalg.inv(self.precision()))
 
     def with_model_error(self) -> Fitted:
-        """The same, the first unknown of each effect known no better than its law holds."""
+        """The same, the first unknown of each effect, all of a force's, known no better than its
+        law holds."""
         rough = np.zeros(self.x.size)
         for i, effect in enumerate(self.model.effects):
-            rough[self.model.own(i)[:1]] = effect.rough**2
+            own = list(self.model.own(i))
+            rough[own if effect.force is not None else own[:1]] = effect.rough**2
         if not rough.any():
             return self
         prior = self.precision() - self.information

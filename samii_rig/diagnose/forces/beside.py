@@ -6,6 +6,7 @@ here is refitted through its own, until that stands still.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -22,9 +23,9 @@ from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.fits import ForceFits
-from samii_rig.diagnose.forces.laws import FRICTION, UNEVEN
+from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS, UNEVEN
 from samii_rig.diagnose.forces.model import ForceModel
-from samii_rig.diagnose.forces.table import presliding, uneven
+from samii_rig.diagnose.forces.table import PRESLID, presliding, uneven
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.types import Float
 
@@ -32,16 +33,19 @@ FORMED_AGAIN = 3  # times that the likelihood is made anew about the best explan
 REFERENCE_STILL = 0.5  # standard deviations, a move from one to the next that is none
 NO_MOVE = 1e-3  # of a logarithm: a refit of few steps has ended
 RENEWED = 3  # times that the chain through which a force acts is renewed in between
-PRESLID = (
-    1e-4,
-    1e-3,
-    1e-2,
-)  # way before dry friction slides over the largest motion, to begin with
+ANEW = 2  # times that presliding is tried: before the likelihood stands about a friction, and then
 BESIDE = 6  # linear effects that are refitted beside the best force, and the other way round
 
 
 class BesideForce(ForceFits):
-    """A force alone, with linear effects, and with others in their place."""
+    """A force alone, with linear effects, and with others in their place.
+
+    preslid : how often presliding was tried in the place of a friction.
+    """
+
+    def __post_init__(self) -> None:
+        self.preslid: Counter[str] = Counter()
+        super().__post_init__()
 
     def _through(self, best: Explanation) -> None:
         """Refit it with the chain through which its force acts renewed where each refit ended,
@@ -107,19 +111,28 @@ class BesideForce(ForceFits):
                     self._renewed(fewer, moved(old.model, x, model))
 
     def _either_way(self, best: Explanation) -> None:
-        """Dry friction that may differ by direction, from where it did not."""
+        """Dry friction that may differ by direction, from where it did not; what sticks and slips
+        after Dahl's law, from where it did after Bouc's and Wen's."""
         forced = next((e for e in best.effects if e.force is not None), None)
-        if forced is None or forced.force is None or forced.force.law is not FRICTION:
+        if forced is None or forced.force is None:
             return
-        other = uneven(forced)
+        other = None
+        if forced.force.law is FRICTION:
+            other, least = uneven(forced), self.critical_value
+        elif forced.force.law is HYSTERESIS:
+            other, least = presliding(forced, self.paths), 0.0
+        if other is None:
+            return
         at = best.effects.index(forced)
         effects = (*best.effects[:at], *best.effects[at + 1 :], other)
         own = best.fitted.model.own(at)
-        start = np.append(np.delete(best.fitted.x, list(own)), np.repeat(best.fitted.x[own[0]], 2))
+        start = np.append(
+            np.delete(best.fitted.x, list(own)), np.resize(best.fitted.x[list(own)], 2)
+        )
         if other.key not in {e.key for e in self.table}:
             self.use((*self.table, other))
         end = self.refitted_from(effects, start)
-        if end is not None and best.fitted.chi2 - end.chi2 > self.critical_value:
+        if end is not None and best.fitted.chi2 - end.chi2 > least:
             self.keep(effects, end)
 
     def _presliding(self, best: Explanation) -> bool:
@@ -130,9 +143,11 @@ class BesideForce(ForceFits):
         if forced.force.law not in (FRICTION, UNEVEN) or self.exhausted:
             return False
         other = presliding(forced, self.paths)
-        if other is None or other.key in {e.key for e in self.table}:
+        if other is None or self.preslid[forced.key] >= ANEW:
             return False
-        self.use((*self.table, other))
+        self.preslid[forced.key] += 1
+        if other.key not in {e.key for e in self.table}:
+            self.use((*self.table, other))
         linear, old = tuple(e for e in best.effects if e is not forced), best.fitted
         own = list(old.model.own(best.effects.index(forced)))
         T_c, known = float(old.x[own[0]]), np.delete(old.x, own)

@@ -141,10 +141,14 @@ class ForceFits(RecordSearch):
             try:
                 r = left(x)
             except SamiiRigError:  # a step to where no rig is: refused
-                r = np.full(problem.goal.size + prior.size, NOWHERE)
+                rows = problem.goal.size + prior.size
+                return np.full(rows, NOWHERE), lambda: np.zeros((rows, x.size))
             return r, slopes
 
-        end = minimise(evaluated, start, model.lower, model.upper, tolerance=EXACT_ENDS)
+        try:
+            end = minimise(evaluated, start, model.lower, model.upper, tolerance=EXACT_ENDS)
+        except SamiiRigError:  # no rig on either side
+            return None
         if 2 * end.cost >= NOWHERE**2:
             return None
         penalty = penalty_of(model, end.x)

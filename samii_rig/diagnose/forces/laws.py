@@ -113,7 +113,7 @@ UNEVEN = Law(
 PRESLIDING = Law(
     "presliding", "coulomb_friction", "dry friction with presliding", BETWEEN,
     ("T_c", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=lambda y, _v, p: _hysteresis(y, p),
-    step=steps.hysteresis, rough=RUBBED,
+    step=steps.presliding, rough=RUBBED,
 )  # fmt: skip
 HARDENING = Law(
     "hardening", "cubic_stiffness", "a spring that hardens", BETWEEN, ("k3",), ONE,

@@ -21,6 +21,7 @@ from samii_rig.types import Float
 
 OUT, LAW_NUMBERS = 14, 3  # entries of `out`, and numbers of a law at most
 NEWTON = 5  # steps at most to the root of a law that is monotonous
+SAFE = 40  # the same of one that bends: halving alone would bring the root to 1e-12
 ROOT_FOUND = 1e-8  # of the root: Newton's next step would be of the square of it, a rounding error
 _f8, _row = types.float64, types.Array(types.float64, 1, "C")
 SIGNATURE = types.void(_f8, _f8, _f8, _f8, _row, _f8, _row)
@@ -152,19 +153,19 @@ def advanced(h: float, dx: float, top: float, k: float) -> tuple[float, float, f
     return sign * (top - rest), k * rest / top, E, sign * by_top, sign * rest * way / top
 
 
-@njit(SIGNATURE, cache=True)
-def hysteresis(
-    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+@njit(cache=True)
+def _within(way: float, g: float, top: float, memory: float) -> tuple[float, float]:
+    """The motion of a step lies between these, as its force does between -top and top."""
+    high = max(top, abs(memory))
+    return way - 0.5 * g * (memory + high), way - 0.5 * g * (memory - high)
+
+
+@njit(cache=True)
+def _sticking(
+    after: tuple[float, float, float, float, float], g: float, memory: float, out: Float
 ) -> None:
-    """Bouc-Wen of height p0 and of stiffness p1 before it slips; the mean force of the step."""
-    dx = free - before - g * memory
-    for _ in range(NEWTON):
-        h, slope, _, _, _ = advanced(memory, dx, p[0], p[1])
-        off = (dx - (free - before) + 0.5 * g * (memory + h)) / (1.0 + 0.5 * g * slope)
-        dx -= off
-        if abs(off) <= ROOT_FOUND * abs(dx):
-            break
-    h, slope, by_h, by_top, by_k = advanced(memory, dx, p[0], p[1])
+    """Fill `out` for a force that is its memory. after : as of `advanced`."""
+    h, slope, by_h, by_top, by_k = after
     held = 1.0 + 0.5 * g * slope
     out[0], out[3] = -0.5 * (memory + h), h
     out[5], out[6] = -slope / held, slope / held
@@ -172,3 +173,60 @@ def hysteresis(
     out[9], out[11] = by_top / held, by_k / held
     out[1], out[2], out[8], out[10] = -0.5 * out[5], -0.5 * out[6], -0.5 * out[9], -0.5 * out[11]
     out[4] = -0.5 * (1.0 + out[7])
+
+
+@njit(SIGNATURE, cache=True)
+def hysteresis(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """Bouc-Wen of height p0 and of stiffness p1 before it slips; the mean force of the step."""
+    low, high = _within(free - before, g, p[0], memory)
+    dx = min(max(free - before - g * memory, low), high)
+    off = high - low
+    for _ in range(SAFE):
+        h, slope, _, _, _ = advanced(memory, dx, p[0], p[1])
+        over = dx - (free - before) + 0.5 * g * (memory + h)
+        low, high = (low, dx) if over > 0.0 else (dx, high)
+        new = dx - over / (1.0 + 0.5 * g * slope)
+        # Halved where Newton leads out, or to and fro across the bend.
+        newton = low <= new <= high and 2.0 * abs(new - dx) <= abs(off)
+        off = (new if newton else 0.5 * (low + high)) - dx
+        dx += off
+        if abs(off) <= ROOT_FOUND * abs(dx):
+            break
+    _sticking(advanced(memory, dx, p[0], p[1]), g, memory, out)
+
+
+@njit(cache=True)
+def slid(h: float, dx: float, top: float, k: float) -> tuple[float, float, float, float, float]:
+    """As `advanced`, of Dahl's friction: dh = k dx (1 - h/top) one way, k dx (1 + h/top) the other
+    (Dahl 1968, Aerospace Corporation TOR-0158(3107-18)-1)."""
+    end = top if dx >= 0.0 else -top
+    way = abs(dx)
+    E = np.exp(-k * way / top)
+    rest = (end - h) * E
+    sign = end / top
+    by_top = sign * (1.0 - E) - rest * k * way / top**2
+    return end - rest, sign * k * rest / top, E, by_top, rest * way / top
+
+
+@njit(SIGNATURE, cache=True)
+def presliding(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """Dahl's friction of height p0 and of stiffness p1 at rest; the mean force of the step."""
+    low, high = _within(free - before, g, p[0], memory)
+    dx = min(max(free - before - g * memory, low), high)
+    off = high - low
+    for _ in range(SAFE):
+        h, slope, _, _, _ = slid(memory, dx, p[0], p[1])
+        over = dx - (free - before) + 0.5 * g * (memory + h)
+        low, high = (low, dx) if over > 0.0 else (dx, high)
+        new = dx - over / (1.0 + 0.5 * g * slope)
+        # Halved where Newton leads out, or to and fro across the bend.
+        newton = low <= new <= high and 2.0 * abs(new - dx) <= abs(off)
+        off = (new if newton else 0.5 * (low + high)) - dx
+        dx += off
+        if abs(off) <= ROOT_FOUND * abs(dx):
+            break
+    _sticking(slid(memory, dx, p[0], p[1]), g, memory, out)

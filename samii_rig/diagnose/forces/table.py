@@ -44,6 +44,11 @@ STRENGTH_STARTS = 14  # of a strength over its range
 # Of a strength over the one that doubles or halves the motion at its place.
 STRENGTH_RANGE = (1e-9, 30.0)
 SOFTEST = 1.0  # the same of a stiffness that falls: beyond, a spring would push
+PRESLID = (
+    1e-4,
+    1e-3,
+    1e-2,
+)  # way before dry friction slides over the largest motion, to begin with
 WIDTHS = (1e-6, 2.0)  # of a gap or limit over the largest amplitude that meets it
 BEYOND = 3.0  # standard deviations of a meter's noise, which is beyond in 0.3 % of the samples
 LEAST_LIMIT = 0.02  # of the largest command
@@ -169,8 +174,11 @@ def presliding(even: Effect, paths: TransferPaths) -> Effect | None:
     T_c = even.unknowns[0]
     of_force, of_way = place.units
     doubles = 1 / float(np.median(ports.y1))
-    k = _log("k", f"{of_force}/{of_way}", STRENGTH_RANGE[0] * doubles, STRENGTH_RANGE[1] * doubles)
-    unknowns = (_log(T_c.symbol, T_c.unit, T_c.low, T_c.high), k)
+    # So that what is as strong as what moves there slides after the least way that is tried.
+    stiff = T_c.high / STRENGTH_RANGE[1] / (PRESLID[0] * _largest(paths, place, of_speed=False))
+    high = max(STRENGTH_RANGE[1] * doubles, stiff)
+    k = _log("k", f"{of_force}/{of_way}", STRENGTH_RANGE[0] * doubles, high)
+    unknowns = (_log(PRESLIDING.symbols[0], T_c.unit, T_c.low, T_c.high), k)
     return effect(
         PRESLIDING, place, even.site, even.aliases[0][1] if even.aliases else "", unknowns
     )

@@ -35,6 +35,7 @@ INVISIBLE = 1e-6
 # Part of what it makes of a command's edges by which a meter is not as `not_held`: one of a plant
 # of ours was by 0.8 % of a sample late.
 METERED = 0.01
+EVERY_SENSOR = "every sensor"  # the site of what all have
 NOT_PHYSICS = tuple(row.name for row in PHYSICS.values() if not row.physical)
 
 
@@ -96,6 +97,7 @@ def effects(rig: Rig, low_hz: float, high_hz: float) -> Iterator[Effect]:
             yield from _tilted(sensor.name)
         if isinstance(sensor, RelativeAngle):
             yield from _encoders(rig, sensor)
+    yield from _coupled(rig, low_hz)
 
 
 def _unknown(symbol: str, unit: str, low: float, high: float, n: int = 8) -> Unknown:
@@ -225,8 +227,7 @@ def _sensor(sensor: SensorBase, low_hz: float, high_hz: float) -> Iterator[Effec
     yield one("sensor_delay", dead_time, times, lambda tau: {"delay": delay + tau})
     yield one("sensor_lag", lag, _corners("p", low_hz, high_hz), lambda p: {"lag": 1 / p})
     yield one("sensor_gain", gain, _gains(), lambda g: {"gain": g * sensor.gain})
-    corner = _unknown("corner", "Hz", 1e-4 * low_hz, 10 * low_hz)
-    yield one("sensor_highpass", highpass, corner, lambda f: {"highpass_hz": f})
+    yield one("sensor_highpass", highpass, _highpass_corner(low_hz), lambda f: {"highpass_hz": f})
     if delay < times.high:  # earlier by less, the delay of the file is not there
         early = _unknown("tau", "s", max(times.low, delay), times.high)
         yield Effect(
@@ -235,6 +236,33 @@ def _sensor(sensor: SensorBase, low_hz: float, high_hz: float) -> Iterator[Effec
             unknowns=(early,),
             factor=Factor("sensor", sensor.name, lead),
         )
+
+
+def _highpass_corner(low_hz: float) -> Unknown:
+    return _unknown("corner", "Hz", 1e-4 * low_hz, 10 * low_hz)
+
+
+def _coupled(rig: Rig, low_hz: float) -> Iterator[Effect]:
+    """One high-pass in all sensors, as of one amplifier or a logger whose channels are AC coupled:
+    the same as one before the only input, where no loop reads any of them."""
+    loops = rig.centred or rig.feedback
+    if len(rig.sensor) < 2 or len(rig.actuator) > 1 or loops:
+        return
+    if any(s.highpass_hz > 0 for s in rig.sensor):
+        return
+
+    def write(rig: Rig, x: Float) -> Rig:
+        for s in rig.sensor:
+            rig = insert.sensor_changed(rig, s.name, highpass_hz=float(x[0]))
+        return rig
+
+    yield Effect(
+        physics="sensor_highpass",
+        site=EVERY_SENSOR,
+        unknowns=(_highpass_corner(low_hz),),
+        factor=Factor("input", rig.actuator[0].name, highpass),
+        write=write,
+    )
 
 
 def _less(sensor: SensorBase) -> Iterator[Effect]:

@@ -48,7 +48,7 @@ _ROWS = (
     Physics("sensor_delay", "a delay of the sensor"),
     Physics("sensor_lag", "a lag of the sensor"),
     Physics("sensor_gain", "a gain of the sensor"),
-    Physics("sensor_highpass", "a high-pass of the sensor"),
+    Physics("sensor_highpass", "a high-pass of the sensor, or one of every sensor"),
     Physics("gravity_cross_sensitivity", "an accelerometer that tilts"),
     Physics("noncollocated_encoder", "an encoder across other parts"),
     Physics("coulomb_friction", "dry friction"),
