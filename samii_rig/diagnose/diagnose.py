@@ -22,6 +22,7 @@ from samii_rig.diagnose.physics.channels import is_stated
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.grid import grid
 from samii_rig.diagnose.physics.poses import weighty
+from samii_rig.diagnose.physics.rows import EVERY_SENSOR
 from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_line import by_lines
@@ -115,7 +116,12 @@ def case_of(
             first, last = whole.records.band
             low, high = min(low, first or low), max(high, last)  # a band may begin at 0 Hz
         effects = table(rig, low, high, signed=signed, recorded_hz=trusted[0].rate_hz)
-    effects = [e for e in clean.competing(effects) if not is_stated(e, rig)]
+    alone = len(clean.sensors(rig)) < 2  # what all sensors have is that one's
+    effects = [
+        e
+        for e in clean.competing(effects)
+        if not is_stated(e, rig) and not (alone and e.site == EVERY_SENSOR)
+    ]
     by_line = Search(rig, seen, at, effects, progress=progress)
     return Case(clean, trusted, runs, lines, by_line, decide, show, whole=whole)
 

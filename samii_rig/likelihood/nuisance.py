@@ -32,7 +32,8 @@ HIGHEST = 0.45
 # make them as well; lines, instants and oscillations, more than they tell apart.
 WITHIN, TAPS, LINES = 7, 24, 64
 
-# Shapes of a meter's noise in one piece: of more pulses each has fewer, those that lines show most.
+# Shapes of a meter's noise in one piece: of many pulses each has fewer, one at least, those that
+# lines show most.
 METERED = 400
 
 # Power, of that of the shape which the lines show most, of one in lost samples that is looked at:
@@ -160,7 +161,8 @@ def metered(piece: Piece, k: Int, impulse: Float) -> Complex:
             size = one.stop - one.start
             if size not in moved:
                 shapes = _shown(size, n, int(k[0]), int(k[-1] - k[0]) + 1)
-                shapes = sd * shapes[:, -max(METERED // len(pulses), 1) :, None]
+                most = max(METERED // (len(pulses) * piece.inputs), 1)
+                shapes = sd * shapes[:, -most:, None]
                 moved[size] = [
                     signal.fftconvolve(impulse, shapes[:, i], axes=0)[: len(impulse)]
                     for i in range(shapes.shape[1])

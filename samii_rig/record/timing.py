@@ -72,8 +72,10 @@ def _rate(seconds: Float, count: Float) -> float:
     length, samples = float(seconds[-1] - seconds[0]), count - count[0]
     mean = float(samples[-1]) / length
     away = float(np.max(np.abs(seconds - seconds[0] - samples / mean)))
-    if away * mean > _JITTER:
-        return float(f"{1.0 / float(np.median(np.diff(seconds) / np.diff(count))):.9g}")
+    if away * mean > _JITTER:  # steps so long that the last digit hardly moves them
+        apart = max(count.size // 8, 1)
+        steps = (seconds[apart:] - seconds[:-apart]) / (count[apart:] - count[:-apart])
+        return float(f"{1.0 / float(np.median(steps)):.9g}")
     off = away / length * mean
     whole = round(mean)
     return float(whole) if abs(mean - whole) <= off else float(f"{mean:.9g}")

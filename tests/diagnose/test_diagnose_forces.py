@@ -24,6 +24,7 @@ from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.fit.stated import IN_DATA
 from samii_rig.diagnose.forces import beside as beside_force
+from samii_rig.diagnose.forces.fits import ForceFits
 from samii_rig.diagnose.forces.laws import CLIPPED
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.problem import ForceProblem
@@ -37,6 +38,7 @@ from samii_rig.diagnose.verdict import by_line
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.diagnose.verdict.force_words import distorted
 from samii_rig.diagnose.verdict.judge import _is_insignificant
+from samii_rig.errors import InputError
 from samii_rig.record.importer import import_file
 from samii_rig.record.maps import load_map
 from samii_rig.rig.load import load_rig
@@ -422,3 +424,14 @@ def test_beside_a_force_all_compete_that_do_there_as_well_as_what_was_found_with
     )
     search._rivals()
     assert tried == [(shift, force), (delay, force)]
+
+
+def test_a_refit_by_differences_that_begins_where_no_rig_is_ends_in_none() -> None:
+    def response(_x: object, _at: object) -> None:
+        raise InputError("rig", "element", "pole at 1 rad/s", "a stable chain")
+
+    nothing = SimpleNamespace(goal=np.zeros(4), at=None)
+    search = SimpleNamespace(_force_problem=nothing, _ways=SimpleNamespace(clear=lambda: None))
+    bounds = {"lower": -np.ones(2), "upper": np.ones(2)}
+    model = SimpleNamespace(n_nominal=1, prior=np.ones(2), response=response, **bounds)
+    assert ForceFits.refitted_exactly(search, model, np.zeros(2)) is None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hammer_kit import RATE, RIG, TOML, diagnosed, struck
@@ -9,13 +11,20 @@ from scipy import signal
 from table_kit import Effects, table_of
 from two_masses_kit import random_command
 
+from samii_rig.diagnose.diagnose import case_of
 from samii_rig.diagnose.fit.records import Whole
+from samii_rig.diagnose.forces.laws import HARDENING
+from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.paths import TransferPaths
-from samii_rig.diagnose.forces.table import forces
+from samii_rig.diagnose.forces.place import Place
+from samii_rig.diagnose.forces.table import effect, forces
+from samii_rig.diagnose.physics.effect import Unknown
 from samii_rig.diagnose.physics.model import Model
+from samii_rig.errors import InputError
 from samii_rig.likelihood.inputs import calibrated
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
+from samii_rig.signal.estimate import estimate
 
 FEW = Effects(lambda: table_of(RIG, 1.0, 450.0, "input_not_held", "ground_spring", "added_mass"))
 
@@ -79,6 +88,28 @@ def test_one_high_pass_of_all_sensors_is_one_cause() -> None:
     assert cause.parameters["corner"].value == pytest.approx(1.0, rel=0.05)
     assert found.rig is not None
     assert [s.highpass_hz for s in found.rig.sensor] == [cause.parameters["corner"].value] * 2
+
+
+def test_what_all_sensors_have_is_one_s_where_that_alone_was_recorded() -> None:
+    run = struck(9)
+    few = run.channels[:2], run.values[:, :2], run.quality[:, :2]
+    one = replace(run, channels=few[0], values=few[1], quality=few[2])
+    both, alone = (
+        {e.site for e in case_of(estimate([r], gaps="auto"), STATED, None, None, [r]).by_line.table
+         if e.physics == "sensor_highpass"}
+        for r in (run, one)
+    )  # fmt: skip
+    assert "every sensor" in both
+    assert "every sensor" not in alone
+
+
+def test_beside_a_force_no_high_pass_of_every_sensor_is_tried() -> None:
+    """It stands before the input, and would change what drives the force."""
+    every = next(e for e in table_of(STATED, 1.0, 450.0) if e.site == "every sensor")
+    place = Place("joint", ("columns_1",), slides=True)
+    force = effect(HARDENING, place, "columns_1", "", (Unknown("k3", "N/m^3", 1.0, 9.0, (3.0,)),))
+    with pytest.raises(InputError, match="every sensor"):
+        ForceModel(STATED, (every, force))
 
 
 def test_a_force_that_a_cell_measured_has_no_valve_before_it() -> None:

@@ -78,6 +78,13 @@ def test_the_rate_is_as_exact_as_all_stamps_together(digits: int) -> None:
     assert found.rate_hz == 2048.0
 
 
+def test_a_clock_that_wanders_does_not_bring_the_last_digit_back() -> None:
+    n = np.arange(40_960.0)
+    t = (n + 0.5 * np.sin(2 * np.pi * n / n.size)) / 2048.0
+    found = timing({"t": np.round(t, 4)}, {"t": "s"}, None)
+    assert found.rate_hz == pytest.approx(2048.0, rel=2e-4)
+
+
 def test_a_clock_that_jumps_beside_a_count_does_not_move_the_rate() -> None:
     n = np.arange(4000.0)
     t = n / 2048.0 + np.where(n > 2000, 0.5, 0.0)

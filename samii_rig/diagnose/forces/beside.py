@@ -40,11 +40,11 @@ BESIDE = 6  # linear effects that are refitted beside the best force, and the ot
 class BesideForce(ForceFits):
     """A force alone, with linear effects, and with others in their place.
 
-    preslid : how often presliding was tried in the place of a friction.
+    preslid : how often presliding was tried in the place of the friction of each explanation.
     """
 
     def __post_init__(self) -> None:
-        self.preslid: Counter[str] = Counter()
+        self.preslid: Counter[frozenset[str]] = Counter()
         super().__post_init__()
 
     def _through(self, best: Explanation) -> None:
@@ -120,7 +120,7 @@ class BesideForce(ForceFits):
         if forced.force.law is FRICTION:
             other, least = uneven(forced), self.critical_value
         elif forced.force.law is HYSTERESIS:
-            other, least = presliding(forced, self.paths), 0.0
+            other, least = self._known(presliding(forced, self.paths)), 0.0
         if other is None:
             return
         at = best.effects.index(forced)
@@ -135,6 +135,12 @@ class BesideForce(ForceFits):
         if end is not None and best.fitted.chi2 - end.chi2 > least:
             self.keep(effects, end)
 
+    def _known(self, effect: Effect | None) -> Effect | None:
+        """The same effect of the table, if one is there: its bounds are those of its models."""
+        if effect is None:
+            return None
+        return next((e for e in self.table if e.key == effect.key), effect)
+
     def _presliding(self, best: Explanation) -> bool:
         """Dry friction with presliding, from where that which does not ended; whether
         it explains more."""
@@ -142,10 +148,10 @@ class BesideForce(ForceFits):
         assert forced.force is not None
         if forced.force.law not in (FRICTION, UNEVEN) or self.exhausted:
             return False
-        other = presliding(forced, self.paths)
-        if other is None or self.preslid[forced.key] >= ANEW:
+        other = self._known(presliding(forced, self.paths))
+        if other is None or self.preslid[best.key] >= ANEW:
             return False
-        self.preslid[forced.key] += 1
+        self.preslid[best.key] += 1
         if other.key not in {e.key for e in self.table}:
             self.use((*self.table, other))
         linear, old = tuple(e for e in best.effects if e is not forced), best.fitted

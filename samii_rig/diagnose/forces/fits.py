@@ -147,7 +147,7 @@ class ForceFits(RecordSearch):
 
         try:
             end = minimise(evaluated, start, model.lower, model.upper, tolerance=EXACT_ENDS)
-        except SamiiRigError:  # no rig on either side
+        except (SamiiRigError, np.linalg.LinAlgError):  # no rig at the start, or on either side
             return None
         if 2 * end.cost >= NOWHERE**2:
             return None

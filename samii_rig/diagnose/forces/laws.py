@@ -67,6 +67,17 @@ class Law:
 
 
 @njit(cache=True)
+def _presliding(x: Float, p: Float) -> Float:
+    out = np.zeros(x.size)
+    h, before = 0.0, 0.0
+    for n in range(x.size):
+        new = steps.slid(h, x[n] - before, p[0], p[1])[0]
+        out[n] = -0.5 * (h + new)
+        h, before = new, x[n]
+    return out
+
+
+@njit(cache=True)
 def _hysteresis(x: Float, p: Float) -> Float:
     out = np.zeros(x.size)
     h, before = 0.0, 0.0
@@ -112,7 +123,7 @@ UNEVEN = Law(
 # Of bearings and guides: over microns the asperities bend before they slide (Dahl 1968).
 PRESLIDING = Law(
     "presliding", "coulomb_friction", "dry friction with presliding", BETWEEN,
-    ("T_c", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=lambda y, _v, p: _hysteresis(y, p),
+    ("T_c", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=lambda y, _v, p: _presliding(y, p),
     step=steps.presliding, rough=RUBBED,
 )  # fmt: skip
 HARDENING = Law(

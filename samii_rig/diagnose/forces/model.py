@@ -12,6 +12,7 @@ from samii_rig.diagnose.forces.steps import LAW_NUMBERS
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.grid import Grid
 from samii_rig.diagnose.physics.model import Model
+from samii_rig.diagnose.physics.rows import EVERY_SENSOR
 from samii_rig.errors import InputError
 from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
@@ -42,6 +43,9 @@ class ForceModel(Model):
         forced = [(i, e) for i, e in enumerate(effects) if e.force is not None]
         if len(forced) != 1:
             raise InputError(rig.name, "effects", len(forced), "one force at a time")
+        if any(e.site == EVERY_SENSOR for e in effects):
+            # As one before the input it would change what drives the force, too.
+            raise InputError(rig.name, "effects", EVERY_SENSOR, "no force beside it")
         which, effect = forced[0]
         assert effect.force is not None
         self.force: Force = effect.force

@@ -164,8 +164,8 @@ def uneven(even: Effect) -> Effect:
 
 
 def presliding(even: Effect, paths: TransferPaths) -> Effect | None:
-    """Dry friction with presliding in the place of one that does not; None where it has
-    no place to give."""
+    """Dry friction with presliding in the place of one without, or of what sticks and slips by
+    another law; None where it has no place to give."""
     assert even.force is not None
     place = even.force.place
     ports = paths.ports(place, of_speed=False)

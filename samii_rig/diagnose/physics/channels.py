@@ -12,7 +12,7 @@ import numpy as np
 from samii_rig.diagnose.physics import insert
 from samii_rig.diagnose.physics.effect import Effect, Factor, Key, Unknown, Values
 from samii_rig.diagnose.physics.reduced import FASTER, faster_than, slower_than
-from samii_rig.diagnose.physics.rows import PHYSICS
+from samii_rig.diagnose.physics.rows import EVERY_SENSOR, PHYSICS
 from samii_rig.diagnose.physics.scales import SMALLEST
 from samii_rig.diagnose.physics.unheld import measured
 from samii_rig.rig.schema import (
@@ -35,7 +35,6 @@ INVISIBLE = 1e-6
 # Part of what it makes of a command's edges by which a meter is not as `not_held`: one of a plant
 # of ours was by 0.8 % of a sample late.
 METERED = 0.01
-EVERY_SENSOR = "every sensor"  # the site of what all have
 NOT_PHYSICS = tuple(row.name for row in PHYSICS.values() if not row.physical)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+EVERY_SENSOR = "every sensor"  # the site of what all have alike
+
 
 @dataclass(frozen=True, slots=True)
 class Physics:

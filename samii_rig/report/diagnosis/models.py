@@ -21,6 +21,7 @@ from samii_rig.diagnose.physics.along import POSITION
 from samii_rig.diagnose.physics.grid import grid
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.physics.points import POINTS
+from samii_rig.diagnose.physics.rows import EVERY_SENSOR
 from samii_rig.diagnose.result import Cause
 from samii_rig.model.sampled import sampled_response
 from samii_rig.report.compare import ModelCurve
@@ -149,7 +150,7 @@ def _jump(cause: Cause, rig: Rig, r: FrequencyResponse, f: Float) -> Lines | Non
 def _factor(cause: Cause, rig: Rig, r: FrequencyResponse, f: Float) -> Lines | None:
     """The same for a factor on one sensor, or on the input."""
     y = _entries(rig, r, f)
-    every = not cause.physics.startswith("sensor")
+    every = not cause.physics.startswith("sensor") or cause.site == EVERY_SENSOR
     outputs = [c.name for c in r.outputs for _ in r.inputs]
     shown = [
         k
