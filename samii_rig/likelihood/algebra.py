@@ -9,7 +9,7 @@ from samii_rig.types import Complex, Float
 SAME = 1e-9  # of the largest, power in a direction that columns do not have
 
 
-UNSEEN = 1e-6  # of the noise's, power of what is known to be so small: a thousandth of it
+NEGLIGIBLE = 1e-6  # of the noise's, power of what is known to be so small: a thousandth of it
 
 
 def by_sensor(dh: Complex) -> Float:
@@ -63,7 +63,7 @@ def shrinking(X: Float, prior: Float) -> Float:
     X = X / np.sqrt(prior[prior > 0])
     X -= gone @ (gone.T @ X)
     power, turn = np.linalg.eigh(X.T @ X)
-    kept = power > UNSEEN
+    kept = power > NEGLIGIBLE
     power = power[kept]
     shrunk = X @ (turn[:, kept] * np.sqrt((1 - 1 / np.sqrt(1 + power)) / power))
     return np.concatenate([gone, shrunk], axis=1)

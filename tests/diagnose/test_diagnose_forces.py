@@ -430,7 +430,7 @@ def test_a_refit_by_differences_that_begins_where_no_rig_is_ends_in_none() -> No
     def response(_x: object, _at: object) -> None:
         raise InputError("rig", "element", "pole at 1 rad/s", "a stable chain")
 
-    nothing = SimpleNamespace(goal=np.zeros(4), at=None)
+    nothing = SimpleNamespace(goal=np.zeros(4), at=None, residual=np.real)
     search = SimpleNamespace(_force_problem=nothing, _ways=SimpleNamespace(clear=lambda: None))
     bounds = {"lower": -np.ones(2), "upper": np.ones(2)}
     model = SimpleNamespace(n_nominal=1, prior=np.ones(2), response=response, **bounds)

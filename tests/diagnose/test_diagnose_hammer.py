@@ -95,7 +95,7 @@ def test_what_all_sensors_have_is_one_s_where_that_alone_was_recorded() -> None:
     few = run.channels[:2], run.values[:, :2], run.quality[:, :2]
     one = replace(run, channels=few[0], values=few[1], quality=few[2])
     both, alone = (
-        {e.site for e in case_of(estimate([r], gaps="auto"), STATED, None, None, [r]).by_line.table
+        {e.site for e in case_of(estimate([r], gaps="auto"), STATED, None, None, [r]).search.table
          if e.physics == "sensor_highpass"}
         for r in (run, one)
     )  # fmt: skip
