@@ -120,26 +120,26 @@ class BesideForce(ForceFits):
         if forced.force.law is FRICTION:
             other, least = uneven(forced), self.critical_value
         elif forced.force.law is HYSTERESIS:
-            other, least = self._known(presliding(forced, self.paths)), 0.0
+            other, least = presliding(forced, self.paths), 0.0
         if other is None:
             return
+        other = self._of_table(other)
         at = best.effects.index(forced)
         effects = (*best.effects[:at], *best.effects[at + 1 :], other)
         own = best.fitted.model.own(at)
         start = np.append(
             np.delete(best.fitted.x, list(own)), np.resize(best.fitted.x[list(own)], 2)
         )
-        if other.key not in {e.key for e in self.table}:
-            self.use((*self.table, other))
         end = self.refitted_from(effects, start)
         if end is not None and best.fitted.chi2 - end.chi2 > least:
             self.keep(effects, end)
 
-    def _known(self, effect: Effect | None) -> Effect | None:
-        """The same effect of the table, if one is there: its bounds are those of its models."""
-        if effect is None:
-            return None
-        return next((e for e in self.table if e.key == effect.key), effect)
+    def _of_table(self, effect: Effect) -> Effect:
+        """The same effect of the table, whose bounds are those of its models; put there if none
+        is."""
+        if effect.key not in {e.key for e in self.table}:
+            self.use((*self.table, effect))
+        return next(e for e in self.table if e.key == effect.key)
 
     def _presliding(self, best: Explanation) -> bool:
         """Dry friction with presliding, from where that which does not ended; whether
@@ -148,12 +148,11 @@ class BesideForce(ForceFits):
         assert forced.force is not None
         if forced.force.law not in (FRICTION, UNEVEN) or self.exhausted:
             return False
-        other = self._known(presliding(forced, self.paths))
+        other = presliding(forced, self.paths)
         if other is None or self.preslid[best.key] >= ANEW:
             return False
         self.preslid[best.key] += 1
-        if other.key not in {e.key for e in self.table}:
-            self.use((*self.table, other))
+        other = self._of_table(other)
         linear, old = tuple(e for e in best.effects if e is not forced), best.fitted
         own = list(old.model.own(best.effects.index(forced)))
         T_c, known = float(old.x[own[0]]), np.delete(old.x, own)

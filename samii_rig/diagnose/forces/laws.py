@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from samii_rig.diagnose.forces import steps
 from samii_rig.diagnose.forces.place import Kind, Place
@@ -66,26 +65,9 @@ class Law:
         return own
 
 
-@njit(cache=True)
-def _presliding(x: Float, p: Float) -> Float:
-    out = np.zeros(x.size)
-    h, before = 0.0, 0.0
-    for n in range(x.size):
-        new = steps.slid(h, x[n] - before, p[0], p[1])[0]
-        out[n] = -0.5 * (h + new)
-        h, before = new, x[n]
-    return out
-
-
-@njit(cache=True)
-def _hysteresis(x: Float, p: Float) -> Float:
-    out = np.zeros(x.size)
-    h, before = 0.0, 0.0
-    for n in range(x.size):
-        new = steps.advanced(h, x[n] - before, p[0], p[1])[0]
-        out[n] = -0.5 * (h + new)
-        h, before = new, x[n]
-    return out
+def _remembered(step: Step) -> Callable[[Float, Float, Float], Float]:
+    """The weak force of a law that has a memory."""
+    return lambda y, _v, p: steps.remembered(step, np.ascontiguousarray(y, np.float64), p)
 
 
 def _clip_slopes(y: Float, half: Float) -> tuple[Float, Float]:
@@ -123,7 +105,7 @@ UNEVEN = Law(
 # Of bearings and guides: over microns the asperities bend before they slide (Dahl 1968).
 PRESLIDING = Law(
     "presliding", "coulomb_friction", "dry friction with presliding", BETWEEN,
-    ("T_c", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=lambda y, _v, p: _presliding(y, p),
+    ("T_c", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=_remembered(steps.presliding),
     step=steps.presliding, rough=RUBBED,
 )  # fmt: skip
 HARDENING = Law(
@@ -150,7 +132,7 @@ SLACK = Law(
 )  # fmt: skip
 HYSTERESIS = Law(
     "hysteresis", "hysteresis", "a part that sticks, then slips (Bouc-Wen)", BETWEEN,
-    ("T_y", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=lambda y, _v, p: _hysteresis(y, p),
+    ("T_y", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=_remembered(steps.hysteresis),
     step=steps.hysteresis,
 )  # fmt: skip
 ORIFICE = Law(

@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, types
 
-from samii_rig.diagnose.forces.steps import LAW_NUMBERS, OUT, SIGNATURE, Step
+from samii_rig.diagnose.forces.steps import LAW, LAW_NUMBERS, OUT, Step
 from samii_rig.types import Float, Int
 
-_law = types.FunctionType(SIGNATURE)
 _f8, _i8 = types.float64, types.int64
 _row, _rows, _cube = (types.Array(_f8, n, "C") for n in (1, 2, 3))
 _FAST = {"reassoc", "contract", "nsz"}
@@ -32,7 +31,7 @@ def _stepped(wr: Float, wi: Float, tr: Float, ti: Float, er: Float, ei: Float, e
     return total
 
 
-@njit(_rows(_law, _rows, _rows, _rows, _f8, _f8, _row, _row, _i8, _i8, _row, _rows), cache=True,
+@njit(_rows(LAW, _rows, _rows, _rows, _f8, _f8, _row, _row, _i8, _i8, _row, _rows), cache=True,
       fastmath=_FAST)  # fmt: skip
 def march(
     law: Step,

@@ -25,9 +25,11 @@ SAFE = 40  # the same of one that bends: halving alone would bring the root to 1
 ROOT_FOUND = 1e-8  # of the root: Newton's next step would be of the square of it, a rounding error
 _f8, _row = types.float64, types.Array(types.float64, 1, "C")
 SIGNATURE = types.void(_f8, _f8, _f8, _f8, _row, _f8, _row)
+LAW = types.FunctionType(SIGNATURE)
 
 Step = Callable[[float, float, float, float, Float, float, Float], None]
 """(before, free, u, g, p, memory, out); u is the command."""
+After = Callable[[float, float, float, float], tuple[float, float, float, float, float]]
 
 
 @njit(SIGNATURE, cache=True)
@@ -153,19 +155,28 @@ def advanced(h: float, dx: float, top: float, k: float) -> tuple[float, float, f
     return sign * (top - rest), k * rest / top, E, sign * by_top, sign * rest * way / top
 
 
-@njit(cache=True)
-def _within(way: float, g: float, top: float, memory: float) -> tuple[float, float]:
-    """The motion of a step lies between these, as its force does between -top and top."""
-    high = max(top, abs(memory))
-    return way - 0.5 * g * (memory + high), way - 0.5 * g * (memory - high)
-
-
-@njit(cache=True)
-def _sticking(
-    after: tuple[float, float, float, float, float], g: float, memory: float, out: Float
-) -> None:
-    """Fill `out` for a force that is its memory. after : as of `advanced`."""
-    h, slope, by_h, by_top, by_k = after
+@njit(inline="always")
+def _sticking(after: After, way: float, g: float, p: Float, memory: float, out: Float) -> None:
+    """Fill `out` for a force between -p0 and p0 that is its memory. after : (memory, motion, p0,
+    p1) -> memory after it, and its slopes by motion, memory, p0 and p1. way : motion of the step
+    without the force over it."""
+    # The motion lies between these, as the force does between -top and top.
+    top = max(p[0], abs(memory))
+    low, high = way - 0.5 * g * (memory + top), way - 0.5 * g * (memory - top)
+    dx = min(max(way - g * memory, low), high)
+    off = high - low
+    for _ in range(SAFE):
+        h, slope, _, _, _ = after(memory, dx, p[0], p[1])
+        over = dx - way + 0.5 * g * (memory + h)
+        low, high = (low, dx) if over > 0.0 else (dx, high)
+        new = dx - over / (1.0 + 0.5 * g * slope)
+        # Halved where Newton leads out, or to and fro across the bend.
+        newton = low <= new <= high and 2.0 * abs(new - dx) <= abs(off)
+        off = (new if newton else 0.5 * (low + high)) - dx
+        dx += off
+        if abs(off) <= ROOT_FOUND * abs(dx):
+            break
+    h, slope, by_h, by_top, by_k = after(memory, dx, p[0], p[1])
     held = 1.0 + 0.5 * g * slope
     out[0], out[3] = -0.5 * (memory + h), h
     out[5], out[6] = -slope / held, slope / held
@@ -180,21 +191,7 @@ def hysteresis(
     before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
 ) -> None:
     """Bouc-Wen of height p0 and of stiffness p1 before it slips; the mean force of the step."""
-    low, high = _within(free - before, g, p[0], memory)
-    dx = min(max(free - before - g * memory, low), high)
-    off = high - low
-    for _ in range(SAFE):
-        h, slope, _, _, _ = advanced(memory, dx, p[0], p[1])
-        over = dx - (free - before) + 0.5 * g * (memory + h)
-        low, high = (low, dx) if over > 0.0 else (dx, high)
-        new = dx - over / (1.0 + 0.5 * g * slope)
-        # Halved where Newton leads out, or to and fro across the bend.
-        newton = low <= new <= high and 2.0 * abs(new - dx) <= abs(off)
-        off = (new if newton else 0.5 * (low + high)) - dx
-        dx += off
-        if abs(off) <= ROOT_FOUND * abs(dx):
-            break
-    _sticking(advanced(memory, dx, p[0], p[1]), g, memory, out)
+    _sticking(advanced, free - before, g, p, memory, out)
 
 
 @njit(cache=True)
@@ -215,18 +212,15 @@ def presliding(
     before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
 ) -> None:
     """Dahl's friction of height p0 and of stiffness p1 at rest; the mean force of the step."""
-    low, high = _within(free - before, g, p[0], memory)
-    dx = min(max(free - before - g * memory, low), high)
-    off = high - low
-    for _ in range(SAFE):
-        h, slope, _, _, _ = slid(memory, dx, p[0], p[1])
-        over = dx - (free - before) + 0.5 * g * (memory + h)
-        low, high = (low, dx) if over > 0.0 else (dx, high)
-        new = dx - over / (1.0 + 0.5 * g * slope)
-        # Halved where Newton leads out, or to and fro across the bend.
-        newton = low <= new <= high and 2.0 * abs(new - dx) <= abs(off)
-        off = (new if newton else 0.5 * (low + high)) - dx
-        dx += off
-        if abs(off) <= ROOT_FOUND * abs(dx):
-            break
-    _sticking(slid(memory, dx, p[0], p[1]), g, memory, out)
+    _sticking(slid, free - before, g, p, memory, out)
+
+
+@njit(_row(LAW, _row, _row), cache=True)
+def remembered(law: Step, x: Float, p: Float) -> Float:
+    """(n,) the force of a law that has a memory under a motion x (n,) that it does not change."""
+    f, out = np.zeros(x.size), np.zeros(OUT)
+    before, memory = 0.0, 0.0
+    for n in range(x.size):
+        law(before, x[n], 0.0, 0.0, p, memory, out)
+        f[n], memory, before = out[0], out[3], x[n]
+    return f

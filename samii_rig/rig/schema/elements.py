@@ -514,18 +514,8 @@ def input_unit(kind: str, unit: str) -> str:
     """Unit of K of a source of this kind with an input in `unit`."""
     # A `/` is for the next factor alone: of an input in N m the bracket makes it one of both.
     whole = f"({unit})" if set(unit) & set(" /*") else unit
-    match kind:
-        case "torque_source":
-            return f"N m/{whole}"
-        case "force_source":
-            return f"N/{whole}"
-        case "displacement_source":
-            return f"m/{whole}"
-        case "velocity_source":
-            return f"m/(s {unit})"
-        case "acceleration_source":
-            return f"m/(s^2 {unit})"
-    return f"rad/(s {unit})"
+    way, a, time = output_unit(kind).partition("/")
+    return f"{way}/({time} {unit})" if a else f"{way}/{whole}"
 
 
 def flattened(elements: tuple[Any, ...]) -> Iterator[Any]:
