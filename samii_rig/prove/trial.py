@@ -24,6 +24,7 @@ WHOLE = "whole records"  # a truth's `size_is` where its size is of these
 # What plants call a part that has a row in the table under another name.
 IN_TABLE = {
     "fractional_damper": "fractional_damping",
+    "one_sided_stiffness": "end_stop",
     "quadratic_damper": "quadratic_damping",
     "parametric_stiffness": "stiffness_variation",
     "run_to_run_stiffness": "stiffness_variation",

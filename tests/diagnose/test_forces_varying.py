@@ -134,7 +134,7 @@ def test_a_joint_that_differs_from_run_to_run_is_named(
     assert variation(*question) is None
 
 
-def test_a_spring_that_is_stiffer_to_one_side_is_none_that_swings(
+def test_a_spring_that_is_stiffer_to_one_side_has_a_stop_that_it_touches_at_rest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It swings as the motion does, which of a multisine is a few lines: it was told as that."""
@@ -147,10 +147,13 @@ def test_a_spring_that_is_stiffer_to_one_side_is_none_that_swings(
     (truth,) = json.loads((tmp_path / "truth" / "outside_4.json").read_text())["effects"]
     runs = [read_recording(path) for path in sorted(folder.glob("*.mcap"))]
     found = diagnose(estimate(runs), rig, runs=runs)
-    assert found.verdict == "unknown"
-    assert not found.causes
-    words = f"the spring of {truth['site']} is not the same to both sides"
-    assert any(words in said for said in found.not_physics)
+    assert found.verdict == "named"
+    (cause,) = found.causes
+    assert (cause.physics, cause.site) == ("end_stop", truth["site"])
+    k, dk = cause.parameters["k"], truth["parameters"]["dk"]["value"]
+    assert k.low < dk < k.high
+    x_1 = [c.name for c in runs[0].channels].index("x_1")
+    assert cause.parameters["gap"].value < 0.02 * float(np.ptp(runs[0].values[:, x_1]))
 
 
 def search_in(folder: Path, band: tuple[float, float] | None) -> ForceSearch:

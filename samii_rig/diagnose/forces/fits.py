@@ -47,7 +47,12 @@ RIVALS = 4  # linear explanations that forces are held against
 
 
 class ForceFits(RecordSearch):
-    """Explanations with and without a force, on the complete likelihood, every level by itself."""
+    """Explanations with and without a force, on the complete likelihood, every level by itself.
+
+    own : (q,) the noise that is taken for that of the records, as of `Complete.about`.
+    """
+
+    own: Float | None = None
 
     def __init__(self, linear: RecordSearch, known: Sequence[Explanation] = ()) -> None:
         assert isinstance(linear.whole, Whole)  # of one state
@@ -83,7 +88,8 @@ class ForceFits(RecordSearch):
 
     def _about(self, fitted: Fitted) -> None:
         self._ways.clear()
-        self.problem = ForceProblem.near(self.levels, fitted, self.by_line.problem, self._ways)
+        by_line = self.by_line.problem
+        self.problem = ForceProblem.near(self.levels, fitted, by_line, self._ways, self.own)
         between = self.levels.between(self.reduced, fitted)
         self._between = between, fitted.model.response(fitted.x, between)
 

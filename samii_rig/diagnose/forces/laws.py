@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -86,6 +87,11 @@ def _excess(v: Float, p: Float) -> tuple[Float, Float]:
     return kept - v, np.stack([by, np.zeros_like(by)], axis=1)
 
 
+def _past(y: Float, p: Float, low: float, high: float) -> Float:
+    """The force of stops at p0 times `low` and `high`."""
+    return np.asarray(-p[1] * (y - np.clip(y, low * p[0], high * p[0])))
+
+
 def _starved(M: Float, v: Float, p: Float) -> Float:
     return np.asarray(v * (np.sqrt(np.maximum(1 + np.sign(v) * M / p[0], 0.0)) - 1))
 
@@ -135,6 +141,19 @@ HYSTERESIS = Law(
     ("T_y", "k"), ((1.0, 0.0), (0.0, 1.0)), weak=_remembered(steps.hysteresis),
     step=steps.hysteresis,
 )  # fmt: skip
+# What something runs against: a bumper, a neighbour, the end of a slot.
+STOPS = Law(
+    "stops", "end_stop", "a stop beyond a gap", BETWEEN, ("gap", "k"), ((1.0, 0.0), (0.0, 1.0)),
+    weak=lambda y, _v, p: _past(y, p, -1.0, 1.0), step=steps.stops, rough=TREMBLED,
+)  # fmt: skip
+STOP_ABOVE = replace(
+    STOPS, tag="stop above", words="a stop above a gap", step=steps.stop_above,
+    weak=lambda y, _v, p: _past(y, p, -math.inf, 1.0),
+)  # fmt: skip
+STOP_BELOW = replace(
+    STOPS, tag="stop below", words="a stop below a gap", step=steps.stop_below,
+    weak=lambda y, _v, p: _past(y, p, -1.0, math.inf),
+)  # fmt: skip
 ORIFICE = Law(
     "orifice", "flow_saturation", "flow with limited supply", ("flow",), ("T_s",), ONE,
     weak=_starved, step=steps.orifice,
@@ -148,8 +167,8 @@ CLIPPED = Law(
     of_command=_excess,
 )  # fmt: skip
 LAWS = (
-    FRICTION, UNEVEN, PRESLIDING, HARDENING, SOFTENING, QUADRATIC, PLAY, SLACK, HYSTERESIS, ORIFICE,
-    OVERLAP, CLIPPED,
+    FRICTION, UNEVEN, PRESLIDING, HARDENING, SOFTENING, QUADRATIC, PLAY, SLACK, HYSTERESIS, STOPS,
+    STOP_ABOVE, STOP_BELOW, ORIFICE, OVERLAP, CLIPPED,
 )  # fmt: skip
 
 

@@ -7,14 +7,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from samii_rig.diagnose.fit.rigfile import valued
 from samii_rig.diagnose.forces.laws import Force
+from samii_rig.diagnose.forces.place import Place
 from samii_rig.diagnose.forces.steps import LAW_NUMBERS
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.grid import Grid
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.physics.rows import EVERY_SENSOR
 from samii_rig.errors import InputError
-from samii_rig.model.tmm import Chain
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float
 
@@ -49,14 +50,9 @@ class ForceModel(Model):
         which, effect = forced[0]
         assert effect.force is not None
         self.force: Force = effect.force
-        self.chain = self.chain_of(self.force.place.augmented(self.built))
         self.unknowns = tuple(self.own(which))
         own = (self.keys.index(key) for key in self.force.keys if key in self.keys)
         self.moving = (*self.unknowns, *own)
-
-    def plain(self, x: Float) -> Chain:
-        """As of `Model`, without the force's input and sensor."""
-        return self.chain_of(self.built).with_values(self.values(x)).plain
 
     def strengths(self, x: Float) -> Float:
         """The force's unknowns."""
@@ -112,6 +108,13 @@ class ForceModel(Model):
         more = np.zeros((*added.shape[:2], self.n), complex)
         more[:, :, list(self.moving)] = added[:, :, 1:]
         return np.concatenate([h, added[:, :, 0]]), np.concatenate([dh, more])
+
+
+def augmented(model: Model, x: Float, place: Place) -> Rig:
+    """The rig of a model at x with what a force at a place needs more."""
+    values = model.values(x)
+    element = tuple(valued(e, values, {}) for e in model.built.element)
+    return place.augmented(model.built.model_copy(update={"element": element}))
 
 
 def _wide(lines: Complex, width: int) -> Complex:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import fft
 
 from samii_rig.diagnose.fit.records import Whole
+from samii_rig.diagnose.forces.model import augmented
 from samii_rig.diagnose.forces.place import Place
 from samii_rig.diagnose.forces.problem import as_driven, mean_command
 from samii_rig.diagnose.physics.effect import Key
@@ -30,6 +31,7 @@ OVER = 4.0  # rate over the highest line: third harmonics fold beside the band, 
 RESTS = 0.05
 # Of the contour: 0.7 % wraps around, what is cut above the rate grows 12 times.
 CONTOUR_DAMPING = 5.0
+ALIKE = 1e-6  # relative, by which what is the same differs by rounding
 
 
 @dataclass(frozen=True)
@@ -231,11 +233,24 @@ class TransferPaths:
                 self._ports[key] = None
         return self._ports[key]
 
+    def alike(self, a: Place, b: Place) -> bool:
+        """Whether a force at either place does the same, with no law of the speed."""
+        one, other = self.ports(a, of_speed=False), self.ports(b, of_speed=False)
+        if one is None or other is None or one.y1.shape != other.y1.shape:
+            return False
+        pairs = ((one.y1, other.y1), (one.sensors[0], other.sensors[0]))
+        return all(bool(np.allclose(x, y, rtol=ALIKE, atol=0)) for x, y in pairs)
+
     def _made(self, place: Place, *, of_speed: bool) -> Ports | None:
         rig, records = self.model.built, self.whole.records
         of_command = place.kind == "command"
-        chain = self.model.chain_of(rig if of_command else place.augmented(rig))
-        chain = chain.with_values(self.model.values(self.x))
+        if of_command:
+            chain = self.model.chain.with_values(self.model.values(self.x))
+        else:
+            values = self.model.values(self.x)
+            own = [k for e in self.model.effects if e.fractional for k in e.fractional.keys]
+            chain = self.model.chain_of(augmented(self.model, self.x, place))
+            chain = chain.with_values({k: values[k] for k in own})
         n, on, acting, loop = len(rig.sensor), self.whole.sensor, self.whole.acting, self.whole.loop
         at = place.acts_on(rig)
 

@@ -2,29 +2,42 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 from samii_rig.diagnose.physics import insert
+from samii_rig.diagnose.physics.along import BODIES, cut, sensors_on, stretches
+from samii_rig.errors import InputError
 from samii_rig.rig.schema import (
+    BEAMS,
     SOURCES,
     AbsoluteAngle,
     ActuatorSpec,
+    Branch,
     Displacement,
     Element,
     Force,
     ForceSource,
+    GravityStiffness,
+    LumpedMass,
     Moment,
     Parameter,
     RelativeAngle,
     Rig,
     Sensor,
     TorqueSource,
+    TorsionalGroundSpring,
+    TranslationalGroundSpring,
 )
 
 EXTRA = f"{insert.PREFIX}force"  # the input and the sensor that the chain has more
 
 Kind = Literal["joint", "ground", "drive", "command", "flow"]
+GROUNDED = (TorsionalGroundSpring, TranslationalGroundSpring)
+# Elements with no extent and nothing that gives: what is behind moves as what is before.
+AT_A_POINT = (LumpedMass, Branch, GravityStiffness, TorqueSource, ForceSource, *GROUNDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +46,7 @@ class Place:
 
     kind : `joint`, a torque between both sides of `across`, driven by the angle over it, or, where
         it `slides`, a force driven by the way over it; `ground`, one between what is behind
-        `across` and the ground;
+        `across`, or at `position` m from the upstream end of a beam, and the ground;
         `drive`, on the input of the source, driven by the source's own angle; `command`, on
         the input, driven by the input; `flow`, on the input, driven by it and by the torque
         behind the source.
@@ -43,6 +56,7 @@ class Place:
     kind: Kind
     across: tuple[str, ...]
     slides: bool = False
+    position: float | None = None
 
     @property
     def own_input(self) -> bool:
@@ -69,7 +83,9 @@ class Place:
     @property
     def name(self) -> str:
         """Different for different places."""
-        return " ".join((self.kind, *self.across))
+        way = ("along",) if self.kind == "ground" and self.slides else ()
+        at = () if self.position is None else (f"{self.position:g}",)
+        return " ".join((self.kind, *way, *self.across, *at))
 
     def augmented(self, rig: Rig, name: str = EXTRA) -> Rig:
         """The rig with the force's input behind its own and its sensor behind its own; `name` of
@@ -80,11 +96,15 @@ class Place:
         sensor: Sensor
         match self.kind:
             case "joint" | "ground":
-                rig = insert.inserted(rig, last, self._source(1.0, name, "behind"))
+                source = self._source(1.0, name, "behind")
+                if self.position is not None:
+                    rig, last = _into(rig, last, self.position, source), source.name
+                else:
+                    rig = insert.inserted(rig, last, source)
                 if self.kind == "joint":
                     rig = insert.inserted(rig, before, self._source(-1.0, name, "before"))
                     rig = _read_behind(rig, last, f"{name}_behind")
-                sensor = self._moved(name, before)
+                sensor = self._moved(name, before, last)
             case "flow":
                 sensor = Moment(kind="moment", name=name, after=last, unit="N m")
             case _:
@@ -97,9 +117,8 @@ class Place:
             update["actuator"] = (*rig.actuator, spec)
         return rig.model_copy(update=update)
 
-    def _moved(self, name: str, before: str | None) -> Sensor:
-        """What drives a force between two parts, or between one and the ground."""
-        last = self.across[-1]
+    def _moved(self, name: str, before: str | None, last: str) -> Sensor:
+        """What drives a force between two parts, or between what is behind `last` and ground."""
         if self.slides:
             against = before if self.kind == "joint" else None
             return Displacement(
@@ -115,6 +134,66 @@ class Place:
         if self.slides:
             return ForceSource(kind="force_source", name=own, input=name, K=gain)
         return TorqueSource(kind="torque_source", name=own, input=name, K=gain)
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """A part of a rig that moves, and may rub or run against the ground.
+
+    site : its name. others : names of what else is there. after : the element that it is behind;
+    or the beam that it is on, `position` m from the upstream end.
+    """
+
+    site: str
+    others: tuple[str, ...]
+    after: str
+    position: float | None = None
+
+    def to_ground(self, *, slides: bool) -> Place:
+        """The place between it and the ground."""
+        return Place("ground", (self.after,), slides, self.position)
+
+
+def parts(rig: Rig) -> Iterator[Part]:
+    """The bodies of a rig, ends of beams and links among them, that no spring to the ground is at
+    already; and where a sensor stands on a beam."""
+    at: list[Element] = []  # what one point has
+    for element in rig.element:
+        if not isinstance(element, AT_A_POINT):
+            yield from _at_point(at)
+            at = []
+        at.append(element)
+        if isinstance(element, BEAMS):
+            yield from _with_sensor(rig, element)
+    yield from _at_point(at)
+
+
+def _at_point(at: list[Element]) -> Iterator[Part]:
+    if any(isinstance(e, GROUNDED) for e in at):
+        return
+    some = [e.name for e in at if isinstance(e, (LumpedMass, *BODIES))]
+    if some:
+        yield Part(some[-1], tuple(some[:-1]), at[-1].name)
+
+
+def _with_sensor(rig: Rig, beam: Element) -> Iterator[Part]:
+    inner = [along.start for along in stretches(rig, beam)][1:]
+    for x in sorted({s.position for s in sensors_on(rig, beam.name)}):
+        if x in inner:
+            yield Part(beam.name, (), beam.name, x)
+
+
+def _into(rig: Rig, beam: str, position: float, part: Element) -> Rig:
+    """The rig with a part in a beam, at `position` m from its upstream end.
+
+    Raises InputError where another part stands along it already.
+    """
+    element = next(e for e in rig.element if e.name == beam)
+    at = (a for a in stretches(rig, element) if a.start <= position <= a.end)
+    if (along := next(at, None)) is None:
+        raise InputError(rig.name, "position", position, f"one along {beam}, in one piece")
+    share = (position - along.start) / (along.end - along.start)
+    return cut(rig, along, part, math.exp(share))
 
 
 def _read_behind(rig: Rig, last: str, name: str) -> Rig:

@@ -182,11 +182,18 @@ class ForceProblem(RecordProblem):
     goal: Float = field(kw_only=True)
 
     @classmethod
-    def near(cls, whole: Whole, fitted: Fitted, by_line: Problem, ways: Ways) -> ForceProblem:
-        """About a fit, with a force or without."""
+    def near(
+        cls,
+        whole: Whole,
+        fitted: Fitted,
+        by_line: Problem,
+        ways: Ways,
+        own: Float | None = None,
+    ) -> ForceProblem:
+        """About a fit, with a force or without. own : as of `Complete.about`."""
         moved = Moved(whole, ways)
         about = moved.without(fitted) if isinstance(fitted.model, ForceModel) else whole
-        complete = about.complete(fitted)
+        complete = about.complete(fitted, own)
         records, exact = whole.records, whole.records.exact()
         S = whole.response(fitted)(exact.s)
         order, k = complete.rows.order, [records.lines(p).k for p in records.pieces]
@@ -199,8 +206,8 @@ class ForceProblem(RecordProblem):
             return np.asarray(np.concatenate(each)[order])
 
         nodes = whole.grid(complete.reduced.frequency, complete.reduced.sigma, fitted)
-        own: dict[str, Any] = {f.name: getattr(nodes, f.name) for f in fields(nodes)}
-        at = RecordGrid(**own, added=added)
+        same: dict[str, Any] = {f.name: getattr(nodes, f.name) for f in fields(nodes)}
+        at = RecordGrid(**same, added=added)
         e = complete.rows.e
         if isinstance(fitted.model, ForceModel):
             e = np.asarray(e + added(fitted.model, fitted.x, ())[:, :, 0])

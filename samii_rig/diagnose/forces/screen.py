@@ -22,6 +22,7 @@ from samii_rig.diagnose.forces.laws import (
     OVERLAP,
     PLAY,
     SLACK,
+    STOPS,
     Force,
     Law,
 )
@@ -37,6 +38,7 @@ GAPS = (3e-4, 2e-3, 1e-2, 4e-2, 0.15, 0.5)
 # Limits over the largest amplitude: one just below it cuts only a little.
 LIMITS = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999)
 SLIPS = (0.03, 0.15, 0.6)  # motion at which a part slips over the largest motion
+REACHED = (0.02, 0.15, 0.4, 0.6, 0.75, 0.87, 0.95)  # ways to a stop over the largest motion
 WEAK_START = 1e-3  # of the upper end of a supply's range
 CAP = 1.5  # power of its height, that what a limit cuts off a sine grows with
 AT_ONCE = 8  # changes of all lines that are whitened together
@@ -112,6 +114,9 @@ def trial_strengths(effect: Effect, paths: TransferPaths) -> list[Float]:
         return [np.array([high * x]) for x in LIMITS]
     if law in (OVERLAP, PLAY, SLACK):
         return [np.array([high / 2 * x]) for x in GAPS]
+    if law.physics == STOPS.physics:
+        k = effect.unknowns[1].high * WEAK_START**2  # which begins beyond what moves nothing
+        return [np.array([high * x, k]) for x in REACHED]
     if law is ORIFICE:
         return [np.array([high * WEAK_START])]
     if law is HYSTERESIS:
@@ -127,6 +132,8 @@ def scaled(law: Law, strengths: Float, times: float, largest: float) -> Float:
     if law is CLIPPED:
         cut = np.maximum(largest - strengths, 0.0)
         return np.asarray(largest - cut * times ** (1 / CAP))
+    if law.physics == STOPS.physics:
+        return np.asarray(strengths * np.array([1.0, times]))
     return np.asarray(strengths / times if law is ORIFICE else strengths * times)
 
 

@@ -122,6 +122,41 @@ def slack(
         out[8], out[10] = sign / g, 0.0
 
 
+@njit(inline="always")
+def _beyond(before: float, free: float, g: float, p: Float, side: float, out: Float) -> None:
+    """-p1 (x - side p0) of a stop on one side, where x is beyond it."""
+    over = 0.5 * (before + free) - side * p[0]
+    if side * over > 0.0:
+        held = 1.0 + 0.5 * g * p[1]
+        out[0] = -p[1] * over / held
+        out[1] = out[2] = -0.5 * p[1] / held
+        out[8], out[10] = side * p[1] / held, -over / (held * held)
+
+
+@njit(SIGNATURE, cache=True)
+def stop_above(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """A stop of stiffness p1 at a way p0 from rest, above."""
+    _beyond(before, free, g, p, 1.0, out)
+
+
+@njit(SIGNATURE, cache=True)
+def stop_below(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """A stop of stiffness p1 at a way p0 from rest, below."""
+    _beyond(before, free, g, p, -1.0, out)
+
+
+@njit(SIGNATURE, cache=True)
+def stops(
+    before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float
+) -> None:
+    """Stops of stiffness p1 at a way p0 from rest, on both sides."""
+    _beyond(before, free, g, p, 1.0 if before + free > 0.0 else -1.0, out)
+
+
 @njit(SIGNATURE, cache=True)
 def orifice(
     before: float, free: float, u: float, g: float, p: Float, memory: float, out: Float

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,12 +19,15 @@ from samii_rig.diagnose.forces.laws import (
     QUADRATIC,
     SLACK,
     SOFTENING,
+    STOP_ABOVE,
+    STOP_BELOW,
+    STOPS,
     UNEVEN,
     Force,
     Law,
 )
 from samii_rig.diagnose.forces.paths import TransferPaths
-from samii_rig.diagnose.forces.place import Place
+from samii_rig.diagnose.forces.place import Place, parts
 from samii_rig.diagnose.physics.effect import Effect, Unknown
 from samii_rig.diagnose.physics.scales import spread
 from samii_rig.rig.schema import (
@@ -49,6 +53,8 @@ PRESLID = (
     1e-3,
     1e-2,
 )  # way before dry friction slides over the largest motion, to begin with
+NEAREST = 1e-3  # of the largest motion, a way to a stop: nearer, it is a spring
+HARDEST = 1e3  # stiffness of a stop over the one that halves the motion there: it moves no further
 WIDTHS = (1e-6, 2.0)  # of a gap or limit over the largest amplitude that meets it
 BEYOND = 3.0  # standard deviations of a meter's noise, which is beyond in 0.3 % of the samples
 LEAST_LIMIT = 0.02  # of the largest command
@@ -74,6 +80,7 @@ def forces(rig: Rig, paths: TransferPaths) -> Iterator[Effect]:
             ]
             for across in ((e.name,), *near):
                 yield from _between(paths, Place("joint", across), e)
+    yield from _to_ground(rig, paths)
     for index in paths.whole.acting:
         actuator = rig.actuator[index]
         source = next(
@@ -93,16 +100,14 @@ def _between(paths: TransferPaths, place: Place, spring: Spring) -> Iterator[Eff
     a part and the ground."""
     name, (of_force, of_way) = spring.name, place.units
     other = next((n for n in place.across if n != name), "")
-    speed, ports = _largest(paths, place, of_speed=True), paths.ports(place, of_speed=True)
-    if speed <= 0 or ports is None:
-        return
-    force = np.pi / 4 * speed / float(np.median(ports.y1))
-    T_c = _log("T_c", of_force, STRENGTH_RANGE[0] * force, STRENGTH_RANGE[1] * force)
-    yield effect(FRICTION, place, name, other, (T_c,))
+    rubbing = list(_rubbing(paths, place, name, other))
+    yield from (*rubbing, *_stops(paths, place, name, other))
     moved = paths.ports(place, of_speed=False)
-    if other or moved is None:
+    if other or moved is None or not rubbing:
         return
     # The sine in c2 |speed| speed is two thirds of that in friction of T_c = c2 speed^2.
+    speed = _largest(paths, place, of_speed=True)
+    force = rubbing[0].unknowns[0].high / STRENGTH_RANGE[1]
     c2 = 3 / 2 * force / speed**2
     unknown = _log(
         "c2", f"{of_force} s^2/{of_way}^2", STRENGTH_RANGE[0] * c2, STRENGTH_RANGE[1] * c2
@@ -124,6 +129,52 @@ def _between(paths: TransferPaths, place: Place, spring: Spring) -> Iterator[Eff
     )
     k = _log("k", f"{of_force}/{of_way}", STRENGTH_RANGE[0] * doubles, STRENGTH_RANGE[1] * doubles)
     yield effect(HYSTERESIS, place, name, "", (T_y, k))
+
+
+def _to_ground(rig: Rig, paths: TransferPaths) -> Iterator[Effect]:
+    """Forces between a body and the ground: across, or about it where nothing shifts."""
+    bodies = list(parts(rig))
+    shifts = [_moves(paths, b.to_ground(slides=True)) for b in bodies]
+    springs = [
+        Place("joint", (e.name,), isinstance(e, TranslationalSpring))
+        for e in rig.element
+        if isinstance(e, TorsionalSpring | TranslationalSpring)
+    ]
+    for body, on in zip(bodies, shifts, strict=True):
+        place = body.to_ground(slides=on)
+        if any(shifts) and not on:
+            continue
+        if any(paths.alike(place, spring) for spring in springs):  # one that stands on the ground
+            continue
+        others = (*_rubbing(paths, place, body.site, ""), *_stops(paths, place, body.site))
+        for e in others:
+            aliases = tuple((e.physics, other) for other in body.others)
+            yield replace(e, aliases=aliases, position=body.position)
+
+
+def _moves(paths: TransferPaths, place: Place) -> bool:
+    return paths.ports(place, of_speed=False) is not None
+
+
+def _rubbing(paths: TransferPaths, place: Place, site: str, other: str) -> Iterator[Effect]:
+    speed, ports = _largest(paths, place, of_speed=True), paths.ports(place, of_speed=True)
+    if speed <= 0 or ports is None:
+        return
+    force = np.pi / 4 * speed / float(np.median(ports.y1))
+    T_c = _log("T_c", place.units[0], STRENGTH_RANGE[0] * force, STRENGTH_RANGE[1] * force)
+    yield effect(FRICTION, place, site, other, (T_c,))
+
+
+def _stops(paths: TransferPaths, place: Place, site: str, other: str = "") -> Iterator[Effect]:
+    top, moved = _largest(paths, place, of_speed=False), paths.ports(place, of_speed=False)
+    if top <= 0 or moved is None:
+        return
+    of_force, of_way = place.units
+    doubles = 1 / float(np.median(moved.y1))
+    gap = _log("gap", of_way, NEAREST * top, top)
+    k = _log("k", f"{of_force}/{of_way}", STRENGTH_RANGE[0] * doubles, HARDEST * doubles)
+    for law in (STOPS, STOP_ABOVE, STOP_BELOW):
+        yield effect(law, place, site, other, (gap, k))
 
 
 def _drive(

@@ -7,13 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from samii_rig.diagnose.fit.rigfile import valued
 from samii_rig.diagnose.forces.march import march, moved, read
-from samii_rig.diagnose.forces.model import ForceModel
+from samii_rig.diagnose.forces.model import ForceModel, augmented
 from samii_rig.diagnose.forces.steps import LAW_NUMBERS
 from samii_rig.errors import InputError
 from samii_rig.model.realise import Realisation, realise
-from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, Int
 
 INNER = 8  # steps a sample: 3 % of what a force adds, halved steps a quarter of that
@@ -67,7 +65,7 @@ class Way:
 
         Raises InputError as that does.
         """
-        made = realise(_augmented(model, x), near=near)
+        made = realise(augmented(model, x, model.force.place), near=near)
         rig = model.built
         n = len(rig.sensor)
         h = 1 / (rig.rate_hz * INNER)
@@ -173,13 +171,6 @@ class Ways:
 
 def _linear_keys(model: ForceModel) -> list[str]:
     return [e.key for e in model.effects if e.force is None]
-
-
-def _augmented(model: ForceModel, x: Float) -> Rig:
-    """The rig at x with what its force needs more."""
-    values = model.values(x)
-    element = tuple(valued(e, values, {}) for e in model.built.element)
-    return model.force.place.augmented(model.built.model_copy(update={"element": element}))
 
 
 def _steps(poles: Complex, h: float) -> tuple[Complex, Complex]:

@@ -125,8 +125,8 @@ def arm_of(name: str) -> str:
     return f"{name}_place"
 
 
-def cut(rig: Rig, along: Along, part: Element) -> Rig:
-    """The rig with a beam or rod cut and `part` in the cut, in the middle of `along`.
+def cut(rig: Rig, along: Along, part: Element, u: float = math.exp(0.5)) -> Rig:
+    """The rig with a beam or rod cut and `part` in the cut, at u of `along`: in its middle.
 
     The last piece keeps the name, so that what measures behind the body still does.
 
@@ -137,7 +137,7 @@ def cut(rig: Rig, along: Along, part: Element) -> Rig:
     body: Any = rig.element[at]
     if any(body_of(name) == along.body != name for name in order):
         raise InputError("cut", "", along.body, "a body with no other part along it")
-    lengths = along.lengths(math.exp(0.5), body.L.value)
+    lengths = along.lengths(u, body.L.value)
     if along.start > 0:
         lengths[along.pieces[0], "L"] = along.start
 

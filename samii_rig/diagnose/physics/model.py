@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.diagnose.physics.aliases import NEAR_ALIASES, lower, over
+from samii_rig.diagnose.physics.along import body_of
 from samii_rig.diagnose.physics.causal import CausalChain
 from samii_rig.diagnose.physics.effect import Effect, Factor, Key
 from samii_rig.diagnose.physics.fractional import ChainLike, FractionalChain
@@ -106,7 +107,8 @@ class Model:
         chain: ChainLike = Chain(rig)
         causal = dict(e.causal for e in self.effects if e.causal is not None)
         if causal:
-            pieces = [p for e in self.effects if e.site in causal for p in e.pieces]
+            own = [e.name for e in flattened(rig.element) if body_of(e.name) in causal]
+            pieces = [name for name in own if name not in causal]
             middle = next(iter(causal.values()))
             chain = CausalChain(chain.plain, (*causal, *pieces), middle)
         for joint in (e.fractional for e in self.effects if e.fractional is not None):

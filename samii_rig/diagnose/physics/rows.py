@@ -57,6 +57,7 @@ _ROWS = (
     Physics("quadratic_damping", "a damper that grows with the speed"),
     Physics("valve_deadband", "a dead band of the valve"),
     Physics("backlash", "play"),
+    Physics("end_stop", "a stop beyond a gap"),
     Physics("cubic_stiffness", "a joint that stiffens or softens"),
     Physics("stiffness_variation", "a stiffness that is not constant"),
     Physics("hysteresis", "a part that sticks, then slips"),

@@ -12,19 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from samii_rig.diagnose.fit.explanations import Explanation
+from samii_rig.diagnose.fit.own_noise import MORE_NOISE, estimated, stated
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.units import pretty
 
-# Times the noise of a sensor, root mean square, from which it is told: a data sheet's and a bench's
-# differ by two or three, with a floor that shakes.
-MORE_NOISE = 5.0
-# The same, from which nothing is said to be missing or not, and no cause is sure: twice the most of
-# 46 recordings in which nothing was hidden. A spring that swings by 3 % in one record makes 29.
+# Times the noise of a sensor, root mean square, from which nothing is said to be missing or not,
+# and no cause is sure: twice the most of 46 recordings in which nothing was hidden. A spring that
+# swings by 3 % in one record makes 29.
 FAR_MORE = 20.0
-# Steps of its converter by which a sensor moves, root mean square, below which a loop around it
-# drives the rig by its rounding: noise that no rig file states.
-FEW_STEPS = 4.0
 # Times as far below 1 as the threshold is above, from which chi-square is no steady noise's: 2 of
 # 685 recordings in which nothing was hidden lie below, gains that sag and cogging do by as much.
 TOO_WELL = 2.0
@@ -88,31 +84,12 @@ def more_noise(search: RecordSearch) -> MoreNoise | None:
     """The sensor whose noise is the most over the one that the rig file states; None where no
     sensor has so much, or none has its noise stated."""
     whole = search.whole
-    if not isinstance(whole, Whole) or _steps_drive(whole):
+    if not isinstance(whole, Whole) or np.all(np.isnan(known := stated(whole))):
         return None
-    each_line = []
-    for i, piece in enumerate(whole.records.pieces):
-        f = whole.records.lines(piece).frequency
-        L = search.reduced.noise.root(f, np.full(f.size, i))
-        each_line.append(np.sum(np.abs(L) ** 2, axis=2))
-    # In the middle of the lines: a disturbance at a resonance, or a few lines, is not its noise.
-    found = np.sqrt(np.median(np.concatenate(each_line), axis=0))
-    stated = {s.name: s for s in whole.rig.sensor}
-    each = []
-    for name, rms in zip(whole.wired.sensors, found, strict=True):
-        sensor = stated[name]
-        own = sensor.own_noise
-        if sensor.noise_rms > 0 and rms > MORE_NOISE * own:
-            each.append(MoreNoise(name, sensor.unit, float(rms) / own, float(rms)))
+    units = {s.name: s.unit for s in whole.rig.sensor}
+    each = [
+        MoreNoise(name, units[name], float(rms / own), float(rms))
+        for name, rms, own in zip(whole.wired.sensors, estimated(search, whole), known, strict=True)
+        if rms > MORE_NOISE * own
+    ]
     return max(each, key=lambda one: one.times, default=None)
-
-
-def _steps_drive(whole: Whole) -> bool:
-    """Whether a loop feeds back a sensor that hardly moves by its steps."""
-    closed = whole.rig.centred | {f.sensor for f in whole.rig.feedback}
-    steps = {s.name: s.resolution for s in whole.rig.sensor}
-    for j, name in enumerate(whole.wired.sensors):
-        moved = max(float(np.std(piece.z[:, j])) for piece in whole.records.pieces)
-        if name in closed and moved < FEW_STEPS * steps[name]:
-            return True
-    return False

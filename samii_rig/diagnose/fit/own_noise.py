@@ -1,0 +1,54 @@
+"""The noise of the records, and that which the rig file states for its sensors.
+
+Noise is estimated from what no change of a linear response explains. A force that depends on the
+amplitude passes for it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.records import Whole
+from samii_rig.types import Float
+
+# Times the noise of a sensor, root mean square, from which it is more: a data sheet's and a bench's
+# differ by two or three, with a floor that shakes.
+MORE_NOISE = 5.0
+# Steps of its converter by which a sensor moves, root mean square, below which a loop around it
+# drives the rig by its rounding: noise that no rig file states.
+FEW_STEPS = 4.0
+
+
+def estimated(search: RecordSearch, whole: Whole) -> Float:
+    """(q,) root mean square of each sensor in the middle of the lines: a disturbance at a
+    resonance, or a few lines, is not its noise."""
+    each_line = []
+    for i, piece in enumerate(whole.records.pieces):
+        f = whole.records.lines(piece).frequency
+        L = search.reduced.noise.root(f, np.full(f.size, i))
+        each_line.append(np.sum(np.abs(L) ** 2, axis=2))
+    return np.asarray(np.sqrt(np.median(np.concatenate(each_line), axis=0)))
+
+
+def stated(whole: Whole) -> Float:
+    """(q,) root mean square of noise and rounding by the rig file, nan where it states none; of all
+    where a loop feeds back a sensor that hardly moves by its steps."""
+    sensors = {s.name: s for s in whole.rig.sensor}
+    known = not _steps_drive(whole)
+    return np.array(
+        [
+            sensors[name].own_noise if known and sensors[name].noise_rms > 0 else np.nan
+            for name in whole.wired.sensors
+        ]
+    )
+
+
+def _steps_drive(whole: Whole) -> bool:
+    closed = whole.rig.centred | {f.sensor for f in whole.rig.feedback}
+    steps = {s.name: s.resolution for s in whole.rig.sensor}
+    for j, name in enumerate(whole.wired.sensors):
+        moved = max(float(np.std(piece.z[:, j])) for piece in whole.records.pieces)
+        if name in closed and moved < FEW_STEPS * steps[name]:
+            return True
+    return False
