@@ -302,7 +302,8 @@ def _honest_scores(trials: Sequence[Trial]) -> list[Score]:
 
 
 FORCES = (
-    "cubic_stiffness", "backlash", "coulomb_friction", "output_saturation", "stiffness_variation",
+    "cubic_stiffness", "backlash", "coulomb_friction", "end_stop", "output_saturation",
+    "stiffness_variation",
 )  # fmt: skip
 
 

@@ -39,7 +39,8 @@ class Draft:
     that makes sense. least : a strength below which noise-free records, in which no converter
     rounds, do not say how large it is. fixed : it has no size, and is in or not. run : in place of
     apply, for an effect that is another one in each run, by the run's number.
-    also : other names that mean the same here, (physics, site).
+    also : other names that mean the same here, (physics, site). where : the variant, of physics
+    that has some.
     """
 
     physics: str
@@ -54,6 +55,7 @@ class Draft:
     fixed: bool = False
     run: Callable[[Setup, Numbers, int], Setup] | None = None
     also: tuple[tuple[str, str], ...] = ()
+    where: str = ""
 
     def put(self, setup: Setup, strength: float) -> Setup:
         """`setup` with the effect at this strength."""
@@ -121,7 +123,7 @@ def _place(rng: Rng, setup: Setup, names: set[str]) -> tuple[str, float]:
     return host.name, float(rng.uniform(0.3 if first else 0.0, 1.0)) * host.values.get("L", 0.0)
 
 
-def _at_end(setup: Setup, on: str, x: float) -> tuple[str, ...]:
+def at_end(setup: Setup, on: str, x: float) -> tuple[str, ...]:
     """Names of the neighbours that mean the same place, for a place at a link's end."""
     part = setup.part(on)
     if part.kind not in EXTENDED:
@@ -180,7 +182,7 @@ def _attached(
     def apply(s: Setup, v: Numbers) -> Setup:
         return s.attached(Attachment(kind, on, x, v))  # type: ignore[arg-type]
 
-    also = tuple((physics, n) for n in _at_end(setup, on, x) if n != on)
+    also = tuple((physics, n) for n in at_end(setup, on, x) if n != on)
     return Draft(physics, on, x, units, values, apply, *span, also=also)
 
 

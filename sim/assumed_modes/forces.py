@@ -8,26 +8,37 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sim.assumed_modes.effects import Draft, Numbers, drawn_drive, turning_drives
+from sim.assumed_modes.ground import held, length, same_as_body, same_as_joint
 from sim.assumed_modes.parts import ANGLE_SOURCES, JOINTS, Drive, Force, Setup
 
 Rng = np.random.Generator
+GROUND = 1 / 3  # of the draws of friction that are of a body against the ground
+SIDES = ("both", "both", "above", "below")  # of a stop: half are on both
+GAPS = (0.2, 0.9)  # of what a place moves by at the largest level
+HARDEST = 30.0  # times a place's own stiffness: a stop that gives no more than the place beside it
 START = 1e-3  # of a joint's swing, or its spring's largest moment: what a force begins with
 
 
 @dataclass(frozen=True, slots=True)
 class Swing:
     """What the nominal rig does at the trial's largest level: peaks of the joints' relative motion
-    (rad or m); by actuator, of the moment at its source (N m) and of the command (its unit)."""
+    (rad or m); by actuator, of the moment at its source (N m) and of the command (its unit);
+    of the bodies' displacements against the ground (m)."""
 
     joints: dict[str, float]
     moment: dict[str, float]
     command: dict[str, float]
+    bodies: dict[str, float]
+
+
+def springs(setup: Setup) -> list[str]:
+    """Joints with a stiffness."""
+    return [p.name for p in setup.parts if p.kind in JOINTS and p.values["k"] > 0]
 
 
 def joint(rng: Rng, setup: Setup, swing: Swing) -> tuple[str, float, float]:
     """A joint that moves: its name, its stiffness and its peak."""
-    names = [p.name for p in setup.parts if p.kind in JOINTS and p.values["k"] > 0]
-    name = str(rng.choice(names))
+    name = str(rng.choice(springs(setup)))
     return name, setup.part(name).values["k"], swing.joints[name]
 
 
@@ -54,12 +65,49 @@ def _also(physics: str, setup: Setup, on: str) -> tuple[tuple[str, str], ...]:
 
 
 def friction(rng: Rng, setup: Setup, swing: Swing) -> Draft:
-    """Dry friction of a joint."""
+    """Dry friction of a joint, or of a body against the ground."""
+    if swing.bodies and (not springs(setup) or rng.random() < GROUND):
+        on = str(rng.choice(list(swing.bodies)))
+        peak, own = swing.bodies[on], held(setup, on)
+
+        def apply(s: Setup, v: Numbers) -> Setup:
+            return replace(s, forces=(*s.forces, Force("coulomb_friction", on, v, ground=True)))
+
+        return Draft(
+            "coulomb_friction", on, length(setup, on), {"T_c": "N"}, lambda x: {"T_c": x}, apply,
+            START * own * peak, 0.3 * own * peak, also=same_as_body("coulomb_friction", setup, on),
+            where="ground",
+        )  # fmt: skip
     on, k, peak = joint(rng, setup, swing)
     return Draft(
         "coulomb_friction", on, None, {"T_c": units(setup, on)[0]}, lambda x: {"T_c": x},
         on_joint("coulomb_friction", on), START * k * peak, 0.3 * k * peak,
-        also=_also("coulomb_friction", setup, on),
+        also=(*_also("coulomb_friction", setup, on), *same_as_joint("coulomb_friction", setup, on)),
+    )  # fmt: skip
+
+
+def stop(rng: Rng, setup: Setup, swing: Swing) -> Draft:
+    """A stop at a way `gap` from rest, on both sides or one: of a joint, or of a body against the
+    ground. Its strength is its stiffness."""
+    places = [*((name, False) for name in springs(setup)), *((name, True) for name in swing.bodies)]
+    on, ground = places[int(rng.integers(len(places)))]
+    sides = SIDES[int(rng.integers(len(SIDES)))]
+    own = held(setup, on) if ground else setup.part(on).values["k"]
+    peak = swing.bodies[on] if ground else swing.joints[on]
+    gap = peak * float(np.exp(rng.uniform(*np.log(GAPS))))
+    also = same_as_body if ground else same_as_joint
+    force, motion = ("N", "m") if ground else units(setup, on)
+    numbers = {"above": float(sides != "below"), "below": float(sides != "above")}
+
+    def apply(s: Setup, v: Numbers) -> Setup:
+        return replace(s, forces=(*s.forces, Force("end_stop", on, {**v, **numbers}, ground)))
+
+    return Draft(
+        "end_stop", on, length(setup, on) if ground else None,
+        {"gap": motion, "k": f"{force}/{motion}"}, lambda x: {"gap": gap, "k": x}, apply,
+        START * own, HARDEST * own,
+        also=(*(() if ground else _also("end_stop", setup, on)), *also("end_stop", setup, on)),
+        where=sides,
     )  # fmt: skip
 
 
@@ -141,6 +189,7 @@ def orifice(rng: Rng, setup: Setup, swing: Swing) -> Draft:
 
 FORCES: dict[str, Callable[[Rng, Setup, Swing], Draft]] = {
     "coulomb_friction": friction,
+    "end_stop": stop,
     "backlash": play,
     "cubic_stiffness": hardening,
     "quadratic_damping": drag,

@@ -2,8 +2,8 @@
 
 The linear part moves by the exact pieces of a `Timeline`. A law that is not linear is a force held
 over a piece: a smooth law the mean of its values at both ends, found by iteration, so that the
-error falls with the square of the piece; dry friction the value at the end, solved for exactly
-(stick is an equation there, not a tolerance).
+error falls with the square of the piece; a stop likewise, without iteration; dry friction the value
+at the end, solved for exactly (stick is an equation there, not a tolerance).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numba import njit
 from samii_rig.types import Float, Int
 
 # Laws by number, as the compiled loop knows them, with their numbers in order.
-CUBIC, BACKLASH, FRICTION, BOUC_WEN, PARAMETRIC, FLOW, DRAG, ONE_SIDED = range(8)
+CUBIC, BACKLASH, FRICTION, BOUC_WEN, PARAMETRIC, FLOW, DRAG, ONE_SIDED, STOP = range(9)
 ITERATIONS = 6  # of a smooth law; each gains a factor k h^2/2m, about 1 %
 N_VALUES = 5
 
@@ -86,6 +86,18 @@ def smooth(law: int, p: Float, z: float, dz: float, t: float, memory: float, h: 
         return float(-p[0] * max(z, 0.0))
     # parametric, p = k, depth 1, w1, depth 2, w2
     return float(-p[0] * z * (p[1] * np.sin(p[2] * t) + p[3] * np.sin(p[4] * t)))
+
+
+@njit(cache=True)
+def stop(p: Float, z: float, g: float) -> float:
+    """The force of a stop, p = k, gap and its sides above and below (1 or 0), at a place that is at
+    z but for half of that force; g : how far a unit force moves it. Exact, however hard it is."""
+    beyond = 0.0
+    if p[2] > 0.0 and z > p[1]:
+        beyond = z - p[1]
+    elif p[3] > 0.0 and z < -p[1]:
+        beyond = z + p[1]
+    return float(-p[0] * beyond / (1.0 + 0.5 * p[0] * g))
 
 
 @njit(cache=True)
@@ -218,8 +230,8 @@ def _with_laws(
             push = min(max(push, -value[0]), value[0])
             f[i] = push
         else:
-            force = f[i]
-            for _ in range(ITERATIONS):
+            force = stop(value, at, pieces.g[p, i]) if law == 8 else f[i]
+            for _ in range(0 if law == 8 else ITERATIONS):
                 force = smooth(
                     law,
                     value,

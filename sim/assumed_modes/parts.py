@@ -93,11 +93,13 @@ class Force:
     `one_sided`.
 
     on : the joint whose relative motion it opposes, or the actuator. values : its numbers.
+    ground : it opposes the motion of the body `on`, at its downstream end, against the ground.
     """
 
     law: str
     on: str
     values: dict[str, float]
+    ground: bool = False
 
 
 @dataclass(frozen=True, slots=True)

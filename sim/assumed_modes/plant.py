@@ -28,6 +28,7 @@ from samii_rig.rig.schema import (
 )
 from samii_rig.types import Float
 from sim.assumed_modes.parts import SOURCES, Lag, Part, Setup
+from sim.assumed_modes.parts import Force as Law
 from sim.assumed_modes.ritz import FLOOR, Mechanism
 
 GRAVITY = 9.80665  # m/s^2, as the rig file's `tilt` means it
@@ -209,9 +210,7 @@ def plant(setup: Setup, pushes: tuple[Push, ...] = ()) -> Plant:
         row = _source(sig, mech, part, moves[part.name], (Q, dQ, ddQ), load)
         if row is not None:
             pushed[part.name] = row
-    for i, force in enumerate(setup.forces):
-        if force.on in mech.joints:
-            load[mech.joints[force.on], first_law + i] += 1.0
+    _push_back(mech, first_law, load)
     _pushes(mech, pushes, first_push, load, ddQ)
     slipped = _relaxations(sig, mech, Q, load)
     if n_r:
@@ -233,7 +232,7 @@ def plant(setup: Setup, pushes: tuple[Push, ...] = ()) -> Plant:
         for s, sections in zip(setup.sensors, filters, strict=True)
     ]
     Y = np.array(rows)
-    Z = np.array([row for x in setup.forces for row in _read(x.on, mech, Q, dQ, inside)])
+    Z = np.array([row for x in setup.forces for row in _read(x, mech, Q, dQ, inside)])
     Z = Z.reshape(2 * n_law, n_x + n_u)[:, :n_x]
     return Plant(sig.rate[:, :n_x], sig.rate[:, n_x:], Y[:, :n_x], Y[:, n_x:], Z, n_in, n_law)
 
@@ -278,6 +277,15 @@ def _source(
     push = sig.filtered(values["K"] * drive, lag)
     load += np.outer(row, push)
     return push
+
+
+def _push_back(mech: Mechanism, first: int, load: Float) -> None:
+    """Where a unit force of each law acts: across a joint, or on a body."""
+    for i, force in enumerate(mech.setup.forces):
+        if force.ground:
+            load[:, first + i] += mech.against_ground(force.on)
+        elif force.on in mech.joints:
+            load[mech.joints[force.on], first + i] += 1.0
 
 
 def _pushes(mech: Mechanism, pushes: tuple[Push, ...], first: int, load: Float, ddQ: Float) -> None:
@@ -349,8 +357,13 @@ def _stretch(sensor: Displacement | Velocity, mech: Mechanism) -> Float:
     return w if sensor.against is None else w - mech.after(sensor.against)[0]
 
 
-def _read(on: str, mech: Mechanism, Q: Float, dQ: Float, inside: Float) -> tuple[Float, Float]:
-    """Displacement and velocity of a joint; of an actuator's law the moment at its source."""
+def _read(law: Law, mech: Mechanism, Q: Float, dQ: Float, inside: Float) -> tuple[Float, Float]:
+    """Displacement and velocity of a joint, or of a body against the ground; of an actuator's law
+    the moment at its source."""
+    on = law.on
+    if law.ground:
+        row = mech.against_ground(on)
+        return row @ Q, row @ dQ
     if on in mech.joints:
         return Q[mech.joints[on]], dQ[mech.joints[on]]
     drive = next(d for d in mech.setup.drives if d.name == on)

@@ -135,6 +135,12 @@ class Mechanism:
             return self._cut_to_size(self._after[on])
         return self._cut_to_size(self._along(part, x))
 
+    def against_ground(self, on: str) -> Float:
+        """The row of w right behind a part, less that of the ground, which moves with the floor."""
+        row = self.after(on)[0].copy()
+        row[FLOOR] = 0.0
+        return row
+
     def bend(self, on: str, x: float) -> Float:
         """The row of the curvature at `x` m along a beam."""
         length, own = self._beams[on]

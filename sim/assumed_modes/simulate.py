@@ -16,6 +16,9 @@ from sim.assumed_modes.sampled import Timeline, timeline
 PIECE = 5e-4  # s, longest piece with a law: 100 a period of the fastest motion of 20 Hz
 STIFF = 0.05  # largest k g of a law: how far its own force moves its place, for the iteration
 MOST_STEPS = 64
+# The same of a stop, which is not iterated: against it a place swings at w, and its period is wrong
+# by (w h)^2/12 = k g/6 of itself. Where that asks for more, pieces of STOP_PIECE s are enough.
+STOP_STIFF, STOP_PIECE = 4e-4, 1.25e-4
 # s of rest under the disturbances before a record, to make them stationary: twice the time
 # in which mode 1 of SAMII falls to 1/e.
 SETTLE = 20.0
@@ -28,6 +31,7 @@ NUMBERS = {
     "parametric": (kernel.PARAMETRIC, ("k", "depth_1", "w_1", "depth_2", "w_2")),
     "quadratic_damping": (kernel.DRAG, ("c2",)),
     "one_sided": (kernel.ONE_SIDED, ("dk",)),
+    "end_stop": (kernel.STOP, ("k", "gap", "above", "below")),
     "flow_saturation": (kernel.FLOW, ("M_stall",)),
 }
 STATIC = {"valve_deadband": "width", "output_saturation": "limit"}
@@ -52,16 +56,20 @@ def ready(
     while True:
         line = timeline(setup, made, control.rate_hz, steps)
         pieces = _pieces(made, line)
-        stiff = max((_slope(f) * g for f, g in zip(dynamic, pieces.g.max(axis=0), strict=True)),
-                    default=0.0)  # fmt: skip
-        if stiff <= STIFF or steps >= MOST_STEPS:
+        each = list(zip(dynamic, pieces.g.max(axis=0).tolist(), strict=True))
+        stiff = max((_slope(f) * g for f, g in each), default=0.0)
+        hard = max((f.values["k"] * g for f, g in each if f.law == "end_stop"), default=0.0)
+        followed = hard <= STOP_STIFF or line.h.max() <= 1.001 * STOP_PIECE
+        if (stiff <= STIFF and followed) or steps >= MOST_STEPS:
             return made, pieces
         steps *= 2
 
 
 def _slope(force: Force) -> float:
-    """Largest stiffness of a law in its usual range, in its place's unit."""
+    """Largest stiffness of a law that is iterated in its usual range, in its place's unit."""
     v = force.values
+    if force.law == "end_stop":
+        return 0.0
     if force.law == "bouc_wen":
         return v["T_y"] / v["z_y"]
     return v.get("k", 0.0)

@@ -17,7 +17,7 @@ from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Float
 from sim.assumed_modes import effects as table
-from sim.assumed_modes import record, rigfile, styles
+from sim.assumed_modes import ground, record, rigfile, styles
 from sim.assumed_modes.effects import Draft
 from sim.assumed_modes.forces import FORCES, Swing
 from sim.assumed_modes.noise import Noise, noise_model, unit_effect, whitener
@@ -317,12 +317,14 @@ def _pushes(rng: Rng, setup: Setup) -> tuple[Push, ...]:
 
 
 def _swing(scene: Scene) -> Swing:
-    """What the nominal rig's joints and sources do at the largest level."""
+    """What the nominal rig's joints, sources and bodies do at the largest level."""
     joints = [p.name for p in scene.setup.parts if p.kind in JOINTS]
     angles = {p.name for p in scene.setup.parts if p.kind in ANGLE_SOURCES}
     drives = [d.name for d in scene.setup.drives]
     turned = [d.name for d in scene.setup.drives if angles.intersection(d.sources)]
+    bodies = ground.bodies(scene.setup)
     probes = [Force("probe", name, {}) for name in (*joints, *turned)]
+    probes += [Force("probe", name, {}, ground=True) for name in bodies]
     made = plant(replace(scene.setup, forces=tuple(probes)))
     c = scene.control
     loop = closed(discrete(made, timeline(scene.setup, made, c.rate_hz)), c.feedback)
@@ -337,11 +339,12 @@ def _swing(scene: Scene) -> Swing:
         # Rows act on the state after r.
         moved[1:, commands] = moved[:-1, commands] + w.r[1:]
         peak = np.maximum(peak, max(w.levels) * np.abs(moved).max(axis=0))
-    each, n = peak.tolist(), len(joints)
+    each, n, m = peak.tolist(), len(joints), len(joints) + len(turned)
     return Swing(
         dict(zip(joints, each[:n], strict=True)),
-        dict(zip(turned, each[n : len(probes)], strict=True)),
+        dict(zip(turned, each[n:m], strict=True)),
         dict(zip(drives, each[commands], strict=True)),
+        dict(zip(bodies, each[m : len(probes)], strict=True)),
     )
 
 
@@ -563,6 +566,7 @@ def _truth(made: Conceals, faults: list[record.Faults], *, rivals: bool) -> dict
                 "physics": draft.physics,
                 "site": draft.site,
                 "position": draft.position,
+                "where": draft.where,
                 "parameters": {
                     name: {"value": numbers[name], "unit": unit}
                     for name, unit in draft.units.items()

@@ -17,11 +17,12 @@ from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.elements import parameters
 from sim.concealed.effects import ROWS, TABLES, Row, clamp_of, places
-from sim.concealed.measure import Errors, draw_errors
+from sim.concealed.measure import Errors, draw_errors, reach
 from sim.concealed.modes import Poles, poles_of
+from sim.concealed.nonlinear import is_body
 from sim.concealed.parts import Description, described
 from sim.concealed.runs import Design
-from sim.concealed.scales import RIGID, RIGID_SOURCE, UNDAMPED_SOURCE, Concealed, Dose
+from sim.concealed.scales import REACH, RIGID, RIGID_SOURCE, UNDAMPED_SOURCE, Concealed, Dose
 from sim.concealed.size import Yardstick, response_change, yardstick
 from sim.concealed.stated import Stated, as_stated, row_of
 
@@ -64,18 +65,27 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """An effect before it is put in: what, where, and how much of it if that is stated."""
+    """An effect before it is put in: what, where, and how much of it if that is stated. reach : of
+    `Dose`."""
 
     row: Row
     site: str
     stated: Stated | None = None
+    reach: float = REACH
+
+    def at(self, rig: Rig, plant: Description, design: Design) -> Chosen:
+        """The same with how far its place moves in the runs of a design, where that counts."""
+        if not self.row.gap:
+            return self
+        most = reach(rig, plant, design, self.site, ground=is_body(plant, self.site))
+        return replace(self, reach=most)
 
     def put(self, plant: Description, x: float, seed: int) -> Concealed:
         """Change a plant. x, seed : of what is not stated."""
         rng = np.random.default_rng(seed)
         if self.stated is None:
-            return self.row.put(plant, self.site, Dose(x, rng))
-        dose = Dose(x, rng, self.stated.parameters, self.stated.where)
+            return self.row.put(plant, self.site, Dose(x, rng, reach=self.reach))
+        dose = Dose(x, rng, self.stated.parameters, self.stated.where, self.reach)
         effect = self.row.put(plant, self.site, dose)
         as_stated(self.stated, effect)
         return effect
@@ -111,6 +121,7 @@ def draw(
     span = math.log(least), math.log(LARGEST)
     targets = [math.exp(rng.uniform(*span)) for _ in seeds]
     clean = poles_of(base)
+    chosen = [one.at(rig, base, design) for one in chosen]
     errors = draw_errors(rig, clean, design.noise, rng)
     multiples, sizes, sizings = [], [], []
     for one, s, target in zip(chosen, seeds, targets, strict=False):

@@ -22,6 +22,7 @@ class Row:
 
     at : which parts or sensors can have it. linear : whether its response does not depend on
     the level. most : the largest multiple. fixed : whether it is there or not, without a size.
+    gap : whether it acts beyond a gap, which is drawn from how far its place moves.
     """
 
     physics: str
@@ -31,6 +32,7 @@ class Row:
     most: float = 3.0
     fixed: bool = False
     outside: bool = False
+    gap: bool = False
 
 
 def clamp_of(plant: Description) -> str:
@@ -49,21 +51,34 @@ def places(plant: Description, row: Row) -> list[str]:
     angles = [s.name for s in plant.sensors if s.kind != "acceleration"]
     accelerations = [s.name for s in plant.sensors if s.kind == "acceleration"]
     loose = [name for name in kinds("torsional_spring") if name != clamp_of(plant)]
+    joints, sources = kinds("torsional_spring"), kinds("angular_velocity_source")
+    bodies = kinds(*nonlinear.BODIES)
     spanned = {n for s in plant.sensors if s.kind == "relative_angle" for n in s.across}
     return {
-        "joint": kinds("torsional_spring"),
+        "joint": joints,
         "loose": loose,
         "junction": loose + kinds("beam"),
-        "support": kinds("torsional_spring") + kinds("beam"),
+        "support": joints + kinds("beam"),
         "body": kinds("rigid_link", "beam"),
         "link": kinds("rigid_link"),
         "beam": kinds("beam"),
-        "source": kinds("angular_velocity_source"),
-        "friction": kinds("torsional_spring") + kinds("angular_velocity_source"),
+        "source": sources,
+        "friction": _every_third(joints + sources, bodies),
+        "stop": _every_third(joints, bodies),
         "sensor": angles + accelerations,
         "accelerometer": accelerations,
         "encoder": [s.name for s in plant.sensors if len(s.across) > 1 and s.across[0] in spanned],
     }[row.at]
+
+
+def _every_third(names: list[str], bodies: list[str]) -> list[str]:
+    """Names with one of the bodies behind each second: every third place is the ground."""
+    out = []
+    for i, name in enumerate(names):
+        out.append(name)
+        if bodies and i % 2:
+            out.append(bodies[i // 2 % len(bodies)])
+    return out or bodies
 
 
 ROWS = (
@@ -96,6 +111,7 @@ ROWS = (
     Row("quadratic_damping", "joint", nonlinear.drag, linear=False, most=20.0),
     Row("flow_saturation", "source", nonlinear.flow, linear=False, most=10.0),
     Row("output_saturation", "source", nonlinear.clipped, linear=False, most=20.0),
+    Row("end_stop", "stop", nonlinear.stop, linear=False, most=30.0, gap=True),
 )
 OUTSIDE = (
     Row("hysteresis", "joint", nonlinear.slip, linear=False, most=10.0, outside=True),

@@ -5,7 +5,7 @@ with the motion it causes (`solve`), so that stiff laws and dry friction need no
 
 | kind | acts | probes | values |
 |---|---|---|---|
-| coulomb | on a joint, beside its spring | angle, rate | T_c |
+| coulomb | on a joint, beside its spring, or on a body | motion, rate | T_c |
 | drive_friction | on the source, in command units | rate, rate | F_c |
 | cubic | on a joint | angle, rate | k3 |
 | backlash | on a joint, in series with its spring; its damper stays | angle, rate | width, k |
@@ -13,6 +13,7 @@ with the motion it causes (`solve`), so that stiff laws and dry friction need no
 | slip | on a joint: elements (k, T) that stick and slide | angle, rate | k1, T1, ... |
 | drag | on a joint: c2 abs(rate) rate | angle, rate | c2 |
 | one_sided | on a joint, stiffer where its angle is positive | angle, rate | k |
+| stop | on a joint or a body; its sides are 1 or 0 | motion, rate | k, gap, above, below |
 | flow_saturation | on the source: v sqrt(1 + sign(v) M/T_s) | M, v | T_s |
 """
 
@@ -27,9 +28,11 @@ from samii_rig.types import Float
 
 KINDS = (
     "coulomb", "drive_friction", "cubic", "backlash", "drift", "slip", "flow_saturation", "drag",
-    "one_sided",
+    "one_sided", "stop",
 )  # fmt: skip
-COULOMB, DRIVE_FRICTION, CUBIC, BACKLASH, DRIFT, SLIP, FLOW, DRAG, ONE_SIDED = range(len(KINDS))
+COULOMB, DRIVE_FRICTION, CUBIC, BACKLASH, DRIFT, SLIP, FLOW, DRAG, ONE_SIDED, STOP = range(
+    len(KINDS)
+)
 NEWTON_STEPS = 30  # Newton steps; three are usual
 WHOLE = 1e-10  # relative change of the force at which the solution stands
 VALUES = 16  # numbers a law may have
@@ -67,6 +70,9 @@ def force(kind: int, q: Float, memory: Float, t: float, a: float, b: float) -> f
         return float(-q[0] * abs(b) * b)
     if kind == ONE_SIDED:
         return float(-q[0] * max(a, 0.0))
+    if kind == STOP:
+        beyond = max(a - q[1], 0.0) * q[2] - max(-q[1] - a, 0.0) * q[3]
+        return float(-q[0] * beyond)
     if kind == FLOW:
         side = 1.0 if b > 0.0 else -1.0
         return b * (math.sqrt(max(1.0 + side * a / q[0], 0.0)) - 1.0)

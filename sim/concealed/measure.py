@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import numpy as np
 
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Float
-from sim.concealed.integrate import Loop, Tables, run
-from sim.concealed.modes import Poles
-from sim.concealed.parts import Description
-from sim.concealed.runs import Run
+from sim.concealed.integrate import Loop, Tables, run, tabulate
+from sim.concealed.modes import Poles, poles_of
+from sim.concealed.parts import Description, Law
+from sim.concealed.runs import Design, Run, burst
 
 BAND = (0.5, 40.0)  # Hz, in which the disturbance is sized
 
@@ -96,3 +97,21 @@ def ideally(run_: Run, tables: Tables, loop: Loop) -> tuple[Float, Float, Float]
     """v, sensors and the probes' peaks of one run without any error; `loop` an ideal one."""
     n, m = len(run_.u), loop.grain.size
     return run(tables, loop, run_.u, run_.theta_ref, np.zeros(n), np.zeros((n, m)))
+
+
+def reach(rig: Rig, plant: Description, design: Design, site: str, *, ground: bool) -> float:
+    """What the angle across a joint (rad), or a body's end (m), moves by at most in one burst of
+    the largest level, of each drive in turn, from rest and without errors."""
+    probed = copy.deepcopy(plant)
+    # A stop without stiffness: it reads, and pushes with nothing.
+    probed.laws = [Law("stop", site, (0.0, 1.0, 1.0, 1.0), ground)]
+    tables = tabulate(poles_of(probed), probed, inner=1)
+    loop = loop_of(rig, plant, ideal=True)
+    wave = max(design.levels) * burst(design, rig.rate_hz)
+    none = np.zeros((wave.size, len(rig.sensor)))
+    peaks = []
+    for k in range(len(plant.drives)):
+        u = np.zeros((wave.size, len(plant.drives)))
+        u[:, k] = wave
+        peaks.append(run(tables, loop, u, 0.0 * u, np.zeros(wave.size), none)[2][0])
+    return float(max(peaks))

@@ -126,7 +126,7 @@ def state_space(plant: Description, structure: Structure | None = None) -> State
     force[:, push] = s.ends[plant.push][0]
     for j, law in enumerate(plant.laws):
         if law.kind not in DRIVE_LAWS:
-            force[s.joints[law.site][-1], push + 1 + j] += 1.0
+            force[:, push + 1 + j] += _place(law, s)
     seen_by = _sources(plant, phis, A, B)
     speeds = phis + 1
 
@@ -244,8 +244,16 @@ def _seen(sensor: SensorPath, s: Structure, Q: Float, Ax: Float, Au: Float) -> t
 def _joint_probes(
     law: Law, s: Structure, Q: Float, Qd: Float, inputs: int
 ) -> tuple[list[Float], list[Float]]:
-    i = s.joints[law.site][-1]
-    return [Q[i], Qd[i]], [np.zeros(inputs), np.zeros(inputs)]
+    row = _place(law, s)
+    return [row @ Q, row @ Qd], [np.zeros(inputs), np.zeros(inputs)]
+
+
+def _place(law: Law, s: Structure) -> Float:
+    """(n,) row of the motion that a law acts on: the angle across a joint, or a body's
+    displacement."""
+    if law.ground:
+        return s.ends[law.site][0]
+    return unit(s.M.shape[0], s.joints[law.site][-1])
 
 
 def _drive_probes(

@@ -7,16 +7,50 @@ times the rig's own scale or drawn (`scales.Dose`).
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+
+from sim.concealed.assemble import assemble
 from sim.concealed.parts import Description, Law
 from sim.concealed.scales import Concealed, Dose, Scales
 
+GROUND = "ground"  # the variant that acts between a body and the ground
+BODIES = ("beam", "lumped_mass")  # what shifts and may touch the ground
+SIDES = {"both": (1.0, 1.0), "above": (1.0, 0.0), "below": (0.0, 1.0)}
+GAPS = (0.2, 0.9)  # of what a place moves by: a stop that is met at the largest level
+
+
+def is_body(plant: Description, site: str) -> bool:
+    """Whether an element is one that a force to the ground acts on, at its downstream end."""
+    return plant.part(site).kind in BODIES
+
+
+def holding(plant: Description, site: str) -> float:
+    """What holds a body's downstream end sideways, N/m, the drives held; of one that nothing holds
+    the rig's own scale, a joint's stiffness at a link's length."""
+    s = assemble(plant)
+    free = np.delete(np.arange(s.M.shape[0]), list(s.driven.values()))
+    row = s.ends[site][0][free]
+    scale = Scales.of(plant)
+    try:
+        gives = float(row @ np.linalg.solve(s.K[np.ix_(free, free)], row))
+    except np.linalg.LinAlgError:
+        gives = 0.0
+    return 1 / gives if gives > 0 else scale.k / scale.length**2
+
 
 def friction(plant: Description, site: str, dose: Dose) -> Concealed:
-    """Dry friction beside a joint's spring, N m, or in the drive, in command units."""
+    """Dry friction beside a joint's spring, N m, in the drive, in command units, or of a body
+    against the ground, N."""
     if any(site == drive.element for drive in plant.drives):
         T_c = dose("T_c", 0.1 * dose.x)
         plant.laws.append(Law("drive_friction", site, (T_c,)))
         return Concealed("coulomb_friction", site, {"T_c": T_c}, where="command units")
+    if is_body(plant, site):
+        T_c = dose("T_c", 1e-3 * dose.x * holding(plant, site))
+        plant.laws.append(Law("coulomb", site, (T_c,), ground=True))
+        return Concealed("coulomb_friction", site, {"T_c": T_c}, where=GROUND)
     T_c = dose("T_c", 1e-3 * dose.x * Scales.of(plant).k)
     plant.laws.append(Law("coulomb", site, (T_c,)))
     return Concealed("coulomb_friction", site, {"T_c": T_c})
@@ -48,6 +82,21 @@ def drag(plant: Description, site: str, dose: Dose) -> Concealed:
     c2 = dose("c2", 1e-3 * dose.x * plant.part(site).values["k"])
     plant.laws.append(Law("drag", site, (c2,)))
     return Concealed("quadratic_damping", site, {"c2": c2})
+
+
+def stop(plant: Description, site: str, dose: Dose) -> Concealed:
+    """A stop at a way `gap` from rest, on both sides or one: of a joint, or of a body against the
+    ground."""
+    # Half of the stops are on both sides.
+    drawn = ("both", "both", "above", "below")[int(dose.rng.integers(4))]
+    where = dose.choose(SIDES, drawn)
+    share = math.exp(dose.rng.uniform(math.log(GAPS[0]), math.log(GAPS[1])))
+    gap = dose("gap", share * dose.reach)
+    ground = is_body(plant, site)
+    own = holding(plant, site) if ground else plant.part(site).values["k"]
+    k = dose("k", dose.x * own)
+    plant.laws.append(Law("stop", site, (k, gap, *SIDES[where]), ground))
+    return Concealed("end_stop", site, {"gap": gap, "k": k}, where=where)
 
 
 def one_sided(plant: Description, site: str, dose: Dose) -> Concealed:

@@ -84,12 +84,14 @@ class Drive:
 class Law:
     """A force that is not linear, see `sim.concealed.laws`.
 
-    kind : a name of `laws.KINDS`. site : the spring it acts beside, or the source.
+    kind : a name of `laws.KINDS`. site : the spring it acts beside, or the source. ground : it
+    acts instead between the ground and the downstream end of the body `site`, sideways.
     """
 
     kind: str
     site: str
     values: tuple[float, ...]
+    ground: bool = False
 
 
 @dataclass(slots=True)

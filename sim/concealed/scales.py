@@ -13,6 +13,7 @@ from sim.concealed.parts import Description
 RIGID = 1e9  # N m/rad: what a rig file says of a joint that is believed to be rigid
 RIGID_SOURCE = "taken as rigid"
 UNDAMPED_SOURCE = "taken as undamped"
+REACH = 1e-3  # rad or m, what a place moves by where no run was asked
 DISPLACEMENT = 0.01475e-3  # m^3/rad, of the papers' vane motor: turns a stiffness into C_h
 
 
@@ -43,12 +44,14 @@ class Scales:
 @dataclass(frozen=True, slots=True)
 class Dose:
     """How much of an effect: parameters that are stated (SI), the others at `x` times the rig's own
-    scale or drawn. where : the variant, of an effect that has some; drawn if empty."""
+    scale or drawn. where : the variant, of an effect that has some; drawn if empty. reach : rad or
+    m, what the place moves by at most without the effect, for what acts beyond a gap."""
 
     x: float
     rng: np.random.Generator
     stated: Mapping[str, float] = field(default_factory=dict)
     where: str = ""
+    reach: float = REACH
 
     def __call__(self, symbol: str, otherwise: float) -> float:
         """The parameter as stated, or else as the scale or the draw has it."""

@@ -216,6 +216,9 @@ def describing(law: Law, a: Float, v: Float, s: Complex) -> Complex:
             return np.asarray(-8 / (3 * np.pi) * q[0] * a * np.abs(s) * s)
         case "one_sided":
             return np.asarray(np.full(a.shape, -q[0] / 2, complex))
+        case "stop":
+            beyond = 1 - _clip(a, q[1])
+            return np.asarray(-q[0] * (q[2] + q[3]) / 2 * beyond + 0j)
         case "flow_saturation":
             return np.asarray(0.42 * v / q[0] + 0j)
     raise ValueError(law.kind)

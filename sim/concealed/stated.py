@@ -63,7 +63,8 @@ def row_of(plant: Description, effect: Stated) -> Row:
         if effect.site in own:
             return row
         sites += own
-    raise InputError(effect.physics, "site", effect.site, f"one of {', '.join(sites)}")
+    known = ", ".join(dict.fromkeys(sites))
+    raise InputError(effect.physics, "site", effect.site, f"one of {known}")
 
 
 def as_stated(effect: Stated, put: Concealed) -> None:

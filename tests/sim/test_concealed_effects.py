@@ -271,7 +271,7 @@ def test_fractional_damper_is_a_power_of_s() -> None:
 def test_every_row_of_the_vocabulary_has_a_place() -> None:
     plant = described(SAMII)
     assert all(places(plant, row) for row in (*ROWS, *OUTSIDE))
-    assert len(list(physics())) == 28
+    assert len(list(physics())) == 29
 
 
 # Laws. A sine at one frequency, held until it is settled, shows the describing function N(A) as
@@ -294,6 +294,11 @@ LAWS: dict[str, tuple[Law, Callable[[Float, Float], Complex]]] = {
         lambda A, s: -8 / (3 * np.pi) * 2e4 * A * np.abs(s) * s,
     ),
     "one_sided": (Law("one_sided", "joint_1", (1000.0,)), lambda A, s: np.asarray(-500.0 + 0j)),
+    # A stop that is met early: half of its stiffness, but for the way to it.
+    "stop": (
+        Law("stop", "joint_1", (1000.0, 1e-6, 1.0, 0.0)),
+        lambda A, s: np.asarray(-500.0 * (1 - 4e-6 / (np.pi * A)) + 0j),
+    ),
 }
 
 
@@ -344,6 +349,8 @@ def test_deadband_and_clipping_act_as_theirs() -> None:
         (Law("cubic", "joint_1", (1e9,)), 3.0),
         (Law("backlash", "joint_1", (1e-3, 1.36e4)), 2.5),
         (Law("drag", "joint_1", (2e4,)), 3.0),
+        (Law("stop", "joint_1", (1.36e4, 3e-4, 1.0, 1.0)), 2.5),
+        (Law("stop", "beam", (5e3, 1e-3, 1.0, 0.0), ground=True), 2.5),
         (Law("drift", "joint_1", (1.36e4, -0.3, 1.0)), 3.0),
         (Law("coulomb", "joint_2", (2.0,)), 1.7),
         (Law("drive_friction", "joint_2_source", (0.05,)), 1.6),
