@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, Literal
 
@@ -38,6 +38,7 @@ from samii_rig.rig.schema import (
     parameters,
 )
 from samii_rig.types import Complex, Float
+from samii_rig.units import STANDARD_GRAVITY
 
 Law = Literal["spring", "softness", "column", "damper", "slip", "mass"]
 LOSS = (1e-4, 10.0)  # damping force over spring force in mid band
@@ -214,6 +215,11 @@ def _at_port(rig: Rig, where: Places, row: Point, port: int) -> Iterator[Effect]
     if row.at_source and not any(isinstance(kinds[n], ANGLE_SOURCES) for n in names):
         return
     w = middle(where)
+    unknowns = row.unknowns(x, w)
+    if row.kind is GravityStiffness:
+        if (strong := _below(unknowns[0], _heaviest(rig))) is None:
+            return
+        unknowns = (strong, *unknowns[1:])
     after = names[0] if port > 0 else None
     signs = (1.0, -1.0) if row.either_sign else (1.0,)
     site, others, position = _site(rig, row, names, port)
@@ -236,7 +242,7 @@ def _at_port(rig: Rig, where: Places, row: Point, port: int) -> Iterator[Effect]
         yield Effect(
             physics=row.physics,
             site=site,
-            unknowns=row.unknowns(x, w),
+            unknowns=unknowns,
             build=build,
             parameters=values,
             jump=Jump(f"{row.jump} by {row.by} at port {port}{tail}", x_of, (row.jump, row.by)),
@@ -433,6 +439,22 @@ def _sum(rig: Rig, hanging: Hanging) -> float:
         elif symbol in p:
             total += p[symbol].value
     return total
+
+
+def _heaviest(rig: Rig) -> float:
+    """N m/rad of the weight of all that may hang on a rig, at the end of all its lengths; inf where
+    the file has no mass or no length."""
+    lengths = sum(p["L"].value for p in map(parameters, rig.element) if "L" in p)
+    return MOST_HUNG * STANDARD_GRAVITY * _sum(rig, ACROSS) * lengths or math.inf
+
+
+def _below(unknown: Unknown, most: float) -> Unknown | None:
+    """The same, of no more than `most`; None where none of it is left."""
+    if most >= unknown.high:
+        return unknown
+    if most <= unknown.low:
+        return None
+    return replace(unknown, high=most, starts=spread(unknown.low, most, STARTS))
 
 
 def _hanging_at(rig: Rig, where: Places, hanging: Hanging, port: int) -> Iterator[Effect]:

@@ -51,6 +51,7 @@ _ROWS = (
     Physics("sensor_lag", "a lag of the sensor"),
     Physics("sensor_gain", "a gain of the sensor"),
     Physics("sensor_highpass", "a high-pass of the sensor, or one of every sensor"),
+    Physics("sensor_position", "a sensor at another place"),
     Physics("gravity_cross_sensitivity", "an accelerometer that tilts"),
     Physics("noncollocated_encoder", "an encoder across other parts"),
     Physics("coulomb_friction", "dry friction"),

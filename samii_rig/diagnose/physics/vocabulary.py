@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from importlib.metadata import entry_points
 
 from samii_rig.devices.plugins import asked, named, wrong
-from samii_rig.diagnose.physics import bodies, channels, faults, points, reduced
+from samii_rig.diagnose.physics import bodies, channels, elsewhere, faults, points, reduced
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.scales import places
 from samii_rig.rig.schema import Rig
@@ -38,6 +38,7 @@ def hypotheses(
         *bodies.effects(rig, where),
         *reduced.effects(rig, between=signed),
         *channels.effects(rig, low_hz, high_hz),
+        *elsewhere.effects(rig),
         *faults.effects(rig, recorded_hz or rig.rate_hz),
         *plugged(rig, low_hz, high_hz),
     ]
