@@ -55,10 +55,10 @@ class Complete:
         disturbances: Disturbances,
         loop: Loops = (),
         part: Callable[[Int], NDArray[np.bool_]] | None = None,
-        own: Float | None = None,
+        own_power: Float | None = None,
     ) -> Complete:
         """As `formed`."""
-        found, rows = formed(records, response, disturbances, loop, part, own=own)
+        found, rows = formed(records, response, disturbances, loop, part, own_power=own_power)
         root = np.sqrt(2) * np.linalg.inv(found.noise.root(rows.f, rows.piece))
         nuisances = tuple((on, _columns(root[on] @ N, prior)) for on, N, prior in rows.each())
         likely = any(prior.any() for prior in rows.prior)

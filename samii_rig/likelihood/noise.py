@@ -146,18 +146,13 @@ class Noise:
         about = (turn * np.maximum(values, least)[:, None, :]) @ turn.conj().swapaxes(1, 2)
         return replace(self, edges=f[starts[1:]], about=about)
 
-    def no_more_than(self, own: Float) -> Noise:
-        """White noise of each sensor's own power `own` (q,) and what is known beforehand alone; of
-        a sensor whose `own` is nan the noise that it has here."""
+    def of_sensors_alone(self, own_power: Float) -> Noise:
+        """White noise of each sensor, of `own_power` (q,), and what is known beforehand; nothing
+        that disturbs the rig."""
         power = np.zeros_like(self.power)
-        power[: own.size] = np.where(np.isnan(own)[:, None], self.power[: own.size], 0.0)
-        power[: own.size, np.isinf(self.corners)] += np.nan_to_num(own)[:, None]
-        return replace(
-            self,
-            power=power,
-            edges=self.edges[:0],
-            about=np.eye(own.size, dtype=np.complex128)[None],
-        )
+        power[: own_power.size, np.isinf(self.corners)] = own_power[:, None]
+        alike = np.eye(own_power.size, dtype=np.complex128)[None]
+        return replace(self, power=power, edges=self.edges[:0], about=alike)
 
     def covariance(self, f: Float, piece: Int) -> Complex:
         """(n, q, q) at f (n,) in pieces (n,)."""

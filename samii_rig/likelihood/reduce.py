@@ -102,10 +102,10 @@ def formed(
     loop: Loops = (),
     part: Part | None = None,
     at: Float | None = None,
-    own: Float | None = None,
+    own_power: Float | None = None,
 ) -> tuple[Reduced, Rows]:
-    """As `reduced`, and the lines that it was made of. own : as of `Noise.no_more_than`, of noise
-    that is not what the lines show; None for what they do."""
+    """As `reduced`, and the lines that it was made of. own_power : as of `Noise.of_sensors_alone`,
+    of noise that is not what the lines show; None for what they do."""
     smooth, exact = records.smooth(), records.exact()
     H, S = response(exact.s), response(smooth.s)
     records = records.without_spikes(H)
@@ -137,7 +137,7 @@ def formed(
     times = _as_changes(rows, seen, power)
     if np.any(times > 1):
         power = noise(replace(known, times=times))
-    power = power if own is None else power.no_more_than(own)
+    power = power if own_power is None else power.of_sensors_alone(own_power)
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
     rows = rows.take(counted)
     form = quadratic(rows, power, S[nodes])

@@ -44,6 +44,14 @@ def stated(whole: Whole) -> Float:
     )
 
 
+def own_power(search: RecordSearch, whole: Whole) -> Float:
+    """(q,) power a sample of each sensor's noise, without its rounding: by the rig file, or as
+    estimated where that states none."""
+    sensors = {s.name: s for s in whole.rig.sensor}
+    by_file = np.array([sensors[name].noise_rms for name in whole.wired.sensors])
+    return np.where(by_file > 0, by_file, estimated(search, whole)) ** 2
+
+
 def _steps_drive(whole: Whole) -> bool:
     closed = whole.rig.centred | {f.sensor for f in whole.rig.feedback}
     steps = {s.name: s.resolution for s in whole.rig.sensor}

@@ -280,11 +280,11 @@ class Whole:
         response, disturbed = self.response(fitted), self.disturbed(fitted)
         return reduced(self.records, response, disturbed, self._loop, fitted_lines, at)
 
-    def complete(self, fitted: Fitted, own: Float | None = None) -> Complete:
-        """The same, with what no linear model explains. own : as of `Complete.about`."""
+    def complete(self, fitted: Fitted, own_power: Float | None = None) -> Complete:
+        """The same, with what no linear model explains. own_power : as of `Complete.about`."""
         disturbed = self.disturbed(fitted)
         return Complete.about(
-            self.records, self.response(fitted), disturbed, self._loop, fitted_lines, own
+            self.records, self.response(fitted), disturbed, self._loop, fitted_lines, own_power
         )
 
     def residuals(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> LineResiduals:

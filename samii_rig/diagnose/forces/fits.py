@@ -49,16 +49,17 @@ RIVALS = 4  # linear explanations that forces are held against
 class ForceFits(RecordSearch):
     """Explanations with and without a force, on the complete likelihood, every level by itself.
 
-    own : (q,) the noise that is taken for that of the records, as of `Complete.about`.
+    own_power : as of `Complete.about`. handed : keys of explanations of an earlier search.
     """
 
-    own: Float | None = None
+    own_power: Float | None = None
 
     def __init__(self, linear: RecordSearch, known: Sequence[Explanation] = ()) -> None:
         assert isinstance(linear.whole, Whole)  # of one state
         self.levels = whole = linear.whole.by_level().with_harmonics()
         self._ways = Ways(acting=tuple(whole.acting.tolist()))
         self.linear = linear
+        self.handed = {e.key for e in known}
         moved = of_data(linear).fitted
         self.paths = TransferPaths(whole, moved.model, moved.x)
         self.forces = tuple(forces(whole.rig, self.paths))
@@ -89,9 +90,13 @@ class ForceFits(RecordSearch):
     def _about(self, fitted: Fitted) -> None:
         self._ways.clear()
         by_line = self.by_line.problem
-        self.problem = ForceProblem.near(self.levels, fitted, by_line, self._ways, self.own)
+        self.problem = ForceProblem.near(self.levels, fitted, by_line, self._ways, self.own_power)
         between = self.levels.between(self.reduced, fitted)
         self._between = between, fitted.model.response(fitted.x, between)
+
+    def deviance(self, fitted: Fitted) -> float:
+        """As of `RecordSearch`, of all lines."""
+        return fitted.cost + self.reduced.log_determinant
 
     def on(self, levels: Whole, fitted: Fitted) -> Self:
         """The same on other records of these inputs, the likelihood about a fit of them."""

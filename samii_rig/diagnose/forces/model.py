@@ -50,6 +50,7 @@ class ForceModel(Model):
         which, effect = forced[0]
         assert effect.force is not None
         self.force: Force = effect.force
+        self.force.place.augmented(self.built)  # refused where a part stands along its beam
         self.unknowns = tuple(self.own(which))
         own = (self.keys.index(key) for key in self.force.keys if key in self.keys)
         self.moving = (*self.unknowns, *own)

@@ -238,8 +238,9 @@ class TransferPaths:
         one, other = self.ports(a, of_speed=False), self.ports(b, of_speed=False)
         if one is None or other is None or one.y1.shape != other.y1.shape:
             return False
-        pairs = ((one.y1, other.y1), (one.sensors[0], other.sensors[0]))
-        return all(bool(np.allclose(x, y, rtol=ALIKE, atol=0)) for x, y in pairs)
+        pairs = [(one.y1, other.y1), *zip(one.sensors[0].T, other.sensors[0].T, strict=True)]
+        norm = np.linalg.norm
+        return all(bool(norm(x - y) <= ALIKE * norm(y)) for x, y in pairs)
 
     def _made(self, place: Place, *, of_speed: bool) -> Ports | None:
         rig, records = self.model.built, self.whole.records

@@ -8,19 +8,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 from samii_rig.diagnose.physics import insert
-from samii_rig.diagnose.physics.along import BODIES, cut, sensors_on, stretches
+from samii_rig.diagnose.physics.along import AT_A_POINT, BODIES, cut, stretches
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import (
     BEAMS,
     SOURCES,
     AbsoluteAngle,
     ActuatorSpec,
-    Branch,
     Displacement,
     Element,
     Force,
     ForceSource,
-    GravityStiffness,
     LumpedMass,
     Moment,
     Parameter,
@@ -35,9 +33,6 @@ from samii_rig.rig.schema import (
 EXTRA = f"{insert.PREFIX}force"  # the input and the sensor that the chain has more
 
 Kind = Literal["joint", "ground", "drive", "command", "flow"]
-GROUNDED = (TorsionalGroundSpring, TranslationalGroundSpring)
-# Elements with no extent and nothing that gives: what is behind moves as what is before.
-AT_A_POINT = (LumpedMass, Branch, GravityStiffness, TorqueSource, ForceSource, *GROUNDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +98,7 @@ class Place:
                     rig = insert.inserted(rig, last, source)
                 if self.kind == "joint":
                     rig = insert.inserted(rig, before, self._source(-1.0, name, "before"))
+                if self.position is None:
                     rig = _read_behind(rig, last, f"{name}_behind")
                 sensor = self._moved(name, before, last)
             case "flow":
@@ -141,13 +137,15 @@ class Part:
     """A part of a rig that moves, and may rub or run against the ground.
 
     site : its name. others : names of what else is there. after : the element that it is behind;
-    or the beam that it is on, `position` m from the upstream end.
+    or the beam that it is on, `position` m from the upstream end. held : whether it slides, and
+    whether it turns, on a spring to the ground that is a place by itself.
     """
 
     site: str
     others: tuple[str, ...]
     after: str
     position: float | None = None
+    held: tuple[bool, bool] = (False, False)
 
     def to_ground(self, *, slides: bool) -> Place:
         """The place between it and the ground."""
@@ -155,8 +153,7 @@ class Part:
 
 
 def parts(rig: Rig) -> Iterator[Part]:
-    """The bodies of a rig, ends of beams and links among them, that no spring to the ground is at
-    already; and where a sensor stands on a beam."""
+    """The bodies of a rig, ends of beams and links among them; where a sensor stands on a beam."""
     at: list[Element] = []  # what one point has
     for element in rig.element:
         if not isinstance(element, AT_A_POINT):
@@ -169,18 +166,16 @@ def parts(rig: Rig) -> Iterator[Part]:
 
 
 def _at_point(at: list[Element]) -> Iterator[Part]:
-    if any(isinstance(e, GROUNDED) for e in at):
-        return
+    slides = any(isinstance(e, TranslationalGroundSpring) for e in at)
+    turns = any(isinstance(e, TorsionalGroundSpring) for e in at)
     some = [e.name for e in at if isinstance(e, (LumpedMass, *BODIES))]
     if some:
-        yield Part(some[-1], tuple(some[:-1]), at[-1].name)
+        yield Part(some[-1], tuple(some[:-1]), at[-1].name, held=(slides, turns))
 
 
 def _with_sensor(rig: Rig, beam: Element) -> Iterator[Part]:
-    inner = [along.start for along in stretches(rig, beam)][1:]
-    for x in sorted({s.position for s in sensors_on(rig, beam.name)}):
-        if x in inner:
-            yield Part(beam.name, (), beam.name, x)
+    for along in list(stretches(rig, beam))[1:]:  # from one sensor to the next
+        yield Part(beam.name, (), beam.name, along.start)
 
 
 def _into(rig: Rig, beam: str, position: float, part: Element) -> Rig:

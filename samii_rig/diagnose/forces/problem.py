@@ -188,12 +188,12 @@ class ForceProblem(RecordProblem):
         fitted: Fitted,
         by_line: Problem,
         ways: Ways,
-        own: Float | None = None,
+        own_power: Float | None = None,
     ) -> ForceProblem:
-        """About a fit, with a force or without. own : as of `Complete.about`."""
+        """About a fit, with a force or without. own_power : as of `Complete.about`."""
         moved = Moved(whole, ways)
         about = moved.without(fitted) if isinstance(fitted.model, ForceModel) else whole
-        complete = about.complete(fitted, own)
+        complete = about.complete(fitted, own_power)
         records, exact = whole.records, whole.records.exact()
         S = whole.response(fitted)(exact.s)
         order, k = complete.rows.order, [records.lines(p).k for p in records.pieces]

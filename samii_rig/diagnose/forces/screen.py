@@ -115,8 +115,8 @@ def trial_strengths(effect: Effect, paths: TransferPaths) -> list[Float]:
     if law in (OVERLAP, PLAY, SLACK):
         return [np.array([high / 2 * x]) for x in GAPS]
     if law.physics == STOPS.physics:
-        k = effect.unknowns[1].high * WEAK_START**2  # which begins beyond what moves nothing
-        return [np.array([high * x, k]) for x in REACHED]
+        k = effect.unknowns[1].high * WEAK_START**2  # a thousandth of what halves the motion
+        return [np.array([high / 2 * x, k]) for x in REACHED]
     if law is ORIFICE:
         return [np.array([high * WEAK_START])]
     if law is HYSTERESIS:

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from copy import copy
 
 import numpy as np
 
 from samii_rig.diagnose.fit.explanations import NEAR_BEST, Explanation, named, threshold
-from samii_rig.diagnose.fit.own_noise import MORE_NOISE, estimated, stated
+from samii_rig.diagnose.fit.own_noise import MORE_NOISE, estimated, own_power, stated
 from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
@@ -24,6 +25,7 @@ from samii_rig.diagnose.forces.fits import of_data
 from samii_rig.diagnose.forces.laws import SLACK
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.screen import ForceScreen, Score, first_order, scaled
+from samii_rig.diagnose.forces.way import Ways
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.errors import SamiiRigError
 from samii_rig.likelihood.unexplained import Unexplained, as_rounding, evenly
@@ -41,6 +43,7 @@ PROMISING = 0.25  # of what the best force gains, at least
 # Of what passes for noise, that a force leaves before the chain moves with it: three true ones left
 # between 0.02 and 0.8, the best of others 0.997.
 NOT_NOISE = 0.9
+COMPETE = 8  # explanations that compete again about such a force
 MIMICS = 3  # physics of which such a force is refitted: a stop that gives bends like a cubic spring
 INCONSISTENT = 1e-4  # chance of a true force to explain lines as unevenly, below which it is none
 # The same of a linear effect, whose refit may end elsewhere: of 14 right ones the least even had
@@ -91,45 +94,67 @@ class ForceSearch(BesideForce):
 
     def _beyond_noise(self) -> None:
         """Where the records have more noise than their sensors, look for a force that passes for
-        it: with noise of the sensors' own colour, as large as what the best explanation leaves."""
+        it, and stand about it where these are more likely with the noise that it leaves."""
         whole = self.linear.whole
         assert isinstance(whole, Whole)  # of one state
-        own = stated(whole)
-        if not np.any(estimated(self.linear, whole) > MORE_NOISE * own):
+        if not np.any(estimated(self.linear, whole) > MORE_NOISE * stated(whole)):
             return
-        known = [e for e in self.ranked() if isinstance(e.fitted.model, ForceModel)]
-        kept = [e for e in self.ranked() if e.effects and e not in known]
-        left = self._as_large(own, self.nominal)
-        self._only((self.nominal, *_first_of_each(known)))
-        self._try(self.scores([self.nominal]), self.nominal, 0, all_to_the_end=True)
-        for some in (MIMICS, 1, 1):
-            enough = NOT_NOISE * self.nominal.fitted.cost
-            best = [e for e in _first_of_each(self.ranked()) if e.fitted.cost < enough][:some]
-            if not best or self.exhausted:
-                break
-            for e in best:
-                self._exactly(e)
-            before, first = left, self.ranked()[0]
-            left = self._as_large(own, first)
-            self._only((first, self.nominal))
-            if left > before / 2:
-                break
-        first = self.ranked()[0]
-        self.own = None
-        self._about((first if first.effects else (*kept, first)[0]).fitted)
-        self._only((first, *kept, self.nominal))
+        before = self.ranked()
+        known = next((e for e in before if e.key in self.handed and _alone(e)), None)
+        best = known or self._in_sensors_noise(own_power(self.linear, whole))
+        if best is None:
+            return
+        anew = self.on(self.levels, best.fitted)
+        end = anew.refitted(best.effects, best, far=False)
+        if end is None or anew.deviance(end) > self.deviance(before[0].fitted):
+            self._ways.clear()
+            return
+        self.problem, self._between = anew.problem, anew._between
+        best = Explanation(best.effects, end, 0.0)
+        self._only((self.nominal, of_data(self), *before[:COMPETE], best))
+        self.most_explained = max(self.most_explained, self.nominal.fitted.chi2 - end.chi2)
 
-    def _as_large(self, own: Float, best: Explanation) -> float:
-        """Take noise of the sensors' own colour that is as large as what an explanation leaves; how
+    def _in_sensors_noise(self, own_power: Float) -> Explanation | None:
+        """The force that explains most where the noise is the sensors' own, as many times as large
+        as what is left, None where none explains what passes for noise. own_power : (q,)."""
+        trial = copy(self)
+        trial._ways = Ways(acting=self._ways.acting)
+        trial.found = {}
+        base = of_data(self)
+        try:
+            left = trial._as_large(own_power, base)
+            trial._only((self.nominal, base, *_first_of_each(self.ranked())))
+            base = trial.found[base.key]
+            trial._try(trial.scores([base]), base, 0, all_to_the_end=True)
+            for some in (MIMICS, 1, 1):
+                each = _first_of_each(trial.ranked())[:some]
+                best = [e for e in each if e.fitted.cost < NOT_NOISE * base.fitted.cost]
+                if not best or trial.exhausted:
+                    break
+                for e in best:
+                    trial._exactly(e)
+                first, before = trial.ranked()[0], left
+                left = trial._as_large(own_power, first)
+                trial._only((trial.nominal, base, first))
+                base = trial.found[base.key]
+                if np.sum(np.log(before / left)) < math.log(2):  # hardly less
+                    break
+        except (SamiiRigError, np.linalg.LinAlgError, KeyError):
+            return None  # in that noise no rig is near what was recorded
+        first = trial.ranked()[0]
+        return first if first.fitted.cost < NOT_NOISE * base.fitted.cost else None
+
+    def _as_large(self, own_power: Float, best: Explanation) -> Float:
+        """Take noise of the sensors alone that is as large as what an explanation leaves; (q,) how
         many times it has the power of their own."""
-        fitted = best.fitted
-        self.own = own**2
-        self._about(fitted)
-        r = self._force_problem.residual(fitted.model.response(fitted.x, self._force_problem.at))
-        left = max(float(r @ r) / self._force_problem.expected, 1.0)
-        self.own = own**2 * left
-        self._about(fitted)
-        return left
+        self.own_power = own_power
+        self._about(best.fitted)
+        complete = self._force_problem.complete
+        white = complete.white(complete.rows.e)
+        left = np.maximum(np.mean(np.abs(white) ** 2, axis=0) / 2, 1.0)
+        self.own_power = own_power * left
+        self._about(best.fitted)
+        return np.asarray(left)
 
     def _to_rest(self) -> bool:
         """Make the likelihood anew about the best explanation until that stands still; whether it
@@ -299,17 +324,26 @@ def compete_on_records(linear: RecordSearch, known: Sequence[Explanation] = ()) 
     return search
 
 
+def _alone(e: Explanation) -> bool:
+    """Whether a force is all that is missing of the rig."""
+    real = [x for x in e.effects if x.physical]
+    return len(real) == 1 and real[0].force is not None
+
+
 def _first_of_each(ranked: Sequence[Explanation]) -> list[Explanation]:
     """Of forces that stand alone the best of each physics."""
-    alone = [e for e in ranked if len(e.effects) == 1 and e.effects[0].force is not None]
-    return list({e.effects[0].physics: e for e in reversed(alone)}.values())[::-1]
+    best: dict[str, Explanation] = {}
+    for e in filter(_alone, ranked):
+        best.setdefault(next(x.physics for x in e.effects if x.physical), e)
+    return list(best.values())
 
 
 def _first(scores: Sequence[Score], most: int) -> list[Score]:
     """The first so many, and play in which nothing acts: to first order it looks like play."""
-    others = [h for h in scores if h.effect.force is None or h.effect.force.law is not SLACK][:most]
+    slack = [h for h in scores if h.effect.force is not None and h.effect.force.law is SLACK]
+    others = [h for h in scores if h not in slack][:most]
     names = {h.effect.name for h in others}
-    return [h for h in scores if h in others or h.effect.name in names]
+    return [h for h in scores if h in others or (h in slack and h.effect.name in names)]
 
 
 def _promising(scores: Sequence[Score], critical_value: float, at: int) -> list[Score]:
@@ -320,7 +354,10 @@ def _promising(scores: Sequence[Score], critical_value: float, at: int) -> list[
     some = [h for h in ranked if h.own[at] > max(critical_value / 2, PROMISING * ranked[0].own[at])]
     if not some:
         return []
-    first = list({h.effect.physics: h for h in reversed(some)}.values())[::-1]
+    best: dict[str, Score] = {}
+    for h in some:
+        best.setdefault(h.effect.physics, h)
+    first = list(best.values())
     # Torques and angles of neighbouring joints go nearly together.
     elsewhere = [h for h in some[1:] if h.effect.physics == some[0].effect.physics]
     return list({h.effect.key: h for h in (*first[:TRIED], *elsewhere[:TRIED])}.values())

@@ -53,6 +53,7 @@ PRESLID = (
     1e-3,
     1e-2,
 )  # way before dry friction slides over the largest motion, to begin with
+HELD = 1e-9  # of the largest motion, one that is rounding
 NEAREST = 1e-3  # of the largest motion, a way to a stop: nearer, it is a spring
 HARDEST = 1e3  # stiffness of a stop over the one that halves the motion there: it moves no further
 WIDTHS = (1e-6, 2.0)  # of a gap or limit over the largest amplitude that meets it
@@ -134,26 +135,26 @@ def _between(paths: TransferPaths, place: Place, spring: Spring) -> Iterator[Eff
 def _to_ground(rig: Rig, paths: TransferPaths) -> Iterator[Effect]:
     """Forces between a body and the ground: across, or about it where nothing shifts."""
     bodies = list(parts(rig))
-    shifts = [_moves(paths, b.to_ground(slides=True)) for b in bodies]
     springs = [
         Place("joint", (e.name,), isinstance(e, TranslationalSpring))
         for e in rig.element
         if isinstance(e, TorsionalSpring | TranslationalSpring)
     ]
-    for body, on in zip(bodies, shifts, strict=True):
-        place = body.to_ground(slides=on)
-        if any(shifts) and not on:
+    ways = {
+        on: [_largest(paths, b.to_ground(slides=on), of_speed=False) for b in bodies]
+        for on in (True, False)
+    }
+    top = max((way for each in ways.values() for way in each), default=0.0)  # m, or rad
+    slides = any(way > HELD * top for way in ways[True])
+    for body, way in zip(bodies, ways[slides], strict=True):
+        place = body.to_ground(slides=slides)
+        if way <= HELD * top or body.held[not slides]:
             continue
         if any(paths.alike(place, spring) for spring in springs):  # one that stands on the ground
             continue
-        others = (*_rubbing(paths, place, body.site, ""), *_stops(paths, place, body.site))
-        for e in others:
+        for e in (*_rubbing(paths, place, body.site, ""), *_stops(paths, place, body.site)):
             aliases = tuple((e.physics, other) for other in body.others)
             yield replace(e, aliases=aliases, position=body.position)
-
-
-def _moves(paths: TransferPaths, place: Place) -> bool:
-    return paths.ports(place, of_speed=False) is not None
 
 
 def _rubbing(paths: TransferPaths, place: Place, site: str, other: str) -> Iterator[Effect]:
@@ -171,7 +172,7 @@ def _stops(paths: TransferPaths, place: Place, site: str, other: str = "") -> It
         return
     of_force, of_way = place.units
     doubles = 1 / float(np.median(moved.y1))
-    gap = _log("gap", of_way, NEAREST * top, top)
+    gap = _log("gap", of_way, NEAREST * top, WIDTHS[1] * top)
     k = _log("k", f"{of_force}/{of_way}", STRENGTH_RANGE[0] * doubles, HARDEST * doubles)
     for law in (STOPS, STOP_ABOVE, STOP_BELOW):
         yield effect(law, place, site, other, (gap, k))
@@ -210,8 +211,15 @@ def uneven(even: Effect) -> Effect:
     assert even.force is not None
     (T_c,) = even.unknowns
     unknowns = tuple(_log(symbol, T_c.unit, T_c.low, T_c.high) for symbol in UNEVEN.symbols)
-    alias = even.aliases[0][1] if even.aliases else ""
-    return effect(UNEVEN, even.force.place, even.site, alias, unknowns)
+    return _in_place_of(even, UNEVEN, unknowns)
+
+
+def _in_place_of(old: Effect, law: Law, unknowns: tuple[Unknown, ...]) -> Effect:
+    """Another law where a force is, by all names of that place."""
+    assert old.force is not None
+    aliases = tuple((law.physics, site) for _, site in old.aliases)
+    made = effect(law, old.force.place, old.site, "", unknowns)
+    return replace(made, aliases=aliases, position=old.position)
 
 
 def presliding(even: Effect, paths: TransferPaths) -> Effect | None:
@@ -230,9 +238,7 @@ def presliding(even: Effect, paths: TransferPaths) -> Effect | None:
     high = max(STRENGTH_RANGE[1] * doubles, stiff)
     k = _log("k", f"{of_force}/{of_way}", STRENGTH_RANGE[0] * doubles, high)
     unknowns = (_log(PRESLIDING.symbols[0], T_c.unit, T_c.low, T_c.high), k)
-    return effect(
-        PRESLIDING, place, even.site, even.aliases[0][1] if even.aliases else "", unknowns
-    )
+    return _in_place_of(even, PRESLIDING, unknowns)
 
 
 def _largest(paths: TransferPaths, place: Place, *, of_speed: bool) -> float:

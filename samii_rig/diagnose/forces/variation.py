@@ -213,8 +213,8 @@ class Uneven:
             )
         return (
             f"the spring of {self.site} is not the same to both sides: that explains "
-            f"{math.sqrt(self.chi2):.3g} sigma, and has no row in the table (a crack, a stop or a "
-            "preload that ends would do it)"
+            f"{math.sqrt(self.chi2):.3g} sigma (no stop beyond a gap does it as well; a preload "
+            "that ends, or a spring that is softer to one side, would)"
         )
 
 

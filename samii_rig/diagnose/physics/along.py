@@ -21,17 +21,27 @@ from samii_rig.rig.schema import (
     Acceleration,
     Branch,
     Element,
+    ForceSource,
+    GravityStiffness,
     LumpedMass,
     Rig,
     RigidLink,
     Rod,
     Strain,
+    TorqueSource,
+    TorsionalGroundSpring,
+    TranslationalGroundSpring,
 )
 
 POSITION = "position"  # symbol of the unknown
 PIECE = "_piece_"  # in the names of what a body is cut into, between its own and a number
 SHORTEST = 1e-4  # of a body's length, of a piece: to the data the same as none
 SHORT = 0.25  # of a stretch, that its ends take at most where that is hardly longer than SHORTEST
+# Elements with no extent and nothing that gives: what is behind moves as what is before.
+AT_A_POINT = (
+    LumpedMass, Branch, GravityStiffness, TorqueSource, ForceSource, TorsionalGroundSpring,
+    TranslationalGroundSpring,
+)  # fmt: skip
 BODIES = (RigidLink, *BEAMS, Rod)  # elements with a length, along which something may stand
 
 

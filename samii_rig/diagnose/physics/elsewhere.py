@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from samii_rig.diagnose.physics import along as along_
 from samii_rig.diagnose.physics import insert
-from samii_rig.diagnose.physics.along import Along, stretches
+from samii_rig.diagnose.physics.along import AT_A_POINT, BODIES, Along, stretches
 from samii_rig.diagnose.physics.effect import Effect, Key, Values
 from samii_rig.rig.schema import (
     BEAMS,
@@ -36,16 +36,17 @@ def effects(rig: Rig) -> Iterator[Effect]:
 
 
 def _beams(rig: Rig, sensor: Placed) -> Iterator[Element]:
-    """The beam that a sensor is on; the beams that end where it is, if it is on none."""
+    """The beam that a sensor is on; those that end where it is, if it is at an end."""
     order = list(rig.element)
     at = next(i for i, e in enumerate(order) if e.name == _place(sensor))
-    if isinstance(order[at], BEAMS):
-        yield order[at]
-        if isinstance(sensor, Acceleration):
-            return
-    yield from (
-        e for e in (*order[max(at - 1, 0) : at], *order[at + 1 : at + 2]) if isinstance(e, BEAMS)
-    )
+    here = order[at]
+    if isinstance(sensor, Acceleration) and isinstance(here, BODIES):
+        yield from (here,) if isinstance(here, BEAMS) else ()  # along a link it has no end
+        return
+    upstream = [e for e in order[: at + 1] if not isinstance(e, AT_A_POINT)]
+    yield from (e for e in upstream[-1:] if isinstance(e, BEAMS))
+    downstream = [e for e in order[at + 1 :] if not isinstance(e, AT_A_POINT)]
+    yield from (e for e in downstream[:1] if isinstance(e, BEAMS))
 
 
 def _place(sensor: Placed) -> str:

@@ -37,6 +37,7 @@ from samii_rig.rig.schema import (
     TranslationalSpring,
     parameters,
 )
+from samii_rig.rig.schema.elements import flattened
 from samii_rig.types import Complex, Float
 from samii_rig.units import STANDARD_GRAVITY
 
@@ -433,7 +434,7 @@ def _swinging(rig: Rig, where: Places, hanging: Hanging, x: float) -> tuple[Unkn
 def _sum(rig: Rig, hanging: Hanging) -> float:
     """kg of all bodies of a rig file, or kg m^2."""
     symbol, total = hanging.point.strong, 0.0
-    for p in map(parameters, rig.element):
+    for p in map(parameters, flattened(rig.element)):
         if symbol == "m" and "mu" in p:
             total += p["mu"].value * p["L"].value
         elif symbol in p:
@@ -444,7 +445,7 @@ def _sum(rig: Rig, hanging: Hanging) -> float:
 def _heaviest(rig: Rig) -> float:
     """N m/rad of the weight of all that may hang on a rig, at the end of all its lengths; inf where
     the file has no mass or no length."""
-    lengths = sum(p["L"].value for p in map(parameters, rig.element) if "L" in p)
+    lengths = sum(e.L.value for e in rig.element if isinstance(e, along_.BODIES))
     return MOST_HUNG * STANDARD_GRAVITY * _sum(rig, ACROSS) * lengths or math.inf
 
 

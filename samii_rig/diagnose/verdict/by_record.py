@@ -15,6 +15,7 @@ from samii_rig.diagnose.fit.explanations import FIVE, Explanation, threshold
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import TEST_TURN, Whole
 from samii_rig.diagnose.fit.rigfile import explained
+from samii_rig.diagnose.forces.laws import STOPS
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.variation import (
     BySpring,
@@ -388,8 +389,13 @@ def _constant(
     rival = max(judged.best.weight - own.weight, (own.fitted.cost - judged.best.fitted.cost) / 2)
     seen = None if _is_linear(judged) and not differ else BySpring.of(forces, base)
     sides = uneven_spring(seen) if seen else None
-    # What is in no row is not told of less than what is.
-    if sides is not None and sides.chi2 > max(2 * rival, judged.evidence.worth):
+    # What is in no row is not told of less than what is, nor of a spring that a stop is named at.
+    stops = {e.site for e in judged.best.effects if e.physics == STOPS.physics}
+    if (
+        sides is not None
+        and sides.site not in stops
+        and sides.chi2 > max(2 * rival, judged.evidence.worth)
+    ):
         looked = replace(looked, remarks=(*looked.remarks, sides.describe()))
         return looked if sides.bent else _unknown(looked)
     physical = any(e.physical for e in judged.best.effects)
