@@ -9,6 +9,8 @@ import pytest
 from table_kit import table_of
 
 from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.fit.refit import Fitted
+from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.physics import elsewhere
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.model.tmm import Chain
@@ -56,6 +58,22 @@ def test_a_sensor_that_is_moved_shows_what_one_there_shows(there: float) -> None
     got = model.chain.with_values(model.values(x)).response(F)
     want = Chain(rig_of(strip(there))).response(F)
     np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-9 * np.abs(want).max())
+
+
+def test_the_new_rig_file_has_the_beam_in_one_piece_and_the_sensor_there() -> None:
+    rig = rig_of(strip(0.12))
+    stretched = rig_of(strip(0.12).replace('on = "tip_mass"', 'on = "strip"\nposition = 0.3'))
+    for stated in (rig, stretched):
+        (effect,) = (e for e in elsewhere.effects(stated) if e.site == "a_mid")
+        model = Model(stated, (effect,))
+        x = np.append(np.zeros(model.n_nominal), 0.19 / 0.3)
+        new = explained(Fitted(model, x, 0.0, 0.0, np.zeros((0, model.n)), np.eye(model.n)))
+        assert [e.name for e in new.element] == [e.name for e in stated.element]
+        moved = next(s for s in new.sensor if s.name == "a_mid")
+        assert (moved.on, moved.position) == ("strip", pytest.approx(0.19))
+        got = Chain(new).response(F)
+        want = model.chain.with_values(model.values(x)).response(F)
+        np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-9 * np.abs(want).max())
 
 
 def test_it_may_be_along_each_beam_that_ends_where_it_is() -> None:

@@ -181,6 +181,28 @@ def cut(rig: Rig, along: Along, part: Element, u: float = math.exp(0.5)) -> Rig:
     return rig.model_copy(update={"element": elements, "sensor": sensors})
 
 
+def joined(rig: Rig, along: Along, part: str) -> Rig:
+    """The rig as before `cut`, without `part`: its pieces and the sensors on them as one body's."""
+    tip = f"{along.body}{PIECE}end"
+    gone = {*along.pieces, part, tip}
+    names = (*along.pieces, along.body)
+    L = sum(e.L.value for e in rig.element if isinstance(e, BODIES) and e.name in names)
+
+    def whole(e: Any) -> Any:
+        if e.name != along.body:
+            return e
+        return e.model_copy(update={"L": e.L.model_copy(update={"value": L})})
+
+    def on_it(sensor: Any) -> Any:
+        if getattr(sensor, "on", None) not in (*gone, along.body):
+            return sensor
+        at = {tip: L, along.body: along.end + sensor.position}.get(sensor.on, sensor.position)
+        return sensor.model_copy(update={"on": along.body, "position": at})
+
+    elements = tuple(whole(e) for e in rig.element if e.name not in gone)
+    return rig.model_copy(update={"element": elements, "sensor": tuple(map(on_it, rig.sensor))})
+
+
 def body_of(piece: str) -> str:
     """The body that a piece is of; its own name for what is no piece."""
     return piece.partition(PIECE)[0]

@@ -82,6 +82,12 @@ def _moved(sensor: Placed, beam: Element, stretch: Along) -> Effect:
             out |= {(piece, s): nominal[beam.name, s] for s in symbols}
         return out
 
+    def write(r: Rig, x: Float) -> Rig:
+        if isinstance(sensor, Displacement):
+            return r  # it stands behind an element
+        at = {"on": beam.name, "position": stretch.position(float(x[0]))}
+        return insert.sensor_changed(along_.joined(r, stretch, part.name), sensor.name, **at)
+
     return Effect(
         physics="sensor_position",
         site=sensor.name,
@@ -90,6 +96,7 @@ def _moved(sensor: Placed, beam: Element, stretch: Along) -> Effect:
         parameters=placed,
         touches=tuple((beam.name, s) for s in parameters(beam)),
         report=lambda x: x * 0 + stretch.position(float(x[0])),
+        write=write,
         weight=stretch.share,
         variant=stretch.place(),
         pieces=stretch.pieces,
