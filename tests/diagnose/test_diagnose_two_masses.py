@@ -34,6 +34,18 @@ def noisy(found: Diagnosis) -> list[str]:
     return [words for words in found.not_physics if "times the noise" in words]
 
 
+def test_noise_that_is_more_than_the_sensors_is_no_force() -> None:
+    """Ten times as much of both, as on a floor that shakes the meter: every force was tried as one
+    that passes for it."""
+    run = recorded(V, 4)
+    more = np.random.default_rng(8).standard_normal((V.size, 2)) * [10e-6, 0.2]
+    values = run.values.copy()
+    values[:, 1:] += more
+    found = diagnosed(replace(run, values=values), effects=table_of(RIG, 0.5, 40.0, "added_mass"))
+    assert found.verdict == "no_mismatch"
+    assert len(noisy(found)) == 1
+
+
 def test_nothing_is_missing_and_the_noise_is_the_sensors_own(nothing: Diagnosis) -> None:
     assert nothing.verdict == "no_mismatch"
     assert noisy(nothing) == []
