@@ -43,6 +43,8 @@ PROMISING = 0.25  # of what the best force gains, at least
 # Of what passes for noise, that a force leaves before the chain moves with it: three true ones left
 # between 0.02 and 0.8, the best of others 0.997.
 NOT_NOISE = 0.9
+# The same, that it explains before it is refitted, at least: true ones did a sixth and more.
+PROMISED = 0.05
 COMPETE = 8  # explanations that compete again about such a force
 MIMICS = 3  # physics of which such a force is refitted: a stop that gives bends like a cubic spring
 INCONSISTENT = 1e-4  # chance of a true force to explain lines as unevenly, below which it is none
@@ -125,9 +127,11 @@ class ForceSearch(BesideForce):
             left = trial._as_large(own_power, base)
             trial._only((self.nominal, base, *_first_of_each(self.ranked())))
             base = trial.found[base.key]
-            trial._try(trial.scores([base]), base, 0, all_to_the_end=True)
-            for some in (MIMICS, 1, 1):
-                each = _first_of_each(trial.ranked())[:some]
+            least = PROMISED * base.fitted.cost
+            some = [h for h in trial.scores([base]) if h.own[0] > least]
+            trial._try(some, base, 0, all_to_the_end=True)
+            for many in (MIMICS, 1, 1):
+                each = _first_of_each(trial.ranked())[:many]
                 best = [e for e in each if e.fitted.cost < NOT_NOISE * base.fitted.cost]
                 if not best or trial.exhausted:
                     break
