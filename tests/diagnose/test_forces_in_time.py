@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -129,42 +130,45 @@ def test_uneven_friction_holds_back_as_much_as_each_way_says() -> None:
     assert np.max(e) == pytest.approx(0.6)
 
 
-@given(top=st.floats(0.1, 3.0), k=st.floats(0.5, 20.0), phase=st.floats(0.0, 6.0))
-@settings(max_examples=10, deadline=None)
-def test_a_step_of_bouc_wen_is_its_differential_equation(top: float, k: float, phase: float):
-    """h' = k x' (1 - (sign(x' h) + 1)/2 |h|/top), x of two sines."""
+def follows(
+    after: Callable[..., tuple[float, ...]],
+    grows: Callable[[float, Float], Float],
+    top: float,
+    k: float,
+    phase: float,
+) -> None:
+    """Steps of a law are h' = k x' grows(x', h), x of two sines."""
     t = np.linspace(0, 6, 4001)
     x = np.sin(t) + 0.5 * np.sin(2.7 * t + phase)
 
     def rate(now: float, h: Float) -> Float:
         speed = math.cos(now) + 1.35 * math.cos(2.7 * now + phase)
-        return k * speed * (1 - 0.5 * (np.sign(speed * h) + 1) * np.abs(h) / top)
+        return k * speed * grows(speed, h)
 
     want = solve_ivp(rate, (0, 6), [0.0], t_eval=t, rtol=1e-8, atol=1e-10, max_step=2e-3).y[0]
     h, got = 0.0, [0.0]
     for dx in np.diff(x):
-        h = advanced(h, dx, top, k)[0]
+        h = after(h, dx, top, k)[0]
         got.append(h)
     assert np.max(np.abs(got - want)) < 2e-3 * top
+
+
+@given(top=st.floats(0.1, 3.0), k=st.floats(0.5, 20.0), phase=st.floats(0.0, 6.0))
+@settings(max_examples=10, deadline=None)
+def test_a_step_of_bouc_wen_is_its_differential_equation(top: float, k: float, phase: float):
+    """h' = k x' (1 - (sign(x' h) + 1)/2 |h|/top)."""
+
+    def grows(speed: float, h: Float) -> Float:
+        return 1 - 0.5 * (np.sign(speed * h) + 1) * np.abs(h) / top
+
+    follows(advanced, grows, top, k, phase)
 
 
 @given(top=st.floats(0.1, 3.0), k=st.floats(0.5, 20.0), phase=st.floats(0.0, 6.0))
 @settings(max_examples=5, deadline=None)
 def test_a_step_of_dahl_is_his_differential_equation(top: float, k: float, phase: float) -> None:
-    """h' = k x' (1 - sign(x') h/top), x of two sines."""
-    t = np.linspace(0, 6, 4001)
-    x = np.sin(t) + 0.5 * np.sin(2.7 * t + phase)
-
-    def rate(now: float, h: Float) -> Float:
-        speed = math.cos(now) + 1.35 * math.cos(2.7 * now + phase)
-        return k * speed * (1 - np.sign(speed) * h / top)
-
-    want = solve_ivp(rate, (0, 6), [0.0], t_eval=t, rtol=1e-8, atol=1e-10, max_step=2e-3).y[0]
-    h, got = 0.0, [0.0]
-    for dx in np.diff(x):
-        h = slid(h, dx, top, k)[0]
-        got.append(h)
-    assert np.max(np.abs(got - want)) < 2e-3 * top
+    """h' = k x' (1 - sign(x') h/top)."""
+    follows(slid, lambda speed, h: 1 - np.sign(speed) * h / top, top, k, phase)
 
 
 @pytest.mark.parametrize("law", [laws.HYSTERESIS, laws.PRESLIDING], ids=lambda law: law.tag)

@@ -8,8 +8,9 @@ linear effects against what a force leaves. One rule decides.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
+from typing import TypeVar
 
 import numpy as np
 
@@ -51,6 +52,8 @@ INCONSISTENT = 1e-4  # chance of a true force to explain lines as unevenly, belo
 # The same of a linear effect, whose refit may end elsewhere: of 14 right ones the least even had
 # 1e-5, the oscillator that took a few lines of a clipped command 3e-29.
 LINEAR_INCONSISTENT = 1e-10
+
+One = TypeVar("One")
 
 
 class ForceSearch(BesideForce):
@@ -336,9 +339,14 @@ def _alone(e: Explanation) -> bool:
 
 def _first_of_each(ranked: Sequence[Explanation]) -> list[Explanation]:
     """Of forces that stand alone the best of each physics."""
-    best: dict[str, Explanation] = {}
-    for e in filter(_alone, ranked):
-        best.setdefault(next(x.physics for x in e.effects if x.physical), e)
+    return _firsts(filter(_alone, ranked), lambda e: next(x for x in e.effects if x.physical))
+
+
+def _firsts(ranked: Iterable[One], effect: Callable[[One], Effect]) -> list[One]:
+    """Of each physics the first."""
+    best: dict[str, One] = {}
+    for one in ranked:
+        best.setdefault(effect(one).physics, one)
     return list(best.values())
 
 
@@ -358,10 +366,7 @@ def _promising(scores: Sequence[Score], critical_value: float, at: int) -> list[
     some = [h for h in ranked if h.own[at] > max(critical_value / 2, PROMISING * ranked[0].own[at])]
     if not some:
         return []
-    best: dict[str, Score] = {}
-    for h in some:
-        best.setdefault(h.effect.physics, h)
-    first = list(best.values())
+    first = _firsts(some, lambda h: h.effect)
     # Torques and angles of neighbouring joints go nearly together.
     elsewhere = [h for h in some[1:] if h.effect.physics == some[0].effect.physics]
     return list({h.effect.key: h for h in (*first[:TRIED], *elsewhere[:TRIED])}.values())

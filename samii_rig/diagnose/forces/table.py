@@ -108,8 +108,7 @@ def _between(paths: TransferPaths, place: Place, spring: Spring) -> Iterator[Eff
         return
     # The sine in c2 |speed| speed is two thirds of that in friction of T_c = c2 speed^2.
     speed = _largest(paths, place, of_speed=True)
-    force = rubbing[0].unknowns[0].high / STRENGTH_RANGE[1]
-    c2 = 3 / 2 * force / speed**2
+    c2 = 3 / 2 * _stopping(paths, place) / speed**2
     unknown = _log(
         "c2", f"{of_force} s^2/{of_way}^2", STRENGTH_RANGE[0] * c2, STRENGTH_RANGE[1] * c2
     )
@@ -158,12 +157,17 @@ def _to_ground(rig: Rig, paths: TransferPaths) -> Iterator[Effect]:
 
 
 def _rubbing(paths: TransferPaths, place: Place, site: str, other: str) -> Iterator[Effect]:
-    speed, ports = _largest(paths, place, of_speed=True), paths.ports(place, of_speed=True)
-    if speed <= 0 or ports is None:
+    force = _stopping(paths, place)
+    if force <= 0:
         return
-    force = np.pi / 4 * speed / float(np.median(ports.y1))
     T_c = _log("T_c", place.units[0], STRENGTH_RANGE[0] * force, STRENGTH_RANGE[1] * force)
     yield effect(FRICTION, place, site, other, (T_c,))
+
+
+def _stopping(paths: TransferPaths, place: Place) -> float:
+    """Dry friction that would halve the speed at a place; 0 where nothing moves."""
+    speed, ports = _largest(paths, place, of_speed=True), paths.ports(place, of_speed=True)
+    return 0.0 if ports is None else np.pi / 4 * speed / float(np.median(ports.y1))
 
 
 def _stops(paths: TransferPaths, place: Place, site: str, other: str = "") -> Iterator[Effect]:

@@ -8,13 +8,13 @@ place is a length of the chain, so that derivatives by it are the chain's own.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 from samii_rig.diagnose.physics import insert
-from samii_rig.diagnose.physics.effect import Key, Unknown
+from samii_rig.diagnose.physics.effect import Key, Unknown, Values
 from samii_rig.errors import InputError
 from samii_rig.rig.schema import (
     BEAMS,
@@ -97,6 +97,14 @@ class Along:
         if not behind:
             return {**out, (self.body, "L"): L - at}
         return {**out, (behind[0], "L"): self.end - at, (self.body, "L"): L - self.end}
+
+    def of_pieces(self, u: float, nominal: Values, symbols: Sequence[str]) -> dict[Key, float]:
+        """Parameters of all pieces: their lengths, and `symbols` of the body, whose material they
+        are. nominal : values of the body's own."""
+        out = self.lengths(u, nominal[self.body, "L"])
+        for piece in self.pieces:
+            out |= {(piece, s): nominal[self.body, s] for s in symbols if s != "L"}
+        return out
 
 
 def stretches(rig: Rig, element: Element) -> Iterator[Along]:

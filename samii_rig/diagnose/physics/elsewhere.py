@@ -62,7 +62,6 @@ def _moved(sensor: Placed, beam: Element, stretch: Along) -> Effect:
     """It anywhere along a stretch: on a part with no mass, where the beam is cut."""
     name = f"{insert.PREFIX}place_of_{sensor.name}"
     part = LumpedMass(kind="lumped_mass", name=name, m=insert.parameter(0.0, "kg"))
-    symbols = [s for s in parameters(beam) if s != "L"]
 
     def build(r: Rig) -> Rig:
         own = next(s for s in r.sensor if s.name == sensor.name)
@@ -77,10 +76,7 @@ def _moved(sensor: Placed, beam: Element, stretch: Along) -> Effect:
         return cut.model_copy(update={"sensor": sensors})
 
     def placed(x: Float, nominal: Values) -> dict[Key, float]:
-        out = stretch.lengths(float(x[0]), nominal[beam.name, "L"])
-        for piece in stretch.pieces:
-            out |= {(piece, s): nominal[beam.name, s] for s in symbols}
-        return out
+        return stretch.of_pieces(float(x[0]), nominal, [*parameters(beam)])
 
     def write(r: Rig, x: Float) -> Rig:
         if isinstance(sensor, Displacement):

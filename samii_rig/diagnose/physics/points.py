@@ -338,7 +338,6 @@ def _standing(
     values, report, x_of : of the other unknowns."""
     name, element = part
     body = next(e for e in rig.element if e.name == stretch.body)
-    symbols = [s for s in parameters(body) if s != "L"]
     touches = tuple((body.name, s) for s in parameters(body))
     link = isinstance(body, RigidLink)
 
@@ -353,10 +352,7 @@ def _standing(
         if link:
             out[along_.arm_of(f"{name}_on"), "L"] = stretch.position(float(x[-1]))
             return out
-        out |= stretch.lengths(float(x[-1]), nominal[body.name, "L"])
-        for piece in stretch.pieces:
-            out |= {(piece, s): nominal[body.name, s] for s in symbols}
-        return out
+        return out | stretch.of_pieces(float(x[-1]), nominal, [*parameters(body)])
 
     return Effect(
         physics=row.physics,
