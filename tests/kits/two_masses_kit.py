@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numba import njit
 
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.physics.effect import Effect
@@ -44,38 +45,11 @@ def recorded(
     every : samples of the command for one that is recorded. meter : V, noise of what showed the
     command, the mean of both sides of its edges; 0 where it was recorded as it was sent.
     """
-    h, v, m2 = 1 / (RATE * SUBSTEPS), v.copy(), M2 + more
+    v = v.copy()
     noise = np.random.default_rng(seed).standard_normal((v.size, 2)) * [1e-6, 0.02]
-    read = np.zeros(v.size)
-    z = np.zeros(6)  # x_1, its speed, x_2, its speed, the coil's force, the friction's
-    T_c, bristles = dry
-    out = np.zeros((v.size, 2))  # m, m/s^2
-
-    def rate_of(z: Float, force: float) -> Float:
-        x1, v1, x2, v2, f, h = z
-        way = x2 - x1
-        inner = K2 * (way - 0.5 * np.copysign(gap, way)) + C2 * (v2 - v1)
-        if 2 * abs(way) < gap:
-            inner = 0.0
-        a1 = (f + inner - K1 * x1 - C1 * v1 - k3 * x1**3 - h) / M1
-        rubs = bristles * (v1 - abs(v1) * h / T_c) if T_c else 0.0
-        return np.array([v1, a1, v2, -inner / m2, CORNER * (force - f), rubs])
-
-    for i, asked in enumerate(v):
-        out[i] = z[0], rate_of(z, 0.0)[3]
-        read[i] = np.round((z[0] + noise[i, 0]) / 0.5e-6) * 0.5e-6
-        command = asked
-        if pd is not None:
-            back = pd[0] * read[i] + pd[1] * RATE * (read[i] - (read[i - 1] if i else 0.0))
-            v[i] = command = np.round((asked - back) / 0.3e-3) * 0.3e-3
-        for j in range(SUBSTEPS):
-            force = GAIN * gain((i + j / SUBSTEPS) / RATE) * float(command)
-            a = rate_of(z, force)
-            b = rate_of(z + h / 2 * a, force)
-            c = rate_of(z + h / 2 * b, force)
-            d = rate_of(z + h * c, force)
-            z = z + h / 6 * (a + 2 * b + 2 * c + d)
-    noisy = np.column_stack([read, out[:, 1] + noise[:, 1]])
+    gains = np.array([gain(i / SUBSTEPS / RATE) for i in range(v.size * SUBSTEPS)])
+    read, a_2 = _integrated(v, noise[:, 0], GAIN * gains, (k3, gap, M2 + more, *dry, *(pd or ())))
+    noisy = np.column_stack([read, a_2 + noise[:, 1]])
     channels = (
         Channel("v", "V", "command", low=-10.0, high=10.0),
         Channel("x_1", "m", resolution=0.5e-6),
@@ -97,6 +71,49 @@ def recorded(
         rig_toml=TEXT,
         source=f"two_masses_{seed}.mcap",
     )
+
+
+@njit(cache=True)
+def _integrated(
+    v: Float, noise: Float, gains: Float, parts: tuple[float, ...]
+) -> tuple[Float, Float]:  # pragma: no cover (compiled)
+    """What the encoder reads (n,) m, and the acceleration of the second mass (n,) m/s^2.
+
+    v : (n,) V, as of `recorded`; what goes out is written there. noise : (n,) m. gains : (n
+    SUBSTEPS,) N/V. parts : k3, gap, the second mass, T_c and bristles of `dry`, then pd if there is
+    a loop.
+    """
+    k3, gap, m2, T_c, bristles = parts[:5]
+    h = 1 / (RATE * SUBSTEPS)
+    read, a_2 = np.zeros(v.size), np.zeros(v.size)
+    z = np.zeros(6)  # x_1, its speed, x_2, its speed, the coil's force, the friction's
+    a, b, c, d = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
+
+    def rate_of(z: Float, force: float, out: Float) -> None:
+        way = z[2] - z[0]
+        inner = 0.0
+        if 2 * abs(way) >= gap:
+            inner = K2 * (way - 0.5 * np.copysign(gap, way)) + C2 * (z[3] - z[1])
+        out[0], out[2], out[3] = z[1], z[3], -inner / m2
+        out[1] = (z[4] + inner - K1 * z[0] - C1 * z[1] - k3 * z[0] ** 3 - z[5]) / M1
+        out[4] = CORNER * (force - z[4])
+        out[5] = bristles * (z[1] - abs(z[1]) * z[5] / T_c) if T_c else 0.0
+
+    for i in range(v.size):
+        rate_of(z, 0.0, a)
+        a_2[i] = a[3]
+        read[i] = np.round((z[0] + noise[i]) / 0.5e-6) * 0.5e-6
+        if len(parts) > 5:
+            back = parts[5] * read[i] + parts[6] * RATE * (read[i] - (read[i - 1] if i else 0.0))
+            v[i] = np.round((v[i] - back) / 0.3e-3) * 0.3e-3
+        for j in range(SUBSTEPS):
+            force = gains[i * SUBSTEPS + j] * v[i]
+            rate_of(z, force, a)
+            rate_of(z + h / 2 * a, force, b)
+            rate_of(z + h / 2 * b, force, c)
+            rate_of(z + h * c, force, d)
+            z = z + h / 6 * (a + 2 * b + 2 * c + d)
+    return read, a_2
 
 
 def random_command(n: int, rms: float, seed: int) -> Float:
