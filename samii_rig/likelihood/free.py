@@ -145,12 +145,13 @@ def _beside(
 
 
 def differing(
-    records: Records, H: Complex, seen: Sequence[Seen], noise: Noise
+    records: Records, H: Complex, seen: Sequence[Seen], noise: Noise, *, repeats: bool = False
 ) -> tuple[float, float]:
-    """Chi-square of the levels against each other, and its mean."""
+    """Chi-square of the levels against each other, or of repeats, and its mean."""
     total = count = 0.0
     for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
-        every = _beside(records, piece, piece.contrasts, H, own)
+        others = piece.repeats if repeats else piece.contrasts
+        every = _beside(records, piece, others, H, own)
         if every:
             f, left = every[0][0], np.stack([e for _, e, _ in every], axis=2)
             total += 2 * float(np.sum(np.abs(noise.whitened(f, np.full(f.size, i), left)) ** 2))

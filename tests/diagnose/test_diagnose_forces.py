@@ -433,5 +433,5 @@ def test_a_refit_by_differences_that_begins_where_no_rig_is_ends_in_none() -> No
     nothing = SimpleNamespace(goal=np.zeros(4), at=None, residual=np.real)
     search = SimpleNamespace(_force_problem=nothing, _ways=SimpleNamespace(clear=lambda: None))
     bounds = {"lower": -np.ones(2), "upper": np.ones(2)}
-    model = SimpleNamespace(n_nominal=1, prior=np.ones(2), response=response, **bounds)
+    model = SimpleNamespace(n=2, n_nominal=1, prior=np.ones(2), response=response, **bounds)
     assert ForceFits.refitted_exactly(search, model, np.zeros(2)) is None

@@ -34,9 +34,11 @@ from samii_rig.errors import SamiiRigError
 from samii_rig.levenberg import minimise
 from samii_rig.likelihood.reduce import LineResiduals
 from samii_rig.likelihood.unexplained import Unexplained, unexplained
-from samii_rig.types import Float
+from samii_rig.types import Complex, Float
 
-SLOPE_STEP = 1e-4  # of a logarithm, for a slope by a difference: rounding and bend are below 1e-3
+# Of a logarithm, for a slope by a difference. All of a rig may scale alike, and priors of 1 % alone
+# hold that: the bend in a slope, squared, has to be small beside them. Rounding is below 1e-4.
+SLOPE_STEP = 1e-6
 EXACT_ENDS = 1e-5  # relative, at which a refit with such slopes ends: 0.1 of a chi-square of 10,000
 NOWHERE = 1e6  # noise units of every line, more than any rig is off by
 FEW = 6  # steps of a refit of a force: what may win is refitted again, from where it ended
@@ -129,32 +131,33 @@ class ForceFits(RecordSearch):
         """As `refitted_from`, the chain through which the force acts that of every step, and every
         slope by a difference; None where the rig has no partial fractions or is not stable."""
         problem, prior = self._force_problem, model.prior[: model.n_nominal]
+        pulls = np.eye(model.n_nominal, model.n) / prior[:, None]
 
-        def left(x: Float) -> Float:
+        def response(x: Float) -> Complex:
             self._ways.clear()
-            r = problem.residual(model.response(x, problem.at))
-            return np.concatenate([r, x[: model.n_nominal] / prior])
+            return model.response(x, problem.at)
+
+        def slope(x: Float, e: Float, h: Complex) -> Complex:
+            try:
+                change = response(x + e) - h
+            except SamiiRigError:  # no rig is there: the other side
+                change = h - response(x - e)
+            return np.asarray(change / e.sum())
 
         def evaluated(x: Float) -> tuple[Float, Callable[[], Float]]:
             # Away from the bound that it stands at, if it does.
             steps = np.where(x + SLOPE_STEP > model.upper, -SLOPE_STEP, SLOPE_STEP)
-
-            def slope(e: Float) -> Float:
-                try:
-                    change = left(x + e) - r
-                except SamiiRigError:  # no rig is there: the other side
-                    change = r - left(x - e)
-                return np.asarray(change / e.sum())
-
-            def slopes() -> Float:
-                return np.stack([slope(e) for e in np.diag(steps)], axis=1)
-
             try:
-                r = left(x)
+                h = response(x)
             except SamiiRigError:  # a step to where no rig is: refused
                 rows = problem.goal.size + prior.size
                 return np.full(rows, NOWHERE), lambda: np.zeros((rows, x.size))
-            return r, slopes
+
+            def slopes() -> Float:
+                dh = np.stack([slope(x, e, h) for e in np.diag(steps)], axis=2)
+                return np.concatenate([problem.whiten(dh), pulls])
+
+            return np.concatenate([problem.residual(h), pulls @ x]), slopes
 
         try:
             end = minimise(evaluated, start, model.lower, model.upper, tolerance=EXACT_ENDS)

@@ -230,7 +230,8 @@ def _elsewhere(e: Explanation, change: Change, f: Float) -> tuple[Complex, Compl
 def _noise(problem: Problem, y: Complex) -> Float:
     """Standard deviation of one real part of each entry (n, q'), from the measured ones: that of
     the response over its root mean square, like that of the entries measured."""
-    variance = np.diagonal(np.linalg.pinv(problem.data.W), axis1=1, axis2=2).real
+    inverse = np.linalg.pinv(problem.data.W)
+    variance = np.maximum(np.diagonal(inverse, axis1=1, axis2=2).real, 0.0)  # 0 but for rounding
     relative = np.median(np.sqrt(variance) / np.maximum(np.abs(problem.data.H), 1e-300), axis=0)
     level = np.sqrt(np.mean(np.abs(y) ** 2, axis=0))
     share = np.full(y.shape[1], float(np.median(relative)))
