@@ -152,11 +152,12 @@ class Point:
 
 POINTS: tuple[Point, ...] = (
     Point(
-        "torsional_compliance", "theta", "M", "softness", "k", "c", TorsionalSpring, "spring_"
+        "torsional_compliance", "theta", "M", "softness", "k", "c", TorsionalSpring, "spring_",
+        along=True,
     ),
     Point(
         "translational_compliance", "w", "V", "softness", "k", "c", TranslationalSpring,
-        "shear_spring_",
+        "shear_spring_", along=True,
     ),
     Point("added_mass", "V", "w", "mass", "m", "", LumpedMass, "mass_", along=True),
     Point("added_inertia", "M", "theta", "mass", "I", "", LumpedMass, "inertia_", "J", along=True),
@@ -297,17 +298,22 @@ def _strength(where: Places, pair: int, at: int) -> float:
     return min(where.strength(pair, at), where.strength(pair, at + 1))
 
 
+def _stands_along(rig: Rig, row: Point, body: Element) -> bool:
+    """Whether a row's part makes a difference along a body that no port does."""
+    axial = rig.motion == "axial"
+    if row.jump in ("theta", "w"):  # a crack: a beam bends there more, a rod stretches more
+        return not isinstance(body, RigidLink) and (row.jump == "w") == axial
+    if row.jump == "M":  # wherever a part turns a rigid link it does the same
+        return not isinstance(body, RigidLink) and not axial
+    # A mass on a link that has some is in `bodies`.
+    return not (isinstance(body, RigidLink) and row.law == "mass" and body.m.value > 0)
+
+
 def _along(rig: Rig, where: Places, row: Point, at: int, stretch: Along) -> Iterator[Effect]:
     """A row's part along a body."""
     element = rig.element[at]
-    link = isinstance(element, RigidLink)
-    # Wherever a part turns a rigid link it does the same: that is a port's. A mass on a link that
-    # has some is in `bodies`.
-    own = isinstance(element, RigidLink) and row.law == "mass" and element.m.value > 0
-    if not row.along or own or (link and row.jump == "M"):
-        return
     x = _strength(where, row.pair, at)
-    if not 0 < x < math.inf or (rig.motion == "axial" and row.jump == "M"):
+    if not row.along or not _stands_along(rig, row, element) or not 0 < x < math.inf:
         return
     w = middle(where)
     tail = "w" if row.jump == "V" else ""

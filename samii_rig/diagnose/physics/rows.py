@@ -28,7 +28,7 @@ class Physics:
 _ROWS = (
     Physics(
         "torsional_compliance",
-        "a joint or clamp that gives",
+        "a joint or clamp that gives, or a crack",
         hidden=("a joint that gives", "a joint spring stiffer than"),
         soft=True,
     ),
