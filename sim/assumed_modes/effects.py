@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from samii_rig.rig.schema import Acceleration, RelativeAngle, SensorBase
+from samii_rig.rig.schema import Acceleration, RelativeAngle, SensorBase, Strain
 from sim.assumed_modes.parts import (
     ANGLE_SOURCES,
     EXTENDED,
@@ -28,6 +28,10 @@ from sim.assumed_modes.parts import (
 Rng = np.random.Generator
 Numbers = dict[str, float]
 NEAR_END = 0.02  # of a link's length within which a place counts as its end
+NEAR_SENSOR = 0.02  # of a beam's length, that a crack is away from its sensors at least
+WITHIN = (0.15, 0.85)  # of a beam's length: where it may be cracked
+SOFTEST = 3.0  # times as much as all of its beam gives, a crack at most
+CRACKED = 0.5  # of the compliances of a rig with a beam are a crack in one
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +141,10 @@ def at_end(setup: Setup, on: str, x: float) -> tuple[str, ...]:
 
 
 def compliance(rng: Rng, setup: Setup) -> Draft:
-    """A clamp or joint that gives in rotation."""
+    """A clamp or joint that gives in rotation, or a beam between its ends."""
+    beams = [p for p in setup.parts if p.kind == "beam" and p.name in setup.turning()]
+    if beams and rng.random() < CRACKED:
+        return crack(rng, setup, beams[int(rng.integers(len(beams)))])
     ports = _ports(setup, setup.turning())
     after, site = ports[int(rng.integers(len(ports)))]
     loss = float(np.exp(rng.uniform(np.log(3e-4), np.log(8e-3))))  # s, c over k
@@ -150,6 +157,25 @@ def compliance(rng: Rng, setup: Setup) -> Draft:
         "torsional_compliance", site, None, {"k": "N m/rad", "c": "N m s/rad"},
         lambda x: {"k": 1 / x, "c": loss / x}, apply, 1e-9, 1.0,
         also=tuple(("torsional_compliance", n) for n in names if n != site),
+    )  # fmt: skip
+
+
+def crack(rng: Rng, setup: Setup, beam: Part) -> Draft:
+    """A beam that gives in rotation at a place between its ends, clear of its sensors."""
+    length = beam.values["L"]
+    seen = [s for s in setup.sensors if isinstance(s, Acceleration | Strain) and s.on == beam.name]
+    at = length * float(rng.uniform(*WITHIN))
+    while any(abs(at - s.position) <= NEAR_SENSOR * length for s in seen):
+        at = length * float(rng.uniform(*WITHIN))
+    loss = float(np.exp(rng.uniform(np.log(3e-4), np.log(8e-3))))
+    own = length / beam.values["EI"]  # rad/(N m), that the beam gives from end to end
+
+    def apply(s: Setup, v: Numbers) -> Setup:
+        return s.attached(Attachment("crack", beam.name, at, v))
+
+    return Draft(
+        "torsional_compliance", beam.name, at, {"k": "N m/rad", "c": "N m s/rad"},
+        lambda x: {"k": 1 / x, "c": loss / x}, apply, 1e-5 * own, SOFTEST * own,
     )  # fmt: skip
 
 

@@ -68,10 +68,11 @@ class Attachment:
     without extent `x` is 0 and means right behind it.
 
     mass : values m (kg) and J (kg m^2). ground, ground_torsion : spring k and damper c to the
-    ground. oscillator : a mass m on a spring k and a damper c, across the chain.
+    ground. oscillator : a mass m on a spring k and a damper c, across the chain. crack : a spring k
+    and a damper c against a jump of a beam's slope there.
     """
 
-    kind: Literal["mass", "ground", "ground_torsion", "oscillator"]
+    kind: Literal["mass", "ground", "ground_torsion", "oscillator", "crack"]
     on: str
     x: float
     values: dict[str, float]

@@ -8,14 +8,17 @@ angle. A beam of length L has the curvature
 P_i the Legendre polynomials. q_0 and q_1 are the exact static shapes under an end moment and
 an end force (the static correction); the others leave displacement and slope of the end alone.
 Its stiffness is diagonal, EI/L /(2 i + 1), as Legendre polynomials are orthogonal; its mass
-follows from products of the shapes, by Gauss's quadrature, exactly. Displacement w and slope
-theta of every place are rows over all coordinates, with the rig file's convention w' = theta.
+follows from products of the shapes, by Gauss's quadrature, exactly. No smooth shape has a slope
+that jumps: where a beam is cracked the jump is a coordinate of its own, whose shape is straight but
+for a kink there. Displacement w and slope theta of every place are rows over all coordinates, with
+the rig file's convention w' = theta.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -93,7 +96,7 @@ class Mechanism:
             + len(self._gap_after)
             + sum(_coordinates(p) for p in setup.parts)
         )
-        n += sum(a.kind == "oscillator" for a in setup.attachments)
+        n += sum(a.kind in ("oscillator", "crack") for a in setup.attachments)
         self._n, self._used = n, 1
         self.M, self.C, self.K = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
         self.maxwell: list[Maxwell] = []
@@ -104,8 +107,11 @@ class Mechanism:
         self._before: dict[str, tuple[Float, Float]] = {}
         self._after: dict[str, tuple[Float, Float]] = {}
         self._beams: dict[str, tuple[float, slice]] = {}
+        self._kinks: dict[str, list[tuple[float, int]]] = {}  # of a beam: x/L, coordinate
         self._walk()
         for a in setup.attachments:
+            if a.kind == "crack":  # a coordinate of its beam, not of a place on it
+                continue
             self._attach(a.kind, self.place(a.on, a.x), a.values)
         for r in setup.relaxations:
             at = self.joints[r.on]
@@ -240,22 +246,45 @@ class Mechanism:
                 Maxwell(int(i), float(ki * g), float(t))
                 for g, t in zip(strengths, times, strict=True)
             ]
-        # Products of two shapes are polynomials of degree 2 ORDER + 2.
+        kinks = self._kinks[part.name] = self._cracks(part)
+        # Products of two shapes are polynomials of degree 2 ORDER + 2 from kink to kink.
         x, weight = legendre.leggauss(ORDER + 2)
-        for xi, gi in zip((x + 1) / 2, weight / 2, strict=True):
-            w = self._before[part.name][0] + xi * v["L"] * self._before[part.name][1]
-            w[own] += v["L"] * shapes(float(xi))[0]
-            self._add(self.M, w, v["mu"] * v["L"] * gi)
+        for start, end in pairwise([0.0, *sorted(kink for kink, _ in kinks), 1.0]):
+            for xi, gi in zip((x + 1) / 2, weight / 2, strict=True):
+                w, _ = self._rows(part.name, float(start + (end - start) * xi))
+                self._add(self.M, w, v["mu"] * v["L"] * (end - start) * gi)
+
+    def _cracks(self, part: Part) -> list[tuple[float, int]]:
+        """x/L of each crack of a beam and the coordinate of its jump. One beyond the end of a beam
+        that a refit made shorter moves nothing."""
+        found = []
+        for a in self.setup.attachments:
+            if a.kind == "crack" and a.on == part.name:
+                at = self._new()
+                self.K[at, at] += a.values["k"]
+                self.C[at, at] += a.values["c"]
+                found.append((min(a.x / part.values["L"], 1.0), at))
+        return found
+
+    def _rows(self, beam: str, at: float) -> tuple[Float, Float]:
+        """Rows of w and theta at x/L of a beam."""
+        w, theta = self._before[beam]
+        length, own = self._beams[beam]
+        out_w, out_theta = w + at * length * theta, theta.copy()
+        place, slope = shapes(at)
+        out_w[own] += length * place
+        out_theta[own] += slope
+        for kink, i in self._kinks[beam]:
+            if at > kink:
+                out_w[i] += length * (at - kink)
+                out_theta[i] += 1.0
+        return out_w, out_theta
 
     def _along(self, part: Part, x: float) -> tuple[Float, Float]:
-        w, theta = self._before[part.name]
-        out_w, out_theta = w + x * theta, theta.copy()
         if part.kind == "beam":
-            length, own = self._beams[part.name]
-            place, slope = shapes(x / length)
-            out_w[own] += length * place
-            out_theta[own] += slope
-        return out_w, out_theta
+            return self._rows(part.name, x / part.values["L"])
+        w, theta = self._before[part.name]
+        return w + x * theta, theta.copy()
 
     def _attach(self, kind: str, rows: tuple[Float, Float], v: dict[str, float]) -> None:
         w, theta = rows

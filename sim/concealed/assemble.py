@@ -2,14 +2,17 @@
 
 Every displacement of the chain is a linear form of the coordinates, carried as a row from base to
 tip: w and theta of the current place. A spring adds a coordinate of its own (the angle across it),
-a beam the displacement and rotation of its nodes, a rigid link none. So no constraint is left, and
-the angle of a driven joint is one coordinate among the others, prescribed by its drive.
+a beam the displacement and rotation of its nodes, a crack in it the jump of the slope, a rigid link
+none. So no constraint is left, and the angle of a driven joint is one coordinate among the others,
+prescribed by its drive.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -193,12 +196,13 @@ class Assembly:
 
     def _beam(self, part: Part) -> None:
         v = part.values
-        count = len(self.like.inside[part.name]) if self.like else self._elements(v)
-        h = v["L"] / count
-        stiffness, mass = v["EI"] * bending(h), v["mu"] * consistent_mass(h)
         tau = v.get("tau", 0.0)
+        gives = {x: (k, c) for x, k, c in part.cracks}
         found, bent = [], []
-        for j in range(count):
+        for x, h in self._divided(part):
+            if x in gives:
+                self._joint(part, *gives[x])
+            stiffness, mass = v["EI"] * bending(h), v["mu"] * consistent_mass(h)
             w1, theta1 = self.unit(self.coordinate()), self.unit(self.coordinate())
             rows = np.stack([self.w, self.theta, w1, theta1])
             used = np.flatnonzero(rows.any(axis=0))
@@ -207,12 +211,23 @@ class Assembly:
             self.K[block] += bent_by
             self.C[block] += tau * bent_by
             self.M[block] += r.T @ mass @ r
-            found.append((j * h, h, rows))
+            found.append((x, h, rows))
             if part.ladder:
                 bent += self._curvatures(rows, h, v["EI"])
             self.w, self.theta = w1, theta1
         self.inside[part.name] = found
         self.relaxations += [Relaxation(b, k, rate) for b in bent for k, rate in part.ladder]
+
+    def _divided(self, part: Part) -> Iterator[tuple[float, float]]:
+        """Place and length of each element of a beam: a node at each crack, even between them."""
+        length = part.values["L"]
+        for x0, x1 in pairwise([0.0, *sorted(x for x, *_ in part.cracks), length]):
+            if self.like:
+                count = sum(x0 <= x < x1 for x, *_ in self.like.inside[part.name])
+            else:
+                count = math.ceil(self._elements(part.values) * ((x1 - x0) / length))
+            h = (x1 - x0) / count
+            yield from ((x0 + j * h, h) for j in range(count))
 
     def _elements(self, v: dict[str, float]) -> int:
         wave: float = (v["mu"] * self.highest**2 / v["EI"]) ** 0.25

@@ -85,7 +85,8 @@ class Chosen:
         rng = np.random.default_rng(seed)
         if self.stated is None:
             return self.row.put(plant, self.site, Dose(x, rng, reach=self.reach))
-        dose = Dose(x, rng, self.stated.parameters, self.stated.where, self.reach)
+        said = self.stated
+        dose = Dose(x, rng, said.parameters, said.where, self.reach, said.position)
         effect = self.row.put(plant, self.site, dose)
         as_stated(self.stated, effect)
         return effect

@@ -22,7 +22,8 @@ class Row:
 
     at : which parts or sensors can have it. linear : whether its response does not depend on
     the level. most : the largest multiple. fixed : whether it is there or not, without a size.
-    gap : whether it acts beyond a gap, which is drawn from how far its place moves.
+    gap : whether it acts beyond a gap, which is drawn from how far its place moves. along : whether
+    it has a position along its site.
     """
 
     physics: str
@@ -33,6 +34,7 @@ class Row:
     fixed: bool = False
     outside: bool = False
     gap: bool = False
+    along: bool = False
 
 
 def clamp_of(plant: Description) -> str:
@@ -112,6 +114,7 @@ ROWS = (
     Row("flow_saturation", "source", nonlinear.flow, linear=False, most=10.0),
     Row("output_saturation", "source", nonlinear.clipped, linear=False, most=20.0),
     Row("end_stop", "stop", nonlinear.stop, linear=False, most=30.0, gap=True),
+    Row("torsional_compliance", "beam", linear.crack, along=True),
 )
 OUTSIDE = (
     Row("hysteresis", "joint", nonlinear.slip, linear=False, most=10.0, outside=True),

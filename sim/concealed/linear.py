@@ -40,6 +40,17 @@ def compliance(plant: Description, site: str, dose: Dose) -> Concealed:
     return Concealed("torsional_compliance", site, {"k": k, "c": c}, edits)
 
 
+def crack(plant: Description, site: str, dose: Dose) -> Concealed:
+    """A beam that gives at one place between its ends: there its slope jumps by M/(k + c s)."""
+    part = plant.part(site)
+    seen = [s.position for s in plant.sensors if s.kind == "acceleration" and s.across[0] == site]
+    x = dose.along(part.values["L"], seen)
+    k = dose("k", part.values["EI"] / part.values["L"] / dose.x)
+    c = dose("c", k * float(dose.rng.uniform(1e-3, 4e-3)))
+    part.cracks = (*part.cracks, (x, k, c))
+    return Concealed("torsional_compliance", site, {"k": k, "c": c}, position=x)
+
+
 def sideways(plant: Description, site: str, dose: Dose) -> Concealed:
     """A support that gives sideways."""
     scale = Scales.of(plant)

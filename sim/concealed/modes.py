@@ -228,10 +228,11 @@ def _seen(sensor: SensorPath, s: Structure, Q: Float, Ax: Float, Au: Float) -> t
         case "relative_angle":
             row = np.zeros(Q.shape[0])
             for name in sensor.across:
+                if name in s.inside:  # with what gives within it and behind it
+                    row += s.ends[name][1] - s.starts[name][1]
+                    continue
                 for i in s.joints.get(name, ()):
                     row[i] += 1.0
-                if name in s.inside:
-                    row += s.ends[name][1] - s.starts[name][1]
             return row @ Q, none
         case "absolute_angle":
             return s.ends[sensor.across[0]][1] @ Q, none

@@ -34,12 +34,15 @@ class Part:
     name : of the rig file's element to which it belongs; an encoder across that element spans
         it as well.
     values : SI numbers by symbol.
+    cracks : of a beam, (x, k, c) of each place within it where its slope jumps: m behind its
+        upstream end, N m/rad, N m s/rad.
     """
 
     kind: str
     name: str
     values: dict[str, float]
     ladder: tuple[tuple[float, float], ...] = ()
+    cracks: tuple[tuple[float, float, float], ...] = ()
 
 
 @dataclass(slots=True)

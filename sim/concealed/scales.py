@@ -14,6 +14,8 @@ RIGID = 1e9  # N m/rad: what a rig file says of a joint that is believed to be r
 RIGID_SOURCE = "taken as rigid"
 UNDAMPED_SOURCE = "taken as undamped"
 REACH = 1e-3  # rad or m, what a place moves by where no run was asked
+WITHIN = (0.15, 0.85)  # of a body's length: what lies there is not at its ends
+NEAR = 0.02  # of the length, within which a place counts as a sensor's
 DISPLACEMENT = 0.01475e-3  # m^3/rad, of the papers' vane motor: turns a stiffness into C_h
 
 
@@ -45,13 +47,15 @@ class Scales:
 class Dose:
     """How much of an effect: parameters that are stated (SI), the others at `x` times the rig's own
     scale or drawn. where : the variant, of an effect that has some; drawn if empty. reach : rad or
-    m, what the place moves by at most without the effect, for what acts beyond a gap."""
+    m, what the place moves by at most without the effect, for what acts beyond a gap. position : m
+    along its body, of an effect within one; drawn if None."""
 
     x: float
     rng: np.random.Generator
     stated: Mapping[str, float] = field(default_factory=dict)
     where: str = ""
     reach: float = REACH
+    position: float | None = None
 
     def __call__(self, symbol: str, otherwise: float) -> float:
         """The parameter as stated, or else as the scale or the draw has it."""
@@ -63,14 +67,28 @@ class Dose:
             raise InputError("effect", "where", self.where, f"one of {', '.join(known)}")
         return self.where or otherwise
 
+    def along(self, length: float, taken: Iterable[float]) -> float:
+        """The position as stated, or else drawn within a body of this length, clear of its ends and
+        of the positions `taken`. InputError for one that is not between the ends."""
+        if self.position is not None:
+            if not 0.0 < self.position < length:
+                expected = f"more than 0 and less than {length:g} m"
+                raise InputError("effect", "position", self.position, expected)
+            return self.position
+        while True:
+            x = float(self.rng.uniform(*WITHIN)) * length
+            if all(abs(x - at) > NEAR * length for at in taken):
+                return x
+
 
 @dataclass(slots=True)
 class Concealed:
     """One effect as it was put in.
 
-    site : of the rig file. parameters : SI, by the vocabulary's symbols. edits : what the nominal
-    rig file must not know, {(element, symbol): (value, source)}. across : {sensor: elements} that
-    the nominal rig file gives instead.
+    site : of the rig file. position : m from the site's upstream end, of what is within it.
+    parameters : SI, by the vocabulary's symbols. edits : what the nominal rig file must not know,
+    {(element, symbol): (value, source)}. across : {sensor: elements} that the nominal rig file
+    gives instead.
     """
 
     physics: str
@@ -78,3 +96,4 @@ class Concealed:
     parameters: dict[str, float]
     edits: dict[tuple[str, str], tuple[float, str]] = field(default_factory=dict)
     where: str = ""
+    position: float | None = None

@@ -125,6 +125,7 @@ def truth(
             {
                 "physics": e.physics,
                 "site": e.site,
+                "position": e.position,
                 "parameters": e.parameters,
                 "where": e.where,
                 "multiple": x,

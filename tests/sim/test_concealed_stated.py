@@ -31,9 +31,9 @@ def test_what_was_drawn_and_is_then_stated_is_the_same_plant(row: Row) -> None:
     site = places(described(SAMII), row)[-1]
     drawn, again = described(SAMII), described(SAMII)
     effect = row.put(drawn, site, Dose(1.0 if row.fixed else 0.7, np.random.default_rng(5)))
-    said = Stated(row.physics, site, effect.parameters, effect.where)
+    said = Stated(row.physics, site, effect.parameters, effect.where, effect.position)
     assert row_of(again, said) is row
-    dose = Dose(1.0, np.random.default_rng(8), said.parameters, said.where)
+    dose = Dose(1.0, np.random.default_rng(8), said.parameters, said.where, position=said.position)
     as_stated(said, row.put(again, site, dose))
     old, new = (NUMBER.findall(repr(asdict(plant))) for plant in (drawn, again))
     assert NUMBER.sub("", repr(drawn)) == NUMBER.sub("", repr(again))
@@ -72,6 +72,9 @@ def test_names_of_stated_trials_differ_and_say_nothing() -> None:
         (["noncollocated_encoder", "theta_2", "k=1"], "none: it is there or not"),
         (["ground_spring", "beam", "where=sky"], "one of torsional_ground_spring, "),
         (["added_mass", "beam", "where=sky"], "where is 'sky'; expected ''"),
+        (["added_mass", "beam", "position=1"], "position is 1.0; expected none"),
+        (["torsional_compliance", "beam", "position=nan"], "a finite number"),
+        (["torsional_compliance", "beam", "position=4.7"], "less than 4.6"),
     ],
 )
 def test_what_cannot_be_concealed_is_refused_in_one_line(words: list[str], expected: str) -> None:

@@ -200,9 +200,10 @@ def test_the_concealed_plant_s_truth_names_what_acts_against_the_ground(
 
 def test_the_concealed_plant_draws_gaps_that_are_met() -> None:
     n = len(ROWS)
-    sites = places(described(load_rig("samii")[0]), ROWS[-1])
+    (number,) = (i for i, row in enumerate(ROWS) if row.gap)
+    sites = places(described(load_rig("samii")[0]), ROWS[number])
     for turn, site in enumerate(sites[:3]):
-        drawn = draw("one", n - 1 + n * turn, SAMII_TOML, QUICK)
+        drawn = draw("one", number + n * turn, SAMII_TOML, QUICK)
         (effect,), (law,) = drawn.effects, drawn.plant.laws
         assert (effect.site, law.ground) == (site, site == "beam")
         most = reach(drawn.nominal, drawn.plant, QUICK, site, ground=law.ground)
