@@ -144,14 +144,25 @@ def _beside(
     return [(lines.frequency, left[:, :, i], free) for i in range(len(others))]
 
 
+def scatter(records: Records, H: Complex, seen: Sequence[Seen], noise: Noise) -> Float:
+    """(q,) power of repeats against each other over that of the noise, most of both where that is
+    largest; nan where nothing was repeated."""
+    power, mean = np.zeros((2, H.shape[1] // records.pieces[0].inputs))
+    for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
+        for f, left, free in _beside(records, piece, piece.repeats, H, own):
+            C = noise.covariance(f, np.full(f.size, i))
+            power += np.sum(np.abs(left) ** 2, axis=0)
+            mean += free @ np.diagonal(C, axis1=1, axis2=2).real
+    return np.asarray(np.divide(power, mean, out=np.full(mean.size, np.nan), where=mean > 0))
+
+
 def differing(
-    records: Records, H: Complex, seen: Sequence[Seen], noise: Noise, *, repeats: bool = False
+    records: Records, H: Complex, seen: Sequence[Seen], noise: Noise
 ) -> tuple[float, float]:
-    """Chi-square of the levels against each other, or of repeats, and its mean."""
+    """Chi-square of the levels against each other, and its mean."""
     total = count = 0.0
     for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
-        others = piece.repeats if repeats else piece.contrasts
-        every = _beside(records, piece, others, H, own)
+        every = _beside(records, piece, piece.contrasts, H, own)
         if every:
             f, left = every[0][0], np.stack([e for _, e, _ in every], axis=2)
             total += 2 * float(np.sum(np.abs(noise.whitened(f, np.full(f.size, i), left)) ** 2))

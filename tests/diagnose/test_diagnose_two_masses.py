@@ -10,13 +10,14 @@ import pytest
 from table_kit import table_of
 from two_masses_kit import CORNER, K1, K2, RIG, diagnosed, random_command, recorded
 
-from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit.classes import Class
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.variation import Uneven
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.result import Cause, Diagnosis, Moved
 from samii_rig.diagnose.verdict import by_record, stages
+from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.signal.estimate import estimate
@@ -103,17 +104,31 @@ def test_a_lag_that_is_longer_than_the_file_says_is_one_cause() -> None:
 
 def test_a_gap_in_which_nothing_acts_is_play() -> None:
     gap = 4e-4
-    found = diagnosed(recorded(V, 1, gap=gap))
+    found = diagnosed(recorded(V[:2000], 1, gap=gap))
     (cause,) = found.causes
     assert (found.verdict, cause.physics, cause.site) == ("named", "backlash", "spring_2")
     width = cause.parameters["width"]
     assert width.value == pytest.approx(gap, rel=0.05)
 
 
+@pytest.mark.parametrize(("gap", "least", "most"), [(0.0, 0.8, 1.2), (4e-5, 0.005, 0.05)])
+@pytest.mark.parametrize("levels", [(1.0,), (1.0, 2.0)])
+def test_repeats_scatter_by_noise_and_not_by_play_that_passes_for_it(gap, least, most, levels):
+    v = V[:1500]
+    runs = [recorded(x * v, int(9 * x) + i, gap=gap) for x in levels for i in (1, 2)]
+    search = on_records(case_of(estimate(runs, gaps="auto"), RIG, None, (), runs))
+    assert search is not None
+    whole = search.whole.by_level().with_harmonics()
+    fitted = search.nominal.fitted
+    ratio = whole.scatter(fitted, whole.about(fitted))
+    assert ratio.shape == (2,)
+    assert np.all((ratio > least) & (ratio < most))
+
+
 def test_friction_that_gives_before_it_slides_has_both_its_values() -> None:
     """By Bouc's and Wen's law, which gives less stiffly backwards, k is 30 % high."""
     T_c, k = 2.0, 4e4  # slides after 0.05 mm of 2 mm
-    found = diagnosed(recorded(V, 1, dry=(T_c, k)), effects=())
+    found = diagnosed(recorded(V[:2000], 1, dry=(T_c, k)), effects=())
     (cause,) = found.causes
     assert (found.verdict, cause.physics, cause.site) == ("named", "coulomb_friction", "spring_1")
     assert cause.parameters["T_c"].value == pytest.approx(T_c, rel=0.05)
@@ -231,7 +246,7 @@ def test_a_cause_that_needs_a_number_off_the_file_is_not_sure(said, away, told) 
 def test_a_spring_that_hardens_as_much_as_it_is_stiff_has_its_value() -> None:
     """Its force depends on the chain's parameters as much as the linear motion does."""
     few = table_of(RIG, 0.5, 40.0, "added_mass", "ground_spring")
-    found = diagnosed(recorded(2 * V, 2, k3=K3), recorded(V, 3, k3=K3), effects=few)
+    found = diagnosed(recorded(2 * V[:1500], 2, k3=K3), recorded(V[:1500], 3, k3=K3), effects=few)
     assert found.verdict == "named"
     (cause,) = found.causes
     assert (cause.physics, cause.site) == ("cubic_stiffness", "spring_1")

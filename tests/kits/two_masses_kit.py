@@ -48,7 +48,8 @@ def recorded(
     v = v.copy()
     noise = np.random.default_rng(seed).standard_normal((v.size, 2)) * [1e-6, 0.02]
     gains = np.array([gain(i / SUBSTEPS / RATE) for i in range(v.size * SUBSTEPS)])
-    read, a_2 = _integrated(v, noise[:, 0], GAIN * gains, (k3, gap, M2 + more, *dry, *(pd or ())))
+    parts = (k3, gap, M2 + more, *dry, *(pd or ()))
+    read, a_2 = _integrated(v, noise[:, 0], GAIN * gains, tuple(map(float, parts)))
     noisy = np.column_stack([read, a_2 + noise[:, 1]])
     channels = (
         Channel("v", "V", "command", low=-10.0, high=10.0),

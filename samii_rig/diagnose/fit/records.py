@@ -26,7 +26,7 @@ from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.excited import DRIVES, excited, records_of
 from samii_rig.likelihood.form import Reduced
-from samii_rig.likelihood.free import differing
+from samii_rig.likelihood.free import scatter
 from samii_rig.likelihood.noise import Disturbances, Noise
 from samii_rig.likelihood.nuisance import HIGHEST
 from samii_rig.likelihood.pieces import Loops, Wiring, faster, joined, pieces_of, wiring
@@ -288,13 +288,13 @@ class Whole:
             self.records, self.response(fitted), disturbed, self._loop, fitted_lines, own_power
         )
 
-    def scatter(self, fitted: Fitted, noise: Reduced) -> tuple[float, float]:
-        """Chi-square of the repeats of one excitation against each other, and its mean: 0, 0 where
-        nothing was repeated."""
+    def scatter(self, fitted: Fitted, noise: Reduced) -> Float:
+        """(q,) as of `scatter`, of the repeats of one command: of each sensor what its noise has
+        of it."""
         response = self.response(fitted)
         H = response(self.records.exact().s)
         seen = self.records.seen(H, self._loop, response)
-        return differing(self.records, H, seen, noise.noise, repeats=True)
+        return scatter(self.records, H, seen, noise.noise)
 
     def residuals(self, fitted: Fitted, noise: Reduced, *, shown: bool = False) -> LineResiduals:
         """What a fit leaves, line by line: on the lines that are fitted, or on those shown."""

@@ -46,9 +46,9 @@ PROMISING = 0.25  # of what the best force gains, at least
 NOT_NOISE = 0.9
 # The same, that it explains before it is refitted, at least: true ones did a sixth and more.
 PROMISED = 0.05
-REPEATED = (
-    0.5  # of the noise, that repeats scatter by, from which it is no force that passes for it
-)
+# Of a sensor's noise, that repeats scatter by, from which no force passes for it: noise does by 0.9
+# to 1.1 of it, play that passes for 6 times the power of a sensor's own by 0.16, for 90 by 0.01.
+REPEATED = 0.5
 COMPETE = 8  # explanations that compete again about such a force
 MIMICS = 3  # physics of which such a force is refitted: a stop that gives bends like a cubic spring
 INCONSISTENT = 1e-4  # chance of a true force to explain lines as unevenly, below which it is none
@@ -83,7 +83,8 @@ class ForceSearch(BesideForce):
         self._try([h for h in scores if h.own[0] >= STRONG * ahead], self.nominal, 0)
         if first is not None:
             self._try(self.scores([first]) if faulty else scores, first, -1)
-        if scores:  # of true ones that passed for noise each promised something in that noise, too
+        # Of true ones that passed for noise each promised something in that noise, too.
+        if scores or any(e.key in self.handed and _alone(e) for e in self.ranked()):
             self._beyond_noise()
         best = self.ranked()[0]
         if (does := self._does(best)) is not None and does[1] < INCONSISTENT:
@@ -106,10 +107,11 @@ class ForceSearch(BesideForce):
         it, and stand about it where these are more likely with the noise that it leaves."""
         whole = self.linear.whole
         assert isinstance(whole, Whole)  # of one state
-        if not np.any(estimated(self.linear, whole) > MORE_NOISE * stated(whole)):
+        more = estimated(self.linear, whole) > MORE_NOISE * stated(whole)
+        if not more.any():
             return
-        scatter, mean = whole.scatter(of_data(self).fitted, self.reduced)
-        if scatter > REPEATED * mean > 0:  # no force differs between repeats of one command
+        again = self.levels.scatter(of_data(self).fitted, self.reduced)
+        if np.all(again[more] > REPEATED):  # hardly any force differs between repeats
             return
         before = self.ranked()
         known = next((e for e in before if e.key in self.handed and _alone(e)), None)
