@@ -118,6 +118,8 @@ def shift_between(first: Phases, other: Phases) -> int:
     parts += [one for one in sensors if told[one].sum() * BANDS >= told.sum()]
     # A shift of all is one of each, and its lines agree in more than what chance brings together.
     for part in parts:
+        if not told[part].any():
+            continue
         late = tried[np.argmin(off[part].sum(axis=(0, 1)))]
         near = np.cos(turned + shift * first.omega)[part][weight[part] > 0]
         far = abs(late - shift) > WHOLE + 2 / np.sqrt(told[part].sum())

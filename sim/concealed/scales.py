@@ -69,10 +69,11 @@ class Dose:
 
     def along(self, length: float, taken: Iterable[float]) -> float:
         """The position as stated, or else drawn within a body of this length, clear of its ends and
-        of the positions `taken`. InputError for one that is not between the ends."""
+        of the positions `taken`. InputError for one that is not clear of the ends."""
         if self.position is not None:
-            if not 0.0 < self.position < length:
-                expected = f"more than 0 and less than {length:g} m"
+            least = NEAR * length
+            if not least < self.position < length - least:
+                expected = f"more than {least:g} and less than {length - least:g} m"
                 raise InputError("effect", "position", self.position, expected)
             return self.position
         while True:

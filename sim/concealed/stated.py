@@ -62,6 +62,8 @@ def row_of(plant: Description, effect: Stated) -> Row:
     sites = []
     # What has a position is along its site, what has none at the end: first the rows of that kind.
     for row in sorted(rows, key=lambda row: row.along != (effect.position is not None)):
+        if row.along and effect.position is None:  # where along a body is to be said
+            continue
         own = places(plant, row)
         if row.at in ("loose", "junction") and clamp_of(plant):
             own.append(clamp_of(plant))

@@ -74,7 +74,7 @@ def test_names_of_stated_trials_differ_and_say_nothing() -> None:
         (["added_mass", "beam", "where=sky"], "where is 'sky'; expected ''"),
         (["added_mass", "beam", "position=1"], "position is 1.0; expected none"),
         (["torsional_compliance", "beam", "position=nan"], "a finite number"),
-        (["torsional_compliance", "beam", "position=4.7"], "less than 4.6"),
+        (["torsional_compliance", "beam", "position=4.7"], "and less than 4.5"),
     ],
 )
 def test_what_cannot_be_concealed_is_refused_in_one_line(words: list[str], expected: str) -> None:

@@ -180,7 +180,8 @@ class Growing(Explanations):
 
         What is missing everywhere in small parts is not found by adding one part after another.
         """
-        effects = tuple(e for e in self.table if e.physics == physics)
+        # A crack is none of many joints, and one body carries no two.
+        effects = tuple(e for e in self.table if e.physics == physics and not e.pieces)
         if not 2 <= len(effects) <= MOST_SATURATED:
             return
         ends = []

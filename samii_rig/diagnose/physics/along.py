@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any
 
 from samii_rig.diagnose.physics import insert
@@ -24,12 +24,14 @@ from samii_rig.rig.schema import (
     ForceSource,
     GravityStiffness,
     LumpedMass,
+    RelativeAngle,
     Rig,
     RigidLink,
     Rod,
     Strain,
     TorqueSource,
     TorsionalGroundSpring,
+    TorsionalSpring,
     TranslationalGroundSpring,
 )
 
@@ -148,7 +150,7 @@ def cut(rig: Rig, along: Along, part: Element, u: float = math.exp(0.5)) -> Rig:
 
     The last piece keeps the name, so that what measures behind the body still does.
 
-    Raises InputError where the body is cut already.
+    Raises InputError where the body is cut already, or has a sensor between the stretch's ends.
     """
     order = [e.name for e in rig.element]
     at = order.index(along.body)
@@ -173,15 +175,22 @@ def cut(rig: Rig, along: Along, part: Element, u: float = math.exp(0.5)) -> Rig:
         s.position >= most for s in sensors_on(rig, along.body) if isinstance(s, Acceleration)
     )
     there = [*map(of, along.pieces[:before]), part, *map(of, along.pieces[before:]), last]
+    turning = [e.name for e in there if isinstance(e, (*BEAMS, TorsionalSpring))]
     there += [tip] if at_tip else []
 
     def kept(sensor: Any) -> Any:
+        if isinstance(sensor, RelativeAngle):
+            each = ([n] if n != along.body else turning for n in sensor.across)
+            return sensor.model_copy(update={"across": tuple(chain.from_iterable(each))})
         if not isinstance(sensor, Acceleration | Strain) or sensor.on != along.body:
             return sensor
         if sensor.position >= most and isinstance(sensor, Acceleration):
             return sensor.model_copy(update={"on": tip.name, "position": 0.0})
         if sensor.position <= along.start:
             return sensor.model_copy(update={"on": along.pieces[0]})
+        if sensor.position < along.end:  # on which side of the part it is depends on u
+            expected = f"one up to {along.start:g} or from {along.end:g} m on"
+            raise InputError("cut", f"sensor[{sensor.name}].position", sensor.position, expected)
         return sensor.model_copy(update={"position": sensor.position - along.end})
 
     elements = (*rig.element[:at], *there, *rig.element[at + 1 :])
@@ -202,6 +211,9 @@ def joined(rig: Rig, along: Along, part: str) -> Rig:
         return e.model_copy(update={"L": e.L.model_copy(update={"value": L})})
 
     def on_it(sensor: Any) -> Any:
+        if isinstance(sensor, RelativeAngle):
+            across = tuple(n for n in sensor.across if n not in gone)
+            return sensor.model_copy(update={"across": across})
         if getattr(sensor, "on", None) not in (*gone, along.body):
             return sensor
         at = {tip: L, along.body: along.end + sensor.position}.get(sensor.on, sensor.position)

@@ -32,7 +32,7 @@ _ROWS = (
         hidden=("a joint that gives", "a joint spring stiffer than"),
         soft=True,
     ),
-    Physics("translational_compliance", "a support that gives sideways"),
+    Physics("translational_compliance", "a support that gives sideways, or a crack in a rod"),
     Physics("added_mass", "a mass", hidden=("a mass", "a mass under")),
     Physics("added_inertia", "a rotary inertia"),
     Physics("ground_spring", "a spring to ground"),

@@ -230,9 +230,13 @@ def _elsewhere(e: Explanation, change: Change, f: Float) -> tuple[Complex, Compl
 def _noise(problem: Problem, y: Complex) -> Float:
     """Standard deviation of one real part of each entry (n, q'), from the measured ones: that of
     the response over its root mean square, like that of the entries measured."""
-    inverse = np.linalg.pinv(problem.data.W)
-    variance = np.maximum(np.diagonal(inverse, axis1=1, axis2=2).real, 0.0)  # 0 but for rounding
-    relative = np.median(np.sqrt(variance) / np.maximum(np.abs(problem.data.H), 1e-300), axis=0)
+    variance = np.diagonal(np.linalg.pinv(problem.data.W), axis1=1, axis2=2).real
+    told = variance > 0  # an entry that nothing was told of has none, but for rounding
+    each = np.sqrt(np.where(told, variance, 0.0)) / np.maximum(np.abs(problem.data.H), 1e-300)
+    every = float(np.median(each[told]))
+    relative = np.array(
+        [np.median(r[on]) if on.any() else every for r, on in zip(each.T, told.T, strict=True)]
+    )
     level = np.sqrt(np.mean(np.abs(y) ** 2, axis=0))
     share = np.full(y.shape[1], float(np.median(relative)))
     share[: relative.size] = relative[: y.shape[1]]
