@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from samii_rig.diagnose.physics.rows import PHYSICS
+from samii_rig.diagnose.physics.rows import PHYSICS, SOFT
 from samii_rig.display import FORMS, card
 from samii_rig.rig.schema import Rig
 from samii_rig.types import Complex, Float, FrequencyResponse
@@ -20,7 +20,6 @@ Verdict = Literal["no_mismatch", "named", "ambiguous", "unknown"]
 
 # Physics that a person asks for first: where any of it could hide, and with its size.
 HIDING = {row.name: row.hidden for row in PHYSICS.values() if row.hidden}
-SOFT = tuple(row.name for row in PHYSICS.values() if row.soft)  # the larger, the less of it
 LIKELY = 0.5  # probability of a site from which it is told as the place
 PROBABLE = 0.3  # probability of causes below which they are told for a part of a mismatch at most
 REMARKS = 2  # on the console, of what is no physics

@@ -79,3 +79,4 @@ _ROWS = (
 )
 PHYSICS = {row.name: row for row in _ROWS}
 RESONANT = frozenset(row.name for row in _ROWS if row.resonant)
+SOFT = frozenset(row.name for row in _ROWS if row.soft)  # the larger, the less of it

@@ -17,7 +17,7 @@ from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.physics.along import POSITION
 from samii_rig.diagnose.physics.effect import Effect
-from samii_rig.diagnose.physics.rows import PHYSICS
+from samii_rig.diagnose.physics.rows import SOFT
 from samii_rig.diagnose.result import Hiding
 from samii_rig.errors import SamiiRigError
 from samii_rig.types import Float
@@ -39,7 +39,7 @@ def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
     taken = {e.key for e in best.effects}
     for effect in search.table:
         plain = effect.unknowns and effect.force is None and effect.physical
-        if effect.pieces and PHYSICS[effect.physics].soft:  # a joint is asked for, not every crack
+        if effect.pieces and effect.physics in SOFT:  # a joint is asked for, not every crack
             continue
         if plain and effect.key not in taken and effect.name not in found:
             seen = _smallest(search, best, screens, effect, needed)
