@@ -149,10 +149,12 @@ def scatter(records: Records, H: Complex, seen: Sequence[Seen], noise: Noise) ->
     largest; nan where nothing was repeated."""
     power, mean = np.zeros((2, H.shape[1] // records.pieces[0].inputs))
     for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
-        for f, left, free in _beside(records, piece, piece.repeats, H, own):
+        every = _beside(records, piece, piece.repeats, H, own)
+        if every:
+            f, _, free = every[0]  # of one piece all repeats have the same
             C = noise.covariance(f, np.full(f.size, i))
-            power += np.sum(np.abs(left) ** 2, axis=0)
-            mean += free @ np.diagonal(C, axis1=1, axis2=2).real
+            mean += len(every) * (free @ np.diagonal(C, axis1=1, axis2=2).real)
+            power += sum(np.sum(np.abs(left) ** 2, axis=0) for _, left, _ in every)
     return np.asarray(np.divide(power, mean, out=np.full(mean.size, np.nan), where=mean > 0))
 
 

@@ -256,7 +256,7 @@ class Mechanism:
 
     def _cracks(self, part: Part) -> list[tuple[float, int]]:
         """x/L of each crack of a beam and the coordinate of its jump. One beyond the end of a beam
-        that a refit made shorter moves nothing."""
+        that a refit made shorter is a coordinate without mass, of which no plant is made."""
         found = []
         for a in self.setup.attachments:
             if a.kind == "crack" and a.on == part.name:

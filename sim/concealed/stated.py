@@ -60,9 +60,8 @@ def row_of(plant: Description, effect: Stated) -> Row:
         known = ", ".join(dict.fromkeys(row.physics for row in (*ROWS, *OUTSIDE, *VARYING)))
         raise InputError("effect", "physics", effect.physics, f"one of {known}")
     sites = []
-    # What has a position is along its site, what has none at the end: first the rows of that kind.
-    for row in sorted(rows, key=lambda row: row.along != (effect.position is not None)):
-        if row.along and effect.position is None:  # where along a body is to be said
+    for row in sorted(rows, key=lambda row: not row.along):
+        if row.along and effect.position is None:  # what has no position is at its site's end
             continue
         own = places(plant, row)
         if row.at in ("loose", "junction") and clamp_of(plant):

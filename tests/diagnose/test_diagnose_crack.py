@@ -22,6 +22,7 @@ from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import load_rig, parse
 from samii_rig.rig.schema import BEAMS, Rig, Rod
 from samii_rig.signal.estimate import estimate
+from samii_rig.types import Complex
 from sim.assumed_modes import styles, trial
 
 BAND = (2.0, 200.0)  # Hz, with three modes of the strip
@@ -49,25 +50,34 @@ c = {{ value = {C}, unit = "N m s/rad", source = "made" }}
     return text.replace(whole, front + spring + own.replace("300.0", f"{300 - 1e3 * AT}"))
 
 
-def along_the_strip(rig: Rig) -> Effect:
-    every = table_of(rig, *BAND, "torsional_compliance")
-    (effect,) = (e for e in every if e.site == "strip" and e.unknowns[-1].symbol == "position")
-    return effect
+def along_a_body(rig: Rig) -> list[Effect]:
+    every = table_of(rig, *BAND, "torsional_compliance", "translational_compliance")
+    return [e for e in every if e.unknowns[-1].symbol == "position"]
+
+
+def with_crack(rig: Rig, k: float, c: float, share: float) -> tuple[Effect, Fitted]:
+    """The one crack that a rig may have, and a fit at these values and this share of its body."""
+    (effect,) = along_a_body(rig)
+    model = Model(rig, (effect,))
+    u = math.exp(share)
+    loss = c / effect.report(np.array([k, 1.0, u]))[1]
+    x = np.append(np.zeros(model.n_nominal), np.log([k, loss, u]))
+    return effect, Fitted(model, x, 0.0, 0.0, np.zeros((0, model.n)), np.eye(model.n))
+
+
+def answer(fitted: Fitted) -> Complex:
+    return fitted.model.chain.with_values(fitted.model.values(fitted.x)).response(F)
 
 
 def test_a_crack_is_a_spring_between_two_pieces_in_the_model_and_in_the_new_rig_file() -> None:
     _, text = load_rig("beam_on_shaker")
     rig = rig_of(text)
-    effect = along_the_strip(rig)
-    model = Model(rig, (effect,))
-    u = math.exp(AT / 0.3)
-    loss = C / effect.report(np.array([K, 1.0, u]))[1]
-    x = np.append(np.zeros(model.n_nominal), np.log([K, loss, u]))
-    assert effect.report(np.exp(x[model.n_nominal :])) == pytest.approx([K, C, AT])
+    effect, fitted = with_crack(rig, K, C, AT / 0.3)
+    unknowns = np.exp(fitted.x[fitted.model.n_nominal :])
+    assert effect.report(unknowns) == pytest.approx([K, C, AT])
     want = Chain(rig_of(cracked(text))).response(F)
-    got = model.chain.with_values(model.values(x)).response(F)
-    np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-9 * np.abs(want).max())
-    new = explained(Fitted(model, x, 0.0, 0.0, np.zeros((0, model.n)), np.eye(model.n)))
+    np.testing.assert_allclose(answer(fitted), want, rtol=1e-6, atol=1e-9 * np.abs(want).max())
+    new = explained(fitted)
     np.testing.assert_allclose(Chain(new).response(F), want, rtol=1e-6, atol=1e-9)
 
 
@@ -95,11 +105,6 @@ def on_a_rod() -> str:
     return text[:a] + ROD + text[b:]
 
 
-def along_a_body(rig: Rig) -> list[Effect]:
-    every = table_of(rig, *BAND, "torsional_compliance", "translational_compliance")
-    return [e for e in every if e.unknowns[-1].symbol == "position"]
-
-
 def test_a_crack_stands_along_beams_and_rods_and_on_no_rigid_link() -> None:
     for text, physics in (
         (load_rig("beam_on_shaker")[1], "torsional_compliance"),
@@ -115,17 +120,11 @@ def test_a_crack_stands_along_beams_and_rods_and_on_no_rigid_link() -> None:
 
 def test_a_crack_in_a_rod_is_a_spring_between_two_pieces() -> None:
     text = on_a_rod()
-    rig = rig_of(text)
-    (effect,) = along_a_body(rig)
-    model = Model(rig, (effect,))
-    u = math.exp(0.3)  # 30 mm of 100
-    loss = 0.3 / effect.report(np.array([2000.0, 1.0, u]))[1]
-    x = np.append(np.zeros(model.n_nominal), np.log([2000.0, loss, u]))
+    _, fitted = with_crack(rig_of(text), 2000.0, 0.3, 0.3)  # 30 mm of 100
     front = ROD.replace('"spring"', '"front"').replace("100.0", "30.0")
     pieces = front + CRACK_IN_ROD + ROD.replace("100.0", "70.0")
     want = Chain(rig_of(text.replace(ROD, pieces))).response(F)
-    got = model.chain.with_values(model.values(x)).response(F)
-    np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-9 * np.abs(want).max())
+    np.testing.assert_allclose(answer(fitted), want, rtol=1e-6, atol=1e-9 * np.abs(want).max())
 
 
 ACROSS = """

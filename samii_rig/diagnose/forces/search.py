@@ -83,9 +83,7 @@ class ForceSearch(BesideForce):
         self._try([h for h in scores if h.own[0] >= STRONG * ahead], self.nominal, 0)
         if first is not None:
             self._try(self.scores([first]) if faulty else scores, first, -1)
-        # Of true ones that passed for noise each promised something in that noise, too.
-        if scores or any(e.key in self.handed and _alone(e) for e in self.ranked()):
-            self._beyond_noise()
+        self._beyond_noise(promising=bool(scores))
         best = self.ranked()[0]
         if (does := self._does(best)) is not None and does[1] < INCONSISTENT:
             self._presliding(best)
@@ -102,9 +100,17 @@ class ForceSearch(BesideForce):
         self._forget_inconsistent()
         self.take_overdispersion()
 
-    def _beyond_noise(self) -> None:
+    def _beyond_noise(self, *, promising: bool) -> None:
         """Where the records have more noise than their sensors, look for a force that passes for
-        it, and stand about it where these are more likely with the noise that it leaves."""
+        it, and stand about it where these are more likely with the noise that it leaves.
+
+        promising : whether any force promises something in the noise as it is estimated: each true
+        one that passed for noise did.
+        """
+        before = self.ranked()
+        known = next((e for e in before if e.key in self.handed and _alone(e)), None)
+        if not (promising or known):
+            return
         whole = self.linear.whole
         assert isinstance(whole, Whole)  # of one state
         more = estimated(self.linear, whole) > MORE_NOISE * stated(whole)
@@ -113,8 +119,6 @@ class ForceSearch(BesideForce):
         again = self.levels.scatter(of_data(self).fitted, self.reduced)
         if np.all(again[more] > REPEATED):  # hardly any force differs between repeats
             return
-        before = self.ranked()
-        known = next((e for e in before if e.key in self.handed and _alone(e)), None)
         best = known or self._in_sensors_noise(own_power(self.linear, whole))
         if best is None:
             return

@@ -300,13 +300,11 @@ def _strength(where: Places, pair: int, at: int) -> float:
 
 def _stands_along(rig: Rig, row: Point, body: Element) -> bool:
     """Whether a row's part makes a difference along a body that no port does."""
-    axial = rig.motion == "axial"
-    if row.jump in ("theta", "w"):  # a crack: a beam bends there more, a rod stretches more
-        return not isinstance(body, RigidLink) and (row.jump == "w") == axial
-    if row.jump == "M":  # wherever a part turns a rigid link it does the same
-        return not isinstance(body, RigidLink) and not axial
-    # A mass on a link that has some is in `bodies`.
-    return not (isinstance(body, RigidLink) and row.law == "mass" and body.m.value > 0)
+    if row.jump == "V":  # a mass on a link that has some is in `bodies`
+        return not (isinstance(body, RigidLink) and row.law == "mass" and body.m.value > 0)
+    # Wherever a part turns a rigid link it does the same, and no link has a crack. What lets w jump
+    # is a rod's crack; a beam's shifts nothing across it.
+    return not isinstance(body, RigidLink) and (row.jump == "w") == (rig.motion == "axial")
 
 
 def _along(rig: Rig, where: Places, row: Point, at: int, stretch: Along) -> Iterator[Effect]:

@@ -39,9 +39,8 @@ def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
     taken = {e.key for e in best.effects}
     for effect in search.table:
         plain = effect.unknowns and effect.force is None and effect.physical
-        if effect.pieces and effect.physics in SOFT:  # a joint is asked for, not every crack
-            continue
-        if plain and effect.key not in taken and effect.name not in found:
+        crack = effect.pieces and effect.physics in SOFT  # a joint is asked for, not every one
+        if plain and not crack and effect.key not in taken and effect.name not in found:
             seen = _smallest(search, best, screens, effect, needed)
             if seen is not None:
                 found[effect.name] = seen
