@@ -17,7 +17,6 @@ from scipy import ndimage, signal
 from samii_rig.likelihood.algebra import by_input
 from samii_rig.likelihood.contour import Contour
 from samii_rig.likelihood.pieces import Loops, Piece
-from samii_rig.likelihood.staircase import Stretch
 from samii_rig.types import Complex, Float, Int
 
 WANDER = 3  # degree of the polynomial that a sensor wanders by within a piece
@@ -235,31 +234,23 @@ def _tones(left: Complex, k: Int, step: float) -> list[float]:
 
 
 def unread(
-    piece: Piece,
-    k: Int,
-    free: Mapping[int, Sequence[Stretch]],
-    H: Complex,
-    contour: Contour,
-    loops: Loops,
+    piece: Piece, k: Int, factors: Mapping[int, Float], H: Complex, contour: Contour, loops: Loops
 ) -> Complex:
-    """(n_lines, q, m) of what a converter makes of a motion within few steps, of a size that nobody
-    knows; the loop is told so.
+    """(n_lines, q, m) of motion that a converter hardly reads, as it stays within few steps:
+    rounding scales it by a factor that nobody knows, and the loop is told so.
 
-    free : as of `Rounding`. H : (M//2 + 1, q) from the input on the contour; (M//2 + 1, q m) of m
-    inputs.
+    factors : of each sensor (p, n) parts of its motion. H : (M//2 + 1, q) from the input on the
+    contour; (M//2 + 1, q m) of m inputs.
     """
     n, q = piece.z.shape
     out = []
-    for i, stretches in free.items():
-        for on, shapes in stretches:
-            x = np.zeros((len(shapes), n))
-            x[:, on] = shapes
-            spectra = np.fft.rfft(x, axis=1)[:, k].T
-            seen = np.zeros((k.size, q, len(shapes)), complex)
-            seen[:, i] = spectra
+    for i, parts in factors.items():
+        for spectrum in np.fft.rfft(parts, axis=1)[:, k]:
+            seen = np.zeros((k.size, q), complex)
+            seen[:, i] = spectrum
             for kp, sensor, of in loops:
                 if sensor == i:
                     there = np.round(k * (contour.samples / n)).astype(np.int64)
-                    seen -= kp * H[there, of :: piece.inputs, None] * spectra[:, None, :]
+                    seen -= kp * H[there, of :: piece.inputs] * spectrum[:, None]
             out.append(seen)
-    return np.concatenate(out, axis=2) if out else np.zeros((k.size, q, 0), complex)
+    return np.stack(out, axis=2) if out else np.zeros((k.size, q, 0), complex)

@@ -15,12 +15,10 @@ from samii_rig.errors import EstimateError
 from samii_rig.likelihood import inputs, spikes
 from samii_rig.likelihood.bridged import MOST_GAPS, Bridged, bridge
 from samii_rig.likelihood.outside import followed, outside
-from samii_rig.likelihood.staircase import within_few
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import is_open, of_input, proportional
 from samii_rig.signal.groups import segments_of
 from samii_rig.signal.several.undriven import driven_of
-from samii_rig.signal.steps import step_of
 from samii_rig.types import Float, Int, Quality, Recording, Segment
 
 SPOILT = Quality.MISSING | Quality.CLIPPED | Quality.STALE
@@ -158,7 +156,6 @@ def wiring(
     hidden : sensors that show next to nothing but their converter's steps. A loop around one of
     them does nothing that its command does not show: that is an input as of an open loop, and the
     rest of the noise has not gone round.
-    So is that of a loop around one that moves by few steps of its converter in all of them.
     An input is a command that any of them has. Where one has no column of it, it rested there.
 
     Raises EstimateError where they have no sensor in common or no command, where a loop is closed
@@ -200,21 +197,7 @@ def _input(
                 f"the rig file closes a loop from {sensor} to it"
             )
     closed = Input(command, sensor, kp)
-    if all(_by_few_steps(r, rig, closed) for r in recordings):
-        return Input(command)
     return Input(command) if all(_is_open(r, closed) for r in recordings) else closed
-
-
-def _by_few_steps(recording: Recording, rig: Rig, x: Input) -> bool:
-    """Whether a loop's sensor moves by few steps of its converter, and the command was recorded as
-    it was sent: its rounding follows the motion and goes round the loop, as no noise does. The
-    command holds all of that."""
-    theta = recording.values_of(x.centring)
-    theta = theta[np.isfinite(theta)]
-    step = step_of(recording.channels[recording.column(x.centring)], theta)
-    if step == 0 or not within_few(theta / step, recording.rate_hz):
-        return False
-    return recording.rate_hz == rig.rate_hz and _meter(recording, x) is None
 
 
 def _is_open(recording: Recording, x: Input) -> bool:
@@ -253,8 +236,8 @@ def pieces_of(
     segments to leave out, as `Recording.place` gives them. by_level : of one level only, for what
     depends on the level. times : as of `faster`.
 
-    The input of a loop is v + kp theta as they were recorded: it holds the reference, the rounding
-    and the clipping of the command, and nothing of the sensors' noise.
+    The input of the loop is v + kp theta as they were recorded: it holds the reference, the
+    rounding and the clipping of the command, and nothing of the sensors' noise.
     """
     steps = {s.name: s.resolution for s in rig.sensor}
     step = np.array([steps[n] for n in wired.sensors])

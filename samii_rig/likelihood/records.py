@@ -11,7 +11,6 @@ from samii_rig.likelihood import nuisance, spikes
 from samii_rig.likelihood.algebra import by_input
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.pieces import Loops, Piece, Samples, across
-from samii_rig.likelihood.rounding import ROOM
 from samii_rig.likelihood.seen import Answers, Seen
 from samii_rig.types import Complex, Float, Int
 
@@ -149,11 +148,7 @@ class Records:
             fine = contour.record(response(contour.s), self.longest * self.every)
             folded = nuisance.folding(answers.impulse, fine, self.every)
             answers = replace(answers, folded=folded)
-        each = [self.lines(p).k for p in self.pieces]
-        room = ROOM // sum(k.size for k in each)
-        return [
-            Seen.of(p, k, answers, self.step, room) for p, k in zip(self.pieces, each, strict=True)
-        ]
+        return [Seen.of(p, self.lines(p).k, answers, self.step) for p in self.pieces]
 
 
 def _left_in_time(samples: Samples | Piece, H: Complex, contour: Contour) -> Float:

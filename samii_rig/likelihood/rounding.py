@@ -6,7 +6,8 @@ order. Elsewhere it is what the motion makes of it:
   for what noise of sd sigma dithers: of harmonic h of a sawtooth, 6/(pi h)^2 of its power,
   exp(-(2 pi h sigma/step)^2) is the same in all repeats (Widrow and Kollar 2008, Quantization
   Noise, ch. 4). A motion that rests keeps one error as long as it rests.
-- Where the motion stays within few steps, what is read is not in proportion to it (`staircase`).
+- Where the motion stays within few steps, what is read is not in proportion to it, but for noise
+  that dithers it: of the sawtooth's first harmonic exp(-2 (pi sigma/step)^2) is left.
 """
 
 from __future__ import annotations
@@ -16,68 +17,58 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize
+from scipy import ndimage, optimize
 
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.likelihood.staircase import RESTS_IN_STEP, Stretch, follows
 from samii_rig.types import Complex, Float, Int
 
 WHITE = 1 / 12  # of a step, squared
 HARMONIC = np.arange(1.0, 200.0)  # of a sawtooth: all but 0.3 % of its power
+# Steps within which a motion is not read in proportion: the describing function of a staircase
+# is within 10 % of 1 from here on.
+FEW = 3.0
+STILL = 1e-3  # steps, rms of a motion that has no factor worth estimating
+UNREAD_FOR = 0.5  # s in which a motion that crosses no step is not read: some periods of the band
 ALIKE = 0.05  # of a rounding error, that repeats itself: repeats do not show it
-# Shapes that are free: numbers that they may be in the lines of all pieces, 200 MB, and the part of
-# the lines of one sensor in a piece that they take at most.
-ROOM, OF_LINES = 12_000_000, 0.25
+UNREAD = 6  # parts in which what is hardly read has a factor of its own
 # Of a step, noise sd from which a rounding error is white: the first harmonic of a sawtooth is the
 # same to 0.7 % from here on.
 DITHERED = 0.5
+UNSEEN = 0.05  # of a staircase's error, what dithering leaves of it that nobody sees
 # Times by which what rounding adds may differ between pieces of one group, and how many groups are
 # distinguished at most: each has bins of its own.
 GROUPS_APART, GROUPS = 1.5, 8
-WANDERS = 2.0  # times that one place for all leaves more than one a second, of what does not rest
+# s for which what wanders, below the band, rests in its step: some periods of the band, from which
+# its place is determined.
+RESTS_IN_STEP = 1.0
 OFFSETS = 16  # places of a motion in its step, at which its rounding is tried: within 25 % a line
-# Of a rounding error's power, what free harmonics miss of it: the sensor has moved within a stretch
-# and stands not quite as the reference has it. With none, motions within 3 to 8 steps leave 0.9 to
-# 1.1 of the noise but scatter by 0.7; with this 0.8 to 0.94, and half of that.
-MISSED = 0.05
-TRIED, TRIED_AT = 6, 4  # sd of noise, and places, at which its readings are tried
 LIKELY = 4  # of these, that are nearest to what is read
 
 
-def repeating(sd: float) -> float:
-    """The part of a rounding error's power that repeats, where noise of sd steps dithers it."""
-    each = 6 / (np.pi * HARMONIC) ** 2
-    return float(each @ np.exp(-((2 * np.pi * HARMONIC * sd) ** 2)))
+def repeating(spread: float) -> float:
+    """The part of a rounding error's power that repeats, from the variance of repeats about their
+    mean, in steps squared: spread = (1 - part)/12 + sigma^2."""
 
-
-def dithering(spread: float) -> float:
-    """The sd of noise in steps, from the variance of repeats about their mean, in steps squared:
-    spread = (1 - repeating(sd))/12 + sd^2; inf where it is large enough for any."""
-
-    def off(power: float) -> float:
-        return (1 - repeating(math.sqrt(power))) * WHITE + power - spread
+    def part(power: float) -> float:
+        each = 6 / (np.pi * HARMONIC) ** 2
+        return float(each @ np.exp(-((2 * np.pi * HARMONIC) ** 2) * power))
 
     if spread >= 1:
-        return math.inf
-    return math.sqrt(optimize.brentq(off, 0.0, 1.0)) if off(0.0) < 0 else 0.0
-
-
-def dithered(piece: Piece, step: Float) -> Float:
-    """(q,) sd of the noise that dithers each sensor, in its steps, from what repeats of a piece
-    differ by; inf where nothing is rounded."""
-    out = np.full(step.size, math.inf)
-    for i in np.flatnonzero(step > 0):
-        # What repeats differ by from sample to sample: no wandering.
-        power = np.mean([np.var(np.diff(s.z[:, i])) / 2 for s in piece.repeats])
-        out[i] = dithering(float(power) / step[i] ** 2)
-    return out
+        return 0.0
+    if spread <= (1 - part(0.0)) * WHITE:  # they hardly differ
+        return part(0.0)
+    found = optimize.brentq(lambda x: (1 - part(x)) * WHITE + x - spread, 0.0, 1.0)
+    return part(float(found))
 
 
 def alike(piece: Piece, step: Float) -> Float:
     """(q,) part of each sensor's rounding error that is the same in all repeats of a piece."""
-    if not piece.repeats:
-        return np.zeros(step.size)
-    return np.array([repeating(sd) if sd < math.inf else 0.0 for sd in dithered(piece, step)])
+    out = np.zeros(step.size)
+    for i in np.flatnonzero(step > 0) if piece.repeats else ():
+        # What repeats differ by from sample to sample: no wandering.
+        power = np.mean([np.var(np.diff(s.z[:, i])) / 2 for s in piece.repeats])
+        out[i] = repeating(float(power) / step[i] ** 2)
+    return out
 
 
 @dataclass(frozen=True)
@@ -136,119 +127,101 @@ def _at(f: Float, of: tuple[Float, Float]) -> Float:
 class Rounding:
     """What the converters' steps do to a piece.
 
-    frequency : (m,) Hz. power : (m, q) a sample, of each sensor's rounding. free : of each sensor
-    that less than half a step dithers, shapes of its error that have any amplitude. draws : of each
-    of these (OFFSETS, n_lines) what such shapes leave of it, a sample's power, as it is wherever
-    the sensor stands in its step.
+    frequency : (m,) Hz. power : (m, q) a sample, of each sensor's rounding. factors : of each
+    sensor (p, n) parts of its motion that are read by a factor of their own. draws : of each sensor
+    that nothing dithers (OFFSETS, n_lines) rounding beyond these, a sample's power, as it is
+    wherever the sensor stands in its step.
     """
 
     frequency: Float
     power: Float
-    free: dict[int, list[Stretch]]
+    factors: dict[int, Float]
     draws: dict[int, Complex]
 
     @classmethod
-    def of_piece(
-        cls, piece: Piece, k: Int, step: Float, y: Float, rate_hz: float, room: int = ROOM
-    ) -> Rounding:
+    def of_piece(cls, piece: Piece, k: Int, step: Float, y: Float, rate_hz: float) -> Rounding:
         """k : (n_lines,) that count. step : (q,) of the converters. y : (n, q) as the sensors
-        would move without noise. room : numbers a line that all free shapes of it may be."""
+        would move without noise."""
         n, q = piece.z.shape
         frequency = np.asarray(np.fft.rfftfreq(n, 1 / rate_hz), np.float64)
         power = np.zeros((frequency.size, q))
-        free, draws = {}, {}
+        factors, draws = {}, {}
         same = alike(piece, step)
-        noise = dithered(piece, step) if piece.repeats else None
-        shares = np.array([c.part for c in piece.commands] or [1.0])
-        rounded = np.flatnonzero(step > 0).tolist()
-        most = min(int(2 * OF_LINES * k.size), room // (q * max(len(rounded), 1)))
-        for i in rounded:
+        for i in np.flatnonzero(step > 0).tolist():
             power[:, i] = (1 + len(piece.repeats) * same[i]) * WHITE * step[i] ** 2
-            moved = y[:, i] / step[i]
-            if noise is None and _drowned(piece.z[:, i] / step[i] - moved, shares):
+            sd = _noise(piece.z[:, i] - y[:, i], float(step[i]))
+            if sd >= DITHERED * step[i]:
                 continue
+            parts = _parts(piece, y[:, i], float(step[i]), sd, rate_hz)
+            shares = np.array([c.part for c in piece.commands] or [1.0])
+            moved = y[:, i] / step[i]
             if shares.size == 1 and not piece.repeats and not piece.contrasts:
                 width = max(int(RESTS_IN_STEP * rate_hz), 3)
                 moved = moved + _wandering(moved, piece.z[:, i] / step[i], width)
-            left = piece.z[:, i] / step[i] - moved
-            sd = _noise(left, moved, shares) if noise is None else noise[i]
-            if sd >= DITHERED:
-                continue
-            free[i] = follows(y[:, i] / step[i], shares, sd, rate_hz, most)
-            errors = _errors(moved, shares, _dither(moved, shares, sd), OFFSETS)
-            every = _power(errors)
-            for on, shapes in free[i]:
-                errors[:, on] -= (errors[:, on] @ shapes.T) @ shapes
-            power[:, i] = step[i] ** 2 * (MISSED * every + (1 - MISSED) * _power(errors))
+            errors = _errors(moved, shares, parts, sd / step[i])
             spectra = np.fft.rfft(step[i] / math.sqrt(n) * errors, axis=1)
-            draws[i] = np.asarray(spectra[:, k])
-        return cls(frequency, power, free, draws)
+            power[:, i] = np.mean(np.abs(spectra) ** 2, axis=0)
+            factors[i], draws[i] = parts, np.asarray(spectra[:, k])
+        return cls(frequency, power, factors, draws)
 
 
-def _power(x: Float) -> Float:
-    """(m,) power a sample along frequency, of rows (r, n) in the mean."""
-    return np.asarray(np.mean(np.abs(np.fft.rfft(x, axis=1)) ** 2, axis=0) / x.shape[1])
-
-
-def _white(x: Float) -> Float:
-    """Power of the white part of rows (..., n)."""
-    power = np.abs(np.fft.rfft(x - np.mean(x, axis=-1, keepdims=True))) ** 2 / x.shape[-1]
-    return np.asarray(np.median(power[..., power.shape[-1] // 2 :], axis=-1) / math.log(2))
-
-
-def _drowned(left: Float, shares: Float) -> bool:
-    """Whether more is left of a sensor (n,), in steps, than its rounding and noise that dithers it
-    can be."""
-    return float(_white(left)) >= float(np.sum(np.abs(shares))) ** 2 * (DITHERED**2 + WHITE)
-
-
-def _noise(left: Float, y: Float, shares: Float) -> float:
-    """Sd in steps of the noise that dithers a sensor of motion y (n,), from what a reference leaves
-    of it (n,), in steps: that with which the reading of the motion leaves as much; `DITHERED` at
-    most. shares : as of `_errors`."""
-    shown = float(_white(left))
-    before, had = 0.0, 0.0
-    for sd in np.linspace(0.0, DITHERED, TRIED):
-        noise = _dither(y, shares, sd)
-        has = float(np.mean(_white(_errors(y, shares, noise, TRIED_AT) + shares @ noise)))
-        if has >= shown:
-            return float(np.interp(shown, [had, has], [before, sd]))
-        before, had = sd, has
-    return DITHERED
+def _noise(left: Float, step: float) -> float:
+    """Sd of the noise that dithers a converter, from what a reference leaves of it (n,)."""
+    power = np.abs(np.fft.rfft(left - np.mean(left))) ** 2 / left.size
+    white = float(np.median(power[power.size // 2 :])) / math.log(2)
+    return math.sqrt(max(white - WHITE * step**2, 0.0))
 
 
 def _wandering(y: Float, z: Float, width: int) -> Float:
     """(n,) by how much a motion y (n,) stands elsewhere in its step than over all: of each `width`
-    samples the place at which its rounding is nearest to what is read z (n,). 0 where one place
-    leaves hardly more. All in steps."""
-    parts = np.array_split(np.arange(y.size), max(y.size // width, 1))
+    samples the place at which its rounding is nearest to what is read z (n,). All in steps."""
+    every = np.arange(y.size)
+    parts = np.array_split(every, max(y.size // width, 1))
     offsets = np.arange(OFFSETS) / OFFSETS
-    off = np.rint(y + offsets[:, None]) - z
-    left = np.stack([np.var(off[:, on], axis=1) for on in parts])
-    one = int(np.argmin(np.mean(left, axis=0)))
-    least = np.min(left, axis=1)
-    if np.mean(left[:, one]) <= WANDERS * np.mean(least):
-        return np.zeros(y.size)
-    at = np.where(left[:, one] <= least, one, np.argmin(left, axis=1))  # at rest all are alike
-    return np.repeat(offsets[at] - offsets[one], [on.size for on in parts])
+
+    def place(on: Int) -> float:
+        off = np.rint(y[on] + offsets[:, None]) - z[on]
+        return float(offsets[np.argmin(np.var(off, axis=1))])
+
+    return np.repeat([place(on) for on in parts], [on.size for on in parts]) - place(every)
 
 
-def _dither(y: Float, shares: Float, sd: float) -> Float:
-    """(records, n) of noise, the same each time."""
-    return np.random.default_rng(0).standard_normal((shares.size, y.size)) * sd
-
-
-def _errors(y: Float, shares: Float, dither: Float, places: int) -> Float:
-    """(places, n) rounding of a motion y (n,) in steps wherever it stands in its step.
+def _errors(y: Float, shares: Float, parts: Float, sd: float) -> Float:
+    """(OFFSETS, n) rounding of a motion y (n,) in steps wherever it stands in its step, less what
+    factors of its parts (p, n) explain.
 
     shares : of the records behind it, whose sum it is, each with its share of y and of its own
-    rounding: repeats round alike, other levels otherwise. dither : (records, n) noise of each, in
+    rounding: repeats round alike, other levels otherwise. sd : of the noise that dithers each, in
     steps.
     """
+    dither = np.random.default_rng(0).standard_normal((shares.size, y.size)) * sd
     moved = y * shares[:, None] + dither
-    out = np.zeros((places, y.size))
-    for one, offset in zip(out, (np.arange(places) + 0.5) / places, strict=True):
+    out = np.zeros((OFFSETS, y.size))
+    size = np.sum(parts**2, axis=1)
+    for one, offset in zip(out, (np.arange(OFFSETS) + 0.5) / OFFSETS, strict=True):
         x = moved + offset
         error = shares @ (np.rint(x) - x)
-        one[:] = error - np.mean(error)
+        error -= np.mean(error)
+        one[:] = error - (parts @ error / size) @ parts
     return out
+
+
+def _parts(piece: Piece, y: Float, step: float, sd: float, rate_hz: float) -> Float:
+    """(p, n) what of the motion y (n,) of a sensor stays within few steps and is not read in
+    proportion, less its mean: each stretch its own, as a part may rest at another place after it
+    was moved. In parts of equal power: the factor depends on the amplitude. sd : of the noise."""
+    times = math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
+    width = max(int(UNREAD_FOR * rate_hz), 3)
+    high, low = ndimage.maximum_filter1d(y, width), ndimage.minimum_filter1d(y, width)
+    still = high - low < FEW * step * times
+    labels, count = ndimage.label(still)
+    if count == 0 or math.exp(-2 * (math.pi * sd / step) ** 2) < UNSEEN:
+        return np.zeros((0, y.size))
+    mean = np.append(0.0, ndimage.mean(y, labels, np.arange(1, count + 1)))
+    part = np.where(still, y - mean[labels], 0.0)
+    grown = np.cumsum(part**2)
+    if grown[-1] <= y.size * (STILL * step) ** 2:
+        return np.zeros((0, y.size))
+    turn = np.minimum((UNREAD * grown / grown[-1]).astype(np.int64), UNREAD - 1)
+    # A part before all motion, which jumps from none to the next, has nothing to be scaled.
+    return np.stack([np.where(turn == j, part, 0.0) for j in np.unique(turn[part != 0])])

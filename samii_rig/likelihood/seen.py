@@ -6,7 +6,7 @@ impulse. Neither is computed twice.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -96,9 +96,8 @@ class Seen:
     left: Float
 
     @classmethod
-    def of(cls, piece: Piece, k: Int, answers: Answers, step: Float, room: int) -> Seen:
-        """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known.
-        room : as of `Rounding`."""
+    def of(cls, piece: Piece, k: Int, answers: Answers, step: Float) -> Seen:
+        """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known."""
         n = len(piece.z)
         H, exact = answers.H, answers.exact
         y = exact.predicted(H, piece.r)[piece.history :]
@@ -108,8 +107,8 @@ class Seen:
         own = [wander, nuisance.hum(left, k, exact.rate_hz, n)]
         if np.any(step > 0):  # what a converter reads is the whole motion
             y = y + _before(past, left[k], wander, answers.impulse, piece)
-        rounding = Rounding.of_piece(piece, k, step, y, exact.rate_hz, room)
-        own += [nuisance.unread(piece, k, rounding.free, H, exact, answers.loops)]
+        rounding = Rounding.of_piece(piece, k, step, y, exact.rate_hz)
+        own += [nuisance.unread(piece, k, rounding.factors, H, exact, answers.loops)]
         own += [nuisance.edges(piece, k, answers.impulse, answers.folded)]
         own += [nuisance.lost(piece, k, answers.impulse)]
         beside = _of_size_one(np.concatenate(own, axis=2))
@@ -122,7 +121,7 @@ class Seen:
             np.repeat([0.0, 1.0], [N.shape[2] - metered.shape[2], metered.shape[2]]),
             past,
             slice(first, first + beside.shape[2]),
-            replace(rounding, free={}),  # of an hour all samples again
+            rounding,
             left_in_time,
         )
 

@@ -40,6 +40,7 @@ def test_the_encoder_is_left_out_and_the_command_is_what_was_recorded(
     nothing: list[Recording],
 ) -> None:
     assert 0 < np.std(nothing[0].values_of("theta_2")) < STEP
+    assert wiring(nothing, RIG).only.kp > 0
     assert wiring(nothing, RIG, hidden=["theta_2"]).only.kp == 0
     case = case_of(estimate(nothing), RIG, None, FEW, nothing)
     assert case.clean.hidden == {"theta_2"}
