@@ -20,15 +20,12 @@ import numpy as np
 from scipy import ndimage, optimize
 
 from samii_rig.likelihood.pieces import Piece
+from samii_rig.signal.steps import FEW, crossed
 from samii_rig.types import Complex, Float, Int
 
 WHITE = 1 / 12  # of a step, squared
 HARMONIC = np.arange(1.0, 200.0)  # of a sawtooth: all but 0.3 % of its power
-# Steps within which a motion is not read in proportion: the describing function of a staircase
-# is within 10 % of 1 from here on.
-FEW = 3.0
 STILL = 1e-3  # steps, rms of a motion that has no factor worth estimating
-UNREAD_FOR = 0.5  # s in which a motion that crosses no step is not read: some periods of the band
 ALIKE = 0.05  # of a rounding error, that repeats itself: repeats do not show it
 UNREAD = 6  # parts in which what is hardly read has a factor of its own
 # Of a step, noise sd from which a rounding error is white: the first harmonic of a sawtooth is the
@@ -41,34 +38,45 @@ GROUPS_APART, GROUPS = 1.5, 8
 # s for which what wanders, below the band, rests in its step: some periods of the band, from which
 # its place is determined.
 RESTS_IN_STEP = 1.0
+WANDERS = 2.0  # times that one place for all leaves more than one a second, of what does not rest
 OFFSETS = 16  # places of a motion in its step, at which its rounding is tried: within 25 % a line
 LIKELY = 4  # of these, that are nearest to what is read
 
 
-def repeating(spread: float) -> float:
-    """The part of a rounding error's power that repeats, from the variance of repeats about their
-    mean, in steps squared: spread = (1 - part)/12 + sigma^2."""
+def repeating(sd: float) -> float:
+    """The part of a rounding error's power that repeats, where noise of sd steps dithers it."""
+    each = 6 / (np.pi * HARMONIC) ** 2
+    return float(each @ np.exp(-((2 * np.pi * HARMONIC * sd) ** 2)))
 
-    def part(power: float) -> float:
-        each = 6 / (np.pi * HARMONIC) ** 2
-        return float(each @ np.exp(-((2 * np.pi * HARMONIC) ** 2) * power))
+
+def dithering(spread: float) -> float:
+    """The sd of noise in steps, from the variance of repeats about their mean, in steps squared:
+    spread = (1 - repeating(sd))/12 + sd^2; inf where it is large enough for any."""
+
+    def off(power: float) -> float:
+        return (1 - repeating(math.sqrt(power))) * WHITE + power - spread
 
     if spread >= 1:
-        return 0.0
-    if spread <= (1 - part(0.0)) * WHITE:  # they hardly differ
-        return part(0.0)
-    found = optimize.brentq(lambda x: (1 - part(x)) * WHITE + x - spread, 0.0, 1.0)
-    return part(float(found))
+        return math.inf
+    return math.sqrt(optimize.brentq(off, 0.0, 1.0)) if off(0.0) < 0 else 0.0
+
+
+def dithered(piece: Piece, step: Float) -> Float:
+    """(q,) sd of the noise that dithers each sensor, in its steps, from what repeats of a piece
+    differ by; inf where nothing is rounded."""
+    out = np.full(step.size, math.inf)
+    for i in np.flatnonzero(step > 0):
+        # What repeats differ by from sample to sample: no wandering.
+        power = np.mean([np.var(np.diff(s.z[:, i])) / 2 for s in piece.repeats])
+        out[i] = dithering(float(power) / step[i] ** 2)
+    return out
 
 
 def alike(piece: Piece, step: Float) -> Float:
     """(q,) part of each sensor's rounding error that is the same in all repeats of a piece."""
-    out = np.zeros(step.size)
-    for i in np.flatnonzero(step > 0) if piece.repeats else ():
-        # What repeats differ by from sample to sample: no wandering.
-        power = np.mean([np.var(np.diff(s.z[:, i])) / 2 for s in piece.repeats])
-        out[i] = repeating(float(power) / step[i] ** 2)
-    return out
+    if not piece.repeats:
+        return np.zeros(step.size)
+    return np.array([repeating(sd) if sd < math.inf else 0.0 for sd in dithered(piece, step)])
 
 
 @dataclass(frozen=True)
@@ -147,9 +155,12 @@ class Rounding:
         power = np.zeros((frequency.size, q))
         factors, draws = {}, {}
         same = alike(piece, step)
+        repeats = dithered(piece, step) if piece.repeats else None
         for i in np.flatnonzero(step > 0).tolist():
             power[:, i] = (1 + len(piece.repeats) * same[i]) * WHITE * step[i] ** 2
             sd = _noise(piece.z[:, i] - y[:, i], float(step[i]))
+            if repeats is not None:  # what a reference leaves of them has the rounding alike
+                sd = float(repeats[i] * step[i])
             if sd >= DITHERED * step[i]:
                 continue
             parts = _parts(piece, y[:, i], float(step[i]), sd, rate_hz)
@@ -174,16 +185,18 @@ def _noise(left: Float, step: float) -> float:
 
 def _wandering(y: Float, z: Float, width: int) -> Float:
     """(n,) by how much a motion y (n,) stands elsewhere in its step than over all: of each `width`
-    samples the place at which its rounding is nearest to what is read z (n,). All in steps."""
-    every = np.arange(y.size)
-    parts = np.array_split(every, max(y.size // width, 1))
+    samples the place at which its rounding is nearest to what is read z (n,). 0 where one place
+    leaves hardly more. All in steps."""
+    parts = np.array_split(np.arange(y.size), max(y.size // width, 1))
     offsets = np.arange(OFFSETS) / OFFSETS
-
-    def place(on: Int) -> float:
-        off = np.rint(y[on] + offsets[:, None]) - z[on]
-        return float(offsets[np.argmin(np.var(off, axis=1))])
-
-    return np.repeat([place(on) for on in parts], [on.size for on in parts]) - place(every)
+    off = np.rint(y + offsets[:, None]) - z
+    left = np.stack([np.var(off[:, on], axis=1) for on in parts])
+    one = int(np.argmin(np.mean(left, axis=0)))
+    least = np.min(left, axis=1)
+    if np.mean(left[:, one]) <= WANDERS * np.mean(least):
+        return np.zeros(y.size)
+    at = np.where(left[:, one] <= least, one, np.argmin(left, axis=1))  # at rest all are alike
+    return np.repeat(offsets[at] - offsets[one], [on.size for on in parts])
 
 
 def _errors(y: Float, shares: Float, parts: Float, sd: float) -> Float:
@@ -211,9 +224,7 @@ def _parts(piece: Piece, y: Float, step: float, sd: float, rate_hz: float) -> Fl
     proportion, less its mean: each stretch its own, as a part may rest at another place after it
     was moved. In parts of equal power: the factor depends on the amplitude. sd : of the noise."""
     times = math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
-    width = max(int(UNREAD_FOR * rate_hz), 3)
-    high, low = ndimage.maximum_filter1d(y, width), ndimage.minimum_filter1d(y, width)
-    still = high - low < FEW * step * times
+    still = crossed(y, rate_hz) < FEW * step * times
     labels, count = ndimage.label(still)
     if count == 0 or math.exp(-2 * (math.pi * sd / step) ** 2) < UNSEEN:
         return np.zeros((0, y.size))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy import ndimage
 
 from samii_rig.types import Channel, Float
 
@@ -15,6 +16,11 @@ COARSE_VALUES = 1000
 # 2008, 6.2); of half a step 1.4 % of it is lost, of a third a fifth, and of a sine below half a
 # step all: with half a step, 2 of 16 recordings of nothing were told as something.
 LEAST_STEPS = 1.0
+# Steps within which a motion is not read in proportion: the describing function of a staircase
+# is within 10 % of 1 from here on.
+FEW = 3.0
+CROSSED_IN = 0.5  # s in which few steps are crossed, or none: some periods of the band
+DRIVES = 0.05  # of the most that it does anywhere, by how much a command moves where it drives
 
 
 def step_of(channel: Channel, x: Float) -> float:
@@ -27,6 +33,24 @@ def steps_moved(channel: Channel, x: Float) -> float:
     one without steps."""
     step = step_of(channel, x)
     return _moved(x) / step if step else math.inf
+
+
+def crossed(x: Float, rate_hz: float) -> Float:
+    """(n,) by how much x (n,) moves about each sample."""
+    width = max(int(CROSSED_IN * rate_hz), 3)
+    return np.asarray(ndimage.maximum_filter1d(x, width) - ndimage.minimum_filter1d(x, width))
+
+
+def steps_driven(channel: Channel, x: Float, command: Float, rate_hz: float) -> Float:
+    """Steps by which a channel with values x (n,) moves about each sample where a command (n,)
+    drives; none for one without steps."""
+    known = np.isfinite(x + command)
+    x, command = x[known], command[known]
+    step = step_of(channel, x)
+    if step == 0 or x.size == 0:
+        return np.zeros(0)
+    drives = crossed(command, rate_hz)
+    return crossed(x, rate_hz)[drives > DRIVES * np.max(drives)] / step
 
 
 def _moved(x: Float) -> float:

@@ -94,3 +94,20 @@ def test_what_is_missing_is_named_by_the_other_sensors(tmp_path: Path) -> None:
     (cause,) = found.causes
     assert (cause.physics, cause.site) == ("actuator_lag", "joint_2_source")
     assert found.sigma > 10
+
+
+def test_an_encoder_that_moves_by_two_steps_hides_no_mass_from_the_other_sensors(
+    tmp_path: Path,
+) -> None:
+    """It moves by more than one step, root mean square. In the loop its rounding took 1.6 times
+    the noise for half of it."""
+    toml = SAMII_TOML.replace(FINE, "resolution = 0.02", 1)
+    rig = parse(Rig, toml, "coarse")
+    runs = cut_sweeps(tmp_path, "added_mass link_0 m=3", design=SHORT, toml=toml)
+    case = case_of(estimate(runs), rig, None, FEW, runs)
+    assert "theta_2" in {c.name for r in case.clean.responses for c in r.outputs}
+    assert case.clean.hidden == {"theta_2"}
+    found = diagnose(estimate(runs), rig, runs=runs, effects=FEW)
+    assert found.verdict == "named"
+    assert {(c.physics, c.site) for c in found.causes} == {("added_mass", "link_0")}
+    assert any(said.startswith("theta_2 is left out") for said in found.not_physics)

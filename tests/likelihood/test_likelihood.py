@@ -19,10 +19,25 @@ from samii_rig.likelihood.inputs import MeterNoise
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.past import Past, likely
-from samii_rig.likelihood.pieces import Input, Piece, Wiring, pieces_of, wiring
+from samii_rig.likelihood.pieces import (
+    Input,
+    Piece,
+    Samples,
+    Wiring,
+    by_few_steps,
+    pieces_of,
+    wiring,
+)
 from samii_rig.likelihood.records import Records
 from samii_rig.likelihood.reduce import reduced, residuals_by_line
-from samii_rig.likelihood.rounding import Added, Rounding, repeating
+from samii_rig.likelihood.rounding import (
+    Added,
+    Rounding,
+    _wandering,
+    dithered,
+    dithering,
+    repeating,
+)
 from samii_rig.likelihood.rows import Rows
 from samii_rig.likelihood.spikes import mended
 from samii_rig.rig.load import load_rig
@@ -416,7 +431,7 @@ def test_a_rounding_error_repeats_itself_as_far_as_noise_does_not_dither_it(sigm
     y = 40 * np.sin(np.linspace(0, 60, 20_000))
     a, b = (np.rint(y + sigma * rng.standard_normal(y.size)) for _ in range(2))
     common = float(np.mean((a - y) * (b - y))) * 12
-    assert repeating(float(np.var(a - b)) / 2) == pytest.approx(common, abs=0.06)
+    assert repeating(dithering(float(np.var(a - b)) / 2)) == pytest.approx(common, abs=0.06)
 
 
 def rounded(y: Float, sigma: float) -> tuple[Float, Float]:
@@ -457,7 +472,7 @@ def test_a_part_at_rest_keeps_one_rounding_error_as_long_as_it_rests():
 
 
 def test_repeats_that_hardly_differ_have_the_same_rounding_error():
-    assert repeating(0.0) == pytest.approx(1.0, abs=5e-3)
+    assert repeating(dithering(0.0)) == pytest.approx(1.0, abs=5e-3)
 
 
 def recording(n: int = 2000, level: float = 0.5, repeat: int = 0) -> Recording:
@@ -710,6 +725,76 @@ def test_a_motion_that_is_within_few_steps_for_some_samples_has_no_part_without_
     found = read(y, y)
     assert np.all(np.sum(found.factors[0] ** 2, axis=1) > 0)
     assert np.all(np.isfinite(found.power))
+
+
+def looped(steps: float, rate_hz: float = SAMII.rate_hz) -> Recording:
+    """A loop around an encoder that moves by so many steps of its converter, from end to end."""
+    run, centring = recording(), SAMII.centring_of("v_2")
+    assert centring is not None
+    values, names = run.values.copy(), [c.name for c in run.channels]
+    step = 1e-3  # rad
+    theta = np.rint(steps / 2 * sweep(len(values))) * step
+    values[:, names.index(centring.sensor)] = theta
+    values[:, names.index("v_2")] -= centring.kp * theta
+    known = tuple(
+        replace(c, resolution=step) if c.name == centring.sensor else c for c in run.channels
+    )
+    return replace(run, channels=known, values=values, rate_hz=rate_hz)
+
+
+def test_a_loop_s_sensor_that_moves_by_few_steps_is_done_without() -> None:
+    """Where its command was sent at the rig's rate, another sensor is read, and most of the
+    time."""
+    few, many, every = looped(2.0), looped(60.0), [s.name for s in SAMII.sensor]
+    centring = SAMII.centring_of("v_2")
+    assert centring is not None
+    theta = centring.sensor
+    assert by_few_steps([few], SAMII, every) == {theta}
+    assert by_few_steps([many], SAMII, every) == set()
+    assert by_few_steps([few, few, many], SAMII, every) == {theta}
+    assert by_few_steps([few, many, many], SAMII, every) == set()
+    assert by_few_steps([few], SAMII, [theta]) == set()
+    assert by_few_steps([looped(2.0, SAMII.rate_hz / 2)], SAMII, every) == set()
+    fine = replace(few, channels=tuple(replace(c, resolution=1e-9) for c in few.channels))
+    assert by_few_steps([fine], SAMII, every) == set()
+
+
+def test_a_loop_that_did_not_run_needs_its_coarse_sensor() -> None:
+    run, centring = looped(2.0), SAMII.centring_of("v_2")
+    assert centring is not None
+    values, names = run.values.copy(), [c.name for c in run.channels]
+    values[:, names.index("v_2")] += centring.kp * values[:, names.index(centring.sensor)]
+    every = [s.name for s in SAMII.sensor]
+    assert by_few_steps([replace(run, values=values)], SAMII, every) == set()
+
+
+@pytest.mark.parametrize("sd", [0.0, 0.1, 0.3])
+def test_repeats_tell_what_dithers_a_sensor_that_crosses_few_steps(sd: float) -> None:
+    """What a reference leaves of them does not: their error is alike, and of several times the
+    power of one that is white."""
+    y = 0.6 * np.sin(2 * np.pi * np.arange(8000) / 61)
+    rng = np.random.default_rng(3)
+    each = [np.rint(y + sd * rng.standard_normal(y.size)) for _ in range(3)]
+    whole = np.sum(each, axis=0) / np.sqrt(3)
+    others = [(each[0] - each[1]) / np.sqrt(2), (each[0] + each[1] - 2 * each[2]) / np.sqrt(6)]
+    samples = tuple(Samples(np.zeros(y.size), z[:, None]) for z in others)
+    of = replace(piece(np.zeros(y.size), whole[:, None]), repeats=samples)
+    assert dithered(of, np.ones(1))[0] == pytest.approx(sd, abs=0.12)
+    found = Rounding.of_piece(of, np.arange(1, 4000), np.ones(1), np.sqrt(3) * y[:, None], RATE)
+    assert 0 in found.draws  # it is tried, and not taken for white
+
+
+def test_a_sensor_that_rests_for_a_while_stands_at_one_place_in_its_step() -> None:
+    """Each second by itself it would stand anywhere while it rests; one that wanders does."""
+    i = np.arange(40 * int(RATE))
+    y = np.where(i % (2 * int(RATE)) < RATE, 0.0, 4 * np.sin(2 * np.pi * i / 61))
+    for place in (0.0, 0.3, 0.45):
+        moved = _wandering(y, np.rint(y + place), int(RATE))
+        assert np.all(moved == 0.0)
+    slow = 0.8 * np.sin(2 * np.pi * i / i.size)
+    always = 4 * np.sin(2 * np.pi * i / 61)
+    moved = _wandering(always, np.rint(always + slow), int(RATE))
+    assert np.abs(np.mean(np.exp(2j * np.pi * (moved - slow)))) > 0.9  # places are of a circle
 
 
 @pytest.mark.parametrize("size", [1.5, 2.5, 4.0])

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -71,6 +71,12 @@ class Checked:
         closed = rig.centred
         often = [n for n, k in held.items() if n in closed or 2 * k >= len(self.responses)]
         return tuple(n for n in often if n not in self.hidden)
+
+    def without(self, sensors: Collection[str]) -> Checked:
+        """The same, and whole records do without these sensors too."""
+        also = sorted(set(sensors) - self.hidden)
+        said = (*self.remarks, *map(_direct, also))
+        return replace(self, hidden=self.hidden.union(also), remarks=said)
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics, as 9.81 is not 9.80665; and
