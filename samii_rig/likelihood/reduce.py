@@ -29,7 +29,7 @@ from samii_rig.likelihood.algebra import (
 from samii_rig.likelihood.before import with_past
 from samii_rig.likelihood.form import Reduced, quadratic
 from samii_rig.likelihood.free import Free, differing, residual_of, with_repeats
-from samii_rig.likelihood.nodes import between, nodes_of
+from samii_rig.likelihood.nodes import between, nodes_of, size_about
 from samii_rig.likelihood.noise import Disturbances, Noise
 from samii_rig.likelihood.pieces import Loops
 from samii_rig.likelihood.records import Records, Response
@@ -109,9 +109,7 @@ def formed(
     smooth, exact = records.smooth(), records.exact()
     H, S = response(exact.s), response(smooth.s)
     records = records.without_spikes(H)
-    low, high = records.changing[0], records.band[1]
-    inside = (smooth.frequency > low) & (smooth.frequency < high)
-    shape = S / np.median(np.abs(S[inside]), axis=0)
+    shape = S / size_about(S)
     if at is None:
         nodes = nodes_of(smooth, shape, records.changing)
     else:

@@ -30,7 +30,9 @@ def weak_ones(search: ForceSearch) -> Iterator[tuple[Law, str, float, float]]:
             FRICTION,
         ):  # whose shape depends on the strength, or that stick
             continue
-        share = 0.02 if law.of_command is None else 1.0
+        # So little that what it adds is of first order also beside the nominal parameters, which do
+        # nearly all that a stop near the clamp does.
+        share = 5e-4 if law.of_command is None else 1.0
         largest = search.paths.largest(score.effect.force.place)
         strengths = scaled(law, score.strengths, share, largest)
         model = search.model((score.effect,))

@@ -17,6 +17,7 @@ from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.free import _of_pieces
 from samii_rig.likelihood.inputs import MeterNoise
 from samii_rig.likelihood.leak import columns
+from samii_rig.likelihood.nodes import nodes_of, size_about
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.past import Past, likely
 from samii_rig.likelihood.pieces import (
@@ -725,6 +726,25 @@ def test_a_motion_that_is_within_few_steps_for_some_samples_has_no_part_without_
     found = read(y, y)
     assert np.all(np.sum(found.factors[0] ** 2, axis=1) > 0)
     assert np.all(np.isfinite(found.power))
+
+
+def test_a_sensor_that_falls_with_the_frequency_covers_no_mode_of_another_one() -> None:
+    """As SAMII's encoder at its first mode, of which its accelerometers see less than of others."""
+    contour = Contour(24_000, 500.0, SMOOTH / 24_000)
+    s, mode = contour.s, 2 * np.pi * 1.65
+    a = s**2 * (0.2 + mode**2 / (s**2 + 2 * 0.03 * mode * s + mode**2))
+    angle = 1 / (s + 1.0)
+    near = 1.65 + 0.1 * np.array([-1.0, 1.0])  # Hz, twice the mode's half width
+
+    def nodes(H: Complex, *, spare: bool) -> int:
+        f = contour.frequency[nodes_of(contour, H, (0.3, 20.0), spare=spare)]
+        return int(np.count_nonzero((f > near[0]) & (f < near[1])))
+
+    for spare in (False, True):
+        alone, both = a[:, None], np.stack([angle, a], axis=1)
+        found = nodes(both / size_about(both), spare=spare)
+        assert found >= 0.7 * nodes(alone / size_about(alone), spare=spare)
+        assert found > nodes(both / np.median(np.abs(both[15:960]), axis=0), spare=spare)
 
 
 def looped(steps: float, rate_hz: float = SAMII.rate_hz) -> Recording:

@@ -141,7 +141,7 @@ def variation(seen: BySpring, files: int) -> Variation | None:
         return None
     seen = seen.in_own_noise()
     search, best, springs, found = seen.search, seen.best, seen.springs, seen.strongest
-    tried = []
+    tried, known = [], dict(found)
     for site, modulation in found:
         k = search.paths.scale((site, STIFFNESS))
         # None varies by more than all of it: something else does.
@@ -153,7 +153,7 @@ def variation(seen: BySpring, files: int) -> Variation | None:
     # the noise there is what that spring does. One round tells.
     nothing = tried[0].evidence
     for one in tried:
-        one.closer(best)
+        one.closer(best, known[one.site])
     tried.sort(key=lambda one: -one.evidence)
     # Once the rig moves as it is fitted, it may be that nothing of it varies.
     tried = [one for one in tried if one.modulations]
@@ -275,12 +275,15 @@ class _Taken:
         sought = sum(one.chi2 / 2 - one.evidence for one in self.modulations)
         return likelihood(self.search, self.fitted) - sought
 
-    def closer(self, best: Explanation) -> bool:
-        """Take out what varies still, and make the likelihood anew. False if noise could do it."""
+    def closer(self, best: Explanation, seen: Modulation | None = None) -> bool:
+        """Take out what varies still, and make the likelihood anew. False if noise could do it.
+        seen : what is taken out then all the same, as noise could not do what a neighbour does."""
         step = 1 / self.springs.longest
         left = _some(self.search.unexplained(self.fitted))
         here = self.springs.pieces(self.search, left, self.site)
         self.pieces, more = here[self.site], self.springs.strongest(here)
+        if not more and seen is not None:
+            more = [(self.site, seen)]
         known = [*self.swings.hz, *(0.0 for one in self.modulations if one.hz == 0)]
         if more and all(abs(more[0][1].hz - hz) > step for hz in known):
             one = more[0][1].closer(self.pieces, step)
