@@ -7,6 +7,7 @@ from importlib import import_module, metadata
 from samii_rig.devices.plugins import asked, checked_device, named
 from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, InputError, SamiiRigError, one_of
+from samii_rig.installed import points
 from samii_rig.rig.schema import Rig
 
 GROUP = "samii_rig.devices"
@@ -14,7 +15,7 @@ GROUP = "samii_rig.devices"
 
 def drivers() -> dict[str, metadata.EntryPoint]:
     """Entry points by the name that a rig file's `[device] driver` gives."""
-    return {point.name: point for point in metadata.entry_points(group=GROUP)}
+    return {point.name: point for point in points(GROUP)}
 
 
 def known_driver(rig: Rig) -> metadata.EntryPoint:

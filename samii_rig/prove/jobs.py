@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from samii_rig.errors import InputError, one_of
+from samii_rig.installed import points
 
 GROUP = "samii_rig.plants"
 KINDS = ("nothing", "one", "two", "outside", "joints", "force", "varying")
@@ -47,7 +47,7 @@ def plant(name: str) -> Plant:
 
     InputError for one that is not installed.
     """
-    known = {point.name: point for point in metadata.entry_points(group=GROUP)}
+    known = {point.name: point for point in points(GROUP)}
     if name not in known:
         raise InputError("samii-rig prove", "--plant", name, one_of(name, sorted(known)))
     loaded: Plant = known[name].load()
@@ -56,7 +56,7 @@ def plant(name: str) -> Plant:
 
 def plants() -> tuple[str, ...]:
     """Names of all plants that are installed."""
-    return tuple(sorted({point.name for point in metadata.entry_points(group=GROUP)}))
+    return tuple(sorted({point.name for point in points(GROUP)}))
 
 
 Pairs = Mapping[str, Sequence[tuple[str, str]]]

@@ -5,12 +5,14 @@ from __future__ import annotations
 from importlib import metadata, resources
 from importlib.resources.abc import Traversable
 
+from samii_rig.installed import points
+
 GROUP = "samii_rig.experiments"
 
 
 def kinds() -> dict[str, metadata.EntryPoint]:
     """Entry points by the kind of experiment that they load (`experiment = "..."`)."""
-    return {point.name: point for point in metadata.entry_points(group=GROUP)}
+    return {point.name: point for point in points(GROUP)}
 
 
 def shipped() -> dict[str, Traversable]:

@@ -8,8 +8,8 @@ effects by the entry point `samii_rig.effects`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from importlib.metadata import entry_points
 
+from samii_rig import installed
 from samii_rig.devices.plugins import asked, named, wrong
 from samii_rig.diagnose.physics import bodies, channels, elsewhere, faults, points, reduced
 from samii_rig.diagnose.physics.effect import Effect
@@ -50,7 +50,7 @@ def plugged(rig: Rig, low_hz: float, high_hz: float) -> Iterator[Effect]:
 
     Raises InputError with the entry point's name for what it raises or gives in place of effects.
     """
-    for point in entry_points(group=GROUP):
+    for point in installed.points(GROUP):
         who = named(point)
         with asked(who, "effects"):
             made = list(point.load()(rig, low_hz, high_hz))
