@@ -20,8 +20,9 @@ _TURN = np.array([1.0, -1.0, 1.0, -1.0])  # theta and V of a mirrored chain
 TRANSFORMERS = ("gear", "spindle", "bend")
 
 
-def bind(c: CompiledChain, s: Complex, slopes: bool = False) -> Factors:
-    """What depends on s at s (n,); `slopes`: with derivatives for gradients."""
+def bind(c: CompiledChain, s: Complex, slopes: bool = False, driven: bool = True) -> Factors:
+    """What depends on s at s (n,); `slopes`: with derivatives for gradients; not `driven`: without
+    the sources, which no pole of the chain depends on."""
     pars = c.system.pars
     jump = np.zeros((len(c.points), s.size), complex)
     jump_d = np.zeros((len(c.points) if slopes else 0, WIDTH, s.size), complex)
@@ -31,7 +32,8 @@ def bind(c: CompiledChain, s: Complex, slopes: bool = False) -> Factors:
         if slopes:
             d = law.slopes(s, pars[e])
             jump_d[row, : d.shape[0]] = d
-    drive, drive_d = _drive(c, s, slopes)
+    none = np.zeros((0, s.size), complex), np.zeros((0, SOURCE_WIDTH, s.size), complex)
+    drive, drive_d = _drive(c, s, slopes) if driven else none
     return Factors(jump, _matrices(c, s), drive, jump_d, drive_d)
 
 
@@ -210,7 +212,7 @@ def characteristic(c: CompiledChain, s: Complex, clear: bool) -> tuple[Complex, 
     mantissa, log = np.zeros(s.size, complex), np.zeros(s.size)
     if not s.size:
         return mantissa, log
-    respond.characteristic(c.system, bind(c, s), s, mantissa, log)
+    respond.characteristic(c.system, bind(c, s, driven=False), s, mantissa, log)
     branches = {e for e, _, _ in c.branches}
     for e in c.waves:
         if e not in branches and c.kinds[e] not in TRANSFORMERS:

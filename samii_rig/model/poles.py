@@ -270,6 +270,8 @@ def _newton(D: Characteristic, s: Complex) -> Complex:
         step *= np.minimum(1.0, size / np.maximum(np.abs(step), size))
         s = s - np.where(real, step.real, step)
         settled = np.abs(step) <= SETTLED * size
+        if settled.all():  # what is left is less than rounding: a step squares it
+            break
     out: list[complex] = []
     for root in np.where(np.abs(s.imag) <= CLUSTER, s.real, s)[settled].tolist():
         if all(abs(root - x) > CLUSTER for x in out):

@@ -131,10 +131,17 @@ class ForceFits(RecordSearch):
         """As `refitted_from`, the chain through which the force acts that of every step, and every
         slope by a difference; None where the rig has no partial fractions or is not stable."""
         problem, prior = self._force_problem, model.prior[: model.n_nominal]
+        self._ways.clear()
         pulls = np.eye(model.n_nominal, model.n) / prior[:, None]
+        strengths = list(model.unknowns) if isinstance(model, ForceModel) else []
+        there = np.zeros(0)  # of x, what the chain through which the force acts was computed for
 
         def response(x: Float) -> Complex:
-            self._ways.clear()
+            nonlocal there
+            chain = np.delete(x, strengths)
+            if not np.array_equal(chain, there):
+                self._ways.clear()
+                there = chain
             return model.response(x, problem.at)
 
         def slope(x: Float, e: Float, h: Complex) -> Complex:
@@ -154,8 +161,9 @@ class ForceFits(RecordSearch):
                 return np.full(rows, NOWHERE), lambda: np.zeros((rows, x.size))
 
             def slopes() -> Float:
-                dh = np.stack([slope(x, e, h) for e in np.diag(steps)], axis=2)
-                return np.concatenate([problem.whiten(dh), pulls])
+                # The strengths, which are last, first: the chain is still that of x.
+                dh = [slope(x, e, h) for e in np.diag(steps)[::-1]]
+                return np.concatenate([problem.whiten(np.stack(dh[::-1], axis=2)), pulls])
 
             return np.concatenate([problem.residual(h), pulls @ x]), slopes
 
