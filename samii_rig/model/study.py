@@ -25,7 +25,7 @@ from samii_rig.model.vary import Varied as Varied
 from samii_rig.model.vary import vary as vary
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Key, Rig
-from samii_rig.types import Float, Int
+from samii_rig.types import Complex, Float, Int
 
 TOGETHER = 8  # points that are one piece of work
 AT_REST = 1e-6  # Re s over the edge of the search, below which a pole is not called unstable
@@ -114,17 +114,26 @@ def _some(
     rig_toml: str, keys: Sequence[Key], points: Float, band: tuple[float, float]
 ) -> list[Point]:
     chain = Chain(parse(Rig, rig_toml, "the rig file"))
-    return [_one(chain, dict(zip(keys, map(float, row), strict=True)), band) for row in points]
+    some: list[Point] = []
+    near = None
+    for row in points:
+        point, near = _one(chain, dict(zip(keys, map(float, row), strict=True)), band, near)
+        some.append(point)
+    return some
 
 
-def _one(chain: Chain, values: dict[Key, float], band: tuple[float, float]) -> Point:
+def _one(
+    chain: Chain, values: dict[Key, float], band: tuple[float, float], near: Complex | None
+) -> tuple[Point, Complex | None]:
+    """A point of the grid, and its poles, which are close to those of the next. near : those of the
+    one before, None where there is none."""
     try:
         here = chain.with_values(values)
         region = search_region(here.rig, band[1])
         # An unstable pole may lie far right of the axis.
-        found = find_poles(determinant(here), replace(region, right=region.top))
+        found = find_poles(determinant(here), replace(region, right=region.top), near)
     except SamiiRigError as error:
-        return [], str(error).removeprefix("with_values: ")
+        return ([], str(error).removeprefix("with_values: ")), None
     p = Poles(found.poles, found.multiplicity, {}, found)
     times = p.multiplicity * p.oscillating
     modes = [
@@ -136,4 +145,5 @@ def _one(chain: Chain, values: dict[Key, float], band: tuple[float, float]) -> P
     ]
     worst = p.pole[p.pole.real.argmax()] if p.pole.size else 0j
     unstable = worst.real > AT_REST * region.top
-    return modes, f"unstable: pole at {worst:.6g} rad/s" if unstable else ""
+    note = f"unstable: pole at {worst:.6g} rad/s" if unstable else ""
+    return (modes, note), found.poles
