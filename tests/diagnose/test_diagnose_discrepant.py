@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from sweep_kit import swept
 
-from samii_rig.diagnose.diagnose import case_of, table
+from samii_rig.diagnose.diagnose import case_of
 from samii_rig.diagnose.fit.discrepancy import Discrepancy
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.explanations import Explanation
@@ -25,6 +25,7 @@ from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import refit
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.physics.model import Model
+from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.form import Reduced
@@ -36,7 +37,7 @@ from samii_rig.types import Complex, Float, Recording
 RIG, _ = load_rig("two_masses")
 FEW = [
     e
-    for e in table(RIG, 0.8, 35.0)
+    for e in hypotheses(RIG, 0.8, 35.0)
     if e.name in (("added_mass", "mass_2"), ("transport_delay", "coil"))
     or e.name == ("attached_oscillator", "mass_2")
 ]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from identify_kit import noiseless, samii
-from table_kit import table_of
+from table_kit import Effects, table_of
 
 from samii_rig.diagnose.data.measured import measured
 from samii_rig.diagnose.fit.moebius import place_of
@@ -13,6 +13,7 @@ from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.physics.causal import RISE, CausalChain
 from samii_rig.diagnose.physics.grid import grid
 from samii_rig.diagnose.physics.model import Model
+from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.verdict.judge import judge
 from samii_rig.diagnose.verdict.locate import traces
 from samii_rig.identify.bootstrap import redraw
@@ -21,8 +22,8 @@ from samii_rig.model.tmm import Chain
 
 BAND = (0.5, 40.0)
 LINES = np.geomspace(*BAND, 160)
-ALL = table_of(samii(), *BAND)
-PARTS = [e for e in ALL if e.jump is not None]
+ALL = Effects(lambda: table_of(samii(), *BAND))
+PARTS = [e for e in hypotheses(samii(), *BAND) if e.jump is not None]
 ROWS = {f"{e.physics} {e.jump.states or e.jump.place.split()[0]} {e.jump.fixed}": e for e in PARTS}
 # Of a logger that shifts its columns.
 ROW = "is in another row than what it moved: the sensors' stand"
