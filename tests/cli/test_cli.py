@@ -125,7 +125,7 @@ def test_a_figure_alone_leaves_the_page_of_the_run_as_it_is(log: Path, tmp_path:
 def test_a_diagnosis_is_kept_with_a_recording_if_it_is_of_its_own_rig_file(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    only(monkeypatch, ("torsional_compliance", "joint_1"))
+    only(monkeypatch, ("torsional_compliance", "joint_1"), forced=False)
     copy, other = tmp_path / "run.mcap", tmp_path / "other.toml"
     copy.write_bytes(log.read_bytes())
     other.write_text(f"{load_rig('samii')[1]}\n# a guess\n")
@@ -137,7 +137,10 @@ def test_a_diagnosis_is_kept_with_a_recording_if_it_is_of_its_own_rig_file(
     assert read_remarks(copy).diagnosis["verdict"]
 
 
-def test_a_report_begins_with_the_diagnosis_if_it_is_asked_for(log: Path, tmp_path: Path) -> None:
+def test_a_report_begins_with_the_diagnosis_if_it_is_asked_for(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only(monkeypatch, ("torsional_compliance", "joint_1"), ("added_mass", "link_3_6"), forced=False)
     page = tmp_path / "page.html"
     code, said = call("report", log, "--diagnosis", "--out", page)
     assert code == 0

@@ -133,7 +133,7 @@ def rigid() -> Rig:
 
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    only(monkeypatch, ("torsional_compliance", "joint_1"))
+    only(monkeypatch, ("torsional_compliance", "joint_1"), forced=False)
 
 
 def test_a_rig_file_that_leaves_something_out_fails_with_the_lines_of_the_page(run, few):
