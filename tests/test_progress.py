@@ -13,6 +13,7 @@ from states_kit import RIG, effects, recorded
 from samii_rig.diagnose.changed import changed
 from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.usual import LINES, POSES, RECORDS, STATES, takes
+from samii_rig.diagnose.forces import fits
 from samii_rig.progress import (
     START,
     Aside,
@@ -143,8 +144,11 @@ def test_a_part_of_more_tells_the_end_of_all_where_that_is_known() -> None:
 
 
 @pytest.mark.parametrize("several", [False, True])
-def test_a_diagnosis_tells_its_end_from_its_first_stage_on(several: bool) -> None:
+def test_a_diagnosis_tells_its_end_from_its_first_stage_on(
+    several: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Of one state, and of two while the state before is diagnosed."""
+    monkeypatch.setattr(fits, "forces", lambda *_: [])  # the stage has a name without any
     state, said = recorded(0), []
 
     def say(stage: str) -> None:
