@@ -263,7 +263,7 @@ def test_what_a_meter_shows_of_an_input_at_rest_bends_no_spring() -> None:
     lead = np.zeros(int(0.2 * RIG.rate_hz))
     runs = []
     for seed, level in ((2, 2.0), (3, 1.0)):
-        run = recorded(np.append(lead, level * V[:2000]), seed, k3=K3 / 10, meter=0.004)
+        run = recorded(np.append(lead, level * V[:1200]), seed, k3=K3 / 10, meter=0.004)
         values = run.values.copy()
         values[:, 0] += 0.3 * np.std(2 * V)
         runs.append(replace(run, values=values))
