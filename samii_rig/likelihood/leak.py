@@ -101,8 +101,9 @@ def _leak(
     W, sums = np.zeros(6 * BLOCK), np.zeros((m, 8 * BLOCK))
     for start in range(0, lines, BLOCK):
         size = min(BLOCK, lines - start)
-        W[:size] = back_r[start : start + size]
-        W[BLOCK : BLOCK + size] = back_i[start : start + size]
+        # One by one: for slices numba compiles the words of their shapes' error too, 4 s.
+        for i in range(size):
+            W[i], W[BLOCK + i] = back_r[start + i], back_i[start + i]
         rows = of[start], of[start + size - 1] + 1
         for at in range(b - 1):
             if not np.any(wanted[rows[0] : rows[1], at]):

@@ -136,6 +136,13 @@ def _at_source(control: Controller, i: int, out: float) -> float:
 
 
 @njit(cache=True)
+def _put(x: Float, values: Float) -> None:
+    """x[:] = values, for which numba compiles the words of its error too, 5 s."""
+    for i in range(x.size):
+        x[i] = values[i]
+
+
+@njit(cache=True)
 def run(
     pieces: Pieces,
     laws: Laws,
@@ -177,7 +184,8 @@ def run(
                 old[i, j] = old[i, j - 1]
             old[i, 0] = _at_source(control, i, out)
         for j in range(deep):
-            line[j] = line[j + 1]
+            for i in range(n_y):
+                line[j, i] = line[j + 1, i]
         for j in range(push.shape[1]):
             u[n_in + n_law + j] = push[k, j]
         for p in range(pieces.h.size):
@@ -185,7 +193,7 @@ def run(
                 u[i] = old[i, pieces.wait[i] + 1 - pieces.new[p, i]]
             t += pieces.h[p]
             if n_law == 0:
-                x[:] = np.dot(pieces.Phi[p], x) + np.dot(pieces.Gamma[p], u)
+                _put(x, np.dot(pieces.Phi[p], x) + np.dot(pieces.Gamma[p], u))
             else:
                 _with_laws(pieces, laws, p, x, u, f, memory, z, t)
             for i in range(n_y):
@@ -217,8 +225,8 @@ def _with_laws(
             u[d] *= np.sqrt(max(0.0, 1.0 + np.sign(u[d]) * z[2 * i] / laws.value[i, 0]))
         elif laws.law[i] != 2:
             u[first + i] = 0.5 * f[i]
-    x[:] = np.dot(pieces.Phi[p], x) + np.dot(pieces.Gamma[p], u)
-    z[:] = np.dot(pieces.Z, x)
+    _put(x, np.dot(pieces.Phi[p], x) + np.dot(pieces.Gamma[p], u))
+    _put(z, np.dot(pieces.Z, x))
     for i in range(n_law):
         law, value = laws.law[i], laws.value[i]
         if law == 5:
@@ -248,4 +256,4 @@ def _with_laws(
         u[first + i] += push
         for j in range(x.size):
             x[j] += pieces.Gamma[p, j, first + i] * push
-        z[:] = np.dot(pieces.Z, x)
+        _put(z, np.dot(pieces.Z, x))

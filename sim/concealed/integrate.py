@@ -238,7 +238,8 @@ def _run(
                     for j in range(laws):
                         total += t.D[s, drives + 1 + j] * f[j]
                     waiting[(i + 1 + t.behind[s]) % slots, s] = total
-        applied[:] = new
+        for d in range(drives):  # no slice: numba compiles the words of its error too, 5 s
+            applied[d] = new[d]
 
 
 @njit(cache=True)

@@ -198,56 +198,56 @@ def _ports(x: System, asked: Asked) -> Ports:
     return Ports(wanted, elements, adjoint, first, last, low, high)
 
 
-@part
-def _blocks(x: System, f: Factors, s: Complex, asked: Asked, found: Found) -> None:
-    n_op = x.kinds.shape[0]
-    n_sensor, n_source = x.feed.shape
-    k = workspace(n_op)
-    ports = _ports(x, asked)
-    # Names of their own for what the loop uses: numba counts an array at each look into a tuple.
-    wanted, elements, adjoint = ports.wanted, ports.elements, ports.adjoint
-    first, last, low, high = ports.first, ports.last, ports.low, ports.high
-    slots, source_slots, H, dH = asked.slots, asked.source_slots, found.H, found.dH
-    answers = np.zeros((n_sensor, 2 * LANES))
-    z = np.zeros((n_source, n_op if adjoint else 0, 16 * LANES))
-    zh = np.zeros((n_sensor, n_op if adjoint else 0, 16 * LANES))
-    for start in range(0, s.shape[0], LANES):
-        span = Span(start, block(x, f, k, s, start, first, last, wanted))
-        if asked.task == CHARACTERISTIC:
-            _characteristic(x, k, span, found.mantissa, found.log)
-        elif asked.task == FIELD:
-            _fields(x, k, span, asked, wanted, found.states)
-        else:
-            for source in range(n_source):
-                jump = x.source[source, 0]
-                set_factor(k.W, f.drive[source], start)
-                solve(x, k, jump, x.source_c[source, :4], low, high, wanted)
-                read_sensors(x, f, k, source, answers, start)
-                _store_answers(x, source, answers, span.n, H[start:])
-                slot = source_slots[source]
-                if slot.max() >= 0:
-                    slopes = f.drive_d[source]
-                    source_parameters(x.source[source, 1], slopes, answers, slot, span, dH[start:])
-                if adjoint:
-                    element_states(x, k, elements, jump, False, z[source])
-            if adjoint:
-                for t in range(x.term.shape[0]):
-                    jump = x.term[t, 1]
-                    set_term_factor(x, f.jump, k.W, t, start)
-                    solve(x, k, jump, x.term_c[t], low, high, wanted)
-                    more = t > 0 and x.term[t, 0] == x.term[t - 1, 0]
-                    element_states(x, k, elements, jump, more, zh[x.term[t, 0]])
-                states = States(elements, z, zh)
-                element_parameters(x, f.jump_d, k, slots, states, span, dH[start:])
-                keep_waves(x, elements, z, span, found.states)
-                keep_waves(x, elements, zh, span, found.duals)
-
-
+# The loop stands in the entry itself: as a part that it calls, all would be optimised twice.
 @kernel
 def _run(files: int) -> Callable[..., None]:
     def run(x: System, f: Factors, s: Complex, asked: Asked, found: Found) -> None:
-        if files > 0:
-            _blocks(x, f, s, asked, found)
+        if files < 0:  # never: it is here to be closed over
+            return
+        n_op = x.kinds.shape[0]
+        n_sensor, n_source = x.feed.shape
+        k = workspace(n_op)
+        ports = _ports(x, asked)
+        # Names of their own for what the loop uses: numba counts an array at each look into a
+        # tuple.
+        wanted, elements, adjoint = ports.wanted, ports.elements, ports.adjoint
+        first, last, low, high = ports.first, ports.last, ports.low, ports.high
+        slots, source_slots, H, dH = asked.slots, asked.source_slots, found.H, found.dH
+        answers = np.zeros((n_sensor, 2 * LANES))
+        z = np.zeros((n_source, n_op if adjoint else 0, 16 * LANES))
+        zh = np.zeros((n_sensor, n_op if adjoint else 0, 16 * LANES))
+        for start in range(0, s.shape[0], LANES):
+            span = Span(start, block(x, f, k, s, start, first, last, wanted))
+            if asked.task == CHARACTERISTIC:
+                _characteristic(x, k, span, found.mantissa, found.log)
+            elif asked.task == FIELD:
+                _fields(x, k, span, asked, wanted, found.states)
+            else:
+                for source in range(n_source):
+                    jump = x.source[source, 0]
+                    set_factor(k.W, f.drive[source], start)
+                    solve(x, k, jump, x.source_c[source, :4], low, high, wanted)
+                    read_sensors(x, f, k, source, answers, start)
+                    _store_answers(x, source, answers, span.n, H[start:])
+                    slot = source_slots[source]
+                    if slot.max() >= 0:
+                        slopes = f.drive_d[source]
+                        source_parameters(
+                            x.source[source, 1], slopes, answers, slot, span, dH[start:]
+                        )
+                    if adjoint:
+                        element_states(x, k, elements, jump, False, z[source])
+                if adjoint:
+                    for t in range(x.term.shape[0]):
+                        jump = x.term[t, 1]
+                        set_term_factor(x, f.jump, k.W, t, start)
+                        solve(x, k, jump, x.term_c[t], low, high, wanted)
+                        more = t > 0 and x.term[t, 0] == x.term[t - 1, 0]
+                        element_states(x, k, elements, jump, more, zh[x.term[t, 0]])
+                    states = States(elements, z, zh)
+                    element_parameters(x, f.jump_d, k, slots, states, span, dH[start:])
+                    keep_waves(x, elements, z, span, found.states)
+                    keep_waves(x, elements, zh, span, found.duals)
 
     return run
 
