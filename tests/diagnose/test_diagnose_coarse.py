@@ -107,6 +107,10 @@ def test_an_encoder_that_moves_by_two_steps_hides_no_mass_from_the_other_sensors
     case = case_of(estimate(runs), rig, None, FEW, runs)
     assert "theta_2" in {c.name for r in case.clean.responses for c in r.outputs}
     assert case.clean.hidden == {"theta_2"}
+    assert case.whole is not None
+    ((channel, why),) = case.whole.left_out
+    assert channel == "theta_2"
+    assert why.startswith("theta_2 moves by 3 of its steps or less")
     found = diagnose(estimate(runs), rig, runs=runs, effects=FEW)
     assert found.verdict == "named"
     assert {(c.physics, c.site) for c in found.causes} == {("added_mass", "link_0")}

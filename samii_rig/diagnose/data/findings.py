@@ -22,6 +22,7 @@ from samii_rig.diagnose.physics.faults import SHIFTED
 from samii_rig.diagnose.result import Verdict
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.rig.schema import Rig, parameters
+from samii_rig.signal.steps import FEW
 from samii_rig.types import Finding, FrequencyResponse
 
 LOST_GAIN = 0.02  # relative change of one channel's gain between levels that is told
@@ -48,7 +49,8 @@ class Checked:
     mend : of all recordings' columns, the same as in the responses.
     of_lines : of `remarks`, what concerns responses alone. samples : why segments or channels were
     left out for what their samples are. hidden : sensors that loops are closed around, of which
-    rounding hides the response in most of what was recorded; whole records do without them.
+    rounding hides the response, or follows the motion, in most of what was recorded; whole records
+    do without them.
     aligned : whether a loop's law tells that what was sent and measured stand at one time."""
 
     responses: tuple[FrequencyResponse, ...]
@@ -75,8 +77,12 @@ class Checked:
     def without(self, sensors: Collection[str]) -> Checked:
         """The same, and whole records do without these sensors too."""
         also = sorted(set(sensors) - self.hidden)
-        said = (*self.remarks, *map(_direct, also))
-        return replace(self, hidden=self.hidden.union(also), remarks=said)
+        return replace(
+            self,
+            hidden=self.hidden.union(also),
+            remarks=(*self.remarks, *map(_direct, also)),
+            samples=(*map(_few_steps, also), *self.samples),
+        )
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics, as 9.81 is not 9.80665; and
@@ -169,6 +175,14 @@ def _direct(sensor: str) -> str:
         f"{sensor} is left out: its rounding hides most of its motion; what its loop made of that "
         "stands in the command, which is taken as it was recorded"
     )
+
+
+def _few_steps(sensor: str) -> Finding:
+    """Why whole records do without a sensor of few steps."""
+    text = (
+        f"{sensor} moves by {FEW:g} of its steps or less most of the time, and rounding follows it"
+    )
+    return Finding("resolution", "warning", text, sensor)
 
 
 def estimated(
