@@ -12,8 +12,8 @@ WIDEST = 0.1  # nodes, apart over frequency at most
 # Nodes over lines of the contour, at most, of a change that is free where noise is estimated: at
 # the lowest lines one a line would leave no noise to be seen.
 FREE_NODES = 0.1
-ABOUT = 2**0.5  # times a line, and part of it, that are about it: an octave holds a mode's peak
 BELOW = 2**0.5  # the same, below the band: a change of 1/s is linear between them to 3 %
+ABOUT = 2**0.5  # times a line, and part of it, that are about it: an octave holds a mode's peak
 
 
 def nodes_of(

@@ -63,9 +63,9 @@ def dithering(spread: float) -> float:
 
 def dithered(piece: Piece, step: Float) -> Float:
     """(q,) sd of the noise that dithers each sensor, in its steps, from what repeats of a piece
-    differ by; inf where nothing is rounded."""
+    differ by; inf where nothing is rounded, or nothing was repeated."""
     out = np.full(step.size, math.inf)
-    for i in np.flatnonzero(step > 0):
+    for i in np.flatnonzero(step > 0) if piece.repeats else ():
         # What repeats differ by from sample to sample: no wandering.
         power = np.mean([np.var(np.diff(s.z[:, i])) / 2 for s in piece.repeats])
         out[i] = dithering(float(power) / step[i] ** 2)
@@ -74,9 +74,7 @@ def dithered(piece: Piece, step: Float) -> Float:
 
 def alike(piece: Piece, step: Float) -> Float:
     """(q,) part of each sensor's rounding error that is the same in all repeats of a piece."""
-    if not piece.repeats:
-        return np.zeros(step.size)
-    return np.array([repeating(sd) if sd < math.inf else 0.0 for sd in dithered(piece, step)])
+    return np.array([repeating(sd) for sd in dithered(piece, step)])
 
 
 @dataclass(frozen=True)
@@ -154,13 +152,14 @@ class Rounding:
         frequency = np.asarray(np.fft.rfftfreq(n, 1 / rate_hz), np.float64)
         power = np.zeros((frequency.size, q))
         factors, draws = {}, {}
-        same = alike(piece, step)
-        repeats = dithered(piece, step) if piece.repeats else None
+        repeats = dithered(piece, step)
         for i in np.flatnonzero(step > 0).tolist():
-            power[:, i] = (1 + len(piece.repeats) * same[i]) * WHITE * step[i] ** 2
-            sd = _noise(piece.z[:, i] - y[:, i], float(step[i]))
-            if repeats is not None:  # what a reference leaves of them has the rounding alike
+            same = len(piece.repeats) * repeating(repeats[i])
+            power[:, i] = (1 + same) * WHITE * step[i] ** 2
+            if piece.repeats:  # what a reference leaves of them has the rounding alike
                 sd = float(repeats[i] * step[i])
+            else:
+                sd = _noise(piece.z[:, i] - y[:, i], float(step[i]))
             if sd >= DITHERED * step[i]:
                 continue
             parts = _parts(piece, y[:, i], float(step[i]), sd, rate_hz)

@@ -131,15 +131,15 @@ class ForceFits(RecordSearch):
         """As `refitted_from`, the chain through which the force acts that of every step, and every
         slope by a difference; None where the rig has no partial fractions or is not stable."""
         problem, prior = self._force_problem, model.prior[: model.n_nominal]
-        self._ways.clear()
         pulls = np.eye(model.n_nominal, model.n) / prior[:, None]
         strengths = list(model.unknowns) if isinstance(model, ForceModel) else []
-        there = np.zeros(0)  # of x, what the chain through which the force acts was computed for
+        # Of x, what the chain through which the force acts was computed for.
+        there: Float | None = None
 
         def response(x: Float) -> Complex:
             nonlocal there
             chain = np.delete(x, strengths)
-            if not np.array_equal(chain, there):
+            if there is None or not np.array_equal(chain, there):
                 self._ways.clear()
                 there = chain
             return model.response(x, problem.at)
