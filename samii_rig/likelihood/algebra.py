@@ -47,9 +47,15 @@ def orthonormal(X: Float) -> Float:
 
 def spanned(X: Float) -> Float:
     """The directions of columns that are of size 1, or were before something was projected out."""
-    values, vectors = np.linalg.eigh(X.T @ X)
+    return np.asarray(X @ root_of(X.T @ X))
+
+
+def root_of(square: Float) -> Float:
+    """(p, m) R so that X R are the directions of columns X, from their products (p, p), as of
+    `spanned`."""
+    values, vectors = np.linalg.eigh(square)
     kept = values > SAME * np.max(values, initial=0.0)
-    return np.asarray(X @ (vectors[:, kept] / np.sqrt(values[kept])))
+    return np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
 
 
 def shrinking(X: Float, prior: Float) -> Float:

@@ -8,14 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from samii_rig.likelihood.algebra import as_complex, as_real, orthonormal
-from samii_rig.likelihood.form import products, weights
-from samii_rig.likelihood.free import Free
+from samii_rig.likelihood.algebra import as_complex, as_real, root_of
+from samii_rig.likelihood.form import weights
+from samii_rig.likelihood.free import Free, Group
 from samii_rig.likelihood.noise import Noise
-from samii_rig.likelihood.past import likely, shown
+from samii_rig.likelihood.past import shown
 from samii_rig.likelihood.records import Records
 from samii_rig.likelihood.seen import Seen
-from samii_rig.types import Complex, Float, Int
+from samii_rig.types import Complex, Float
 
 
 def with_past(records: Records, change: Free, seen: Sequence[Seen], noise: Noise) -> Records | None:
@@ -23,66 +23,49 @@ def with_past(records: Records, change: Free, seen: Sequence[Seen], noise: Noise
     whatever the change of the response is; None where nothing did."""
     W = weights(change.rows, noise)
     pieces = list(records.pieces)
-    for which, on, X in change.groups:
-        own = [(i, seen[i]) for i in which]
-        group = change.rows.piece[on]
+    for group in change.groups:
         blocks = []
-        for i, s in own:
-            before = s.past.likely / math.sqrt(len(pieces[i].z))  # lines are a sample's
-            blocks.append((np.flatnonzero(group == i), before, s.N[:, :, s.beside]))
-        found = _past_of(orthonormal(X), blocks, change.rows.e[on], W[on])
+        for i in group.pieces:
+            before = seen[i].past.likely / math.sqrt(len(pieces[i].z))  # lines are a sample's
+            blocks.append((before, seen[i].N[:, :, seen[i].beside]))
+        found = _past_of(group, blocks, change.rows.e, W)
         if found is None:
             continue
-        for i, s in own:
-            amplitudes, found = np.split(found, [s.past.impulses.shape[1]])
-            if s.past.begins(s.left, amplitudes):
-                pieces[i] = s.past.before(pieces[i], amplitudes)
+        for i in group.pieces:
+            past = seen[i].past
+            amplitudes, found = np.split(found, [past.impulses.shape[1]])
+            if past.begins(seen[i].left, amplitudes):
+                pieces[i] = past.before(pieces[i], amplitudes)
     if all(a is b for a, b in zip(pieces, records.pieces, strict=True)):
         return None
     return replace(records, pieces=tuple(pieces))
 
 
 def _past_of(
-    Q: Float, blocks: Sequence[tuple[Int, Complex, Complex]], e: Complex, W: Complex
+    group: Group, blocks: Sequence[tuple[Complex, Complex]], e: Complex, W: Complex
 ) -> Float | None:
-    """The amplitudes of what moved the rig before pieces that share one change, as `past.likely`.
+    """The amplitudes of what moved the rig before pieces that share one change, as `past.likely`,
+    whatever that change is.
 
-    Q : (2 n, p) directions of the change, of each sensor. blocks : of each piece its lines, the
-    shapes of what was before, and those beside them. e : (n, q) lines. W : as of `likely`.
+    blocks : of each piece the shapes of what was before, and those beside them. e : (n, q) all
+    lines. W : as of `past.likely`.
     """
-    if len(blocks) == 1:
-        ((_, before, beside),) = blocks
-        return likely(_beyond(Q, before), _beyond(Q, e[:, :, None])[:, :, 0], _beyond(Q, beside), W)
-    # Side by side the shapes of many pieces would be many times as much as all lines: of each its
-    # products, and what all lose to the change by its p directions.
-    n, q = e.shape
-    We = (W @ e[:, :, None])[:, :, 0]
-    K, pull = products(as_complex(Q), W, We)
-
-    def along(at: Int, x: Complex) -> Float:
-        """(q p, m) of lines x (k, q, m) along the change."""
-        there = Q[np.concatenate([at, n + at])].T
-        return np.concatenate([there @ as_real(x[:, c]) for c in range(q)])
-
-    last = sum(before.shape[2] for _, before, _ in blocks)
-    m = last + sum(beside.shape[2] for _, _, beside in blocks)
-    square, head, first = np.zeros((m, m)), np.zeros(m), 0
-    B, T = np.zeros((len(K), m)), np.zeros((len(K), m))
-    for at, before, beside in blocks:
-        A = np.concatenate([before, beside], axis=2)
-        place = np.r_[first : first + before.shape[2], last : last + beside.shape[2]]
+    last = sum(before.shape[2] for before, _ in blocks)
+    m, q, p = last + sum(beside.shape[2] for _, beside in blocks), e.shape[1], len(group.square)
+    along, first = np.zeros((p, q, m + 1)), 0  # the change of each shape, and of the lines
+    every = []
+    for on, X, (before, beside) in zip(group.on, group.X, blocks, strict=True):
+        place = np.r_[first : first + before.shape[2], last : last + beside.shape[2], m]
         first, last = first + before.shape[2], last + beside.shape[2]
-        WA, flat = W[at] @ A, A.reshape(-1, A.shape[2]).conj().T
-        square[np.ix_(place, place)] = (flat @ WA.reshape(-1, A.shape[2])).real
-        head[place] = (flat @ We[at].ravel()).real
-        B[:, place], T[:, place] = along(at, A), along(at, WA)
-    square += B.T @ (K @ B) - T.T @ B - B.T @ T
-    own = along(np.arange(n), e[:, :, None])[:, 0]
-    head += B.T @ (K @ own - pull) - T.T @ own
-    return shown(square, head, sum(before.shape[2] for _, before, _ in blocks))
-
-
-def _beyond(Q: Float, x: Complex) -> Complex:
-    """Lines (n, q, m) less what is along directions Q (2 n, p) of each sensor."""
-    flat = as_real(x.reshape(len(x), -1))
-    return as_complex(flat - Q @ (Q.T @ flat)).reshape(x.shape)
+        shapes = np.concatenate([before, beside, e[on, :, None]], axis=2)
+        along[:, :, place] += (X.T @ as_real(shapes.reshape(len(on), -1))).reshape(p, q, -1)
+        every.append((on, X, place, shapes))
+    root = root_of(group.square)
+    change = (root @ (root.T @ along.reshape(p, -1))).reshape(p, -1)
+    both = np.zeros((m, m + 1))
+    for on, X, place, shapes in every:
+        beyond = as_complex(X @ -change).reshape(len(on), q, m + 1)
+        beyond[:, :, place] += shapes
+        flat = (W[on] @ beyond).reshape(-1, m + 1)
+        both += (beyond.reshape(-1, m + 1)[:, :m].conj().T @ flat).real
+    return shown(both[:, :m], both[:, m], sum(before.shape[2] for before, _ in blocks))

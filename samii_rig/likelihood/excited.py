@@ -23,7 +23,8 @@ EXCITED = 0.003
 # square wave does so far above its band.
 DRIVES = 1e-6
 METER = 9.0  # times a converter's rounding or a meter's noise, power of an input that is more
-TAPER = 0.05  # of a record, both ends that count less where its spectrum is held against noise
+TAPER = 0.05  # of a record: half of it at the end counts less where its spectrum is what drives
+FROM_REST = 2  # times a record's length, of which every other line is that of its repetition
 # Where not every sample was recorded: of an input's power what may fold back, 1 % of its amplitude;
 # of the rate, from where that is judged, and up to where it is taken for none; lines as one.
 FOLDS, EDGE, UNFOLDED, TOGETHER = 1e-4, 0.47, 0.3, 16
@@ -79,22 +80,39 @@ def _above_meter(pieces: Sequence[Piece], rate_hz: float) -> float:
     meter = np.max(each, axis=0)
     if not np.any(meter):
         return np.inf
-    # The end of a record that is cut leaks, and drives nothing that is seen.
-    ends = (np.asarray((signal.windows.tukey(len(p.r), TAPER) * p.r.T).T) for p in pieces)
-    tapered = [replace(p, r=r) for p, r in zip(pieces, ends, strict=True)]
-    reached = excited(tapered, rate_hz, np.asarray(meter**2), part=DRIVES)
+    return driven_to(pieces, rate_hz, np.asarray(meter**2))
+
+
+def driven_to(pieces: Sequence[Piece], rate_hz: float, noise: Float | None = None) -> float:
+    """Hz up to which an input moves a rig by more than its noise; inf where none does. noise : as
+    of `excited`.
+
+    A record that begins at once drives all modes: of a command the spectrum from rest on counts,
+    not that of its repetition. Its end, cut, leaks as well, and drives nothing that is seen.
+    """
+    ending = []
+    for p in pieces:
+        window = signal.windows.tukey(len(p.r), TAPER)
+        window[: len(window) // 2] = 1.0
+        ending.append(replace(p, r=np.asarray((window * p.r.T).T)))
+    reached = excited(ending, rate_hz, noise, part=DRIVES, padded=FROM_REST)
     return max((band[1] for band in reached if band), default=np.inf)
 
 
 def excited(
-    pieces: Sequence[Piece], rate_hz: float, noise: Float | None = None, part: float = EXCITED
+    pieces: Sequence[Piece],
+    rate_hz: float,
+    noise: Float | None = None,
+    part: float = EXCITED,
+    padded: int = 1,
 ) -> list[tuple[float, float] | None]:
     """Hz, of each piece the band in which an input has more than a small part of its largest
     energy in any; None for one that nothing drives: what is left of a sweep behind a gap.
 
-    noise : (m,) power of each input that is none; one that never has more is at rest.
+    noise : (m,) power of each input that is none; one that never has more is at rest. padded :
+    times the record's length, with rest behind it, of which the spectrum is.
     """
-    each = [[_energy(r, rate_hz) for r in by_input(p.r)] for p in pieces]
+    each = [[_energy(r, rate_hz, padded) for r in by_input(p.r)] for p in pieces]
     most = np.max([[np.max(power) for _, power, _ in inputs] for inputs in each], axis=0)
     still = np.zeros(most.size) if noise is None else METER * noise
     out: list[tuple[float, float] | None] = []
@@ -129,15 +147,16 @@ def _unfolded(piece: Piece, rate_hz: float) -> float:
     return max(float(max(tops)), UNFOLDED * rate_hz)
 
 
-def _energy(r: Float, rate_hz: float) -> tuple[Float, Float, Float]:
+def _energy(r: Float, rate_hz: float, padded: int) -> tuple[Float, Float, Float]:
     """Hz of the edges (m + 1,) of parts of an octave, an input's energy (m,) in each, and how many
-    lines it has."""
-    power = np.abs(np.fft.rfft(r)) ** 2 / r.size
-    f = np.arange(power.size) * (rate_hz / r.size)
+    lines it has. padded : as of `excited`."""
+    power = np.abs(np.fft.rfft(r, padded * r.size)) ** 2 / r.size
+    f = np.arange(power.size) * (rate_hz / (padded * r.size))
     # The offset's line, and the one that it leaks to, are no excitation.
-    part = np.floor(OCTAVE_PARTS * np.log2(f[2:] / f[2])).astype(np.int64)
-    edges = f[2] * 2 ** (np.arange(part[-1] + 2) / OCTAVE_PARTS)
-    energy = np.asarray(np.bincount(part, power[2:]), np.float64)
+    first = 2 * padded
+    part = np.floor(OCTAVE_PARTS * np.log2(f[first:] / f[first])).astype(np.int64)
+    edges = f[first] * 2 ** (np.arange(part[-1] + 2) / OCTAVE_PARTS)
+    energy = np.asarray(np.bincount(part, power[first:]), np.float64)
     return np.asarray(edges), energy, np.asarray(np.bincount(part), np.float64)
 
 

@@ -5,13 +5,13 @@ Pieces, repeats and levels that differ by more than noise are not noise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from samii_rig.likelihood import rounding
-from samii_rig.likelihood.algebra import as_complex, as_real, lengths, spanned
+from samii_rig.likelihood.algebra import as_complex, as_real, lengths, root_of, spanned
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.pieces import Piece, Samples
 from samii_rig.likelihood.records import Records
@@ -23,25 +23,47 @@ ENOUGH = 0.75  # lines over unknowns of a change, from which a piece shows its n
 # Of an input's largest in any piece, what it does in one that it does not excite: where noise is
 # told no change of its response is free there, which would fit that with its converter's rounding.
 RESTS = 0.01
+AT_ONCE = 2048  # rows of a change whose lengths are formed together: 4 MB, what a cache holds
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Pieces that share one change that is free.
+
+    pieces : their numbers. on : (n_i,) of each its lines. X : (2 n_i, p) of each, what the change
+    does in these, of every sensor, a column of size 1 in all of them together. square : (p, p)
+    products of X.
+    """
+
+    pieces: Sequence[int]
+    on: Sequence[Int]
+    X: Sequence[Float]
+    square: Float
+
+    @classmethod
+    def of(cls, pieces: Sequence[int], on: Sequence[Int], X: Sequence[Float]) -> Group:
+        """X : of any size; it is changed."""
+        square = _summed(own.T @ own for own in X)
+        size = np.sqrt(np.diagonal(square))
+        over = 1 / np.where(size > 0, size, 1.0)
+        for own in X:
+            own *= over
+        return cls(pieces, on, X, square * np.outer(over, over))
 
 
 @dataclass(frozen=True, slots=True)
 class Free:
     """A change that is free where noise is estimated, and the lines that show it together: each
-    piece's by themselves where they are enough.
-
-    rows : of all lines. groups : pieces, their lines (n,), and (2 n, p) what the change does in
-    these, of every sensor.
-    """
+    piece's by themselves where they are enough. rows : of all lines."""
 
     rows: Rows
-    groups: list[tuple[Sequence[int], Int, Float]]
+    groups: list[Group]
 
     @classmethod
     def of(cls, rows: Rows, changes: Sequence[Complex], spare: Float) -> Free:
         """changes : of each piece, as `changes_of`. spare : (b, m) the change that is free, on the
         nodes."""
-        b, n = len(spare), len(rows.e)
+        b = len(spare)
         parts = range(0, rows.X[0].shape[1], b)
         each = []
         for change in changes:
@@ -52,23 +74,49 @@ class Free:
         pieces = [on for on, *_ in rows.each()]
         if all(len(on) >= ENOUGH * _free(X) for on, X in zip(pieces, each, strict=True)):
             alone = zip(pieces, each, strict=True)
-            return cls(rows, [([i], on, X) for i, (on, X) in enumerate(alone)])
-        X = np.empty((2 * n, each[0].shape[1]))
-        for on, own in zip(pieces, each, strict=True):
-            X[np.concatenate([on, n + on])] = own
-        return cls(rows, [(range(len(each)), np.arange(n), X)])
+            return cls(rows, [Group.of([i], [on], [X]) for i, (on, X) in enumerate(alone)])
+        return cls(rows, [Group.of(range(len(each)), pieces, each)])
 
 
 def residual_of(change: Free, seen: Sequence[Seen]) -> tuple[Complex, Float]:
     """What the best change of each sensor in each piece leaves (n, q), and the freedom (n,) that
-    each line has left: pieces that differ by more than noise are not noise."""
+    each line has left: pieces that differ by more than noise are not noise.
+
+    Nuisances are projected out piece by piece: side by side those of many pieces would be many
+    times as much as all lines.
+    """
     n, q = change.rows.e.shape
-    left, free = np.zeros((n, q), complex), np.zeros(n)
-    for which, on, X in change.groups:
-        piece = change.rows.piece[on]
-        each = [(np.flatnonzero(piece == i), seen[i].N) for i in which]
-        left[on], free[on] = _of_pieces(change.rows.e[on], each, X)
-    return left, free
+    left, used = np.zeros((n, q), complex), np.zeros(n)
+    for group in change.groups:
+        for c in range(q):
+            _leave(group, change.rows.e[:, c], [seen[i].N[:, c] for i in group.pieces],
+                   left[:, c], used)  # fmt: skip
+    return left, np.maximum(1 - used / (2 * q), 0.0)
+
+
+def _leave(group: Group, e: Complex, N: Sequence[Complex], left: Complex, used: Float) -> None:
+    """Note in `left` (n,) what the best change leaves of one sensor's lines e (n,), and add to
+    `used` (n,) the freedom that this takes. N : of each piece its nuisances (n_i, m)."""
+    beside = [spanned(_nuisances_of(own)) for own in N]
+    across = [Q.T @ X for Q, X in zip(beside, group.X, strict=True)]
+    goals = [as_real(e[on]) for on in group.on]
+    goals = [goal - Q @ (Q.T @ goal) for goal, Q in zip(goals, beside, strict=True)]
+    root = root_of(group.square - _summed(own.T @ own for own in across))
+    best = root @ (root.T @ _summed(X.T @ g for X, g in zip(group.X, goals, strict=True)))
+    for on, X, goal, Q, own in zip(group.on, group.X, goals, beside, across, strict=True):
+        left[on] = as_complex(goal - X @ best + Q @ (own @ best))
+        taken = lengths(Q)
+        for first in range(0, len(X), AT_ONCE):
+            some = slice(first, first + AT_ONCE)
+            taken[some] += lengths(X[some] @ root - Q[some] @ (own @ root))
+        used[on] += taken[: len(on)] + taken[len(on) :]
+
+
+def _summed(each: Iterable[Float]) -> Float:
+    total, *others = each
+    for one in others:
+        total += one
+    return total
 
 
 def _excited(each: Sequence[Float], inputs: int) -> None:
@@ -83,30 +131,6 @@ def _excited(each: Sequence[Float], inputs: int) -> None:
 def _free(X: Float) -> int:
     """Columns that do anything."""
     return int(np.count_nonzero(np.any(X != 0, axis=0)))
-
-
-def _of_pieces(e: Complex, each: Sequence[tuple[Int, Complex]], X: Float) -> tuple[Complex, Float]:
-    """As `residual_of`, of pieces that share one change X (2 n, p). Nuisances are projected out
-    piece by piece: side by side those of many pieces would be many times as much as all lines.
-
-    each : of every piece its lines, and their nuisances.
-    """
-    n, q = e.shape
-    goal, used = as_real(e), np.zeros(2 * n)
-    size = np.linalg.norm(X, axis=0)
-    X = X / np.where(size > 0, size, 1.0)
-    for c in range(q):
-        change = X.copy()
-        for on, N in each:
-            at = np.concatenate([on, n + on]) if len(each) > 1 else slice(None)
-            own = spanned(_nuisances_of(N[:, c]))
-            change[at] -= own @ (own.T @ change[at])
-            goal[at, c] -= own @ (own.T @ goal[at, c])
-            used[at] += lengths(own)
-        change = spanned(change)
-        goal[:, c] -= change @ (change.T @ goal[:, c])
-        used += lengths(change)
-    return as_complex(goal), np.maximum(1 - (used[:n] + used[n:]) / (2 * q), 0.0)
 
 
 def _nuisances_of(N: Complex) -> Float:

@@ -297,6 +297,9 @@ def test_a_force_is_held_against_what_is_wrong_with_the_data_alone():
         def _only(self, some):
             self.kept = list(some)
 
+        def _where_nothing_was_fitted(self, best):
+            pass
+
     search = object.__new__(Kept)
     search.linear, search.table = linear, ()
     search.__post_init__()

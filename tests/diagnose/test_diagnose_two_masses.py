@@ -8,7 +8,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from table_kit import table_of
-from two_masses_kit import CORNER, K1, K2, RIG, diagnosed, random_command, recorded
+from two_masses_kit import (
+    CORNER,
+    GAIN,
+    K1,
+    K2,
+    M1,
+    M2,
+    RATE,
+    RIG,
+    diagnosed,
+    random_command,
+    recorded,
+)
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit.classes import Class
@@ -21,6 +33,7 @@ from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.rig.schema import Rig, parameters
 from samii_rig.signal.estimate import estimate
+from samii_rig.types import Float
 
 V = random_command(3000, 1.0, 1)
 K3 = 1.5e9  # N/m^3: at 3.4 mm as much as the spring itself
@@ -86,6 +99,38 @@ def surer(rig: Rig, **tolerances: float) -> Rig:
             e = e.model_copy(update={symbol: p})
         every.append(e)
     return rig.model_copy(update={"element": tuple(every)})
+
+
+def slow_command(seed: int) -> Float:
+    """(8000,) V, random below both modes; from its largest on, so that both ring from there."""
+    f = np.fft.rfftfreq(8000, 1 / RATE)
+    turn = np.exp(2j * np.pi * np.random.default_rng(seed).random(f.size))
+    v = np.fft.irfft(np.where((f > 0.5) & (f < 6.0), turn, 0.0), 8000)
+    v = np.roll(v, -int(np.argmax(np.abs(v))))
+    return np.asarray(np.round(v / np.std(v) / 0.3e-3) * 0.3e-3)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_nothing_is_missing_where_modes_above_the_band_ring_from_the_start(seed: int) -> None:
+    """What is fitted within the band leaves them anywhere in their tolerances."""
+    effects = table_of(RIG, 0.5, 40.0, "added_mass")
+    assert diagnosed(recorded(slow_command(seed), seed), effects=effects).verdict == "no_mismatch"
+
+
+def test_what_shows_in_such_modes_alone_is_found() -> None:
+    """Ten grams more, of parameters that are known to a thousandth."""
+    known = {"spring_1": K1, "spring_2": K2, "mass_1": M1, "mass_2": M2, "coil": GAIN}
+    every = []
+    for e in RIG.element:
+        symbol, p = next(iter(parameters(e).items()))
+        p = p.model_copy(update={"value": known[e.name], "tolerance": 1e-3})
+        every.append(e.model_copy(update={symbol: p}))
+    rig = RIG.model_copy(update={"element": tuple(every)})
+    effects = table_of(rig, 0.5, 40.0, "added_mass")
+    found = diagnosed(recorded(slow_command(1), 1, more=0.01), rig=rig, effects=effects)
+    (cause,) = found.causes
+    assert (found.verdict, cause.physics, cause.site) == ("named", "added_mass", "mass_2")
+    assert cause.parameters["m"].low < 0.01 < cause.parameters["m"].high
 
 
 def test_a_lag_that_is_longer_than_the_file_says_is_one_cause() -> None:

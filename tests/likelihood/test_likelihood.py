@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ from scipy import linalg, signal
 
 from samii_rig.diagnose.fit.records import _shown, fitted_lines
 from samii_rig.likelihood import pieces
-from samii_rig.likelihood.algebra import as_real, shrinking
-from samii_rig.likelihood.before import _beyond, _past_of
+from samii_rig.likelihood.algebra import as_complex, as_real, shrinking
+from samii_rig.likelihood.before import _past_of
 from samii_rig.likelihood.bridged import bridged
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
-from samii_rig.likelihood.free import _of_pieces
+from samii_rig.likelihood.free import Free, Group, residual_of
 from samii_rig.likelihood.inputs import MeterNoise
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.nodes import nodes_of, size_about
@@ -208,7 +209,9 @@ def test_the_residual_of_pieces_that_share_a_change_is_what_no_change_and_nuisan
     N = [drawn(own, q, m) for own in lines]
     X = drawn(n, b)
     rows = Rows((), drawn(n, q), N, [np.zeros(m)] * len(N), k + 1.0, k, piece, k)
-    left, free = _of_pieces(rows.e, [(on, one) for on, one, _ in rows.each()], as_real(X))
+    each = [on for on, *_ in rows.each()]
+    group = Group.of(range(len(lines)), each, [as_real(X[on]) for on in each])
+    left, free = residual_of(Free(rows, [group]), [SimpleNamespace(N=own) for own in N])  # type: ignore[misc]
     freedom = 0.0
     for c in range(q):
         own = linalg.block_diag(*(one[:, c] for one in N))
@@ -244,7 +247,8 @@ def test_what_moved_the_rig_before_pieces_of_one_change_is_told_without_their_sh
     n = sum(lines)
     e, L = 20 * drawn(n, q), drawn(n, q, q)
     W = L.conj().swapaxes(1, 2) @ L
-    Q = np.linalg.qr(rng.normal(size=(2 * n, 5)))[0]
+    change = drawn(n, 5)
+    Q = np.linalg.qr(as_real(change))[0]
     at = np.split(np.arange(n), [lines[0]])
     blocks = [
         (own, drawn(own.size, q, a), drawn(own.size, q, b))
@@ -254,8 +258,14 @@ def test_what_moved_the_rig_before_pieces_of_one_change_is_told_without_their_sh
     for i, (own, *both) in enumerate(blocks):
         for all_, one, counts in zip(wide, both, (before, beside), strict=True):
             all_[own, :, sum(counts[:i]) : sum(counts[: i + 1])] = one
-    alike = likely(_beyond(Q, wide[0]), _beyond(Q, e[:, :, None])[:, :, 0], _beyond(Q, wide[1]), W)
-    found = _past_of(Q, blocks, e, W)
+
+    def beyond(x: Complex) -> Complex:
+        flat = as_real(x.reshape(n, -1))
+        return as_complex(flat - Q @ (Q.T @ flat)).reshape(x.shape)
+
+    alike = likely(beyond(wide[0]), beyond(e), beyond(wide[1]), W)
+    group = Group.of(range(2), at, [as_real(change[on]) for on in at])
+    found = _past_of(group, [(a, b) for _, a, b in blocks], e, W)
     assert found is not None
     assert alike is not None
     np.testing.assert_allclose(found, alike, rtol=1e-9)

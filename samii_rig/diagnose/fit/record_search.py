@@ -257,11 +257,9 @@ class RecordSearch(Search):
         """Whether a fit changes the response as linearly between nodes as the likelihood has it, to
         noise of so many times the power, and to what the fit leaves: where that is more than noise,
         no less can be told from it."""
-        between, reference = self._between
         there = fitted.model.response(fitted.x, self.problem.at)
-        middle = fitted.model.response(fitted.x, between) - reference
         most = OFF_BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
-        bends = self.reduced.interpolation_error(there - self.reduced.reference, middle)
+        bends = self._bends(fitted, there)
         # What folds back from above is that of the fit about which the likelihood was made, or of
         # each model itself once that shows.
         own = fitted.model.response(fitted.x, self.whole.nodes(self.reduced, fitted))
@@ -269,6 +267,13 @@ class RecordSearch(Search):
         if folds >= most and not self.whole.own_aliases:
             self.whole = self.whole.with_own_aliases()
         return bends <= most and folds < most
+
+    def _bends(self, fitted: Fitted, there: Complex) -> float:
+        """Noise units by which a fit changes the response otherwise than linearly between nodes.
+        there : (b, q) its response on these."""
+        between, reference = self._between
+        middle = fitted.model.response(fitted.x, between) - reference
+        return self.reduced.interpolation_error(there - self.reduced.reference, middle)
 
     @property
     def reduced(self) -> Reduced:

@@ -24,7 +24,7 @@ from samii_rig.diagnose.physics.loops import Closed, JointLoops, Loop
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
-from samii_rig.likelihood.excited import DRIVES, excited, records_of
+from samii_rig.likelihood.excited import driven_to, records_of
 from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.free import scatter
 from samii_rig.likelihood.noise import Disturbances, Noise
@@ -146,10 +146,14 @@ class Whole:
         bands = tuple((0.0, min(times * high, most)) for _, high in records.bands)
         driven = records.driven
         if not np.isfinite(driven):
-            reached = excited(records.pieces, records.rate_hz, part=DRIVES)
-            driven = max(records.band[1], *(band[1] for band in reached if band))
+            driven = max(records.band[1], driven_to(records.pieces, records.rate_hz))
         wide = replace(records, bands=bands, driven=driven, driven_from=records.band[0])
         return replace(self, records=wide)
+
+    def beyond(self) -> Whole:
+        """The same records on all lines of `with_harmonics`, for every explanation."""
+        levels = self.by_level().with_harmonics().records
+        return replace(self.with_harmonics(), of_levels=levels, asked=True)
 
     @property
     def sensor(self) -> Int:

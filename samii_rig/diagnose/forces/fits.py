@@ -20,7 +20,7 @@ from samii_rig.diagnose.fit.explanations import (
     named,
     threshold,
 )
-from samii_rig.diagnose.fit.record_search import RecordSearch
+from samii_rig.diagnose.fit.record_search import MOST_MADE, OFF_BETWEEN, RecordSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import STEPS, Fitted, penalty_of
 from samii_rig.diagnose.forces.model import ForceModel, model_of
@@ -77,6 +77,19 @@ class ForceFits(RecordSearch):
         kept = [e for e in ranked[:RIVALS] if e.weight > ranked[0].weight - NEAR_BEST]
         # Beside what is wrong with the data a force is held against what the rig lacks otherwise.
         self._only((self.linear.nominal, of_data(self.linear), *kept))
+        self._where_nothing_was_fitted(ranked[0])
+
+    def _where_nothing_was_fitted(self, best: Explanation) -> None:
+        """The likelihood anew about what explained the excited lines best, as long as that moves
+        by much on the others: a mode above them stands anywhere in its tolerances at first."""
+        for _ in range(MOST_MADE):
+            fitted = self.found[best.key].fitted
+            there = fitted.model.response(fitted.x, self.problem.at)[: len(self.reduced.reference)]
+            most = OFF_BETWEEN * math.sqrt(max(1.0, self.ratio(fitted)))
+            if self._bends(fitted, there) <= most:
+                break
+            self._about(fitted)
+            self._only(tuple(self.found.values()))
 
     def _only(self, some: Sequence[Explanation]) -> None:
         """Refit some explanations, and forget all others."""

@@ -12,9 +12,11 @@ from samii_rig.diagnose.fit.agreeing import Given, SeveralStates, several_states
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
 from samii_rig.diagnose.fit.explanations import FIVE, Explanation, threshold
+from samii_rig.diagnose.fit.ranking import ranking
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import TEST_TURN, Whole
 from samii_rig.diagnose.fit.rigfile import explained
+from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.laws import STOPS
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.variation import (
@@ -88,6 +90,10 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     search.begin("amplitude levels")
     forces, untried = forces_on(search)
     forced = _winning(forces)
+    if forces is not None and case.whole is not None and _shows_beyond(forces, search, case.whole):
+        wide = replace(case, whole=case.whole.beyond())
+        if (again := on_records(wide)) is not None:
+            return by_records(wide, again)
     if forced is None or _may_be_linear(
         forced, level_dependent=case.search.lines.depends_on_level()
     ):
@@ -325,6 +331,18 @@ def forces_on(
         return compete_on_records(search, known), ()
     except SamiiRigError as error:
         return None, (f"not all forces that depend on amplitude were searched for: {error}",)
+
+
+def _shows_beyond(forces: ForceSearch, search: RecordSearch, whole: Whole) -> bool:
+    """Whether a linear effect shows on lines that nothing excites for long, and by more than any on
+    those that something does: a lightly damped mode rings where a record begins at once, far above
+    its band."""
+    if whole.asked or forces.won:
+        return False
+    plain, nominal = forces.linear_part(forces.nominal)
+    ranked = ranking(Screen.of(plain.problem, nominal.fitted), search.table, (), plain.model)
+    within = search.nominal.fitted.cost - search.ranked()[0].fitted.cost
+    return bool(ranked) and ranked[0][0] > 2 * within + search.critical_value
 
 
 def _may_be_linear(forced: ForceSearch, *, level_dependent: bool) -> bool:
