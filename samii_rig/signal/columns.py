@@ -28,7 +28,9 @@ LEFT = 0.2  # part of what is fed back, or of a command's size, by which a law t
 SEEN = 14.0
 # Part of a command's step that rounding leaves, and medians from which a residual is a spike.
 ROUNDED, SPIKE = 0.3, 8.0
-TAPS = 1  # rows to each side of which what a voltmeter shows of a command is made
+# Rows to each side of which what a voltmeter shows of a command is made: of random to two fifths of
+# half the rate one left 2 % of a motion between them, as much as another shift explains.
+TAPS = 2
 # Rows of that filter's delay: a voltmeter between two commands has half a row, another shift one.
 CENTRED = 0.75
 ALIKE = 0.02  # part of an input that is not proportional to another, below which it is the same

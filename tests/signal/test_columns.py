@@ -304,3 +304,33 @@ def test_beside_noise_what_one_run_is_late_by_is_a_shift_if_it_is_whole(samples,
     (_, _), (found, said) = aligned([run(0.0), run(samples)])
     assert (said is not None) == bool(moved)
     assert len(found) == N - moved
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_no_shift_where_a_voltmeter_shows_a_faster_loop_between_two_rows(seed: int):
+    """Random to two fifths of half the rate: three rows hardly make what is between them."""
+    every, n = 10, 60_000
+    rng = np.random.default_rng(seed)
+    f = np.fft.rfftfreq(n, 1 / (every * RATE))
+    turn = np.exp(2j * np.pi * rng.random(f.size))
+    u = np.fft.irfft(np.where((f > 2.0) & (f < 0.2 * RATE), turn, 0.0), n)
+    u *= 0.25 / np.std(u)
+    theta, v = np.zeros(n), np.zeros(n)
+    for k in range(n - 1):
+        v[k] = u[k] - KP * theta[k]
+        theta[k + 1] = theta[k] + v[k] / (every * RATE)
+    shown = (v + np.append(0.0, v[:-1])) / 2 + 1e-3 * rng.standard_normal(n)
+    read = theta + 1e-5 * rng.standard_normal(n)
+    channels = (
+        Channel("u", "V", "reference"),
+        Channel("v", "V", "command", -10.0, 10.0, 3e-4),
+        Channel("theta", "rad", "sensor"),
+    )
+    values = np.column_stack([u, shown, read])[::every]
+    at = np.arange(len(values))
+    record = Recording(
+        channels, RATE, at * 2_000_000, at, values, np.zeros(values.shape, np.uint8),
+        (Segment("random", "single", 0, at.size, 1.0, "V", 0),), rig_toml=RIG_TOML,
+        source="run.mcap",
+    )  # fmt: skip
+    assert shift_of(record) == 0

@@ -83,6 +83,8 @@ class ForceFits(RecordSearch):
         """The likelihood anew about what explained the excited lines best, as long as that moves
         by much on the others: a mode above them stands anywhere in its tolerances at first."""
         for _ in range(MOST_MADE):
+            if best.key not in self.found:  # its refit has left what any rig allows
+                return
             fitted = self.found[best.key].fitted
             there = fitted.model.response(fitted.x, self.problem.at)[: len(self.reduced.reference)]
             most = OFF_BETWEEN * math.sqrt(max(1.0, self.ratio(fitted)))
