@@ -29,7 +29,7 @@ SEEN = 14.0
 # Part of a command's step that rounding leaves, and medians from which a residual is a spike.
 ROUNDED, SPIKE = 0.3, 8.0
 # Rows to each side of which what a voltmeter shows of a command is made: of random to two fifths of
-# half the rate one left 2 % of a motion between them, as much as another shift explains.
+# half the rate three left 1.5 % of it, as much as another shift explains.
 TAPS = 2
 # Rows of that filter's delay: a voltmeter between two commands has half a row, another shift one.
 CENTRED = 0.75
