@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from samii_rig.likelihood.algebra import as_complex, as_real, root_of
-from samii_rig.likelihood.form import weights
+from samii_rig.likelihood.form import products, weights
 from samii_rig.likelihood.free import Free, Group
 from samii_rig.likelihood.noise import Noise
-from samii_rig.likelihood.past import shown
+from samii_rig.likelihood.past import likely, shown
 from samii_rig.likelihood.records import Records
 from samii_rig.likelihood.seen import Seen
 from samii_rig.types import Complex, Float
@@ -50,22 +50,45 @@ def _past_of(
     blocks : of each piece the shapes of what was before, and those beside them. e : (n, q) all
     lines. W : as of `past.likely`.
     """
-    last = sum(before.shape[2] for before, _ in blocks)
-    m, q, p = last + sum(beside.shape[2] for _, beside in blocks), e.shape[1], len(group.square)
-    along, first = np.zeros((p, q, m + 1)), 0  # the change of each shape, and of the lines
-    every = []
-    for on, X, (before, beside) in zip(group.on, group.X, blocks, strict=True):
-        place = np.r_[first : first + before.shape[2], last : last + beside.shape[2], m]
-        first, last = first + before.shape[2], last + beside.shape[2]
-        shapes = np.concatenate([before, beside, e[on, :, None]], axis=2)
-        along[:, :, place] += (X.T @ as_real(shapes.reshape(len(on), -1))).reshape(p, q, -1)
-        every.append((on, X, place, shapes))
     root = root_of(group.square)
-    change = (root @ (root.T @ along.reshape(p, -1))).reshape(p, -1)
-    both = np.zeros((m, m + 1))
-    for on, X, place, shapes in every:
-        beyond = as_complex(X @ -change).reshape(len(on), q, m + 1)
-        beyond[:, :, place] += shapes
-        flat = (W[on] @ beyond).reshape(-1, m + 1)
-        both += (beyond.reshape(-1, m + 1)[:, :m].conj().T @ flat).real
-    return shown(both[:, :m], both[:, m], sum(before.shape[2] for before, _ in blocks))
+    ways = root @ root.T  # from what is along a change to the change that explains it
+    if len(blocks) == 1:
+        (at,), (X,), ((before, beside),) = group.on, group.X, blocks
+
+        def beyond(x: Complex) -> Complex:
+            """Lines (n, q, m) less what the change of each sensor explains."""
+            flat = as_real(x.reshape(len(x), -1))
+            return as_complex(flat - X @ (ways @ (X.T @ flat))).reshape(x.shape)
+
+        own = beyond(e[at, :, None])[:, :, 0]
+        return likely(beyond(before), own, beyond(beside), W[at])
+
+    # Side by side the shapes of many pieces would be many times as much as all lines: of each its
+    # products, and what all lose to the change by its p unknowns.
+    def along(X: Float, x: Complex) -> Float:
+        """(q, p, m) of lines x (k, q, m) along the change of each sensor."""
+        flat = X.T @ as_real(x.reshape(len(x), -1))
+        return flat.reshape(len(ways), *x.shape[1:]).swapaxes(0, 1)
+
+    last = sum(before.shape[2] for before, _ in blocks)
+    m, q, p = last + sum(beside.shape[2] for _, beside in blocks), e.shape[1], len(ways)
+    K, pull = np.zeros((q * p, q * p)), np.zeros(q * p)
+    square, head, first = np.zeros((m, m)), np.zeros(m), 0
+    B, T, lines = np.zeros((q, p, m)), np.zeros((q, p, m)), np.zeros((q, p, 1))
+    for at, X, (before, beside) in zip(group.on, group.X, blocks, strict=True):
+        A = np.concatenate([before, beside], axis=2)
+        place = np.r_[first : first + before.shape[2], last : last + beside.shape[2]]
+        first, last = first + before.shape[2], last + beside.shape[2]
+        We = (W[at] @ e[at, :, None])[:, :, 0]
+        WA, flat = W[at] @ A, A.reshape(-1, A.shape[2]).conj().T
+        square[np.ix_(place, place)] = (flat @ WA.reshape(-1, A.shape[2])).real
+        head[place] = (flat @ We.ravel()).real
+        B[:, :, place], T[:, :, place] = along(X, A), along(X, WA)
+        lines += along(X, e[at, :, None])
+        K_at, pull_at = products(as_complex(X), W[at], We)
+        K += K_at
+        pull += pull_at
+    change, through, best = (ways @ B).reshape(-1, m), T.reshape(-1, m), (ways @ lines).ravel()
+    square += change.T @ (K @ change) - through.T @ change - change.T @ through
+    head += change.T @ (K @ best - pull) - through.T @ best
+    return shown(square, head, sum(before.shape[2] for before, _ in blocks))

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from samii_rig.errors import EstimateError
-from samii_rig.likelihood.algebra import SAME, as_real, by_sensor, directions
+from samii_rig.likelihood.algebra import AT_ONCE, SAME, as_real, by_sensor, directions
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.rows import Rows
 from samii_rig.types import Complex, Float
 
 RIDGES, MORE = 5, 30.0  # tries of a ridge, each so many times the one before
-AT_ONCE = 1024  # lines whose products are formed together: 4 MB at 120 nodes, what a cache holds
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,13 +5,13 @@ Pieces, repeats and levels that differ by more than noise are not noise.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from samii_rig.likelihood import rounding
-from samii_rig.likelihood.algebra import as_complex, as_real, lengths, root_of, spanned
+from samii_rig.likelihood.algebra import AT_ONCE, as_complex, as_real, lengths, root_of, spanned
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.pieces import Piece, Samples
 from samii_rig.likelihood.records import Records
@@ -23,7 +23,6 @@ ENOUGH = 0.75  # lines over unknowns of a change, from which a piece shows its n
 # Of an input's largest in any piece, what it does in one that it does not excite: where noise is
 # told no change of its response is free there, which would fit that with its converter's rounding.
 RESTS = 0.01
-AT_ONCE = 2048  # rows of a change whose lengths are formed together: 4 MB, what a cache holds
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +42,7 @@ class Group:
     @classmethod
     def of(cls, pieces: Sequence[int], on: Sequence[Int], X: Sequence[Float]) -> Group:
         """X : of any size; it is changed."""
-        square = _summed(own.T @ own for own in X)
+        square = np.asarray(sum(own.T @ own for own in X))
         size = np.sqrt(np.diagonal(square))
         over = 1 / np.where(size > 0, size, 1.0)
         for own in X:
@@ -101,22 +100,16 @@ def _leave(group: Group, e: Complex, N: Sequence[Complex], left: Complex, used: 
     across = [Q.T @ X for Q, X in zip(beside, group.X, strict=True)]
     goals = [as_real(e[on]) for on in group.on]
     goals = [goal - Q @ (Q.T @ goal) for goal, Q in zip(goals, beside, strict=True)]
-    root = root_of(group.square - _summed(own.T @ own for own in across))
-    best = root @ (root.T @ _summed(X.T @ g for X, g in zip(group.X, goals, strict=True)))
+    root = root_of(group.square - sum(own.T @ own for own in across))
+    along = sum(X.T @ goal for X, goal in zip(group.X, goals, strict=True))
+    best = root @ (root.T @ along)
     for on, X, goal, Q, own in zip(group.on, group.X, goals, beside, across, strict=True):
         left[on] = as_complex(goal - X @ best + Q @ (own @ best))
         taken = lengths(Q)
-        for first in range(0, len(X), AT_ONCE):
-            some = slice(first, first + AT_ONCE)
+        for first in range(0, len(X), 2 * AT_ONCE):  # real and imaginary parts
+            some = slice(first, first + 2 * AT_ONCE)
             taken[some] += lengths(X[some] @ root - Q[some] @ (own @ root))
         used[on] += taken[: len(on)] + taken[len(on) :]
-
-
-def _summed(each: Iterable[Float]) -> Float:
-    total, *others = each
-    for one in others:
-        total += one
-    return total
 
 
 def _excited(each: Sequence[Float], inputs: int) -> None:

@@ -258,7 +258,7 @@ class RecordSearch(Search):
         noise of so many times the power, and to what the fit leaves: where that is more than noise,
         no less can be told from it."""
         there = fitted.model.response(fitted.x, self.problem.at)
-        most = OFF_BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
+        most = self._most_off(fitted, times)
         bends = self._bends(fitted, there)
         # What folds back from above is that of the fit about which the likelihood was made, or of
         # each model itself once that shows.
@@ -267,6 +267,10 @@ class RecordSearch(Search):
         if folds >= most and not self.whole.own_aliases:
             self.whole = self.whole.with_own_aliases()
         return bends <= most and folds < most
+
+    def _most_off(self, fitted: Fitted, times: float = 1.0) -> float:
+        """Noise units of which a change may be off; times : as of `_stands`."""
+        return OFF_BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
 
     def _bends(self, fitted: Fitted, there: Complex) -> float:
         """Noise units by which a fit changes the response otherwise than linearly between nodes.

@@ -20,7 +20,7 @@ from samii_rig.diagnose.fit.explanations import (
     named,
     threshold,
 )
-from samii_rig.diagnose.fit.record_search import MOST_MADE, OFF_BETWEEN, RecordSearch
+from samii_rig.diagnose.fit.record_search import MOST_MADE, RecordSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import STEPS, Fitted, penalty_of
 from samii_rig.diagnose.forces.model import ForceModel, model_of
@@ -87,9 +87,8 @@ class ForceFits(RecordSearch):
                 return
             fitted = self.found[best.key].fitted
             there = fitted.model.response(fitted.x, self.problem.at)[: len(self.reduced.reference)]
-            most = OFF_BETWEEN * math.sqrt(max(1.0, self.ratio(fitted)))
-            if self._bends(fitted, there) <= most:
-                break
+            if self._bends(fitted, there) <= self._most_off(fitted):
+                return
             self._about(fitted)
             self._only(tuple(self.found.values()))
 
