@@ -28,10 +28,12 @@ from samii_rig.errors import EstimateError
 from samii_rig.likelihood.powers import most_likely
 from samii_rig.types import Complex, Float, Int
 
-# Degrees of freedom for each sensor in a block of lines, and its width over its frequency, at
-# least: from fewer lines its covariance is off by more than 1/sqrt(12 q).
+# Degrees of freedom for each sensor in a block of lines, at least: from fewer lines its covariance
+# is off by more than 1/sqrt(12 q).
 FREEDOM = 12.0
-NARROWEST = 0.1
+# Width of a block over its frequency: of the sensors' own noise, and where what disturbs the rig
+# has modes of 1 % of loss. And nepers of its power, by which the sum changes within one.
+NARROWEST, MODE, CHANGES = 0.1, 0.01, 0.5
 # Corners of the colours, times the one before: a sum of them is within 5 % of any power of the
 # frequency from 0 to -2 (log-spaced relaxations; van der Ziel 1950, Physica 16).
 CORNERS_APART = 4.0
@@ -41,7 +43,7 @@ TURN = 0.15  # nepers or rad, by which what a disturbance makes may change withi
 # moves anything, in any unit, makes more than 1e-6.
 NOTHING = 1e-12
 # Degrees of freedom with which a block may believe the sum: from not at all to wholly.
-BELIEF = np.geomspace(4.0, 4e4, 25)
+BELIEF = np.geomspace(0.4, 4e4, 31)
 LITTLE = 0.02  # of a line's freedom: one with less says nothing
 
 Disturbances = Callable[[Float], Complex]
@@ -132,7 +134,8 @@ class Noise:
         own = self.disturbances(f)[:, :, :q] * sure[:, None, :]
         both = self.whitened(f, piece, np.concatenate([left[:, :, None], own], axis=2))
         white, sure = both[:, :, 0], both[:, :, 1:]
-        starts = _blocks(f, free, FREEDOM * q)
+        place = self._place(f, self.known.group[piece])
+        starts = _blocks(free, place, FREEDOM * q)
         each = [slice(a, b) for a, b in pairwise([*starts, f.size])]
         A = np.stack([white[on].T @ white[on].conj() for on in each])
         n = np.array([float(np.sum(free[on])) for on in each])
@@ -145,6 +148,26 @@ class Noise:
         least = np.stack([_along(sure[on], V) for on, V in zip(each, turn, strict=True)])
         about = (turn * np.maximum(values, least)[:, None, :]) @ turn.conj().swapaxes(1, 2)
         return replace(self, edges=f[starts[1:]], about=about)
+
+    def _place(self, f: Float, group: Int) -> Float:
+        """(n,) at f (n,) of groups (n,), how many of the widest blocks lie below.
+
+        Where what disturbs the rig is seen above a sensor's own noise, a mode that stands elsewhere
+        than in the sum makes another noise at every line: blocks are as narrow as it there, and
+        as over which the sum changes.
+        """
+        once, first, back = np.unique(f, return_index=True, return_inverse=True)
+        q = self.about.shape[1]
+        power = np.abs(self.disturbances(once)) ** 2
+        power *= (_colours(once, self.corners) @ self.power.T)[:, None, :]
+        own = power[:, :, :q].sum(axis=2) + self.known(once, group[first])
+        rig = power[:, :, q:].sum(axis=2)
+        every = np.maximum(own + rig, np.finfo(np.float64).tiny)
+        share = np.max(rig / every, axis=1)
+        turn = np.max(np.abs(np.diff(np.log(every), axis=0)), axis=1, initial=0.0) / CHANGES
+        each = (1 - share) / NARROWEST + share / MODE
+        step = np.diff(np.log(once)) * np.maximum(each[:-1], each[1:])
+        return np.append(0.0, np.cumsum(step + turn))[back]
 
     def of_sensors_alone(self, own_power: Float) -> Noise:
         """White noise of each sensor, of `own_power` (q,), and what is known beforehand; nothing
@@ -241,12 +264,12 @@ def _mean(x: Float, weight: Float, bins: Int) -> Float:
     return np.asarray(np.stack(sums, axis=1) / np.bincount(bins, weight, n)[:, None])
 
 
-def _blocks(f: Float, free: Float, least: float) -> list[int]:
-    """Where blocks begin that have so much freedom at least."""
+def _blocks(free: Float, place: Float, least: float) -> list[int]:
+    """Where blocks begin that have so much freedom at least. place : (n,) as `Noise._place`."""
     starts, have = [0], 0.0
-    for i in range(f.size):
+    for i in range(free.size):
         have += float(free[i])
-        if have >= least and f[i] > f[starts[-1]] * (1 + NARROWEST):
+        if have >= least and place[i] > place[starts[-1]] + 1:
             starts.append(i + 1)
             have = 0.0
     # What is left at the end is too little for a block of its own.

@@ -13,6 +13,7 @@ from table_kit import Effects, table_of
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit import record_search
+from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.physics.vocabulary import hypotheses
 from samii_rig.diagnose.verdict.by_record import on_records
 from samii_rig.likelihood.pieces import wiring
@@ -70,12 +71,19 @@ def test_the_nominal_model_is_found_at_some_of_many_lines_and_stands_at_all(
     k = few.records.lines(few.records.pieces[0]).k
     assert all(np.any(k % n == 0) for n in range(2, 11))  # of any multisine some are excited
     assert case.whole.thinned(case.whole.lines) is case.whole
+    low = case.whole.up_to(10.0)
+    assert low.of_levels is not None
+    assert {high for one in (low.records, low.of_levels) for _, high in one.bands} == {10.0}
+    assert replace(case.whole, asked=True).up_to(10.0).lines == case.whole.lines
     at_once = on_records(case)
     monkeypatch.setattr(record_search, "FIRST_LINES", case.whole.lines // 3)
     by_few = on_records(case)
     assert at_once is not None
     assert by_few is not None
-    assert by_few.whole.lines == case.whole.lines
+    assert isinstance(by_few.whole, Whole)
+    # Up to where the response shows: it is driven to 20 Hz.
+    (top,) = {high for _, high in by_few.whole.records.bands}
+    assert by_few.whole.shown_to(by_few.nominal.fitted, by_few.reduced) == pytest.approx(top, 0.1)
     a, b = at_once.nominal.fitted, by_few.nominal.fitted
     assert b.away(a) < 0.5
     assert by_few.ratio(b) == pytest.approx(at_once.ratio(a), abs=0.02)

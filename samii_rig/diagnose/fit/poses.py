@@ -113,6 +113,11 @@ class InPoses:
         """As of `Recorded`."""
         return replace(self, each=tuple(w.thinned(most) for w in self.each))
 
+    def showing(self, fitted: Fitted, noise: Reduced) -> InPoses:
+        """As of `Recorded`, each pose by itself."""
+        each = zip(self.each, _each(fitted), parts_of(noise), strict=True)
+        return replace(self, each=tuple(w.showing(own, part) for w, own, part in each))
+
     def about(self, fitted: Fitted) -> Summed:
         """As of `Recorded`."""
         each = zip(self.each, _each(fitted), strict=True)

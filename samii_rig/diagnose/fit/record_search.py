@@ -99,6 +99,10 @@ class Recorded(Protocol):
         """The same at so few of its lines that each state has hardly more than `most`."""
         ...
 
+    def showing(self, fitted: Fitted, noise: Reduced) -> Recorded:
+        """The same up to the line above which nothing that a fit answers shows in noise."""
+        ...
+
 
 @dataclass(frozen=True)
 class RecordProblem(Problem):
@@ -178,6 +182,7 @@ class RecordSearch(Search):
 
     usual = RECORDS
     _between: tuple[Grid, Complex]  # the middles between nodes, and the reference there
+    _of_lines = 1.0  # part of the lines that are looked at
 
     def __init__(self, whole: Recorded, by_line: Search) -> None:
         self.whole, self.by_line = whole, by_line
@@ -187,11 +192,16 @@ class RecordSearch(Search):
     def __post_init__(self) -> None:
         self.use(self.table)
         every, self.whole = self.whole, self.whole.thinned(FIRST_LINES)
+        few = self.whole.lines < every.lines
+        self._of_lines = self.whole.lines / every.lines
         fitted = self._nominal(self.first())
+        if few:
+            every = every.showing(fitted, self.reduced)
         if self.ratio(fitted) > threshold(self.spread):
             fitted = self._cooled(fitted)
-        if self.whole.lines < every.lines:
+        if few:
             self.whole = every.with_own_aliases() if self.whole.own_aliases else every
+            self._of_lines = 1.0
             fitted = self._nominal(fitted)
         self.keep((), fitted)
 
@@ -269,8 +279,9 @@ class RecordSearch(Search):
         return bends <= most and folds < most
 
     def _most_off(self, fitted: Fitted, times: float = 1.0) -> float:
-        """Noise units of which a change may be off; times : as of `_stands`."""
-        return OFF_BETWEEN * math.sqrt(max(times, self.ratio(fitted)))
+        """Noise units of which a change may be off, of all lines together. times : as of
+        `_stands`."""
+        return OFF_BETWEEN * math.sqrt(max(times, self.ratio(fitted)) * self._of_lines)
 
     def _bends(self, fitted: Fitted, there: Complex) -> float:
         """Noise units by which a fit changes the response otherwise than linearly between nodes.

@@ -30,7 +30,7 @@ from samii_rig.likelihood.free import scatter
 from samii_rig.likelihood.noise import Disturbances, Noise
 from samii_rig.likelihood.nuisance import HIGHEST
 from samii_rig.likelihood.pieces import Loops, Wiring, faster, joined, pieces_of, wiring
-from samii_rig.likelihood.records import Records, Response
+from samii_rig.likelihood.records import CYCLES, Records, Response
 from samii_rig.likelihood.reduce import LineResiduals, reduced, residuals_by_line
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned
@@ -48,6 +48,9 @@ HARMONIC = 7
 # Lines to which harmonics may add: a quadratic form of so many takes 5 s of a core. Many records
 # show a force at the lines of their excitation too.
 MOST_LINES = 12000
+# Of chi-square, all that a response does above the lines that are looked at: ten times as large it
+# would add 10, less than what any effect must explain.
+LOST = 0.1
 MOST_KEPT = 20000  # lines at which disturbances are kept: 50 MB of four sensors
 # Of half the rate, width over which samples between those that were recorded are told from these:
 # at `HIGHEST` they are to 1e-6, after 130 samples of either side nothing is left. And how many
@@ -129,6 +132,42 @@ class Whole:
         """As of `Recorded`."""
         times = self.records.one_of * math.ceil(self.lines / most)
         return replace(self, records=replace(self.records, one_of=times)) if times > 1 else self
+
+    def showing(self, fitted: Fitted, noise: Reduced) -> Whole:
+        """As of `Recorded`."""
+        return self.up_to(self.shown_to(fitted, noise))
+
+    def shown_to(self, fitted: Fitted, noise: Reduced) -> float:
+        """Hz above which nothing that a fit answers shows in noise: `LOST` of chi-square in all."""
+        records, exact = self.records, self.records.exact()
+        H = self.response(fitted)(exact.s)
+        f, power = np.zeros(0), np.zeros(0)
+        for i, piece in enumerate(records.pieces):
+            lines = records.lines(piece)
+            y = exact.predicted(H, piece.r)[piece.history :]
+            Y = np.asarray(np.fft.rfft(y, axis=0)[lines.k] / np.sqrt(len(y)))
+            of = np.full(lines.k.size, i)
+            white = noise.noise.whitened(lines.frequency, of, Y[:, :, None])
+            f = np.append(f, lines.frequency)
+            power = np.append(power, 2 * np.sum(np.abs(white) ** 2, axis=(1, 2)))
+        order = np.argsort(-f)
+        above = np.cumsum(power[order]) * records.one_of
+        return float(f[order[min(int(np.searchsorted(above, LOST)), f.size - 1)]])
+
+    def up_to(self, top: float) -> Whole:
+        """The same on lines up to `top` Hz, but on those that somebody asked for."""
+        if self.asked:
+            return self
+
+        def cut(records: Records) -> Records:
+            """Of each piece the least that has lines at all, at least."""
+            least = [CYCLES * records.rate_hz / len(p.z) for p in records.pieces]
+            each = zip(records.bands, least, strict=True)
+            bands = tuple((low, min(high, max(top, low + few))) for (low, high), few in each)
+            return replace(records, bands=bands)
+
+        levels = None if self.of_levels is None else cut(self.of_levels)
+        return replace(self, records=cut(self.records), of_levels=levels)
 
     def by_level(self) -> Whole:
         """The same records, the levels not summed up: for what depends on amplitude."""

@@ -168,6 +168,15 @@ class Both:
         """As of `Recorded`."""
         return replace(self, after=self.after.thinned(most), before=self.before.thinned(most))
 
+    def showing(self, fitted: Fitted, noise: Reduced) -> Both:
+        """As of `Recorded`, of either state."""
+        after, before = parts_of(noise)
+        top = max(
+            self.after.shown_to(_after(fitted), after),
+            self.before.shown_to(_before(fitted), before),
+        )
+        return replace(self, after=self.after.up_to(top), before=self.before.up_to(top))
+
     def about(self, fitted: Fitted) -> Summed:
         """As of `Recorded`."""
         before = self.before.about(_before(fitted))

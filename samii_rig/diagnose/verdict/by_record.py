@@ -90,8 +90,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     search.begin("amplitude levels")
     forces, untried = forces_on(search)
     forced = _winning(forces)
-    if forces is not None and case.whole is not None and _shows_beyond(forces, search, case.whole):
-        wide = replace(case, whole=case.whole.beyond())
+    if (beyond := _beyond(forces, search)) is not None:
+        wide = replace(case, whole=beyond)
         if (again := on_records(wide)) is not None:
             return by_records(wide, again)
     if forced is None or _may_be_linear(
@@ -333,16 +333,18 @@ def forces_on(
         return None, (f"not all forces that depend on amplitude were searched for: {error}",)
 
 
-def _shows_beyond(forces: ForceSearch, search: RecordSearch, whole: Whole) -> bool:
-    """Whether a linear effect shows on lines that nothing excites for long, and by more than any on
-    those that something does: a lightly damped mode rings where a record begins at once, far above
-    its band."""
-    if whole.asked or forces.won:
-        return False
+def _beyond(forces: ForceSearch | None, search: RecordSearch) -> Whole | None:
+    """The records on lines that nothing excites for long, too, where a linear effect shows there by
+    more than any on those that something does: a lightly damped mode rings where a record begins at
+    once, far above its band. None where that is not so."""
+    whole = search.whole
+    if forces is None or forces.won or not isinstance(whole, Whole) or whole.asked:
+        return None
     plain, nominal = forces.linear_part(forces.nominal)
     ranked = ranking(Screen.of(plain.problem, nominal.fitted), search.table, (), plain.model)
     within = search.nominal.fitted.cost - search.ranked()[0].fitted.cost
-    return bool(ranked) and ranked[0][0] > 2 * within + search.critical_value
+    shows = bool(ranked) and ranked[0][0] > 2 * within + search.critical_value
+    return whole.beyond() if shows else None
 
 
 def _may_be_linear(forced: ForceSearch, *, level_dependent: bool) -> bool:
