@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from samii_rig.cli.app import app
 from samii_rig.diagnose.diagnose import diagnose, table
+from samii_rig.diagnose.fit import records
 from samii_rig.diagnose.fit.poses import InPoses, Posed
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
@@ -130,6 +131,16 @@ def test_the_likelihood_of_poses_is_the_sum_of_theirs(summed):
     ]
     assert min(each) > 1
     assert float(np.sum(found.residual(h) ** 2)) == pytest.approx(sum(each), rel=1e-9)
+
+
+def test_each_pose_is_looked_at_up_to_where_its_own_response_shows(plain, summed, monkeypatch):
+    fitted, found, _ = summed
+    both = InPoses(tuple(Whole.of(p.runs, rig) for p, rig in zip(plain, RIGS, strict=True)))
+    assert both.showing(fitted, found).lines == both.lines  # it shows at all lines
+    monkeypatch.setattr(records, "LOST", 1000.0)  # of chi-square
+    tops = [whole.records.band[1] for whole in both.showing(fitted, found).each]
+    assert max(tops) < both.each[0].records.band[1]
+    assert tops[0] != tops[1]
 
 
 def test_all_poses_share_what_is_fitted(summed):

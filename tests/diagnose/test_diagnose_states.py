@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 from samii_rig.cli.app import app
 from samii_rig.diagnose.changed import State, changed, common_rig
 from samii_rig.diagnose.diagnose import diagnose
+from samii_rig.diagnose.fit import records
 from samii_rig.diagnose.fit.known import stated, with_known
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
@@ -159,6 +160,19 @@ def test_the_likelihood_of_two_states_is_the_sum_of_theirs(summed):
     ]
     assert float(np.sum(found.residual(h) ** 2)) == pytest.approx(sum(each), rel=1e-9)
     assert found.known == pytest.approx(sum(part.known for part in found.each))
+
+
+def test_both_states_are_looked_at_up_to_where_the_response_of_either_shows(summed, monkeypatch):
+    (after, before), fitted = summed
+    both = Both(after, before)
+    found = both.about(fitted)
+    assert both.showing(fitted, found).lines == both.lines  # it shows at all lines
+    low = Both(after.up_to(10.0), before)
+    monkeypatch.setattr(records, "LOST", 1e4)  # of chi-square
+    cut = low.showing(fitted, low.about(fitted))
+    (top,) = {high for _, high in cut.before.records.bands}
+    assert 10.0 < top < before.records.band[1]
+    assert cut.after.records.band[1] == 10.0
 
 
 def test_what_is_alike_in_both_states_does_not_count(summed):
