@@ -170,3 +170,11 @@ def within(records: Records, band: tuple[float, float]) -> Records:
     if any(a >= b for a, b in own):
         raise EstimateError("the two states were not excited at the same frequencies")
     return replace(records, bands=own)
+
+
+def up_to(records: Records, top: float) -> Records:
+    """Records on the lines up to `top` Hz; of a piece that begins above, its lowest few."""
+    least = [CYCLES * records.rate_hz / len(p.z) for p in records.pieces]
+    each = zip(records.bands, least, strict=True)
+    bands = tuple((low, min(high, max(top, low + few))) for (low, high), few in each)
+    return replace(records, bands=bands)

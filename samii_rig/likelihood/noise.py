@@ -33,7 +33,7 @@ from samii_rig.types import Complex, Float, Int
 FREEDOM = 12.0
 # Width of a block over its frequency: of the sensors' own noise, and where what disturbs the rig
 # has modes of 1 % of loss. And nepers of its power, by which the sum changes within one.
-NARROWEST, MODE, CHANGES = 0.1, 0.01, 0.5
+OWN_WIDTH, MODE_WIDTH, CHANGES = 0.1, 0.01, 0.5
 # Corners of the colours, times the one before: a sum of them is within 5 % of any power of the
 # frequency from 0 to -2 (log-spaced relaxations; van der Ziel 1950, Physica 16).
 CORNERS_APART = 4.0
@@ -130,12 +130,14 @@ class Noise:
     def _about(self, f: Float, left: Complex, free: Float, piece: Int) -> Noise:
         """The same, what the sum does not give by blocks."""
         q = left.shape[1]
-        sure = np.sqrt(self.known(f, self.known.group[piece]))
-        own = self.disturbances(f)[:, :, :q] * sure[:, None, :]
+        group = self.known.group[piece]
+        sure = np.sqrt(self.known(f, group))
+        once, first, back = np.unique(f, return_index=True, return_inverse=True)
+        u = self.disturbances(once)
+        own = u[back, :, :q] * sure[:, None, :]
         both = self.whitened(f, piece, np.concatenate([left[:, :, None], own], axis=2))
         white, sure = both[:, :, 0], both[:, :, 1:]
-        place = self._place(f, self.known.group[piece])
-        starts = _blocks(free, place, FREEDOM * q)
+        starts = _blocks(free, self._place(once, u, group[first])[back], FREEDOM * q)
         each = [slice(a, b) for a, b in pairwise([*starts, f.size])]
         A = np.stack([white[on].T @ white[on].conj() for on in each])
         n = np.array([float(np.sum(free[on])) for on in each])
@@ -149,25 +151,24 @@ class Noise:
         about = (turn * np.maximum(values, least)[:, None, :]) @ turn.conj().swapaxes(1, 2)
         return replace(self, edges=f[starts[1:]], about=about)
 
-    def _place(self, f: Float, group: Int) -> Float:
-        """(n,) at f (n,) of groups (n,), how many of the widest blocks lie below.
+    def _place(self, f: Float, u: Complex, group: Int) -> Float:
+        """(n,) how many of the widest blocks lie below f (n,) of groups (n,). u : (n, q, K) what
+        disturbances make there.
 
         Where what disturbs the rig is seen above a sensor's own noise, a mode that stands elsewhere
         than in the sum makes another noise at every line: blocks are as narrow as it there, and
         as over which the sum changes.
         """
-        once, first, back = np.unique(f, return_index=True, return_inverse=True)
-        q = self.about.shape[1]
-        power = np.abs(self.disturbances(once)) ** 2
-        power *= (_colours(once, self.corners) @ self.power.T)[:, None, :]
-        own = power[:, :, :q].sum(axis=2) + self.known(once, group[first])
+        q = u.shape[1]
+        power = np.abs(u) ** 2 * (_colours(f, self.corners) @ self.power.T)[:, None, :]
+        own = power[:, :, :q].sum(axis=2) + self.known(f, group)
         rig = power[:, :, q:].sum(axis=2)
         every = np.maximum(own + rig, np.finfo(np.float64).tiny)
         share = np.max(rig / every, axis=1)
         turn = np.max(np.abs(np.diff(np.log(every), axis=0)), axis=1, initial=0.0) / CHANGES
-        each = (1 - share) / NARROWEST + share / MODE
-        step = np.diff(np.log(once)) * np.maximum(each[:-1], each[1:])
-        return np.append(0.0, np.cumsum(step + turn))[back]
+        each = (1 - share) / OWN_WIDTH + share / MODE_WIDTH
+        step = np.diff(np.log(f)) * np.maximum(each[:-1], each[1:])
+        return np.append(0.0, np.cumsum(step + turn))
 
     def of_sensors_alone(self, own_power: Float) -> Noise:
         """White noise of each sensor, of `own_power` (q,), and what is known beforehand; nothing

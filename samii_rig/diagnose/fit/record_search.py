@@ -192,14 +192,13 @@ class RecordSearch(Search):
     def __post_init__(self) -> None:
         self.use(self.table)
         every, self.whole = self.whole, self.whole.thinned(FIRST_LINES)
-        few = self.whole.lines < every.lines
         self._of_lines = self.whole.lines / every.lines
         fitted = self._nominal(self.first())
-        if few:
+        if self._of_lines < 1:
             every = every.showing(fitted, self.reduced)
         if self.ratio(fitted) > threshold(self.spread):
             fitted = self._cooled(fitted)
-        if few:
+        if self._of_lines < 1:
             self.whole = every.with_own_aliases() if self.whole.own_aliases else every
             self._of_lines = 1.0
             fitted = self._nominal(fitted)

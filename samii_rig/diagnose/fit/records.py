@@ -24,13 +24,13 @@ from samii_rig.diagnose.physics.loops import Closed, JointLoops, Loop
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import EstimateError
 from samii_rig.likelihood.complete import Complete
-from samii_rig.likelihood.excited import driven_to, records_of
+from samii_rig.likelihood.excited import driven_to, records_of, up_to
 from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.free import scatter
 from samii_rig.likelihood.noise import Disturbances, Noise
 from samii_rig.likelihood.nuisance import HIGHEST
 from samii_rig.likelihood.pieces import Loops, Wiring, faster, joined, pieces_of, wiring
-from samii_rig.likelihood.records import CYCLES, Records, Response
+from samii_rig.likelihood.records import Records, Response
 from samii_rig.likelihood.reduce import LineResiduals, reduced, residuals_by_line
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import aligned
@@ -158,16 +158,8 @@ class Whole:
         """The same on lines up to `top` Hz, but on those that somebody asked for."""
         if self.asked:
             return self
-
-        def cut(records: Records) -> Records:
-            """Of each piece the least that has lines at all, at least."""
-            least = [CYCLES * records.rate_hz / len(p.z) for p in records.pieces]
-            each = zip(records.bands, least, strict=True)
-            bands = tuple((low, min(high, max(top, low + few))) for (low, high), few in each)
-            return replace(records, bands=bands)
-
-        levels = None if self.of_levels is None else cut(self.of_levels)
-        return replace(self, records=cut(self.records), of_levels=levels)
+        levels = None if self.of_levels is None else up_to(self.of_levels, top)
+        return replace(self, records=up_to(self.records, top), of_levels=levels)
 
     def by_level(self) -> Whole:
         """The same records, the levels not summed up: for what depends on amplitude."""
