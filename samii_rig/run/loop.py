@@ -31,6 +31,7 @@ from samii_rig.run.sink import Collector, QueuedSink, Sink, pair_clocks
 from samii_rig.safety.gate import Gate, GateEvent
 from samii_rig.safety.judgement import State
 from samii_rig.safety.latest import CLOCK_DRIFT
+from samii_rig.safety.limits import MAX_AHEAD
 from samii_rig.types import Quality, SampleBlock, Segment, StopRecord
 
 FIRST_SAMPLE = 1.0  # s to wait for the device's first sample
@@ -104,6 +105,8 @@ class _Run:
         simulated = device.metadata.get("clock") == "simulated"
         self.tick = choose_tick(settings, device, plan.rate_hz, simulated)
         self.ahead = math.ceil((choose_ahead(settings, simulated) + self.tick) * plan.rate_hz)
+        # Samples past the newest one that the gate takes.
+        self.most_ahead = math.floor(MAX_AHEAD * plan.rate_hz)
         self.reports = self.sensor if isinstance(self.sensor, Reports) else None
         self.reference = Reference(plan)
         self.collector = Collector(
@@ -293,7 +296,8 @@ class _Run:
         last set point, so that the deadman stays fed until the last sample has arrived.
 
         Samples come in blocks. In between they are reckoned on by the clock, so that every tick
-        sends, and thus feeds the deadman.
+        sends, and thus feeds the deadman. Where they stay out for long, nothing is sent beyond what
+        the gate takes: the age of the sensors and the deadman are then what judges.
         """
         now = self.clock.now()
         # A little slower than its clock may be, and from the promptest block on: a block that is
@@ -301,7 +305,8 @@ class _Run:
         since = (now - self.reckoned_at) * 1e-9 * self.plan.rate_hz * (1.0 - CLOCK_DRIFT)
         self.reckoned = max(float(self.newest), self.reckoned + since)
         self.reckoned_at = now
-        upto = int(self.reckoned) + 1 - self.start + self.ahead
+        last = min(int(self.reckoned) + self.ahead, self.newest + self.most_ahead)
+        upto = last + 1 - self.start
         n = upto - self.sent
         if n <= 0:
             return

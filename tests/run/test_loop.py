@@ -14,6 +14,7 @@ import pytest
 from fake_device import RATE, FakeDevice, fake_rig
 from loop_kit import Broken, Memory, RealTime, after, patient_rig, plan
 
+from samii_rig.devices.protocols import OpenRig
 from samii_rig.errors import DeviceError, GateError, InputError
 from samii_rig.run.client import Client
 from samii_rig.run.dwell import Reference
@@ -227,6 +228,34 @@ def test_a_sensor_that_falls_silent_trips_the_run():
     stop, _, _ = go(FakeDevice(spoil))
     assert stop.status == "tripped"
     assert "nothing new" in stop.reason
+
+
+@pytest.mark.parametrize(
+    ("silence", "status", "words"),
+    [(0.22, "completed", "segments done"), (0.6, "tripped", "nothing new")],
+)
+def test_samples_that_stay_out_are_waited_for_as_long_as_a_sensor_may_be_silent(
+    silence, status, words
+):
+    """On real time, by a clock that is stepped: the host reckons on, but never past its gate."""
+
+    class Late(FakeDevice):
+        def read(self):
+            out = 0.0 < self.time * 1e-9 - 1.0 < silence
+            rows, self.rows = self.rows, [] if out else self.rows
+            block = super().read()
+            self.rows = rows if out else []
+            return block
+
+        def open(self):
+            return OpenRig(self, self, self, "fake", {})
+
+    device, sink = Late(), Memory()
+    device.deadman = 0.5
+    stop = run(plan(), patient_rig(), device.open(), sink)
+    assert stop.status == status
+    assert words in stop.reason
+    assert not device.live
 
 
 def test_a_plan_over_the_limit_trips_before_the_wire():
