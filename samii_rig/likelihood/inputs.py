@@ -91,6 +91,11 @@ class Meter:
     sd: float
     far: NDArray[np.bool_]
 
+    @property
+    def faster(self) -> bool:
+        """Whether the loop ran more than once for each sample that was recorded."""
+        return abs(self.late - LATEST) > BENT_BY_NOISE * max(self.sd, LEAST)
+
     @classmethod
     def of(
         cls,
@@ -146,21 +151,30 @@ def sent(
     theta: Float | None,
     times: int = 0,
     lost: NDArray[np.bool_] | None = None,
-) -> tuple[Float, NDArray[np.bool_]]:
-    """(n,) the command as it drove the rig, as near as the recording shows; and where it has an
-    edge within a sample, so that nobody knows when that came.
+) -> tuple[Float, Float, NDArray[np.bool_]]:
+    """(n,) the command v as it drove the rig, as near as the recording shows; v + kp theta; and
+    where it has an edge within a sample, so that nobody knows when that came.
 
     command : its column. theta : (n,) of the sensor around which a loop of gain kp is closed.
     times : how often the loop is known to run for each sample, 0 where it is not: then the command
     is a smooth one, the mean over the last hold. lost : (n,) samples that were not recorded.
     """
     v = np.asarray(recording.values[:, command], np.float64)
+    fed = np.zeros(v.size) if theta is None else kp * theta
     meter = Meter.of(recording, command, kp, theta, lost)
     if meter is None:
-        return v, np.zeros(v.size, np.bool_)
-    late = _near(meter.late)
-    drawn = meter.law if times else _filtered(recording, meter.law, _held(late))
-    return np.where(np.isfinite(drawn), drawn, v), meter.far
+        return v, v + fed, np.zeros(v.size, np.bool_)
+    if times:
+        drawn, r = meter.law, meter.law + fed
+    else:
+        held = _held(_near(meter.late))
+        drawn = _filtered(recording, meter.law, held)
+        # What is fed back is held, too. Of the rest, the sensor's noise would lead a change of the
+        # response that is free to itself.
+        calm = calibrated(fed, 0.0)[0]
+        r = drawn + _filtered(recording, fed - calm, held) + calm
+    known = np.isfinite(drawn)
+    return np.where(known, drawn, v), np.where(known, r, v + fed), meter.far
 
 
 class MeterNoise(NamedTuple):

@@ -284,7 +284,8 @@ def pieces_of(
         if not known.any():
             continue
         whole = Bridged.of(recording, known, _driving_columns(recording, wired))
-        slower = round(rig.rate_hz / recording.rate_hz) > 1
+        # Or as a meter shows, by how much faster than the record its loop ran or not.
+        slower = round(rig.rate_hz / recording.rate_hz) > 1 or _ran_faster(recording, wired)
         samples = _Samples.of(whole, rig, wired, slower=slower, times=times)
         for segment in segments_of(recording):
             if recording.place(segment) in without:
@@ -299,6 +300,12 @@ def faster(recordings: Sequence[Recording], wired: Wiring) -> int:
     commands; 0 where these were recorded as they were sent, or do not show it."""
     each = ((r, x) for r in recordings for x in wired.inputs if _has(r, x.command))
     return inputs.times_of([_meter(r, x) for r, x in each])
+
+
+def _ran_faster(recording: Recording, wired: Wiring) -> bool:
+    """Whether a meter shows that the loop of an input ran faster than it was recorded."""
+    each = (_meter(recording, x) for x in wired.inputs if _has(recording, x.command))
+    return any(meter is not None and meter.faster for meter in each)
 
 
 def _known(recording: Recording, wired: Wiring) -> NDArray[np.bool_]:
@@ -342,12 +349,10 @@ def _driving(
     recording = of_input(recording, x.command)
     column = recording.column(x.command)
     theta = values[:, sensors.index(x.centring)] if x.kp else None
-    v, edges = inputs.sent(recording, column, x.kp, theta, times, whole.gaps)
+    v, r, edges = inputs.sent(recording, column, x.kp, theta, times, whole.gaps)
     if slower:
         edges = edges | inputs.jumps(recording, column, x.kp, theta)
-    r, meter = v.copy(), inputs.MeterNoise()
-    if theta is not None:
-        r += x.kp * theta
+    meter = inputs.MeterNoise()
     if not as_sent and not recording.names("reference"):
         noisy = r
         r, meter = inputs.calibrated(noisy, recording.channels[column].resolution)

@@ -18,16 +18,19 @@ from table_kit import Effects, table_of
 
 from samii_rig.diagnose.diagnose import case_of, diagnose
 from samii_rig.diagnose.fit.exact import NINETY
+from samii_rig.diagnose.fit.explanations import Explanation
 from samii_rig.diagnose.forces.laws import HARDENING
 from samii_rig.diagnose.forces.paths import Span
 from samii_rig.diagnose.forces.problem import ForceProblem
 from samii_rig.diagnose.forces.search import ForceSearch
 from samii_rig.diagnose.forces.swings import Swings
 from samii_rig.diagnose.forces.variation import (
+    SWINGS_STILL,
     BySpring,
     Variation,
     _less,
     _repeats_differ,
+    _Taken,
     likelihood,
     of_its_own,
     variation,
@@ -90,6 +93,17 @@ def test_a_spring_that_swings_is_named_with_its_place_how_fast_and_by_how_much(
     monkeypatch.setattr(styles, "HIGH_HZ", (15.0, 15.0))
     truth, runs = concealed(tmp_path, monkeypatch, "in time", 5, "random", rig_toml=text)
     few = table_of(rig, *BAND, "actuator_lag", "added_mass")
+    closer = _Taken.closer
+
+    def watched(taken: _Taken, best: Explanation, seen: Modulation | None = None) -> bool:
+        """What one that is known still misses looks like another beside it."""
+        before = taken.swings
+        more = closer(taken, best, seen)
+        if before.hz.size:
+            assert taken.swings.hz.size == before.hz.size or before.left < SWINGS_STILL
+        return more
+
+    monkeypatch.setattr(_Taken, "closer", watched)
     found = diagnose(estimate(runs), rig, runs=runs, effects=few)
     assert truth["site"] == "spring_1"
     assert found.verdict == "named"

@@ -56,7 +56,7 @@ def recorded(times: int, kp: float = KP, seed: int = 1) -> Recording:
 @pytest.mark.parametrize("kp", [0.0, KP])
 def test_a_meters_noise_is_gone_and_the_hold_is_the_loops(times: int, kp: float) -> None:
     run = recorded(times, kp)
-    v, edges = sent(run, 1, kp, run.values[:, 2])
+    v, _, edges = sent(run, 1, kp, run.values[:, 2])
     # What a hold of T/times gives of a smooth law: its mean over the period before.
     half = 0.5 / (RATE * times)
     inner = np.linspace(-half, half, 41)
@@ -77,7 +77,7 @@ def test_how_often_the_loop_ran_is_told_and_so_is_what_was_sent(times: int, kp: 
         assert meter is not None
         assert meter.kp == kp
         assert abs(meter.late - 0.5 / times) < 5 * meter.sd < 5e-3
-        v, _ = sent(run, 1, KP, run.values[:, 2], times)
+        v, _, _ = sent(run, 1, KP, run.values[:, 2], times)
         np.testing.assert_array_equal(v, run.values[:, 0] - kp * run.values[:, 2])
 
 
@@ -111,7 +111,7 @@ def test_a_command_that_was_recorded_as_sent_is_left_as_it_is() -> None:
     run = Recording(
         run.channels, run.rate_hz, run.time, run.sequence, values, run.quality, run.segments
     )
-    v, _ = sent(run, 1, KP, values[:, 2])
+    v, _, _ = sent(run, 1, KP, values[:, 2])
     np.testing.assert_array_equal(v, values[:, 1])
 
 
@@ -122,7 +122,7 @@ def test_of_a_command_at_rest_the_loop_s_law_is_left_however_loud_the_meter(kp: 
     noise = METER * np.random.default_rng(2).standard_normal(N)
     run.values[:, 0], run.values[:, 1], run.values[:, 2] = 0.0, noise - kp * theta, theta
     assert kp * np.std(theta) < METER / 10
-    v, _ = sent(run, 1, kp, theta)
+    v, _, _ = sent(run, 1, kp, theta)
     assert np.std((v + kp * theta)[5:-5]) < METER / 100
 
 
@@ -132,14 +132,14 @@ def test_of_a_command_at_rest_what_the_law_does_not_say_is_left_as_it_is() -> No
     noise = METER * np.random.default_rng(2).standard_normal(N)
     # A loop of twice the gain that is stated.
     run.values[:, 0], run.values[:, 1] = 0.0, noise - 2 * KP * theta
-    v, _ = sent(run, 1, KP, theta)
+    v, _, _ = sent(run, 1, KP, theta)
     np.testing.assert_array_equal(v, run.values[:, 1])
 
 
 def test_a_clipped_command_is_no_meters_noise() -> None:
     run = recorded(2)
     run.values[:, 1] = np.clip(run.values[:, 1], -0.6, 0.6)
-    v, _ = sent(run, 1, KP, run.values[:, 2])
+    v, _, _ = sent(run, 1, KP, run.values[:, 2])
     np.testing.assert_array_equal(v, run.values[:, 1])
 
 
@@ -149,8 +149,25 @@ def test_without_a_reference_there_is_no_law() -> None:
         run.channels[1:], run.rate_hz, run.time, run.sequence, run.values[:, 1:],
         run.quality[:, 1:], (),
     )  # fmt: skip
-    v, _ = sent(run, 0, KP, run.values[:, 1])
+    v, _, _ = sent(run, 0, KP, run.values[:, 1])
     np.testing.assert_array_equal(v, run.values[:, 0])
+
+
+@pytest.mark.parametrize("times", [0, 4])
+def test_a_sensors_noise_is_none_of_what_drives_its_loop(times: int) -> None:
+    """It would drive a free change of the response to the sensor by the sensor itself."""
+    run = recorded(4)
+    own = 5e-3 * np.random.default_rng(3).standard_normal(N)
+    run.values[:, 2] += own
+    run.values[:, 1] -= KP * own  # the meter shows the noise that went round the loop, too
+    _, r, _ = sent(run, 1, KP, run.values[:, 2], times)
+    window = windows.hann(N)
+    above = np.fft.rfftfreq(N, 1 / RATE) > 100.0  # what is driven ends below
+
+    def largest(x: Float) -> float:
+        return float(np.max(np.abs(np.fft.rfft(window * x))[above]))
+
+    assert largest(r) < 0.1 * KP * largest(own)
 
 
 def test_an_edge_within_a_sample_is_told() -> None:
@@ -158,7 +175,7 @@ def test_an_edge_within_a_sample_is_told() -> None:
     run.values[3000:, 0] += 0.8
     run.values[3000, 1] += 0.4
     run.values[3001:, 1] += 0.8
-    v, edges = sent(run, 1, 0.0, None)
+    v, _, edges = sent(run, 1, 0.0, None)
     assert np.flatnonzero(edges).size > 0
     assert np.all(np.abs(np.flatnonzero(edges) - 3000) <= 3)
     assert np.std(v[:2990] - run.values[:2990, 1]) > METER / 2
@@ -170,7 +187,7 @@ def test_a_command_that_rests_for_most_of_the_record_is_left_as_it_is() -> None:
     run.values[N // 4 :, 0] = 0.0
     run.values[:, 1] = np.rint(run.values[:, 0] / STEP) * STEP
     run.values[N // 4 - 5 : N // 4 + 5, 1] += STEP
-    v, edges = sent(run, 1, 0.0, None)
+    v, _, edges = sent(run, 1, 0.0, None)
     np.testing.assert_array_equal(v, run.values[:, 1])
     assert not edges.any()
 

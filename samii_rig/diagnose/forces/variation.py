@@ -285,7 +285,9 @@ class _Taken:
         if not more and seen is not None:
             more = [(self.site, seen)]
         known = [*self.swings.hz, *(0.0 for one in self.modulations if one.hz == 0)]
-        if more and all(abs(more[0][1].hz - hz) > step for hz in known):
+        # What those that are known still miss looks like others beside them.
+        still = not self.swings.hz.size or self.swings.left < SWINGS_STILL
+        if still and more and all(abs(more[0][1].hz - hz) > step for hz in known):
             one = more[0][1].closer(self.pieces, step)
             self.modulations.append(one)
             self.repeats.append(_repeats_differ(self.pieces, one.hz))

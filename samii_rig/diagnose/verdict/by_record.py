@@ -17,6 +17,7 @@ from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import TEST_TURN, Whole
 from samii_rig.diagnose.fit.rigfile import explained
 from samii_rig.diagnose.fit.screen import Screen
+from samii_rig.diagnose.forces.fits import of_data
 from samii_rig.diagnose.forces.laws import STOPS
 from samii_rig.diagnose.forces.search import ForceSearch, compete_on_records
 from samii_rig.diagnose.forces.variation import (
@@ -65,14 +66,18 @@ def whole_of(
         return None
 
 
-def on_records(case: Case) -> RecordSearch | None:
-    """The search on whole records, where there are any.
+def on_records(case: Case, begun: ForceSearch | None = None) -> RecordSearch | None:
+    """The search on whole records, where there are any. begun : where the nominal model stands near
+    its fit to these.
 
     Raises EstimateError where they cannot be searched, and Welch's windows, which leak, are all
     that there is beside them.
     """
     try:
-        return None if case.whole is None else RecordSearch(case.whole, case.search)
+        if case.whole is None:
+            return None
+        first = begun.nominal.fitted if begun else None
+        return RecordSearch(case.whole, case.search, first)
     except EstimateError:
         if all(r.estimator in welch.METHODS for r in case.responses):
             raise
@@ -92,7 +97,8 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     forced = _winning(forces)
     if (beyond := _beyond(forces, search)) is not None:
         wide = replace(case, whole=beyond)
-        if (again := on_records(wide)) is not None:
+        # A mode above the band stands anywhere at first: the fit that has found it leads on.
+        if (again := on_records(wide, forces)) is not None:
             return by_records(wide, again)
     if forced is None or _may_be_linear(
         forced, level_dependent=case.search.lines.depends_on_level()
@@ -336,13 +342,15 @@ def forces_on(
 def _beyond(forces: ForceSearch | None, search: RecordSearch) -> Whole | None:
     """The records on lines that nothing excites for long, too, where a linear effect shows there by
     more than any on those that something does: a lightly damped mode rings where a record begins at
-    once, far above its band. None where that is not so."""
+    once, far above its band. What is wrong with the data is known from the band, and stays so.
+    None where that is not so."""
     whole = search.whole
     if forces is None or forces.won or not isinstance(whole, Whole) or whole.asked:
         return None
-    plain, nominal = forces.linear_part(forces.nominal)
-    ranked = ranking(Screen.of(plain.problem, nominal.fitted), search.table, (), plain.model)
-    within = search.nominal.fitted.cost - search.ranked()[0].fitted.cost
+    plain, meant = forces.linear_part(of_data(forces))
+    screen = Screen.of(plain.problem, meant.fitted)
+    ranked = ranking(screen, search.table, meant.effects, plain.model)
+    within = of_data(search).fitted.cost - search.ranked()[0].fitted.cost
     shows = bool(ranked) and ranked[0][0] > 2 * within + search.critical_value
     return whole.beyond() if shows else None
 
