@@ -184,8 +184,8 @@ class RecordSearch(Search):
     _between: tuple[Grid, Complex]  # the middles between nodes, and the reference there
     _of_lines = 1.0  # part of the lines that are looked at
 
-    def __init__(self, whole: Recorded, by_line: Search, begun: Fitted | None = None) -> None:
-        self.whole, self.by_line, self.begun = whole, by_line, begun
+    def __init__(self, whole: Recorded, by_line: Search) -> None:
+        self.whole, self.by_line = whole, by_line
         one = by_line
         super().__init__(one.rig, one.lines, one.grid, one.table, progress=one.progress)
 
@@ -252,8 +252,8 @@ class RecordSearch(Search):
         return refit(model, self.problem, x, far=False, steps=0)
 
     def first(self) -> Fitted:
-        """Where the nominal model starts: where it was begun, else where single lines have it."""
-        return self.begun or self.by_line.nominal.fitted
+        """Where the nominal model starts."""
+        return self.by_line.nominal.fitted
 
     def _about(self, fitted: Fitted) -> None:
         """The likelihood anew, about a fit."""

@@ -66,18 +66,14 @@ def whole_of(
         return None
 
 
-def on_records(case: Case, begun: ForceSearch | None = None) -> RecordSearch | None:
-    """The search on whole records, where there are any. begun : where the nominal model stands near
-    its fit to these.
+def on_records(case: Case) -> RecordSearch | None:
+    """The search on whole records, where there are any.
 
     Raises EstimateError where they cannot be searched, and Welch's windows, which leak, are all
     that there is beside them.
     """
     try:
-        if case.whole is None:
-            return None
-        first = begun.nominal.fitted if begun else None
-        return RecordSearch(case.whole, case.search, first)
+        return None if case.whole is None else RecordSearch(case.whole, case.search)
     except EstimateError:
         if all(r.estimator in welch.METHODS for r in case.responses):
             raise
@@ -97,8 +93,7 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     forced = _winning(forces)
     if (beyond := _beyond(forces, search)) is not None:
         wide = replace(case, whole=beyond)
-        # A mode above the band stands anywhere at first: the fit that has found it leads on.
-        if (again := on_records(wide, forces)) is not None:
+        if (again := on_records(wide)) is not None:
             return by_records(wide, again)
     if forced is None or _may_be_linear(
         forced, level_dependent=case.search.lines.depends_on_level()
