@@ -96,7 +96,6 @@ def control(o: ControlOptions) -> None:
 def _designed(o: ControlOptions, rig: Rig, text: str) -> tuple[str, Design, list[Settling]]:
     """The rig file that a loop is put in, "" where one was judged; it; what each recording
     shows of it."""
-    from rich.console import Console
 
     from samii_rig.control.design import Draws, Goals, design
     from samii_rig.control.identified import identified as take_in
@@ -114,7 +113,7 @@ def _designed(o: ControlOptions, rig: Rig, text: str) -> tuple[str, Design, list
         rig, text, known = found.rig, found.text, found.known
     recordings = [read_recording(path) for path in o.steps or ()]
     make_folder("--out", o.out)
-    with working(Console(stderr=True, highlight=False), "control", quiet=o.json) as say:
+    with working("control", quiet=o.json) as say:
         say("modes")
         made = design(
             rig,

@@ -297,7 +297,7 @@ def _together(o: DiagnoseOptions, logs: list[Path], earlier: list[Path]) -> None
 
     asked = _asked(o, logs, earlier)
     console = Console(highlight=False)
-    with working(Console(stderr=True), "diagnosis", quiet=o.json or o.quiet) as say:
+    with working("diagnosis", quiet=o.json or o.quiet) as say:
         found, responses = _found(o, asked, say)
     if asked.kept:
         keep_diagnosis(logs, found)

@@ -266,7 +266,7 @@ def report(o: ReportOptions) -> None:
     from samii_rig.report.summary import summary, working
 
     console = Console(highlight=False)
-    with working(Console(stderr=True), "report", quiet=o.json) as say:
+    with working("report", quiet=o.json) as say:
         say("recordings")
         recordings = read_all(o.logs)
         held = rig_of(recordings, o.rig)

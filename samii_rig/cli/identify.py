@@ -145,8 +145,6 @@ def _by_paper(
 ) -> Identified:
     from typing import cast
 
-    from rich.console import Console
-
     from samii_rig.identify import methods
     from samii_rig.identify.poses import at_pose
     from samii_rig.identify.table import method_table
@@ -156,7 +154,7 @@ def _by_paper(
         expected = "recordings in one pose, or --method likelihood"
         raise InputError("--method", "", o.method, expected)
     responses = Estimating(gaps=o.gaps, band=o.band).of(recordings)
-    with working(Console(stderr=True), "identifying", quiet=o.json):
+    with working("identifying", quiet=o.json):
         found = methods.from_responses(
             cast("methods.Method", o.method), responses, at_pose(rig, at[0]), o.free or (),
             outputs=o.output, band=o.band,
@@ -167,7 +165,6 @@ def _by_paper(
 def _by_likelihood(
     o: IdentifyOptions, recordings: list[Recording], rig: Rig, at: list[Angle]
 ) -> Identified:
-    from rich.console import Console
 
     from samii_rig.identify.maximum_likelihood import problem, solve
     from samii_rig.identify.parameters import uncertain
@@ -178,7 +175,7 @@ def _by_likelihood(
     # Recordings of one pose are pooled.
     estimating = Estimating(output=o.output, gaps=o.gaps, band=o.band)
     in_pose = [(r, pose) for pose, alike in by_pose(recordings, at) for r in estimating.of(alike)]
-    with working(Console(stderr=True), "identifying", quiet=o.json) as say:
+    with working("identifying", quiet=o.json) as say:
         posed = problem(
             [response for response, _ in in_pose], rig, o.free or uncertain(rig),
             prior=not o.free, band=o.band, poses=[one for _, one in in_pose],
@@ -190,8 +187,6 @@ def _by_likelihood(
 def _of_modes(o: IdentifyOptions, files: list[Path]) -> Identified:
     """From saved modes."""
     from typing import cast
-
-    from rich.console import Console
 
     from samii_rig.cli.arguments import check_free
 
@@ -212,7 +207,7 @@ def _of_modes(o: IdentifyOptions, files: list[Path]) -> Identified:
             raise InputError("--modes", "", str(path), "each file once, or its noise counts twice")
     saved = [level for path in files for level in saved_modes(path)]
     own = load_rig(o.rig)[0]
-    with working(Console(stderr=True), "identifying", quiet=o.json):
+    with working("identifying", quiet=o.json):
         found = identify_modes(
             saved, own, o.free or uncertain(own), prior=not o.free,
             use=cast("Use", o.use or "residues"),

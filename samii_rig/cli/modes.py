@@ -103,8 +103,6 @@ def _found(o: ModesOptions, wanted: Sequence[float]) -> tuple[Sequence[Modes], S
     """The modes, written where it is asked for, and what has none in words."""
     from json import dumps
 
-    from rich.console import Console
-
     from samii_rig.record.export import replacing
     from samii_rig.report.figures import save_figure
     from samii_rig.report.modes import modes_of
@@ -119,7 +117,7 @@ def _found(o: ModesOptions, wanted: Sequence[float]) -> tuple[Sequence[Modes], S
         )
         recordings, compared = read_all(o.logs), read_all(o.against or [])
         held = rig_of(recordings, o.rig)
-        with working(Console(stderr=True), "modes", quiet=o.json) as say:
+        with working("modes", quiet=o.json) as say:
             say("frequency responses")
             found, lost = modes_of(
                 _ordered(o.of(recordings)),

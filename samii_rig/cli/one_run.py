@@ -180,7 +180,7 @@ def _diagnosed(rig: Rig, outcome: Outcome, said: Said) -> Diagnosis | None:
     if not outcome.responses or not outcome.completed:
         return None
     try:
-        with working(said.console, "diagnosis", quiet=said.json) as say:
+        with working("diagnosis", quiet=said.json, console=said.console) as say:
             runs = [outcome.recording]
             return diagnose(outcome.responses, rig, progress=say, runs=runs)
     except (EstimateError, InputError) as error:

@@ -125,8 +125,6 @@ def _made(o: ProveOptions) -> list[str]:
     """Carry out what is asked for; what failed, in words."""
     import time
 
-    from rich.console import Console
-
     from samii_rig.progress import Counted
     from samii_rig.prove.campaign import Campaign, carry_out, claim
     from samii_rig.prove.jobs import jobs, pairs, plants
@@ -148,7 +146,7 @@ def _made(o: ProveOptions) -> list[str]:
     campaign = Campaign(out, rigs, keep=o.keep)
     until = time.monotonic() + 3600 * o.hours if o.hours else float("inf")
     with (
-        working(Console(stderr=True, highlight=False), "proof", quiet=o.json) as say,
+        working("proof", quiet=o.json) as say,
         at_work(o.workers, o.scheduler) as executor,
     ):
 

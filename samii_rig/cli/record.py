@@ -130,7 +130,7 @@ def _ordered(experiment: str, rig: str, said: Said, pose: str | None, *, dry_run
         the_rig, rig_text = posed(the_rig, pose), posed_text(rig_text, pose)
     order = Order.named(experiment, the_rig, rig_text)
     planned = order.runs()
-    with working(said.console, "predicting the run", quiet=said.json):
+    with working("predicting the run", quiet=said.json, console=said.console):
         runs = [run.predict(said.settings(i), said.operator) for i, run in enumerate(planned)]
     predicted = [run.predicted for run in runs]
     say_predictions(order.setups, predicted, said.console, dry_run=dry_run, json=said.json)

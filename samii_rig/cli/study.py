@@ -97,8 +97,6 @@ def _found(o: StudyOptions) -> Study:
     rig, text = load_rig(o.rig)
     varied = [values_of(rig, given) for given in o.vary]
 
-    from rich.console import Console
-
     from samii_rig.model.study import study as modes_over
     from samii_rig.progress import Counted
     from samii_rig.record.export import replacing
@@ -112,9 +110,7 @@ def _found(o: StudyOptions) -> Study:
     with ExitStack() as stack:
         # Opened first: a place that cannot be written to is said before the work, not after it.
         parts = [stack.enter_context(replacing(p)) if p else None for p in (o.out, o.plot)]
-        say = stack.enter_context(
-            working(Console(stderr=True, highlight=False), "study", quiet=o.json)
-        )
+        say = stack.enter_context(working("study", quiet=o.json))
         executor = stack.enter_context(at_work(o.workers, o.scheduler))
         found = modes_over(
             text,

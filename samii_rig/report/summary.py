@@ -148,13 +148,16 @@ class LiveProgress:
 
 
 @contextmanager
-def working(console: Console, what: str, *, quiet: bool = False) -> Iterator[Callable[[str], None]]:
+def working(
+    what: str, *, quiet: bool = False, console: Console | None = None
+) -> Iterator[Callable[[str], None]]:
     """Say what is being done and for how long; what is given says what comes next.
 
     Without a terminal it is one line for each stage that begins, whatever is counted in it: a log
     is read for the answer below.
-    quiet : say nothing.
+    quiet : say nothing. console : where it is said, the error output if None.
     """
+    console = console or Console(stderr=True)
     pace = Pace()
     if quiet:
         yield lambda stage: None

@@ -408,7 +408,7 @@ def test_progress_lives_on_a_terminal_and_is_one_line_a_segment_elsewhere():
 
 def test_who_waits_sees_what_is_tried_and_that_kernels_are_compiled():
     said = Console(file=io.StringIO(), width=40)  # a log's lines are not wrapped
-    with working(said, "diagnosis") as say:
+    with working("diagnosis", console=said) as say:
         say("what is missing")
         for tried in range(50):
             say(Counted("what is missing", tried, 50, within="round 1"))  # each soon after
