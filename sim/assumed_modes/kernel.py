@@ -73,16 +73,16 @@ class Converters(NamedTuple):
 @njit(cache=True)
 def smooth(law: int, p: Float, z: float, dz: float, t: float, memory: float, h: float) -> float:
     """The force of a smooth law at displacement z, velocity dz and time t."""
-    if law == 0:  # hardening, p = k3
+    if law == CUBIC:  # p = k3
         return float(-p[0] * z**3)
-    if law == 1:  # play, p = k, width: takes the joint's spring away inside it
+    if law == BACKLASH:  # p = k, width: takes the joint's spring away inside it
         half = 0.5 * p[1]
         return float(p[0] * min(max(z, -half), half))
-    if law == 3:  # Bouc-Wen, p = force at yield, displacement at yield, beta, (1 - beta), n
+    if law == BOUC_WEN:  # p = force at yield, displacement at yield, beta, (1 - beta), n
         return float(-p[0] * bouc_wen(p, dz, memory, h))
-    if law == 6:  # a damper that grows with the speed, p = c2
+    if law == DRAG:  # a damper that grows with the speed, p = c2
         return float(-p[0] * abs(dz) * dz)
-    if law == 7:  # stiffer to one side, p = dk
+    if law == ONE_SIDED:  # stiffer to one side, p = dk
         return float(-p[0] * max(z, 0.0))
     # parametric, p = k, depth 1, w1, depth 2, w2
     return float(-p[0] * z * (p[1] * np.sin(p[2] * t) + p[3] * np.sin(p[4] * t)))
@@ -220,26 +220,26 @@ def _with_laws(
     for i in range(n_law):
         u[first + i] = 0.0
         # Flow through an orifice: less under load, which is a chain's moment against v.
-        if laws.law[i] == 5:
+        if laws.law[i] == FLOW:
             d = laws.drive[i]
             u[d] *= np.sqrt(max(0.0, 1.0 + np.sign(u[d]) * z[2 * i] / laws.value[i, 0]))
-        elif laws.law[i] != 2:
+        elif laws.law[i] != FRICTION:
             u[first + i] = 0.5 * f[i]
     _put(x, np.dot(pieces.Phi[p], x) + np.dot(pieces.Gamma[p], u))
     _put(z, np.dot(pieces.Z, x))
     for i in range(n_law):
         law, value = laws.law[i], laws.value[i]
-        if law == 5:
+        if law == FLOW:
             continue
         at, speed = z[2 * i], z[2 * i + 1]
         push = 0.0
-        if law == 2:
+        if law == FRICTION:
             push = -speed / pieces.gv[p, i]
             push = min(max(push, -value[0]), value[0])
             f[i] = push
         else:
-            force = stop(value, at, pieces.g[p, i]) if law == 8 else f[i]
-            for _ in range(0 if law == 8 else ITERATIONS):
+            force = stop(value, at, pieces.g[p, i]) if law == STOP else f[i]
+            for _ in range(0 if law == STOP else ITERATIONS):
                 force = smooth(
                     law,
                     value,
@@ -250,7 +250,7 @@ def _with_laws(
                     h,
                 )
             push = 0.5 * force
-            if law == 3:
+            if law == BOUC_WEN:
                 memory[i] = bouc_wen(value, speed + pieces.gv[p, i] * push, memory[i], h)
             f[i] = force
         u[first + i] += push
