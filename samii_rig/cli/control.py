@@ -96,7 +96,6 @@ def control(o: ControlOptions) -> None:
 def _designed(o: ControlOptions, rig: Rig, text: str) -> tuple[str, Design, list[Settling]]:
     """The rig file that a loop is put in, "" where one was judged; it; what each recording
     shows of it."""
-
     from samii_rig.control.design import Draws, Goals, design
     from samii_rig.control.identified import identified as take_in
     from samii_rig.control.settle import settling

@@ -165,7 +165,6 @@ def _by_paper(
 def _by_likelihood(
     o: IdentifyOptions, recordings: list[Recording], rig: Rig, at: list[Angle]
 ) -> Identified:
-
     from samii_rig.identify.maximum_likelihood import problem, solve
     from samii_rig.identify.parameters import uncertain
     from samii_rig.identify.poses import by_pose

@@ -284,7 +284,7 @@ def pieces_of(
         if not known.any():
             continue
         whole = Bridged.of(recording, known, _driving_columns(recording, wired))
-        # Or as a meter shows, by how much faster than the record its loop ran or not.
+        # By the rig file, or as a meter shows, though not always by how much.
         slower = round(rig.rate_hz / recording.rate_hz) > 1 or _ran_faster(recording, wired)
         samples = _Samples.of(whole, rig, wired, slower=slower, times=times)
         for segment in segments_of(recording):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fake_device import fake_rig
 from scipy.signal import butter, sosfilt, windows
 
 from samii_rig.likelihood.inputs import (
@@ -18,6 +19,7 @@ from samii_rig.likelihood.inputs import (
     sent,
     times_of,
 )
+from samii_rig.likelihood.pieces import Input, Wiring, pieces_of
 from samii_rig.types import Channel, Float, Recording
 
 RATE, N, KP, STEP = 500.0, 6000, 3.0, 3e-4
@@ -179,6 +181,19 @@ def test_an_edge_within_a_sample_is_told() -> None:
     assert np.flatnonzero(edges).size > 0
     assert np.all(np.abs(np.flatnonzero(edges) - 3000) <= 3)
     assert np.std(v[:2990] - run.values[:2990, 1]) > METER / 2
+
+
+def test_a_jump_of_a_loop_that_ran_faster_than_the_record_lies_between_samples() -> None:
+    """As its meter shows, however many times as fast."""
+    run = recorded(4)
+    run.values[3000:, :2] += 0.15  # as the meter shows it, the law has it: it passes for no edge
+    theta = run.values[:, 2]
+    found = {4: Meter.of(run, 1, KP, theta), 1: Meter.of(recorded(1), 1, KP, theta)}
+    assert {times: m is not None and m.faster for times, m in found.items()} == {4: True, 1: False}
+    assert not sent(run, 1, KP, theta)[2].any()
+    wired = Wiring((Input("v", "theta", KP),), ("theta",))
+    (piece,) = pieces_of([run], fake_rig(), wired)
+    assert {2999, 3000} <= {at for at, _ in piece.edges}
 
 
 def test_a_command_that_rests_for_most_of_the_record_is_left_as_it_is() -> None:
