@@ -21,7 +21,9 @@ from samii_rig.errors import DeviceError
 ANSWER_WITHIN = 0.25  # s, of a question before the samples begin
 TRIES = 3
 GIVE_UP = 20_000_000  # ns after which a request has no reply any more
-SYNC = "SerialNumber"  # what is asked after a lost reply: what comes before its answer is late
+# What is asked after a lost reply: what comes before its answer is late. Where that stays out too,
+# another is asked: the answer to an earlier one says nothing of what was asked after it.
+SYNCS = ("SerialNumber", "Firmware", "CountsPerUnit", "Units")
 HANG = 1.0  # s without a turn of the thread after which it hangs
 QUIET = 4  # of a period goes by after a reply before the next request
 SAMPLES_KEPT = 65_536  # samples that wait for read()
@@ -73,7 +75,9 @@ class Reader:
         self._pending = False
         self._first: bytes | None = None
         self._whole: Reading | None = None
-        self._syncing, self._syncs = False, 0  # and questions asked whose answer may still come
+        # The question whose answer ends what is late, "" for none; and of each of them how often it
+        # was asked whose answer may still come.
+        self._syncing, self._syncs = "", dict.fromkeys(SYNCS, 0)
         self._turn = time.monotonic()
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, name="reader of the CAN bus", daemon=True)
@@ -85,7 +89,7 @@ class Reader:
 
     def ask(self, *messages: str, data: bytes = b"") -> list[bytes]:
         """The data of a reply in these messages; DeviceError if it does not come."""
-        for _ in range(TRIES):
+        for tried in range(TRIES):
             send(self._bus, self._frames.identifier(messages[0]), data)
             until = time.monotonic() + ANSWER_WITHIN
             replies: list[bytes] = []
@@ -98,8 +102,17 @@ class Reader:
                 elif self._fits(frame, messages[len(replies)]):
                     replies.append(bytes(frame.data))
             if len(replies) == len(messages):
+                if tried:
+                    self._clear()
                 return replies
         raise DeviceError(self._silent(messages[0]))
+
+    def _clear(self) -> None:
+        """Let pass what still comes: the answer to an earlier try would pass for that to the next
+        question, as the rows of the matrix have the same identifiers."""
+        until = time.monotonic() + ANSWER_WITHIN
+        while (left := until - time.monotonic()) > 0:
+            self._receive(left)
 
     def start(self) -> None:
         """Begin to sample."""
@@ -130,7 +143,7 @@ class Reader:
             while not self._ending.is_set():
                 self._turn = time.monotonic()
                 now = time.monotonic_ns()
-                busy = self._pending or self._syncing
+                busy = self._pending or bool(self._syncing)
                 wait = GIVE_UP if busy else max(self._due - now, 0)
                 frame = self._receive(min(wait, self._period) * 1e-9)
                 if frame is not None:
@@ -154,9 +167,9 @@ class Reader:
             self.counts.lost += self._pending
             self._drop()
             # The late reply of the lost request would look like that of the next one.
-            self._syncing, self._asked = True, now
-            self._syncs += 1
-            send(self._bus, self._frames.identifier(SYNC))
+            self._syncing, self._asked = min(SYNCS, key=self._syncs.__getitem__), now
+            self._syncs[self._syncing] += 1
+            send(self._bus, self._frames.identifier(self._syncing))
             return
         if now < self._due:
             return
@@ -202,9 +215,11 @@ class Reader:
             self._pending = False
             self._listen(now)
             return
-        if self._syncs and self._fits(frame, SYNC):
-            self._syncing = False
-            self._syncs -= 1
+        answered = next((q for q, n in self._syncs.items() if n and self._fits(frame, q)), "")
+        if answered:
+            self._syncs[answered] -= 1
+            if answered == self._syncing:
+                self._syncing = ""
             return
         if self._syncing and any(self._fits(frame, name) for name in SAMPLE):
             self.counts.late += 1

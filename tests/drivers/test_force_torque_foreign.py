@@ -8,11 +8,11 @@ from unittest.mock import patch
 import can
 import numpy as np
 from can_fuzz_kit import sensor
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from drivers.force_torque.frames import Frames
-from drivers.force_torque.reader import GIVE_UP, Reader
+from drivers.force_torque.frames import MATRIX, Frames
+from drivers.force_torque.reader import GIVE_UP, SYNCS, Reader
 from sim.wire.can_sensor import Sensor
 
 BASE = 0x20
@@ -42,11 +42,12 @@ class Bus:
     channel_info = "a bus"
 
     def __init__(self) -> None:
-        self.asked = self.sync = False
+        self.asked, self.sync = False, 0
 
     def send(self, frame: can.Message, timeout: float) -> None:
         self.asked = frame.arbitration_id == 0x200
-        self.sync = frame.arbitration_id == 0x205
+        questions = [FRAMES.identifier(name) for name in SYNCS]
+        self.sync = frame.arbitration_id if frame.arbitration_id in questions else 0
 
 
 def play(script: list[tuple[int | None, int | None, int | None, bool, bool]]) -> Reader:
@@ -63,10 +64,10 @@ def carried_out(script, clock) -> Reader:
     reader = Reader(bus, FRAMES, PERIOD)  # type: ignore[arg-type]
     for before, between, after, first, second in script:
         now = clock.now = clock.now + PERIOD
-        bus.asked = bus.sync = False
+        bus.asked, bus.sync = False, 0
         reader._go_on(now)
         if bus.sync:
-            reader._take(message(*SENSOR.answer(0x205, b"")[0]), now)
+            reader._take(message(*SENSOR.answer(bus.sync, b"")[0]), now)
         frames: list[can.Message] = []
         own = pair(SENSOR) if bus.asked else []
         for stranger, mine, kept in ((before, 0, first), (between, 1, second)):
@@ -114,6 +115,40 @@ def test_frames_that_are_lost_are_counted_and_blamed_on_nobody(script):
     assert TRUE != FALSE
 
 
+@settings(max_examples=300)
+@given(st.lists(st.tuples(st.integers(0, 3), st.sampled_from([0, 1, GIVE_UP])), max_size=40))
+@example([(0, GIVE_UP), (0, GIVE_UP), (2, 0), (0, GIVE_UP), (0, GIVE_UP), (2, 0), (3, 0), (3, 0)])
+def test_a_sensor_that_stalls_and_answers_all_in_order_is_no_other_sender(script):
+    """What it answers at a time, and how long it then stalls: no answer is that of a later request.
+    A reply to one that was given up came behind the answer to the first of two questions."""
+    clock = SimpleNamespace(now=0, monotonic=lambda: 0.0)
+    clock.monotonic_ns = lambda: clock.now
+    asked: list[int] = []
+    bus = SimpleNamespace(
+        channel_info="a bus", send=lambda frame, timeout: asked.append(frame.arbitration_id)
+    )
+    loads = np.zeros(6)
+    own = Sensor(BASE, lambda: loads, 400.0)
+    with patch("drivers.force_torque.reader.time", clock):
+        reader = Reader(bus, FRAMES, PERIOD)  # type: ignore[arg-type]
+        for answered, stalls in [*script, *[(3, 0)] * 8]:
+            clock.now += PERIOD
+            reader._go_on(clock.now)
+            for identifier in [asked.pop(0) for _ in range(min(answered, len(asked)))]:
+                loads[5] += identifier == 0x200  # a newton metre more with each request
+                for frame in own.answer(identifier, b""):
+                    reader._take(message(*frame), clock.now)
+            clock.now += stalls
+    assert not reader.trouble
+    assert reader.counts.foreign == 0
+    assert len(reader.samples) >= 2
+    of_request = {}
+    for n in range(1, reader.counts.requests + 1):
+        loads[5] = n
+        of_request[n] = FRAMES.gauges(*(d for _, d in own.answer(0x200, b""))).counts.tolist()
+    assert all(r.gauges.counts.tolist() == of_request[r.number] for r in reader.samples)
+
+
 def test_a_foreign_second_frame_is_told_also_where_the_next_request_is_overdue():
     clock = SimpleNamespace(now=0, monotonic=lambda: 0.0)
     clock.monotonic_ns = lambda: clock.now
@@ -132,6 +167,33 @@ def test_a_foreign_second_frame_is_told_also_where_the_next_request_is_overdue()
         reader._take(own[1], clock.now)
     assert "another sender" in reader.trouble
     assert not reader.samples
+
+
+def test_a_late_row_of_the_matrix_is_not_taken_for_the_next():
+    """Its second try is answered, too, and a reply does not tell of which row it is."""
+    clock = SimpleNamespace(now=0.0)
+    clock.monotonic = lambda: clock.now
+    coming: list[tuple[float, can.Message]] = []
+
+    def send(frame, timeout):
+        when = max(clock.now, 0.3)  # s, after the first try was given up
+        answer = SENSOR.answer(frame.arbitration_id, bytes(frame.data))
+        coming.extend((when, message(*each)) for each in answer)
+
+    def recv(seconds):
+        if coming and coming[0][0] <= clock.now + seconds:
+            when, frame = coming.pop(0)
+            clock.now = max(clock.now, when)
+            return frame
+        clock.now += seconds
+        return None
+
+    bus = SimpleNamespace(channel_info="a bus", send=send, recv=recv)
+    with patch("drivers.force_torque.reader.time", clock):
+        reader = Reader(bus, FRAMES, PERIOD)  # type: ignore[arg-type]
+        for i in range(6):
+            true = [data for _, data in SENSOR.answer(0x202, bytes([i]))]
+            assert reader.ask(*MATRIX, data=bytes([i])) == true
 
 
 def test_no_damage_on_the_bus_becomes_a_sample_that_was_not_sent():

@@ -38,8 +38,11 @@ BITS = {
     12: "ThermistorLow",
     13: "Converter",
 }
-GAUGES, MATRIX_ROW, SERIAL = 0x200, 0x202, 0x205
-SHAPES = {GAUGES: 8, 0x201: 6, MATRIX_ROW: 8, 0x203: 8, 0x204: 8, SERIAL: 8}
+GAUGES, MATRIX_ROW = 0x200, 0x202
+# Serial number, counts per unit, units and firmware: what may be asked after a lost reply.
+FIXED = {0x205: b"FT-00017", 0x207: bytes(7) + b"d", 0x208: b"\2\3", 0x20F: b"\1\2\0\3"}
+SHAPES = {GAUGES: 8, 0x201: 6, MATRIX_ROW: 8, 0x203: 8, 0x204: 8}
+SHAPES |= {identifier: len(data) for identifier, data in FIXED.items()}
 OURS = range(0x200, 0x210)
 
 
@@ -76,8 +79,8 @@ class Bus:
         del timeout
         if frame.arbitration_id == GAUGES:
             self._sample()
-        elif frame.arbitration_id == SERIAL:
-            self._put([(SERIAL, b"FT-00017")] if self.rng.random() < 0.8 else [])
+        elif (said := FIXED.get(frame.arbitration_id)) is not None:
+            self._put([(frame.arbitration_id, said)] if self.rng.random() < 0.8 else [])
         else:
             self._row(frame.data[0])
 
