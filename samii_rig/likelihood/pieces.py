@@ -298,14 +298,17 @@ def pieces_of(
 def faster(recordings: Sequence[Recording], wired: Wiring) -> int:
     """How often the rig's loop ran for each sample that was recorded, by what a meter shows of its
     commands; 0 where these were recorded as they were sent, or do not show it."""
-    each = ((r, x) for r in recordings for x in wired.inputs if _has(r, x.command))
-    return inputs.times_of([_meter(r, x) for r, x in each])
+    return inputs.times_of([meter for r in recordings for meter in _meters(r, wired)])
 
 
 def _ran_faster(recording: Recording, wired: Wiring) -> bool:
     """Whether a meter shows that the loop of an input ran faster than it was recorded."""
-    each = (_meter(recording, x) for x in wired.inputs if _has(recording, x.command))
-    return any(meter is not None and meter.faster for meter in each)
+    return any(meter is not None and meter.faster for meter in _meters(recording, wired))
+
+
+def _meters(recording: Recording, wired: Wiring) -> Iterator[inputs.Meter | None]:
+    """What a meter showed of each input that was recorded."""
+    return (_meter(recording, x) for x in wired.inputs if _has(recording, x.command))
 
 
 def _known(recording: Recording, wired: Wiring) -> NDArray[np.bool_]:

@@ -31,7 +31,6 @@ from samii_rig.run.sink import Collector, QueuedSink, Sink, pair_clocks
 from samii_rig.safety.gate import Gate, GateEvent
 from samii_rig.safety.judgement import State
 from samii_rig.safety.latest import CLOCK_DRIFT
-from samii_rig.safety.limits import MAX_AHEAD
 from samii_rig.types import Quality, SampleBlock, Segment, StopRecord
 
 FIRST_SAMPLE = 1.0  # s to wait for the device's first sample
@@ -105,14 +104,14 @@ class _Run:
         simulated = device.metadata.get("clock") == "simulated"
         self.tick = choose_tick(settings, device, plan.rate_hz, simulated)
         self.ahead = math.ceil((choose_ahead(settings, simulated) + self.tick) * plan.rate_hz)
-        # Samples past the newest one that the gate takes.
-        self.most_ahead = math.floor(MAX_AHEAD * plan.rate_hz)
         self.reports = self.sensor if isinstance(self.sensor, Reports) else None
         self.reference = Reference(plan)
         self.collector = Collector(
             rig, plan, self.reference, self.sensor.channels, max(1, round(GATHER * plan.rate_hz))
         )
         limits = plan_limits(plan, rig, settings.heartbeat_age)
+        # Samples past the newest one that the gate takes.
+        self.most_ahead = math.floor(min(one.max_ahead for one in limits) * plan.rate_hz)
         self.gate = Gate(device.actuator, limits, self.sensor.channels, self._log)
         self.zero = Zero(device, *(one.output for one in limits))
         self.watch = Watch(self.reference, self.sensor.channels, plan.actuator)

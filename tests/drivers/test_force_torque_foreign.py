@@ -7,7 +7,7 @@ from unittest.mock import patch
 
 import can
 import numpy as np
-from can_fuzz_kit import sensor
+from can_fuzz_kit import sensor, stepped_clock
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -17,6 +17,7 @@ from sim.wire.can_sensor import Sensor
 
 BASE = 0x20
 FRAMES = Frames(BASE)
+QUESTIONS = [FRAMES.identifier(name) for name in SYNCS]
 PERIOD = 2_000_000
 OWN, FOREIGN = 60.0, -300.0  # N m
 SENSOR = Sensor(BASE, lambda: np.array([0, 0, 0, 0, 0, OWN]), 400.0)
@@ -37,7 +38,8 @@ STRANGERS = [*pair(OTHER), message(0x200, bytes(3)), message(0x207, bytes(8)), m
 
 
 class Bus:
-    """Takes requests; `asked` tells that one for a sample came, `sync` one after a lost reply."""
+    """Takes requests; `asked` tells that one for a sample came, `sync` which question after a lost
+    reply, 0 for none."""
 
     channel_info = "a bus"
 
@@ -46,15 +48,13 @@ class Bus:
 
     def send(self, frame: can.Message, timeout: float) -> None:
         self.asked = frame.arbitration_id == 0x200
-        questions = [FRAMES.identifier(name) for name in SYNCS]
-        self.sync = frame.arbitration_id if frame.arbitration_id in questions else 0
+        self.sync = frame.arbitration_id if frame.arbitration_id in QUESTIONS else 0
 
 
 def play(script: list[tuple[int | None, int | None, int | None, bool, bool]]) -> Reader:
     """One request after the other: strangers before, between and after the two frames of each
     reply, of which the first or the second may be lost."""
-    clock = SimpleNamespace(now=0, monotonic=lambda: 0.0)
-    clock.monotonic_ns = lambda: clock.now
+    clock = stepped_clock()
     with patch("drivers.force_torque.reader.time", clock):
         return carried_out(script, clock)
 
@@ -121,8 +121,7 @@ def test_frames_that_are_lost_are_counted_and_blamed_on_nobody(script):
 def test_a_sensor_that_stalls_and_answers_all_in_order_is_no_other_sender(script):
     """What it answers at a time, and how long it then stalls: no answer is that of a later request.
     A reply to one that was given up came behind the answer to the first of two questions."""
-    clock = SimpleNamespace(now=0, monotonic=lambda: 0.0)
-    clock.monotonic_ns = lambda: clock.now
+    clock = stepped_clock()
     asked: list[int] = []
     bus = SimpleNamespace(
         channel_info="a bus", send=lambda frame, timeout: asked.append(frame.arbitration_id)
@@ -150,8 +149,7 @@ def test_a_sensor_that_stalls_and_answers_all_in_order_is_no_other_sender(script
 
 
 def test_a_foreign_second_frame_is_told_also_where_the_next_request_is_overdue():
-    clock = SimpleNamespace(now=0, monotonic=lambda: 0.0)
-    clock.monotonic_ns = lambda: clock.now
+    clock = stepped_clock()
     with patch("drivers.force_torque.reader.time", clock):
         bus = Bus()
         reader = Reader(bus, FRAMES, PERIOD)  # type: ignore[arg-type]
@@ -171,21 +169,21 @@ def test_a_foreign_second_frame_is_told_also_where_the_next_request_is_overdue()
 
 def test_a_late_row_of_the_matrix_is_not_taken_for_the_next():
     """Its second try is answered, too, and a reply does not tell of which row it is."""
-    clock = SimpleNamespace(now=0.0)
-    clock.monotonic = lambda: clock.now
-    coming: list[tuple[float, can.Message]] = []
+    clock = stepped_clock()
+    coming: list[tuple[int, can.Message]] = []
 
     def send(frame, timeout):
-        when = max(clock.now, 0.3)  # s, after the first try was given up
+        when = max(clock.now, 300_000_000)  # ns, after the first try was given up
         answer = SENSOR.answer(frame.arbitration_id, bytes(frame.data))
         coming.extend((when, message(*each)) for each in answer)
 
     def recv(seconds):
-        if coming and coming[0][0] <= clock.now + seconds:
+        until = clock.now + round(seconds * 1e9) + 1
+        if coming and coming[0][0] <= until:
             when, frame = coming.pop(0)
             clock.now = max(clock.now, when)
             return frame
-        clock.now += seconds
+        clock.now = until
         return None
 
     bus = SimpleNamespace(channel_info="a bus", send=send, recv=recv)
