@@ -197,6 +197,7 @@ def minimise(
     *,
     tolerance: float = 1e-9,
     damping: float = NEAR,
+    trials: int = TRIALS,
 ) -> Minimum:
     """A local minimum of the sum of squares within bounds.
 
@@ -207,7 +208,7 @@ def minimise(
     evaluated : residuals (n,) and their Jacobian (n, k) at x, or what computes that, which is
         asked for where a step was not refused.
     tolerance : of the cost and of x, relative, at which it ends.
-    damping : the first one, of the squared norm of a column.
+    damping : the first one, of the squared norm of a column. trials : at most.
     """
     norms, J = np.zeros(start.size), np.zeros((0, start.size))  # J where the last step went
 
@@ -240,7 +241,7 @@ def minimise(
         return p.expected < tolerance * p.cost
 
     first = point(np.clip(start, lower, upper))
-    end = descend(first, normal, trial, settled, ByGain(damping), trials=TRIALS)
+    end = descend(first, normal, trial, settled, ByGain(damping), trials=trials)
     return Minimum(end.at.x, end.at.cost / 2, J, end.settled)
 
 

@@ -205,10 +205,10 @@ def test_what_stands_beside_a_force_must_do_a_hundredth_of_it(physics, left, nee
         for name, effects in (("nominal", ()), ("force", (one,)))
     )
     search = SimpleNamespace(
-        nominal=nominal, critical_value=30.0, overdispersion=1.0, spread=1e-4,
+        nominal=nominal, critical_value_of=lambda _: 30.0, overdispersion=1.0, spread=1e-4,
         ratio=lambda _: left,
     )  # fmt: skip
-    assert _critical_value(search, less) == pytest.approx(needed)
+    assert _critical_value(search, less, less) == pytest.approx(needed)
 
 
 def test_several_effects_that_leave_much_are_no_answer_whatever_a_force_is_confirmed_to_be():

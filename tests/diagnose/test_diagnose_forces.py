@@ -24,7 +24,7 @@ from samii_rig.diagnose.fit.refit import Fitted, Problem
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.fit.stated import IN_DATA
 from samii_rig.diagnose.forces import beside as beside_force
-from samii_rig.diagnose.forces.fits import ForceFits
+from samii_rig.diagnose.forces.fits import MOST_MARCHED, ForceFits
 from samii_rig.diagnose.forces.laws import CLIPPED
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.problem import ForceProblem
@@ -211,7 +211,7 @@ def test_a_linear_effect_beside_a_force_must_show_in_the_data(gained: float, tol
     search = SimpleNamespace(
         found={one.key: one},
         overdispersion=1.0,
-        critical_value=IN_DATA,
+        critical_value_of=lambda _: IN_DATA,
         nominal=SimpleNamespace(effects=(), fitted=fit_of(5000.0)),
         ratio=lambda _: 1.0,
         spread=1e-3,
@@ -236,7 +236,7 @@ def test_several_effects_must_outdo_a_law_by_more_than_it_is_off(
     search = SimpleNamespace(
         found={one.key: one},
         overdispersion=1.0,
-        critical_value=IN_DATA,
+        critical_value_of=lambda _: IN_DATA,
         nominal=SimpleNamespace(fitted=fit_of(1.6e6)),
         without=lambda _e, _i: without,
     )
@@ -434,7 +434,33 @@ def test_a_refit_by_differences_that_begins_where_no_rig_is_ends_in_none() -> No
         raise InputError("rig", "element", "pole at 1 rad/s", "a stable chain")
 
     nothing = SimpleNamespace(goal=np.zeros(4), at=None, residual=np.real)
-    search = SimpleNamespace(_force_problem=nothing, _ways=SimpleNamespace(clear=lambda: None))
+    ways = SimpleNamespace(clear=lambda: None, marched=0)
+    levels = SimpleNamespace(
+        records=SimpleNamespace(pieces=(SimpleNamespace(r=np.zeros(4)),)), every=1
+    )
+    search = SimpleNamespace(_force_problem=nothing, _ways=ways, levels=levels)
     bounds = {"lower": -np.ones(2), "upper": np.ones(2)}
     model = SimpleNamespace(n=2, n_nominal=1, prior=np.ones(2), response=response, **bounds)
     assert ForceFits.refitted_exactly(search, model, np.zeros(2)) is None
+
+
+@pytest.mark.parametrize(("marched", "end"), [(0, 0.0), (MOST_MARCHED, 3.0)])
+def test_a_refit_by_differences_ends_with_what_a_person_waits_for(marched: int, end: float) -> None:
+    """From far above the root of exp(x) - 1, where Newton's steps go down by one."""
+
+    def response(x: np.ndarray, _at: object) -> np.ndarray:
+        return np.exp(x[:1, None]).astype(complex)
+
+    nothing = SimpleNamespace(
+        goal=np.zeros(1), at=None,
+        residual=lambda h: 1e3 * (h[0].real - 1.0), whiten=lambda dh: 1e3 * dh[0].real,
+    )  # fmt: skip
+    ways = SimpleNamespace(clear=lambda: None, marched=marched)
+    pieces = (SimpleNamespace(r=np.zeros(100)),)
+    levels = SimpleNamespace(records=SimpleNamespace(pieces=pieces), every=1)
+    search = SimpleNamespace(_force_problem=nothing, _ways=ways, levels=levels)
+    bounds = {"lower": -9 * np.ones(1), "upper": 9 * np.ones(1)}
+    model = SimpleNamespace(n=1, n_nominal=1, prior=np.ones(1), response=response, **bounds)
+    found = ForceFits.refitted_exactly(search, model, np.array([4.0]))
+    assert found is not None
+    assert found.x[0] == pytest.approx(end, abs=0.1)

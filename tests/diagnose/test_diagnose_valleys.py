@@ -161,7 +161,7 @@ def searched(found):
     """A search that found these, the first with nothing missing."""
     search = SimpleNamespace(
         found={e.key: e for e in found},
-        critical_value=28.0,
+        critical_value_of=lambda _: 28.0,
         overdispersion=1.0,
         nominal=found[0],
         without=lambda e, i: search.found[e.key - {e.effects[i].key}],

@@ -214,6 +214,10 @@ class Explanations:
         """Chi-square that an effect must explain of the data to be called missing."""
         return IN_DATA
 
+    def critical_value_of(self, effects: Iterable[Effect]) -> float:
+        """The same of these effects, as far as their physics asks for more."""
+        return self.critical_value
+
     @property
     def spread(self) -> float:
         """Relative variance of chi-square over all lines."""

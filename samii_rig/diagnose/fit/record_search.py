@@ -8,9 +8,9 @@ better there: a first step from far away, and pictures.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -23,6 +23,7 @@ from samii_rig.diagnose.fit.gap import gap_of
 from samii_rig.diagnose.fit.refit import Fitted, Problem, counted, refit
 from samii_rig.diagnose.fit.search import Search
 from samii_rig.diagnose.fit.usual import RECORDS
+from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.grid import Grid
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.diagnose.physics.rows import RESONANT
@@ -177,6 +178,17 @@ class RecordProblem(Problem):
         return F, (F.T @ F).reshape(n, 2 * q, n, 2 * q)
 
 
+@lru_cache(maxsize=64)
+def _reached(unknowns: tuple[int, ...]) -> float:
+    """Chi-square that noise reaches in the best of effects of so many unknowns each, with half of
+    `ALARM`: the other half is that of effects that resonate."""
+
+    def false_alarm(t: float) -> float:
+        return float(np.sum(stats.chi2.sf(t, unknowns or (1,)))) - ALARM / 2
+
+    return float(optimize.brentq(false_alarm, 1.0, HIGHEST_CRITICAL))
+
+
 class RecordSearch(Search):
     """As `Search`, on whole records."""
 
@@ -303,21 +315,18 @@ class RecordSearch(Search):
 
     @property
     def critical_value(self) -> float:
-        """As of `Explanations`: with `ALARM`, noise reaches it in the best of the whole table."""
-        if not self.table:
-            return float(stats.chi2.isf(ALARM, 1))
-        unknowns = np.array([max(len(e.unknowns), 1) for e in self.table])
-        trials = np.ones(unknowns.size)
-        # What resonates is looked for at every line: as many trials of its mass and phase, alike at
-        # neighbouring places (a bound of the maximum of a scan; Davies 1987, Biometrika 74).
-        resonant = np.array([e.physics in RESONANT for e in self.table], bool)
-        unknowns[resonant] = 2
-        trials[resonant] = 2 * self.whole.lines / max(int(np.count_nonzero(resonant)), 1)
+        """As of `Explanations`, of what does not resonate: with `ALARM`, noise reaches it in the
+        best of the table, or what `critical_value_of` says in what resonates."""
+        others = (e for e in self.table if e.physics not in RESONANT)
+        return _reached(tuple(max(len(e.unknowns), 1) for e in others))
 
-        def false_alarm(t: float) -> float:
-            return float(trials @ stats.chi2.sf(t, unknowns)) - ALARM
-
-        return float(optimize.brentq(false_alarm, 1.0, HIGHEST_CRITICAL))
+    def critical_value_of(self, effects: Iterable[Effect]) -> float:
+        """As of `Explanations`. What resonates is looked for at every line: as many trials of its
+        mass and phase, alike at neighbouring places (a bound of the maximum of a scan; Davies 1987,
+        Biometrika 74)."""
+        if all(e.physics not in RESONANT for e in effects):
+            return self.critical_value
+        return max(float(stats.chi2.isf(ALARM / (4 * self.whole.lines), 2)), self.critical_value)
 
     def ratio(self, fitted: Fitted) -> float:
         """Chi-square per degree of freedom of what a change of the response explains."""

@@ -180,12 +180,13 @@ class BesideForce(ForceFits):
             Screen.of(plain.problem, rest.fitted), self.linear.table, (), plain.model
         )[:BESIDE]:
             effects = (*best.effects, effect)
-            if drop < self.critical_value / 2 or self.model(effects) is None:
+            needed = self.critical_value_of((effect,))
+            if drop < needed / 2 or self.model(effects) is None:
                 continue
             end = self.refitted(effects, best, np.log(starts[0]).tolist())
             alone = [best, self.found.get(frozenset({effect.key}))]
             if end is not None and all(
-                e is None or e.fitted.chi2 - end.chi2 > self.critical_value for e in alone
+                e is None or e.fitted.chi2 - end.chi2 > needed for e in alone
             ):
                 self._renewed(effects, end.x)
 

@@ -31,7 +31,7 @@ from samii_rig.diagnose.forces.way import Ways
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.diagnose.physics.model import Model
 from samii_rig.errors import SamiiRigError
-from samii_rig.levenberg import minimise
+from samii_rig.levenberg import TRIALS, minimise
 from samii_rig.likelihood.reduce import LineResiduals
 from samii_rig.likelihood.unexplained import Unexplained, unexplained
 from samii_rig.types import Complex, Float
@@ -51,23 +51,24 @@ RIVALS = 4  # linear explanations that forces are held against
 class ForceFits(RecordSearch):
     """Explanations with and without a force, on the complete likelihood, every level by itself.
 
-    own_power : as of `Complete.about`. handed : keys of explanations of an earlier search.
+    own_power : as of `Complete.about`. handed : keys of explanations of an earlier search; None
+        where there was none.
     """
 
     own_power: Float | None = None
 
-    def __init__(self, linear: RecordSearch, known: Sequence[Explanation] = ()) -> None:
+    def __init__(self, linear: RecordSearch, known: Sequence[Explanation] | None = None) -> None:
         assert isinstance(linear.whole, Whole)  # of one state
         self.levels = whole = linear.whole.by_level().with_harmonics()
         self._ways = Ways(acting=tuple(whole.acting.tolist()))
         self.linear = linear
-        self.handed = {e.key for e in known}
+        self.handed = None if known is None else {e.key for e in known}
         moved = of_data(linear).fitted
         self.paths = TransferPaths(whole, moved.model, moved.x)
         self.forces = tuple(forces(whole.rig, self.paths))
         super().__init__(whole, linear.by_line)
         self.use((*linear.table, *self.forces))
-        self._again(known)
+        self._again(known or ())
 
     def __post_init__(self) -> None:
         self.stage = self.linear.stage
@@ -143,7 +144,8 @@ class ForceFits(RecordSearch):
 
     def refitted_exactly(self, model: Model, start: Float) -> Fitted | None:
         """As `refitted_from`, the chain through which the force acts that of every step, and every
-        slope by a difference; None where the rig has no partial fractions or is not stable."""
+        slope by a difference, as long as the search is not exhausted; None where the rig has no
+        partial fractions or is not stable."""
         problem, prior = self._force_problem, model.prior[: model.n_nominal]
         pulls = np.eye(model.n_nominal, model.n) / prior[:, None]
         strengths = list(model.unknowns) if isinstance(model, ForceModel) else []
@@ -181,8 +183,14 @@ class ForceFits(RecordSearch):
 
             return np.concatenate([problem.residual(h), pulls @ x]), slopes
 
+        before = self._ways.marched
+        every_slope = (1 + model.n) * sum(len(p.r) for p in self.levels.records.pieces)
+        trials = max((MOST_MARCHED - before) // (every_slope * self.levels.every), 1)
         try:
-            end = minimise(evaluated, start, model.lower, model.upper, tolerance=EXACT_ENDS)
+            end = minimise(
+                evaluated, start, model.lower, model.upper,
+                tolerance=EXACT_ENDS, trials=min(trials, TRIALS),
+            )  # fmt: skip
         except (SamiiRigError, np.linalg.LinAlgError):  # no rig at the start, or on either side
             return None
         if 2 * end.cost >= NOWHERE**2:

@@ -105,11 +105,12 @@ class ForceSearch(BesideForce):
         it, and stand about it where these are more likely with the noise that it leaves.
 
         promising : whether any force promises something in the noise as it is estimated: each true
-        one that passed for noise did.
+        one that passed for noise did. An earlier search has looked beside the very same nominal
+        model.
         """
-        before = self.ranked()
-        known = next((e for e in before if e.key in self.handed and _alone(e)), None)
-        if not (promising or known):
+        before, handed = self.ranked(), self.handed or ()
+        known = next((e for e in before if e.key in handed and _alone(e)), None)
+        if known is None and (self.handed is not None or not promising):
             return
         whole = self.linear.whole
         assert isinstance(whole, Whole)  # of one state
@@ -333,9 +334,11 @@ class ForceSearch(BesideForce):
         return best
 
 
-def compete_on_records(linear: RecordSearch, known: Sequence[Explanation] = ()) -> ForceSearch:
+def compete_on_records(
+    linear: RecordSearch, known: Sequence[Explanation] | None = None
+) -> ForceSearch:
     """Let forces compete with what the linear search of whole records found. known : explanations
-    with a force, of an earlier search.
+    with a force, of an earlier search; None where there was none.
 
     Raises SamiiRigError where no force can be computed on this rig.
     """

@@ -324,7 +324,7 @@ def _of_lengths(
 
 
 def forces_on(
-    search: RecordSearch, known: Sequence[Explanation] = ()
+    search: RecordSearch, known: Sequence[Explanation] | None = None
 ) -> tuple[ForceSearch | None, tuple[str, ...]]:
     """The search among forces; None where the rig has no partial fractions in which they could be
     computed, and that in words. known : as of `compete_on_records`."""
@@ -346,7 +346,7 @@ def _beyond(forces: ForceSearch | None, search: RecordSearch) -> Whole | None:
     screen = Screen.of(plain.problem, meant.fitted)
     ranked = ranking(screen, search.table, meant.effects, plain.model)
     within = of_data(search).fitted.cost - search.ranked()[0].fitted.cost
-    shows = bool(ranked) and ranked[0][0] > 2 * within + search.critical_value
+    shows = any(gain > 2 * within + search.critical_value_of((e,)) for gain, e, _ in ranked)
     return whole.beyond() if shows else None
 
 

@@ -34,14 +34,15 @@ def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
     """Of each physics and site, beside what was found, the smallest that would have been seen."""
     screen = Screen.of(search.problem, _pinned(best.fitted)).of_data()
     screens = screen.unprojected(), screen
-    needed = math.sqrt(search.critical_value * search.overdispersion) + float(stats.norm.ppf(FOUND))
+    found_by = float(stats.norm.ppf(FOUND))
     found: dict[tuple[str, str], Hiding] = {}
     taken = {e.key for e in best.effects}
     for effect in search.table:
         plain = effect.unknowns and effect.force is None and effect.physical
         crack = effect.pieces and effect.physics in SOFT  # a joint is asked for, not every one
         if plain and not crack and effect.key not in taken and effect.name not in found:
-            seen = _smallest(search, best, screens, effect, needed)
+            least = search.critical_value_of((effect,)) * search.overdispersion
+            seen = _smallest(search, best, screens, effect, math.sqrt(least) + found_by)
             if seen is not None:
                 found[effect.name] = seen
     return tuple(found.values())

@@ -138,7 +138,7 @@ def _changing(
     if any(e.force is not None for e in best.effects):
         return None
     if decide is not None and evidence.held > threshold(decide.spread):
-        absorbed = evidence.drop <= search.critical_value
+        absorbed = evidence.drop <= evidence.worth
         base = search.nominal if absorbed else best
         return between_runs(search, base.fitted, decide)
     return None
@@ -209,7 +209,7 @@ def _evidence(
         names=chosen.names(),
         pair=len(physics) == 2 and physics[0] == physics[1],
         closed=search.closed(base, first.fitted),
-        worth=search.critical_value,
+        worth=search.critical_value_of(first.effects),
     )
 
 
@@ -249,7 +249,7 @@ def _verdict(
     # What a refit of the nominal parameters absorbs, at the cost of values that their tolerances
     # make unlikely, is not in the data; what is no physics is told beside the verdict.
     physics = [e for e in chosen.first.effects if e.physical]
-    if not physics or evidence.drop <= search.critical_value:
+    if not physics or evidence.drop <= evidence.worth:
         return "unknown" if _unexplained(evidence, search, decide) else "no_mismatch"
     if evidence.names > MOST_NAMES:
         return "unknown"
@@ -350,15 +350,16 @@ def _is_insignificant(search: Search, e: Explanation) -> bool:
             # or not at all.
             fewer.append(search.found.get(e.key - {effect.key}))
     return any(
-        less is not None and less.fitted.chi2 - e.fitted.chi2 < _critical_value(search, less)
+        less is not None and less.fitted.chi2 - e.fitted.chi2 < _critical_value(search, less, e)
         for less in fewer
     )
 
 
-def _critical_value(search: Search, less: Explanation) -> float:
-    """Chi-square that an effect beside those of `less` must explain: more than chance does, and
-    more than their own laws are off by."""
-    least = max(search.critical_value * search.overdispersion, _off(search, less))
+def _critical_value(search: Search, less: Explanation, more: Explanation) -> float:
+    """Chi-square that an effect which `more` has beside those of `less` must explain: more than
+    chance does, and more than their own laws are off by."""
+    critical = search.critical_value_of(more.effects)
+    least = max(critical * search.overdispersion, _off(search, less))
     forced = any(x.force is not None for x in less.effects)
     if forced and search.ratio(less.fitted) <= threshold(search.spread):
         did = as_meant(search, less).fitted.chi2 - less.fitted.chi2
