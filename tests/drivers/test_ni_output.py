@@ -15,7 +15,8 @@ from samii_rig.rig.load import load_rig
 from samii_rig.safety.gate import Gate
 from samii_rig.safety.limits import gate_limits
 
-DEADMAN = 0.2  # s; a loaded machine may feed late
+# s; a tenth of it is what a loaded machine may be late by: from there on the watchdog comes first.
+DEADMAN = 0.5
 INTERLOCK = {
     "name": "pressure switch K3",
     "line": "port0/line0",
