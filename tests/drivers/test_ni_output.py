@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 from contract import DeviceContract
-from ni_kit import installed
+from ni_kit import PATIENT, installed
 from wire_kit import until
 
 from drivers.ni_daq import open_rig
@@ -15,8 +15,7 @@ from samii_rig.rig.load import load_rig
 from samii_rig.safety.gate import Gate
 from samii_rig.safety.limits import gate_limits
 
-# s; a tenth of it is what a loaded machine may be late by: from there on the watchdog comes first.
-DEADMAN = 0.5
+DEADMAN = 0.2  # s; a loaded machine may feed late
 INTERLOCK = {
     "name": "pressure switch K3",
     "line": "port0/line0",
@@ -31,9 +30,9 @@ SETTINGS = {
 }
 
 
-def rig_of_two():
+def rig_of_two(deadman=DEADMAN):
     whole = load_rig("samii")[0]
-    spec = whole.actuator[0].model_copy(update={"deadman": DEADMAN})
+    spec = whole.actuator[0].model_copy(update={"deadman": deadman})
     part = {"sensor": whole.sensor[:2], "actuator": (spec,), "centring": None}
     return whole.model_copy(update=part)
 
@@ -54,6 +53,14 @@ def board(monkeypatch):
 @pytest.fixture
 def device(board):
     opened = open_rig(RIG, SETTINGS)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def patient(board):
+    """A device whose own end comes well before its watchdog's."""
+    opened = open_rig(rig_of_two(PATIENT), SETTINGS)
     yield opened
     opened.close()
 
@@ -104,7 +111,7 @@ def ends(board, within):
 
 @pytest.mark.usefixtures("installation")
 class TestNiOutput(DeviceContract):
-    rig = RIG
+    rig = rig_of_two(PATIENT)
 
     @pytest.fixture
     def installation(self, monkeypatch):
@@ -133,12 +140,12 @@ def test_the_watchdog_ends_the_output_of_a_program_that_hangs(board, device, mon
         until(lambda: device.sensor.read() is None)
 
 
-def test_the_device_ends_it_before_its_watchdog_has_to(board, device):
-    live(board, device)
+def test_the_device_ends_it_before_its_watchdog_has_to(board, patient):
+    live(board, patient)
     ends(board, 1.0)
-    until(lambda: device.sensor.read().quality[-1:, 2].any())
+    until(lambda: patient.sensor.read().quality[-1:, 2].any())
     assert not board.watchdog.expired
-    device.actuator.configure(LOOP)
+    patient.actuator.configure(LOOP)
 
 
 def test_the_next_program_gets_a_board_whose_watchdog_had_expired(board, device, monkeypatch):

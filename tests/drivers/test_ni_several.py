@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 from contract_several import OutputsContract
-from ni_kit import installed
+from ni_kit import PATIENT, installed
 from wire_kit import until
 
 from drivers.ni_daq import check_rig, open_rig
@@ -36,10 +36,10 @@ SETTINGS = {
 }
 
 
-def rig_of_two():
+def rig_of_two(deadman=DEADMAN):
     """Two driven joints without loops, as a board closes none."""
     whole = load_rig("samii_two_joints")[0]
-    free = {"deadman": DEADMAN, "centring": None}
+    free = {"deadman": deadman, "centring": None}
     specs = tuple(a.model_copy(update=free) for a in whole.actuator)
     part = {"sensor": whole.sensor[:3], "actuator": specs, "centring": None}
     return whole.model_copy(update=part)
@@ -61,6 +61,14 @@ def board(monkeypatch):
 @pytest.fixture
 def device(board):
     opened = open_rig(RIG, SETTINGS)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def patient(board):
+    """A device whose own end comes well before its watchdog's."""
+    opened = open_rig(rig_of_two(PATIENT), SETTINGS)
     yield opened
     opened.close()
 
@@ -112,7 +120,7 @@ def ends(board, within=1.0, nulls=NULLS):
 
 @pytest.mark.usefixtures("installation")
 class TestNiOutputs(OutputsContract):
-    rig = RIG
+    rig = rig_of_two(PATIENT)
 
     @pytest.fixture
     def installation(self, monkeypatch):
@@ -153,12 +161,12 @@ def test_a_program_that_hangs_is_ended_by_the_watchdog_in_both(board, device, mo
         until(lambda: device.sensor.read() is None)
 
 
-def test_a_host_that_feeds_no_more_is_ended_before_the_watchdog(board, device):
-    live(board, device)
+def test_a_host_that_feeds_no_more_is_ended_before_the_watchdog(board, patient):
+    live(board, patient)
     ends(board)
-    until(lambda: device.sensor.read().quality[-1:, 4:6].all())
+    until(lambda: len(told := patient.sensor.read().quality) and told[-1, 4:6].all())
     assert not board.watchdog.expired
-    device.actuator.configure(LOOPS)
+    patient.actuator.configure(LOOPS)
 
 
 def test_a_program_that_dies_opens_the_interlock_of_both(board, monkeypatch):

@@ -15,6 +15,9 @@ import numpy as np
 TURN = 0.5  # rad/s that one volt at an output turns its encoder
 PLACES = 2  # outputs, and encoders
 HOLD = 0.1  # s after the last edge at port0/line0 that the interlock stays closed
+# s of a deadman whose end by the device, at nine tenths, comes 50 ms before the watchdog's: so late
+# a loaded machine may be.
+PATIENT = 0.5
 UNDERFLOW = "-200290: The generation has stopped to prevent the regeneration of old samples."
 EXPIRED = "-200678: Writing failed, because the watchdog timer expired."
 CONSTANTS = SimpleNamespace(

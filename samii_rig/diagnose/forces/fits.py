@@ -183,9 +183,8 @@ class ForceFits(RecordSearch):
 
             return np.concatenate([problem.residual(h), pulls @ x]), slopes
 
-        before = self._ways.marched
-        every_slope = (1 + model.n) * sum(len(p.r) for p in self.levels.records.pieces)
-        trials = max((MOST_MARCHED - before) // (every_slope * self.levels.every), 1)
+        samples = self.levels.every * sum(len(p.r) for p in self.levels.records.pieces)
+        trials = max((MOST_MARCHED - self._ways.marched) // ((1 + model.n) * samples), 1)
         try:
             end = minimise(
                 evaluated, start, model.lower, model.upper,
