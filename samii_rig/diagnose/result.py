@@ -481,7 +481,7 @@ class Diagnosis:
             )
         if self.experiment:
             parts.append(f"Next: {self.experiment} ({self.why}).")
-        if not self.experiment and self.could_hide:
+        if self.could_hide and (not self.experiment or self.verdict == "no_mismatch"):
             parts.append(f"What could hide: {'; '.join(_hides(self.could_hide))}.")
         return " ".join(parts) or "No further experiment is needed."
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from samii_rig.errors import SamiiRigError
@@ -40,19 +41,26 @@ def main(arguments: list[str] | None = None) -> int:
     maker.add_argument("--rig", default="samii", help="rig file or name [default: samii]")
     maker.add_argument("--noise", type=float, default=usual.noise, help="multiple of the errors")
     maker.add_argument("--burst", type=float, default=usual.burst, help="s of one swept sine")
-    maker.add_argument("--bursts", type=int, default=usual.bursts, help="of each level")
-    maker.add_argument("--levels", type=float, nargs="+", default=list(usual.levels))
+    maker.add_argument("--bursts", type=int, help="of each level [default: 4; of two inputs 3]")
+    maker.add_argument(
+        "--levels",
+        type=float,
+        nargs="+",
+        help="peaks, in the actuator's unit [default: up to a tenth of its range]",
+    )
     maker.add_argument("--sensors", nargs="*", default=[], help="to record [default: all]")
     chosen = parser.parse_args(arguments)
-    design = Design(
-        levels=tuple(sorted(chosen.levels)),
-        bursts=chosen.bursts,
-        burst=chosen.burst,
-        noise=chosen.noise,
-        sensors=tuple(chosen.sensors),
-    )
     try:
-        _, text = load_rig(chosen.rig)
+        rig, text = load_rig(chosen.rig)
+        own = Design.usual(rig)
+        design = replace(
+            own,
+            levels=tuple(sorted(chosen.levels or own.levels)),
+            bursts=chosen.bursts or own.bursts,
+            burst=chosen.burst,
+            noise=chosen.noise,
+            sensors=tuple(chosen.sensors),
+        )
         stated = tuple(Stated.of(words) for words in chosen.effect)
         kind: Kind = chosen.kind or "stated"
         for seed in range(chosen.seed, chosen.seed + chosen.count):

@@ -113,7 +113,7 @@ def draw(
     rng = np.random.default_rng([KINDS.index(kind), seed])
     base, values = draw_values(rig, rng)
     chosen = [Chosen(row_of(base, s), s.site, s) for s in stated] or _chosen(kind, seed, base, rng)
-    innocent = {} if stated else _innocent(base, {c.site for c in chosen}, rng)
+    innocent = {} if stated else _innocent(rig, base, {c.site for c in chosen}, rng)
     rig_toml = edited(rig_toml, innocent)
     values.update({f"{name}.{symbol}": v for (name, symbol), (v, _) in innocent.items()})
     rig = parse(Rig, rig_toml, "rig file")
@@ -211,11 +211,20 @@ def _chosen(kind: Kind, seed: int, plant: Description, rng: np.random.Generator)
 
 
 def _innocent(
-    plant: Description, sites: set[str], rng: np.random.Generator
+    rig: Rig, plant: Description, sites: set[str], rng: np.random.Generator
 ) -> dict[tuple[str, str], tuple[float, str]]:
     """In some trials a joint that the rig file has as rigid or undamped, and that is so: what a
-    rig file says must not tell where something is concealed."""
-    taken = {*sites, clamp_of(plant)}
+    rig file says must not tell where something is concealed. None that a loop is closed across,
+    which its damper keeps stable."""
+    order = [p.name for p in plant.parts]
+    loops = [
+        (drive.element, sensor.across[-1])
+        for drive, actuator in zip(plant.drives, rig.actuator, strict=True)
+        for sensor in plant.sensors
+        if (loop := rig.centring_of(actuator.name)) and loop.sensor == sensor.name
+    ]
+    closed = [n for a, b in loops for n in order[order.index(a) : order.index(b) + 1]]
+    taken = {*sites, clamp_of(plant), *closed}
     joints = [p for p in plant.parts if p.kind == "torsional_spring" and p.name not in taken]
     if not joints or rng.random() >= INNOCENT:
         return {}

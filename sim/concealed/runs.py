@@ -22,6 +22,9 @@ from samii_rig.types import Float, Segment
 SCHEDULE = ((4.0, 1.0), (6.0, 0.35), (9.0, 0.35), (12.0, 1.0))
 STEP_SIZE = 0.04  # of set point at the highest level, in the centring sensor's unit
 STEP_HOLD = 5.0  # s between steps
+# Of the output's range at the highest level: 1 V of SAMII's 10. A level in the actuator's own unit
+# drives a motor of 255 counts with one, less than its encoder reads.
+SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,10 +53,13 @@ class Design:
     sensors: tuple[str, ...] = ()
 
     @classmethod
-    def usual(cls, inputs: int) -> Design:
+    def usual(cls, rig: Rig) -> Design:
         """That of a trial: of several inputs two levels and three bursts, so that two inputs are
         recorded for 760 s where one is for 678."""
-        return cls() if inputs == 1 else cls(levels=(0.5, 1.0), bursts=3)
+        several = len(rig.actuator) > 1
+        most = SHARE * min(min(a.high, -a.low) for a in rig.actuator)
+        levels = tuple(most * x for x in ((0.5, 1.0) if several else (0.25, 0.5, 1.0)))
+        return cls(levels=levels, bursts=3) if several else cls(levels=levels)
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,7 +52,7 @@ def make(
 ) -> Path:
     """Make one trial, or find it made; returns the folder of its recordings. stated : what it
     conceals, of the kind of this name; the rig file says what is there besides."""
-    design = design or Design.usual(len(parse(Rig, rig_toml, "rig file").actuator))
+    design = design or Design.usual(parse(Rig, rig_toml, "rig file"))
     name = trial_id(kind, seed, stated)
     folder, truths = out / "recordings" / name, out / "truth"
     if folder.is_dir():

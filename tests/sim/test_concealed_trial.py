@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -221,3 +222,19 @@ def test_module_runs() -> None:
         [sys.executable, "-m", "sim.concealed", "make", "--help"], capture_output=True, check=True
     )
     assert b"--kind" in done.stdout
+
+
+def test_no_damper_that_a_loop_needs_is_taken_away() -> None:
+    """Undamped, the spring between SFLR's motor and its encoder makes the loop unstable."""
+    rig, text = load_rig("sflr")
+    edits = [
+        e
+        for seed in range(12)
+        for e in re.findall(
+            r'name = "(\w+)"[^[]*\nc = \{ value = 0\.0,',
+            draw("nothing", seed, text, Design.usual(rig)).nominal_toml,
+        )
+    ]
+    assert set(edits) == set()
+    assert Design.usual(rig).levels == (6.375, 12.75, 25.5)
+    assert Design.usual(load_rig("samii")[0]) == Design()

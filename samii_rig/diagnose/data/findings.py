@@ -80,7 +80,7 @@ class Checked:
         return replace(
             self,
             hidden=self.hidden.union(also),
-            remarks=(*self.remarks, *map(_direct, also)),
+            remarks=(*map(_direct, also), *self.remarks),
             samples=(*map(_few_steps, also), *self.samples),
         )
 
@@ -144,7 +144,7 @@ def checked(
         guessed = Refusal(NO_REPEATS, "repeat each run three times, each from rest", "ambiguous")
     return Checked(
         tuple(steady),
-        tuple(remarks + lost + found.remarks + changed + [_direct(n) for n in sorted(hidden)]),
+        tuple([_direct(n) for n in sorted(hidden)] + remarks + lost + found.remarks + changed),
         (*lacks(steady, rig), *unreferenced),
         refusal,
         found.units,

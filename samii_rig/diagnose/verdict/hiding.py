@@ -28,6 +28,9 @@ Screens = tuple[Screen, Screen]  # without directions projected out, and with
 # over so many at least, where a refit no longer bends.
 WEAKER, NOISE_MOVES = 3, 2.0
 STRENGTHS = 20  # strengths over the range of an effect, log-spaced, for one that is weak
+# Times the weakest that is tried: of a part a thousand times the chain's own. What would be seen
+# from there on alone is said to hide, however large: nothing that these sensors show moves there.
+GROSS = 1e6
 
 
 def could_hide(search: Explanations, best: Explanation) -> tuple[Hiding, ...]:
@@ -79,6 +82,7 @@ def _smallest(
     rate = needed / max(shows, 1e-12)
     value[0] *= rate if grows else 1 / rate
     least, most = (first.low, first.high) if grows else (first.high, first.low)
+    most = min(most, GROSS * least) if grows else max(most, least / GROSS)
     toward = 1 if grows else -1
     if toward * (value[0] - least) < 0:
         # What would be seen is less than the range begins with, up to which it is a nominal

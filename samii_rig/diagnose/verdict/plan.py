@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 import numpy as np
 
@@ -25,7 +25,8 @@ from samii_rig.rig.schema import (
     TranslationalGroundSpring,
 )
 from samii_rig.rig.schema.pose import Angle
-from samii_rig.types import Complex, Float
+from samii_rig.signal.steps import FEW, steps_driven
+from samii_rig.types import Complex, Float, Recording
 
 Change = Callable[[Rig], Rig]
 
@@ -72,6 +73,36 @@ def next_experiment(
         none = "no experiment that was tried distinguishes them: to every sensor they are the same"
         return what, none, best[1]
     return f"{what}; predicted {best[1]:.0f} noise units apart", *best
+
+
+def harder(runs: Sequence[Recording], rig: Rig, hidden: Collection[str]) -> tuple[str, str]:
+    """(why, experiment) in words for sensors that are left out as they move by few of their steps;
+    both empty where there are none."""
+    for a in rig.actuator:
+        loop = rig.centring_of(a.name)
+        if loop is None or loop.sensor not in hidden:
+            continue
+        moved = [
+            steps_driven(
+                r.channels[r.column(loop.sensor)],
+                r.values_of(loop.sensor),
+                r.values_of(a.name),
+                r.rate_hz,
+            )
+            for r in runs
+            if {loop.sensor, a.name} <= {c.name for c in r.channels}
+        ]
+        every = np.concatenate([*moved, np.zeros(0)])
+        if not (moves := every[every > 0]).size:
+            continue
+        steps = float(np.median(moves))
+        times = max(math.ceil((FEW + 1) / steps), 2)  # beyond FEW, by whole steps
+        return (
+            f"{loop.sensor} is left out: what shows in it alone is not looked for",
+            f"drive {a.name} {times} times as hard, or read {loop.sensor} with finer steps: it "
+            f"moves by {steps:.0f} of them most of the time that it moves; more than {FEW:g} count",
+        )
+    return "", ""
 
 
 def _alone(search: Search) -> tuple[str, str] | None:

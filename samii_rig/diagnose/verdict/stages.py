@@ -23,7 +23,7 @@ from samii_rig.diagnose.verdict.force_words import next_levels
 from samii_rig.diagnose.verdict.hiding import could_hide
 from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.diagnose.verdict.locate import traces
-from samii_rig.diagnose.verdict.plan import next_experiment
+from samii_rig.diagnose.verdict.plan import harder, next_experiment
 from samii_rig.types import FrequencyResponse, Recording
 
 ALTERNATIVES = 6
@@ -101,16 +101,15 @@ def of_states(found: Diagnosis, several: Sequence[SeveralStates]) -> Diagnosis:
 
 
 def _next(
+    case: Case,
     search: Search,
     judged: Judgement,
     refusal: Refusal | None,
-    levels: int,
     exact: tuple[Exact, ...],
     off: tuple[str, str] | None,
 ) -> tuple[str, str, float | None]:
-    """Why no more may be said, the experiment that would tell, and what it would gain. levels :
-    that were recorded. exact : the number of the rig file that is wrong, if one is. off : as of
-    `_beyond_the_file`."""
+    """Why no more may be said, the experiment that would tell, and what it would gain. exact : the
+    number of the rig file that is wrong, if one is. off : as of `_beyond_the_file`."""
     if off is not None:
         return *off, None
     if exact:
@@ -122,7 +121,8 @@ def _next(
         return refusal.why, refusal.experiment, None
     if judged.varies is not None:
         return ("", "", None) if judged.verdict == "named" else (*REPEAT, None)
-    return next_levels(judged) or next_experiment(search, judged, levels)
+    found = next_levels(judged) or next_experiment(search, judged, case.levels)
+    return found if found[1] else (*harder(case.runs, search.rig, case.clean.hidden), None)
 
 
 def _alternatives(
@@ -208,7 +208,7 @@ def diagnosis_of(
     words = (*found, *remarks, *clean.remarks, *clean.lacks)
     exact, told = ((), best.fitted) if missing else _wrong(search, best.fitted)
     refused = refusal if missing else None
-    why, experiment, gain = _next(search, judged, refused, case.levels, exact, off)
+    why, experiment, gain = _next(case, search, judged, refused, exact, off)
     if exact:
         judged = replace(judged, verdict="unknown")
     untold = judged.varies.describe() if judged.varies is not None and not causes else ""
