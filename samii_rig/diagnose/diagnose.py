@@ -28,7 +28,6 @@ from samii_rig.diagnose.result import Diagnosis
 from samii_rig.diagnose.verdict.by_line import by_lines
 from samii_rig.diagnose.verdict.by_record import by_records, on_records, whole_of
 from samii_rig.diagnose.verdict.stages import Case
-from samii_rig.likelihood.pieces import by_few_steps
 from samii_rig.progress import Begun, Progress
 from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import is_aligned
@@ -107,7 +106,6 @@ def case_of(
     seen, decide, show = lines.splits()
     at = grid(rig, lines.frequency, lines.sensor, lines.actuator)
     runs = runs if clean.mend is None else [clean.mend(run) for run in runs]
-    clean = clean.without(by_few_steps(runs, rig, clean.sensors(rig)))
     whole = whole_of(clean, runs, rig, band)
     if whole is not None and whole.rig.rate_hz != rig.rate_hz:
         clean = replace(clean, remarks=(*clean.remarks, _loop_runs(whole, rig)))

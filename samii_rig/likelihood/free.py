@@ -169,9 +169,11 @@ def scatter(records: Records, H: Complex, seen: Sequence[Seen], noise: Noise) ->
         every = _beside(records, piece, piece.repeats, H, own)
         if every:
             f, _, free = every[0]  # of one piece all repeats have the same
-            C = noise.covariance(f, np.full(f.size, i))
-            mean += len(every) * (free @ np.diagonal(C, axis1=1, axis2=2).real)
-            power += sum(np.sum(np.abs(left) ** 2, axis=0) for _, left, _ in every)
+            of = np.full(f.size, i)
+            read = ~noise.covered(f, of)
+            C = np.diagonal(noise.covariance(f, of), axis1=1, axis2=2).real
+            mean += len(every) * (free[read] @ C[read])
+            power += sum(np.sum(np.abs(left[read]) ** 2, axis=0) for _, left, _ in every)
     return np.asarray(np.divide(power, mean, out=np.full(mean.size, np.nan), where=mean > 0))
 
 
@@ -183,9 +185,13 @@ def differing(
     for i, (piece, own) in enumerate(zip(records.pieces, seen, strict=True)):
         every = _beside(records, piece, piece.contrasts, H, own)
         if every:
-            f, left = every[0][0], np.stack([e for _, e, _ in every], axis=2)
-            total += 2 * float(np.sum(np.abs(noise.whitened(f, np.full(f.size, i), left)) ** 2))
-            count += 2.0 * left.shape[1] * sum(float(np.sum(free)) for _, _, free in every)
+            f, k = every[0][0], records.lines(piece).k
+            of = np.full(f.size, i)
+            first = 1 + len(piece.repeats)
+            covered = [e + noise.cover(f, of, k, j) for j, (_, e, _) in enumerate(every, first)]
+            white = noise.whitened(f, of, np.stack(covered, axis=2))
+            total += 2 * float(np.sum(np.abs(white) ** 2))
+            count += 2.0 * white.shape[1] * sum(float(np.sum(free)) for _, _, free in every)
     return total, count
 
 

@@ -22,6 +22,7 @@ from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from samii_rig.errors import EstimateError
@@ -61,6 +62,10 @@ class Known(Protocol):
 
     def __call__(self, f: Float, group: Int) -> Float:
         """(n, q) at f (n,) Hz in pieces of groups (n,)."""
+        ...
+
+    def cover(self, f: Float, group: Int) -> Float:
+        """(n, q) the part of it that stands in the place of what a sensor shows there."""
         ...
 
 
@@ -116,6 +121,9 @@ class Noise:
         # its rounding has next to nothing.
         weight = np.asarray(np.bincount(which, free, at.size), np.float64)
         own = _mean(known(at, group), weight, bins)
+        more = w[:, None] * _mean(known.cover(at, group), weight, bins)
+        its = u[:, :, : more.shape[1]]
+        S = S + (its * more[:, None, :]) @ its.conj().swapaxes(1, 2)
         power = most_likely(u, S, w, _colours(at[middle], corners), own)
         plain = cls(
             disturbances,
@@ -131,10 +139,13 @@ class Noise:
         """The same, what the sum does not give by blocks."""
         q = left.shape[1]
         group = self.known.group[piece]
-        sure = np.sqrt(self.known(f, group))
         once, first, back = np.unique(f, return_index=True, return_inverse=True)
         u = self.disturbances(once)
-        own = u[back, :, :q] * sure[:, None, :]
+        alone = u[back, :, :q]
+        own = alone * np.sqrt(self.known(f, group))[:, None, :]
+        # Blocks scatter by it as by all other noise.
+        cover = np.sqrt(free[:, None] * self.known.cover(f, group)) * _drawn((0,), f.size, q)
+        left = left + (alone @ cover[:, :, None])[:, :, 0]
         both = self.whitened(f, piece, np.concatenate([left[:, :, None], own], axis=2))
         white, sure = both[:, :, 0], both[:, :, 1:]
         starts = _blocks(free, self._place(once, u, group[first])[back], FREEDOM * q)
@@ -178,6 +189,25 @@ class Noise:
         alike = np.eye(own_power.size, dtype=np.complex128)[None]
         return replace(self, power=power, edges=self.edges[:0], about=alike)
 
+    def cover(self, f: Float, piece: Int, k: Int, repeat: int = 0) -> Complex:
+        """(n, q) what stands at lines k (n,) of pieces (n,), f (n,) Hz, in the place of what
+        sensors show there: noise of its power, the same whenever it is asked for. repeat : 0 of
+        the piece itself, else of those beside it which."""
+        power = self.known.cover(f, self.known.group[piece])
+        if not power.any():
+            return np.zeros_like(power, dtype=np.complex128)
+        q = power.shape[1]
+        drawn = np.zeros((f.size, q), np.complex128)
+        for i in np.unique(piece):
+            on = piece == i
+            drawn[on] = _drawn((int(i), repeat), int(k[on].max()) + 1, q)[k[on]]
+        u = self.disturbances(f)[:, :, :q]
+        return np.asarray((u @ (np.sqrt(power) * drawn)[:, :, None])[:, :, 0])
+
+    def covered(self, f: Float, piece: Int) -> NDArray[np.bool_]:
+        """(n,) whether any sensor is covered at f (n,) Hz in pieces (n,)."""
+        return np.asarray(self.known.cover(f, self.known.group[piece]).any(axis=1))
+
     def covariance(self, f: Float, piece: Int) -> Complex:
         """(n, q, q) at f (n,) in pieces (n,)."""
         L = self.root(f, piece)
@@ -203,6 +233,12 @@ class Noise:
         block = np.searchsorted(self.edges, at, side="right")
         roots = np.linalg.cholesky(self.about)[block]
         return np.asarray((_cholesky(plain) @ roots)[which])
+
+
+def _drawn(seed: tuple[int, ...], n: int, q: int) -> Complex:
+    """(n, q) normal of power 1; of more lines the first are the same."""
+    each = np.random.default_rng(seed).standard_normal((n, q, 2)) / np.sqrt(2)
+    return np.asarray(each @ np.array([1, 1j]))
 
 
 def _once(f: Float, group: Int) -> tuple[Float, Int, Int]:

@@ -19,7 +19,6 @@ from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import is_open, of_input, proportional
 from samii_rig.signal.groups import segments_of
 from samii_rig.signal.several.undriven import driven_of
-from samii_rig.signal.steps import FEW, steps_driven
 from samii_rig.types import Float, Int, Quality, Recording, Segment
 
 SPOILT = Quality.MISSING | Quality.CLIPPED | Quality.STALE
@@ -199,42 +198,6 @@ def _input(
             )
     closed = Input(command, sensor, kp)
     return Input(command) if all(_is_open(r, closed) for r in recordings) else closed
-
-
-def by_few_steps(
-    recordings: Sequence[Recording], rig: Rig, sensors: Collection[str]
-) -> frozenset[str]:
-    """Of some sensors those that loops are closed around and that stay within few steps of their
-    converter most of the time that anything drives, where the command was recorded as it was sent.
-
-    Their rounding follows the motion, and goes round the loop as no noise does. The command holds
-    all that the loop made of it. Beside it the sensor would tell its own rounding, which the
-    command follows, as a response. None where no other sensor would be left.
-    """
-    read = set(sensors).intersection(*({c.name for c in r.channels} for r in recordings))
-    each = ((a.name, rig.centring_of(a.name)) for a in rig.actuator)
-    loops = [] if rig.feedback else [Input(n, c.sensor, c.kp) for n, c in each if c is not None]
-    few = {x.centring for x in loops if x.centring in read and _few_steps(recordings, rig, x)}
-    return frozenset(few) if read - few else frozenset()
-
-
-def _few_steps(recordings: Sequence[Recording], rig: Rig, x: Input) -> bool:
-    having = [r for r in recordings if _has(r, x.command)]
-    steps = [
-        steps_driven(
-            r.channels[r.column(x.centring)],
-            r.values_of(x.centring),
-            r.values_of(x.command),
-            r.rate_hz,
-        )
-        for r in having
-    ]
-    every = np.concatenate([*steps, np.zeros(0)])
-    # What is read moves by whole steps: three of them are up to 3.5.
-    if every.size == 0 or np.median(every) > FEW + 0.5:
-        return False
-    as_sent = all(r.rate_hz == rig.rate_hz and _meter(r, x) is None for r in having)
-    return as_sent and not all(_is_open(r, x) for r in having)
 
 
 def _is_open(recording: Recording, x: Input) -> bool:

@@ -148,7 +148,8 @@ class Records:
             fine = contour.record(response(contour.s), self.longest * self.every)
             folded = nuisance.folding(answers.impulse, fine, self.every)
             answers = replace(answers, folded=folded)
-        return [Seen.of(p, self.lines(p).k, answers, self.step) for p in self.pieces]
+        sent = self.every == 1
+        return [Seen.of(p, self.lines(p).k, answers, self.step, as_sent=sent) for p in self.pieces]
 
 
 def _left_in_time(samples: Samples | Piece, H: Complex, contour: Contour) -> Float:

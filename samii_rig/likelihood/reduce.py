@@ -62,6 +62,7 @@ def residuals_by_line(
     H = response(records.exact().s)
     records = records.without_spikes(H)
     every = rows_of(records, (), records.seen(H, loop, response))
+    every = replace(every, e=every.e + noise.noise.cover(every.f, every.piece, every.k))
     out = []
     for part in parts or (lambda k: np.ones(k.size, bool),):
         rows = every.take(part(every.k))
@@ -138,6 +139,7 @@ def formed(
     power = power if own_power is None else power.of_sensors_alone(own_power)
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
     rows = rows.take(counted)
+    rows = replace(rows, e=rows.e + power.cover(rows.f, rows.piece, rows.k))
     form = quadratic(rows, power, S[nodes])
     count = 2.0 * rows.e.shape[1] * int(counted.sum()) - form.nuisances
     made = Reduced(

@@ -8,19 +8,23 @@ order. Elsewhere it is what the motion makes of it:
   Noise, ch. 4). A motion that rests keeps one error as long as it rests.
 - Where the motion stays within few steps, what is read is not in proportion to it, but for noise
   that dithers it: of the sawtooth's first harmonic exp(-2 (pi sigma/step)^2) is left.
+- A loop closed around the sensor makes the motion follow the error, too. At lines where such a
+  motion stays within few steps nothing is read: so much noise of the sensor's own stands in the
+  error's place (`cover`) that its lines tell nothing, and those of all others what they tell beside
+  the command as it was recorded. Where it rests, it rests anywhere within its step.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, optimize
+from scipy import ndimage, optimize, signal
 
 from samii_rig.likelihood.pieces import Piece
-from samii_rig.signal.steps import FEW, crossed
+from samii_rig.signal.steps import CROSSED_IN, FEW, crossed
 from samii_rig.types import Complex, Float, Int
 
 WHITE = 1 / 12  # of a step, squared
@@ -39,7 +43,12 @@ GROUPS_APART, GROUPS = 1.5, 8
 # its place is determined.
 RESTS_IN_STEP = 1.0
 WANDERS = 2.0  # times that one place for all leaves more than one a second, of what does not rest
+# Times its power, by which a rounding error is covered where it is not read: of what it does as the
+# motion does, at most all of it, 1e-4 is left.
+COVERS = 1e4
 OFFSETS = 16  # places of a motion in its step, at which its rounding is tried: within 25 % a line
+ALIKE_OVER = 1.0  # Hz, over which a rounding error's power is spread by what wanders
+RESTS = 0.5  # steps, within which a motion rests
 LIKELY = 4  # of these, that are nearest to what is read
 
 
@@ -81,20 +90,21 @@ def alike(piece: Piece, step: Float) -> Float:
 class Added:
     """What rounding adds to pieces, in groups that it adds alike to.
 
-    group : (p,) of each piece. each : of every group, for each of its pieces, Hz (m,) and power a
-    sample (m, q) of each sensor's rounding; the largest counts. times : (q,) as much of each.
+    group : (p,) of each piece. each : of every group, for each of its pieces, Hz (m,), power a
+    sample (m, q) of each sensor's rounding, and of what covers it; the largest counts. times : (q,)
+    as much of each rounding.
     """
 
     group: Int
-    each: tuple[tuple[tuple[Float, Float], ...], ...]
+    each: tuple[tuple[tuple[Float, Float, Float], ...], ...]
     times: Float
 
     @classmethod
     def of(cls, pieces: Sequence[Rounding]) -> Added:
         """Of every piece."""
-        each = [(x.frequency, x.power) for x in pieces]
+        each = [(x.frequency, x.power, x.covered) for x in pieces]
         f = max((x[0] for x in each), key=len)
-        level = np.stack([_at(f, x) for x in each])
+        level = np.stack([_at(f, x, power + cover) for x, power, cover in each])
         largest = np.max(level, axis=(0, 1))
         level = np.log(np.maximum(level, 1e-3 * np.where(largest > 0, largest, 1.0)))
         apart = math.log(GROUPS_APART)
@@ -116,17 +126,25 @@ class Added:
 
     def __call__(self, f: Float, group: Int) -> Float:
         """(n, q) power a sample at f (n,) Hz in pieces of groups (n,)."""
-        q = self.each[0][0][1].shape[1]
-        out = np.zeros((f.size, q))
+        return self._largest(f, group, 1) * self.times + self.cover(f, group)
+
+    def cover(self, f: Float, group: Int) -> Float:
+        """(n, q) the part of it that stands in the place of what is not read."""
+        return self._largest(f, group, 2)
+
+    def _largest(self, f: Float, group: Int, which: int) -> Float:
+        out = np.zeros((f.size, self.times.size))
+        if not any(one[which].any() for members in self.each for one in members):
+            return out
         for j, members in enumerate(self.each):
             on = group == j
             for one in members:
-                out[on] = np.maximum(out[on], _at(f[on], one))
-        return out * self.times
+                out[on] = np.maximum(out[on], _at(f[on], one[0], one[which]))
+        return out
 
 
-def _at(f: Float, of: tuple[Float, Float]) -> Float:
-    return np.stack([np.interp(f, of[0], p) for p in of[1].T], axis=1)
+def _at(f: Float, known: Float, power: Float) -> Float:
+    return np.stack([np.interp(f, known, p) for p in power.T], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,22 +154,38 @@ class Rounding:
     frequency : (m,) Hz. power : (m, q) a sample, of each sensor's rounding. factors : of each
     sensor (p, n) parts of its motion that are read by a factor of their own. draws : of each sensor
     that nothing dithers (OFFSETS, n_lines) rounding beyond these, a sample's power, as it is
-    wherever the sensor stands in its step.
+    wherever the sensor stands in its step. cover : (m, q) power of what stands in its place where
+    it is not read, None for nowhere.
     """
 
     frequency: Float
     power: Float
     factors: dict[int, Float]
     draws: dict[int, Complex]
+    cover: Float | None = None
+
+    @property
+    def covered(self) -> Float:
+        """(m, q) as of `cover`."""
+        return np.zeros_like(self.power) if self.cover is None else self.cover
 
     @classmethod
-    def of_piece(cls, piece: Piece, k: Int, step: Float, y: Float, rate_hz: float) -> Rounding:
+    def of_piece(
+        cls,
+        piece: Piece,
+        k: Int,
+        step: Float,
+        y: Float,
+        rate_hz: float,
+        closed: Collection[int] = (),
+    ) -> Rounding:
         """k : (n_lines,) that count. step : (q,) of the converters. y : (n, q) as the sensors
-        would move without noise."""
+        would move without noise. closed : sensors that loops follow, whose commands were recorded
+        as they were sent."""
         n, q = piece.z.shape
         frequency = np.asarray(np.fft.rfftfreq(n, 1 / rate_hz), np.float64)
         power = np.zeros((frequency.size, q))
-        factors, draws = {}, {}
+        factors, draws, cover = {}, {}, np.zeros_like(power)
         repeats = dithered(piece, step)
         for i in np.flatnonzero(step > 0).tolist():
             same = len(piece.repeats) * repeating(repeats[i])
@@ -172,7 +206,52 @@ class Rounding:
             spectra = np.fft.rfft(step[i] / math.sqrt(n) * errors, axis=1)
             power[:, i] = np.mean(np.abs(spectra) ** 2, axis=0)
             factors[i], draws[i] = parts, np.asarray(spectra[:, k])
-        return cls(frequency, power, factors, draws)
+            if i in closed and _is_staircase(sd / step[i]):
+                moved = y[:, i] / (step[i] * _records(piece))
+                few = steps_by_line(moved, rate_hz, frequency) <= FEW
+                if few[k].any():
+                    rests = WHITE * step[i] ** 2 * _of_rests(moved, rate_hz)
+                    power[:, i] = np.maximum(_unlike(power[:, i], n / rate_hz), rests)
+                    cover[few, i] = COVERS * power[few, i]
+        return cls(frequency, power, factors, draws, cover if cover.any() else None)
+
+
+def _is_staircase(sd: float) -> bool:
+    """Whether a motion of few steps is read as a staircase, beside noise of sd steps."""
+    return math.exp(-2 * (math.pi * sd) ** 2) >= UNSEEN
+
+
+def _unlike(power: Float, seconds: float) -> Float:
+    """(m,) power of a rounding error at the lines of a record of so many seconds, where what
+    wanders moves the sensor in its step, so that no repeat rounds as the one before it does."""
+    near = ndimage.uniform_filter1d(power, max(round(ALIKE_OVER * seconds), 1))
+    return np.maximum(power, near)
+
+
+def _records(piece: Piece) -> float:
+    """Times by which a piece moves as one of its records does."""
+    return math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
+
+
+def steps_by_line(y: Float, rate_hz: float, frequency: Float) -> Float:
+    """(m,) steps within which a motion y (n,) in steps stays while it has what it has at
+    `frequency` (m,), Hz."""
+    width = min(2 * max(int(CROSSED_IN * rate_hz), 3), y.size)
+    f, t, power = signal.spectrogram(y, rate_hz, "hann", width, width // 2)
+    stays = crossed(y, rate_hz)[np.minimum(np.rint(t * rate_hz).astype(np.int64), y.size - 1)]
+    total = np.sum(power, axis=1)
+    each = np.divide(power @ stays, total, out=np.zeros(total.size), where=total > 0)
+    return np.asarray(np.interp(frequency, f, each))
+
+
+def _of_rests(y: Float, rate_hz: float) -> Float:
+    """(m,) power a sample, at the lines of a record, of an error of power 1 that is the same for as
+    long as a motion y (n,) in steps rests, and another at each rest."""
+    labels, count = ndimage.label(crossed(y, rate_hz) < RESTS)
+    out = np.zeros(y.size // 2 + 1)
+    for on in ndimage.find_objects(labels, count):
+        out += np.abs(np.fft.rfft((labels[on] > 0) * 1.0, y.size)) ** 2 / y.size
+    return out
 
 
 def _noise(left: Float, step: float) -> float:
@@ -222,10 +301,9 @@ def _parts(piece: Piece, y: Float, step: float, sd: float, rate_hz: float) -> Fl
     """(p, n) what of the motion y (n,) of a sensor stays within few steps and is not read in
     proportion, less its mean: each stretch its own, as a part may rest at another place after it
     was moved. In parts of equal power: the factor depends on the amplitude. sd : of the noise."""
-    times = math.sqrt(1 + len(piece.repeats) + len(piece.contrasts))
-    still = crossed(y, rate_hz) < FEW * step * times
+    still = crossed(y, rate_hz) < FEW * step * _records(piece)
     labels, count = ndimage.label(still)
-    if count == 0 or math.exp(-2 * (math.pi * sd / step) ** 2) < UNSEEN:
+    if count == 0 or not _is_staircase(sd / step):
         return np.zeros((0, y.size))
     mean = np.append(0.0, ndimage.mean(y, labels, np.arange(1, count + 1)))
     part = np.where(still, y - mean[labels], 0.0)

@@ -96,8 +96,11 @@ class Seen:
     left: Float
 
     @classmethod
-    def of(cls, piece: Piece, k: Int, answers: Answers, step: Float) -> Seen:
-        """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known."""
+    def of(
+        cls, piece: Piece, k: Int, answers: Answers, step: Float, *, as_sent: bool = True
+    ) -> Seen:
+        """k : (n,) numbers of the lines. step : (q,) of each sensor's converter, 0 if not known.
+        as_sent : whether the commands are those that the loops sent, all of them."""
         n = len(piece.z)
         H, exact = answers.H, answers.exact
         y = exact.predicted(H, piece.r)[piece.history :]
@@ -107,7 +110,9 @@ class Seen:
         own = [wander, nuisance.hum(left, k, exact.rate_hz, n)]
         if np.any(step > 0):  # what a converter reads is the whole motion
             y = y + _before(past, left[k], wander, answers.impulse, piece)
-        rounding = Rounding.of_piece(piece, k, step, y, exact.rate_hz)
+        sent = as_sent and not any(m.shown for told in piece.commands for m in told.meter)
+        closed = {sensor for _, sensor, _ in answers.loops} if sent else ()
+        rounding = Rounding.of_piece(piece, k, step, y, exact.rate_hz, closed)
         own += [nuisance.unread(piece, k, rounding.factors, H, exact, answers.loops)]
         own += [nuisance.edges(piece, k, answers.impulse, answers.folded)]
         own += [nuisance.lost(piece, k, answers.impulse)]

@@ -60,9 +60,13 @@ def unexplained(
         zip(records.pieces, records.seen(H, loop, response), strict=True)
     ):
         lines = records.lines(piece)
-        root = np.sqrt(2) * np.linalg.inv(
-            noise.noise.root(lines.frequency, np.full(lines.k.size, i))
-        )
+        own_piece = np.full(lines.k.size, i)
+        root = np.sqrt(2) * np.linalg.inv(noise.noise.root(lines.frequency, own_piece))
+        each = [seen.e, *(records.residual(x, lines.k, H, exact) for x in piece.repeats)]
+        each = [
+            e + noise.noise.cover(lines.frequency, own_piece, lines.k, j)
+            for j, e in enumerate(each)
+        ]
         N = (root @ seen.N).reshape(-1, seen.N.shape[2])
         Q = shrinking(as_real(N), seen.prior)
 
@@ -71,13 +75,12 @@ def unexplained(
             goal = as_real((root @ e[..., None]).reshape(len(e), -1).T)
             return as_complex(goal - Q @ (Q.T @ goal)).T.reshape(e.shape)
 
-        repeats = (records.residual(x, lines.k, H, exact) for x in piece.repeats)
         own = {}
         for c, draws in seen.rounding.draws.items() if rounded else ():
             own[c] = np.zeros((*draws.shape, seen.e.shape[1]), complex)
             own[c][:, :, c] = draws
             own[c] = white(own[c])
-        out.append(Unexplained(lines.k, root, white(np.stack([seen.e, *repeats])), own))
+        out.append(Unexplained(lines.k, root, white(np.stack(each)), own))
     return out
 
 

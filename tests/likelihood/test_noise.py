@@ -21,6 +21,10 @@ class Comb:
         on = np.rint(f / STEP) % PERIODS == 0
         return np.asarray(np.where(on, 4.0, 0.04)[:, None])
 
+    def cover(self, f: Float, group: Int) -> Float:
+        """As of `Known`."""
+        return np.zeros((f.size, 1))
+
 
 def own(f: Float) -> Complex:
     """One sensor, its own noise alone."""
@@ -49,6 +53,8 @@ class Nothing:
     def __call__(self, f: Float, group: Int) -> Float:
         """As of `Known`."""
         return np.zeros((f.size, 1))
+
+    cover = __call__
 
 
 def resonant(f: Float, at: float) -> Complex:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -22,7 +22,6 @@ from samii_rig.diagnose.physics.faults import SHIFTED
 from samii_rig.diagnose.result import Verdict
 from samii_rig.errors import EstimateError, InputError
 from samii_rig.rig.schema import Rig, parameters
-from samii_rig.signal.steps import FEW
 from samii_rig.types import Finding, FrequencyResponse
 
 LOST_GAIN = 0.02  # relative change of one channel's gain between levels that is told
@@ -73,16 +72,6 @@ class Checked:
         closed = rig.centred
         often = [n for n, k in held.items() if n in closed or 2 * k >= len(self.responses)]
         return tuple(n for n in often if n not in self.hidden)
-
-    def without(self, sensors: Collection[str]) -> Checked:
-        """The same, and whole records do without these sensors too."""
-        also = sorted(set(sensors) - self.hidden)
-        return replace(
-            self,
-            hidden=self.hidden.union(also),
-            remarks=(*map(_direct, also), *self.remarks),
-            samples=(*map(_few_steps, also), *self.samples),
-        )
 
     def competing(self, effects: Sequence[Effect]) -> list[Effect]:
         """The table, with what is left of a wrong unit as no physics, as 9.81 is not 9.80665; and
@@ -175,14 +164,6 @@ def _direct(sensor: str) -> str:
         f"{sensor} is left out: its rounding hides most of its motion; what its loop made of that "
         "stands in the command, which is taken as it was recorded"
     )
-
-
-def _few_steps(sensor: str) -> Finding:
-    """Why whole records do without a sensor of few steps."""
-    text = (
-        f"{sensor} moves by {FEW:g} of its steps or less most of the time, and rounding follows it"
-    )
-    return Finding("resolution", "warning", text, sensor)
 
 
 def estimated(

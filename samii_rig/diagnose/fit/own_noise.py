@@ -10,6 +10,7 @@ import numpy as np
 
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
+from samii_rig.diagnose.fit.search import Search
 from samii_rig.types import Float
 
 # Times the noise of a sensor, root mean square, from which it is more: a data sheet's and a bench's
@@ -21,14 +22,29 @@ FEW_STEPS = 4.0
 
 
 def estimated(search: RecordSearch, whole: Whole) -> Float:
-    """(q,) root mean square of each sensor in the middle of the lines: a disturbance at a
-    resonance, or a few lines, is not its noise."""
-    each_line = []
+    """(q,) root mean square of each sensor in the middle of the lines, but for those where one is
+    covered, if others are left: a disturbance at a resonance, or a few lines, is not its noise."""
+    each_line, covered = [], []
+    noise = search.reduced.noise
     for i, piece in enumerate(whole.records.pieces):
         f = whole.records.lines(piece).frequency
-        L = search.reduced.noise.root(f, np.full(f.size, i))
-        each_line.append(np.sum(np.abs(L) ** 2, axis=2))
-    return np.asarray(np.sqrt(np.median(np.concatenate(each_line), axis=0)))
+        own = np.full(f.size, i)
+        each_line.append(np.sum(np.abs(noise.root(f, own)) ** 2, axis=2))
+        covered.append(noise.covered(f, own))
+    power, without = np.concatenate(each_line), ~np.concatenate(covered)
+    return np.asarray(np.sqrt(np.median(power[without] if without.any() else power, axis=0)))
+
+
+def not_read(search: Search) -> dict[str, float]:
+    """Sensors of which nothing is read at some lines, as they move by few steps, and at which part
+    of all lines."""
+    if not isinstance(search, RecordSearch) or not isinstance(search.whole, Whole):
+        return {}
+    records, noise = search.whole.records, search.reduced.noise
+    lines = [records.lines(piece).frequency for piece in records.pieces]
+    of = np.repeat(np.arange(len(lines)), [f.size for f in lines])
+    part = np.mean(noise.known.cover(np.concatenate(lines), noise.known.group[of]) > 0, axis=0)
+    return {n: float(x) for n, x in zip(search.whole.wired.sensors, part, strict=True) if x > 0}
 
 
 def stated(whole: Whole) -> Float:

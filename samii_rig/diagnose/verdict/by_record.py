@@ -12,6 +12,7 @@ from samii_rig.diagnose.fit.agreeing import Given, SeveralStates, several_states
 from samii_rig.diagnose.fit.discrepant import DiscrepantSearch
 from samii_rig.diagnose.fit.exact import wrong_lengths
 from samii_rig.diagnose.fit.explanations import FIVE, Explanation, threshold
+from samii_rig.diagnose.fit.own_noise import not_read
 from samii_rig.diagnose.fit.ranking import ranking
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import TEST_TURN, Whole
@@ -27,7 +28,7 @@ from samii_rig.diagnose.forces.variation import (
     uneven_spring,
     variation,
 )
-from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap
+from samii_rig.diagnose.result import Band, Diagnosis, Exact, Gap, Used, percent
 from samii_rig.diagnose.verdict import judge as verdict
 from samii_rig.diagnose.verdict.judge import Judgement
 from samii_rig.diagnose.verdict.odd_sensor import describe, odd_sensor
@@ -41,6 +42,7 @@ from samii_rig.diagnose.verdict.stated_noise import (
 from samii_rig.errors import EstimateError, SamiiRigError
 from samii_rig.rig.schema import Rig
 from samii_rig.signal import welch
+from samii_rig.signal.steps import FEW
 from samii_rig.types import Recording
 
 EXHAUSTED = (
@@ -241,6 +243,17 @@ def _at_first(search: RecordSearch) -> tuple[float, tuple[Band, ...]]:
     return search.ratio(search.nominal.fitted), search.bands(search.nominal.fitted)
 
 
+def _used(search: RecordSearch) -> Used:
+    """As of the search, and sensors of which nothing is read at some lines."""
+    used = search.used()
+    hardly = [
+        (name, f"it moves by {FEW:g} of its steps or less at {percent(part)} of the lines: there "
+         "nothing is read of it")
+        for name, part in not_read(search).items()
+    ]  # fmt: skip
+    return replace(used, left_out=(*used.left_out, *hardly))
+
+
 def _answer(
     case: Case,
     search: RecordSearch,
@@ -256,7 +269,7 @@ def _answer(
         nominal=(search.ratio(nominal), looked.plain),
         with_causes=(search.ratio(best.fitted), looked.after),
         gap=looked.gap,
-        used=search.used(),
+        used=_used(search),
     )
     if isinstance(varies := looked.judged.varies, Variation):
         shown = replace(shown, with_causes=varies.after)

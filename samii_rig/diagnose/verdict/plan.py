@@ -76,7 +76,7 @@ def next_experiment(
 
 
 def harder(runs: Sequence[Recording], rig: Rig, hidden: Collection[str]) -> tuple[str, str]:
-    """(why, experiment) in words for sensors that are left out as they move by few of their steps;
+    """(why, experiment) in words for sensors that are not read as they move by few of their steps;
     both empty where there are none."""
     for a in rig.actuator:
         loop = rig.centring_of(a.name)
@@ -98,7 +98,8 @@ def harder(runs: Sequence[Recording], rig: Rig, hidden: Collection[str]) -> tupl
         steps = float(np.median(moves))
         times = max(math.ceil((FEW + 1) / steps), 2)  # beyond FEW, by whole steps
         return (
-            f"{loop.sensor} is left out: what shows in it alone is not looked for",
+            f"{loop.sensor} is not read where it moves by few of its steps: what shows in it alone "
+            "could hide",
             f"drive {a.name} {times} times as hard, or read {loop.sensor} with finer steps: it "
             f"moves by {steps:.0f} of them most of the time that it moves; more than {FEW:g} count",
         )

@@ -10,6 +10,7 @@ from samii_rig.diagnose.data.findings import Checked, Refusal
 from samii_rig.diagnose.data.measured import Measured
 from samii_rig.diagnose.fit.agreeing import Saved, SeveralStates
 from samii_rig.diagnose.fit.exact import off_the_file, wrong_numbers
+from samii_rig.diagnose.fit.own_noise import not_read
 from samii_rig.diagnose.fit.poses import Posed
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
@@ -27,6 +28,7 @@ from samii_rig.diagnose.verdict.plan import harder, next_experiment
 from samii_rig.types import FrequencyResponse, Recording
 
 ALTERNATIVES = 6
+MOSTLY = 0.5  # of the lines, at which a sensor is not read, from which driving harder is proposed
 REPEAT = (
     "a stiffness that changes is distinguished from a force by when it does",
     "repeat one recording at once, and again after a pause",
@@ -122,7 +124,10 @@ def _next(
     if judged.varies is not None:
         return ("", "", None) if judged.verdict == "named" else (*REPEAT, None)
     found = next_levels(judged) or next_experiment(search, judged, case.levels)
-    return found if found[1] else (*harder(case.runs, search.rig, case.clean.hidden), None)
+    if found[1] or judged.verdict == "named":
+        return found
+    few = {name for name, part in not_read(search).items() if part > MOSTLY}
+    return *harder(case.runs, search.rig, case.clean.hidden | few), None
 
 
 def _alternatives(
