@@ -188,7 +188,10 @@ def differing(
             f, k = every[0][0], records.lines(piece).k
             of = np.full(f.size, i)
             first = 1 + len(piece.repeats)
-            covered = [e + noise.cover(f, of, k, j) for j, (_, e, _) in enumerate(every, first)]
+            covered = [  # as much of it as nuisances leave of all noise
+                e + np.sqrt(free)[:, None] * noise.cover(f, of, k, j)
+                for j, (_, e, free) in enumerate(every, first)
+            ]
             white = noise.whitened(f, of, np.stack(covered, axis=2))
             total += 2 * float(np.sum(np.abs(white) ** 2))
             count += 2.0 * white.shape[1] * sum(float(np.sum(free)) for _, _, free in every)

@@ -3,9 +3,12 @@ read of it, and the command, which follows its rounding, tells what it tells."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from samii_rig.likelihood import free
 from samii_rig.likelihood.noise import Noise
 from samii_rig.likelihood.pieces import Command, Piece
 from samii_rig.likelihood.rounding import COVERS, WHITE, Added, Rounding, steps_by_line
@@ -77,22 +80,19 @@ def alone(f: Float) -> Complex:
     return u
 
 
+def known_above(hz: float) -> Added:
+    """Rounding of the first of two sensors, which is covered above a frequency."""
+    at = np.array([0.0, hz, hz + 1e-3, RATE])
+    power = np.array([[0.1, 0.0]] * 4)
+    return Added.of([Rounding(at, power, {}, {}, COVERS * power * (at > hz)[:, None])])
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_what_is_covered_is_noise_of_its_power_and_leaves_the_others_alone(seed: int) -> None:
     """The error under the cover is ten times what is known: the second sensor's own noise is found
     all the same, and chi-square is what it should be."""
     f = 0.02 * np.arange(50.0, 2000.0)
-    known = Added.of(
-        [
-            Rounding(
-                np.array([0.0, 20.0, 20.001, RATE]),
-                np.array([[0.1, 0.0]] * 4),
-                {},
-                {},
-                COVERS * np.array([[0.0, 0.0], [0.0, 0.0], [0.1, 0.0], [0.1, 0.0]]),
-            )
-        ]
-    )
+    known = known_above(20.0)
     rng = np.random.default_rng(seed)
     own = rng.standard_normal((f.size, 2, 2)) @ np.array([1, 1j]) / np.sqrt(2)
     own *= np.sqrt([0.1, 0.04])
@@ -114,3 +114,22 @@ def test_what_is_covered_is_noise_of_its_power_and_leaves_the_others_alone(seed:
     np.testing.assert_allclose(np.median(beside[f > 21]), 0.04, rtol=0.15)
     some: Int = k[::7]
     np.testing.assert_array_equal(noise.cover(f[some], piece[some], some), cover[some])
+
+
+@pytest.mark.parametrize("left", [1.0, 1e-12])
+def test_levels_are_covered_by_as_much_as_nuisances_leave_of_them(
+    left: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of few lines nothing may be left."""
+    f, k = 0.02 * np.arange(50.0, 2000.0), np.arange(1950)
+    rng = np.random.default_rng(0)
+    own = rng.standard_normal((f.size, 2, 2)) @ np.array([1, 1j]) * np.sqrt([0.05, 0.02])
+    e = (alone(f) @ own[:, :, None])[:, :, 0]
+    of = np.zeros(f.size, np.int64)
+    noise = Noise.of(f, e, np.ones(f.size), of, alone, known_above(0.0))
+    each = [(f, np.sqrt(left) * e, np.full(f.size, left))]
+    monkeypatch.setattr(free, "_beside", lambda *_: each)
+    piece = SimpleNamespace(contrasts=(None,), repeats=())
+    records = SimpleNamespace(pieces=[piece], lines=lambda _: SimpleNamespace(k=k))
+    total, count = free.differing(records, None, [None], noise)  # type: ignore[arg-type,list-item]
+    assert total / count == pytest.approx(1.0, abs=0.1)
