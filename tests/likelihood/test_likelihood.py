@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from scipy import linalg, signal
 
+from samii_rig.diagnose.fit.records import _shown, fitted_lines
 from samii_rig.likelihood import pieces
 from samii_rig.likelihood.algebra import as_complex, as_real, shrinking
 from samii_rig.likelihood.before import _past_of
 from samii_rig.likelihood.bridged import bridged
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
 from samii_rig.likelihood.free import Free, Group, residual_of
+from samii_rig.likelihood.inputs import MeterNoise
 from samii_rig.likelihood.leak import columns
 from samii_rig.likelihood.nodes import nodes_of, size_about
 from samii_rig.likelihood.noise import Noise
@@ -22,6 +24,7 @@ from samii_rig.likelihood.past import Past, likely
 from samii_rig.likelihood.pieces import (
     Input,
     Piece,
+    Samples,
     Wiring,
     pieces_of,
     wiring,
@@ -31,10 +34,13 @@ from samii_rig.likelihood.reduce import reduced, residuals_by_line
 from samii_rig.likelihood.rounding import (
     Added,
     Rounding,
+    _wandering,
+    dithered,
     dithering,
     repeating,
 )
 from samii_rig.likelihood.rows import Rows
+from samii_rig.likelihood.spikes import mended
 from samii_rig.rig.load import load_rig
 from samii_rig.types import Channel, Complex, Float, Int, Quality, Recording, Segment
 
@@ -748,3 +754,132 @@ def test_a_sensor_that_falls_with_the_frequency_covers_no_mode_of_another_one() 
         found = nodes(both / size_about(both), spare=spare)
         assert found >= 0.7 * nodes(alone / size_about(alone), spare=spare)
         assert found > nodes(both / np.median(np.abs(both[15:960]), axis=0), spare=spare)
+
+
+@pytest.mark.parametrize("sd", [0.0, 0.1, 0.3])
+def test_repeats_tell_what_dithers_a_sensor_that_crosses_few_steps(sd: float) -> None:
+    """What a reference leaves of them does not: their error is alike, and of several times the
+    power of one that is white."""
+    y = 0.6 * np.sin(2 * np.pi * np.arange(8000) / 61)
+    rng = np.random.default_rng(3)
+    each = [np.rint(y + sd * rng.standard_normal(y.size)) for _ in range(3)]
+    whole = np.sum(each, axis=0) / np.sqrt(3)
+    others = [(each[0] - each[1]) / np.sqrt(2), (each[0] + each[1] - 2 * each[2]) / np.sqrt(6)]
+    samples = tuple(Samples(np.zeros(y.size), z[:, None]) for z in others)
+    of = replace(piece(np.zeros(y.size), whole[:, None]), repeats=samples)
+    assert dithered(of, np.ones(1))[0] == pytest.approx(sd, abs=0.12)
+    found = Rounding.of_piece(of, np.arange(1, 4000), np.ones(1), np.sqrt(3) * y[:, None], RATE)
+    assert 0 in found.draws  # it is tried, and not taken for white
+
+
+def test_a_sensor_that_rests_for_a_while_stands_at_one_place_in_its_step() -> None:
+    """Each second by itself it would stand anywhere while it rests; one that wanders does."""
+    i = np.arange(40 * int(RATE))
+    y = np.where(i % (2 * int(RATE)) < RATE, 0.0, 4 * np.sin(2 * np.pi * i / 61))
+    for place in (0.0, 0.3, 0.45):
+        moved = _wandering(y, np.rint(y + place), int(RATE))
+        assert np.all(moved == 0.0)
+    slow = 0.8 * np.sin(2 * np.pi * i / i.size)
+    always = 4 * np.sin(2 * np.pi * i / 61)
+    moved = _wandering(always, np.rint(always + slow), int(RATE))
+    assert np.abs(np.mean(np.exp(2j * np.pi * (moved - slow)))) > 0.9  # places are of a circle
+
+
+@pytest.mark.parametrize("size", [1.5, 2.5, 4.0])
+def test_the_rounding_of_a_motion_that_follows_the_input_is_no_change_of_the_response(size: float):
+    """Steps of the input: each is followed by the same motion, of three to eight steps of a
+    converter, and by the same error. Taken for independent from line to line, 1.7 to 2.1."""
+    left, denominator = [], poles(damping=0.08)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.choice([-1.0, 1.0], 20), 400)
+        z = from_rest(u, denominator)
+        z[:, 0] = np.rint(z[:, 0] / size + rng.random()) * size
+        z[:, 1] += 1e-2 * rng.standard_normal(u.size)
+        records = Records((piece(u, z),), RATE, ((0.8, 15.0),), (size, 0.0))
+        found = reduced(records, lambda s: response(s, denominator), own_alone)
+        left.append(float(found.target @ found.target) / found.known)
+    assert 0.7 < np.mean(left) < 1.1
+
+
+def coarse(u: Float, denominator: Float, place: float, rng: np.random.Generator) -> Piece:
+    """What a converter of steps of 2 shows of a motion that rests at a place in its step."""
+    z = from_rest(u, denominator)
+    z[:, 0] = np.rint(z[:, 0] / 2 + place) * 2 - 2 * place
+    z[:, 1] += 1e-2 * rng.standard_normal(u.size)
+    return replace(piece(u, z), commands=(pieces.Command(u, 1.0, (MeterNoise(),)),))
+
+
+def test_what_rests_at_one_place_in_its_step_is_rounded_alike_in_all_records():
+    """One motion in several records and at two levels, some of them joined. Each by itself, the
+    levels taken for one larger motion, 1.5."""
+    left, denominator = [], poles(damping=0.08)
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        u, place = np.repeat(rng.choice([-1.0, 1.0], 20), 400), rng.random()
+        parts = (u, 0.63 * u, u[:-9], 0.63 * u[:-50])
+        found = tuple(pieces.joined([coarse(x, denominator, place, rng) for x in parts]))
+        assert [len(p.commands) for p in found] == [2, 1, 1]
+        records = Records(found, RATE, ((0.8, 15.0),) * 3, (2.0, 0.0))
+        form = reduced(records, lambda s: response(s, denominator), own_alone)
+        left.append(float(form.target @ form.target) / form.known)
+    assert 0.6 < np.mean(left) < 1.15, left
+
+
+def test_the_rounding_of_what_wanders_in_its_step_follows_what_is_read():
+    """A joint that nothing holds wanders by one step in a record. Taken for at rest, 1.6."""
+    left, denominator = [], poles(damping=0.08)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        u = sweep(12_000)
+        z = from_rest(u, denominator)
+        size = 0.6 * np.std(z[:, 0])
+        wander = 0.6 * np.sin(2 * np.pi * (np.arange(u.size) / u.size + rng.random()))
+        z[:, 0] = (np.rint(z[:, 0] / size + wander) - wander) * size
+        z[:, 1] += 1e-2 * rng.standard_normal(u.size)
+        records = Records((piece(u, z),), RATE, ((0.8, 15.0),), (size, 0.0))
+        found = reduced(records, lambda s: response(s, denominator), own_alone)
+        left.append(float(found.target @ found.target) / found.known)
+    assert 0.6 < np.mean(left) < 1.15, left
+
+
+def test_a_spike_that_a_fast_motion_hides_shows_beside_the_prediction():
+    """At a third of the rate a cubic through the neighbours misses every sample by as much."""
+    denominator, rng = poles(frequency=30.0, damping=0.02), np.random.default_rng(3)
+    u = sweep(4000, 20.0, 34.0)
+    z = from_rest(u, denominator)
+    sd = 0.01 * np.std(z, axis=0)
+    z += sd * rng.standard_normal(z.shape)
+    struck = z.copy()
+    struck[2500, 1] += 40 * sd[1]
+    assert not mended(struck, np.zeros(2))[1]
+    records = Records((piece(u, struck),), RATE, ((20.0, 34.0),))
+    H = response(records.exact().s, denominator)
+    (found,) = records.without_spikes(H).pieces
+    assert np.abs(found.z[2500, 1] - z[2500, 1]) < 6 * sd[1]
+    np.testing.assert_array_equal(np.delete(found.z, 2500, axis=0), np.delete(z, 2500, axis=0))
+
+
+@pytest.mark.parametrize("every", [1, 2, 3, 7, 10, 16, 64])
+def test_one_line_in_ten_is_kept_apart_of_any_comb(every: int):
+    k = np.arange(every, 400 * every, every)
+    assert np.mean(_shown(k)) == pytest.approx(0.1, abs=0.03)
+    assert np.array_equal(fitted_lines(k), ~_shown(k))
+
+
+@pytest.mark.parametrize("last", [3000, 20 + 256 * 10 + 1])  # and a block of one line
+def test_what_is_far_from_a_block_of_lines_is_known_from_a_few_points(last: int) -> None:
+    """A change in each node as its own response: the record of each, transformed."""
+    n, history, lines = 9000, 400, np.arange(20, last)
+    contour = Contour.over(n + history, RATE, SMOOTH)
+    r = np.random.default_rng(5).normal(size=n + history)
+    nodes = np.unique(np.geomspace(30, 6300 * contour.samples / (2 * n), 40).astype(np.int64))
+    nodes = nodes[nodes <= contour.samples // 2]
+    got = columns(contour, contour.damped(r)[None], nodes, history, n, lines)[0]
+    for j in (0, 7, nodes.size - 2):
+        H = np.zeros((contour.samples // 2 + 1, 1), complex)
+        at = np.arange(nodes[0], nodes[-1] + 1)
+        H[at, 0] = np.interp(at, nodes, np.eye(nodes.size)[j])
+        y = contour.predicted(H, r)[history:]
+        want = np.fft.rfft(y, axis=0)[lines, 0]
+        assert np.max(np.abs(got[:, j] - want)) < 1e-8 * np.max(np.abs(want))
