@@ -48,7 +48,7 @@ WANDERS = 2.0  # times that one place for all leaves more than one a second, of 
 COVERS = 1e4
 OFFSETS = 16  # places of a motion in its step, at which its rounding is tried: within 25 % a line
 ALIKE_OVER = 1.0  # Hz, over which a rounding error's power is spread by what wanders
-RESTS = 0.5  # steps, within which a motion rests
+AT_REST = 0.5  # steps, within which a motion rests
 LIKELY = 4  # of these, that are nearest to what is read
 
 
@@ -247,7 +247,7 @@ def steps_by_line(y: Float, rate_hz: float, frequency: Float) -> Float:
 def _of_rests(y: Float, rate_hz: float) -> Float:
     """(m,) power a sample, at the lines of a record, of an error of power 1 that is the same for as
     long as a motion y (n,) in steps rests, and another at each rest."""
-    labels, count = ndimage.label(crossed(y, rate_hz) < RESTS)
+    labels, count = ndimage.label(crossed(y, rate_hz) < AT_REST)
     out = np.zeros(y.size // 2 + 1)
     for on in ndimage.find_objects(labels, count):
         out += np.abs(np.fft.rfft((labels[on] > 0) * 1.0, y.size)) ** 2 / y.size

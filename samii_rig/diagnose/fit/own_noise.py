@@ -11,7 +11,7 @@ import numpy as np
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.search import Search
-from samii_rig.types import Float
+from samii_rig.types import Float, Int
 
 # Times the noise of a sensor, root mean square, from which it is more: a data sheet's and a bench's
 # differ by two or three, with a floor that shakes.
@@ -24,15 +24,9 @@ FEW_STEPS = 4.0
 def estimated(search: RecordSearch, whole: Whole) -> Float:
     """(q,) root mean square of each sensor in the middle of the lines, but for those where one is
     covered, if others are left: a disturbance at a resonance, or a few lines, is not its noise."""
-    each_line, covered = [], []
-    noise = search.reduced.noise
-    for i, piece in enumerate(whole.records.pieces):
-        f = whole.records.lines(piece).frequency
-        own = np.full(f.size, i)
-        each_line.append(np.sum(np.abs(noise.root(f, own)) ** 2, axis=2))
-        covered.append(noise.covered(f, own))
-    power, without = np.concatenate(each_line), ~np.concatenate(covered)
-    return np.asarray(np.sqrt(np.median(power[without] if without.any() else power, axis=0)))
+    noise, lines = search.reduced.noise, _lines(whole)
+    power, read = np.sum(np.abs(noise.root(*lines)) ** 2, axis=2), ~noise.covered(*lines)
+    return np.asarray(np.sqrt(np.median(power[read] if read.any() else power, axis=0)))
 
 
 def not_read(search: Search) -> dict[str, float]:
@@ -40,11 +34,15 @@ def not_read(search: Search) -> dict[str, float]:
     of all lines."""
     if not isinstance(search, RecordSearch) or not isinstance(search.whole, Whole):
         return {}
-    records, noise = search.whole.records, search.reduced.noise
-    lines = [records.lines(piece).frequency for piece in records.pieces]
-    of = np.repeat(np.arange(len(lines)), [f.size for f in lines])
-    part = np.mean(noise.known.cover(np.concatenate(lines), noise.known.group[of]) > 0, axis=0)
+    known, (f, piece) = search.reduced.noise.known, _lines(search.whole)
+    part = np.mean(known.cover(f, known.group[piece]) > 0, axis=0)
     return {n: float(x) for n, x in zip(search.whole.wired.sensors, part, strict=True) if x > 0}
+
+
+def _lines(whole: Whole) -> tuple[Float, Int]:
+    """Hz of all lines (n,), and the piece (n,) of each."""
+    each = [whole.records.lines(piece).frequency for piece in whole.records.pieces]
+    return np.concatenate(each), np.repeat(np.arange(len(each)), [f.size for f in each])
 
 
 def stated(whole: Whole) -> Float:
