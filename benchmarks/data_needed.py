@@ -1,19 +1,22 @@
 """What data a diagnosis needs, and what each part of the method buys.
 
-    samii-rig prove --keep --plant concealed --rig samii --nothing 100 --one 100 --two 0 \\
-        --outside 0 --joints 0 --force 0 --varying 0 --out kept
+    samii-rig prove --keep --nothing 60 --one 60 --force 40 --two 0 --outside 0 --joints 0 \\
+        --varying 0 --out kept
     python benchmarks/data_needed.py kept
 
-makes kept/data-needed.md and its picture beside it. The swept sines of each kept
-trial are diagnosed with less: more noise, fewer channels, levels and repeats, a shorter part of
-each sweep; and with one part of the method taken out. Every row is of the same trials, so that rows
-compare. Answers are kept in OUT/needed and not made again: with --minutes it stops there, and the
-page is of the trials that have all answers. OPENBLAS_NUM_THREADS=1.
+makes kept/data-needed.md and its picture beside it. The trials that conceal nothing, or one effect
+of 10 to 100 sigma, are diagnosed with less: more noise, fewer sensors, levels and repeats, a
+shorter part of each record; and with one part of the method taken out. Each row has the trials in
+which there is something to leave out, and stands beside the whole data of the very same trials.
+Answers are kept in kept/needed and not made again: with --minutes it stops there, and the page is
+of the trials that have all answers. Several campaigns may be given: the page is put in the first.
+OPENBLAS_NUM_THREADS=1.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import statistics
 import subprocess
@@ -24,17 +27,19 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from samii_rig.diagnose.diagnose import diagnose
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
+from samii_rig.diagnose.posed import InPose, in_poses, of_any_kind, sorted_by_pose
 from samii_rig.errors import SamiiRigError
+from samii_rig.identify.poses import poses_of
 from samii_rig.likelihood.noise import Disturbances
 from samii_rig.plain import plain
 from samii_rig.prove.outcomes import truth_of
@@ -45,102 +50,125 @@ from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.elements import parameters
-from samii_rig.signal.columns import centring_of
 from samii_rig.signal.estimate import estimate
-from samii_rig.types import Complex, Float, Recording, Segment
+from samii_rig.types import Complex, Float, FrequencyResponse, Recording
 
-FROM = 10.0  # sigma that a refit leaves in the whole data, from which an effect should be found
+# Sigma that a refit leaves in the whole data: from the first on an effect should be found, beyond
+# the second it is with a tenth of the data.
+FROM, TO = 10.0, 100.0
+SECONDS = 20.0  # of the diagnosis in its campaign: of longer ones there would be few trials
+NULLS = 4  # every so manieth trial conceals nothing
 PAGE, PICTURE = "data-needed.md", "data-needed.png"
 WIDE, HIGH, DPI = 11.0, 6.0, 110  # inches of the picture, and dots per inch
 
 Recordings = Sequence[Recording]
-Less = Callable[[Recordings, Rig], list[Recording]]
+Less = Callable[[Recordings, Rig], list[Recording] | None]
+"""The recordings with less in them; None where there is nothing to leave out."""
+
+
+def in_loop(rig: Rig) -> set[str]:
+    """The sensors that a loop is closed about."""
+    centrings = (rig.centring_of(a.name) for a in rig.actuator)
+    return {c.sensor for c in (*centrings, *rig.feedback) if c is not None}
 
 
 def noisier(factor: float) -> Less:
-    """White noise, so that each sensor's own is `factor` times as large as the rig file says.
+    """White noise, so that each sensor's own is `factor` times as large as the rig file says. Not
+    of rigs in a loop, which would answer to it."""
 
-    The command has what the loop makes of it, so that the loop's law holds: the input r = v + kp
-    theta stays, and what the rig would have answered to it (kp K is 2 rad/s) is left out.
-    """
-
-    def change(runs: Recordings, rig: Rig) -> list[Recording]:
+    def change(runs: Recordings, rig: Rig) -> list[Recording] | None:
+        if in_loop(rig):
+            return None
         rng = np.random.default_rng(7)
         out = []
         for run in runs:
             values = run.values.copy()
-            added: dict[str, Float] = {}
             for s in rig.sensor:
-                rms = np.sqrt((factor**2 - 1) * (s.noise_rms**2 + s.resolution**2 / 12))
-                added[s.name] = rms * rng.normal(size=len(values))
-                values[:, run.column(s.name)] += added[s.name]
-            loop = centring_of(run)
-            if loop is not None:
-                (command,) = run.names("command")
-                values[:, run.column(command)] -= loop[1] * added[loop[0]]
+                if s.name in run.names("sensor"):
+                    rms = np.sqrt((factor**2 - 1) * (s.noise_rms**2 + s.resolution**2 / 12))
+                    values[:, run.column(s.name)] += rms * rng.normal(size=len(values))
             out.append(replace(run, values=values))
         return out
 
     return change
 
 
-def only(*names: str) -> Less:
-    """These sensors alone."""
+def fewer(part: float) -> Less:
+    """The first part of the sensors, at least one, and those that a loop needs."""
 
-    def change(runs: Recordings, _: Rig) -> list[Recording]:
+    def change(runs: Recordings, rig: Rig) -> list[Recording] | None:
+        names = runs[0].names("sensor")
+        loop = in_loop(rig)
+        ordered = sorted(names, key=lambda n: n not in loop)
+        kept = set(ordered[: max(round(part * len(names)), len(loop), 1)])
+        if len(kept) == len(names) or any(set(run.names("sensor")) != set(names) for run in runs):
+            return None
         out = []
         for run in runs:
-            kept = [i for i, c in enumerate(run.channels) if c.role != "sensor" or c.name in names]
-            channels = tuple(run.channels[i] for i in kept)
-            values, quality = run.values[:, kept], run.quality[:, kept]
+            at = [i for i, c in enumerate(run.channels) if c.role != "sensor" or c.name in kept]
+            channels = tuple(run.channels[i] for i in at)
+            values, quality = run.values[:, at], run.quality[:, at]
             out.append(replace(run, channels=channels, values=values, quality=quality))
         return out
 
     return change
 
 
-def segments(keep: Callable[[Sequence[Segment], Segment], Segment | None]) -> Less:
-    """Of each recording the segments that `keep` gives back, of all recordings' segments and
-    one."""
+def first_of(what: str) -> Less:
+    """Of each recording the segments of the highest level, or the first repeat of each."""
 
-    def change(runs: Recordings, _: Rig) -> list[Recording]:
+    def change(runs: Recordings, _: Rig) -> list[Recording] | None:
         every = [s for run in runs for s in run.segments]
+        if what == "level":
+            top = max(s.level for s in every)
+            keep = {id(s) for s in every if s.level == top}
+        else:
+            seen: set[tuple[object, ...]] = set()
+            keep = set()
+            for s in every:
+                key = (s.name.rsplit("_", 1)[0], s.kind, s.level, s.excited)
+                if s.repeat == 0 and key not in seen:
+                    keep.add(id(s))
+                seen.add(key)
+        if len(keep) == len(every) or not keep:
+            return None
+        each = ((run, tuple(s for s in run.segments if id(s) in keep)) for run in runs)
+        return [replace(run, segments=own) for run, own in each if own]
+
+    return change
+
+
+def shorter(part: float) -> Less:
+    """The first part of each segment, which ends there while the rig still moves."""
+
+    def change(runs: Recordings, _: Rig) -> list[Recording] | None:
+        if all(s.kind == "transient" for run in runs for s in run.segments):
+            return None
         out = []
         for run in runs:
-            kept = tuple(s for one in run.segments if (s := keep(every, one)) is not None)
-            if kept:
-                out.append(replace(run, segments=kept))
+            end = int(run.sequence[-1]) + 1
+            own = tuple(
+                replace(
+                    s,
+                    kind="transient" if s.kind == "transient" else "single",
+                    stop=s.start + round(part * (min(s.stop, end) - s.start)),
+                )
+                for s in run.segments
+            )
+            out.append(replace(run, segments=own))
         return out
 
     return change
 
 
-def highest(n: int) -> Less:
-    """The n highest levels."""
-
-    def keep(every: Sequence[Segment], one: Segment) -> Segment | None:
-        return one if one.level in sorted({s.level for s in every})[-n:] else None
-
-    return segments(keep)
-
-
-def first(n: int) -> Less:
-    """The first n repeats of each level."""
-    return segments(lambda _, one: one if one.repeat < n else None)
-
-
-def shorter(part: float) -> Less:
-    """The first part of each sweep, which ends there while the rig still moves."""
-
-    def keep(_: Sequence[Segment], one: Segment) -> Segment | None:
-        return replace(one, kind="single", stop=one.start + round(part * (one.stop - one.start)))
-
-    return segments(keep)
-
-
 def same(runs: Recordings, _: Rig) -> list[Recording]:
     """As they are."""
     return list(runs)
+
+
+def several_levels(runs: Recordings, rig: Rig) -> list[Recording] | None:
+    """As they are, where there are several levels."""
+    return list(runs) if first_of("level")(runs, rig) else None
 
 
 def certain(rig: Rig) -> Rig:
@@ -168,7 +196,7 @@ _DISTURBED = Whole.disturbed
 
 
 @contextmanager
-def _replaced(of: type, **names: object) -> Iterator[None]:
+def _replaced(of: type, **names: Any) -> Iterator[None]:
     """Methods of a class replaced for a while."""
     with patch.multiple(of, **names):
         yield
@@ -189,37 +217,54 @@ class Case:
     @property
     def key(self) -> str:
         """A file's name."""
-        return f"{self.curve} {self.at}".replace(" ", "_").replace("/", "_")
+        return f"{self.curve} {self.at}".strip().replace(" ", "_").replace("/", "_of_")
+
+    def answer(self, runs: Recordings, rig: Rig) -> dict[str, object]:
+        """What a diagnosis says, or {"nothing": ...} where there is nothing to leave out."""
+        own = self.less(runs, rig)
+        if own is None:
+            return {"nothing": "to leave out"}
+
+        def estimated(some: Recordings) -> Sequence[FrequencyResponse]:
+            return estimate(of_any_kind(some))
+
+        try:
+            with self.without():
+                each = sorted_by_pose(own, poses_of(own, rig, ()), estimated)
+                if not self.whole:
+                    each = [InPose(one.pose, one.responses, ()) for one in each]
+                said: dict[str, object] = plain(in_poses(each, self.held(rig)).plain())
+        except SamiiRigError as error:
+            return {"refused": str(error)}
+        return said
 
 
 ALL = Case("everything", "")
-CURVES = ("noise", "channels", "levels", "length", "repeats")
+CURVES = ("noise", "sensors", "levels", "length", "repeats")
 OUT = "without"
 CASES = (
     ALL,
     Case("noise", "x 3", noisier(3.0)),
     Case("noise", "x 10", noisier(10.0)),
-    Case("channels", "2", only("theta_2", "a_2")),
-    Case("channels", "1", only("theta_2")),
-    Case("levels", "2", highest(2)),
-    Case("levels", "1", highest(1)),
-    Case("length", "3/4", shorter(0.75)),
+    Case("sensors", "half", fewer(0.5)),
+    Case("sensors", "one", fewer(0.0)),
+    Case("levels", "highest", first_of("level")),
     Case("length", "1/2", shorter(0.5)),
-    Case("repeats", "2", first(2)),
-    Case("repeats", "1", first(1)),
+    Case("length", "1/4", shorter(0.25)),
+    Case("repeats", "one", first_of("repeat")),
     Case(OUT, "the transient", whole=False),
     Case(OUT, "the discrepancy",
          without=lambda: _replaced(RecordSearch, overdispersion_of=lambda _self, _fitted: 1.0)),
     Case(OUT, "the nominal refit", held=certain),
-    Case(OUT, "the levels", without=lambda: _replaced(Whole, by_level=lambda self: self)),
+    Case(OUT, "the levels", several_levels,
+         without=lambda: _replaced(Whole, by_level=lambda self: self)),
     Case(OUT, "the noise model", without=lambda: _replaced(Whole, disturbed=_alone)),
 )  # fmt: skip
-WHOLE = {"noise": "x 1", "channels": "4", "levels": "3", "length": "1", "repeats": "4"}
 SAID = {
     "noise": "sensors' noise, of the rig file's",
-    "channels": "sensors",
+    "sensors": "sensors",
     "levels": "levels",
-    "length": "part of each sweep",
+    "length": "part of each record",
     "repeats": "repeats",
 }
 
@@ -232,22 +277,16 @@ def kept_at(folder: Path, case: Case) -> Path:
 def answered(folder: Path, until: float) -> bool:
     """Diagnose one trial in the cases that have no answer yet, each kept as soon as it is there;
     whether all have one."""
-    runs = [read_recording(log) for log in sorted(folder.glob("swept_sine*.mcap"))]
-    rig = parse(Rig, runs[0].rig_toml, str(folder))
-    for case in CASES:
-        kept = kept_at(folder, case)
-        if kept.exists():
-            continue
+    left = [case for case in CASES if not kept_at(folder, case).exists()]
+    if not left:
+        return True
+    runs = [read_recording(log) for log in sorted(folder.glob("*.mcap"))]
+    rig = parse(Rig, next(r.rig_toml for r in runs if r.rig_toml), str(folder))
+    for case in left:
         if time.monotonic() > until:
             return False
-        own = case.less(runs, rig)
-        try:
-            with case.without():
-                responses = estimate(own)
-                found = diagnose(responses, case.held(rig), runs=own if case.whole else ())
-            said = plain(found.plain())
-        except SamiiRigError as error:
-            said = {"failed": str(error)}
+        said = case.answer(runs, rig)
+        kept = kept_at(folder, case)
         kept.parent.mkdir(parents=True, exist_ok=True)
         with replacing(kept) as part:
             part.write_text(json.dumps(said), encoding="utf-8")
@@ -257,74 +296,109 @@ def answered(folder: Path, until: float) -> bool:
 REFUSAL = {"verdict": "refused", "causes": [], "sites": [], "fit": {}}
 
 
-def trial_of(folder: Path, case: Case) -> Trial:
-    """The trial with its answer."""
+def trial_of(folder: Path, case: Case) -> Trial | None:
+    """The trial with its answer; None where there was nothing to leave out."""
     said = json.loads(kept_at(folder, case).read_text("utf-8"))
-    if "failed" in said:
-        print(f"{folder.name} {case.key}: {said['failed']}", file=sys.stderr, flush=True)
+    if "nothing" in said:
+        return None
+    if "refused" in said:
+        print(f"{folder.name} {case.key}: {said['refused']}", file=sys.stderr, flush=True)
         said = REFUSAL
     return Trial(truth_of(folder.parents[1], folder.name), Answer.of(said))
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """What came of a case."""
+class Told:
+    """What came of some trials: of those that conceal nothing and of those that do."""
 
-    case: Case
     alarms: Score
     place: Score
     name: Score
     wrong: Score
-    kept: float
 
     @classmethod
-    def of(cls, case: Case, folders: Sequence[Path]) -> Row:
-        """Over all trials."""
-        trials = [trial_of(f, case) for f in folders]
+    def of(cls, trials: Sequence[Trial]) -> Told:
+        """Of the trials of one case."""
         nothing = [t for t in trials if t.truth.kind == "nothing"]
-        big = [t for t in trials if t.truth.kind == "one" and t.truth.size >= FROM]
-        kept = [t.answer.sigma / t.truth.size for t in big if t.right]
+        some = [t for t in trials if t.truth.kind != "nothing"]
         return cls(
-            case,
             frequency("", [t.answer.verdict != "no_mismatch" for t in nothing]),
-            frequency("", [t.place_right for t in big]),
-            frequency("", [t.right for t in big]),
+            frequency("", [t.place_right for t in some]),
+            frequency("", [t.right for t in some]),
             frequency("", [confidently_wrong(t) for t in trials]),
-            statistics.median(kept) if kept else float("nan"),
         )
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A case beside the whole data of the same trials. hidden, nothing : trials that conceal an
+    effect, and nothing. sigma : of what is told, of that in the whole data, the median of the
+    effects named right in both."""
+
+    case: Case
+    hidden: int
+    nothing: int
+    whole: Told
+    less: Told
+    sigma: float
+
+    @classmethod
+    def of(cls, case: Case, folders: Sequence[Path]) -> Row | None:
+        """Over all trials in which there is something to leave out; None where there is none."""
+        each = ((trial_of(f, ALL), trial_of(f, case)) for f in folders)
+        both = [(a, b) for a, b in each if a is not None and b is not None]
+        hidden = sum(a.truth.kind != "nothing" for a, _ in both)
+        if not hidden:
+            return None
+        kept = [
+            b.answer.sigma / a.answer.sigma
+            for a, b in both
+            if a.truth.kind != "nothing" and a.right and b.right and a.answer.sigma > 0
+        ]
+        sigma = statistics.median(kept) if kept else float("nan")
+        whole, less = (Told.of(some) for some in zip(*both, strict=True))
+        return cls(case, hidden, len(both) - hidden, whole, less, sigma)
 
     def line(self) -> str:
         """Of the page's table."""
-        cells = [f"{c.value:.0%} ({c.low:.0%} to {c.high:.0%})"
-                 for c in (self.alarms, self.place, self.name, self.wrong)]  # fmt: skip
+
+        def cell(a: Score, b: Score) -> str:
+            return f"{a.value:.0%} to {b.value:.0%}" if b.n else ""
+
+        told = ((getattr(self.whole, k), getattr(self.less, k)) for k in ("place", "name", "wrong"))
+        alarms = cell(self.whole.alarms, self.less.alarms)
+        cells = [*(cell(*pair) for pair in told), alarms]
         what = f"{self.case.curve} {self.case.at}".strip()
-        kept = f"{self.kept:.2f}" if self.kept == self.kept else ""
-        return f"| {what} | {' | '.join(cells)} | {kept} |"
+        kept = f"{self.sigma:.2f}" if self.sigma == self.sigma else ""
+        return f"| {what} | {self.hidden} + {self.nothing} | {' | '.join(cells)} | {kept} |"
 
 
-def page(rows: Sequence[Row], nothing: int, one: int) -> str:
+def page(rows: Sequence[Row], nothing: int, hidden: int) -> str:
     """The tables, with how they were made."""
     git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
     commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
     return "\n".join(
         [
             "# What data a diagnosis needs\n",
-            f"Made at commit {commit} by `python benchmarks/data_needed.py kept`, of {one} trials",
-            f"of the first plant that conceal one effect of {FROM:g} sigma or more, and {nothing}",
-            "that conceal nothing. Each has three levels of four swept sines of 36 s on SAMII,",
-            "read by four sensors. A row changes one thing and keeps the rest. Intervals are 90 %.",
-            f"With {one} trials a share is known to some {_width(one):.0%} either way. Only what",
-            "is larger than that counts.\n",
+            f"Made at commit {commit} by `python benchmarks/data_needed.py`, of {hidden} trials",
+            f"of both plants, all rigs and all styles, that conceal one effect of {FROM:g} to",
+            f"{TO:g} sigma, and {nothing} that conceal nothing. Each row leaves one thing out.",
+            "It has the trials in which there is something to leave out, and tells what came of",
+            "them with everything and without it. Trials whose diagnosis took more than",
+            f"{SECONDS:g} s are not among them. With {hidden} trials a share is known to some",
+            f"{_width(hidden):.0%} either way; as a row has the same trials twice, a change of",
+            "half that counts.\n",
             "![Effects told right, by what the recordings have](data-needed.png)\n",
-            "| recordings or method | missing where nothing is | place right | name right | "
-            "confidently wrong | sigma kept, named right |",
-            "|---|---|---|---|---|---|",
+            "| left out | trials with an effect + with none | place right | name right | "
+            "confidently wrong | missing where nothing is | sigma told, of that with everything |",
+            "|---|---|---|---|---|---|---|",
             *(r.line() for r in rows),
             "",
-            "- `noise`: white noise is added to each sensor, and to the command what the loop",
-            "  makes of it.",
-            "- `channels`: theta_2 and a_2, and theta_2 alone.",
-            "- `length`: each sweep ends there, while the rig moves; the band above is lost too.",
+            "- `noise`: white noise is added to each sensor, of rigs without a loop.",
+            "- `sensors`: the first half in the rig file's order, and the first; those of loops",
+            "  stay.",
+            "- `levels`, `repeats`: the highest level alone, and the first repeat of each.",
+            "- `length`: each record ends there, while the rig moves; a sweep loses what is above.",
             "- Without the transient: responses line by line, estimated before any model is known.",
             "- Without the discrepancy: what all explanations leave counts as noise does.",
             "- Without the nominal refit: the rig file's values are taken for exact.",
@@ -343,58 +417,95 @@ def _width(n: int) -> float:
 
 
 def picture(rows: Sequence[Row], path: Path) -> None:
-    """Names right, a panel a curve and one of the parts taken out."""
+    """Names and places right with everything and with less, a panel a curve."""
     own: dict[str, list[Row]] = defaultdict(list)
     for r in rows:
         own[r.case.curve].append(r)
-    whole = own["everything"][0]
     figure = Figure((WIDE, HIGH), layout="constrained")
     axes = figure.subplots(2, 3, sharey=True).ravel()
     for ax, curve in zip(axes, (*CURVES, OUT), strict=True):
-        points = [(WHOLE.get(curve, "nothing"), whole), *((r.case.at, r) for r in own[curve])]
-        for score, label, colour in (("name", "name", "C0"), ("place", "place", "C1")):
-            each = [getattr(r, score) for _, r in points]
-            y = np.array([s.value for s in each])
-            error = np.array([[s.value - s.low for s in each], [s.high - s.value for s in each]])
-            x = np.arange(len(points)) + (0.06 if score == "place" else -0.06)
-            style = "o-" if curve != OUT else "o"
-            ax.errorbar(x, y, np.maximum(error, 0), fmt=style, color=colour, label=label, capsize=3)
-        ticks = [at.removeprefix("the ") for at, _ in points]
-        ax.set_xticks(range(len(points)), ticks, rotation=20 if curve == OUT else 0)
+        for name, colour, aside in (("name", "C0", -0.08), ("place", "C1", 0.08)):
+            for which, marker in (("whole", "_"), ("less", "o")):
+                each = [getattr(getattr(r, which), name) for r in own[curve]]
+                y = np.array([s.value for s in each])
+                x = np.arange(y.size) + aside
+                if which == "whole":
+                    ax.plot(x, y, marker, color=colour, markersize=14, markeredgewidth=2,
+                            label=f"{name}, everything", linestyle="")  # fmt: skip
+                    continue
+                error = np.array([[s.value - s.low, s.high - s.value] for s in each]).T
+                ax.errorbar(x, y, np.maximum(error, 0), fmt=marker, color=colour, capsize=3,
+                            label=f"{name}, with less")  # fmt: skip
+        ticks = [f"{r.case.at.removeprefix('the ')}\n({r.hidden})" for r in own[curve]]
+        ax.set_xticks(range(len(ticks)), ticks, rotation=25 if curve == OUT else 0)
+        ax.set_xlim(-0.5, len(ticks) - 0.5)
         ax.set_xlabel(SAID.get(curve, "taken out of the method"))
         ax.set_ylim(0, 1.02)
         ax.grid(alpha=0.3)
-    axes[0].legend()
-    axes[0].set_ylabel("told right")
-    axes[3].set_ylabel("told right")
+    axes[0].legend(fontsize="small")
+    for ax in (axes[0], axes[3]):
+        ax.set_ylabel("told right")
     figure.savefig(path, dpi=DPI)
 
 
+def chosen_of(out: Path) -> tuple[list[Path], list[Path]]:
+    """Folders of a campaign's trials that conceal one effect, and nothing, in an order that is as
+    good as random."""
+    hidden, nothing = [], []
+    for file in (out / "outcomes").glob("*.json"):
+        outcome = json.loads(file.read_text("utf-8"))
+        folder = out / "recordings" / outcome.get("trial", "-")
+        if "error" in outcome or not folder.exists() or outcome["seconds"]["diagnosis"] > SECONDS:
+            continue
+        truth = truth_of(out, folder.name)
+        if truth.kind == "nothing":
+            nothing.append(folder)
+        elif truth.kind in ("one", "force") and FROM <= truth.size <= TO:
+            hidden.append(folder)
+
+    def mixed(some: list[Path]) -> list[Path]:
+        return sorted(some, key=lambda f: hashlib.sha256(f.name.encode()).digest())
+
+    return mixed(hidden), mixed(nothing)
+
+
+def in_turn(hidden: Sequence[Path], nothing: Sequence[Path]) -> Iterator[Path]:
+    """All of them, every `NULLS`th one that conceals nothing as long as there are such."""
+    rest = iter(nothing)
+    for n, folder in enumerate(hidden, 1):
+        yield folder
+        if n % (NULLS - 1) == 0 and (one := next(rest, None)) is not None:
+            yield one
+    yield from rest
+
+
 def main() -> None:
-    """Diagnose every kept trial in every case; write the page and its picture."""
+    """Diagnose every chosen trial in every case; write the page and its picture."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("out", type=Path, help="folder of trials with their recordings")
+    parser.add_argument("out", type=Path, nargs="+", help="folders of trials with recordings")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no case later")
+    parser.add_argument("--part", default="1/1", help="of every n trials the k-th alone, as k/n")
     chosen = parser.parse_args()
     mpl.use("Agg")
-    folders = [
-        p for p in sorted((chosen.out / "recordings").iterdir()) if list(p.glob("swept_sine*.mcap"))
-    ]
+    each = [chosen_of(out) for out in chosen.out]
+    hidden = [folder for some, _ in each for folder in some]
+    nothing = [folder for _, some in each for folder in some]
+    folders = list(in_turn(hidden, nothing))
+    k, n = map(int, chosen.part.split("/"))
     until = time.monotonic() + 60 * chosen.minutes
-    whole = []
-    for n, folder in enumerate(folders, 1):
-        if not answered(folder, until):
-            break
-        whole.append(folder)
-        print(f"{n} of {len(folders)}", file=sys.stderr, flush=True)
-    truths = [truth_of(chosen.out, f.name) for f in whole]
-    nothing = sum(t.kind == "nothing" for t in truths)
-    one = sum(t.kind == "one" and t.size >= FROM for t in truths)
-    if not one or not nothing:
+    for at, folder in enumerate(folders):
+        if at % n == k - 1:
+            if not answered(folder, until):
+                break
+            print(f"{at + 1} of {len(folders)}", file=sys.stderr, flush=True)
+    whole = [f for f in folders if all(kept_at(f, case).exists() for case in CASES)]
+    kinds = [truth_of(f.parents[1], f.name).kind for f in whole]
+    quiet = sum(kind == "nothing" for kind in kinds)
+    if not quiet or quiet == len(whole):
         sys.exit(f"{len(whole)} trials have all answers: expected some of one effect, some of none")
-    rows = [Row.of(case, whole) for case in CASES]
-    (chosen.out / PAGE).write_text(page(rows, nothing, one), encoding="utf-8")
-    picture(rows, chosen.out / PICTURE)
+    rows = [row for case in CASES[1:] if (row := Row.of(case, whole)) is not None]
+    (chosen.out[0] / PAGE).write_text(page(rows, quiet, len(whole) - quiet), encoding="utf-8")
+    picture(rows, chosen.out[0] / PICTURE)
     print("\n".join(r.line() for r in rows))
 
 

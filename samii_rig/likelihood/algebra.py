@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from samii_rig.types import Complex, Float
@@ -52,26 +54,48 @@ def spanned(X: Float) -> Float:
 def root_of(square: Float) -> Float:
     """(p, m) R so that X R are the directions of columns X, from their products (p, p), as of
     `spanned`."""
+    if not len(square):
+        return square
     values, vectors = np.linalg.eigh(square)
     kept = values > SAME * np.max(values, initial=0.0)
     return np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
 
 
-def shrinking(X: Float, prior: Float) -> Float:
-    """(n, m) Q so that r - Q Q' r is what columns X (n, p) leave of r that have amplitudes as
-    likely as a normal deviation makes them: of 1/sqrt(prior), none where prior (p,) is 0. Its
-    square is that of r in the noise that unit noise and the columns make together."""
-    gone = orthonormal(X[:, prior == 0])
-    X = X[:, prior > 0]
-    if not X.shape[1]:
-        return gone
-    X = X / np.sqrt(prior[prior > 0])
-    X -= gone @ (gone.T @ X)
-    power, turn = np.linalg.eigh(X.T @ X)
-    kept = power > NEGLIGIBLE
-    power = power[kept]
-    shrunk = X @ (turn[:, kept] * np.sqrt((1 - 1 / np.sqrt(1 + power)) / power))
-    return np.concatenate([gone, shrunk], axis=1)
+@dataclass(frozen=True, slots=True)
+class Shrinking:
+    """What columns X (n, p) leave of lines: Q = X C (n, m) projects, or shrinks. Q is not formed,
+    as that is most of the work where columns are many."""
+
+    X: Float
+    C: Float
+
+    @classmethod
+    def of(cls, X: Float, prior: Float) -> Shrinking:
+        """So that r - Q Q' r is what columns X (n, p) leave of r that have amplitudes as likely as
+        a normal deviation makes them: of 1/sqrt(prior), none where prior (p,) is 0. Its square is
+        that of r in the noise that unit noise and the columns make together."""
+        square = X.T @ X
+        scale = np.sqrt(np.where(prior > 0, prior, np.diagonal(square)))
+        scale = 1 / np.where(scale > 0, scale, 1.0)
+        square *= scale[:, None] * scale
+        any_, some = np.flatnonzero(prior == 0), np.flatnonzero(prior > 0)
+        root = root_of(square[np.ix_(any_, any_)])
+        C = np.zeros((len(prior), root.shape[1]))
+        C[any_] = root
+        if some.size:
+            across = root.T @ square[np.ix_(any_, some)]
+            power, turn = np.linalg.eigh(square[np.ix_(some, some)] - across.T @ across)
+            kept = power > NEGLIGIBLE
+            power, turn = power[kept], turn[:, kept]
+            turn = turn * np.sqrt((1 - 1 / np.sqrt(1 + power)) / power)
+            beside = np.zeros((len(prior), turn.shape[1]))
+            beside[any_], beside[some] = -root @ (across @ turn), turn
+            C = np.concatenate([C, beside], axis=1)
+        return cls(X, scale[:, None] * C)
+
+    def left(self, r: Float) -> Float:
+        """(n, ...) of lines r (n, ...)."""
+        return np.asarray(r - self.X @ (self.C @ (self.C.T @ (self.X.T @ r))))
 
 
 def directions(square: Float) -> tuple[Float, Float]:

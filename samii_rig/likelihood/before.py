@@ -80,9 +80,9 @@ def _past_of(
         place = np.r_[first : first + before.shape[2], last : last + beside.shape[2]]
         first, last = first + before.shape[2], last + beside.shape[2]
         We = (W[at] @ e[at, :, None])[:, :, 0]
-        WA, flat = W[at] @ A, A.reshape(-1, A.shape[2]).conj().T
-        square[np.ix_(place, place)] = (flat @ WA.reshape(-1, A.shape[2])).real
-        head[place] = (flat @ We.ravel()).real
+        WA, flat = W[at] @ A, as_real(A.reshape(-1, A.shape[2]))
+        square[np.ix_(place, place)] = flat.T @ as_real(WA.reshape(-1, A.shape[2]))
+        head[place] = flat.T @ as_real(We.ravel())
         B[:, :, place], T[:, :, place] = along(X, A), along(X, WA)
         lines += along(X, e[at, :, None])
         K_at, pull_at = products(as_complex(X), W[at], We)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-from samii_rig.likelihood.algebra import as_complex, as_real, shrinking
+from samii_rig.likelihood.algebra import Shrinking, as_complex, as_real
 from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.noise import Disturbances
 from samii_rig.likelihood.pieces import Loops
@@ -35,15 +35,15 @@ class Complete:
     rows : the lines, without `X` and `N`. columns : (2 n, 2 b) real parts of `X`, then imaginary
     ones.
     root : (n, q, q) so that root e has real and imaginary parts of variance 1. nuisances : of each
-    piece its lines and orthonormal columns over their real, then imaginary parts, as of
-    `shrinking`. factor : (m, m) C. likely : whether any has a size that is known.
+    piece its lines and what its nuisances leave of their real, then imaginary parts. factor :
+    (m, m) C. likely : whether any has a size that is known.
     """
 
     reduced: Reduced
     rows: Rows
     columns: Float
     root: Complex
-    nuisances: tuple[tuple[Int, Float], ...]
+    nuisances: tuple[tuple[Int, Shrinking], ...]
     factor: Float
     likely: bool
 
@@ -60,7 +60,7 @@ class Complete:
         """As `formed`."""
         found, rows = formed(records, response, disturbances, loop, part, own_power=own_power)
         root = np.sqrt(2) * np.linalg.inv(found.noise.root(rows.f, rows.piece))
-        nuisances = tuple((on, _columns(root[on] @ N, prior)) for on, N, prior in rows.each())
+        nuisances = tuple((on, _beside(root[on] @ N, prior)) for on, N, prior in rows.each())
         likely = any(prior.any() for prior in rows.prior)
         m = found.factor.shape[0]
         columns = np.empty((2 * rows.f.size, rows.X[0].shape[1]))
@@ -111,18 +111,17 @@ class Complete:
 
     def _without(self, white: Complex) -> Complex:
         """Whitened lines (n, q, p) without nuisances, in place."""
-        for on, Q in self.nuisances:
+        for on, beside in self.nuisances:
             own = white[on].reshape(-1, white.shape[2])
-            goal = np.concatenate([own.real, own.imag])
-            goal -= Q @ (Q.T @ goal)
+            goal = beside.left(as_real(own))
             white[on] = (goal[: len(own)] + 1j * goal[len(own) :]).reshape(
                 on.size, *white.shape[1:]
             )
         return white
 
 
-def _columns(N: Complex, prior: Float) -> Float:
-    """(2 n q, m) directions of one piece's nuisances (n, q, m_all), as of `shrinking`."""
+def _beside(N: Complex, prior: Float) -> Shrinking:
+    """What one piece's nuisances (n, q, m) leave of its lines (2 n q,)."""
     flat = N.reshape(-1, N.shape[2])
     some = np.any(flat != 0, axis=0)
-    return shrinking(as_real(flat[:, some]), prior[some])
+    return Shrinking.of(as_real(flat[:, some]), prior[some])

@@ -143,16 +143,15 @@ def _nuisances(rows: Rows, W: Complex, We: Complex) -> _Nuisances:
     likely, log_determinant = 0, 0.0
     for (on, N, prior), (_, X) in zip(rows.each(), rows.changes(), strict=True):
         q, m = N.shape[1:]
-        flat = N.reshape(-1, m)
-        WN = W[on] @ N
-        square = (flat.conj().T @ WN.reshape(-1, m)).real
+        flat, WN = as_real(N.reshape(-1, m)), as_real((W[on] @ N).reshape(-1, m))
+        square = flat.T @ WN
         some = prior > 0
         log_determinant += np.linalg.slogdet(square[np.ix_(some, some)] + np.eye(some.sum()))[1]
         likely += int(some.sum())
         values, turn = directions(square + np.diag(prior))
-        cross = as_real(X).T @ as_real(WN.reshape(-1, q * m))
+        cross = as_real(X).T @ WN.reshape(-1, q * m)
         cross = cross.reshape(-1, q, m).swapaxes(0, 1).reshape(-1, m)
-        head = (flat.conj().T @ We[on].ravel()).real
+        head = flat.T @ as_real(We[on].ravel())
         found.append((values, turn, cross, head))
     largest = max(float(np.max(values, initial=0.0)) for values, *_ in found)
     crosses, heads = [], []

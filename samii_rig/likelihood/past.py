@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from samii_rig.likelihood.algebra import SAME, directions
+from samii_rig.likelihood.algebra import SAME, as_real, directions
 from samii_rig.likelihood.contour import Contour
 from samii_rig.likelihood.pieces import Piece
 from samii_rig.types import Complex, Float, Int
@@ -144,9 +144,9 @@ def likely(shapes: Complex, e: Complex, N: Complex, W: Complex) -> Float | None:
     nuisances N (n, q, p); None where they show none. W : (n, q, q) twice the inverse of the noise.
     """
     every = np.concatenate([shapes, N], axis=2)
-    flat = every.reshape(-1, every.shape[2])
-    square = (flat.conj().T @ (W @ every).reshape(flat.shape)).real
-    head = (flat.conj().T @ (W @ e[:, :, None]).ravel()).real
+    flat = as_real(every.reshape(-1, every.shape[2]))
+    square = flat.T @ as_real((W @ every).reshape(-1, every.shape[2]))
+    head = flat.T @ as_real((W @ e[:, :, None]).ravel())
     return shown(square, head, shapes.shape[2])
 
 

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from samii_rig.likelihood import rounding
 from samii_rig.likelihood.algebra import (
     SAME,
+    Shrinking,
     as_complex,
     as_real,
     directions,
     lengths,
-    shrinking,
 )
 from samii_rig.likelihood.before import with_past
 from samii_rig.likelihood.form import Reduced, quadratic
@@ -70,9 +70,8 @@ def residuals_by_line(
         for on, N, prior in rows.each():
             both = np.concatenate([rows.e[on][:, :, None], N], axis=2)
             both = np.sqrt(2) * noise.noise.whitened(rows.f[on], rows.piece[on], both)
-            Q = shrinking(as_real(both[:, :, 1:].reshape(-1, N.shape[2])), prior)
-            goal = as_real(both[:, :, 0].ravel())
-            goal -= Q @ (Q.T @ goal)
+            beside = Shrinking.of(as_real(both[:, :, 1:].reshape(-1, N.shape[2])), prior)
+            goal = beside.left(as_real(both[:, :, 0].ravel()))
             white[on] = as_complex(goal).reshape(on.size, -1)
         each = noise.noise.scaled(rows.f, rows.piece, white) / 2
         out.append(LineResiduals(rows.f, np.sum(np.abs(white) ** 2, axis=1), each))

@@ -144,5 +144,8 @@ def _before(past: Past, e: Complex, wander: Complex, impulse: Float, piece: Piec
 
 def _of_size_one(shapes: Complex) -> Complex:
     """Shapes (n, q, m) that are any, each of size 1."""
-    size = np.linalg.norm(shapes, axis=(0, 1))
-    return np.asarray(shapes[:, :, size > 0] / size[size > 0])
+    flat = shapes.reshape(-1, shapes.shape[2])
+    size = np.sqrt(np.einsum("ij,ij->j", flat.real, flat.real)
+                   + np.einsum("ij,ij->j", flat.imag, flat.imag))  # fmt: skip
+    some = size > 0
+    return np.asarray((shapes if some.all() else shapes[:, :, some]) / size[some])

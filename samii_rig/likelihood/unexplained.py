@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import stats
 
-from samii_rig.likelihood.algebra import as_complex, as_real, shrinking
+from samii_rig.likelihood.algebra import Shrinking, as_complex, as_real
 from samii_rig.likelihood.form import Reduced
 from samii_rig.likelihood.pieces import Loops
 from samii_rig.likelihood.records import Records, Response
@@ -68,12 +68,12 @@ def unexplained(
             for j, e in enumerate(each)
         ]
         N = (root @ seen.N).reshape(-1, seen.N.shape[2])
-        Q = shrinking(as_real(N), seen.prior)
+        beside = Shrinking.of(as_real(N), seen.prior)
 
-        def white(e: Complex, root: Complex = root, Q: Float = Q) -> Complex:
+        def white(e: Complex, root: Complex = root, beside: Shrinking = beside) -> Complex:
             """(m, n, q) whitened, nuisances at their best."""
             goal = as_real((root @ e[..., None]).reshape(len(e), -1).T)
-            return as_complex(goal - Q @ (Q.T @ goal)).T.reshape(e.shape)
+            return as_complex(beside.left(goal)).T.reshape(e.shape)
 
         own = {}
         for c, draws in seen.rounding.draws.items() if rounded else ():

@@ -11,7 +11,7 @@ from scipy import linalg, signal
 
 from samii_rig.diagnose.fit.records import _shown, fitted_lines
 from samii_rig.likelihood import pieces
-from samii_rig.likelihood.algebra import as_complex, as_real, shrinking
+from samii_rig.likelihood.algebra import Shrinking, as_complex, as_real
 from samii_rig.likelihood.before import _past_of
 from samii_rig.likelihood.bridged import bridged
 from samii_rig.likelihood.contour import EXACT, SMOOTH, Contour
@@ -227,8 +227,7 @@ def test_columns_of_likely_amplitudes_are_left_as_in_the_noise_of_both(likely: i
     rng = np.random.default_rng(5)
     X, r = rng.normal(size=(12, 3)) * [1e-3, 1.0, 30.0], rng.normal(size=12)
     prior = np.repeat([0.0, 1.0], [3 - likely, likely])
-    Q = shrinking(X, prior)
-    left = r - Q @ (Q.T @ r)
+    left = Shrinking.of(X, prior).left(r)
     # Diffuse amplitudes: the limit of ever larger ones.
     sd = np.where(prior > 0, 1.0, 1e4 / np.linalg.norm(X, axis=0))
     both = np.eye(12) + (X * sd**2) @ X.T

@@ -9,7 +9,7 @@ import pytest
 from scipy import signal, special
 
 from samii_rig.likelihood import nuisance
-from samii_rig.likelihood.algebra import as_real, shrinking
+from samii_rig.likelihood.algebra import Shrinking, as_real
 from samii_rig.likelihood.complete import Complete
 from samii_rig.likelihood.inputs import BESIDE_TURN
 from samii_rig.likelihood.pieces import Piece, _cut_off
@@ -133,7 +133,7 @@ def test_all_lines_count_as_in_the_noise_of_sensors_and_of_a_measured_force() ->
     flat = as_real(A.reshape(-1, 4))
     whole = Complete(
         SimpleNamespace(), rows_of_lines(e), as_real(X), np.tile(np.eye(q), (n, 1, 1)),
-        ((np.arange(n), shrinking(flat, np.ones(4))),), factor_of(X, flat, q), likely=True,
+        ((np.arange(n), Shrinking.of(flat, np.ones(4))),), factor_of(X, flat, q), likely=True,
     )  # fmt: skip
     both = np.eye(2 * n * q) + flat @ flat.T
     want = as_real(e.ravel()) @ np.linalg.solve(both, as_real(e.ravel()))

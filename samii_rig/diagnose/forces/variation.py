@@ -98,11 +98,13 @@ class Variation:
 
 @dataclass(frozen=True)
 class BySpring:
-    """What a linear explanation `best` leaves of the records, taken back to each spring."""
+    """What a linear explanation `best` leaves of the records, taken back to each spring. left : of
+    each piece, on the lines fitted."""
 
     search: ForceSearch
     best: Explanation
     springs: Springs
+    left: list[Unexplained]
     pieces: dict[str, list[PieceModulation]]
 
     @classmethod
@@ -110,7 +112,7 @@ class BySpring:
         """Of an explanation of these records."""
         springs = Springs.of(search)
         left = _some(search.unexplained(best.fitted))
-        return cls(search, best, springs, springs.pieces(search, left))
+        return cls(search, best, springs, left, springs.pieces(search, left))
 
     def in_own_noise(self) -> BySpring:
         """The same in the noise that the explanation itself leaves. In that of another all that
@@ -236,7 +238,8 @@ class _Taken:
 
     search, fitted : of these, and a model of them. levels : the records with it. modulations : what
     varies, as it was found. repeats : of each, whether repeats of one input differ by it, None
-    where there are none. swings : of all of them, what is taken out.
+    where there are none. swings : of all of them, what is taken out. left : as of `BySpring`, of
+    these records.
     """
 
     search: ForceSearch
@@ -245,6 +248,7 @@ class _Taken:
     site: str
     levels: Whole
     swings: Swings
+    left: list[Unexplained]
     modulations: list[Modulation] = field(default_factory=list)
     repeats: list[bool | None] = field(default_factory=list)
     pieces: list[PieceModulation] = field(default_factory=list)
@@ -254,7 +258,7 @@ class _Taken:
         """Nothing taken out yet of the spring of a site."""
         search, pieces = seen.search, seen.pieces[site]
         none = Swings.none([one.times.size for one in pieces])
-        return cls(search, seen.best.fitted, seen.springs, site, search.levels, none)
+        return cls(search, seen.best.fitted, seen.springs, site, search.levels, none, seen.left)
 
     def settled(self, best: Explanation) -> _Taken:
         """The same, once nothing is left that varies and what was found stands still."""
@@ -273,21 +277,22 @@ class _Taken:
         """As of `likelihood`, less what phases and frequencies that were looked for add by
         themselves."""
         sought = sum(one.chi2 / 2 - one.evidence for one in self.modulations)
-        return likelihood(self.search, self.fitted) - sought
+        return _likelihood(self.left, self.fitted) - sought
 
     def closer(self, best: Explanation, seen: Modulation | None = None) -> bool:
-        """Take out what varies still, and make the likelihood anew. False if noise could do it.
-        seen : what is taken out then all the same, as noise could not do what a neighbour does."""
+        """Take out what varies still, and make the likelihood anew. False if noise could do it, or
+        what was found does. seen : what is taken out then all the same, as noise could not do what
+        a neighbour does."""
         step = 1 / self.springs.longest
-        left = _some(self.search.unexplained(self.fitted))
-        here = self.springs.pieces(self.search, left, self.site)
+        here = self.springs.pieces(self.search, self.left, self.site)
         self.pieces, more = here[self.site], self.springs.strongest(here)
         if not more and seen is not None:
             more = [(self.site, seen)]
         known = [*self.swings.hz, *(0.0 for one in self.modulations if one.hz == 0)]
         # What those that are known still miss looks like others beside them.
         still = not self.swings.hz.size or self.swings.left < SWINGS_STILL
-        if still and more and all(abs(more[0][1].hz - hz) > step for hz in known):
+        new = bool(more) and all(abs(more[0][1].hz - hz) > step for hz in known)
+        if still and new:
             one = more[0][1].closer(self.pieces, step)
             self.modulations.append(one)
             self.repeats.append(_repeats_differ(self.pieces, one.hz))
@@ -304,8 +309,9 @@ class _Taken:
         self.search = self.search.on(levels, self.fitted)
         again = self.search.refitted(best.effects, replace(best, fitted=self.fitted))
         self.fitted = again or self.fitted
+        self.left = _some(self.search.unexplained(self.fitted))
         self._move()
-        return bool(more)
+        return new
 
     def _move(self) -> None:
         """Let the rig move as it is fitted without what varies: the first motion is that of a rig
@@ -385,11 +391,15 @@ class _Taken:
 
 def likelihood(search: ForceSearch, fitted: Fitted) -> float:
     """Logarithm of the likelihood of the lines fitted, the noise that of the search."""
-    each = _some(search.unexplained(fitted))
+    return _likelihood(_some(search.unexplained(fitted)), fitted)
+
+
+def _likelihood(left: Sequence[Unexplained], fitted: Fitted) -> float:
+    """As `likelihood`, of what is left of each piece."""
     found = sum(
         len(x.white) * float(np.sum(2 * np.linalg.slogdet(x.root)[1]))
         - float(np.sum(np.abs(x.white) ** 2)) / 2
-        for x in each
+        for x in left
     )
     return found - fitted.penalty / 2
 

@@ -93,38 +93,23 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     search.begin("amplitude levels")
     forces, untried = forces_on(search)
     forced = _winning(forces)
-    if (beyond := _beyond(forces, search)) is not None:
+    level_dependent = case.search.lines.depends_on_level()
+    in_pairs = forced is None or _may_be_linear(forced, level_dependent=level_dependent)
+    varied = _varying(forces, forced, search, len(case.runs)) if in_pairs else None
+    if varied is None and (beyond := _beyond(forces, search)) is not None:
         wide = replace(case, whole=beyond)
         if (again := on_records(wide)) is not None:
             return by_records(wide, again)
-    if forced is None or _may_be_linear(
-        forced, level_dependent=case.search.lines.depends_on_level()
-    ):
-        search.begin("what is missing, in pairs")
-        single = search.ranked()[0].key
-        search.run()
-        search.begin("amplitude levels, beside pairs")
-        best = search.ranked()[0]
-        more = search.ratio(best.fitted) > threshold(search.spread)
-        if best.key != single and (forced is not None or more):
-            # What a force did beside a single effect competes with what it does beside pairs.
-            beside, untried = forces_on(search, forced.ranked()[:1] if forced else ())
-            if beside is not None and forces is not None:
-                both = [u for u in (beside.uneven, forces.uneven) if u is not None]
-                beside.uneven = max(both, key=lambda u: u[1], default=None)
-            forces = beside or forces
-            forced = _winning(forces)
+    if varied is None and in_pairs:
+        forces, untried = _beside_pairs(search, forces, forced, untried)
+        forced = _winning(forces)
     search.begin("what cannot be distinguished")
-    if forced is None:
-        looked = _even(forces, search, _consistent(search, _looked(search)))
-    else:
+    if forced is not None:
         first, bands = _at_first(forced)
-        looked = _looked(forced)
-        if forced.exhausted:
-            looked = replace(looked, remarks=(*looked.remarks, EXHAUSTED))
+    looked = varied or _of_best(forces, forced, search)
     given = Given.of(search, case.runs, case.clean.samples)
     several, doubted = None, False
-    if forces is not None:
+    if forces is not None and varied is None:
         if _without_force(looked.judged):
             several = _several(search, [given], None)
         search.begin("whether stiffnesses are constant")
@@ -142,6 +127,55 @@ def by_records(case: Case, search: RecordSearch) -> Diagnosis:
     looked = replace(looked, remarks=(*looked.remarks, *untried))
     found = _agreeing(case, last, first, bands, looked, [given], several=several)
     return found if doubted else _of_sensor(case, found)
+
+
+def _beside_pairs(
+    search: RecordSearch,
+    forces: ForceSearch | None,
+    forced: ForceSearch | None,
+    untried: tuple[str, ...],
+) -> tuple[ForceSearch | None, tuple[str, ...]]:
+    """Pairs of linear effects, and the search among forces beside the best of these, as of
+    `forces_on`; the one before where a single effect does as well. forced : as of `_winning`."""
+    search.begin("what is missing, in pairs")
+    single = search.ranked()[0].key
+    search.run()
+    search.begin("amplitude levels, beside pairs")
+    best = search.ranked()[0]
+    more = search.ratio(best.fitted) > threshold(search.spread)
+    if best.key == single or (forced is None and not more):
+        return forces, untried
+    # What a force did beside a single effect competes with what it does beside pairs.
+    beside, untried = forces_on(search, forced.ranked()[:1] if forced else ())
+    if beside is not None and forces is not None:
+        both = [u for u in (beside.uneven, forces.uneven) if u is not None]
+        beside.uneven = max(both, key=lambda u: u[1], default=None)
+    return beside or forces, untried
+
+
+def _of_best(
+    forces: ForceSearch | None, forced: ForceSearch | None, search: RecordSearch
+) -> _Looked:
+    """What is judged of the best explanation. forced : as of `_winning`."""
+    if forced is None:
+        return _even(forces, search, _consistent(search, _looked(search)))
+    looked = _looked(forced)
+    return replace(looked, remarks=(*looked.remarks, EXHAUSTED)) if forced.exhausted else looked
+
+
+def _varying(
+    forces: ForceSearch | None, forced: ForceSearch | None, search: RecordSearch, files: int
+) -> _Looked | None:
+    """A stiffness that varies, where no linear response explains all records and it leaves no more
+    than noise: nothing is left for a pair of effects, nor to be seen beyond what is excited; None
+    else. forced : as of `_winning`. files : as of `_constant`."""
+    if forces is None or not _disagree(search):
+        return None
+    search.begin("whether stiffnesses are constant")
+    looked = _constant(forces, forced or search, _of_best(forces, forced, search), files)
+    varies = looked.judged.varies
+    told = looked.judged.verdict == "named" and isinstance(varies, Variation) and varies.inside
+    return looked if told else None
 
 
 def _of_sensor(case: Case, found: Diagnosis) -> Diagnosis:
@@ -411,7 +445,12 @@ def _explained(forces: ForceSearch, judged: Judgement) -> float:
 
 
 def _constant(
-    forces: ForceSearch, search: RecordSearch, looked: _Looked, files: int, *, differ: bool
+    forces: ForceSearch,
+    search: RecordSearch,
+    looked: _Looked,
+    files: int,
+    *,
+    differ: bool = False,
 ) -> _Looked:
     """The same, but where a stiffness varies that is the answer: in the place of another that the
     data make less likely, or in words beside it. What no row explains as well as a spring that is
@@ -476,12 +515,18 @@ def _without_force(judged: Judgement) -> bool:
     return all(e.force is None for e in judged.best.effects)
 
 
+def _disagree(search: RecordSearch) -> bool:
+    """Whether no linear response explains all records."""
+    left, sd = search.inconsistent()
+    return left >= 1 + FIVE * sd
+
+
 def _consistent(search: RecordSearch, looked: _Looked) -> _Looked:
     """The same, but where no linear response explains all records something is missing; and that in
     words."""
-    left, sd = search.inconsistent()
-    if left < 1 + FIVE * sd:
+    if not _disagree(search):
         return looked
+    left, _ = search.inconsistent()
     remarks = (
         f"the records disagree: chi-square per degree of freedom {left:.3g} of what no linear "
         "model can explain, so something depends on amplitude or changed between runs",
