@@ -4,12 +4,13 @@
         --varying 0 --out kept
     python benchmarks/data_needed.py kept
 
-makes kept/data-needed.md and its picture beside it. The trials that conceal nothing, or one effect
-of 10 to 100 sigma, are diagnosed with less: more noise, fewer sensors, levels and repeats, a
-shorter part of each record; and with one part of the method taken out. Each row has the trials in
-which there is something to leave out, and stands beside the whole data of the very same trials.
-Answers are kept in kept/needed and not made again: with --minutes it stops there, and the page is
-of the trials that have all answers. Several campaigns may be given: the page is put in the first.
+makes kept/evidence/data-needed.md and its picture in kept/images. The trials that conceal nothing,
+or one effect of 10 to 100 sigma, are diagnosed with less: more noise, fewer sensors, levels and
+repeats, a shorter part of each record; and with one part of the method taken out. Each row has the
+trials in which there is something to leave out, and stands beside the whole data of the very same
+trials. Answers are kept in kept/needed and not made again: with --minutes it stops there, and the
+page is of the trials that have all answers. Several campaigns may be given: the page is put in the
+first, or in the folder that --docs names.
 OPENBLAS_NUM_THREADS=1.
 """
 
@@ -44,12 +45,13 @@ from samii_rig.likelihood.noise import Disturbances
 from samii_rig.plain import plain
 from samii_rig.prove.outcomes import truth_of
 from samii_rig.prove.score import Score, confidently_wrong, frequency
-from samii_rig.prove.trial import Answer, Trial
+from samii_rig.prove.trial import REFUSED, Answer, Trial
 from samii_rig.record.export import replacing
 from samii_rig.record.reader import read_recording
 from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.elements import parameters
+from samii_rig.signal.columns import centring_of, is_open
 from samii_rig.signal.estimate import estimate
 from samii_rig.types import Complex, Float, FrequencyResponse, Recording
 
@@ -58,7 +60,7 @@ from samii_rig.types import Complex, Float, FrequencyResponse, Recording
 FROM, TO = 10.0, 100.0
 SECONDS = 20.0  # of the diagnosis in its campaign: of longer ones there would be few trials
 NULLS = 4  # every so manieth trial conceals nothing
-PAGE, PICTURE = "data-needed.md", "data-needed.png"
+PAGE, PICTURE = Path("evidence/data-needed.md"), Path("images/data-needed.png")
 WIDE, HIGH, DPI = 11.0, 6.0, 110  # inches of the picture, and dots per inch
 
 Recordings = Sequence[Recording]
@@ -73,24 +75,36 @@ def in_loop(rig: Rig) -> set[str]:
 
 
 def noisier(factor: float) -> Less:
-    """White noise, so that each sensor's own is `factor` times as large as the rig file says. Not
-    of rigs in a loop, which would answer to it."""
+    """White noise, so that each sensor's own is `factor` times as large as the rig file says.
+
+    The command has what the centring makes of it, so that its law holds: the input r = v + kp theta
+    stays, and what the rig would have answered to it (kp K is some 2 rad/s) is left out. Not of
+    rigs with a filter in a loop.
+    """
 
     def change(runs: Recordings, rig: Rig) -> list[Recording] | None:
-        if in_loop(rig):
+        if rig.feedback:
             return None
         rng = np.random.default_rng(7)
-        out = []
-        for run in runs:
-            values = run.values.copy()
-            for s in rig.sensor:
-                if s.name in run.names("sensor"):
-                    rms = np.sqrt((factor**2 - 1) * (s.noise_rms**2 + s.resolution**2 / 12))
-                    values[:, run.column(s.name)] += rms * rng.normal(size=len(values))
-            out.append(replace(run, values=values))
-        return out
+        return [_noisier(run, rig, factor, rng) for run in runs]
 
     return change
+
+
+def _noisier(run: Recording, rig: Rig, factor: float, rng: np.random.Generator) -> Recording:
+    values = run.values.copy()
+    loop = centring_of(run)
+    for s in rig.sensor:
+        if s.name not in run.names("sensor"):
+            continue
+        rms = np.sqrt((factor**2 - 1) * (s.noise_rms**2 + s.resolution**2 / 12))
+        added = rms * rng.normal(size=len(values))
+        values[:, run.column(s.name)] += added
+        if loop is not None and loop[0] == s.name:
+            (command,) = run.names("command")
+            if not is_open(run, command, *loop):
+                values[:, run.column(command)] -= loop[1] * added
+    return replace(run, values=values)
 
 
 def fewer(part: float) -> Less:
@@ -226,7 +240,7 @@ class Case:
             return {"nothing": "to leave out"}
 
         def estimated(some: Recordings) -> Sequence[FrequencyResponse]:
-            return estimate(of_any_kind(some))
+            return estimate(of_any_kind(some), gaps="auto")
 
         try:
             with self.without():
@@ -293,7 +307,7 @@ def answered(folder: Path, until: float) -> bool:
     return True
 
 
-REFUSAL = {"verdict": "refused", "causes": [], "sites": [], "fit": {}}
+REFUSAL = {"verdict": REFUSED, "causes": [], "sites": [], "fit": {}}
 
 
 def trial_of(folder: Path, case: Case) -> Trial | None:
@@ -309,8 +323,10 @@ def trial_of(folder: Path, case: Case) -> Trial | None:
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What came of some trials: of those that conceal nothing and of those that do."""
+    """What came of some trials: of those that conceal nothing and of those that do. refused : how
+    many of both."""
 
+    refused: int
     alarms: Score
     place: Score
     name: Score
@@ -322,7 +338,8 @@ class Told:
         nothing = [t for t in trials if t.truth.kind == "nothing"]
         some = [t for t in trials if t.truth.kind != "nothing"]
         return cls(
-            frequency("", [t.answer.verdict != "no_mismatch" for t in nothing]),
+            sum(t.answer.verdict == REFUSED for t in trials),
+            frequency("", [t.answer.verdict not in ("no_mismatch", REFUSED) for t in nothing]),
             frequency("", [t.place_right for t in some]),
             frequency("", [t.right for t in some]),
             frequency("", [confidently_wrong(t) for t in trials]),
@@ -367,7 +384,7 @@ class Row:
 
         told = ((getattr(self.whole, k), getattr(self.less, k)) for k in ("place", "name", "wrong"))
         alarms = cell(self.whole.alarms, self.less.alarms)
-        cells = [*(cell(*pair) for pair in told), alarms]
+        cells = [*(cell(*pair) for pair in told), alarms, str(self.less.refused or "")]
         what = f"{self.case.curve} {self.case.at}".strip()
         kept = f"{self.sigma:.2f}" if self.sigma == self.sigma else ""
         return f"| {what} | {self.hidden} + {self.nothing} | {' | '.join(cells)} | {kept} |"
@@ -388,13 +405,15 @@ def page(rows: Sequence[Row], nothing: int, hidden: int) -> str:
             f"{SECONDS:g} s are not among them. With {hidden} trials a share is known to some",
             f"{_width(hidden):.0%} either way; as a row has the same trials twice, a change of",
             "half that counts.\n",
-            "![Effects told right, by what the recordings have](data-needed.png)\n",
+            f"![Effects told right, by what the recordings have](../{PICTURE})\n",
             "| left out | trials with an effect + with none | place right | name right | "
-            "confidently wrong | missing where nothing is | sigma told, of that with everything |",
-            "|---|---|---|---|---|---|---|",
+            "confidently wrong | missing where nothing is | refused | sigma told, of that with "
+            "everything |",
+            "|---|---|---|---|---|---|---|---|",
             *(r.line() for r in rows),
             "",
-            "- `noise`: white noise is added to each sensor, of rigs without a loop.",
+            "- `noise`: white noise is added to each sensor, and to the command what the loop",
+            "  makes of it.",
             "- `sensors`: the first half in the rig file's order, and the first; those of loops",
             "  stay.",
             "- `levels`, `repeats`: the highest level alone, and the first repeat of each.",
@@ -484,6 +503,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path, nargs="+", help="folders of trials with recordings")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no case later")
+    parser.add_argument("--docs", type=Path, help="folder of the page, evidence/, and images/")
     parser.add_argument("--part", default="1/1", help="of every n trials the k-th alone, as k/n")
     chosen = parser.parse_args()
     mpl.use("Agg")
@@ -504,8 +524,11 @@ def main() -> None:
     if not quiet or quiet == len(whole):
         sys.exit(f"{len(whole)} trials have all answers: expected some of one effect, some of none")
     rows = [row for case in CASES[1:] if (row := Row.of(case, whole)) is not None]
-    (chosen.out[0] / PAGE).write_text(page(rows, quiet, len(whole) - quiet), encoding="utf-8")
-    picture(rows, chosen.out[0] / PICTURE)
+    docs = chosen.docs or chosen.out[0]
+    for file in (PAGE, PICTURE):
+        (docs / file).parent.mkdir(parents=True, exist_ok=True)
+    (docs / PAGE).write_text(page(rows, quiet, len(whole) - quiet), encoding="utf-8")
+    picture(rows, docs / PICTURE)
     print("\n".join(r.line() for r in rows))
 
 
