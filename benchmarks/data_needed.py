@@ -27,6 +27,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -299,7 +300,7 @@ def answered(folder: Path, until: float) -> bool:
     for case in left:
         if time.monotonic() > until:
             return False
-        said = case.answer(runs, rig)
+        said = {**case.answer(runs, rig), "commit": commit()}
         kept = kept_at(folder, case)
         kept.parent.mkdir(parents=True, exist_ok=True)
         with replacing(kept) as part:
@@ -390,15 +391,25 @@ class Row:
         return f"| {what} | {self.hidden} + {self.nothing} | {' | '.join(cells)} | {kept} |"
 
 
-def page(rows: Sequence[Row], nothing: int, hidden: int) -> str:
-    """The tables, with how they were made."""
+@cache
+def commit() -> str:
+    """Of this code."""
     git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
-    commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+    return subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
+
+
+def page(rows: Sequence[Row], whole: Sequence[Path], nothing: int) -> str:
+    """The tables, with how they were made. whole : folders of all trials, of which so many conceal
+    nothing."""
+    hidden = len(whole) - nothing
+    kept = (kept_at(f, case).read_text("utf-8") for f in whole for case in CASES)
+    commits = sorted({json.loads(text)["commit"] for text in kept})
     return "\n".join(
         [
             "# What data a diagnosis needs\n",
-            f"Made at commit {commit} by `python benchmarks/data_needed.py`, of {hidden} trials",
-            f"of both plants, all rigs and all styles, that conceal one effect of {FROM:g} to",
+            "Made by `python benchmarks/data_needed.py`, with the code of commit",
+            f"{' and '.join(commits)}, of {hidden} trials",
+            f"of many rigs and styles, that conceal one effect of {FROM:g} to",
             f"{TO:g} sigma, and {nothing} that conceal nothing. Each row leaves one thing out.",
             "It has the trials in which there is something to leave out, and tells what came of",
             "them with everything and without it. Trials whose diagnosis took more than",
@@ -527,7 +538,7 @@ def main() -> None:
     docs = chosen.docs or chosen.out[0]
     for file in (PAGE, PICTURE):
         (docs / file).parent.mkdir(parents=True, exist_ok=True)
-    (docs / PAGE).write_text(page(rows, quiet, len(whole) - quiet), encoding="utf-8")
+    (docs / PAGE).write_text(page(rows, whole, quiet), encoding="utf-8")
     picture(rows, docs / PICTURE)
     print("\n".join(r.line() for r in rows))
 
