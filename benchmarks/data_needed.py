@@ -36,16 +36,16 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
+from samii_rig.diagnose.batch import How, responses_by_pose
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
-from samii_rig.diagnose.posed import InPose, in_poses, of_any_kind, sorted_by_pose
+from samii_rig.diagnose.posed import in_poses
 from samii_rig.errors import SamiiRigError
-from samii_rig.identify.poses import poses_of
 from samii_rig.likelihood.noise import Disturbances
 from samii_rig.plain import plain
 from samii_rig.prove.outcomes import truth_of
-from samii_rig.prove.score import Score, confidently_wrong, frequency
+from samii_rig.prove.score import Score, confidently_wrong, detected, frequency
 from samii_rig.prove.trial import REFUSED, Answer, Trial
 from samii_rig.record.export import replacing
 from samii_rig.record.reader import read_recording
@@ -53,8 +53,7 @@ from samii_rig.rig.load import parse
 from samii_rig.rig.schema import Rig
 from samii_rig.rig.schema.elements import parameters
 from samii_rig.signal.columns import centring_of, is_open
-from samii_rig.signal.estimate import estimate
-from samii_rig.types import Complex, Float, FrequencyResponse, Recording
+from samii_rig.types import Complex, Float, Recording, Segment
 
 # Sigma that a refit leaves in the whole data: from the first on an effect should be found, beyond
 # the second it is with a tenth of the data.
@@ -129,28 +128,33 @@ def fewer(part: float) -> Less:
     return change
 
 
-def first_of(what: str) -> Less:
-    """Of each recording the segments of the highest level, or the first repeat of each."""
+def highest_level(runs: Recordings, _: Rig) -> list[Recording] | None:
+    """The segments of the highest level."""
+    top = max(s.level for run in runs for s in run.segments)
+    return _segments(runs, lambda s: s.level == top)
 
-    def change(runs: Recordings, _: Rig) -> list[Recording] | None:
-        every = [s for run in runs for s in run.segments]
-        if what == "level":
-            top = max(s.level for s in every)
-            keep = {id(s) for s in every if s.level == top}
-        else:
-            seen: set[tuple[object, ...]] = set()
-            keep = set()
-            for s in every:
-                key = (s.name.rsplit("_", 1)[0], s.kind, s.level, s.excited)
-                if s.repeat == 0 and key not in seen:
-                    keep.add(id(s))
-                seen.add(key)
-        if len(keep) == len(every) or not keep:
-            return None
-        each = ((run, tuple(s for s in run.segments if id(s) in keep)) for run in runs)
-        return [replace(run, segments=own) for run, own in each if own]
 
-    return change
+def first_repeats(runs: Recordings, _: Rig) -> list[Recording] | None:
+    """The first repeat of each."""
+    seen: set[tuple[object, ...]] = set()
+
+    def is_first(s: Segment) -> bool:
+        key = (s.name.rsplit("_", 1)[0], s.kind, s.level, s.excited)
+        known = key in seen
+        seen.add(key)
+        return s.repeat == 0 and not known
+
+    return _segments(runs, is_first)
+
+
+def _segments(runs: Recordings, keep: Callable[[Segment], bool]) -> list[Recording] | None:
+    """Of each recording the segments that are kept, of which it has some; None where that is all or
+    nothing."""
+    kept = [replace(run, segments=tuple(s for s in run.segments if keep(s))) for run in runs]
+    count = sum(len(run.segments) for run in kept)
+    if count in (0, sum(len(run.segments) for run in runs)):
+        return None
+    return [run for run in kept if run.segments]
 
 
 def shorter(part: float) -> Less:
@@ -183,7 +187,7 @@ def same(runs: Recordings, _: Rig) -> list[Recording]:
 
 def several_levels(runs: Recordings, rig: Rig) -> list[Recording] | None:
     """As they are, where there are several levels."""
-    return list(runs) if first_of("level")(runs, rig) else None
+    return list(runs) if highest_level(runs, rig) else None
 
 
 def certain(rig: Rig) -> Rig:
@@ -240,14 +244,11 @@ class Case:
         if own is None:
             return {"nothing": "to leave out"}
 
-        def estimated(some: Recordings) -> Sequence[FrequencyResponse]:
-            return estimate(of_any_kind(some), gaps="auto")
-
         try:
             with self.without():
-                each = sorted_by_pose(own, poses_of(own, rig, ()), estimated)
+                each = responses_by_pose(own, rig, How())
                 if not self.whole:
-                    each = [InPose(one.pose, one.responses, ()) for one in each]
+                    each = [replace(one, runs=()) for one in each]
                 said: dict[str, object] = plain(in_poses(each, self.held(rig)).plain())
         except SamiiRigError as error:
             return {"refused": str(error)}
@@ -263,10 +264,10 @@ CASES = (
     Case("noise", "x 10", noisier(10.0)),
     Case("sensors", "half", fewer(0.5)),
     Case("sensors", "one", fewer(0.0)),
-    Case("levels", "highest", first_of("level")),
+    Case("levels", "highest", highest_level),
     Case("length", "1/2", shorter(0.5)),
     Case("length", "1/4", shorter(0.25)),
-    Case("repeats", "one", first_of("repeat")),
+    Case("repeats", "one", first_repeats),
     Case(OUT, "the transient", whole=False),
     Case(OUT, "the discrepancy",
          without=lambda: _replaced(RecordSearch, overdispersion_of=lambda _self, _fitted: 1.0)),
@@ -340,7 +341,7 @@ class Told:
         some = [t for t in trials if t.truth.kind != "nothing"]
         return cls(
             sum(t.answer.verdict == REFUSED for t in trials),
-            frequency("", [t.answer.verdict not in ("no_mismatch", REFUSED) for t in nothing]),
+            frequency("", [detected(t) for t in nothing]),
             frequency("", [t.place_right for t in some]),
             frequency("", [t.right for t in some]),
             frequency("", [confidently_wrong(t) for t in trials]),

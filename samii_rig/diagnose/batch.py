@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from samii_rig.diagnose.posed import in_poses, of_any_kind, sorted_by_pose
+from samii_rig.diagnose.posed import InPose, in_poses, of_any_kind, sorted_by_pose
 from samii_rig.diagnose.result import Diagnosis
 from samii_rig.errors import InputError, SamiiRigError
 from samii_rig.identify.poses import poses_of
@@ -46,12 +46,19 @@ def together(logs: Sequence[Path], how: How) -> Diagnosis:
     if not text:
         raise InputError("--rig", "", None, "a rig: these recordings carry none")
     rig = parse(Rig, text, "the rig file")
+    return in_poses(responses_by_pose(recordings, rig, how), rig, band=how.band)
+
+
+def responses_by_pose(recordings: Sequence[Recording], rig: Rig, how: How) -> list[InPose]:
+    """The recordings of each pose with their responses, for `in_poses`.
+
+    Raises InputError, EstimateError.
+    """
 
     def estimated(runs: Sequence[Recording]) -> Sequence[FrequencyResponse]:
         return estimate(of_any_kind(runs), outputs=how.outputs, gaps=how.gaps, band=how.band)
 
-    each = sorted_by_pose(recordings, poses_of(recordings, rig, ()), estimated)
-    return in_poses(each, rig, band=how.band)
+    return sorted_by_pose(recordings, poses_of(recordings, rig, ()), estimated)
 
 
 def each(

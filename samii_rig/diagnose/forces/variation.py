@@ -98,13 +98,11 @@ class Variation:
 
 @dataclass(frozen=True)
 class BySpring:
-    """What a linear explanation `best` leaves of the records, taken back to each spring. left : of
-    each piece, on the lines fitted."""
+    """What a linear explanation `best` leaves of the records, taken back to each spring."""
 
     search: ForceSearch
     best: Explanation
     springs: Springs
-    left: list[Unexplained]
     pieces: dict[str, list[PieceModulation]]
 
     @classmethod
@@ -112,7 +110,7 @@ class BySpring:
         """Of an explanation of these records."""
         springs = Springs.of(search)
         left = _some(search.unexplained(best.fitted))
-        return cls(search, best, springs, left, springs.pieces(search, left))
+        return cls(search, best, springs, springs.pieces(search, left))
 
     def in_own_noise(self) -> BySpring:
         """The same in the noise that the explanation itself leaves. In that of another all that
@@ -238,8 +236,8 @@ class _Taken:
 
     search, fitted : of these, and a model of them. levels : the records with it. modulations : what
     varies, as it was found. repeats : of each, whether repeats of one input differ by it, None
-    where there are none. swings : of all of them, what is taken out. left : as of `BySpring`, of
-    these records.
+    where there are none. swings : of all of them, what is taken out. left : what `fitted` leaves
+    of each piece, on the lines fitted.
     """
 
     search: ForceSearch
@@ -258,7 +256,8 @@ class _Taken:
         """Nothing taken out yet of the spring of a site."""
         search, pieces = seen.search, seen.pieces[site]
         none = Swings.none([one.times.size for one in pieces])
-        return cls(search, seen.best.fitted, seen.springs, site, search.levels, none, seen.left)
+        left = [one.left for one in pieces]
+        return cls(search, seen.best.fitted, seen.springs, site, search.levels, none, left)
 
     def settled(self, best: Explanation) -> _Taken:
         """The same, once nothing is left that varies and what was found stands still."""
