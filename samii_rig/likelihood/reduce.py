@@ -116,25 +116,7 @@ def formed(
         nodes = np.rint(at * (smooth.samples / smooth.rate_hz)).astype(np.int64)
     seen = records.seen(H, loop, response)
     free = between(nodes, nodes_of(smooth, shape, records.changing, spare=True))
-
-    known = rounding.Added.of([s.rounding for s in seen])
-
-    def told(whole: Records) -> tuple[Rows, Free, Callable[[rounding.Added], Noise]]:
-        changes = changes_of(whole, smooth, nodes)
-        rows = rows_of(records, changes, seen)
-        change = Free.of(rows, changes, free)
-        left = with_repeats(records, H, seen, rows, *residual_of(change, seen))
-        return rows, change, lambda known: Noise.of(*left, disturbances=disturbances, known=known)
-
-    rows, change, noise = told(records)
-    power = noise(known)
-    moved = with_past(records, change, seen, power)
-    if moved is not None:
-        rows, _, noise = told(moved)
-        power = noise(known)
-    times = _as_changes(rows, seen, power)
-    if np.any(times > 1):
-        power = noise(replace(known, times=times))
+    rows, power = _with_noise(records, H, seen, nodes, free, disturbances)
     power = power if own_power is None else power.of_sensors_alone(own_power)
     counted = np.ones(rows.f.size, bool) if part is None else part(rows.k)
     rows = rows.take(counted)
@@ -154,6 +136,37 @@ def formed(
         log_determinant=form.log_determinant,
     )
     return made, rows
+
+
+def _with_noise(
+    records: Records,
+    H: Complex,
+    seen: Sequence[Seen],
+    nodes: Int,
+    free: Float,
+    disturbances: Disturbances,
+) -> tuple[Rows, Noise]:
+    """The lines, beside motion from before their pieces where they show any, and their noise.
+
+    H : the reference on the contour. free : (b, m) the change that is free where noise is told.
+    """
+    known = rounding.Added.of([s.rounding for s in seen])
+
+    def told(whole: Records) -> tuple[Rows, Free, Callable[[rounding.Added], Noise]]:
+        changes = changes_of(whole, records.smooth(), nodes)
+        rows = rows_of(records, changes, seen)
+        change = Free.of(rows, changes, free)
+        left = with_repeats(records, H, seen, rows, *residual_of(change, seen))
+        return rows, change, lambda known: Noise.of(*left, disturbances=disturbances, known=known)
+
+    rows, change, noise = told(records)
+    power = noise(known)
+    moved = with_past(records, change, seen, power)
+    if moved is not None:
+        rows, _, noise = told(moved)
+        power = noise(known)
+    times = _as_changes(rows, seen, power)
+    return rows, noise(replace(known, times=times)) if np.any(times > 1) else power
 
 
 def _as_changes(rows: Rows, seen: Sequence[Seen], noise: Noise) -> Float:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from samii_rig.diagnose.fit.ranking import moved
-from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.laws import FRICTION, HYSTERESIS, PLAY, SLACK, Law
 from samii_rig.diagnose.forces.model import ForceModel
 from samii_rig.diagnose.forces.screen import ForceScreen, first_order, scaled
@@ -18,7 +17,7 @@ from samii_rig.types import Float
 def weak_ones(search: ForceSearch) -> Iterator[tuple[Law, str, float, float]]:
     """Of each force its law and site, and the power of what it adds, to first order and in time."""
     nominal = search.nominal.fitted
-    screen = ForceScreen(search.problem, (Screen.of(search.problem, nominal),))
+    screen = ForceScreen.of(search.problem, [nominal])
     scores = first_order(search.forces, search.paths, screen)
     assert {h.effect.key for h in scores} == {e.key for e in search.forces}
     for score in scores:
@@ -38,7 +37,8 @@ def weak_ones(search: ForceSearch) -> Iterator[tuple[Law, str, float, float]]:
         model = search.model((score.effect,))
         assert isinstance(model, ForceModel)
         x = np.append(moved(nominal.model, nominal.x, model), np.log(strengths))
-        in_time = _power(*screen.gains(search.problem.change(model, x))) / share**2
+        (gains,) = screen.gains([search.problem.added(model, x)])
+        in_time = _power(*gains) / share**2
         yield law, score.effect.site, _power(score.own, score.may, score.times), in_time
 
 

@@ -236,13 +236,13 @@ class ForceProblem(RecordProblem):
         """As of `Problem`."""
         return replace(self, goal=self.residual(h) + self.goal)
 
-    def change(self, model: ForceModel, x: Float) -> Float:
-        """What the force of a model adds to the prediction, in noise units.
+    def added(self, model: ForceModel, x: Float) -> Complex:
+        """(n, q) what the force of a model adds to the lines.
 
         Raises SamiiRigError where the rig has no partial fractions at x.
         """
         assert isinstance(self.at, RecordGrid)
-        return self.complete.split(self.at.added(model, x, ())[:, :, 0])
+        return np.asarray(self.at.added(model, x, ())[:, :, 0])
 
     def without_force(self) -> RecordProblem:
         """For linear models alone, beside the force that the reference has."""

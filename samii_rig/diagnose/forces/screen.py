@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from samii_rig.diagnose.fit.refit import Fitted
 from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.laws import (
     CLIPPED,
@@ -26,7 +27,7 @@ from samii_rig.diagnose.forces.laws import (
     Force,
     Law,
 )
-from samii_rig.diagnose.forces.paths import Span, TransferPaths
+from samii_rig.diagnose.forces.paths import Ports, TransferPaths
 from samii_rig.diagnose.forces.problem import ForceProblem
 from samii_rig.diagnose.physics.effect import Effect
 from samii_rig.likelihood.algebra import by_input
@@ -63,39 +64,43 @@ class Score:
 
 @dataclass(frozen=True)
 class ForceScreen:
-    """Fits, and what they leave, against which changes of the lines are held."""
+    """Fits, and what they leave, against which changes of the lines are held.
+
+    sides : of each fit (2 n q, 1 + m) what it leaves of the whitened lines, and the directions that
+    it may still move in for nothing.
+    """
 
     problem: ForceProblem
-    screens: tuple[Screen, ...]
+    sides: tuple[Float, ...]
 
-    def gains(self, g: Float) -> tuple[Float, Float, Float]:
-        """(n_look,) of a change g of what is predicted: fall of chi-square with it, with its best
-        multiple, and how many times it is that."""
-        found = []
-        for base in self.screens:
-            through = base.directions[: g.size].T @ g
-            found.append((-float(g @ base.residual()[: g.size]), float(g @ g - through @ through)))
-        return _gains(*np.array(found).T)
+    @classmethod
+    def of(cls, problem: ForceProblem, fits: Sequence[Fitted]) -> ForceScreen:
+        """About some fits."""
+        complete, sides = problem.complete, []
+        rows = complete.rows.e.size * 2 + len(complete.factor)
+        for fitted in fits:
+            base = Screen.of(problem, fitted)
+            parts = base.residual()[:rows, None], base.directions[:rows]
+            sides.append(np.concatenate([_real(complete.joined(x)) for x in parts], axis=1))
+        return cls(problem, tuple(sides))
 
-    def first_order(self, changes: Sequence[Complex]) -> list[tuple[Float, Float, Float]]:
-        """`gains` of each of many changes of the lines (n, q)."""
-        rows = self.problem.complete.rows.e.size * 2 + len(self.problem.complete.factor)
-        sides = [np.column_stack([s.residual(), s.directions])[:rows] for s in self.screens]
-        joined = self.problem.complete.joined(np.concatenate(sides, axis=1))
-        flat = _real(joined.reshape(-1, joined.shape[2]))
-        out, ends = [], np.cumsum([side.shape[1] for side in sides])
-        for first in range(0, len(changes), AT_ONCE):
-            white = self.problem.complete.white(np.stack(changes[first : first + AT_ONCE], axis=2))
-            G = _real(white.reshape(-1, white.shape[2]))
-            for along, power in zip(G.T @ flat, np.sum(G**2, axis=0), strict=True):
-                each = np.split(along, ends[:-1])
-                found = [(-x[0], float(power - x[1:] @ x[1:])) for x in each]
-                out.append(_gains(*np.array(found).T))
-        return out
+    def gains(self, changes: Sequence[Complex]) -> list[tuple[Float, Float, Float]]:
+        """Of each of some changes of the lines (n, q), each (n_look,): the fall of chi-square with
+        it, with its best multiple, and how many times it is that."""
+        G = _real(self.problem.complete.white(np.stack(changes, axis=2)))
+        power = np.sum(G**2, axis=0)
+        along, free = [], []
+        for side in self.sides:
+            own = side.T @ G
+            along.append(-own[0])
+            free.append(power - np.sum(own[1:] ** 2, axis=0))
+        return [_gains(*both) for both in zip(np.transpose(along), np.transpose(free), strict=True)]
 
 
 def _real(x: Complex) -> Float:
-    return np.concatenate([x.real, x.imag])
+    """(2 n q, k) of x (n, q, k)."""
+    flat = x.reshape(-1, x.shape[2])
+    return np.concatenate([flat.real, flat.imag])
 
 
 def _gains(along: Float, power: Float) -> tuple[Float, Float, Float]:
@@ -141,32 +146,51 @@ def first_order(
     effects: Sequence[Effect], paths: TransferPaths, screen: ForceScreen
 ) -> list[Score]:
     """Of each force its best try, to first order."""
-    records, order = paths.whole.records, screen.problem.complete.rows.order
-    k = [records.lines(p).k for p in records.pieces]
-    which, shapes, changed = [], [], []
-    for effect in effects:
-        force = effect.force
-        assert force is not None
-        ports = paths.ports(force.place, of_speed=force.law.of_speed)
-        if ports is None:
-            continue
-        for strengths in trial_strengths(effect, paths):
-            p = force.law.numbers(strengths, [paths.scale(key) for key in force.keys])
-            spectra, share = _forces(force, p, paths)
-            lines = map(Span.lines, paths.spans, spectra, ports.sensors, k)
-            shapes.append(np.concatenate(list(lines))[order])
-            which.append((effect, strengths))
-            changed.append(share)
+    tried = [
+        (effect, strengths)
+        for effect in effects
+        if _ports(effect, paths) is not None
+        for strengths in trial_strengths(effect, paths)
+    ]
     best: dict[str, Score] = {}
-    gains = screen.first_order(shapes)
-    for (effect, strengths), share, (own, may, times) in zip(which, changed, gains, strict=True):
-        at = int(np.argmax(may))
-        weak = share * max(float(times[at]), 0.0) < WEAK_BELOW
-        score = Score(effect, strengths, own, may, float(times[at]), weak)
-        old = best.get(effect.key)
-        if old is None or may[at] > np.max(old.may):
-            best[effect.key] = score
+    # Of some at once: the lines of all forces are many times the records.
+    for first in range(0, len(tried), AT_ONCE):
+        some = tried[first : first + AT_ONCE]
+        changes, shares = zip(*(_lines(*one, paths, screen) for one in some), strict=True)
+        gains = screen.gains(changes)
+        for (effect, strengths), share, (own, may, times) in zip(some, shares, gains, strict=True):
+            at = int(np.argmax(may))
+            weak = share * max(float(times[at]), 0.0) < WEAK_BELOW
+            score = Score(effect, strengths, own, may, float(times[at]), weak)
+            old = best.get(effect.key)
+            if old is None or may[at] > np.max(old.may):
+                best[effect.key] = score
     return sorted(best.values(), key=lambda h: -float(np.max(h.may)))
+
+
+def _ports(effect: Effect, paths: TransferPaths) -> Ports | None:
+    force = effect.force
+    assert force is not None
+    return paths.ports(force.place, of_speed=force.law.of_speed)
+
+
+def _lines(
+    effect: Effect, strengths: Float, paths: TransferPaths, screen: ForceScreen
+) -> tuple[Complex, float]:
+    """(n, q) what a force of such strengths adds to the lines, to first order; its share, as of
+    `_forces`."""
+    force, ports, records = effect.force, _ports(effect, paths), paths.whole.records
+    assert force is not None
+    assert ports is not None
+    p = force.law.numbers(strengths, [paths.scale(key) for key in force.keys])
+    spectra, share = _forces(force, p, paths)
+    each = [
+        span.lines(E, sensors, records.lines(piece).k)
+        for span, E, sensors, piece in zip(
+            paths.spans, spectra, ports.sensors, records.pieces, strict=True
+        )
+    ]
+    return np.concatenate(each)[screen.problem.complete.rows.order], share
 
 
 def _summed(each: Sequence[Float]) -> Float:

@@ -20,7 +20,6 @@ from samii_rig.diagnose.fit.ranking import moved
 from samii_rig.diagnose.fit.record_search import RecordSearch
 from samii_rig.diagnose.fit.records import Whole
 from samii_rig.diagnose.fit.refit import Fitted
-from samii_rig.diagnose.fit.screen import Screen
 from samii_rig.diagnose.forces.beside import FORMED_AGAIN, REFERENCE_STILL, BesideForce
 from samii_rig.diagnose.forces.fits import of_data
 from samii_rig.diagnose.forces.laws import SLACK
@@ -275,11 +274,10 @@ class ForceSearch(BesideForce):
     def scores(self, bases: Sequence[Explanation]) -> list[Score]:
         """Every force that may explain as much as an effect must beside the first of some
         explanations, or beside the last, with what it gains beside each."""
-        screens = tuple(Screen.of(self._force_problem, e.fitted) for e in bases)
-        screen = ForceScreen(self._force_problem, screens)
+        screen = ForceScreen.of(self._force_problem, [e.fitted for e in bases])
         scores = first_order(self.forces, self.paths, screen)
         # Beside the first it must do as much as what the last has more did.
-        ahead = screens[0].base.cost - min(one.base.cost for one in screens)
+        ahead = bases[0].fitted.cost - min(e.fitted.cost for e in bases)
         some = _first(self._matter(scores, ahead), MARCHED)
         each = self.each(some, lambda h: named([h.effect]))
         found = [self._closer(h, screen, bases[0]) for h in each]
@@ -321,12 +319,12 @@ class ForceSearch(BesideForce):
             law, largest = effect.force.law, self.paths.largest(effect.force.place)
             there = np.clip(scaled(law, strengths, times, largest), low, high)
             try:
-                g = self._force_problem.change(model, np.append(known, np.log(there)))
+                lines = self._force_problem.added(model, np.append(known, np.log(there)))
             except SamiiRigError:  # no rig is stable with so much of it
                 times = math.sqrt(times)
                 continue
             strengths = there
-            own, may, each = screen.gains(g)
+            ((own, may, each),) = screen.gains([lines])
             at = int(np.argmax(own))
             times = float(each[at])
             if best is None or own[at] > np.max(best.own):
