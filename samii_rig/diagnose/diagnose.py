@@ -33,7 +33,7 @@ from samii_rig.rig.schema import Rig
 from samii_rig.signal.columns import is_aligned
 from samii_rig.types import FrequencyResponse, Recording
 
-EQUIVALENCE_POINTS = 40
+EQUIVALENCE_POINTS = 40  # frequencies at which effects that are one by structure are compared
 
 
 def table(

@@ -241,7 +241,7 @@ def test_a_cause_is_not_told_that_explains_less_than_a_force_at_some_lines(
         verdict="named", varies=None, evidence=SimpleNamespace(drop=5.0),
         best=SimpleNamespace(effects=(Effect("torsional_compliance", "spring_1"),)),
     )  # fmt: skip
-    pieces = [SimpleNamespace(edges=())]
+    pieces = [SimpleNamespace(edges=((3, 0),))]  # also where an input jumps
     ends = iter([SimpleNamespace(chi2=1043.0), SimpleNamespace(chi2=1000.0)])
     forces = SimpleNamespace(
         nominal=SimpleNamespace(effects=()),

@@ -28,7 +28,7 @@ LOST_GAIN = 0.02  # relative change of one channel's gain between levels that is
 A_CONSTANT = 2.0  # chi-square per degree of freedom up to which a change is a constant
 ELSE = 5.0  # chi-square per degree of freedom from which two levels differ
 NOT_CHANGED = 4.0  # standard deviations by which another channel's gain is not the changed one
-FEW_REPEATS = 3
+FEW_REPEATS = 3  # of fewer, one that is wrong cannot be told from the others
 SAID_PER_KIND = 3  # findings of one kind that are told; the rest is counted
 
 

@@ -21,7 +21,7 @@ from samii_rig.signal import welch
 from samii_rig.types import Complex, Float, FrequencyResponse, Int
 
 BINS = 180  # to begin with; a refit costs a few milliseconds
-MOST_BINS = 400
+MOST_BINS = 400  # after divisions
 SPLIT = 6.0  # standard deviations of chi-square inside a bin above which it is divided
 COARSE = 0.01  # of a model's misfit, over noise, that may be lost in a bin
 SHAPE = 0.6  # weight of the response's own arc (logarithm, radians) against log frequency

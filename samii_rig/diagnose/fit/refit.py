@@ -23,13 +23,12 @@ from samii_rig.identify.likelihood import LOG_FLOOR
 from samii_rig.levenberg import ByFactor, Normal, Point, Progress, descend, step
 from samii_rig.types import Complex, Float
 
-STEPS = 40
-LOG_STEPS = 20
+STEPS, LOG_STEPS = 40, 20  # of a refit at most, and of one of the response's logarithm
 LOGARITHM_FIRST = 20.0  # chi-square per degree of freedom above which the logarithm is fitted first
 LONGEST_LOGARITHM = 1.2  # a step of an effect's logarithm at most
 # Of chi-square, for a step of the largest allowed size.
 DAMPING = ByFactor(10.0, shrink=0.3, grow=5.0, least=1e-2)
-LOG_DAMPING = ByFactor(1e-2, shrink=1.0, grow=1.0)
+LOG_DAMPING = ByFactor(1e-2, shrink=1.0, grow=1.0)  # the same of a logarithm, at every step
 LOG_SETTLED = 1e-3  # of the logarithm's cost, gained by a step: less and they end
 DAMPINGS = 7  # dampings of one step
 CORRECTIONS = 4  # of a step that left the valley

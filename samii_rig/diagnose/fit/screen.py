@@ -18,6 +18,7 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
+from scipy import linalg
 
 from samii_rig.diagnose.fit import forms
 from samii_rig.diagnose.fit.forms import (
@@ -74,9 +75,11 @@ class Screen:
         """The screen about a fit."""
         prior = base.model.prior
         known = np.isfinite(prior)
-        rows = np.diag(np.where(known, 1 / prior, LOOSE))
-        Q = np.linalg.qr(np.concatenate([base.jacobian, rows]))[0]
-        return cls(problem, base, Q, np.where(known, base.x / prior, 0.0))
+        m, n = base.jacobian.shape
+        both = np.zeros((m + n, n), order="F")  # is itself turned into Q: of long records 100 MB
+        both[:m], both[m:] = base.jacobian, np.diag(np.where(known, 1 / prior, LOOSE))
+        Q, _ = linalg.qr(both, overwrite_a=True, mode="economic", check_finite=False)
+        return cls(problem, base, np.asarray(Q), np.where(known, base.x / prior, 0.0))
 
     def of_data(self) -> Screen:
         """As if the effect were all there is: the data are what the fit predicts, and moves of the

@@ -21,7 +21,7 @@ FILE = "calibration.toml"
 ANSWER, PLACE = "weights", "place"  # tables of it
 ODDS = 8.0  # of a logarithm: beyond, evidence says no more
 LEFT = 3.0  # the same of what is left, chi-square per degree of freedom
-TINY = 1e-300
+TINY = 1e-300  # a probability whose logarithm there still is
 IN_DATA = 45.0  # of chi-square, that an effect must explain of responses to be called missing
 
 

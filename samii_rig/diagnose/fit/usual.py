@@ -13,12 +13,11 @@ from samii_rig.progress import START
 
 Usual = Mapping[str, tuple[float, float]]
 
-# s for each thousand samples, or lines: of 31 concealed trials of 9,000 to 339,000 samples, of the
-# 150 to 5,200 lines of 33, of two states of 20,000 samples in 18 trials, of 8 arms in two poses.
-RECORDS_TAKE = (0.08, 0.7)
-LINES_TAKE = (0.25, 9.5)
-STATES_TAKE = (0.2, 0.75)
-POSES_TAKE = (0.16, 1.1)
+# s for each thousand samples, or lines: the quickest and the slowest of
+RECORDS_TAKE = (0.08, 0.7)  # 31 concealed trials of 9,000 to 339,000 samples
+LINES_TAKE = (0.25, 9.5)  # 33 of 150 to 5,200 lines
+STATES_TAKE = (0.2, 0.75)  # 18 of two states of 20,000 samples
+POSES_TAKE = (0.16, 1.1)  # 8 arms in two poses
 LEAST_WORK = 0.5  # s: the work that every diagnosis has
 
 

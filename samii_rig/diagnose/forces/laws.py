@@ -96,7 +96,7 @@ def _starved(M: Float, v: Float, p: Float) -> Float:
     return np.asarray(v * (np.sqrt(np.maximum(1 + np.sign(v) * M / p[0], 0.0)) - 1))
 
 
-ONE = ((1.0, 0.0),)
+ONE = ((1.0, 0.0),)  # how the only unknown of a law enters its first two numbers
 BETWEEN: tuple[Kind, ...] = ("joint", "ground")
 FRICTION = Law(
     "friction", "coulomb_friction", "dry friction", (*BETWEEN, "drive"), ("T_c",), ((1.0, 1.0),),

@@ -28,7 +28,7 @@ from samii_rig.types import Float
 
 # Of a fractional damper: nearer 0 it is the spring that the joint has, nearer 1 its damper.
 POWER = (0.1, 0.9)
-POWERS = (0.2, 0.35, 0.5, 0.7)
+POWERS = (0.2, 0.35, 0.5, 0.7)  # at which a search starts
 COMPLIANCES = (1e-4, 0.01, 1.0)  # of a line's oil over the chain's own, at which a search starts
 # No material's loss is the same at all frequencies: relaxation makes it wander by some per cent.
 LOSS_WANDERS = 0.05

@@ -33,7 +33,8 @@ from samii_rig.types import Complex, Float
 SHIFTED = "columns_shifted"  # of an input against the sensors, by a logger
 MOST_SHIFTED = 5  # samples, by which a logger's columns are apart; as `signal.columns` looks for
 MEASURED = 0.3  # of loggers that shift columns, those that measure the command
-ORDERS = ("a displacement", "a velocity", "an acceleration")  # by how often it was derived
+ORDERS = ("a displacement", "a velocity", "an acceleration")
+# How often that was derived which a sensor measures.
 ORDER = {AbsoluteAngle: 0, RelativeAngle: 0, Displacement: 0, Velocity: 1, Acceleration: 2}
 
 

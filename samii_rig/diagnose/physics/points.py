@@ -43,7 +43,7 @@ from samii_rig.units import STANDARD_GRAVITY
 
 Law = Literal["spring", "softness", "column", "damper", "slip", "mass"]
 LOSS = (1e-4, 10.0)  # damping force over spring force in mid band
-LOSS_STARTS = (0.05,)
+LOSS_STARTS = (0.05,)  # the same, at which a search starts
 # Damping ratio of an oscillator: that of a steel part clamped well; with more it is a damper and
 # does not resonate.
 LEAST_DAMPED, MOST_DAMPED = 1e-3, 0.3
@@ -52,8 +52,7 @@ MOST_HUNG = 10.0
 JOINTS = (TorsionalSpring, TranslationalSpring, *ANGLE_SOURCES)
 # Parts of the way along a stretch at which a search begins; its ends are ports. What moves a rigid
 # link goes with the square of the place at most; a beam has its modes between.
-ON_LINK = (0.3, 0.75)
-ON_BEAM = (0.2, 0.5, 0.8)
+ON_LINK, ON_BEAM = (0.3, 0.75), (0.2, 0.5, 0.8)
 
 
 @dataclass(frozen=True, slots=True)

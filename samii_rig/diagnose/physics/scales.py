@@ -18,7 +18,7 @@ from samii_rig.types import Complex, Float
 
 PAIRS: tuple[tuple[State, State], ...] = (("theta", "M"), ("w", "V"), ("V", "w"), ("M", "theta"))
 STATES: tuple[State, ...] = ("w", "theta", "M", "V")
-BAND_POINTS = 60
+BAND_POINTS = 60  # of the band, at which the chain's own stiffness and mass are taken
 # Of a stiffness or damping over the chain's own, from gross to invisible: a force sensor in line
 # with a cylinder shows a spring to ground of 6e-6 of the cylinder's stiffness. And where on that a
 # search begins: 0.6 decades apart the next start is near enough for a refit. An odd number has the

@@ -412,11 +412,9 @@ def _winning(forces: ForceSearch | None) -> ForceSearch | None:
 
 def _or_uneven(forces: ForceSearch, looked: _Looked) -> _Looked:
     """The same, but nothing is missing alone where no force explains some lines and not others: one
-    that does is another than any in the table, or acts beside what moved the rig unrecorded. Where
-    an input has edges at unknown instants, what is left of them does that. Nor is another cause
-    told that explains less than such a force."""
-    edges = any(piece.edges for piece in forces.levels.records.pieces)
-    if forces.uneven is None or edges or not _without_force(looked.judged):
+    that does is another than any in the table, or acts beside what moved the rig unrecorded. Nor is
+    another cause told that explains less than such a force."""
+    if forces.uneven is None or not _without_force(looked.judged):
         return looked
     effect, fall = forces.uneven
     if looked.judged.verdict == "named" and isinstance(looked.judged.varies, Variation):

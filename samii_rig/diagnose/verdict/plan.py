@@ -31,7 +31,7 @@ from samii_rig.types import Complex, Float, Recording
 Change = Callable[[Rig], Rig]
 
 TELLING = 5.0  # noise units from which an experiment is worth its time
-PLAN_POINTS = 80
+PLAN_POINTS = 80  # frequencies at which experiments are held against each other
 BAND_WIDER = 2.0  # how far a band is widened at either end
 STIFF = 1e9  # N m/rad and N/m: a brace that does not give
 KNOWN_MASS = 0.1  # of the chain's own mass, a mass that is added

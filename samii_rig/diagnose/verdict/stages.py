@@ -27,7 +27,7 @@ from samii_rig.diagnose.verdict.locate import traces
 from samii_rig.diagnose.verdict.plan import harder, next_experiment
 from samii_rig.types import FrequencyResponse, Recording
 
-ALTERNATIVES = 6
+ALTERNATIVES = 6  # that are listed at most
 MOSTLY = 0.5  # of the lines, at which a sensor is not read, from which driving harder is proposed
 REPEAT = (
     "a stiffness that changes is distinguished from a force by when it does",
