@@ -268,6 +268,17 @@ def test_the_jumps_of_steps_stay_as_sharp_as_they_are(behind: float) -> None:
     assert left < 0.3 * meter
 
 
+@pytest.mark.parametrize("meter", [0.0, 5 * METER])
+def test_jumps_beside_a_fast_sweep_are_no_meters_noise(meter: float) -> None:
+    """Both together look white, and bend as noise does: a sweep to a fifth of the rate, and steps
+    behind it."""
+    n, t = 40000, np.arange(36000) / RATE
+    sweep = np.sin(np.pi * 0.2 * RATE / t[-1] * t**2)
+    steps = np.repeat([0.0, 1.0, -1.0, 0.0], 1000)
+    r = np.concatenate([sweep, steps]) + meter * np.random.default_rng(9).standard_normal(n)
+    assert meter_noise(np.rint(r / STEP) * STEP, STEP) == pytest.approx(meter, rel=0.15)
+
+
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_binary_input_is_as_wide_as_noise_and_is_none(seed: int) -> None:
     v = 0.5 * np.sign(np.repeat(np.random.default_rng(seed).standard_normal(500), 10))
